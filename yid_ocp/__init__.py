@@ -1,4 +1,4 @@
-"""Stiffness of flexible objects from robot recordings, and a diagnosis of the sim-to-real gap that is left.
+"""Identification of the stiffness of flexible objects from robot recordings, and diagnosis of the sim-to-real gap.
 
 Names load on first use, so that `import yid_ocp` and `yid-ocp --help` are quick.
 """

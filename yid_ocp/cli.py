@@ -1,4 +1,4 @@
-"""The command line: one row for each command and its arguments; what a command does stands in `workflow`.
+"""The command line: the table of commands and their arguments; `workflow` implements the commands.
 
 A command's module is imported when it runs, so that help needs none of the libraries for numbers.
 """
@@ -28,7 +28,7 @@ ERROR = "yid-error/1"
 
 @dataclass(frozen=True)
 class Command:
-    """One row of the command table.
+    """A command of the command line: name, help, implementing module, arguments.
 
     Attributes
     ----------
@@ -296,10 +296,10 @@ COMMANDS: tuple[Command, ...] = (
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser whose errors are those of the rest of the program, with the nearest name that it knows."""
+    """An argument parser that raises `ConfigError` with the nearest known name."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
-        """As the parser of the library, but what is left over is an error of the command that does not know it."""
+        """Parse as in `argparse`; unknown arguments are an error of the command."""
         found, rest = super().parse_known_args(args, namespace)
         if rest:
             flag, flags = rest[0].partition("=")[0], [name for name in self._option_string_actions if name[:2] == "--"]
@@ -309,7 +309,7 @@ class _Parser(argparse.ArgumentParser):
         return found, rest
 
     def error(self, message: str) -> NoReturn:
-        """Raise what the library found wrong."""
+        """Raise a `ConfigError` for argparse's message."""
         chosen = re.fullmatch(r"argument (\S+): invalid choice: '?(.*?)'? \(choose from (.*)\)", message, re.DOTALL)
         if chosen:
             known = [name.strip(" '") for name in chosen[3].split(",")]
@@ -343,14 +343,14 @@ def _wrong(error: YidError, as_json: bool) -> int:
 
 
 def _told(as_json: bool, kind: str, what: str, code: int, **parts: str) -> None:
-    """An error on standard output, where a program reads it."""
+    """Print an error as JSON on standard output, where `--json` is set."""
     if as_json and sys.stdout is not None:
         print(json.dumps({"format": ERROR, "kind": kind, "what": what, **parts, "exit_code": code}, indent=1))
 
 
 @contextlib.contextmanager
 def _notices() -> Iterator[None]:
-    """Show the library's warnings on standard error while a command runs, each once however often it is given."""
+    """Context manager that prints the package's warnings on standard error, each once."""
     handler, shown = logging.StreamHandler(sys.stderr), set[str]()
 
     def is_new(record: logging.LogRecord) -> bool:
@@ -371,7 +371,7 @@ def _notices() -> Iterator[None]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command.
+    """Run a command and return its exit code.
 
     Returns
     -------
@@ -401,7 +401,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _carried_out(arguments: argparse.Namespace, as_json: bool) -> int:
-    """Exit code of a command."""
+    """Run a command; returns its exit code."""
     if sys.stdout is None:  # closed by who started the program
         sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
     try:
@@ -421,7 +421,7 @@ def _carried_out(arguments: argparse.Namespace, as_json: bool) -> int:
 
 
 def _failed(error: Exception, as_json: bool) -> int:
-    """Say why a command failed; its exit code."""
+    """Print why a command failed; returns its exit code."""
     if isinstance(error, YidError):
         return _wrong(error, as_json)
     if isinstance(error, BrokenPipeError):

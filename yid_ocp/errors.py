@@ -1,4 +1,4 @@
-"""Exceptions of the package: every one says what is wrong, where, what is allowed and what to do."""
+"""Exceptions of the package: each states what is wrong, where, what is allowed and what to do."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TypedDict
 
 
 class YidError(Exception):
-    """A problem that its reader can fix.
+    """An error that the user can correct.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ class YidError(Exception):
 
 
 class ConfigError(YidError):
-    """The configuration file, or a value set over it, is not usable."""
+    """The configuration file, or a value set on top of it, is invalid."""
 
 
 class DataError(YidError):
@@ -39,38 +39,38 @@ class DataError(YidError):
 
 
 class ModelError(YidError):
-    """The mechanical model cannot be built as it was described."""
+    """The mechanical model cannot be built as described."""
 
 
 class SolverError(YidError):
-    """A solver was asked for something that it does not do."""
+    """A solver does not support what was requested."""
 
 
 class OutputError(YidError):
-    """A result cannot be written where it was asked for."""
+    """A result cannot be written to its destination."""
 
 
 class WorkerError(YidError):
-    """Workers cannot be reached, or are not fit for the tasks that they are to do."""
+    """Workers cannot be reached, or cannot do their tasks."""
 
 
 class ResourceError(YidError):
-    """The machine has too little memory for what was asked of it."""
+    """The machine has too little memory."""
 
 
 MANY, FEW = 40, 8
-"""More names than the first are not listed; of so many that something is near, the second."""
+"""Largest number of names listed in full where none is similar, and number of names listed otherwise."""
 
 
 class Choices(TypedDict):
-    """What an error says of a name that is not known: its `allowed` and its `hint`."""
+    """Allowed names and hint for an error about an unknown name."""
 
     allowed: str
     hint: str
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Say which known name the given one resembles most, or list what there is.
+    """Hint for an error about an unknown name: the most similar known name, or a list of known names.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 
 def choices(name: str, known: Iterable[str]) -> Choices:
-    """What is allowed in place of a name, and what it resembles most: no name twice, and long lists cut.
+    """Allowed names and hint for an error about an unknown name; long lists are cut.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def choices(name: str, known: Iterable[str]) -> Choices:
 
 
 def _close(name: str, names: Sequence[str], count: int) -> list[str]:
-    """The names that resemble one, nearest first, whatever their case."""
+    """Known names similar to a name, most similar first, without regard to case."""
     plain = {entry.lower(): entry for entry in reversed(names)}
     return [plain[entry] for entry in difflib.get_close_matches(name.lower(), plain, n=count, cutoff=0.5)]
 
@@ -117,7 +117,7 @@ def _meant(name: str, names: Sequence[str]) -> str:
 
 
 def _listed(name: str, names: Sequence[str]) -> str:
-    """All names, or the nearest where they are many."""
+    """All names, or the most similar ones of many."""
     close = _close(name, names, FEW)
     if len(names) <= FEW or (not close and len(names) <= MANY):
         return ", ".join(names)

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, hashes of files and of plain data, plain data for JSON."""
+"""Atomic file writing, hashes of files and data, conversion to JSON types."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from yid_ocp.errors import DataError, OutputError
 
 @contextlib.contextmanager
 def new_file(path: Path) -> Iterator[Path]:
-    """Give a temporary name beside `path`; what is written there takes its place when the block ends without error.
+    """Context manager that writes a file atomically: the yielded temporary file replaces `path` on success.
 
     Parameters
     ----------
@@ -57,23 +57,23 @@ def new_file(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file as a whole, in UTF-8; errors as `new_file`."""
+    """Write a UTF-8 text file atomically; errors as `new_file`."""
     with new_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, data: Any) -> None:
-    """Write plain data as a whole, as indented JSON; errors as `new_file`, and ValueError for infinities and NaN."""
+    """Write plain data as indented JSON atomically; errors as `new_file`, and ValueError for infinities and NaN."""
     write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is a file; no name is too long or too odd to ask."""
+    """Whether there is a file of that name; False for names that are too long or invalid."""
     return os.path.isfile(path)
 
 
 def file_sha256(path: Path) -> str:
-    """Hash a file, or the files of a folder in the order of their names.
+    """SHA-256 of a file, or of all files in a folder in the order of their names.
 
     Parameters
     ----------
@@ -104,12 +104,12 @@ def file_sha256(path: Path) -> str:
 
 
 def content_hash(data: Any) -> str:
-    """SHA-256 of plain data (what JSON can hold), whatever the order of its keys; 64 hexadecimal digits."""
+    """SHA-256 of plain data as JSON, independent of key order; 64 hexadecimal digits."""
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
 def jsonable(value: Any, notes: list[str] | None = None, path: str = "") -> Any:
-    """A value in JSON's types; numbers that are not finite become None and a line in `notes`."""
+    """A value converted to JSON types; numbers that are not finite become None, with a line in `notes`."""
     if isinstance(value, Mapping):
         return {str(k): jsonable(v, notes, f"{path}.{k}" if path else str(k)) for k, v in value.items()}
     if isinstance(value, (list, tuple, np.ndarray)):
@@ -124,6 +124,6 @@ def jsonable(value: Any, notes: list[str] | None = None, path: str = "") -> Any:
 
 
 def reason(error: Exception) -> str:
-    """Why the system or HDF5 refused something, in words."""
+    """Reason of an error of the operating system or HDF5, in words."""
     number = getattr(error, "errno", None)
     return os.strerror(number) if number else str(error).strip("'\"")

@@ -1,4 +1,4 @@
-"""Signals that end a command: raised in the main thread, again where that was swallowed, and by force in the end."""
+"""Signals that end a command: re-raise those that libraries suppress, and finally kill the process."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from pathlib import Path
 from types import FrameType
 
 PATIENCE = 2.0
-"""Time until an interruption that something swallowed is raised again [s]."""
+"""Time after which a suppressed interruption is raised again [s]."""
 
 LAST_RESORT = 10.0
-"""Time after which a process that does not end, as in a long call of a library, is ended [s]."""
+"""Time after which a process that does not end is killed [s]."""
 
 SIGNALS = tuple(signal.Signals[name] for name in ("SIGINT", "SIGTERM", "SIGHUP") if name in signal.Signals.__members__)
-"""Those that end a command, as far as the system has them."""
+"""Signals that end a command, as far as the system has them."""
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal asked the command to end.
+    """Exception raised when a signal ends the command.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 class _State:
-    """What a process knows of interruptions; one for all, as signals are."""
+    """State of interruptions in this process."""
 
     def __init__(self) -> None:
         self.asked: int | None = None
@@ -49,13 +49,13 @@ _STATE = _State()
 
 
 def asked() -> int | None:
-    """The signal that asked the running command to end, None where none did."""
+    """Number of the signal that requested the command's end; None if there was none."""
     return _STATE.asked
 
 
 @contextlib.contextmanager
 def deferred() -> Iterator[None]:
-    """Let a short block end before an interruption is raised."""
+    """Context manager that delays an interruption until its short block has ended."""
     _STATE.deferring += 1
     before = _STATE.asked
     try:
@@ -68,7 +68,7 @@ def deferred() -> Iterator[None]:
 
 @contextlib.contextmanager
 def removed_by_force(folder: Path) -> Iterator[None]:
-    """Have a folder removed should the process have to be ended while the block runs."""
+    """Context manager that removes a folder if the process is killed during its block."""
     _STATE.unfinished.add(folder)
     try:
         yield
@@ -78,7 +78,7 @@ def removed_by_force(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def signals_raised() -> Iterator[None]:
-    """Raise `Interrupted` for interrupts, requests to end and lost terminals while the block runs.
+    """Context manager that raises `Interrupted` for SIGINT, SIGTERM and SIGHUP during its block.
 
     An exception can get lost: in what collects garbage, in callbacks of libraries, in a call that does not come back.
     So it is raised again every `PATIENCE` seconds, and after `LAST_RESORT` seconds the process is ended with the exit
@@ -118,7 +118,7 @@ def _raise(number: int, frame: FrameType | None) -> None:
 
 
 def _watch(told: socket.socket, ended: threading.Event, main: int) -> None:
-    """Wait for a signal of ours; see that it is obeyed."""
+    """Wait for a signal and ensure that the process ends."""
     number = None
     while number is None:
         received = told.recv(64)

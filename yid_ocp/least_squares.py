@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt for small dense fits: a start, a shape in a cloud, a calibration."""
+"""Levenberg-Marquardt for small dense least-squares problems: initial states, shapes, calibrations."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _FIRST_DAMPING, _MOST_DAMPING = 1e-3, 1e8
 
 @dataclass(frozen=True)
 class SmallFit:
-    """Where a small fit ended.
+    """Result of a least-squares minimisation.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class SmallFit:
 
 @dataclass(frozen=True)
 class Quadratic:
-    """A cost about a point, for costs that are no plain sum of squares or come with many rows.
+    """A local quadratic model of a cost, for costs that are not a plain sum of squares or have many residuals.
 
     Attributes
     ----------
@@ -54,14 +54,14 @@ class Quadratic:
     hessian: Array
 
     def change(self, damping: float) -> Array:
-        """The damped step, shape (n,)."""
+        """The step that minimises the model with Levenberg-Marquardt damping, shape (n,)."""
         damped = self.hessian + damping * np.diag(np.diag(self.hessian))
         return np.asarray(-np.linalg.solve(damped, self.gradient))
 
 
 @dataclass(frozen=True)
 class QuadraticFit:
-    """Where a fit of quadratic models ended: `x` (n,), the model there, iterations, whether it converged."""
+    """Result of `damped_newton`: minimiser `x` (n,), the model there, iterations, convergence."""
 
     x: Array
     model: Quadratic
@@ -113,7 +113,7 @@ def damped_newton(
     cost_tolerance: float = 1e-10,
     least_damping: float = 1e-9,
 ) -> QuadraticFit:
-    """Minimise a cost by the same loop as `levenberg_marquardt`, from quadratic models in place of rows.
+    """Minimise a cost given by local quadratic models, with the loop of `levenberg_marquardt`.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ class _Limits:
 
 
 class _Model(Protocol):
-    """What is known of a cost about a point."""
+    """A local model of a cost."""
 
     @property
     def cost(self) -> float: ...
@@ -151,7 +151,7 @@ _M = TypeVar("_M", bound=_Model)
 
 
 class _SumOfSquares:
-    """|r|^2 about a point, from residual (m,) and Jacobian (m, n)."""
+    """Local model of |r|^2 from residual (m,) and Jacobian (m, n)."""
 
     def __init__(self, residual: Array, jacobian: Array) -> None:
         self.residual, self.jacobian = residual, jacobian
@@ -168,7 +168,7 @@ class _SumOfSquares:
 def _descend(
     model_at: Callable[[Array], _M], start: Array, project: Project | None, limits: _Limits
 ) -> tuple[Array, _M, int, bool]:
-    """The point, its model, iterations used, whether it converged."""
+    """The minimiser, its model, iterations used, and whether it converged."""
     x = np.array(start, float)
     model, damping = model_at(x), _FIRST_DAMPING
     for iteration in range(1, limits.iterations + 1):

@@ -1,4 +1,4 @@
-"""What an option says of itself where it is defined, and what follows from that: its key, its words, its check.
+"""Annotations of options (dataclass fields that users may set), from which keys, descriptions and checks follow.
 
 An option is a field of a frozen dataclass, annotated with its bounds and with `About`:
 
@@ -33,7 +33,7 @@ WORDS = {float: "a number", int: "a whole number", bool: "true or false", str: "
 
 @dataclass(frozen=True)
 class About:
-    """What a key means and its unit; markers may stand in any part of a type.
+    """Annotation of an option: its meaning and unit.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class About:
 
 @dataclass(frozen=True)
 class Among:
-    """Says that a type stands for the classes of a registry: the key `name` chooses one, or the key of a mapping.
+    """Annotation of a type: the user chooses a class of a registry by the key `name`, or by a mapping's key.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class Among:
 
 @dataclass(frozen=True)
 class Option:
-    """Type with its markers, default (`MISSING` where there is none), and the field of the dataclass that it fills."""
+    """An option's annotated type, default (`MISSING` where there is none) and dataclass field name."""
 
     hint: Any
     default: Any
@@ -75,7 +75,7 @@ class Option:
 
 @functools.cache
 def options_of(kind: type) -> Mapping[str, Option]:
-    """Fields of a dataclass that users may set, by key: the field's name, without the `_` behind a word of Python."""
+    """Options of a dataclass by key, which is the field's name without a trailing `_`."""
     hints = get_type_hints(kind, include_extras=True)
     return {
         entry.name.removesuffix("_"): Option(
@@ -89,7 +89,7 @@ def options_of(kind: type) -> Mapping[str, Option]:
 
 
 def stripped(hint: Any) -> tuple[Any, list[Any]]:
-    """A type without its markers, and these."""
+    """A type without its `Annotated` metadata, and the metadata."""
     markers: list[Any] = []
     while get_origin(hint) is Annotated:
         markers += hint.__metadata__
@@ -98,7 +98,7 @@ def stripped(hint: Any) -> tuple[Any, list[Any]]:
 
 
 def members(hint: Any) -> tuple[Any, ...]:
-    """Members of a union, without None; the type itself where it is none."""
+    """Member types of a union, without None; the type itself where it is not a union."""
     bare, _ = stripped(hint)
     if get_origin(bare) in (Union, types.UnionType):
         return tuple(member for member in get_args(bare) if member is not type(None))
@@ -106,20 +106,20 @@ def members(hint: Any) -> tuple[Any, ...]:
 
 
 def values_of(hint: Any) -> Any:
-    """Type of the values of a mapping; None for other types."""
+    """Value type of a mapping; None for other types."""
     found = (stripped(member)[0] for member in members(hint))
     return next((get_args(bare)[1] for bare in found if get_origin(bare) in (Mapping, dict)), None)
 
 
 def entries_of(hint: Any) -> Any:
-    """Type of the entries of a list of any length; None for other types."""
+    """Entry type of a tuple of any length; None for other types."""
     bare, _ = stripped(hint)
     arguments = get_args(bare)
     return arguments[0] if get_origin(bare) is tuple and arguments[-1] is Ellipsis else None
 
 
 def words(hint: Any) -> str:
-    """A type in words, with its range and unit."""
+    """Description of a type with its range and unit, for messages."""
     bare, markers = stripped(hint)
     unit = next((marker.unit for marker in markers if isinstance(marker, About) and marker.unit), "")
     limits = [
@@ -151,7 +151,7 @@ def _words(hint: Any) -> str:
 
 
 def check(options: Any, where: str) -> None:
-    """Refuse options with a number outside its bounds, however they were made.
+    """Check that all numbers of an options object are within their bounds.
 
     Raises
     ------
@@ -165,7 +165,7 @@ def check(options: Any, where: str) -> None:
 
 
 def _within(hint: Any, value: Any) -> bool:
-    """Whether every number of a value is within the bounds of its type; what is no number is."""
+    """Whether every number of a value is within the bounds of its type; True for other values."""
     if isinstance(value, tuple):
         entries = entries_of(hint)
         return entries is None or all(_within(entries, entry) for entry in value)

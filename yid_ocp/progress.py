@@ -1,4 +1,4 @@
-"""How long work is doing: what is told of it where it is done, whoever shows it (`workflow.progress`)."""
+"""Progress reporting of long work: the interface and its silent default (`workflow.progress` displays it)."""
 
 from __future__ import annotations
 
@@ -8,75 +8,75 @@ from typing import Protocol
 
 
 class Point(Protocol):
-    """A point that a search accepted: which one, its cost, the time so far [s], and anything out of the ordinary."""
+    """A point that a search accepted: iteration, cost, elapsed time [s] and a note."""
 
     @property
     def iteration(self) -> int:
-        """Its number."""
+        """Number of the iteration."""
         ...
 
     @property
     def cost(self) -> float:
-        """What the search lowers."""
+        """Cost at the point."""
         ...
 
     @property
     def seconds(self) -> float:
-        """Wall time so far [s]."""
+        """Wall time since the search started [s]."""
         ...
 
     @property
     def note(self) -> str:
-        """Anything out of the ordinary, such as which of several starts it belongs to."""
+        """Remark on the point, such as the number of its starting point."""
         ...
 
 
 class Progress(Protocol):
-    """Whoever wants to know how a long run is doing; asked from one thread at a time."""
+    """Receiver of progress reports; called by one thread at a time."""
 
     def stage(self, text: str) -> None:
-        """A new part of the work begins."""
+        """Report that a new stage of the work begins."""
         ...
 
     def iterate(self, entry: Point) -> None:
-        """A search accepted a point."""
+        """Report that a search accepted a point."""
         ...
 
     def advance(self, done: int, total: int, text: str) -> None:
-        """So many of so many parts of the stage are done, and what was done last or comes next."""
+        """Report that `done` of `total` parts of the stage are finished; `text` names the last or next one."""
         ...
 
 
 class Silent:
-    """Progress that nobody sees."""
+    """Progress that is not reported."""
 
     def stage(self, text: str) -> None:
-        """Nothing."""
+        """Ignore the report."""
 
     def iterate(self, entry: Point) -> None:
-        """Nothing."""
+        """Ignore the report."""
 
     def advance(self, done: int, total: int, text: str) -> None:
-        """Nothing."""
+        """Ignore the report."""
 
 
 class Logged(Silent):
-    """Progress as messages of a log."""
+    """Progress as log messages."""
 
     def __init__(self, log: logging.Logger) -> None:
         self._log = log
 
     def stage(self, text: str) -> None:
-        """See `Progress`."""
+        """Log the name of the stage."""
         self._log.info("%s", text)
 
     def advance(self, done: int, total: int, text: str) -> None:
-        """See `Progress`."""
+        """Log the number of finished parts."""
         self._log.info("%d of %d, %s", done, total, text)
 
 
 class Parts:
-    """Parts of a stage that are done side by side, counted as they end.
+    """Progress of a stage whose parts run in parallel; counts them as they finish.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ class Parts:
         progress.advance(0, total, first)
 
     def done(self, text: str) -> None:
-        """One more is done; from any thread."""
+        """Report one more finished part; may be called from any thread."""
         with self._lock:
             self._count += 1
             self._progress.advance(self._count, self._total, text)

@@ -1,4 +1,4 @@
-"""Named variants of one kind of thing (effects, sensors, readers, solvers, report sections)."""
+"""Tables of named implementations (effects, sensors, readers, solvers, report sections)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ T = TypeVar("T")
 
 
 class Registry(Generic[T]):
-    """A table from name to implementation, filled by decorators where the implementations stand.
+    """A table from name to implementation, filled by decorators.
 
     Parameters
     ----------
@@ -24,7 +24,7 @@ class Registry(Generic[T]):
         self._entries: dict[str, T] = {}
 
     def register(self, name: str) -> Callable[[T], T]:
-        """Return a decorator that enters its argument under `name`."""
+        """A decorator that registers its argument under `name`."""
 
         def enter(entry: T) -> T:
             if name in self._entries:
@@ -38,7 +38,7 @@ class Registry(Generic[T]):
         return enter
 
     def forget(self, names: Iterable[str]) -> None:
-        """Take entries out again, of a module that failed before it was whole."""
+        """Remove entries, such as those of a module whose import failed."""
         for name in names:
             self._entries.pop(name, None)
 

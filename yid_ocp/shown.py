@@ -1,4 +1,4 @@
-"""Objects that show themselves: in a line where they are printed, in a notebook with a small table, never as arrays."""
+"""Short text and notebook representations of objects, without printing their arrays."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 MOST = 30
-"""Rows of a table in a notebook; of more, the rest is counted."""
+"""Largest number of table rows in a notebook; further rows are only counted."""
 
 
 @dataclass(frozen=True)
 class Summary:
-    """What an object says of itself.
+    """The representation of an object: one line and an optional table.
 
     Attributes
     ----------
@@ -27,7 +27,7 @@ class Summary:
 
 
 class Shown:
-    """An object that is shown by its `_summary`; of a dataclass, whose own text would list all arrays, `repr=False`."""
+    """Mixin for `__repr__` and a notebook table from `_summary`; a dataclass needs `repr=False`."""
 
     def _summary(self) -> Summary:
         raise NotImplementedError
@@ -36,7 +36,7 @@ class Shown:
         return f"<{type(self).__name__}: {self._summary().line}>"
 
     def _repr_html_(self) -> str:
-        """What a notebook shows."""
+        """HTML for notebooks."""
         said = self._summary()
         text = f"<p><b>{type(self).__name__}</b>: {html.escape(said.line)}</p>"
         if len(said.rows) < 2:
@@ -53,5 +53,5 @@ def _row(cells: Sequence[str], kind: str) -> str:
 
 
 def counted(number: int, noun: str) -> str:
-    """A number of things, such as `1 joint` and `2 joints`."""
+    """A number with its noun, such as `1 joint` and `2 joints`."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

@@ -1,4 +1,4 @@
-"""Versions: of this package, of its sources, and of what its numbers depend on."""
+"""Versions of this package, its sources and its numerical dependencies."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from pathlib import Path
 
 SOURCES = (".py", ".c")
 NUMERICAL = ("casadi", "numpy", "scipy", "h5py")
-"""Packages whose versions stand beside every result."""
+"""Packages whose versions are stored with every result."""
 
 
 def package_version() -> str:
-    """Version of this package, `0+unknown` where it is not installed."""
+    """Version of this package; `0+unknown` where it is not installed."""
     return _version("yid-ocp", "0+unknown")
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python, this package and what its numbers depend on."""
+    """Versions of Python, this package and its numerical dependencies, by name."""
     result = {"python": platform.python_version(), "platform": f"{platform.system()} {platform.machine()}"}
     return result | {name: _version(name, "not installed") for name in ("yid-ocp", *NUMERICAL)}
 
 
 def code_hash(folder: Path) -> str:
-    """SHA-256 of the sources in a folder and those in it, by name and content; 64 hexadecimal digits."""
+    """SHA-256 of all source files in a folder and its subfolders; 64 hexadecimal digits."""
     digest = hashlib.sha256()
     for file in sorted(path for path in folder.rglob("*") if path.suffix in SOURCES):
         content = hashlib.sha256(file.read_bytes()).hexdigest()
@@ -36,19 +36,19 @@ def code_hash(folder: Path) -> str:
 
 @functools.cache
 def package_code() -> str:
-    """`code_hash` of this package, as it was when this process first asked."""
+    """`code_hash` of this package at the first call in this process."""
     return code_hash(Path(__file__).parent)
 
 
 def fingerprint() -> dict[str, str]:
-    """What has to be the same in two processes for their numbers to be of one kind."""
+    """Versions and source hash that two processes must share to produce the same numbers."""
     python = ".".join(platform.python_version_tuple()[:2])
     own = {name: text for name, text in versions().items() if name in ("yid-ocp", *NUMERICAL)}
     return {"python": python, **own, "code": package_code()}
 
 
 def differences(here: Mapping[str, str], there: Mapping[str, str]) -> list[str]:
-    """Where two fingerprints differ, in words."""
+    """Descriptions of the entries in which two fingerprints differ."""
 
     def shown(name: str, value: str) -> str:
         return value[:12] if name == "code" else value

@@ -1,1 +1,1 @@
-"""Looking at a model and at what an estimation says: sizes, frequencies, feasibility; nothing here changes anything."""
+"""Read-only analyses of a model and of an estimation: identifiability, data quality, convergence, structure."""

@@ -1,4 +1,4 @@
-"""Names for what is seen of several parameters when each by itself is not: a sum, springs in series, a ratio."""
+"""Sentences on parameters that are identifiable only in combination: as a sum, springs in series, a ratio."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NOTHING = 0.1  # a combination holds when the data then move by less than this s
 
 @dataclass(frozen=True)
 class Component:
-    """One parameter's part in a direction of relative changes: name, part, value and unit."""
+    """One parameter's coefficient in a direction of relative parameter changes, with its value and unit."""
 
     name: str
     part: float
@@ -29,7 +29,7 @@ class Component:
 
 @dataclass(frozen=True)
 class Form:
-    """A combination of two parameters.
+    """A function of two parameters that may be identifiable where neither of them is.
 
     Attributes
     ----------
@@ -63,12 +63,12 @@ FORMS: tuple[Form, ...] = (
 
 
 def combination_words(parts: Sequence[Component], moved: Callable[[Mapping[str, float]], float] | None) -> str:
-    """What is seen of parameters that a direction leaves open, in a sentence.
+    """A sentence on which combination of the parameters in an unidentifiable direction the data determine.
 
     Parameters
     ----------
     parts : sequence of Component
-        Of the direction that is not seen.
+        Of the unidentifiable direction.
     moved : callable, optional
         From new values of parameters to how far the data move [standard deviations]; tells combinations apart that look
         alike for small changes. Without it the trade is described and not named.
@@ -89,7 +89,7 @@ def combination_words(parts: Sequence[Component], moved: Callable[[Mapping[str, 
 
 
 def listed_names(names: Sequence[str]) -> str:
-    """Names in a row, all but the first few counted only."""
+    """Names joined to a text; beyond the first four, only the number of further names is given."""
     if len(names) > MOST_NAMES:
         return f"{', '.join(names[:MOST_NAMES])} and {len(names) - MOST_NAMES} more"
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
@@ -117,7 +117,7 @@ def _form(first: Component, second: Component, moved: Callable[[Mapping[str, flo
 
 
 def sparse_basis(vectors: Array) -> list[Array]:
-    """Basis of the space of some row vectors with few components each, of unit length.
+    """Sparse basis, of unit vectors, of the space spanned by row vectors.
 
     Row echelon form with complete pivoting: as many components as there are vectors stand in one vector only.
 

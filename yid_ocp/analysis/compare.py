@@ -1,4 +1,4 @@
-"""Several methods on one problem: what each found, how sure, at what cost, and whether they agree."""
+"""Comparison of estimation methods on one problem: estimates, uncertainty, cost and agreement."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ WHOLE = "all noise"  # what the run is called that weighs residuals by the noise
 
 @dataclass(frozen=True)
 class MethodRun:
-    """One method's outcome.
+    """Solution, cost and computing effort of one estimation method.
 
     Attributes
     ----------
     method : str
     solution : Solution
     whitened_cost : float
-        Cost of its answer in the problem's own weighting, so that methods with another cost can be compared.
+        Cost of its solution in the problem's own weighting, the same for all methods.
     held_out : list of (Episode, EpisodeResult or str)
     wall_seconds, cpu_seconds : float
     peak_memory : float
@@ -57,7 +57,7 @@ class MethodRun:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All runs, and how they compare.
+    """Results of all methods on one problem, and where they disagree.
 
     Attributes
     ----------
@@ -65,16 +65,16 @@ class Comparison:
     reference : str
         Method of the lowest cost, with which the others are compared.
     disturbed : bool
-        Whether noise drives the motion, which the methods are compared without.
+        Whether the problem has process noise, which the methods are compared without.
     judged : Solution
-        That whose verdicts count: the reference's, or, where noise drives the motion, of a method that weighs it.
+        Solution whose verdicts are reported: the reference's or, with process noise, that of a method that models it.
     judged_held_out : list of (Episode, EpisodeResult or str)
-        What it predicts.
+        Its predictions of the held-out recordings.
     agreement : mapping of method to list of str
         One sentence for each identifiable parameter on which the method differs, with the likely reason; empty where
         it agrees.
     explained : tuple of str
-        What became of the parameters that the data do not inform, and, where the truth is known, which parameters
+        Sentences on the estimates of unidentifiable parameters and, where the truth is known, on the parameters that
         steepest descent left far from it.
     """
 
@@ -99,11 +99,11 @@ def compare(
     callback: Callable[[str, Iterate], None] | None = None,
     limits: GapLimits = USUAL,
 ) -> Comparison:
-    """Run several methods from the same start and say whether they agree.
+    """Run several methods from the same initial values and compare their estimates.
 
     Steepest descent gets the paper's cost (points in metres, no noise levels, no weak prior), the others the problem's,
-    weighted by the sensors' noise alone where more drives the motion: not every method can carry its covariance. What
-    may be said of the parameters then comes from one more run, of a method that can.
+    without process noise, whose covariance not every method can carry. With process noise, the verdicts come from one
+    more run of a method that can.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def compare(
     callback : callable, optional
         Called with the method's name and every `Iterate`.
     limits : GapLimits, optional
-        What makes a residual more than noise.
+        Limits from which a residual counts as more than noise.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""How far a model is from its limit of many links and short steps: the lowest frequencies about a rest posture."""
+"""Convergence with links and time step: natural frequencies about an equilibrium, and gaps of open grasps."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ DAMPINGS = ("damping", "twist_damping")
 
 @dataclass(frozen=True)
 class Frequencies:
-    """Natural frequencies of one step map about rest, its robot held still.
+    """Natural frequencies of one step map about an equilibrium, its robot held still.
 
     Attributes
     ----------
     hertz : ndarray, shape (k,)
         Undamped, ascending [Hz].
     growing : int
-        Modes that grow from step to step although the damping acts: the object would leave the posture, or the time
-        step is too long for the tension that the grasps put on it.
+        Number of damped modes that still grow from step to step: the equilibrium is unstable, or the time step is too
+        long for the tension that the grasps put on the object.
     message : str
-        Why there are none, empty otherwise.
+        Why there are no frequencies, empty otherwise.
     """
 
     hertz: Array
@@ -43,7 +43,7 @@ class Frequencies:
 
 
 def held_still(system: System) -> System:
-    """The same system with its driven joints prescribed."""
+    """The system with its driven joints prescribed."""
     return replace(system, driven=(), servos={}, prescribed=(*system.driven, *system.prescribed))
 
 
@@ -56,7 +56,7 @@ def natural_frequencies(
     constraint_force: ConstraintForce = "midpoint",
     guess: Array | None = None,
 ) -> Frequencies:
-    """Frequencies of the step map of a system about rest, from the eigenvalues of A_k without damping.
+    """Natural frequencies of a system's step map about an equilibrium, from the eigenvalues of A_k without damping.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def natural_frequencies(
     time_step : float
         h [s]; the midpoint rule lowers a frequency f to atan(pi f h)/(pi h).
     force_split, constraint_force : str
-        See `compile_step`; the split matters for growth, not for the undamped frequencies.
+        As in `compile_step`; the split affects growth, not the undamped frequencies.
     guess : ndarray, shape (n,), optional
         Configuration from which rest is sought.
     """
@@ -102,7 +102,7 @@ def _eigenvalues(step: Step, rest: Rest, known: Array, theta: Array) -> Array:
 
 
 def grasp_gaps(system: System, posture: Mapping[str, float], theta: Array) -> dict[str, float]:
-    """Smallest distance to which each grasp can be closed at a posture of the robot, by bending the object [m].
+    """Smallest remaining gap of each grasp [m], by name: the robot's joints are fixed, the object may bend.
 
     Parameters
     ----------

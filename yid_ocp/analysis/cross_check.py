@@ -1,7 +1,7 @@
-"""The built model beside Pinocchio: mass matrix, weight and inverse dynamics of the same bodies in another library.
+"""Comparison of a built model with Pinocchio: mass matrix, gravity forces and inverse dynamics.
 
 Pinocchio gets the robot in two ways: from the URDF file, which it reads itself, and joint by joint from the built
-system, object and effects included. The first shows a file that was read wrongly, the second wrong mechanics.
+system, object and effects included. The first detects errors in reading the file, the second errors in the mechanics.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ POSTURES = 3  # at which both are compared, besides the one that is given
 
 @dataclass(frozen=True)
 class CrossCheck:
-    """How far the model is from Pinocchio's.
+    """Relative differences between a model and Pinocchio's model of the same bodies.
 
     Attributes
     ----------
     of : str
-        What was compared.
+        The compared model, in words.
     mass, weight, motion : float
-        Largest difference of mass matrix, gravity's forces and inverse dynamics, each over its largest entry.
+        Largest difference of mass matrix, gravity forces and inverse dynamics, each divided by its largest entry.
     """
 
     of: str
@@ -47,12 +47,12 @@ class CrossCheck:
 
     @property
     def agrees(self) -> bool:
-        """Whether all three are one within rounding."""
+        """Whether all three agree within rounding."""
         return all(size <= TOLERANCE for size in (self.mass, self.weight, self.motion))
 
     @property
     def words(self) -> str:
-        """One sentence."""
+        """A sentence on the agreement or on each difference."""
         if self.agrees:
             largest = max(self.mass, self.weight, self.motion)
             said = f"{self.of}: mass matrix, weight and inverse dynamics are Pinocchio's"
@@ -63,7 +63,7 @@ class CrossCheck:
 
 
 def check_system(system: System, theta: Array, posture: Array) -> CrossCheck:
-    """The built system, its parameters at `theta`, beside Pinocchio's model of the same joints and bodies.
+    """Compare the built system, its parameters at `theta`, with Pinocchio's model of the same joints and bodies.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def check_file(
     locked: Mapping[str, float] | None = None,
     exclude_links: Sequence[str] = (),
 ) -> CrossCheck:
-    """A robot as this package read it beside Pinocchio's own reading of the file.
+    """Compare a robot as this package read it from URDF with Pinocchio's reading of the same file.
 
     Parameters
     ----------

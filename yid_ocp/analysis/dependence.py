@@ -1,4 +1,4 @@
-"""Which equations a parameter enters, and whether a sensor sees them: computed at a rest, said in words."""
+"""Which equations of a step each parameter enters, and which sensors respond to them about an equilibrium."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ FEW = 8  # rows that are named one by one
 
 @dataclass(frozen=True)
 class Dependence:
-    """How one parameter enters a step and what sensors see of it.
+    """The equations of a step that one parameter enters, and how strongly sensors respond to it.
 
     Attributes
     ----------
     parameter, unit : str
     rows : tuple of str
-        Rows that it can enter, whatever the state.
+        Equation rows that contain it, whatever the state.
     seen : tuple of str or None
-        Those to which a reading answers to first order; None where there are no sensors.
+        Those of them to which a sensor responds to first order; None without sensors.
     best : str
-        Sensor that answers most; empty where none does.
+        Sensor that responds most; empty where none does.
     read : tuple of str
         Sensors whose reading depends on the parameter directly.
     moved : float or None
-        Largest change of a reading for a unit of the parameter, from the rest on, in standard deviations.
+        Largest change of a reading per unit of the parameter, starting at the equilibrium, in standard deviations.
     seconds : float
-        How long readings were looked at.
+        Time span over which readings were simulated [s].
     along : float or None
-        Change of all readings of the recordings for a unit of the parameter, in standard deviations (root of the sum of
-        squares); None where it was not asked for.
+        Change of all readings of the recordings per unit of the parameter, in standard deviations (root of the sum of
+        squares); None where not requested.
     """
 
     parameter: str
@@ -61,7 +61,7 @@ class Dependence:
 
     @property
     def words(self) -> str:
-        """One sentence on the rows, then on what a change does from the rest on and along the recordings."""
+        """Sentences on the equation rows, then on the change of readings from rest and along the recordings."""
         said = f"{self.parameter} enters {self._rows}"
         if self.read:
             said += f"; the reading of {', '.join(self.read)} depends on it directly"
@@ -105,7 +105,7 @@ class _Readings:
 def dependence(
     step: Step, symbols: StepSymbols, episode: Episode | None, state: Array, theta: Array, stages: StepLinearization
 ) -> tuple[Dependence, ...]:
-    """How every parameter enters the equations, and what the sensors of a recording see of that about a state.
+    """Dependence of the step equations and of a recording's sensors on every parameter, about a state.
 
     A unit is added to one row of one step that starts at `state`; with A - B_u K the steps after it are linear, K the
     tracking filter's first gain. The row is seen to first order where a reading answers within `WINDOW` steps.
@@ -115,7 +115,7 @@ def dependence(
     step : Step
     symbols : StepSymbols
     episode : Episode or None
-        Whose sensors and filter are meant; without one only rows are listed.
+        Provides the sensors and the tracking filter; without one only rows are listed.
     state : ndarray, shape (nx,)
     theta : ndarray, shape (ntheta,)
     stages : StepLinearization
@@ -153,7 +153,7 @@ def dependence(
 
 
 def listing(names: Sequence[str]) -> str:
-    """Rows in words: one by one where they are few, the kinds counted where they are many."""
+    """Row names joined to a text; more than eight are counted by kind."""
     if len(names) <= FEW:
         return ", ".join(names)
     kinds = [name.partition("[")[0] for name in names]

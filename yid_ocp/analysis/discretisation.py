@@ -1,4 +1,4 @@
-"""How far estimates move with finer links and shorter steps, and what that leaves of their standard deviations."""
+"""Shift of estimates with finer links or shorter time steps, and standard deviations that include it."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ m + m/2 + m/4 + ... What falls faster has less to go."""
 
 @dataclass(frozen=True)
 class Moves:
-    """How far one estimate moves, in its own unit.
+    """Shift of one estimate under a finer discretisation, in its own unit.
 
     Attributes
     ----------
     links : float or None
-        With every link divided in two; None where that was not tried or the finer model could not be rolled out.
+        With every link divided in two; None where not tried or where the finer model could not be rolled out.
     time_step : float or None
         With half the time step.
     """
@@ -41,10 +41,9 @@ class Moves:
     time_step: float | None = None
 
     def counted(self, std: float) -> float:
-        """Standard deviation together with the moves that are larger than it.
+        """Standard deviation combined, in quadrature, with the shifts that exceed it.
 
-        Such a move counts `REMAINING` times, as that is how far the estimate is from a fine model's. Smaller ones are
-        within what the standard deviation says already.
+        Such a shift counts `REMAINING` times: the extrapolated distance from the limit of a fine model.
         """
         found = [move for move in (self.links, self.time_step) if move is not None and abs(move) > std]
         return math.hypot(std, *(REMAINING * move for move in found)) if found else std
@@ -52,15 +51,15 @@ class Moves:
 
 @dataclass(frozen=True)
 class Refined:
-    """A finer problem of the same data, and how its unknowns compare.
+    """An estimation problem with a finer discretisation, and how its unknowns map to the coarse ones.
 
     Attributes
     ----------
     problem : EstimationProblem
     factors : mapping of str to float
-        By what a parameter must be multiplied to mean the same object in the finer model; 1 where a name is not there.
+        Factor from a coarse parameter to the same physical object in the finer model; 1 for absent names.
     divided : mapping of str to tuple of str
-        Joints into which each joint of a divided link went, which share its angle.
+        For each joint of a divided link, the fine joints that share its angle.
     """
 
     problem: EstimationProblem
@@ -68,13 +67,13 @@ class Refined:
     divided: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def factor(self, name: str) -> float:
-        """Of an unknown, which may carry its recording's name."""
+        """Coarse-to-fine factor of an unknown, whose name may include its recording."""
         return float(self.factors.get(name.split("[")[0], 1.0))
 
     def point(self, names: Sequence[str], x: Array) -> Array:
-        """The finer problem's unknowns at a point of the coarse one.
+        """The fine problem's unknowns that correspond to a coarse unknown vector, clipped to the bounds.
 
-        Of an estimated start, divided links share their angle and begin at rest.
+        In an estimated initial state, divided links share their angle and begin at rest.
         """
         made, at = self.problem.start, {name: i for i, name in enumerate(self.problem.names)}
         for name, value in zip(names, x, strict=True):
@@ -88,7 +87,7 @@ class Refined:
         return np.clip(made, *self.problem.bounds)
 
     def warm(self, coarse: System, found: WarmStart) -> WarmStart:
-        """Where equilibria of the finer model are looked for: at the coarse one's shapes."""
+        """Initial guesses for the fine model's equilibria, from the coarse ones."""
         return tuple(None if q is None else self._shape(coarse, q) for q in found)
 
     def _shape(self, coarse: System, q: Array) -> Array:
@@ -101,7 +100,7 @@ class Refined:
 
 
 def divided_joints(coarse: System, fine: System) -> dict[str, tuple[str, ...]]:
-    """Joints of a finer model into which every joint of the coarse one's segments went, where it was divided."""
+    """For each divided joint of the coarse model, the names of the fine joints that replace it."""
     found = {}
     for segment in coarse.segments:
         links = fine.segment(segment.name).links
@@ -115,11 +114,10 @@ def divided_joints(coarse: System, fine: System) -> dict[str, tuple[str, ...]]:
 def moves(
     refined: Refined, coarse: EstimationProblem, x: Array, at_x: Evaluation, *, models_alone: bool = False
 ) -> dict[str, float] | str:
-    """How far each shared free parameter moves by one Gauss-Newton step of a finer model, from a coarse one's point.
+    """Shift of each shared free parameter by one Gauss-Newton step of a finer model from the coarse unknowns.
 
-    At an estimate that is the change which the finer model wants, with the data, bounds and priors of the coarse one.
-    Elsewhere the coarse model wants to move as well: with `models_alone` its prediction stands for the data, and what
-    is left is the difference between the two models.
+    Data, bounds and priors are those of the coarse problem. With `models_alone` the coarse model's prediction replaces
+    the data, so that away from an estimate only the difference between the two models counts.
 
     Parameters
     ----------
@@ -133,7 +131,7 @@ def moves(
     Returns
     -------
     dict of str to float, or str
-        In the coarse parameters' units; why the step cannot be made, in words.
+        In the coarse parameters' units; a message where the step cannot be made.
     """
     point, warm = refined.point(coarse.names, x), refined.warm(coarse.system, at_x.warm)
     weighted = any(own is not None for own in coarse.innovations)
@@ -156,16 +154,16 @@ def moves(
 def counting(
     estimates: Mapping[str, Estimate], found: Mapping[str, Moves], sizes: Mapping[str, float] | None = None
 ) -> dict[str, Estimate]:
-    """Estimates whose standard deviation, interval and verdict count how far discretisation moves them.
+    """Estimates whose standard deviation, interval and verdict include their discretisation shift.
 
-    This is the one place where the two meet; a verdict is only ever lowered.
+    A verdict is only ever lowered.
 
     Parameters
     ----------
     estimates : mapping of str to Estimate
     found : mapping of str to Moves
     sizes : mapping of str to float, optional
-        Size that each parameter might have; see `solvers.judgement.verdict`.
+        Typical size of each parameter, as in `solvers.judgement.verdict`.
     """
     counted = dict(estimates)
     for name, own in found.items():
@@ -185,7 +183,7 @@ def counting(
 
 
 def lower_of(before: str, after: str) -> str:
-    """The worse of two verdicts; one that these three do not rank stays."""
+    """The worse of two verdicts; `before` where either is not one of the three ranked ones."""
     ranks = ("identifiable", "weak", "not_identifiable")
     if before not in ranks or after not in ranks:
         return before

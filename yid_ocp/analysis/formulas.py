@@ -1,4 +1,4 @@
-"""Symbolic expressions as readable text and LaTeX: names in place of symbols, shared parts pulled out."""
+"""Symbolic expressions as readable text and LaTeX, with variable names and shared subexpressions."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ CALLED = {getattr(ca, name): name.removeprefix("OP_").lower() for name in dir(ca
 
 @dataclass(frozen=True)
 class Name:
-    """What a variable is called in text and in LaTeX."""
+    """Name of a variable in plain text and in LaTeX."""
 
     text: str
     latex: str
@@ -67,18 +67,18 @@ class Name:
 
 @dataclass(frozen=True)
 class Formula:
-    """Expressions as text.
+    """Expressions written as text, with their shared subexpressions.
 
     Attributes
     ----------
     shared : tuple of (str, str)
-        Parts that occur more than once: name and expression, each of those before it.
+        Name and expression of each part that occurs more than once; each may use those before it.
     values : tuple of str
-        The expressions themselves, in terms of the shared parts.
+        The expressions, in terms of the shared parts.
     operations : int
-        Sums, products, functions, ..., each shared one counted once.
+        Number of operations, each shared one counted once.
     variables : tuple of int
-        Places of the variables that occur.
+        Indices of the variables that occur.
     """
 
     shared: tuple[tuple[str, str], ...]
@@ -96,14 +96,14 @@ class _Node:
 
 
 def operations(expressions: Sequence[ca.SX], variables: ca.SX) -> int:
-    """Number of operations that expressions take together, each shared one counted once."""
+    """Number of operations that evaluate all expressions, each shared one counted once."""
     function = _function(expressions, variables)
     skipped = (*LEAVES, ca.OP_OUTPUT, ca.OP_PARAMETER)
     return sum(function.instruction_id(i) not in skipped for i in range(function.n_instructions()))
 
 
 def formula(expressions: Sequence[ca.SX], variables: ca.SX, names: Sequence[Name], latex: bool = False) -> Formula:
-    """Expressions in readable form.
+    """Expressions written as text or LaTeX with named variables.
 
     Parameters
     ----------

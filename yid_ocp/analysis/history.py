@@ -1,4 +1,4 @@
-"""Estimates of one model from several days: what they say together, what differs, and which of them to distrust.
+"""Estimates of one model from several runs: pooled mean, drift of parameters, and outlier runs.
 
 For estimates x_i with covariances C_i of the same parameters, their mean is x = (sum C_i^-1)^-1 sum C_i^-1 x_i. Where
 nothing changed, chi2 = sum (x_i - x)' C_i^-1 (x_i - x) has (k - 1) n degrees of freedom. Where it is larger, the
@@ -27,18 +27,18 @@ SMALLEST = 1e-12
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Estimates(Shown):
-    """What one run says of some parameters.
+    """Estimates of parameters from one run, with their covariance.
 
     Attributes
     ----------
     run : str
-        Its name.
+        Name of the run.
     names : tuple of str, length n
     values : ndarray, shape (n,)
     covariance : ndarray, shape (n, n)
     units : mapping of str to str
     explains : bool
-        Whether the model explained the run's recordings; where not, the covariance counts the misfit.
+        Whether the model explains the run's recordings; where not, the covariance includes the misfit.
     effects : mapping of label to mapping of quantity to value
         Effects that the run's model had beyond the nominal one, as `kind@location`.
     """
@@ -63,7 +63,7 @@ class Estimates(Shown):
         return np.sqrt(np.diag(self.covariance))
 
     def of(self, names: Sequence[str]) -> Estimates:
-        """The estimates of those of its parameters that are named, in that order."""
+        """The estimates of the named parameters, in that order; names that the run lacks are skipped."""
         at = [self.names.index(name) for name in names if name in self.names]
         kept = tuple(self.names[i] for i in at)
         covariance = self.covariance[np.ix_(at, at)]
@@ -72,7 +72,7 @@ class Estimates(Shown):
 
 @dataclass(frozen=True)
 class Drift:
-    """Whether one parameter is the same in all runs.
+    """Test whether one parameter has the same value in all runs.
 
     Attributes
     ----------
@@ -81,11 +81,11 @@ class Drift:
         That have it.
     values, std : tuple of float
     mean, mean_std : float
-        Of all together.
+        Pooled over these runs.
     chi2, p_value : float
         Of the differences; p is one where only one run has it.
     drifted : bool
-        At the level asked for, counting how many parameters were looked at.
+        Whether p is below the requested level, Bonferroni-corrected for the number of parameters.
     """
 
     name: str
@@ -102,7 +102,7 @@ class Drift:
 
 @dataclass(frozen=True)
 class Against:
-    """One run against all others together.
+    """Test of one run against the pooled estimates of all others.
 
     Attributes
     ----------
@@ -115,7 +115,7 @@ class Against:
     explains : bool
         Whether the model explained its recordings.
     distrusted : bool
-        Whether it alone does not fit the others, which agree without it.
+        Whether it alone disagrees with the others, which agree without it.
     """
 
     run: str
@@ -129,7 +129,7 @@ class Against:
 
 @dataclass(frozen=True)
 class History:
-    """Runs of one model side by side.
+    """Drift of parameters and consistency of runs over several runs of one model.
 
     Attributes
     ----------
@@ -152,17 +152,17 @@ class History:
 
     @property
     def drifted(self) -> tuple[str, ...]:
-        """Parameters that are not the same in all runs."""
+        """Names of parameters that differ significantly between runs."""
         return tuple(entry.name for entry in self.parameters if entry.drifted)
 
     @property
     def distrusted(self) -> tuple[str, ...]:
-        """Runs that alone do not fit the others."""
+        """Names of runs that alone disagree with the others."""
         return tuple(entry.run for entry in self.against if entry.distrusted)
 
 
 def positive(covariance: Array) -> Array:
-    """The nearest covariance that can be inverted, its standard deviations kept."""
+    """A nearby invertible covariance with the same standard deviations: small correlation eigenvalues are raised."""
     std = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(std, std))
     clipped = (vectors * np.maximum(values, SMALLEST)) @ vectors.T
@@ -171,7 +171,7 @@ def positive(covariance: Array) -> Array:
 
 
 def together(runs: Sequence[Estimates]) -> tuple[Estimates, float, int]:
-    """Several runs as one, with chi2 of their differences and its degrees of freedom.
+    """Pool the estimates of several runs; returns them with chi2 of the differences and its degrees of freedom.
 
     Parameters
     ----------
@@ -209,18 +209,17 @@ def together(runs: Sequence[Estimates]) -> tuple[Estimates, float, int]:
 
 
 def history(runs: Sequence[Estimates], level: float = 0.01) -> History:
-    """Which parameters drifted between runs, and which run to distrust.
+    """Test which parameters drifted between runs and which run is an outlier.
 
-    Every parameter is looked at with what all others correlate with it, by its own variances; the test of a run uses
-    whole covariances. A run is distrusted where it does not fit the others together and these fit each other without
-    it, or better than with any other left out; of two runs that differ neither is named.
+    Each parameter is tested by its marginal variances, each run by its whole covariance. A run is an outlier where it
+    disagrees with the others and these agree without it, or better than with any other left out. With two runs none is.
 
     Parameters
     ----------
     runs : sequence of Estimates
         Two or more, in the order of time.
     level : float
-        Significance; divided by the number of parameters, and by that of runs.
+        Significance level; divided by the number of parameters, and by that of runs.
     """
     names = tuple(dict.fromkeys(name for run in runs for name in run.names))
     _, chi2, degrees = together(runs)
@@ -268,5 +267,5 @@ def _apart(run: Estimates, others: Sequence[Estimates]) -> tuple[float, int, str
 
 
 def p_value(chi2: float, degrees: int) -> float:
-    """Of so large a chi2 by chance; 1 where nothing was compared."""
+    """Probability of a chi2 at least this large; 1 without degrees of freedom."""
     return float(scipy.stats.chi2.sf(chi2, degrees)) if degrees else 1.0

@@ -1,4 +1,4 @@
-"""What recordings say about parameters: Fisher information, correlations, unseen directions in words, verdicts."""
+"""Identifiability of parameters: Fisher information, correlations, unidentifiable directions and verdicts."""
 
 from __future__ import annotations
 
@@ -51,25 +51,25 @@ RANK_TOLERANCE = 1e-10
 
 @dataclass(frozen=True)
 class ParameterInformation:
-    """What the recordings say about one parameter.
+    """Uncertainty and verdict of one parameter.
 
     Attributes
     ----------
     value : float
-        At which the information was taken, in `unit`.
+        Value at which the information was evaluated, in `unit`.
     unit : str
     std : float
         Standard deviation with all other unknowns free; infinite where nothing informs it.
     std_relative : float
-        The same over the value, over its typical size where the value is zero.
+        `std` divided by the value, or by its typical size where the value is zero.
     std_alone : float
-        Relative standard deviation if everything else were known.
+        Relative standard deviation if all other unknowns were known.
     verdict : str
-        That of a solution at the same point (`solvers.judgement.verdict`), which an interval that was asked for does
-        not contradict (`solvers.judgement.by_profile`).
+        That of a solution at the same point (`solvers.judgement.verdict`), made consistent with a requested interval
+        (`solvers.judgement.by_profile`).
     interval : (float or None, float or None), or None
         95 % interval by profile likelihood about the best fit of all unknowns, None for an open end; None as a whole
-        where it was not asked for.
+        where not requested.
     """
 
     value: float
@@ -83,7 +83,7 @@ class ParameterInformation:
 
 @dataclass(frozen=True)
 class Direction:
-    """A joint relative change of parameters and how well it is seen.
+    """A direction of relative parameter changes and its uncertainty.
 
     Attributes
     ----------
@@ -108,7 +108,7 @@ class Direction:
 
 @dataclass(frozen=True, repr=False)
 class Identifiability(Shown):
-    """What a set of recordings can tell about the free parameters.
+    """Identifiability of the free parameters from a set of recordings.
 
     Attributes
     ----------
@@ -120,11 +120,11 @@ class Identifiability(Shown):
     information : ndarray, shape (p, p)
         Fisher information of relative changes, nuisances eliminated.
     directions : tuple of Direction
-        Least seen first; those that a single parameter or a plain combination stands for are named so.
+        Least observable first.
     nuisances : tuple of str
-        Unknowns that were estimated along.
+        Names of further unknowns, estimated together with the parameters.
     chi2_per_dof : float
-        At the point; standard deviations are scaled by its square root where it exceeds one and the point is a fit.
+        At the evaluated point; at a fit, standard deviations are scaled by its square root where it exceeds one.
     profiles : mapping of str to Profile
     """
 
@@ -147,12 +147,12 @@ class Identifiability(Shown):
 
     @property
     def identifiable(self) -> tuple[str, ...]:
-        """Names of parameters with that verdict."""
+        """Names of parameters whose verdict is `identifiable`."""
         return tuple(name for name, entry in self.parameters.items() if entry.verdict == "identifiable")
 
     @property
     def unseen(self) -> tuple[Direction, ...]:
-        """Directions that are not identifiable."""
+        """Directions whose verdict is `not_identifiable`."""
         return tuple(entry for entry in self.directions if entry.verdict == "not_identifiable")
 
 
@@ -166,7 +166,7 @@ def identifiability(
     limits: GapLimits = USUAL,
     progress: Progress = SILENT,
 ) -> Identifiability:
-    """Which free parameters the problem's recordings determine, and what they leave open.
+    """Fisher-information analysis of which free parameters the problem's recordings determine.
 
     The Fisher information of independent Gaussian noise is I = J' J, J = d r/d x the whitened sensitivities; the
     standard deviation of one unknown is the root of the diagonal of its inverse, with all nuisances in it.
@@ -324,7 +324,10 @@ def with_grasp_offsets(system: System) -> System:
 
 
 def unknown_vector(problem: EstimationProblem, solution: Solution | ArrayLike | None) -> Array:
-    """A problem's unknowns from a solution, an array or, when absent, its start; `SolverError` for a wrong shape."""
+    """A problem's unknown vector from a solution, an array or, when absent, its initial values.
+
+    Raises `SolverError` for a wrong shape or a value that is not finite.
+    """
     if solution is None:
         return problem.start
     if isinstance(solution, Solution):
@@ -344,13 +347,13 @@ def unknown_vector(problem: EstimationProblem, solution: Solution | ArrayLike | 
 def with_nuisances(
     problem: EstimationProblem, x: Array, start: StartKnowledge, grasp_std: float | None
 ) -> EstimationProblem:
-    """The problem with start and grasps among its unknowns, or with a known start in place of an estimated one.
+    """The problem with initial state and grasp offsets among its unknowns, or with a fixed initial state.
 
     Parameters
     ----------
     problem : EstimationProblem
     x : ndarray, shape (nx,)
-        Where an estimated start becomes a known one.
+        Point from which an estimated initial state is fixed.
     start : "unknown" or "known"
     grasp_std : float, optional
         [m]
@@ -389,7 +392,7 @@ def with_nuisances(
 
 
 def carried(x: Array, names: Sequence[str], other: EstimationProblem) -> Array:
-    """Unknowns of another problem: those of the same name, its own start for the rest."""
+    """Unknown vector of another problem: values of the same names, its own initial values for the rest."""
     result = other.start
     place = {name: i for i, name in enumerate(names)}
     for i, name in enumerate(other.names):
@@ -408,9 +411,9 @@ class SplitRows:
     Attributes
     ----------
     alone : ndarray, shape (nr, p)
-        With everything else known, priors of the parameters themselves left out.
+        With all other unknowns known, without priors of the parameters.
     sensitivity : ndarray, shape (nr, p)
-        The part of it that no change of nuisances explains.
+        The part of it orthogonal to the nuisances' sensitivities.
     nuisance : ndarray, shape (nr, nn)
         Sensitivities of the nuisances, their priors below those of the data.
     """
@@ -421,7 +424,7 @@ class SplitRows:
 
 
 def split_rows(problem: EstimationProblem, evaluation: Evaluation, chosen: NDArray[np.int64]) -> SplitRows:
-    """Sensitivities of chosen unknowns, those of all others eliminated together with their priors."""
+    """Sensitivities of chosen unknowns with all others, and their priors, projected out."""
     _, jacobian = problem.informing(evaluation)
     jacobian = jacobian.copy()
     others = np.setdiff1d(np.arange(jacobian.shape[1]), chosen)
@@ -432,7 +435,7 @@ def split_rows(problem: EstimationProblem, evaluation: Evaluation, chosen: NDArr
 
 
 def without(columns: Array, explained: Array) -> Array:
-    """Part of columns that is orthogonal to others."""
+    """The part of columns that is orthogonal to the columns `explained`."""
     if explained.shape[1] == 0:
         return columns
     vectors, singular, _ = np.linalg.svd(explained, full_matrices=False)

@@ -1,4 +1,4 @@
-"""The symbolic side of a step in numbers: sizes, operations, sparsity, linearisation at a state, finite differences."""
+"""Diagnostics of a compiled step: dimensions, operation counts, sparsity, and linearisation against differences."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DIFFERENCE = 1e-5  # balances Newton's tolerance against the third derivative, f
 
 @dataclass(frozen=True)
 class Operations:
-    """Size of one generated function: operations of its expression graph and nonzeros of its outputs."""
+    """Number of operations and of nonzero outputs of one generated function."""
 
     name: str
     operations: int
@@ -29,7 +29,7 @@ class Operations:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What the equations of a step look like.
+    """Dimensions, unknowns and function sizes of a step's equations.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class Inspection:
 
 @dataclass(frozen=True)
 class Linearisation:
-    """A_k, B_k at a state, and how far they are from finite differences.
+    """A_k, B_k at a state, with their deviation from finite differences.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class Linearisation:
 
 
 def inspect_step(step: Step) -> Inspection:
-    """Count variables, equations and operations of a step."""
+    """Dimensions, nonzeros and operation counts of a step."""
     e = step.equations
     functions = tuple(
         Operations(f.name(), f.n_instructions(), sum(f.nnz_out(i) for i in range(f.n_out())))
@@ -94,7 +94,7 @@ def jacobian_sparsity(step: Step) -> ca.Sparsity:
 def linearise(
     step: Step, state: ArrayLike, torque: ArrayLike, theta: ArrayLike, prescribed: tuple[ArrayLike, ArrayLike] | None
 ) -> Linearisation:
-    """A_k, B_k at a state by the implicit function theorem, compared with central finite differences of the step.
+    """Linearise a step at a state (A_k, B_k) and compare it with central finite differences.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def linearise(
 
 
 def linearised_rows(step: Step, state: Array, torque: Array, theta: Array, path: Array) -> StepLinearization:
-    """Equations of the step that starts at a state, with their derivatives by all parameters.
+    """Linearised equations of the step that starts at a state, with derivatives by all parameters.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ def linearised_rows(step: Step, state: Array, torque: Array, theta: Array, path:
 
 
 def in_numbers(system: System, theta: Array) -> System:
-    """The system with numbers in place of its parameters, internal coordinates at zero."""
+    """The system with numeric parameter values in place of symbols, internal coordinates at zero."""
     inner = ca.vertcat(*system.internal.values()) if system.internal else ca.SX(0, 1)
     symbols = ca.vertcat(system.parameters.symbols, inner)
     values = np.concatenate([theta, np.zeros(inner.numel())])

@@ -1,4 +1,4 @@
-"""Experiments that were not made: other grasps, arms, motions, every sensor that could look on; their information."""
+"""Hypothetical variants of a recorded experiment: grasps, arms, motions and sensors, with their Fisher information."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ TOGETHER, FORWARD = 0.05, 0.08
 
 @dataclass(frozen=True)
 class View:
-    """What a sensor sees of one frame.
+    """Times and noise at which a sensor measures the position of one frame.
 
     Attributes
     ----------
@@ -63,21 +63,21 @@ class View:
 
 @dataclass(frozen=True)
 class Setting:
-    """The experiment that was made, and what its variations may use.
+    """The recorded experiment, and what its variants may use.
 
     Attributes
     ----------
     problem : EstimationProblem
     x : ndarray, shape (nx,)
-        Point at which to judge.
+        Unknowns at which the information is evaluated.
     start : "unknown" or "known"
     grasp_std : float or None
     second_arm : System, optional
-        The system with one more arm, its grasp included.
+        The system with a second arm and its grasp.
     torque_std : float
         Of joint torques as a measurement, where the recording states none [N m].
     seed : int
-        Of another motion.
+        Random seed of alternative motions.
     """
 
     problem: EstimationProblem
@@ -90,12 +90,12 @@ class Setting:
 
     @property
     def values(self) -> dict[str, float]:
-        """Every parameter at the point."""
+        """Values of all model parameters at `x`, by name."""
         theta, _ = self.problem.split(self.x, 0)
         return dict(zip(self.problem.system.parameters.names, map(float, theta), strict=True))
 
     def camera(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
-        """The camera's group, the times of its frames since the start and its typical standard deviation [m]."""
+        """The camera's point group, its frame times since the start [s] and its typical standard deviation [m]."""
         for group in used_groups(self.problem, episode):
             if camera_pose(group) is not None:
                 std = self._std(group)
@@ -103,14 +103,14 @@ class Setting:
         return None, regular_times(episode.grid, CAMERA_RATE), CAMERA_STD
 
     def arm(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
-        """The same of what the arms measure."""
+        """Point group, sample times [s] and standard deviation [m] of points that the arms measure."""
         for group in used_groups(self.problem, episode):
             if "arm" in group.name or group.sensor == "arm":
                 return group, group.t - episode.grid.start, float(np.nanmedian(self._std(group)))
         return None, episode.grid.times - episode.grid.start, ARM_STD
 
     def views(self, episode: Episode) -> list[View]:
-        """What the sensors of the recording saw, point by point."""
+        """Observations of the recording's sensors, one entry for each point."""
         found = []
         for group in used_groups(self.problem, episode):
             std = self._std(group)
@@ -121,7 +121,7 @@ class Setting:
         return found
 
     def frames(self, group: PointGroup) -> dict[str, str]:
-        """Frame that each used point of a group marks."""
+        """Frame of the mechanism that each used point of a group marks, by point name."""
         choice = self.problem.options.sensors.get(group.name, SensorOptions())
         wanted = choice.points if choice.points is not None else group.names
         frames = {point: choice.frames.get(point, point) for point in wanted}
@@ -137,13 +137,13 @@ class Setting:
 
 
 def used_groups(problem: EstimationProblem, episode: Episode) -> list[PointGroup]:
-    """Groups of points that the problem looks at."""
+    """Point groups of a recording that the problem uses."""
     sensors = problem.options.sensors
     return [g for g in episode.recording.points if sensors.get(g.name, SensorOptions()).use is not False]
 
 
 def regular_times(grid: Grid, rate: float) -> Array:
-    """Times of an even clock over a recording, from its start [s]."""
+    """Evenly spaced sample times over a recording, from its start [s]."""
     return np.arange(0.0, grid.steps * grid.time_step + 1e-9, 1.0 / rate)
 
 
@@ -152,7 +152,7 @@ def regular_times(grid: Grid, rate: float) -> Array:
 
 @dataclass(frozen=True)
 class Sight:
-    """A frame that could be seen: its name, what it is in words, who could see it; `frame` where it must be added."""
+    """A frame that a camera, or also an arm, could measure; `frame` where it must be added to the mechanism."""
 
     name: str
     words: str
@@ -161,7 +161,7 @@ class Sight:
 
 
 def sights(system: System) -> list[Sight]:
-    """Tips and middles of segments and markers beside them; of a mechanism without any, its links and markers there."""
+    """Measurable frames: tips and middles of segments and markers beside them; without segments, links and markers."""
     tree = system.mechanism
     held = {grasp.held for grasp in system.grasps}
     found: list[Sight] = []
@@ -195,7 +195,7 @@ def _displaced(frame: Frame, offset: ArrayLike) -> Frame:
 
 
 def seeing(step: Step, frames: Mapping[str, Frame]) -> Step:
-    """The same step of a system with more frames; sensors need no new equations of motion."""
+    """The step with further frames in its mechanism; the equations of motion stay the same."""
     mechanism = step.system.mechanism
     system = replace(step.system, mechanism=replace(mechanism, frames={**mechanism.frames, **frames}))
     return replace(step, model=replace(step.model, system=system))
@@ -206,24 +206,24 @@ def seeing(step: Step, frames: Mapping[str, Frame]) -> Step:
 
 @dataclass
 class Layout:
-    """One experiment's mechanics and motion with everything that could be seen of it.
+    """One variant of an experiment, with the sensitivities of all frames that could be measured.
 
     Attributes
     ----------
     problem : EstimationProblem
-        With nuisances, and with every sight in view at every node.
+        With nuisances, and with every measurable frame observed at every node.
     x : ndarray, shape (nx,)
     names : tuple of str
-        Free parameters, in the order of judgements.
+        Free parameters, in the order of results.
     slopes : mapping of (episode, group, frame) to ndarray, shape (N + 1, 3, nx + q)
         Sensitivity of a frame's position at every node by the unknowns, then by what stands for the errors of the
         torques that drive this episode (`seen_errors`).
     fixed : ndarray, shape (nx, nx)
-        Information that no error of torques blurs: priors of nuisances.
+        Fisher information of the priors of nuisances.
     by_joints : mapping of episode to ndarray, shape (nx + q, nx + q)
-        What joints tell, torques or angles that are measured, and the prior of the errors.
+        Fisher information of measured torques or angles, and of the prior of the torque errors.
     notes : tuple of str
-        What would stand in the way on a real robot, such as joint limits.
+        Obstacles on a real robot, such as joint limits.
     """
 
     problem: EstimationProblem
@@ -236,7 +236,7 @@ class Layout:
     _known: dict[tuple[int, str, str, bytes, bytes], Array] = field(default_factory=dict, repr=False)
 
     def information(self, views: Sequence[Sequence[View]]) -> Array:
-        """Fisher information of some views, one list for each recording, together with what is fixed."""
+        """Fisher information of observations, one list for each recording, plus the prior information, (nx, nx)."""
         total = self.fixed.copy()
         nx = len(total)
         for i, episode in enumerate(self.problem.episodes):
@@ -272,7 +272,7 @@ MECHANICS: Mapping[str, str] = {
 
 
 class LayoutBuilder:
-    """Builds layouts, each once.
+    """Builds and caches variants of an experiment by their mechanical changes.
 
     Parameters
     ----------
@@ -286,7 +286,7 @@ class LayoutBuilder:
         self._layouts: dict[frozenset[str], Layout | str] = {}
 
     def layout(self, mechanics: frozenset[str]) -> Layout | str:
-        """The experiment with changes of mechanics, or why there is none."""
+        """The experiment with a set of mechanical changes, or a message why it cannot be built."""
         if mechanics not in self._layouts:
             if mechanics:
                 self._progress.stage("working out " + " and ".join(MECHANICS[name] for name in sorted(mechanics)))
@@ -297,7 +297,7 @@ class LayoutBuilder:
         return self._layouts[mechanics]
 
     def possible(self) -> list[str]:
-        """Changes of mechanics that make sense for the system."""
+        """Names of the mechanical changes that apply to the system."""
         setting, system = self.setting, self.setting.problem.system
         found = []
         if any(grasp.kind != "weld" for grasp in system.grasps):

@@ -1,4 +1,4 @@
-"""Which entries of a step's matrices and of the NLP's can differ from zero, whatever the state."""
+"""Structural sparsity of a step's matrices and of the KKT matrix of the NLP."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NEGLIGIBLE = 1e-14  # of the largest entry: rounding
 
 @dataclass(frozen=True)
 class Span:
-    """A named run of rows or columns."""
+    """A named range of row or column indices."""
 
     name: str
     start: int
@@ -29,7 +29,7 @@ class Span:
 
 @dataclass(frozen=True)
 class Pattern:
-    """A matrix's entries that can differ from zero.
+    """Structural nonzeros of a matrix, with names of its blocks, rows and columns.
 
     Attributes
     ----------
@@ -41,9 +41,9 @@ class Pattern:
     row_labels, column_labels : tuple of str
         One for every row and column.
     marked : ndarray of bool, shape (r, c), or None
-        Entries to be told from the others.
+        Entries that are highlighted.
     marked_as : str
-        What they are.
+        Meaning of the highlighted entries.
     """
 
     name: str
@@ -57,13 +57,13 @@ class Pattern:
     marked_as: str = ""
 
     def with_values(self, values: NDArray[np.float64], where: str) -> Pattern:
-        """The pattern with the entries marked that do differ from zero in one matrix."""
+        """The pattern with the numerically nonzero entries of one matrix highlighted."""
         size = np.abs(values)
         return replace(self, marked=size > NEGLIGIBLE * np.max(size, initial=0.0), marked_as=f"not zero at {where}")
 
     @property
     def nonzeros(self) -> int:
-        """Entries that can differ from zero."""
+        """Number of structurally nonzero entries."""
         return int(np.count_nonzero(self.mask))
 
 
@@ -91,7 +91,7 @@ class KktSize:
 
 
 def step_patterns(symbols: StepSymbols) -> dict[str, Pattern]:
-    """Patterns of one step.
+    """Structural sparsity patterns of one step's matrices, by name.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def step_patterns(symbols: StepSymbols) -> dict[str, Pattern]:
 
 
 def inverse_mask(mask: Mask) -> Mask:
-    """Entries of a matrix's inverse that can differ from zero, from those of the matrix.
+    """Structural nonzeros of a matrix's inverse from those of the matrix.
 
     With rows put in the order of a perfect matching the diagonal is full, and entry (i, j) of the inverse can differ
     from zero where a path leads from i to j in the matrix's graph; all can where there is no perfect matching.
@@ -184,7 +184,7 @@ def _mask(pattern: ca.Sparsity) -> Mask:
 
 @dataclass(frozen=True)
 class Stages:
-    """What the NLP's stages have in common; see `stages`.
+    """Sparsity of one stage of the NLP, the same for all stages.
 
     Attributes
     ----------
@@ -219,7 +219,7 @@ class Stages:
 
     @property
     def multipliers(self) -> int:
-        """Of a step."""
+        """Number of multipliers of a step."""
         return len(self.lam_labels)
 
 
@@ -230,7 +230,7 @@ def stages(
     followed: Sequence[int],
     loose: Sequence[int] = (),
 ) -> Stages:
-    """Patterns of one stage of the NLP with a node at every step, in the order of `solvers.transcription`.
+    """Sparsity of one stage of the NLP with a node at every step, in the order of `solvers.transcription`.
 
     Parameters
     ----------
@@ -280,7 +280,7 @@ def stages(
 
 
 def kkt_size(stage: Stages, steps: Sequence[int]) -> KktSize:
-    """Size of the NLP of recordings of so many steps each."""
+    """Size of the NLP of several recordings, whose numbers of steps are given."""
     f, nx, m = stage.free, stage.node_spans[-1].stop, stage.multipliers
     height = len(stage.rows)
     # every step after the first adds the same entries
@@ -295,7 +295,7 @@ def kkt_size(stage: Stages, steps: Sequence[int]) -> KktSize:
 
 
 def nlp_masks(stage: Stages, steps: int) -> tuple[Mask, Mask, Mask]:
-    """Constraints' Jacobian, their Hessian and that of readings at every node, of so many steps of one recording."""
+    """Sparsity masks of one recording's constraint Jacobian, constraint Hessian and measurement Hessian."""
     f, nx, m, fixed = stage.free, stage.node_spans[-1].stop, stage.multipliers, stage.fixed
     width, height = f + (steps + 1) * nx + steps * m, len(stage.rows)
     jacobian = np.zeros((len(fixed) + steps * height, width), bool)

@@ -1,4 +1,4 @@
-"""Profile likelihood of one unknown: the best fit at fixed values of it, and the interval that follows."""
+"""Profile likelihood of one unknown: the others refitted at fixed values of it, and the resulting interval."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Profile:
 
     @property
     def interval(self) -> Interval:
-        """Both ends."""
+        """Lower and upper end of the 95 % interval; None for an open end."""
         return self.lower, self.upper
 
 
@@ -88,7 +88,7 @@ def profile_likelihood(
     evaluation: Evaluation | None = None,
     level: float = LEVEL,
 ) -> Profile:
-    """Interval of one unknown from  min over all others of chi2(x) - chi2(best) = level.
+    """Profile-likelihood interval of one unknown: min over all others of chi2(x) - chi2(best) = level.
 
     Each value is reached from the last one, the others first moved along the tangent and then by Gauss-Newton.
     Unknowns that are positive by nature move in their logarithm. The weak prior does not count.
@@ -133,11 +133,10 @@ def profile_likelihood(
 
 
 def with_intervals(problem: EstimationProblem, solution: Solution, progress: Progress = SILENT) -> Solution:
-    """A solution whose weakly determined parameters have an interval by profile likelihood, and the verdict it allows.
+    """The solution with profile-likelihood intervals, and the verdicts they allow, for weakly determined parameters.
 
-    There the cost is no parabola and a standard deviation tells one side at best; so it is with stiffnesses that are
-    found to be small beside the others (`sure_of_small`). Nothing is added to a problem that is not `small`, for which
-    profiles take long.
+    There the cost is not a parabola; nor is it for stiffnesses that are small compared with their typical size
+    (`sure_of_small`). The solution is unchanged where the problem is not `small`, as profiles then take long.
 
     Parameters
     ----------
@@ -177,7 +176,7 @@ def with_intervals(problem: EstimationProblem, solution: Solution, progress: Pro
 def sure_of_small(
     problem: EstimationProblem, x: Array, index: int, entry: Estimate, size: float, evaluation: Evaluation
 ) -> Estimate:
-    """An estimate that is small beside its typical size counts only where the data rule that size out at 99.9 %.
+    """The estimate, or `not_identifiable` where it is small and the data do not rule out its typical size at 99.9 %.
 
     A branch's twist that no sensor sees swings only where its stiffness is near zero. There it follows the noise: the
     cost has a narrow minimum, below what it is for all large values by what one more parameter takes from the noise.
@@ -192,7 +191,7 @@ def sure_of_small(
     entry : Estimate
         Of this unknown.
     size : float
-        Size that it might have; see `solvers.judgement.typical_sizes`.
+        Its typical size, as in `solvers.judgement.typical_sizes`.
     evaluation : Evaluation
         At `x`, with the Jacobian.
     """
@@ -205,12 +204,12 @@ def sure_of_small(
 
 
 def small(problem: EstimationProblem) -> bool:
-    """Whether intervals of a problem's parameters are worked out unasked."""
+    """Whether a problem is small enough for its profile intervals to be computed by default."""
     return len(parameter_names(problem)) <= MOST_INTERVALS and len(problem.names) <= MOST_UNKNOWNS
 
 
 def best_fit(problem: EstimationProblem, x: Array) -> tuple[Array, Evaluation]:
-    """The problem's optimum near a point, and the evaluation there with its Jacobian."""
+    """Unknowns of the problem's optimum near a point, and the evaluation there with its Jacobian."""
     outcome = GaussNewton(iterations=POLISH).run(problem, x, None)
     return outcome.x, problem.evaluate(outcome.x)
 

@@ -1,4 +1,4 @@
-"""What the source paper found in its four experiments, and what is known of why.
+"""Comparison with the source paper's estimates of its four experiments, and explanations of differences.
 
 Its recordings are not public. What is said of a value rests on twins of its experiments in MuJoCo, whose truth was
 chosen: what their recordings inform, where steepest descent with the paper's cost and step lengths stands after 200
@@ -35,7 +35,7 @@ ZERO = 0.01  # a bound at zero is reached within this fraction of the largest of
 
 @dataclass(frozen=True)
 class Ends:
-    """Where steepest descent with the paper's step lengths ends in the twins.
+    """Values of one parameter where steepest descent with the paper's step lengths ends, on synthetic recordings.
 
     Attributes
     ----------
@@ -54,9 +54,9 @@ class Ends:
 
 @cache
 def ensemble() -> Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]:
-    """Experiment, errors of the torques (none, offsets) and parameter to the members' values [N m/rad].
+    """Estimates of all ensemble members [N m/rad] by experiment, torque errors (none, offsets) and parameter.
 
-    What `benchmarks/torque_ensemble.py` leaves.
+    Written by `benchmarks/torque_ensemble.py`.
     """
     text = (resources.files("yid_ocp.data") / "defaults" / "torque_ensemble.json").read_text(encoding="utf-8")
     found: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]] = json.loads(text)
@@ -66,21 +66,21 @@ def ensemble() -> Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]:
 def published_sentences(
     experiment: str, estimates: Mapping[str, Estimate], truth: Mapping[str, float]
 ) -> tuple[str, ...]:
-    """One sentence for each published value of an experiment, on what is known of why it is what it is.
+    """One sentence for each published estimate of an experiment, explaining its difference from ours.
 
     Parameters
     ----------
     experiment : str
         A key of `PUBLISHED`.
     estimates : mapping of str to Estimate
-        What recordings of such an experiment tell, of the free parameters.
+        Estimates of the free parameters from recordings of such an experiment.
     truth : mapping of str to float
         Of these recordings, where it is known.
 
     Returns
     -------
     tuple of str
-        None where the recordings are not explained, so that nothing can be said of what they inform.
+        Empty where the model does not explain the recordings.
     """
     judged = {name: estimates[name] for name in NAMES if name in estimates and estimates[name].free}
     if any(entry.verdict == "not_trusted" for entry in judged.values()):
@@ -97,7 +97,7 @@ def published_sentences(
 
 
 def reason(published: float, entry: Estimate, truth: float | None, ends: Ends) -> str:
-    """Why a published value is what it is, as far as twins can tell.
+    """Label of the likeliest reason for a published estimate, judged by synthetic recordings.
 
     ============  ======================================================================================================
     not_informed  such recordings do not find the parameter, or only so weakly that their interval holds the value
@@ -108,7 +108,7 @@ def reason(published: float, entry: Estimate, truth: float | None, ends: Ends) -
     unexplained   anything else
     ============  ======================================================================================================
 
-    The first one that holds is said.
+    The first that applies is returned.
     """
     if entry.verdict == "not_identifiable" or (entry.verdict != "identifiable" and _holds(entry, published)):
         return "not_informed"
@@ -122,7 +122,7 @@ def reason(published: float, entry: Estimate, truth: float | None, ends: Ends) -
 
 
 def explained(published: float, values: Sequence[float]) -> bool:
-    """Whether a published value lies within what an ensemble's members found; see `ZERO` for a bound."""
+    """Whether a published estimate lies in the range of an ensemble's estimates, with a margin at a zero bound."""
     return min(values) - ZERO * max(values) <= published <= max(values)
 
 

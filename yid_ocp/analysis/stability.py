@@ -1,4 +1,4 @@
-"""Whether a time step is stable along a motion: errors that alternate from step to step and grow."""
+"""Numerical stability of a time step along a motion: growth of errors that alternate from step to step."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TOLERATED = 6.0
 
 @dataclass(frozen=True)
 class Growth:
-    """How errors that alternate from step to step grow along one motion.
+    """Growth of errors that alternate in sign from step to step along one motion.
 
     What a body does by itself goes on in one direction for several steps; a mode of the linearised step whose
     eigenvalue has a negative real part turns back at every step, and is the method's own. Where its magnitude exceeds
@@ -37,7 +37,7 @@ class Growth:
     factor : float
         Largest growth in one step.
     time : float
-        When that is, from the start of the motion [s].
+        Time of this largest growth, from the start of the motion [s].
     time_step : float
         [s]
     """
@@ -50,12 +50,12 @@ class Growth:
 
     @property
     def stable(self) -> bool:
-        """Whether rounding errors stay below what sensors see."""
+        """Whether rounding errors stay below sensor resolution."""
         return self.decades <= TOLERATED
 
     @property
     def words(self) -> str:
-        """What it means and what to do, for people."""
+        """A sentence on the stability and, where unstable, on the remedy."""
         grows = f"an error that alternates from step to step grows by {100 * (self.factor - 1):.2g} % in a step"
         if self.stable:
             return f"{self.recording}: the step of {self.time_step:g} s is stable along the motion"
@@ -73,7 +73,7 @@ def growth_along(
     name: str = "motion",
     looks: int = LOOKS,
 ) -> Growth:
-    """Growth of alternating errors along a rollout, as far as it got.
+    """Growth of alternating errors along a rollout, up to its first failed step.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def growth_along(
 
 
 def alternating(step: Step, theta: Array, rollout: Rollout, node: int, feedback: Feedback | None) -> float | None:
-    """Largest magnitude of an eigenvalue with a negative real part at a node, zero for none; None where A is not known.
+    """Largest magnitude of the eigenvalues of A - B K with negative real part at a node; None where A is not finite.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ def _largest_sum(rates: Array) -> float:
 
 
 def growth_of_fit(problem: EstimationProblem, x: ArrayLike) -> Growth | None:
-    """The largest growth among a problem's recordings at an unknown vector; None where none has a start.
+    """The largest error growth among a problem's recordings; None where no recording has an initial state.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ def growth_of_fit(problem: EstimationProblem, x: ArrayLike) -> Growth | None:
     Returns
     -------
     Growth or None
-        Also where the rollout fails: along the part that it has.
+        Of a failed rollout, along the part before the failure.
     """
     predictor, system = problem.predictor, problem.system
     found = []

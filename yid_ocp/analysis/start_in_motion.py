@@ -1,4 +1,4 @@
-"""Whether a cable's memory of its start holds for recordings that start in motion: asked of recordings left out."""
+"""Leave-one-out check of a cable's memory parameter on recordings that start in motion."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FEWEST = 2
 
 @dataclass(frozen=True)
 class SafeStart:
-    """A problem and its solution, with memory or without, and why in words; empty where nothing was in question."""
+    """Problem and solution with or without cable memory, and the reason; the message is empty without a decision."""
 
     problem: EstimationProblem
     solution: Solution
@@ -33,7 +33,7 @@ class SafeStart:
 
 
 def safe_start(problem: EstimationProblem, solver: Solver, solution: Solution, limits: GapLimits = USUAL) -> SafeStart:
-    """The solution, or that without a memory where recordings that start in motion do not bear the memory out.
+    """The solution, refitted without cable memory where recordings that start in motion do not support it.
 
     Where a cable moves when its recording begins, the load that it bears there is not known, and what it seems to
     remember may be that motion. Each recording that starts so is predicted from the others alone (one Gauss-Newton
@@ -67,7 +67,7 @@ def safe_start(problem: EstimationProblem, solver: Solver, solution: Solution, l
 
 
 def without_memory(problem: EstimationProblem) -> EstimationProblem:
-    """The problem of a cable that remembers nothing of its start."""
+    """The problem with the cable's memory parameters fixed at zero."""
     memory = [name for name in problem.shared if name.endswith(MEMORY)]
     free = tuple(name for name in problem.free if name not in (*memory, SPEED_SCALE))
     return problem.freeing(free).at(dict.fromkeys(memory, 0.0))

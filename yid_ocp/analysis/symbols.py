@@ -1,4 +1,4 @@
-"""The equations of one step with a name on every row and every column, and single entries by these names."""
+"""Equations of one step with named rows and columns, and access to single entries by name."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MANY = 6  # names of one block that are still listed one by one
 
 @dataclass(frozen=True)
 class Block:
-    """Equations or variables of one kind.
+    """A named block of equations or variables of one kind.
 
     Attributes
     ----------
@@ -31,9 +31,9 @@ class Block:
         One for every entry: a joint, a grasp's equation, an internal coordinate, a parameter.
     values : casadi.SX, shape (len(labels), 1)
     meaning : str
-        In a few words.
+        Short description.
     letter : str
-        In LaTeX, with `#` where the label goes.
+        LaTeX symbol, with `#` in place of the label.
     """
 
     name: str
@@ -50,7 +50,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Entry:
-    """An equation, or its derivative by a variable.
+    """One equation of a step, or its derivative by a variable.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class Entry:
         Full names; no column for the equation itself.
     formula : Formula
     variables : tuple of str
-        On what it depends, as `StepSymbols.grouped`.
+        Variables on which it depends, as `StepSymbols.grouped`.
     expression : casadi.SX
     """
 
@@ -70,16 +70,16 @@ class Entry:
 
     @property
     def title(self) -> str:
-        """What it is, as a formula."""
+        """The entry's name as a formula, `d ROW / d COLUMN` for a derivative."""
         return f"d {self.row} / d {self.column}" if self.column else self.row
 
     @property
     def zero(self) -> bool:
-        """Whether it vanishes whatever the state."""
+        """Whether it is zero for every state."""
         return bool(self.expression.is_zero())
 
     def value(self, variables: ca.SX, at: NDArray[np.float64]) -> float:
-        """The entry in numbers.
+        """Numeric value of the entry.
 
         Parameters
         ----------
@@ -91,7 +91,7 @@ class Entry:
 
     @property
     def lines(self) -> list[str]:
-        """The whole expression for people, its shared parts first."""
+        """Text lines of the whole expression, its shared parts first."""
         if self.zero:
             return [f"{self.title} = 0 whatever the state"]
         said = [_headline(self.title, self.formula.operations, self.variables)]
@@ -101,7 +101,7 @@ class Entry:
 
 @dataclass(frozen=True, repr=False)
 class StepSymbols(Shown):
-    """The equations of one step by name.
+    """Equations of one step with named rows and columns.
 
     Attributes
     ----------
@@ -125,7 +125,7 @@ class StepSymbols(Shown):
 
     @staticmethod
     def of(equations: DiscreteEquations) -> StepSymbols:
-        """Name the equations and variables of a step."""
+        """Named rows and columns of a step's equations."""
         e, system = equations, equations.system
         joints, internal = system.mechanism.joint_names, tuple(system.internal)
         closed = tuple(name for grasp in system.grasps for name in grasp.equation_names)
@@ -161,23 +161,23 @@ class StepSymbols(Shown):
 
     @cached_property
     def all_rows(self) -> ca.SX:
-        """Every row, shape (n + nz + m + n, 1)."""
+        """Expressions of all rows, shape (n + nz + m + n, 1)."""
         return ca.vertcat(*(block.values for block in self.rows))
 
     @cached_property
     def all_columns(self) -> ca.SX:
-        """Every variable."""
+        """Symbols of all columns, one below the other."""
         return ca.vertcat(*(block.values for block in self.columns))
 
     @cached_property
     def pattern(self) -> ca.Sparsity:
-        """Pattern of the derivatives of all rows by all columns."""
+        """Sparsity of the Jacobian of all rows by all columns."""
         found: ca.Sparsity = ca.jacobian_sparsity(self.all_rows, self.all_columns)
         return found
 
     @cached_property
     def names(self) -> tuple[Name, ...]:
-        """How formulas call the columns, in order."""
+        """Text and LaTeX names of all columns, in order."""
         return tuple(
             Name(name, block.letter.replace("#", rf"\mathrm{{{latex_text(label)}}}"))
             for block in self.columns
@@ -185,7 +185,7 @@ class StepSymbols(Shown):
         )
 
     def span(self, block: str) -> slice:
-        """Where a block of rows or of columns stands among its like."""
+        """Index range of a block among all rows or among all columns."""
         blocks = self.rows if any(entry.name == block for entry in self.rows) else self.columns
         at = 0
         for entry in blocks:
@@ -195,15 +195,15 @@ class StepSymbols(Shown):
         raise KeyError(block)
 
     def row(self, name: str) -> int:
-        """Place of a row by its full name; `ConfigError` with the nearest one where there is none."""
+        """Index of a row by its full name; raises `ConfigError` with the nearest name where it does not exist."""
         return _place(name, self.row_names, "row", self.rows)
 
     def column(self, name: str) -> int:
-        """Place of a column by its full name; `ConfigError` with the nearest one where there is none."""
+        """Index of a column by its full name; raises `ConfigError` with the nearest name where it does not exist."""
         return _place(name, self.column_names, "column", self.columns)
 
     def entry(self, text: str) -> Entry:
-        """An equation by its name, or with `ROW, COLUMN` its derivative by a variable.
+        """The equation with a given name or, for `ROW, COLUMN`, its derivative by a variable.
 
         Parameters
         ----------
@@ -232,7 +232,7 @@ class StepSymbols(Shown):
         return Entry(self.row_names[at], column, made, self.grouped(made.variables), expression)
 
     def grouped(self, places: Iterable[int]) -> tuple[str, ...]:
-        """Columns in words: by name, or as `24 of q0` where a block has many."""
+        """Names of columns by index; a block with many of them is abbreviated, `24 of q0`."""
         chosen, names, words = set(places), self.column_names, []
         for block in self.columns:
             span = self.span(block.name)
@@ -241,7 +241,7 @@ class StepSymbols(Shown):
         return tuple(words)
 
     def lines(self) -> list[str]:
-        """All equations for people, the short ones whole, then the names of all variables."""
+        """Text lines of all equations, short ones in full, then the names of all variables."""
         said = []
         place = {self.all_columns[i].element_hash(): i for i in range(self.all_columns.numel())}
         for at, name in enumerate(self.row_names):
@@ -263,7 +263,7 @@ class StepSymbols(Shown):
 
 
 def latex_text(name: str) -> str:
-    """A name as it stands in LaTeX's text."""
+    """A name with LaTeX's special characters escaped."""
     return "".join("\\" + letter if letter in "_%#&${}" else letter for letter in name)
 
 

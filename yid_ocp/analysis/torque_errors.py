@@ -1,9 +1,9 @@
-"""What wrong torques do to all that could be seen of a motion, in as few unknowns as matter.
+"""Low-rank propagation of torque and encoder errors to all readings of a motion.
 
 Torques are wrong in every recorded sample and by a constant, angles that a tracking filter follows in every step: some
 thousands of unknowns in a recording, of which sensors see no more than smooth motions. With G their effect on all
-readings in units of the finest noise, the left singular vectors of G whose singular values are not small stand for all
-of them; what is left out would add less than `NEGLIGIBLE` squared to any reading's variance.
+readings in units of the finest noise, the left singular vectors of G whose singular values are not small represent
+them; the neglected rest would add less than `NEGLIGIBLE` squared to any reading's variance.
 
 References
 ----------
@@ -44,7 +44,7 @@ def in_view(
     finest: Mapping[str, float],
     encoders: EstimationProblem | None = None,
 ) -> tuple[dict[tuple[str, str], Array], Array]:
-    """All that points of an episode could show at every node, and what its joints tell.
+    """Sensitivities of an episode's points at every node, and Fisher information of its joint measurements.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def in_view(
     Returns
     -------
     slopes : dict of (group, frame) to ndarray, shape (N + 1, 3, nx + q)
-        By the unknowns, then by what stands for the errors of what drives the motion.
+        By the unknowns, then by the low-rank unknowns of torque and encoder errors.
     information : ndarray, shape (nx + q, nx + q)
         From joints, and the prior of these errors.
     """
@@ -130,7 +130,7 @@ def _read_angles(encoders: EstimationProblem, x: Array, i: int, blur: Array) -> 
 
 
 def seen_errors(course: Course, errors: InputErrors, slopes: Array) -> Array:
-    """Effect of few unknowns of unit standard deviation that stand for all errors of what drives a motion.
+    """Sensitivity of readings to a few unit-variance unknowns that represent all torque and encoder errors.
 
     The tracking filter keeps the arms on what they followed. Where it follows encoders that are measurements, its share
     of their noise is taken as independent of theirs, which is small beside that of torques.

@@ -1,4 +1,4 @@
-"""Which change of an experiment would make which parameters identifiable, and the fewest changes that do for all."""
+"""Ranking of changes of an experiment by the parameters they make identifiable, and smallest sufficient sets."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Change:
     mechanics : str
         Key of `MECHANICS`, empty where only sensors change.
     camera, arm : tuple of str
-        Frames that they see beside what they saw.
+        Additional frames that the camera, or the arm, measures.
     rate : float or None
         Of the camera [Hz].
     """
@@ -66,23 +66,23 @@ class Change:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What an experiment with some changes would tell.
+    """Predicted identifiability of an experiment with some changes.
 
     Attributes
     ----------
     changes : tuple of str
-        Names; empty for the experiment as it is.
+        Names of the changes; empty for the unchanged experiment.
     words : str
     std_relative : mapping of parameter to float
-        Empty where the experiment could not be worked out.
+        Empty where the experiment could not be evaluated.
     verdicts : mapping of parameter to str
     identifiable : int
         How many parameters.
     gain : float
-        1/2 log det(1 + 16 I) over relative changes [nat]: what is learned by someone who beforehand knew each
-        parameter to within its limit of identifiability, 400 %.
+        Information gain 1/2 log det(1 + 16 I) over relative changes [nat], for a prior standard deviation of 400 % of
+        each parameter.
     message : str
-        Why it could not be worked out, or what stands in the way on a real robot.
+        Why it could not be evaluated, or obstacles on a real robot.
     """
 
     changes: tuple[str, ...]
@@ -101,21 +101,21 @@ class Outcome:
 
 @dataclass(frozen=True, repr=False)
 class WhatIf(Shown):
-    """Changes of an experiment, ranked.
+    """Changes of an experiment, ranked by the parameters they make identifiable.
 
     Attributes
     ----------
     base : Outcome
         The experiment as it is.
     singles : tuple of Outcome
-        Single changes, most identifiable parameters first, then by gain; those that could not be worked out last.
+        Single changes, most identifiable parameters first, then by gain; those that could not be evaluated last.
     smallest : tuple of Outcome
         All sets of fewest changes with which every parameter is identifiable, largest gain first; empty where none of
         up to three changes does it.
     greedy : tuple of Outcome
         Best single change added one after the other.
     searched : int
-        Sets of changes that were judged.
+        Number of evaluated sets of changes.
     """
 
     base: Outcome
@@ -132,16 +132,16 @@ class WhatIf(Shown):
 
 @dataclass(frozen=True)
 class WhatIfOptions:
-    """How changes are searched.
+    """Settings of the search for changes of an experiment.
 
     Attributes
     ----------
     torque_std : float
         Noise of joint torques as a measurement, where the recordings state none [N m].
     seed : int
-        Of another motion.
+        Random seed of alternative motions.
     largest : int
-        Largest set of changes to search for one that makes all parameters identifiable.
+        Largest set of changes that is searched.
     only : tuple of str, optional
         Names of changes to consider, all when absent.
     """
@@ -153,7 +153,7 @@ class WhatIfOptions:
 
 
 Judge = Callable[[Sequence[Sequence[Change]], float], list[Outcome]]
-"""From sets of changes, and the factor by which variances are larger than stated, to what they would tell."""
+"""From sets of changes and a factor on the stated variances to the predicted results, one for each set."""
 
 
 def what_if(
@@ -185,7 +185,7 @@ def what_if(
     options : WhatIfOptions, optional
     progress : Progress, optional
     judge : callable, optional
-        Judges sets of changes elsewhere, as `judged_changes` does there.
+        Evaluates sets of changes, in other processes for example, by `judged_changes`; in this process when absent.
 
     Returns
     -------
@@ -216,7 +216,7 @@ def what_if(
 
 
 def judged_changes(setting: Setting, sets: Sequence[Sequence[str]], inflation: float) -> list[Outcome]:
-    """What an experiment would tell with each of several sets of changes, by their names.
+    """Predicted results of an experiment with each of several sets of changes, given by name.
 
     Parameters
     ----------
@@ -242,7 +242,7 @@ def _smallest(outcomes: _Outcomes, changes: Sequence[Change], base: Outcome, lar
 
 
 def possible_changes(setting: Setting, builder: LayoutBuilder) -> list[Change]:
-    """All single changes that make sense for an experiment."""
+    """All single changes that apply to an experiment."""
     episode = setting.problem.episodes[0]
     camera, arm = setting.camera(episode)[0], setting.arm(episode)[0]
     looked = {view.frame for view in setting.views(episode) if camera is not None and view.group == camera.name}
@@ -262,14 +262,14 @@ def possible_changes(setting: Setting, builder: LayoutBuilder) -> list[Change]:
 
 
 def compatible(changes: Sequence[Change]) -> bool:
-    """Whether changes can be made together: one rate, one motion."""
+    """Whether changes can be combined: at most one camera rate and one motion."""
     rates = sum(change.rate is not None for change in changes)
     motions = sum(change.mechanics in ("motion", "travel") for change in changes)
     return rates <= 1 and motions <= 1
 
 
 def ranked(outcomes: Iterable[Outcome]) -> list[Outcome]:
-    """Most identifiable parameters first, then by gain; what could not be worked out last."""
+    """Results sorted by identifiable parameters, then by gain; those that could not be evaluated last."""
     return sorted(outcomes, key=lambda entry: (not entry.verdicts, -entry.identifiable, -entry.gain))
 
 

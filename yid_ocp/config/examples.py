@@ -1,4 +1,4 @@
-"""An example of every section of a configuration, for the page of settings; a test reads each of them."""
+"""YAML examples of every configuration section, for the settings page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which keys stand where: the settings' classes as a configuration file sees them, for reader, `--set` and schema."""
+"""Allowed keys of each configuration section, derived from the settings classes; for reader, `--set` and schema."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from yid_ocp.options import Among, Option, entries_of, members, options_of, stri
 
 @dataclass(frozen=True)
 class Sections:
-    """Settings classes for which a section may be meant.
+    """Alternative settings classes of one configuration section, and the key that selects one.
 
     Attributes
     ----------
@@ -36,11 +36,11 @@ class Sections:
     nullable: bool = False
 
     def word(self, raw: Any) -> Any:
-        """What a section says about the choice."""
+        """Value of the selector key in a raw section; the default where the key is absent."""
         return raw.get(self.key, self.default) if self.key and isinstance(raw, dict) else self.default
 
     def keys(self, word: Any = "") -> Mapping[str, Option]:
-        """Keys of the section of a word, of the first one for another word."""
+        """Options by key of the selected class; of the first class where the value selects none."""
         known = isinstance(word, str) and word in self.classes
         options = options_of(self.classes[word] if known else next(iter(self.classes.values())))
         if self.key in ("", *options):
@@ -48,7 +48,7 @@ class Sections:
         return {self.key: Option(Literal[tuple(self.classes)], self.default), **options}
 
     def of(self, name: str, where: str) -> Sections:
-        """What stands under a name in a mapping of such sections; of a registry's, the class of that name."""
+        """Classes allowed under one name of a mapping: the registered class of that name, or all."""
         if self.key != "name":
             return self
         if name not in self.classes:
@@ -56,14 +56,14 @@ class Sections:
         return Sections({"": self.classes[name]})
 
     def unknown(self, word: object, where: str) -> ConfigError:
-        """That a word chooses nothing."""
+        """The error for a missing or unknown value of the selector key."""
         if not word:
             return ConfigError(f"the key '{self.key}' is missing", where=where, allowed=", ".join(self.classes))
         return ConfigError(f"there is no {self.noun} '{word}'", where=where, **choices(str(word), self.classes))
 
 
 def sections_of(hint: Any) -> Sections | None:
-    """The settings classes of a type; None for other types."""
+    """Alternative settings classes that a type annotation allows; None for other types."""
     bare, markers = stripped(hint)
     nullable = type(None) in get_args(bare)
     among = next((marker for marker in markers if isinstance(marker, Among)), None)
@@ -79,7 +79,7 @@ def sections_of(hint: Any) -> Sections | None:
 
 
 def unknown_key(root: type, name: str, known: Iterable[str], where: str, within: str = "") -> ConfigError:
-    """That a section has no such key, with the nearest one that it has and the sections that have this one."""
+    """The error for an unknown key, with the nearest allowed key and the sections that have this key."""
     said = choices(name, known)
     homes = list(dict.fromkeys(homes_of(root, name)))
     hints = [said["hint"]] if said["hint"] else []
@@ -95,7 +95,7 @@ def unknown_key(root: type, name: str, known: Iterable[str], where: str, within:
 
 
 def settable(hint: Any, prefix: str, raw: Any, at: str = "") -> Iterator[str]:
-    """Keys with dots that begin with a prefix, up to the next dot, or `=` where a value follows.
+    """Yield completions of a dotted key prefix, up to the next dot or to `=` where a value follows.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def settable(hint: Any, prefix: str, raw: Any, at: str = "") -> Iterator[str]:
 
 
 def homes_of(hint: Any, name: str, at: str = "") -> Iterator[str]:
-    """Sections that have a key, in words; NAME stands for a name that users choose."""
+    """Yield descriptions of the sections that have a key; NAME represents a user-chosen name."""
     for inner, step in ((values_of(hint), ".NAME"), (entries_of(hint), "")):
         if inner is not None:
             yield from homes_of(inner, name, at + step)

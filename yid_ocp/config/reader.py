@@ -1,4 +1,4 @@
-"""Configuration files: YAML read with line numbers and checked against the settings."""
+"""Configuration files: reads YAML with line numbers and validates it against the settings classes."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def load_config(path: str | Path | None = None, overrides: Sequence[str] = (), d
 
 
 def settable(prefix: str, path: str | Path | None = None) -> list[str]:
-    """Keys that `overrides` may set and that begin with a prefix; with names that a file has, where one is given.
+    """Dotted keys that `overrides` may set and that begin with a prefix, with the names used in a given file.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What a configuration may say: as JSON Schema for editors, and as tables for people."""
+"""Documentation of the configuration: a JSON Schema for editors and Markdown tables."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ empties it. How to choose links, time step and split: [choosing.md](choosing.md)
 
 
 def schema() -> dict[str, Any]:
-    """JSON Schema of a configuration file."""
+    """JSON Schema of a configuration file, as plain data."""
     head = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "yid-ocp configuration"}
     return head | _of(Run)
 
@@ -86,7 +86,7 @@ def _about(hint: Any) -> About:
 
 
 def settings_page() -> str:
-    """Every key with what it means, what is allowed and its default, in Markdown."""
+    """Markdown page of all settings with meaning, allowed values and default."""
     lines = HEAD.splitlines()
     tables = {title: (text, rows) for title, text, rows in _tables(Run, "")}
     for title, (text, rows) in tables.items():

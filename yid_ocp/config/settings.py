@@ -1,4 +1,4 @@
-"""The settings of one run: the sections of a configuration file, and the options that belong to no other package.
+"""Settings of one run: dataclasses for the sections of a configuration file.
 
 Plain frozen dataclasses, filled by `reader`. Options of solvers, problem, sensors, cables, tracking and diagnosis are
 defined where they are used (`yid_ocp.options`); the sections here hold those classes.
@@ -42,7 +42,7 @@ GraspName = Literal["point", "axis", "weld"]
 
 @dataclass(frozen=True, kw_only=True)
 class MountSettings:
-    """Where the root of an object sits."""
+    """Pose of an object's root in a parent frame."""
 
     frame: Annotated[str | None, About("frame or clamp that carries it; the world when absent")] = None
     xyz: Annotated[Triple, About("position in that frame", "m")] = (0.0, 0.0, 0.0)
@@ -51,7 +51,7 @@ class MountSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class FrameSettings(MountSettings):
-    """A named frame beside those that robot and object have: a tool's tip, a marker."""
+    """An additional named frame on the robot, the object or in the world, such as a tool tip or a marker."""
 
     straight: Annotated[
         bool,
@@ -64,7 +64,7 @@ class FrameSettings(MountSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class ClampSettings:
-    """A clamp that somebody or something moves as measured: a massless frame that follows two recorded points."""
+    """A massless clamp frame whose prescribed motion follows two recorded points."""
 
     origin: Annotated[str, About("point at which the clamp's origin sits")]
     towards: Annotated[str, About("point to which its z axis looks, never along the world's x axis")]
@@ -88,7 +88,7 @@ class YObject:
 
 @dataclass(frozen=True, kw_only=True)
 class SegmentSettings:
-    """One tube, branch or beam of a chain of rigid links; its stiffness and damping stand under `parameters`."""
+    """One segment (tube, branch or beam) as a chain of rigid links; its stiffness and damping are in `parameters`."""
 
     length: Annotated[float | None, Gt(0), Le(50), About("length; not needed beside link_lengths", "m")] = None
     mass: Annotated[float, Gt(0), About("mass of the whole segment", "kg")]
@@ -111,7 +111,7 @@ class SegmentSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class SegmentedObject:
-    """Any object of segments: a beam, a tube with branches."""
+    """A flexible object built from segments, such as a beam or a tube with branches."""
 
     kind: Annotated[Literal["segments"], About("what the object is")] = "segments"
     segments: Annotated[Mapping[str, SegmentSettings], About("by name, parents first")] = field(default_factory=dict)
@@ -123,7 +123,7 @@ class SegmentedObject:
 
 @dataclass(frozen=True, kw_only=True)
 class CableObject(CableOptions):
-    """A branched cable held at both ends by clamps that follow measured points; its edges come from the recordings."""
+    """A branched cable held at both ends by clamps that follow measured points; lengths come from recordings."""
 
     kind: Annotated[Literal["cable"], About("what the object is")] = "cable"
     parent: Annotated[tuple[str, ...], Len(5), About("points from clamp to clamp, two held at each end")]
@@ -135,7 +135,7 @@ class CableObject(CableOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class GraspSettings:
-    """A frame of the robot that holds a frame of the object."""
+    """A grasp: a constraint between a frame of the robot and a frame of the object."""
 
     holder: Annotated[str, About("frame of the robot, or a clamp")]
     held: Annotated[str, About("frame of the object, or a point along a segment such as T1:40%")]
@@ -145,7 +145,7 @@ class GraspSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class SpringSettings:
-    """A spring (and a damper) on one joint of the robot."""
+    """A spring and damper on one joint of the robot."""
 
     stiffness: Annotated[float, Ge(0), About("stiffness", "N m/rad or N/m")]
     rest: Annotated[float, About("coordinate at which it is relaxed", "rad or m")] = 0.0
@@ -163,7 +163,7 @@ class EffectSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ServoSettings:
-    """How position servos take commands; their numbers are parameters, JOINT.servo_gain and so on."""
+    """How position servos process commands; gains and limits are parameters such as JOINT.servo_gain."""
 
     commands: Annotated[
         Commands, About("what a servo follows between two commands: the last one held, or straight lines")
@@ -175,7 +175,7 @@ class ServoSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ArmSettings:
-    """Which joints of the robot move, and what is known of them."""
+    """Moving joints of the robot and how each is driven."""
 
     joints: Annotated[tuple[str, ...] | None, About("in configuration order; all movable ones when absent")] = None
     mode: Annotated[
@@ -198,7 +198,7 @@ class ArmSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ModelSettings:
-    """What the world is made of."""
+    """Mechanical model: robot, flexible object, grasps, clamps, frames and effects."""
 
     robot: Annotated[
         FilePath | None,
@@ -242,7 +242,7 @@ class ModelSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingSettings:
-    """Which recordings are used for what."""
+    """Recordings for estimation, for held-out prediction and for reference."""
 
     estimate: Annotated[tuple[RecordingPath, ...], About("to estimate on")] = ()
     held_out: Annotated[tuple[RecordingPath, ...], About("only predicted, never touched by the fit")] = ()
@@ -257,7 +257,7 @@ class RecordingSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ImportSettings:
-    """How `import` makes a recording of a file of another tool; a flag of the command line goes before its key here."""
+    """How `import` converts a file of another tool; a command-line flag overrides its key here."""
 
     joint_topics: Annotated[
         tuple[str, ...] | None, About("of a bag: topics of joint states, put on one clock; all when absent")
@@ -304,7 +304,7 @@ class ImportSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ParameterSettings:
-    """What is known of one parameter, or of all that a pattern such as T*.bend names."""
+    """Initial value, bounds and prior of one parameter, or of all that match a pattern such as T*.bend."""
 
     initial: Annotated[float | None, About("value, or where the search starts", "that of the parameter")] = None
     bounds: Annotated[Interval | None, About("lower and upper bound", "that of the parameter")] = None
@@ -317,7 +317,7 @@ class ParameterSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ProblemSettings(ProblemOptions):
-    """What is compared with the recordings and how, and the time step with which the model moves."""
+    """Estimation problem: residuals, initial state and time discretisation."""
 
     time_step: Annotated[float, Gt(0), Le(0.1), About("of the integrator", "s")] = 0.01
     force_split: Annotated[ForceSplit, About("rule for forces; left is the paper's")] = "symmetric"
@@ -327,7 +327,7 @@ class ProblemSettings(ProblemOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class DiagnosisSettings(Thresholds):
-    """How the gap between model and recordings is searched for its cause."""
+    """Candidates and thresholds of the diagnosis of the sim-to-real gap."""
 
     candidates: Annotated[
         Literal["all"] | tuple[str, ...], About("effects to try: all, or a list of kind or kind@location")
@@ -347,7 +347,7 @@ class DiagnosisSettings(Thresholds):
 
     @property
     def of_a_fit(self) -> GapLimits:
-        """What makes the residual of a fit, in the sensors' stated units, more than noise."""
+        """Limits of the null test for a fit's residual, in the sensors' stated standard deviations."""
         return replace(self.gap, noise_fraction=self.noise_fraction)
 
 
@@ -363,7 +363,7 @@ def _compared() -> dict[str, Solver]:
 
 @dataclass(frozen=True, kw_only=True)
 class CompareSettings:
-    """Which methods are compared, each with settings of its own."""
+    """Solvers to compare, each with its own settings."""
 
     methods: Annotated[Mapping[str, Annotated[Solver, Among(SOLVERS)]], About("settings of each method, by name")] = (
         field(default_factory=_compared)
@@ -373,7 +373,7 @@ class CompareSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class VirtualFramesSettings:
-    """A virtual experiment in MuJoCo and the virtual depth camera that films it, where there are no frames."""
+    """A MuJoCo experiment and its virtual depth camera, used when no recorded frames are given."""
 
     seed: Annotated[int, Ge(0), About("of motion, noise and camera")] = 0
     duration: Annotated[float, Gt(0), Le(600), About("of the experiment", "s")] = 5.0
@@ -392,7 +392,7 @@ class VirtualFramesSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class TrackSettings:
-    """How points are measured in a depth camera's frames."""
+    """How points are tracked in the frames of a depth camera."""
 
     frames: Annotated[
         FilePath | None,
@@ -424,7 +424,7 @@ class TrackSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class PlanSettings(PlanOptions):
-    """What `plan` plans, and where the parameters come from."""
+    """Goal of a planned motion and the run that supplies the parameters."""
 
     run: Annotated[
         FilePath | None,
@@ -437,7 +437,7 @@ class PlanSettings(PlanOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class OutputSettings:
-    """Where results go."""
+    """Output: run folders, the report and the discretisation check."""
 
     folder: Annotated[FilePath | None, About("in which run folders are made; `runs` in the working folder")] = None
     report: Annotated[bool, About("whether report.html is written")] = True
@@ -452,7 +452,7 @@ class OutputSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """Everything that one run needs to know.
+    """Resolved settings of one run: all sections of its configuration file.
 
     Attributes
     ----------
@@ -491,7 +491,7 @@ class Run:
     places: Mapping[tuple[str | int, ...], str] = field(default_factory=dict, compare=False, repr=False)
 
     def where(self, *path: str | int) -> str:
-        """File, line and key of a setting, for the `where` of an error."""
+        """Text with file, line and key of a setting, for the `where` of an error."""
         key = ".".join(str(part) for part in path)
         for count in range(len(path), 0, -1):
             if path[:count] in self.places:
@@ -499,12 +499,12 @@ class Run:
         return f"{self.file}: {key}" if self.file else key
 
     def refuse(self, what: str, *path: str | int, allowed: str = "", hint: str = "") -> ConfigError:
-        """A `ConfigError` that points at a setting."""
+        """A `ConfigError` (not raised here) that names file, line and key of a setting."""
         return ConfigError(what, where=self.where(*path), allowed=allowed, hint=hint)
 
 
 def dump_config(run: Run) -> str:
-    """A run's settings as YAML that `load_config` reads back to the same run, every default written out."""
+    """YAML text of a run's settings, with every default, that `load_config` reads back to the same run."""
     stream = io.StringIO()
     yaml = YAML()
     yaml.width = 120

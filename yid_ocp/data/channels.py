@@ -1,4 +1,4 @@
-"""What single channels of a recording say against it: values that repeat, steps, noise, extremes that are cut off."""
+"""Checks of single channels of a recording: repeated values, quantization, noise and saturation."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.sensors.joints import DIFFERENCES, EFFORT, POSITION
 
 REPEATS = 0.1
-"""Part of a channel's samples that may repeat the one before."""
+"""Largest fraction of a channel's samples that may repeat the previous one."""
 COMPUTED = 1e-2
-"""Less than this part of the stated noise is none."""
+"""Noise below this fraction of the stated noise means that the channel was computed, not measured."""
 SLOWEST = 0.02
-"""Motion of an arm is slow beside samples that are as near as this [s]."""
+"""Longest sample period at which arm motion counts as slow [s]."""
 
 
 def _channels(recording: Recording, *wanted: str) -> Iterator[tuple[str, str, Array, Array]]:
@@ -37,7 +37,7 @@ def _channels(recording: Recording, *wanted: str) -> Iterator[tuple[str, str, Ar
 
 
 def stuck(recording: Recording) -> Iterator[Doubt]:
-    """A channel that is noisy elsewhere repeats one value, or stays where its velocity says that it turns."""
+    """Issues for channels that repeat one value although they are noisy elsewhere or their velocity is not zero."""
     joints, found = recording.joints, []
     for group, channel, t, values in _channels(recording, "position", "effort", "points"):
         if len(t) <= LIMITS.stuck_samples:
@@ -92,7 +92,7 @@ def _longest_run(same: NDArray[np.bool_]) -> tuple[int, int]:
 
 
 def white(t: Array, values: Array) -> float:
-    """Noise that is white from sample to sample, robustly; zero for a channel with long rests or an uneven clock."""
+    """Robust standard deviation of a channel's white noise; zero for long rests or an uneven clock."""
     even = np.abs(np.diff(t) / max(period(t), 1e-12) - 1) < 0.2
     if len(t) < DIFFERENCES + FEWEST:
         return 0.0
@@ -104,7 +104,7 @@ def white(t: Array, values: Array) -> float:
 
 
 def quantum(values: Array) -> float:
-    """Step of which all differences of a channel are multiples, zero where there is none."""
+    """Quantization step of a channel, zero if it is not quantized."""
     levels = np.unique(values)
     if not 1 < len(levels) < 0.7 * values.size:
         return 0.0
@@ -140,7 +140,7 @@ def _stated(recording: Recording, choice: Choices, group: str, channel: str) -> 
 
 
 def steps_and_noise(recording: Recording, choice: Choices) -> Iterator[Doubt]:
-    """Steps and noise beside the noise that is stated; where frames are as slow as the motion nothing can be said."""
+    """Issues for channels whose quantization or noise exceeds the stated noise; slow frame rates are skipped."""
     for group, channel, t, values in _channels(recording, "position", "effort", "points"):
         if len(t) < 100 or period(t) > 0.05:
             continue
@@ -184,7 +184,7 @@ def steps_and_noise(recording: Recording, choice: Choices) -> Iterator[Doubt]:
 
 
 def overstated(recording: Recording, choice: Choices) -> Iterator[Doubt]:
-    """Channels far less noisy than the recording itself says, all that are said to be equally noisy taken together.
+    """Issues for channels far less noisy than the recording states; channels of equal stated noise are pooled.
 
     What settings state may stand for what a model misses, and only a fit can say whether it is too much. Noise need not
     be white: the largest of what all samples say, every other one, and so on up to `SLOWEST` counts, and so do steps.
@@ -236,7 +236,7 @@ def _clock(recording: Recording, name: str) -> str:
 
 
 def saturated(recording: Recording) -> Iterator[Doubt]:
-    """Efforts that meet their extreme again and again, to the last digit."""
+    """Issues for efforts that repeatedly equal their extreme value exactly."""
     if recording.joints is not None and recording.joints.effort_taken_as == "command":
         return  # what a controller asks for ends at its own bound
     for group, channel, t, values in _channels(recording, "effort"):

@@ -1,7 +1,6 @@
-"""What one recording says against itself: its clocks, its motion, its channels, and the same data given twice.
+"""Checks of one recording without a model: clocks, motion, channels and duplicated data.
 
-Nothing here needs a model; what a model says against a recording stands in `analysis.plausibility`. Limits come from
-physics or statistics, with room for what robots do.
+Checks against a model are in `analysis.plausibility`. Limits come from physics or statistics.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from yid_ocp.data.recording import PointGroup, Recording
 
 
 def check_recording(recording: Recording, choice: Choices, driving: bool = True) -> list[Doubt]:
-    """Everything that one recording says against itself.
+    """All issues of one recording that need no model.
 
     Parameters
     ----------
@@ -161,7 +160,7 @@ def _dropped(recording: Recording, driving: bool) -> Iterator[Doubt]:
 
 
 def smooth_rate(t: Array, values: Array, rates: Array) -> tuple[Array, Array]:
-    """Differences of values and mean of the recorded rates over windows long enough for noise not to count.
+    """Rates of change from values and from recorded rates, averaged over windows that suppress noise.
 
     Parameters
     ----------
@@ -288,7 +287,7 @@ def _smoothed(values: Array) -> Array:
 
 
 def shared_samples(one: Recording, other: Recording) -> int:
-    """How many samples of motion two recordings have in common, to the last digit."""
+    """Number of bit-identical motion samples that two recordings share."""
     if one.joints is not None and other.joints is not None:
         return _common(_rows(one.joints), _rows(other.joints))
     others = {group.name: group for group in other.points}
@@ -309,7 +308,7 @@ def _common(one: Array, other: Array) -> int:
 
 
 def same_data(one: Recording, other: Recording) -> Doubt | None:
-    """The doubt that two recordings are the same measurement, at least in part; it names the second."""
+    """Issue naming the second recording if both hold the same measurement at least in part, else None."""
     count = shared_samples(one, other)
     few = min(len(group.t) for recording in (one, other) for group in recording.groups[:1])
     if count < min(LIMITS.shared, 0.5 * few):

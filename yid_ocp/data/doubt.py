@@ -1,4 +1,4 @@
-"""A reason not to believe a recording: its cause, place and weight, and the limits from which on anything counts."""
+"""Data quality issues of a recording: cause, place and severity, and the limits of the checks."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ Group = JointGroup | PointGroup
 Weight = Literal["warning", "not_trusted", "refused"]
 
 MOST = 1e3
-"""Evidence beyond which nothing more is to be said."""
+"""Largest value of `Doubt.evidence`; larger ratios are clipped."""
 CLOCK_UNITS: Mapping[str, float] = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
 EPOCH = 1e8
-"""A clock that counts from 1970 is beyond this, one that counts from when a robot was switched on is not [s]."""
+"""Smallest time that is taken for a clock counting from 1970 instead of from power-on [s]."""
 DEGREE = math.degrees(1.0)
 FEWEST = 30
-"""Differences from which noise can be told."""
+"""Fewest differences from which noise is estimated."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """From where on something counts against a recording.
+    """Limits beyond which a check of a recording reports an issue.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ LIMITS = Limits()
 
 @dataclass(frozen=True)
 class Doubt:
-    """One reason not to believe a recording as it is.
+    """One data quality issue of a recording.
 
     Attributes
     ----------
@@ -121,7 +121,7 @@ class Doubt:
 
     @property
     def sure(self) -> str:
-        """How sure it is, in words."""
+        """Certainty in one word: perhaps, likely or certain."""
         return "perhaps" if self.evidence < 1.5 else "likely" if self.evidence < 3 else "certain"
 
     @property
@@ -171,7 +171,7 @@ CAUSES: Mapping[str, str] = {
     "weak_excitation": "the motion is too weak to tell what is asked",
     "worse_than_guess": "a prediction without a model is nearer",
 }
-"""What may be wrong with a recording, in the words of tables."""
+"""Description of every cause of an issue, as shown in tables."""
 
 Choices = Callable[[str], Choice]
 

@@ -1,4 +1,4 @@
-"""Recordings cut where what drives the model was not recorded."""
+"""Splitting of recordings at gaps in the signals that drive the model."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from yid_ocp.data.recording import Recording
 Array = NDArray[np.float64]
 
 LONGEST = 0.1
-"""What lies between samples farther apart is not known: motion of an arm has a band of 5 Hz [s]."""
+"""Longest time between samples that is interpolated; arm motion has a bandwidth of 5 Hz [s]."""
 PERIODS = 5
-"""So many periods may be missing in any case."""
+"""Number of sample periods that may always be missing."""
 SHORTEST = 0.5
-"""A shorter part is not worth a start of its own [s]."""
+"""Shortest part of a recording that is kept [s]."""
 RESTING = 0.01
-"""A part whose joints turn by less in its first fifth of a second starts at rest [rad]."""
+"""Largest joint rotation in the first 0.2 s of a part that starts at rest [rad]."""
 JUMP = 5
-"""Periods in which joints at their speed go as far as across a gap, where the clock jumped and not the joints."""
+"""A gap that the joints cross in fewer periods at their speed is a jump of the clock."""
 FAST = 0.05
-"""What joints would have to go across a gap at their speed for that to be told [rad]."""
+"""Smallest rotation at joint speed over a gap that allows a clock jump to be detected [rad]."""
 
 
 @dataclass(frozen=True)
 class Parts:
-    """A recording without its gaps: what is left of it, and what is said of that."""
+    """Parts of a recording between its gaps, and one issue for each gap."""
 
     recordings: tuple[Recording, ...]
     doubts: tuple[Doubt, ...]
 
 
 def cut_at_gaps(recording: Recording, driving: Sequence[str], anywhere: bool) -> Parts:
-    """Cut a recording where nothing says what drove the model.
+    """Split a recording at gaps in the signals that drive the model.
 
     Parameters
     ----------

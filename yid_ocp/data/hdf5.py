@@ -1,4 +1,4 @@
-"""The HDF5 file of a recording (`yid-recording/1`): reading with every doubt refused, writing whole or not at all."""
+"""Reading and writing of recordings as HDF5 files (`yid-recording/1`), with strict checks and atomic writes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""HDF5 files as such: written from memory as a whole, read only after another process came through them unharmed.
+"""Safe HDF5 access: atomic writes, and reads only after another process has read the file without a crash.
 
 The HDF5 library ends the process that meets a full disk while it writes, or certain damage while it reads, and takes
 links into other files for its own. None of this can be caught, so it is kept away from the process that does the work.
@@ -18,10 +18,10 @@ from yid_ocp.errors import DataError
 from yid_ocp.files import new_file, reason
 
 DEPTH = 10
-"""How deep groups may stand in one another."""
+"""Largest nesting depth of groups."""
 
 LARGEST = 1 << 30
-"""Bytes that all datasets of a file may have together when they are unpacked."""
+"""Largest total size of a file's unpacked datasets [bytes]."""
 
 
 @contextlib.contextmanager
@@ -52,7 +52,7 @@ def new_hdf5(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
 
 @contextlib.contextmanager
 def open_hdf5(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
-    """An HDF5 file to read, after a trial.
+    """Open an HDF5 file after checking in another process that it can be read.
 
     Parameters
     ----------

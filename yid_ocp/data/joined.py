@@ -1,4 +1,4 @@
-"""Joint states of several sources on one clock."""
+"""Merging of joint states from several sources onto one clock."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from yid_ocp.data.recording import Array, JointGroup
 from yid_ocp.errors import DataError
 
 FARTHEST = 5.0
-"""Nothing is interpolated across more than so many periods of a source."""
+"""Longest gap of a source that is interpolated, in its sample periods."""
 
 
 def joined(groups: Sequence[tuple[str, JointGroup]], where: str) -> tuple[JointGroup, tuple[str, ...]]:
-    """Put the joints of several sources on the clock of the one that is sampled most often.
+    """Merge the joints of several sources onto the clock of the fastest one.
 
     Values of the others are interpolated linearly between their samples. A time at which one of them has no sample
     within `FARTHEST` of its periods on both sides is left out, so that a gap stays a gap.
@@ -69,12 +69,12 @@ def joined(groups: Sequence[tuple[str, JointGroup]], where: str) -> tuple[JointG
 
 
 def held(group: JointGroup, t: Array) -> Array:
-    """Positions of a group as they were last set at other times, before its first sample the first; shape (N, nj)."""
+    """Positions of a group at other times by zero-order hold, shape (N, nj); before its first sample, that one."""
     return group.position[np.maximum(np.searchsorted(group.t, t + 1e-9, side="right") - 1, 0)]
 
 
 def covered(known: Array, t: Array) -> NDArray[np.bool_]:
-    """Whether each time lies at a known one, or between two that are near each other."""
+    """Whether each time is a sample or lies between two samples close enough to interpolate."""
     after = np.searchsorted(known, t)
     before = np.searchsorted(known, t, side="right") - 1
     inside = (after < len(known)) & (before >= 0)

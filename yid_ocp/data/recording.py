@@ -1,4 +1,4 @@
-"""The one in-memory form of a recording, and its checks."""
+"""Recordings in memory: joint groups, point groups and their validation."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ JOINT_CHANNELS: Mapping[str, str] = {
 JOINT_STD = ("position_std", "velocity_std", "effort_std", "effort_bias_std")
 """Standard deviations that a joint group may have, in the units of their channels."""
 POINT_GROUP_NAME = re.compile(r"points(_[^/]+)?")
-"""What a group of points may be called."""
+"""Pattern of allowed names of point groups."""
 
 _LARGEST = {"rad": 50.0, "rad/s": 1e6, "N m": 1e9}
 """What no joint does: eight turns, which a posture in degrees nearly always exceeds, or beyond any machine."""
@@ -42,7 +42,7 @@ _TIME_TOLERANCE = 1e-9  # a nominal clock is a sum of rounded periods, so its en
 
 @dataclass(frozen=True, eq=False, repr=False)
 class JointGroup(Shown):
-    """What a robot measured of its joints; N samples of nj joints on one clock.
+    """Joint measurements of a robot: N samples of nj joints on one clock.
 
     Arrays are copied, made float64 and read-only.
 
@@ -103,7 +103,7 @@ class JointGroup(Shown):
 
     @property
     def effort_taken_as(self) -> EffortKind:
-        """`effort_kind`; where nobody says, `sample`, which is what drivers of robots publish."""
+        """`effort_kind`, or `sample` if it is not stated, which is what robot drivers publish."""
         return self.effort_kind or "sample"
 
     def _summary(self) -> Summary:
@@ -180,7 +180,7 @@ class PointGroup(Shown):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Recording(Shown):
-    """One run on a robot, or of a virtual experiment, in SI units.
+    """One recording of a robot or of a virtual experiment, in SI units.
 
     The constructor only stores; `validate(Recording(...))` checks as well.
 
@@ -252,7 +252,7 @@ class Recording(Shown):
         return float(max(group.t[-1] for group in self.groups) - min(group.t[0] for group in self.groups))
 
     def with_effort_kind(self, kind: EffortKind | None) -> Recording:
-        """The recording with its efforts taken as a kind that is stated elsewhere; itself where none is."""
+        """The recording with the given effort kind; unchanged for None."""
         if kind is None or self.joints is None:
             return self
         return replace(self, joints=replace(self.joints, effort_kind=kind))
@@ -363,7 +363,7 @@ def validate(recording: Recording, *, allow_nan_effort: bool = False, where: str
 
 
 def check_names(recording: Recording, joints: Iterable[str], points: Iterable[str]) -> None:
-    """Check that a recording has what a model needs.
+    """Check that a recording has the given joints and points.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Files that another process reads first: some libraries end the process that meets a damaged one, or never return."""
+"""Trial reads in another process, because damaged files can crash or hang some libraries."""
 
 from __future__ import annotations
 
@@ -14,11 +14,13 @@ from pathlib import Path
 from yid_ocp.errors import DataError
 
 TRIAL_TIME = 10.0
-"""How long reading a whole file may take [s]."""
+"""Time limit for reading a whole file [s]."""
 
 
 def try_first(path: Path, complaint: Callable[[Path], str], noun: str) -> None:
-    """Read a file in another process, a fork: a new one would take a second, and one of a pool may have no children.
+    """Check in a forked process that a file can be read.
+
+    A fork, as a new process would take a second and a process of a pool may have no children.
 
     Parameters
     ----------

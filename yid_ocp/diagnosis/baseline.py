@@ -1,4 +1,4 @@
-"""What differs from an earlier run: its estimates as priors, and how far the parameters have moved since.
+"""Comparison with a baseline: estimates of earlier runs as priors, and how far the parameters have moved.
 
 Of a linear model with the prior N(m, C0), the estimate x with the covariance C moves by x - m, which has the covariance
 C0 - C where nothing changed. A misfit that makes the data's noise count k times adds (k - 1) C (1 - C/C0).
@@ -25,7 +25,7 @@ INFORMED = 0.05
 
 @dataclass(frozen=True)
 class Shift:
-    """One parameter then and now.
+    """Change of one parameter from the baseline to the current fit.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Shift:
 
 @dataclass(frozen=True)
 class Since:
-    """What an earlier run says, and what has moved since.
+    """The baseline runs and the shift of every parameter from them.
 
     Attributes
     ----------
@@ -79,12 +79,12 @@ class Since:
 
     @property
     def changed(self) -> tuple[Shift, ...]:
-        """Parameters that are not what they were, the surest first."""
+        """Parameters that have changed significantly, smallest p-value first."""
         return tuple(sorted((entry for entry in self.parameters if entry.changed), key=lambda entry: entry.p_value))
 
 
 def with_baseline(problem: EstimationProblem, baseline: Estimates) -> EstimationProblem:
-    """The problem with an earlier run's estimates as a joint prior; what that run estimated is free.
+    """Return the problem with a baseline's estimates as a joint prior and its parameters free.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def with_baseline(problem: EstimationProblem, baseline: Estimates) -> Estimation
 def since(
     fit: Fit, baseline: Estimates, level: float, runs: tuple[str, ...] = (), apart: tuple[float, float] = (0.0, 1.0)
 ) -> Since:
-    """How far the parameters have moved from an earlier run's in a fit that has it as a prior.
+    """Return how far the parameters of a fit have moved from its baseline prior.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Whether what an effect was found to be on some recordings is found on others: what only imitates moves.
+"""Transfer check: whether the amplitudes of an effect agree between the estimation and the held-out recordings.
 
 Two or three effects together imitate almost anything on the recordings on which they were fitted. What is true of the
 robot comes out the same wherever it is fitted; what stands in for something else has to be something else for every
@@ -17,12 +17,12 @@ from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
 from yid_ocp.effects import EffectBase
 
 APART = 2.0
-"""Standard deviations from which two fits differ by more than they say."""
+"""Standard deviations beyond which two fits disagree."""
 
 
 @dataclass(frozen=True)
 class Carried:
-    """An effect's parameter as it was found, and as it is found on the held-out recordings alone.
+    """One parameter of an effect, estimated on the estimation recordings and again on the held-out ones.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Carried:
 
 
 def carried_over(search: Search, fit: Fit) -> tuple[Carried, ...]:
-    """Every amplitude of a model's effects on held-out recordings; nothing where one recording is split in blocks.
+    """Refit the effects on the held-out recordings and compare every amplitude; empty if one recording is split.
 
     Nothing, too, where the model cannot be fitted there: no evidence against it.
     """
@@ -70,7 +70,7 @@ def _shared(turned: CandidateProblem, fit: Fit) -> dict[str, float]:
 
 
 def compared(effect: EffectBase, first: Fit, second: Fit, limits: Thresholds = DEFAULTS) -> list[Carried]:
-    """The amplitudes of one effect in two fits.
+    """Compare the amplitudes of one effect in two fits.
 
     They agree where they differ by no more than `carried_stds` standard deviations, those of both together, or than the
     part `carried` of the effect's size; sizes of several amplitudes are compared in widths of their ranges.
@@ -91,7 +91,7 @@ def compared(effect: EffectBase, first: Fit, second: Fit, limits: Thresholds = D
 
 
 def counting_both(fit: Fit, entries: Sequence[Carried]) -> Fit:
-    """The same with standard deviations of amplitudes that count how far apart two sets of recordings have them.
+    """Return the fit with amplitude standard deviations inflated by the disagreement between the recordings.
 
     What a model misses of all of a recording its residual does not show: where two fits differ by more than `APART`
     standard deviations of both together, each is known to the spread of the two, their difference over the square root
@@ -107,5 +107,5 @@ def counting_both(fit: Fit, entries: Sequence[Carried]) -> Fit:
 
 
 def disagreeing(entries: Sequence[Carried]) -> tuple[Carried, ...]:
-    """Those that do not carry over."""
+    """Return the checks whose two estimates disagree."""
     return tuple(entry for entry in entries if not entry.agrees)

@@ -22,7 +22,7 @@ Values = Mapping[str, float]
 
 @dataclass(frozen=True)
 class Predicted:
-    """Recordings that no fit of the prediction saw with their effect there, or away.
+    """Prediction errors (RMSE by channel) on recordings no fit has used, without diagnosis and counterfactual.
 
     Attributes
     ----------
@@ -53,13 +53,13 @@ class Predicted:
 
     @property
     def better(self) -> bool:
-        """Whether the effects make the prediction better in the units in which anything is predicted."""
+        """Whether the counterfactual prediction has the smaller RMSE in every unit."""
         return bool(self.means) and all(after < before for before, after in self.means.values())
 
 
 @dataclass(frozen=True)
 class Counterfactual:
-    """What becomes of the world without the effects, and with them.
+    """Prediction errors with the effects removed, and with the effects added.
 
     Attributes
     ----------
@@ -75,14 +75,14 @@ class Counterfactual:
     added: Predicted
 
     def to_dict(self) -> dict[str, object]:
-        """`counterfactual` of `yid-diagnosis/1`."""
+        """Return `counterfactual` of `yid-diagnosis/1`, JSON-compatible."""
         return {name: _entry(part) for name, part in (("removed", self.removed), ("added", self.added))}
 
 
 def counterfactual(
     nominal: Fit, last: Fit, without: Sequence[Recording], baseline: Estimates | None = None
 ) -> Counterfactual:
-    """Take the effects of a diagnosis away and add them, and predict what was recorded without and with them.
+    """Predict reference recordings with the effects removed, and the diagnosed recordings with them added.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""All steps of a diagnosis, one after the other."""
+"""Diagnosis of the sim-to-real gap: all steps in order, from the nominal fit to the verdict."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from yid_ocp.solvers.judgement import spread_by_noise
 log = logging.getLogger(__name__)
 
 ROUNDS = 3
-"""Fits of the nominal model without the events found about the one before."""
+"""Maximum number of refits of the nominal model, each without the events found before it."""
 
 
 def diagnose(
@@ -56,7 +56,7 @@ def diagnose(
     without: Sequence[Recording] = (),
     leave_out: Sequence[str] = (),
 ) -> Finding:
-    """Say whether there is a gap between model and recordings, where, which effect makes it, and how far it closes.
+    """Diagnose the gap between model and recordings: whether it exists, where, its cause, and how far it closes.
 
     Parameters
     ----------
@@ -314,7 +314,7 @@ def _offsets_stated(problem: EstimationProblem) -> bool:
 
 
 def elsewhere(search: Search, nominal: Fit) -> Fit | None:
-    """The nominal model fitted from other starts, where one of them ends far likelier; None where none does.
+    """Return the nominal model refitted from a start that ends far likelier; None if no start does.
 
     A parameter that few samples tell of has several valleys, and a wrong one of them costs too little to be noticed in
     chi2: what candidates gain there, they gain from the parameter's error.
@@ -417,7 +417,7 @@ def nominal_fit(
     store: Store | None = None,
     limits: Thresholds = DEFAULTS,
 ) -> Fit:
-    """The nominal model fitted and placed among the hypotheses.
+    """Return the fit of the nominal model within the problem with all candidates.
 
     Raises
     ------
@@ -452,7 +452,7 @@ def _nominal_start(
 
 
 def largest_angles(fit: Fit) -> dict[str, float]:
-    """How far the joints of each segment turn in the recordings that were fitted [rad]."""
+    """Return the largest joint angle of each segment in the estimation recordings [rad]."""
     system = fit.problem.system
     found = {}
     for segment in system.segments:
@@ -462,13 +462,13 @@ def largest_angles(fit: Fit) -> dict[str, float]:
 
 
 def fitted_test(fit: Fit, limits: Thresholds = DEFAULTS) -> NullTest:
-    """The null test of a model on the recordings on which it was fitted."""
+    """Return the null test of a model on the estimation recordings."""
     series = residual_series(fit.problem)
     return null_test(series, fit.evaluation.residual, len(fit.values), limits.level, limits.window)
 
 
 def held_out_test(fit: Fit, limits: Thresholds = DEFAULTS) -> NullTest:
-    """The null test of a model on the held-out recordings, in which nothing was fitted.
+    """Return the null test of a model on the held-out recordings.
 
     What is held out is predicted by parameters that noise has moved: without a gap the residual has the covariance
     I + J F F' J', where F F' is that of the parameters (`spread_by_noise`). It is tested in units of that.
@@ -498,9 +498,9 @@ def held_out_test(fit: Fit, limits: Thresholds = DEFAULTS) -> NullTest:
 
 
 def smooth_fit(fit: Fit, limits: Thresholds = DEFAULTS) -> Smoothed:
-    """The weak-constraint smoother about a fitted model; noise that drives the motion is among its unknowns.
+    """Run the weak-constraint smoother about a fitted model, with torque noise among its unknowns.
 
-    Constant errors of sensors are off what it sees.
+    Estimated constant sensor errors are subtracted first.
     """
     problem, evaluation, x = fit.problem, fit.evaluation, fit.problem.vector(fit.values)
     if problem.disturbed:

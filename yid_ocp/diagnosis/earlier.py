@@ -1,4 +1,4 @@
-"""What a diagnosis is told of another time: earlier runs, and recordings made without what is looked for."""
+"""Baseline of a diagnosis: estimates of earlier runs, and reference recordings without the effect sought."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from yid_ocp.progress import Progress
 
 @dataclass(frozen=True)
 class Earlier:
-    """What a diagnosis is told of another time.
+    """Combined estimates of earlier runs, and reference recordings made without the effect sought.
 
     Attributes
     ----------
@@ -37,25 +37,25 @@ class Earlier:
 
     @staticmethod
     def of(runs: Sequence[Estimates], without: tuple[Recording, ...]) -> Earlier:
-        """Several runs as one."""
+        """Combine the estimates of several runs into one baseline."""
         if not runs:
             return Earlier(None, (), 0.0, 1.0, without)
         known, chi2, degrees = together(runs)
         return Earlier(known, tuple(run.run for run in runs), chi2, p_value(chi2, degrees), without)
 
     def since(self, fit: Fit, limits: Thresholds) -> Since | None:
-        """How far a fit has moved from the earlier runs; None without any."""
+        """Compare a fit with the earlier runs; None if there are none."""
         if self.known is None:
             return None
         return since(fit, self.known, limits.level, self.runs, (self.chi2, self.p_value))
 
     def changed(self, fit: Fit, limits: Thresholds) -> tuple[Shift, ...]:
-        """Parameters that a fit has moved."""
+        """Return the parameters of a fit that changed significantly since the earlier runs."""
         found = self.since(fit, limits)
         return () if found is None else found.changed
 
     def counterfactual(self, nominal: Fit, added: Sequence[Added], progress: Progress) -> Counterfactual | None:
-        """The world without the effects that were found; None where there are none, or nothing of that world."""
+        """Predict the recordings with effects removed and added; None without effects or reference recordings."""
         if not added or not self.without:
             return None
         progress.stage("predicting the world without the effects")
@@ -63,4 +63,4 @@ class Earlier:
 
 
 UNTOLD = Earlier(None, (), 0.0, 1.0, ())
-"""Of a diagnosis that stands for itself."""
+"""No earlier runs and no reference recordings."""

@@ -45,7 +45,7 @@ Run = tuple[Episode, EpisodeResult, Array]
 INTERVAL = 0.05
 """Time over which an unknown force is constant where events are sought [s]."""
 POINTS = 250
-"""Points of a history that are looked at together."""
+"""Maximum number of points of a force history processed together."""
 LONGEST_RUN = 3
 """Wrong samples in a row; more of them are a gap or a stuck channel."""
 STENCILS = (4, 7, 10)
@@ -64,7 +64,7 @@ SURE = 8.0
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened in one place for a short time.
+    """A brief local disturbance: an external force on one coordinate, or wrong samples of one channel.
 
     Attributes
     ----------
@@ -116,7 +116,7 @@ class Event:
 
 @dataclass(frozen=True)
 class Fall:
-    """From when on nothing is judged in a recording: a joint moves faster than the model can follow."""
+    """Time after which a recording is ignored because a joint moves faster than `Thresholds.fall`."""
 
     recording: str
     joint: str
@@ -125,7 +125,7 @@ class Fall:
 
 @dataclass(frozen=True)
 class Force:
-    """An unknown force over time where there was an event, for people to look at.
+    """Time series of the unknown force at a coordinate with an event, for plots.
 
     Attributes
     ----------
@@ -145,7 +145,7 @@ class Force:
 
 @dataclass(frozen=True)
 class Events:
-    """All events of a diagnosis, by recording and time, the forces there, and where nothing could be judged."""
+    """All events of a diagnosis by recording and time, the force time series, and overspeeds."""
 
     found: tuple[Event, ...] = ()
     falls: tuple[Fall, ...] = ()
@@ -155,7 +155,7 @@ class Events:
         return bool(self.found or self.falls)
 
     def like(self, other: Events) -> bool:
-        """Whether the same happened in the same places at overlapping times."""
+        """Whether both hold events of the same channels at overlapping times."""
         pairs = zip(self.found, other.found, strict=False)
         return len(self.found) == len(other.found) and all(
             (a.recording, a.channel) == (b.recording, b.channel) and a.begin < b.end and b.begin < a.end
@@ -164,16 +164,16 @@ class Events:
 
     @property
     def forces_alone(self) -> Events:
-        """Those that are forces."""
+        """Only the force events."""
         return Events(tuple(event for event in self.found if event.kind == "force"))
 
     @property
     def without_forces(self) -> Events:
-        """Those that are none, and where nothing could be judged."""
+        """The events that are not forces, and the overspeeds."""
         return Events(tuple(event for event in self.found if event.kind != "force"), self.falls)
 
     def of(self, recording: str) -> tuple[Event, ...]:
-        """Those of one recording."""
+        """Return the events of one recording."""
         return tuple(event for event in self.found if event.recording == recording)
 
 
@@ -187,7 +187,7 @@ def find_events(
     smoothed: Smoothed | None,
     limits: Thresholds = DEFAULTS,
 ) -> Events:
-    """Events in all recordings of a problem, estimated on or held out.
+    """Find events in all recordings of a problem, estimation and held-out.
 
     Parameters
     ----------
@@ -551,7 +551,7 @@ def _beside_neighbours(t: Array, values: Array) -> Array:
 
 
 def without_events(problem: EstimationProblem, events: Events) -> EstimationProblem:
-    """The problem with what events explain taken out, as far as that can be done.
+    """Return the problem with force events compensated and affected samples excluded.
 
     Forces at joints that recorded torques drive act beside these. Samples of prescribed joints' efforts in the window
     of an event of that joint, samples that are wrong themselves, and all that follows a fall do not count. Forces on an

@@ -1,4 +1,4 @@
-"""What a diagnosis says, as a value and as `yid-diagnosis/1`."""
+"""The result of a diagnosis, as a dataclass and as `yid-diagnosis/1`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FORMAT = "yid-diagnosis/1"
 
 @dataclass(frozen=True)
 class Absorbed:
-    """How a nominal parameter moves when the effects are added."""
+    """Change of a nominal parameter between the nominal model and the model with the effects."""
 
     name: str
     unit: str
@@ -39,7 +39,7 @@ class Absorbed:
 
 
 def absorption(before: Fit, after: Fit) -> tuple[Absorbed, ...]:
-    """How the nominal parameters move when the effects are added."""
+    """Return how each nominal parameter changes when the effects are added."""
     parameters = before.problem.system.parameters
     return tuple(
         Absorbed(name, parameters[name].unit, before.values[name], after.values[name], after.std[name])
@@ -49,7 +49,7 @@ def absorption(before: Fit, after: Fit) -> tuple[Absorbed, ...]:
 
 @dataclass(frozen=True, repr=False)
 class Finding(Shown):
-    """What a diagnosis says.
+    """The result of a diagnosis: verdict, gap, locations, effects and the statistics behind them.
 
     Attributes
     ----------
@@ -80,20 +80,20 @@ class Finding(Shown):
     in_blocks : bool
         Whether one recording was split in blocks.
     message : str
-        Why data do not suffice, or what else must be said.
+        Why the data are insufficient; empty if they suffice.
     limits : Thresholds
-        By which all this was decided.
+        Thresholds of the decision.
     seconds : dict of stage to float
     since : Since or None
-        What has moved since the baseline; None without one.
+        Parameter changes since the baseline; None without one.
     counterfactual : Counterfactual or None
-        The world without the effects found; None where nothing of it was recorded, or nothing was found.
+        Predictions with the effects removed and added; None without effects or reference recordings.
     summary : str
-        The report in words; see `words.sentences`.
+        Summary text; see `words.sentences`.
     cuts : tuple of Cut
         Held-out recordings that the nominal model cannot follow to their end.
     reason : str
-        Why a gap has no name; see `verdict.Reason`.
+        Why the verdict is unknown; see `verdict.Reason`.
     explained : float
         What the effects explain over what unknown forces, offsets and biases explain.
     carried : tuple of Carried
@@ -146,16 +146,16 @@ class Finding(Shown):
 
     @property
     def effects(self) -> tuple[EffectBase, ...]:
-        """What was added, in order."""
+        """Effects accepted by the verdict, in the order they were added; empty unless effect or confusable."""
         return tuple(entry.effect for entry in self.added) if self.verdict in ("effect", "confusable") else ()
 
     @property
     def last(self) -> Fit:
-        """The model with all that was added."""
+        """The model with all accepted effects; the nominal model if there are none."""
         return self.added[-1].fit if self.effects else self.nominal
 
     def to_dict(self) -> dict[str, Any]:
-        """`yid-diagnosis/1`."""
+        """Return the result as `yid-diagnosis/1`, JSON-compatible."""
         return {
             "format": FORMAT,
             "verdict": self.verdict,
@@ -227,7 +227,7 @@ class Finding(Shown):
 
 
 def statistics(finding: Finding) -> dict[str, Any]:
-    """The numbers that were held against `Thresholds`, as JSON, and by which these are calibrated.
+    """Return the statistics compared with `Thresholds`, JSON-compatible, from which these are calibrated.
 
     None where a step was not come to.
 
@@ -272,7 +272,7 @@ def statistics(finding: Finding) -> dict[str, Any]:
 
 
 def _behind(fits: Sequence[Fit]) -> dict[str, Any]:
-    """How far each of several fits is behind the first."""
+    """Return how much worse each refit is than the first, by effect label."""
     found = {}
     for fit in fits:
         lost, error = gain(fit.loss, fits[0].loss)
@@ -287,7 +287,7 @@ def _behind(fits: Sequence[Fit]) -> dict[str, Any]:
 
 
 def model_result(finding: Finding) -> dict[str, Any]:
-    """`model` of result.json: parameters and covariance of the model that a diagnosis ended with."""
+    """Return `model` of result.json: parameters and covariance of the final model."""
     return {"parameters": _parameters(finding), "covariance": _covariance(finding.last)}
 
 
@@ -366,7 +366,7 @@ def _number(value: float) -> float | None:
 
 
 def which(finding: Finding) -> list[dict[str, Any]]:
-    """Candidates, best first: what was added, then the other refits by held-out loss, then the rest by score."""
+    """Return all candidates ranked: added effects, then other refits by held-out loss, then the rest by score."""
     scores = {score.effect.label: score for score in finding.scores}
     listed: dict[str, dict[str, Any]] = {}
     entries: list[tuple[EffectBase, Fit | None]] = [(a.effect, finding.last) for a in finding.added if finding.effects]

@@ -1,4 +1,4 @@
-"""All candidate effects composed into one system with one compiled step; problems that free parts of it."""
+"""Estimation problem of one system with all candidate effects and one compiled step."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ model is lost already, and a fit on less of the recording may fail earlier."""
 
 
 def chosen_effects(system: System, recordings: Sequence[Recording], choice: Choice) -> list[EffectBase]:
-    """The effects to try: none that the nominal model has already.
+    """Return the candidate effects, excluding those of the nominal model.
 
     Parameters
     ----------
@@ -85,9 +85,9 @@ def chosen_effects(system: System, recordings: Sequence[Recording], choice: Choi
 
 
 def left_out(effects: Sequence[EffectBase], names: Sequence[str]) -> list[EffectBase]:
-    """Those of the candidates that are tried where some are left out.
+    """Return the candidates without those named.
 
-    They stay part of the composed step, neutral: whoever leaves others out the next time has it compiled already.
+    Excluded candidates stay in the compiled step at their neutral values, so that no recompilation is needed.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def left_out(effects: Sequence[EffectBase], names: Sequence[str]) -> list[Effect
 
 @dataclass(frozen=True)
 class Cut:
-    """A held-out recording that the nominal model cannot follow to its end.
+    """A held-out recording truncated where the nominal model stops following it.
 
     Attributes
     ----------
@@ -132,7 +132,7 @@ class Cut:
 
 @dataclass(frozen=True)
 class CandidateProblem:
-    """The estimation problem of a system with all candidates, of which any part can be freed at no cost.
+    """Estimation problem of a system with all candidates, any of which can be freed without recompiling.
 
     Sensors, statics and corrections are differentiated by everything once, recordings are placed on the nodes once, and
     the tracking filter is that of the nominal start, the same for every hypothesis.
@@ -155,7 +155,7 @@ class CandidateProblem:
     def of(
         problem: EstimationProblem, effects: Sequence[EffectBase], held_out: Sequence[Recording] = ()
     ) -> CandidateProblem:
-        """Compose the candidates with a problem's system, all neutral.
+        """Build from a problem and its candidates, all at neutral values.
 
         Raises
         ------
@@ -179,7 +179,7 @@ class CandidateProblem:
         return self.problem.free
 
     def weighted_at(self, values: Mapping[str, float]) -> CandidateProblem:
-        """The same with residuals weighted by all noise, that which drives the motion too, frozen at these unknowns.
+        """Return the problem whitened by sensor noise and torque noise, linearised at these unknowns.
 
         Twice in a row, so that what is frozen is about the offsets that the torques have there.
         """
@@ -187,7 +187,7 @@ class CandidateProblem:
         return replace(self, problem=self.problem.weighted_at(x, rounds=2).held_out_weighted_at(x))
 
     def followed(self, values: Mapping[str, float], margin: float) -> tuple[CandidateProblem, tuple[Cut, ...]]:
-        """The same with held-out recordings only as far as the model can be rolled out on them, and what was cut.
+        """Truncate held-out recordings where the rollout fails; return the problem and the truncated recordings.
 
         A gap may be so large that the nominal model cannot follow a recording at all; what it says until then is
         compared all the same. Where nothing worth predicting is left, those to estimate on are split in blocks. Weights
@@ -213,11 +213,11 @@ class CandidateProblem:
         return replace(self, problem=_in_blocks(problem), blocks=True), tuple(cuts)
 
     def freeing(self, effects: Sequence[EffectBase]) -> EstimationProblem:
-        """The problem with the parameters of some effects free beside the nominal ones."""
+        """Return the problem with the nominal parameters and those of some effects free."""
         return self.problem.freeing((*self.nominal, *(name for effect in effects for name in effect.parameters.names)))
 
     def placed(self, effects: Sequence[EffectBase], at: Mapping[str, float]) -> EstimationProblem:
-        """The problem with some effects free, its filters about the torque errors that are left beside them.
+        """Return the problem with some effects free, relinearised about the torque errors that remain with them.
 
         Torque offsets that the nominal model sees are too large by what an effect does. Filters of held-out recordings
         are left as they are: see `held_out_placed`.
@@ -228,7 +228,7 @@ class CandidateProblem:
     def held_out_placed(
         self, own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]
     ) -> EstimationProblem:
-        """A problem that is `placed`, its filters of held-out recordings too: once, where a fit has ended."""
+        """Return a `placed` problem with the held-out recordings relinearised too, once at the end of a fit."""
         return own.held_out_about_torques_at(*_beside(own, effects, at)) if own.disturbed else own
 
 
@@ -311,5 +311,5 @@ def _masked(episode: Episode, parity: int) -> Episode:
 
 
 def describe(effects: Sequence[Any]) -> str:
-    """`kind@location` of several effects, in words."""
+    """Join the labels `kind@location` of several effects by "and"; "the nominal model" for none."""
     return " and ".join(effect.label for effect in effects) if effects else "the nominal model"

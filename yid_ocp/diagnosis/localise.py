@@ -1,4 +1,4 @@
-"""Step four: where the gap lies, by the weak-constraint smoother and, once effects are added, by what they close."""
+"""Localisation of the gap from the weak-constraint smoother and from the closure of added effects (step four)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MAIN = 3
 
 @dataclass(frozen=True)
 class Place:
-    """One location's part of the gap.
+    """A location with its share of the gap.
 
     Attributes
     ----------
@@ -46,12 +46,12 @@ class Place:
 
 
 def main_places(where: Sequence[Place]) -> tuple[Place, ...]:
-    """The places that are named: those with a share of the gap worth naming, three at most, one in any case."""
+    """Return the locations to report: shares above `NAMED`, at most three, at least one."""
     return tuple([place for place in where if place.share > NAMED] or where[:1])[:MAIN]
 
 
 def localise(smoothed: Smoothed, sure: float = DEFAULTS.sure) -> tuple[Place, ...]:
-    """Places by their share of the log evidence, largest first; places without a share where a gap would have shown.
+    """Return all locations by their share of the log evidence, largest first, then observable ones without a share.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ def _windows(smoothed: Smoothed, sources: Sequence[Source], limit: float) -> tup
 
 
 def merged(spans: Sequence[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
-    """Stretches of time that overlapping or touching spans cover."""
+    """Merge overlapping or adjacent time intervals."""
     joined: list[list[float]] = []
     for begin, end in sorted(spans):
         if joined and begin <= joined[-1][1] + 1e-9:
@@ -112,7 +112,7 @@ def attributed(
     rest: Sequence[Place],
     windows: tuple[tuple[float, float], ...],
 ) -> tuple[Place, ...]:
-    """Places of a gap that effects explain: their locations by what each closes, then those of what is left.
+    """Return locations with shares by the closure of the effects there, the rest shared out by the smoother.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ def attributed(
 def informed_map(
     smoothed: Smoothed, recording: int = 0, mapped: float = DEFAULTS.mapped
 ) -> tuple[Array, tuple[str, ...], Array]:
-    """Unknowns of one recording in standard deviations of their posterior, NaN where the data do not inform them.
+    """Return the unknowns of one recording divided by their posterior standard deviation, NaN if not informed.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ def informed_map(
 
 
 def units(system: System, trace: Trace) -> tuple[str, ...]:
-    """SI unit of every unknown of a trace: that of a joint's load, of a grasp's offset or of a point's bias."""
+    """Return the SI unit of every unknown of a trace: force or torque, push, grasp offset or sensor bias."""
     tree = system.mechanism
     sliding = {joint.name for joint in tree.joints if joint.kind == "prismatic"}
     forces = {name: "N" if name in sliding else "N m" for name in tree.joint_names}

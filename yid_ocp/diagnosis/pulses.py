@@ -57,7 +57,7 @@ SEEN = 1.5
 
 @dataclass(frozen=True)
 class History:
-    """What the data say of an unknown force at one place; see above.
+    """Gaussian log likelihood of an unknown force at one location over time, g'f - f'L f / 2.
 
     Attributes
     ----------
@@ -94,21 +94,21 @@ class History:
         return float(np.median(np.diff(self.t)))
 
     def at(self, keep: NDArray[np.int64]) -> History:
-        """The same at some points alone; what connects them with the others is left out."""
+        """Return the estimate restricted to some time points."""
         information = self.information[np.ix_(keep, keep)]
         parts = {name: getattr(self, name)[keep] for name in ("t", "score", "error", "held")}
         return replace(self, information=information, **parts)
 
     @property
     def values(self) -> Array:
-        """The force that the data ask for by themselves, shape (M,)."""
+        """Maximum-likelihood force at every time point, shape (M,)."""
         least = 1e-6 * max(float(np.mean(np.diag(self.information))), 1e-300)
         return np.asarray(np.linalg.solve(self.information + least * np.eye(len(self.t)), self.score))
 
 
 @dataclass(frozen=True)
 class Pulse:
-    """A force that rises and falls within a window.
+    """A force pulse that rises and falls within a time window.
 
     Attributes
     ----------
@@ -133,7 +133,7 @@ class Pulse:
 
     @property
     def area(self) -> float:
-        """Impulse of a pulse of size one [s]."""
+        """Integral of the pulse shape for unit peak [s]."""
         return (self.end - self.begin) * (1 - FLAT / 2 if self.flat else 0.5)
 
     @property
@@ -142,7 +142,7 @@ class Pulse:
         return self.size * self.area
 
     def values(self, t: Array, cutoff: float = math.inf) -> Array:
-        """The pulse at times, shape of t, as it is seen through a filter."""
+        """Return the low-pass filtered pulse at times `t`."""
         return self.size * _Filter.of(cutoff)(_Windows.one(self.begin, self.end, self.flat), t)[:, 0]
 
 
@@ -273,7 +273,7 @@ class _Rest:
 
 
 def pulses(history: History, limits: Thresholds = DEFAULTS) -> tuple[list[Pulse], float]:
-    """Pulses of one history, those of the largest evidence first, and how many windows were looked at.
+    """Return the pulses of one force history, largest evidence first, and the number of windows searched.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Forces in the world on segments of the object, as forces on its joints: J' f of a point of each segment.
+"""Generalized forces J' f of external forces on segments of the object.
 
 An unknown generalized force is a torque between neighbours. What pulls at a segment from outside is felt by every joint
 between it and the ground, most by the lowest.
@@ -22,7 +22,7 @@ PUSHED = "75%"
 
 
 def weights_of_segments(system: System, theta: Array) -> dict[str, float]:
-    """Weight of every segment of the object that can be pushed [N]; those without mass are left out.
+    """Return the weight of every segment that has a mass [N].
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def weights_of_segments(system: System, theta: Array) -> dict[str, float]:
 
 
 def forces_of_pushes(system: System, theta: Array, q: Array, segments: Sequence[str]) -> Array:
-    """Generalized forces of a newton along x, y and z on each of some segments.
+    """Return the generalized forces of 1 N along x, y and z on each of some segments.
 
     Parameters
     ----------

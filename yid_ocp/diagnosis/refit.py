@@ -42,7 +42,7 @@ FAR = 1.0
 
 @dataclass(frozen=True)
 class Loss:
-    """How badly held-out recordings are predicted.
+    """Whitened squared prediction error of a model on the held-out recordings, by block of time.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class Loss:
 
 @dataclass(frozen=True)
 class Fit:
-    """The model with some effects, refitted.
+    """The nominal model with some effects, fitted again, with its standard deviations and held-out loss.
 
     Attributes
     ----------
@@ -112,13 +112,13 @@ class Fit:
         return sum(len(effect.parameters) for effect in self.effects)
 
     def reported(self, effect: EffectBase) -> dict[str, Reported]:
-        """An effect's quantities as people read them."""
+        """Return an effect's parameters in reported units, with standard deviations."""
         return effect.reported(self.values, self.std)
 
 
 @dataclass(frozen=True)
 class Refitted:
-    """What a refit found: enough to have its `Fit` again by one evaluation.
+    """The result of a refit as stored: one evaluation restores its `Fit`.
 
     Attributes
     ----------
@@ -136,7 +136,7 @@ class Refitted:
 
 
 class Store(Protocol):
-    """Keeps finished refits of one diagnosis, so that another run of it need not repeat them; used by two threads."""
+    """Store of finished refits of one diagnosis, which an interrupted diagnosis reads; called by two threads."""
 
     def get(self, name: str) -> Refitted | None:
         """The refit of this name, None where it is not known."""
@@ -149,7 +149,7 @@ class Store(Protocol):
 
 @dataclass(frozen=True)
 class Search:
-    """What all refits of one diagnosis share.
+    """Problem, thresholds, progress and store shared by all refits of one diagnosis.
 
     Attributes
     ----------
@@ -247,7 +247,7 @@ class _Following(EstimationProblem):
         self._last = problem
 
     def evaluate(self, x: ArrayLike, derivatives: bool = True, warm: WarmStart | None = None) -> Evaluation:
-        """See `EstimationProblem.evaluate`."""
+        """Evaluate residual and Jacobian about the torques estimated at `x`."""
         x = np.asarray(x, float)
         self._last = self._last.about_torques_at(x, x)
         return self._last.evaluate(x, derivatives, warm)
@@ -303,7 +303,7 @@ def _seen(problem: CandidateProblem, effects: Sequence[EffectBase], outcome: Out
 def recalled(
     problem: CandidateProblem, effects: Sequence[EffectBase], store: Store | None, name: str = ""
 ) -> Fit | None:
-    """A refit that a store knows, evaluated once; None where it knows none."""
+    """Return a refit from the store, evaluated once; None if the store does not have it."""
     known = None if store is None else store.get(name or describe(effects))
     own = problem.freeing(effects)
     amplitudes = {name for effect in effects for name in effect.amplitudes}
@@ -323,12 +323,12 @@ def recalled(
 
 
 def refit_covariance(problem: EstimationProblem, finish: Evaluation, limits: Thresholds = DEFAULTS) -> Array:
-    """Covariance of the unknowns, shape (nx, nx), counting the misfit where there is one, as `solve` has it."""
+    """Covariance of the unknowns, shape (nx, nx), inflated by the misfit as in `solve`."""
     return covariance_of_fit(problem, finish, judge_fit(problem, finish, limits.gap))
 
 
 def amplitude_std(names: Sequence[str], effects: Sequence[EffectBase], covariance: Array) -> dict[str, float]:
-    """Standard deviations of the effects' amplitudes with their shapes held where they were found.
+    """Standard deviations of the effects' amplitudes with their shape parameters held at their estimates.
 
     Next to nothing an effect has any shape: that of a weak spring is a rest angle as far away as one likes. Whether it
     is there at all is asked with its shape held (Davies 1987, doi:10.1093/biomet/74.1.33).
@@ -346,7 +346,7 @@ def amplitude_std(names: Sequence[str], effects: Sequence[EffectBase], covarianc
 
 
 def told(effects: Sequence[EffectBase], std: Mapping[str, float]) -> dict[str, float]:
-    """Standard deviations of which those that say nothing are infinite: `UNTOLD` times what one would expect at all."""
+    """Standard deviations, infinite where larger than `UNTOLD` times the width of the prior range."""
     width = {name: high - low for effect in effects for name, (low, high) in effect.prior_range.items()}
     return {name: math.inf if size > UNTOLD * width.get(name, math.inf) else size for name, size in std.items()}
 
@@ -358,7 +358,7 @@ def refit_all(
     values: Mapping[str, float],
     where: str = "",
 ) -> list[Fit]:
-    """Refit the model with each of several effects added to those of `base`; failures are left out.
+    """Refit the model with each of several effects added to those of `base`; return the refits that succeed.
 
     Parameters
     ----------
@@ -381,7 +381,7 @@ def refit_pairs(
     tried: Sequence[tuple[tuple[EffectBase, EffectBase], Mapping[str, float]]],
     values: Mapping[str, float],
 ) -> list[Fit]:
-    """Refit the model with each of several pairs of effects; failures are left out. See `refit_all`."""
+    """Refit the model with each of several pairs of effects; return the refits that succeed."""
     entries = [_Tried(pair, describe(pair), step, "together") for pair, step in tried]
     return _each(search, entries, values, f"{len(tried)} pairs")
 
@@ -414,13 +414,13 @@ def _each(search: Search, tried: Sequence[_Tried], values: Mapping[str, float], 
 
 
 def block_length(episodes: Sequence[Episode]) -> float:
-    """Length of the blocks of held-out time [s]: some forty of them, between half a second and two seconds long."""
+    """Length of the blocks of held-out time [s]: about forty blocks, each 0.5 s to 2 s long."""
     total = sum(episode.grid.steps * episode.grid.time_step for episode in episodes)
     return float(np.clip(total / 40, 0.5, 2.0))
 
 
 def held_out_loss(problem: EstimationProblem, x: Array) -> Loss:
-    """Predict the held-out recordings; initial states are found in the same way for every model."""
+    """Return the loss of a model on the held-out recordings; initial states are found alike for every model."""
     length = block_length(problem.held_out)
     squares: list[Array] = []
     counts: list[Array] = []

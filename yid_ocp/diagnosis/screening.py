@@ -1,4 +1,4 @@
-"""Steps three and five: what could be seen at all, and which candidate lowers the residual, in one sensitivity sweep.
+"""Screening: detectability and score test of every candidate from one sensitivity sweep (steps three and five).
 
 With r the whitened residual of the nominal fit, J_theta its sensitivity to what that fit frees, J_j that to the
 amplitudes of candidate j and P = I - J_theta J_theta^+:
@@ -38,7 +38,7 @@ EQUAL = 1e-6
 
 @dataclass(frozen=True)
 class Signature:
-    """What a candidate does to the residual, to first order.
+    """First-order change of the residual by the amplitudes of a candidate.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class Signature:
 
 @dataclass(frozen=True)
 class Linearisation:
-    """The residual and all signatures at one point.
+    """Residual and signatures of all candidates, linearised at one point.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class Linearisation:
 
 @dataclass(frozen=True)
 class Visibility:
-    """What the data could tell of a candidate, before looking at the residual.
+    """Smallest detectable amplitudes of a candidate, from sensitivity and noise alone.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class Visibility:
 
 @dataclass(frozen=True)
 class Score:
-    """How well a candidate explains the residual, to first order.
+    """Score test (Lagrange multiplier) of a candidate on the residual.
 
     Attributes
     ----------
@@ -118,7 +118,7 @@ class Score:
 
 
 def shape_grid(effect: EffectBase, count: int = DEFAULTS.shape_values) -> list[dict[str, float]]:
-    """Values at which a candidate's shape parameters are tried: even over their range, or even in the logarithm."""
+    """Return grid values of a candidate's shape parameters, uniform or log-uniform over the prior range."""
     if not effect.shapes:
         return [{}]
     axes = []
@@ -134,7 +134,7 @@ def linearise(
     values: Mapping[str, float],
     grid: int = DEFAULTS.shape_values,
 ) -> Linearisation:
-    """Residual and signatures of all candidates but those in the model already.
+    """Return the residual and the signatures of all candidates that are not yet in the model.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ def _basis(matrix: Array) -> Array:
 
 
 def visibility(point: Linearisation, detection: float = DEFAULTS.detection) -> tuple[Visibility, ...]:
-    """Detectable amplitude of every candidate: so many standard deviations under the noise's colour, from J alone."""
+    """Return the detectability of every candidate: amplitudes of `detection` standard deviations, from J and noise."""
     found: dict[str, Visibility] = {}
     for signature in point.signatures:
         effect = signature.effect
@@ -233,7 +233,7 @@ def _coloured(columns: Array, series: Sequence[Series]) -> Array:
 
 
 def robust(columns: Array, residual: Array, series: Sequence[Series]) -> Array:
-    """Covariance of X' r for a residual of unknown colour, shape (p, p).
+    """Return the Newey-West covariance of X' r for a residual of unknown autocorrelation, shape (p, p).
 
     Bartlett's weights of L = sqrt(M) lags are the mean square of the sums over all windows of that length.
     """
@@ -249,7 +249,7 @@ def robust(columns: Array, residual: Array, series: Sequence[Series]) -> Array:
 
 
 def scores(point: Linearisation, series: Sequence[Series], visible: Sequence[Visibility]) -> tuple[Score, ...]:
-    """Score of every candidate that the data can see, by the promised decrease, best first."""
+    """Return the score of every detectable candidate, largest predicted decrease of r'r first."""
     seen = {entry.effect.label for entry in visible if entry.visible}
     best: dict[str, Score] = {}
     tries: dict[str, int] = {}
@@ -270,7 +270,7 @@ def scores(point: Linearisation, series: Sequence[Series], visible: Sequence[Vis
 
 
 def best_of(ranked: Sequence[Score]) -> float:
-    """Smallest p-value of candidates as the best of that many tries, one where there is none (Bonferroni)."""
+    """Return the Bonferroni-corrected smallest p-value of the candidates; 1 if there are none."""
     return min((score.p_value for score in ranked), default=1.0) * max(len(ranked), 1)
 
 
@@ -315,7 +315,7 @@ def _values(effect: EffectBase, step: Array) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Confusability:
-    """How far candidates can stand in for each other.
+    """Fractions of each candidate's signature that the others explain.
 
     Attributes
     ----------
@@ -328,14 +328,14 @@ class Confusability:
     matrix: Array
 
     def like(self, label: str, limit: float) -> tuple[str, ...]:
-        """Candidates that explain at least `limit` of another one's signature."""
+        """Return the candidates that explain at least the fraction `limit` of one candidate's signature."""
         row = self.matrix[self.labels.index(label)]
         return tuple(n for n, f in zip(self.labels, row, strict=True) if f >= limit and n != label)
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two candidates that explain the residual together, to first order.
+    """First-order decrease of the residual by two candidates together.
 
     Attributes
     ----------
@@ -356,7 +356,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Together:
-    """The residual as a linear function of the amplitudes of all candidates at once, each with one value of its shape.
+    """Joint linear model of the residual in the amplitudes of all candidates, each at one shape value.
 
     Attributes
     ----------
@@ -380,7 +380,7 @@ class Together:
         return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
 
     def pairs(self, among: Sequence[str]) -> Iterator[Pair]:
-        """All pairs of some candidates, by what they are worth, best first.
+        """Yield all pairs of some candidates, largest penalised decrease first.
 
         What two effects do together neither need do alone: one of them may hide in what the other leaves.
 
@@ -410,7 +410,7 @@ class Together:
 
 
 def together(point: Linearisation, chosen: Sequence[Score] = ()) -> Together:
-    """All candidates side by side, at the scores' shape values or the middle of the grid."""
+    """Return the joint linear model of all candidates, at the scores' shape values or the middle of the grid."""
     shape = {s.effect.label: {k: v for k, v in s.step.items() if k in s.effect.shapes} for s in chosen}
     groups: dict[str, list[Signature]] = {}
     for signature in point.signatures:
@@ -425,7 +425,7 @@ def together(point: Linearisation, chosen: Sequence[Score] = ()) -> Together:
 
 
 def confusability(everything: Together) -> Confusability:
-    """Fractions of signatures explained by each other; every amplitude counts in units of its prior range."""
+    """Return the matrix of signature fractions that candidates explain, amplitudes scaled by prior range."""
     ranges = [effect.prior_range[name] for effect in everything.effects for name in effect.amplitudes]
     scale = np.array([(high - low) / 2 for low, high in ranges])
     gram = everything.information * scale[:, None] * scale
@@ -442,7 +442,7 @@ def confusability(everything: Together) -> Confusability:
 
 @dataclass(frozen=True)
 class Screened:
-    """All candidates at one point.
+    """Detectability, scores and confusability of all candidates at one point.
 
     Attributes
     ----------
@@ -460,14 +460,14 @@ class Screened:
 
     @property
     def unseen(self) -> list[str]:
-        """Labels of candidates that the data could not show."""
+        """Labels of candidates that these data cannot detect."""
         return [entry.effect.label for entry in self.visible if not entry.visible]
 
 
 def screen(
     problem: CandidateProblem, base: Sequence[EffectBase], values: Mapping[str, float], limits: Thresholds = DEFAULTS
 ) -> Screened:
-    """Linearise, then visibility, scores and confusability of all candidates but those of `base`."""
+    """Screen all candidates except those of `base`: detectability, score and confusability."""
     point = linearise(problem, base, values, limits.shape_values)
     visible = visibility(point, limits.detection)
     ranked = scores(point, residual_series(problem.problem), visible)

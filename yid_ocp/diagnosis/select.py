@@ -26,9 +26,9 @@ RESAMPLES = 1000
 
 @dataclass(frozen=True)
 class Closure:
-    """Part of the held-out gap that a model closes, with a 95 % interval; NaN where there was no gap.
+    """Fraction of the held-out gap that a model closes, with its 95 % interval; NaN if there was no gap.
 
-    `sure` says that the held-out recordings are far more likely with it, however small the gap; see `far_likelier`.
+    `sure`: whether the likelihood ratio favours the model decisively, however small the gap; see `far_likelier`.
     """
 
     value: float
@@ -39,7 +39,7 @@ class Closure:
 
 @dataclass(frozen=True)
 class Added:
-    """An effect that was added, in its round.
+    """An effect added by the selection, with the refitted model of its round.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class Added:
     closure : Closure
         Of the whole gap by all effects up to this one.
     rivals : tuple of EffectBase
-        That pass within one standard error, the chosen one first.
+        Effects that the data cannot tell from this one, the chosen one first.
     """
 
     effect: EffectBase
@@ -59,7 +59,7 @@ class Added:
 
 
 def closure(before: Loss, after: Loss, seed: int = 0, limits: Thresholds = DEFAULTS) -> Closure:
-    """Part of the held-out gap that is closed, with a block-bootstrap interval."""
+    """Return the fraction of the held-out gap closed from `before` to `after`, with a block-bootstrap interval."""
     sure = far_likelier(before, after, limits)
     if before.gap <= 0 or not np.isfinite(after.mean):
         return Closure(float("nan"), float("nan"), float("nan"), sure)
@@ -74,7 +74,7 @@ def closure(before: Loss, after: Loss, seed: int = 0, limits: Thresholds = DEFAU
 
 
 def far_likelier(before: Loss, after: Loss, limits: Thresholds = DEFAULTS) -> bool:
-    """Whether held-out recordings are likelier with `after` by the odds of `worth`, where both leave little but noise.
+    """Whether the held-out log likelihood ratio favours `after` by more than `worth`, if both models leave only noise.
 
     Innovations that are noise are independent, and half the fall of their squares is a log likelihood ratio. What shows
     in a few of them only, as a constant error of a torque does at the start, differs too much from block to block for
@@ -93,7 +93,7 @@ def _squares(loss: Loss) -> float:
 
 
 def gain(before: Loss, after: Loss) -> tuple[float, float]:
-    """Held-out chi2/n that `after` is better by, and its standard error over blocks."""
+    """Return the decrease of held-out chi2/n from `before` to `after`, and its standard error over blocks."""
     total = float(before.counts.sum())
     difference = before.squares - after.squares
     if not np.all(np.isfinite(difference)):
@@ -104,12 +104,12 @@ def gain(before: Loss, after: Loss) -> tuple[float, float]:
 
 
 def within_reach(fits: Sequence[Fit], limits: Thresholds = DEFAULTS) -> list[Fit]:
-    """Fits that predict held-out recordings as well as the best one, the simplest first.
+    """Models that predict the held-out recordings as well as the best one, the simplest first.
 
     Their loss is within one standard error of the best one's, or within `tie` of it, or all recordings together are as
-    likely with them (`as_likely`): of models that predict alike, chance puts the true one beyond a standard error in
-    one case of six. Of these only what is as likely as the likeliest stays (`less_likely`). Where the model errs
-    everywhere, simpler ones are near by the evidence as well; see `outweighs`. An effect whose shape is far from what
+    likely with them (`as_likely`): about 16 % of equally good models trail the best by more than one standard error.
+    Models far less likely than the best are dropped (`less_likely`). Where model error dominates, simpler models are
+    also accepted by BIC; see `outweighs`. An effect whose shape is far from what
     an engineer would expect (`out_of_shape`) counts only where no other comes near it: a solid that relaxes in a tenth
     of the shortest time expected is a damper. So does one that is not sure to be there. One whose amplitude is out of
     its range (`oversized`) comes last.
@@ -135,7 +135,7 @@ def within_reach(fits: Sequence[Fit], limits: Thresholds = DEFAULTS) -> list[Fit
 
 
 def as_likely(fit: Fit, other: Fit, limits: Thresholds = DEFAULTS) -> bool:
-    """Whether all recordings are as likely with a fit as with another, but for what a 95 % interval is worth.
+    """Whether the likelihood ratio of two models over all recordings is within its 95 % bound.
 
     Where more than noise is left, squares count errors of the model, and their differences say little.
     """
@@ -143,12 +143,12 @@ def as_likely(fit: Fit, other: Fit, limits: Thresholds = DEFAULTS) -> bool:
 
 
 def less_likely(fit: Fit, other: Fit, limits: Thresholds = DEFAULTS) -> bool:
-    """Whether all recordings are less likely with a fit than with another by the odds of `worth`; see `as_likely`."""
+    """Whether the log likelihood ratio over all recordings rejects `fit` against `other` by more than `worth`."""
     return _noise_is_left(limits, fit.loss, other.loss) and behind(fit, other) > 2 * limits.worth
 
 
 def behind(fit: Fit, other: Fit) -> float:
-    """By how much r'r of all recordings, fitted and held out, exceeds that of another fit.
+    """Return r'r of `fit` minus that of `other` over all recordings, fitted and held out, with parameter penalty.
 
     Every parameter counts as the one by which chance alone lowers r'r.
     """
@@ -161,7 +161,7 @@ def _likely(effect: EffectBase, fit: Fit, limits: Thresholds) -> bool:
 
 
 def outweighs(fit: Fit, best: Fit, limits: Thresholds = DEFAULTS) -> bool:
-    """Whether fewer parameters outweigh a larger loss where both leave far more than noise.
+    """Whether BIC prefers `fit` with fewer parameters over `best` when model error dominates.
 
     Residuals are then errors of the model, of unknown size and alike for the length of a block: blocks times the
     logarithm of the losses' ratio against parameters times that of the blocks (BIC, Schwarz 1978,
@@ -179,7 +179,7 @@ def out_of_shape(
     limits: Thresholds = DEFAULTS,
     std: Mapping[str, float] | None = None,
 ) -> bool:
-    """Whether a shape parameter lies outside its range by more than `shape_factor`, or `range_widths` widths of it.
+    """Whether a shape parameter lies outside its prior range by more than `shape_factor` or `range_widths` widths.
 
     One that may as well lie within, by `away` standard deviations, does not.
     """
@@ -195,7 +195,7 @@ def out_of_shape(
 
 
 def oversized(effect: EffectBase, values: Mapping[str, float], limits: Thresholds = DEFAULTS) -> bool:
-    """Whether an amplitude lies outside its range by more than `range_widths` widths of it."""
+    """Whether an amplitude lies outside its prior range by more than `range_widths` widths of that range."""
     for name in effect.amplitudes:
         low, high = effect.prior_range[name]
         room = limits.range_widths * (high - low)
@@ -205,16 +205,16 @@ def oversized(effect: EffectBase, values: Mapping[str, float], limits: Threshold
 
 
 def stands_out(effect: EffectBase, fit: Fit, limits: Thresholds = DEFAULTS) -> bool:
-    """Whether any amplitude is `away` standard deviations or more from neutral; an effect that is not is not there.
+    """Whether any amplitude is at least `away` standard deviations from neutral.
 
-    These are of the amplitude with the effect's shape held: see `amplitude_std`.
+    The standard deviations hold the shape fixed; see `amplitude_std`.
     """
     neutral, std = effect.neutral, fit.amplitude_std
     return any(abs(fit.values[n] - neutral[n]) >= limits.away * std.get(n, 0.0) for n in effect.amplitudes)
 
 
 def relevant(before: Loss, after: Loss, limits: Thresholds = DEFAULTS) -> bool:
-    """Whether the held-out error, of all channels together or of any one, falls by the part `relevance`.
+    """Whether the held-out error, of all channels or of any one, is reduced by at least the fraction `relevance`.
 
     Held-out recordings that are far likelier need not show it: what tells of a constant error shows in few samples.
     """
@@ -224,7 +224,7 @@ def relevant(before: Loss, after: Loss, limits: Thresholds = DEFAULTS) -> bool:
 
 
 def fall(before: Loss, after: Loss) -> float:
-    """Part of the held-out error that is gone, of all channels together or of that which gains most."""
+    """Return the relative reduction of the held-out RMSE: the larger of all channels together and the best channel."""
     pairs = [(np.sqrt(before.mean), np.sqrt(after.mean))]
     pairs += [(rmse, after.channels[name][0]) for name, (rmse, _) in before.channels.items() if name in after.channels]
     return float(max(1.0 - later / earlier if earlier > 0 else 0.0 for earlier, later in pairs))
@@ -236,7 +236,7 @@ def fall(before: Loss, after: Loss) -> float:
 def shortlist(
     scores: Sequence[Score], alike: Confusability, limits: Thresholds, places: Sequence[str] = ()
 ) -> list[tuple[EffectBase, Mapping[str, float]]]:
-    """Which candidates of the first pass are refitted: none is left out because worse ones stand before it.
+    """Choose the candidates to refit, with their start values.
 
     Of those that are significant, the best by what they promise; those that can stand in for them; the best by their
     statistic, which a promise made far from its end says little about. Beside any of these the best of every place
@@ -285,7 +285,7 @@ def _likelier(fits: Sequence[Fit], others: Sequence[Fit]) -> list[Fit]:
 def compose(
     search: Search, nominal: Fit, screened: Screened, places: Sequence[str] = (), moved: bool = False
 ) -> tuple[tuple[Fit, ...], tuple[Added, ...]]:
-    """Add effects one after the other while the held-out gap closes, then try others in the place of each, and without.
+    """Select effects by forward selection on the held-out gap, then try replacing and removing each.
 
     Parameters
     ----------
@@ -360,7 +360,7 @@ def compose(
 def likely_pairs(
     screened: Screened, limits: Thresholds, without: EffectBase
 ) -> list[tuple[tuple[EffectBase, EffectBase], Mapping[str, float]]]:
-    """Which pairs of candidates are refitted: those worth most, none of which one before it can stand in for.
+    """Choose the pairs of candidates to refit: best penalized decrease first, without confusable duplicates.
 
     Parameters
     ----------

@@ -42,7 +42,7 @@ LATER = 6
 
 @dataclass(frozen=True)
 class Trace:
-    """Unknowns of one recording as the smoother finds them.
+    """Smoothed unknowns of one recording over its intervals: posterior mean and standard deviation.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class Trace:
 
 @dataclass(frozen=True)
 class Smoothed:
-    """What the smoother says.
+    """Result of the weak-constraint smoother: smoothed unknowns and the evidence of every group.
 
     Attributes
     ----------
@@ -107,14 +107,14 @@ class Smoothed:
 
     @property
     def explainable(self) -> float:
-        """Part of the gap G = max(0, chi2/n - 1) that unknown forces, offsets and biases can explain at all."""
+        """Fraction of the gap G = max(0, chi2/n - 1) that unknown forces, offsets and biases can explain."""
         gap = self.before / self.degrees_before - 1
         rest = max(self.after / self.degrees_after - 1, 0.0)
         return float(np.clip(1 - rest / gap, 0.0, 1.0)) if gap > 0 else 0.0
 
     @property
     def side(self) -> str:
-        """Whether the gap lies in the plant, in the sensors or in both, by evidence; "either" where it cannot tell."""
+        """Origin of the gap by evidence: "none", "plant", "sensor", "both", or "either" if they are confounded."""
         if max(self.evidence.values()) <= 0:
             return "none"
         heaviest = max(self.weight, key=lambda source: self.weight[source])
@@ -422,7 +422,7 @@ def _largest_evidence(bases: Sequence[_Base], source: Source) -> tuple[float, fl
 
 
 def smooth(problem: EstimationProblem, x: Array, evaluation: Evaluation, limits: Thresholds = DEFAULTS) -> Smoothed:
-    """Find the unknowns with the largest evidence.
+    """Run the smoother: choose the groups of unknowns with the largest evidence and estimate them.
 
     Parameters
     ----------
@@ -476,7 +476,7 @@ def smooth(problem: EstimationProblem, x: Array, evaluation: Evaluation, limits:
 
 
 def history_of_force(model: Linear, variance: Mapping[Source, float], unknown: int) -> tuple[Array, Array]:
-    """What one recording says of the values f of one unknown over its intervals: log p = g'f - f'L f / 2 + constant.
+    """Return g and L of the log likelihood g'f - f'L f / 2 of one unknown f over the intervals of a recording.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The linear model of a recording: how unknown forces, grasp offsets and sensor biases would move its residual.
+"""Linear model of a recording: how unknown forces, grasp offsets and sensor biases change its residual.
 
 About the rollout of a fitted model every DEL row gets an unknown generalized force, every segment an unknown push (a
 force in the world on a point of it, which all joints between it and the ground feel), every grasp an unknown offset and
@@ -41,7 +41,7 @@ Array = NDArray[np.float64]
 Kind = Literal["force", "push", "offset", "bias"]
 
 MEMORY = 0.5
-"""Time in which an unknown forgets its value [s]."""
+"""Correlation time of the unknowns [s]."""
 INTERVAL = 0.1
 """Shortest time over which unknowns are constant [s]."""
 INTERVALS = 150
@@ -50,7 +50,7 @@ INTERVALS = 150
 
 @dataclass(frozen=True)
 class Source:
-    """Unknowns that share a place and a standard deviation.
+    """Group of unknowns that share a location and a standard deviation.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Interval:
-    """One interval's share of the linear model.
+    """Linear model of one interval: residual, state transition and input of the unknowns.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class Interval:
 
 @dataclass(frozen=True)
 class Linear:
-    """The linear model of one recording.
+    """Linear state-space model of the residual of one recording, interval by interval.
 
     Attributes
     ----------
@@ -139,7 +139,7 @@ def linear_model(
     limits: Thresholds = DEFAULTS,
     interval: float = INTERVAL,
 ) -> tuple[Linear, ...]:
-    """Linearise a problem about its rollouts at the unknowns `x`, with unknown forces, offsets and biases.
+    """Return the linear model of every recording about its rollout at `x`, with unknown forces, offsets and biases.
 
     Parameters
     ----------
@@ -298,7 +298,7 @@ def _unknown_forces(course: _Course, part: float) -> tuple[list[str], list[Sourc
 
 
 def seen_by(system: System, sensor: Sensor, frame: str) -> str:
-    """What could be wrong where a point is misread: the camera, the arm that holds it, else the sensor's group."""
+    """Return the location of a sensor's bias: the camera, the arm that holds the frame, else the sensor's group."""
     if sensor.camera is not None:
         return "camera"
     for grasp in system.grasps:

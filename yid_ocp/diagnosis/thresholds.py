@@ -1,4 +1,4 @@
-"""All numbers that decide a verdict, in one place."""
+"""Thresholds that decide the verdict of a diagnosis."""
 
 from __future__ import annotations
 
@@ -13,94 +13,94 @@ from yid_ocp.problem.null_test import USUAL, WINDOW, GapLimits
 
 @dataclass(frozen=True)
 class Thresholds:
-    """All that a verdict depends on besides the data.
+    """Thresholds of every step of a diagnosis: null test, screening, refits, selection, localisation and events.
 
     Attributes
     ----------
     level : float
         Significance below which a residual is more than noise.
     smallest_gap : float
-        chi2/n - 1 below which a gap is not worth a name, however sure.
+        Smallest excess chi2/n - 1 that counts as a gap, even if a smaller one is significant.
     smallest_channel : float
-        chi2/n - 1 of the worst channel below which what a candidate would surely mend is not worth a name.
+        Smallest excess chi2/n - 1 of the worst channel for a significant candidate alone to show a gap.
     candidate_level : float
-        Significance, as the best of all candidates, from which one shows a gap that the residual as a whole does not.
+        Bonferroni-corrected significance at which a candidate shows a gap that the null test does not.
     shapeless : float
-        Part of the significance level that an excess without any shape has to reach.
+        Factor on `level` for the p-value of an excess that no candidate and no unknown explains.
     samples_per_unknown : float
-        Effective samples for every unknown below which nothing is said.
+        Effective samples required for every unknown; with fewer the verdict is insufficient_data.
     window : float
-        Length of the windows in which the residual is looked at [s].
+        Length of the windows of the null test [s].
     detection : float
-        Standard deviations of a detectable amplitude: found at the 1 % level nine times out of ten.
+        Detectable amplitude in standard deviations: 90 % power at the 1 % level.
     shape_values : int
-        Values tried of every shape parameter; the best counts as the best of that many tries.
+        Grid values of every shape parameter; the p-value is Bonferroni-corrected for them.
     refits : int
-        Candidates refitted in a round, and once more as many that are like them.
+        Candidates refitted in a round, plus at most as many that are confusable with them.
     surest : int
-        Candidates of the smallest p-values that are refitted in any case.
+        Number of candidates with the smallest p-values that are always refitted.
     pairs : int
-        Pairs of candidates refitted where one effect leaves a gap.
+        Number of candidate pairs refitted if one effect leaves a gap.
     alike : float
-        Part of a signature explained by another candidate from which both are refitted.
+        Fraction of a signature explained by another candidate above which both are refitted.
     poor, promising : float
-        A refit that ends above the chi2/n `poor`, but lowers the excess by the part `promising` or more, is tried again
+        A refit that ends above chi2/n `poor` but reduces the excess by at least the fraction `promising` is restarted
         from the initial values of the nominal parameters.
     effects : int
-        How many may be added.
+        Maximum number of effects added.
     away : float
-        Standard deviations that an effect must be away from neutral to be kept.
+        Distance from neutral, in standard deviations, below which an effect is dropped.
     relevance : float
-        Part of the held-out error, of all channels together or of any one, that an effect must take away.
+        Relative reduction of the held-out error, of all channels or of any one, required of an effect.
     closure : float
-        A held-out closure whose lower end is below this is no improvement; nor is an effect that closes a smaller part
-        of what is left.
+        Smallest fraction of the held-out gap to close: by the lower 95 % bound in total, and by each effect of what is
+        left.
     tie : float
-        Part of chi2/n by which two models may differ and still count as equal, however sure the difference.
+        Relative difference of chi2/n below which two models are equivalent, even if it is significant.
     everywhere : float
-        chi2/n from which residuals are errors of the model and not noise, so that blocks of time are what is
-        independent, and fewer parameters outweigh a larger loss as in BIC.
+        chi2/n above which model error dominates, so that blocks of time are the independent samples and BIC weighs
+        parameters against loss.
     stand_in : float
-        Part of chi2/n by which an effect of an unlikely shape must beat all others to count.
+        Relative improvement of chi2/n over all other models required of an effect with an implausible shape.
     shape_factor : float
-        Factor by which a shape parameter may leave its range before the shape is unlikely.
+        Factor by which a shape parameter may leave its prior range before the shape is implausible.
     range_widths : float
-        Widths of its range by which an amplitude, or a shape parameter whose range begins at zero or below, may leave
-        it before the value is unlikely.
+        Widths of its prior range by which an amplitude, or a shape parameter whose range begins at zero or below, may
+        leave it before the value is implausible.
     carried : float
-        Part of an effect's size by which it may come out otherwise on the held-out recordings.
+        Relative tolerance between an effect's amplitudes on the estimation and the held-out recordings.
     carried_stds : float
-        Standard deviations by which it may in any case.
+        Largest difference of the same amplitudes in standard deviations; smaller ones always agree.
     explained : float
-        Part of what the smoother explains of the residual which effects have to explain.
+        Fraction of the smoother's explained chi2 that the effects are required to explain.
     worth : float
-        Rise of the log evidence for which a group of unknowns is taken in: odds of 150 to 1.
+        Smallest log Bayes factor for adding a group of unknowns; 5 means odds of 150 to 1.
     places : int
-        Groups of unknowns taken in at most.
+        Maximum number of groups of unknowns.
     noticed : float
-        Rise of r'r by which unknowns of the reference size below would be noticed.
+        Rise of r'r at which unknowns of the reference size below are detectable.
     force : float
-        Reference standard deviation of an unknown force, as a part of the load that its place carries.
+        Prior standard deviation of an unknown force, relative to the load at its location.
     offset : float
-        Reference standard deviation of a grasp's unknown offset [m].
+        Prior standard deviation of a grasp's unknown offset [m].
     bias : float
-        Reference standard deviation of a sensor's unknown bias, in standard deviations of its noise.
+        Prior standard deviation of a sensor's unknown bias, relative to its noise.
     sure : float
-        Standard deviations that an unknown must be away from zero to say when the gap is there.
+        Distance of an unknown from zero, in standard deviations, at which a time interval belongs to the gap.
     as_well : float
-        Part of what a place raises the log evidence by that another must reach to be named beside it.
+        Fraction of a location's log evidence that another must reach to be indistinguishable from it.
     mapped : float
-        1 - posterior/prior variance from which an unknown's value is informed by the data.
+        1 - posterior/prior variance above which the data inform an unknown's value.
     term_error : float
-        Part of every term of the inverse dynamics (inertia, Coriolis forces, gravity, springs, friction, the torque
-        itself) that a good model may be wrong by at any moment without making an event.
+        Relative error of the inverse dynamics terms (inertia, Coriolis forces, gravity, springs, friction, the torque
+        itself) allowed at any moment without an event.
     pulse : float
-        Length of the longest event [s]; what lasts longer is the model's.
+        Maximum duration of an event [s]; longer disturbances count as model error.
     event_share : float
-        Part of what r'r exceeds the number of samples by that pushes must take with them to be events, and not the
-        largest errors of a model that errs everywhere.
+        Smallest fraction of the excess of r'r over the number of samples that force events must explain; with less,
+        model error dominates and they are dropped.
     fall : float
-        Speed of a joint beyond which the model is not held to anything for the rest of a recording [rad/s or m/s].
+        Joint speed above which the rest of a recording is ignored [rad/s or m/s].
     """
 
     # is there a gap
@@ -160,9 +160,9 @@ class Thresholds:
 
     @property
     def gap(self) -> GapLimits:
-        """What makes a residual more than noise; the same for a fit."""
+        """Limits of the null test, which `solve` uses as well."""
         return GapLimits(self.level, self.smallest_gap)
 
 
 DEFAULTS = Thresholds()
-"""What holds where nothing else is said."""
+"""Default thresholds."""

@@ -1,4 +1,4 @@
-"""How large the terms of the inverse dynamics are: what a model's torque cannot be trusted beyond a few per cent of."""
+"""Magnitude of the inverse dynamics terms, which bounds the torque error of a good model."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from yid_ocp.model.system import MidpointState, System
 Array = NDArray[np.float64]
 
 STANDSTILL = 0.1
-"""Speed below which friction may hold with anything up to what it slides with [rad/s or m/s]."""
+"""Speed below which static friction may act [rad/s or m/s]."""
 
 
 @dataclass(frozen=True)
 class TorqueTerms:
-    """Sizes of torques at some nodes of a rollout, of every coordinate.
+    """Magnitude of the inverse dynamics terms of every coordinate at some nodes of a rollout.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class TorqueTerms:
 
 
 class TorqueModel:
-    """M(q) a + c(q, v) + g(q) = tau of a model, made once for all recordings: with many joints that takes long.
+    """Inverse dynamics M(q) a + c(q, v) + g(q) = tau of a model, built once for all recordings.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class TorqueModel:
         return _function(self._step.system, self._step.time_step)
 
     def terms(self, theta: Array, rollout: Rollout, nodes: NDArray[np.int64]) -> TorqueTerms:
-        """Terms along a rollout, accelerations by differences of its nodes.
+        """Return the term magnitudes along a rollout, accelerations from finite differences.
 
         Parameters
         ----------

@@ -13,13 +13,13 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.problem.null_test import NullTest, more_than_noise
 
 Reason = Literal["", "none", "unsure", "little", "stand_in"]
-"""Why a gap has no name: no candidate closes a part of it, none surely, none enough, or what does only imitates."""
+"""Why the verdict is unknown: no candidate helps, closure not significant, too little explained, no transfer."""
 
 
 def has_gap(
     before: NullTest, held_out: NullTest, limits: Thresholds, ranked: Sequence[Score] = (), offsets: bool = False
 ) -> bool:
-    """Whether the residual is more than noise, by enough to be worth a name.
+    """Whether the residual exceeds noise significantly and by a relevant amount.
 
     Either as a whole, or along what a candidate would do to it with some channel above noise: the sum over all channels
     does not notice what only a few samples show. A candidate alone has to be surer than that sum: it is the best of
@@ -48,7 +48,7 @@ def has_gap(
 def shapeless(
     smoothed: Smoothed | None, ranked: Sequence[Score], before: NullTest, held_out: NullTest, limits: Thresholds
 ) -> bool:
-    """Whether an excess is barely significant and neither any unknown nor any candidate explains it: chance, then.
+    """Whether an excess is barely significant and no unknown or candidate explains it, so that it counts as chance.
 
     A sure excess without shape stays a gap: stated noise that is too small looks like that.
     """
@@ -67,7 +67,7 @@ def decide(
     explained: float = 1.0,
     carried: bool = True,
 ) -> str:
-    """The verdict of step eight.
+    """Return the verdict: insufficient_data, no_gap, unknown, confusable or effect.
 
     Parameters
     ----------
@@ -95,22 +95,22 @@ def decide(
 
 
 def assumptions(added: Sequence[Added]) -> int:
-    """How many things effects assume: one law at several places is one, loads in several places are several."""
+    """Count independent assumptions: one law at several locations counts once, local effects count each."""
     return len({entry.effect.label if entry.effect.alone else entry.effect.kind for entry in added})
 
 
 def needed(added: Sequence[Added], limits: Thresholds) -> float:
-    """Part of the smoother's explanation that effects have to reach."""
+    """Return the fraction of the smoother's explained chi2 that the effects are required to explain."""
     return 1.0 - (1.0 - limits.explained) ** assumptions(added)
 
 
 def why_unknown(
     added: Sequence[Added], total: Closure, limits: Thresholds, explained: float = 1.0, carried: bool = True
 ) -> Reason:
-    """Why no effect is named where there is a gap; empty where one is.
+    """Return why a gap has no accepted effect; empty if it has one.
 
     Effects have to explain the part `needed` of what the smoother explains where the model was fitted. One that
-    stands for all may instead surely close it on held-out motions, of which nothing could explain more than all. Of
+    single assumption also passes if the lower 95 % bound of its held-out closure reaches `explained`. Of
     several each further assumption has to explain at least the part `explained` of what could be left: two or three
     together imitate almost anything, but only in part.
     """
@@ -125,7 +125,7 @@ def why_unknown(
 
 
 def explained_part(nominal: Fit, added: Sequence[Added], smoothed: Smoothed | None) -> float:
-    """Fall of r'r by the effects over that by the smoother, each less what it takes of the noise.
+    """Return the decrease of r'r by the effects divided by that of the smoother, both corrected for degrees of freedom.
 
     Both are on the recordings to estimate on, so that the same noise stands in both. One where nothing was smoothed.
     """

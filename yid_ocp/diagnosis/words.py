@@ -1,4 +1,4 @@
-"""What a finding says in sentences, and the experiment that would say more."""
+"""Sentences that describe a diagnosis, and the recommended next experiment."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SIDES = {
 DIFFER = 0.01
 """Significance below which several runs of a baseline differ."""
 NOWHERE = ("world", "clock", "camera", "object", "base")
-"""Places that nobody can move alone."""
+"""Locations that cannot be moved by themselves."""
 NEXT = {
     "insufficient_data": "Record longer and larger motions; more of the object has to be seen.",
     "separate": "Vary {aspects} independently of each other, over a wide range, in one recording.",
@@ -45,7 +45,7 @@ NEXT = {
     "no_gap": "None is needed.",
     "effect": "Repeat with other motions to see whether the effect's parameters stay.",
 }
-"""The next experiment."""
+"""Texts of the recommended next experiment, by situation."""
 
 
 NAMELESS = {
@@ -57,11 +57,11 @@ NAMELESS = {
     "close{s} {low:.3g} % on held-out motions; {enough:.3g} % {asked}.",
     "stand_in": "{names} imitate{s} it (closing {closure:.3g} % on held-out motions) and {are} not its cause: {apart}.",
 }
-"""Why a gap has no name, by `verdict.Reason`."""
+"""Sentences on why the verdict is unknown, by `verdict.Reason`."""
 
 
 def separating(rivals: Sequence[EffectBase]) -> str:
-    """The experiment that would tell rivals apart, from what their equations depend on."""
+    """Return the experiment that separates indistinguishable effects, from what their equations depend on."""
     said = list(dict.fromkeys(effect.depends_on for effect in rivals if effect.depends_on))
     aspects = sorted(said, key=lambda aspect: ASPECTS.index(aspect) if aspect in ASPECTS else len(ASPECTS))
     places = list(dict.fromkeys(effect.location for effect in rivals))
@@ -73,7 +73,7 @@ def separating(rivals: Sequence[EffectBase]) -> str:
 
 
 def next_experiment(verdict: str, added: Sequence[Added], where: Sequence[Place], unseen: Sequence[str]) -> str:
-    """What to record next."""
+    """Return the recommended next recording as text."""
     if verdict == "insufficient_data":
         return NEXT["insufficient_data"]
     rivals = next((entry.rivals for entry in added if len(entry.rivals) > 1), ())
@@ -89,7 +89,7 @@ def next_experiment(verdict: str, added: Sequence[Added], where: Sequence[Place]
 
 
 def shortage(verdict: str, before: NullTest, unknowns: int, seen: Sequence[Visibility], limits: Thresholds) -> str:
-    """Why data do not suffice, empty where they do.
+    """Return why the data are insufficient; empty if they suffice.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def shortage(verdict: str, before: NullTest, unknowns: int, seen: Sequence[Visib
 
 
 def cut_short(cut: Cut) -> str:
-    """How far the nominal model can follow a held-out recording."""
+    """Return the sentence on how far the nominal model follows a held-out recording."""
     if cut.kept == 0:
         return f"The nominal model cannot follow {cut.recording} at all, which is left out."
     return (
@@ -120,7 +120,7 @@ def cut_short(cut: Cut) -> str:
 
 
 def sentences(finding: Finding) -> str:
-    """The report in words."""
+    """Return the summary text of a diagnosis."""
     text = [_gap(finding)]
     if finding.verdict not in ("insufficient_data", "no_gap"):
         text.append(_places(finding))
@@ -304,11 +304,11 @@ def _out_of_range(effect: EffectBase, fit: Fit) -> list[str]:
 # -- events ---------------------------------------------------------------------------------------------------------
 
 NAMED = 8
-"""Events that are told one by one."""
+"""Maximum number of events listed one by one."""
 
 
 def event_sentences(events: Events) -> str:
-    """What happened, where and when; empty where nothing did."""
+    """Return the sentences on all events: what, where, when; empty if there are none."""
     text = []
     if events.found:
         count = len(events.found)
@@ -320,7 +320,7 @@ def event_sentences(events: Events) -> str:
 
 
 def fall_sentences(events: Events) -> list[str]:
-    """Where judging ends."""
+    """Return one sentence for each recording whose end is ignored because a joint moves too fast."""
     why = "moves too fast for the model to follow."
     return [
         f"From {fall.time:.3g} s on nothing is judged in {fall.recording}, where {fall.joint} {why}"

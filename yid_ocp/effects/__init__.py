@@ -1,4 +1,4 @@
-"""The library of unmodelled effects: kinds, where each can sit, `make_effect`; a new kind is one file with one class.
+"""The library of unmodelled effects: kinds, their possible locations, and `make_effect`; a new kind is one file.
 
 A kind's equation, quantities, units, bounds and ranges stand at its class; `docs/extending.md` shows a new one.
 """
@@ -18,8 +18,7 @@ from yid_ocp.errors import Choices, ModelError, choices
 from yid_ocp.model.system import System
 
 SENSORS = ("joints.position", "joints.effort", "camera", "nominal_clock")
-"""What `candidates` may be told of a recording: measured joint angles, joint efforts, points seen by a camera, and a
-clock that is a sample index times a nominal period."""
+"""Kinds of recorded signals on which candidates depend; `nominal_clock` is a sample index times a nominal period."""
 
 # every file of this folder registers its kinds when it is imported
 for _family in iter_modules(__path__):
@@ -27,7 +26,7 @@ for _family in iter_modules(__path__):
 
 
 def make_effect(kind: str, location: str, system: System, values: Mapping[str, float] | None = None) -> EffectBase:
-    """An effect, to be added with `System.with_effects`.
+    """An effect of a kind at a location, to be added with `System.with_effects`.
 
     Parameters
     ----------
@@ -64,7 +63,7 @@ def make_effect(kind: str, location: str, system: System, values: Mapping[str, f
 
 
 def candidates(system: System, sensors_present: Collection[str]) -> list[tuple[str, str]]:
-    """Every (kind, location) that could be at work in a system and show in a recording.
+    """Every (kind, location) that is possible in a system and visible in a recording.
 
     Parameters
     ----------
@@ -97,5 +96,5 @@ def candidates(system: System, sensors_present: Collection[str]) -> list[tuple[s
 
 
 def vocabulary() -> list[tuple[str, str, str]]:
-    """Every kind with the equation that it adds and the sensors without which it cannot be seen."""
+    """Every kind with its equation and the sensors that it requires."""
     return [(kind, EFFECTS[kind].equation, ", ".join(sorted(EFFECTS[kind].needs))) for kind in EFFECTS]

@@ -1,4 +1,4 @@
-"""What lies between a motor and what is recorded of it: elastic gears, play, effort sensing, late torque.
+"""Effects between a motor and its recorded signals: elastic gears, backlash, effort sensing errors, late torque.
 
 Recorded torques drive the model and recorded angles prescribe or guide it, so that these effects reach a driven joint,
 or the angle of a prescribed one, through `correct`; the effort that a prescribed joint needs is compared with the
@@ -16,7 +16,7 @@ from yid_ocp.effects.base import EFFECTS, EffectBase, Quantity, arms, on_joint, 
 from yid_ocp.model.system import MidpointState, NodeState, System, Terms
 
 PLAY_TORQUE = 0.2
-"""Torque by which the play of a gear is taken up to three quarters [N m]."""
+"""Torque at which three quarters of the backlash are taken up [N m]."""
 
 
 @EFFECTS.register("series_elasticity")
@@ -32,21 +32,21 @@ class SeriesElasticity(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Arm joints that are driven or prescribed."""
+        """Names of arm joints that are driven or prescribed."""
         return _recorded(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Compliance [rad/(N m)], reported as stiffness [N m/rad]."""
+        """Definition of the gear's compliance [rad/(N m)], reported as stiffness [N m/rad]."""
         text, reported = "compliance of the gear", "stiffness N m/rad"
         return (Quantity("compliance", "rad/(N m)", 0.0, 0.0, 0.02, (1 / 2000, 1 / 100), text, reciprocal=reported),)
 
     def measure(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
-        """See the class."""
+        """The encoder's reading: the joint angle plus the gear's deflection under the effort."""
         return output + self._give(channel, _effort(state, self.location))
 
     def correct(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
-        """See the class."""
+        """The joint angle: the encoder's reading minus the gear's deflection under the effort."""
         return reading - self._give(channel, effort)
 
     def _give(self, channel: str, effort: ca.SX) -> ca.SX:
@@ -55,7 +55,7 @@ class SeriesElasticity(EffectBase):
 
 @EFFECTS.register("backlash")
 class Backlash(EffectBase):
-    """A gear with play, the encoder on the motor's side: measured angle = q + width/2 tanh(effort/`PLAY_TORQUE`).
+    """A gear with backlash, encoder on the motor's side: measured angle = q + width/2 tanh(effort/`PLAY_TORQUE`).
 
     A servo acts on what its encoder reads: there the play z that is taken up solves z = width/2 tanh(torque(q + z)/
     `PLAY_TORQUE`) in every step, an internal coordinate without a memory.
@@ -67,16 +67,16 @@ class Backlash(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Arm joints that are driven or prescribed."""
+        """Names of arm joints that are driven or prescribed; of joints with a servo where there are none."""
         return _recorded(system) or tuple(name for name in robot_joints(system) if name in system.servos)
 
     @classmethod
     def internal_names(cls, location: str, system: System) -> tuple[str, ...]:
-        """Of a servo's joint the play that is taken up."""
+        """`play`, the taken-up backlash, for a joint with a servo; none otherwise."""
         return ("play",) if location in system.servos else ()
 
     def terms(self, state: MidpointState) -> Terms:
-        """See the class."""
+        """The equation of the taken-up backlash and the servo torque change that it causes; nothing without a servo."""
         if not self.internal:
             return Terms()
         [name] = self.internal
@@ -92,17 +92,17 @@ class Backlash(EffectBase):
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Width [rad]."""
+        """Definition of the backlash width [rad]."""
         return (Quantity("width", "rad", 0.0, 0.0, 0.1, (0.0, 0.01), "play of the gear"),)
 
     def measure(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
-        """See the class."""
+        """The encoder's reading: the joint angle plus the taken-up backlash."""
         for name in self.internal if channel == f"joints.position.{self.location}" else ():
             return output + state.z[state.internal[name]]
         return output + self._give(channel, _effort(state, self.location))
 
     def correct(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
-        """See the class."""
+        """The joint angle: the encoder's reading minus the taken-up backlash; unchanged for a joint with a servo."""
         # a servo's coordinate follows from the motion, and its command is of the motor's side
         return reading if self.internal else reading - self._give(channel, effort)
 
@@ -125,17 +125,17 @@ class EffortGain(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Arm joints that are driven or prescribed."""
+        """Names of arm joints that are driven or prescribed."""
         return _recorded(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """1/scale [1], reported as scale."""
+        """Definition of 1/scale [1], reported as scale."""
         text, expected = "true over measured effort", (1 / 1.2, 1 / 0.8)
         return (Quantity("inverse", "1", 1.0, -1.5, 3.0, expected, text, reciprocal="scale 1"),)
 
     def elsewhere(self, start: Mapping[str, float]) -> Mapping[str, float] | None:
-        """From the flipped sign as well, where the linear model goes further than to no effort at all.
+        """A start with the opposite sign of scale where the estimate of 1/scale is at least 1 away from 1; else None.
 
         Compared efforts are linear in scale, torques that drive in 1/scale: a flipped sign is two away either way.
         """
@@ -146,11 +146,11 @@ class EffortGain(EffectBase):
         return {name: 1.0 if value < 0 else -1.0}
 
     def measure(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
-        """See the class."""
+        """The recorded effort: the true effort times scale."""
         return output / self["inverse"] if channel == f"joints.effort.{self.location}" else output
 
     def correct(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
-        """See the class."""
+        """The true effort: the recorded effort divided by scale."""
         return reading * self["inverse"] if channel == f"joints.effort.{self.location}" else reading
 
 
@@ -164,21 +164,21 @@ class EffortOffset(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Arm joints that are driven or prescribed."""
+        """Names of arm joints that are driven or prescribed."""
         return _recorded(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Offset [N m]."""
+        """Definition of the offset, measured minus true effort [N m]."""
         bound, width = (size * strength(system, location) for size in (10.0, 1.5))
         return (Quantity("offset", "N m", 0.0, -bound, bound, (-width, width), "measured less true effort"),)
 
     def measure(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
-        """See the class."""
+        """The recorded effort: the true effort plus the offset."""
         return output + self["offset"] if channel == f"joints.effort.{self.location}" else output
 
     def correct(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
-        """See the class."""
+        """The true effort: the recorded effort minus the offset."""
         return reading - self["offset"] if channel == f"joints.effort.{self.location}" else reading
 
 
@@ -196,22 +196,22 @@ class EffortDelay(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Arms of which a joint is driven or prescribed."""
+        """Names of arms with a driven or prescribed joint."""
         known = set(_recorded(system))
         return tuple(name for name, joints in arms(system).items() if known & set(joints))
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Delay [s]."""
+        """Definition of the delay from recorded to acting torque [s]."""
         return (Quantity("delay", "s", 0.0, -0.2, 0.2, (0.0, 0.1), "how late recorded torque acts"),)
 
     @classmethod
     def joints_at(cls, location: str, system: System) -> tuple[str, ...]:
-        """Joints of the arm."""
+        """Names of the arm's joints."""
         return arms(system)[location]
 
     def delay(self, channel: str, camera: bool) -> ca.SX:
-        """See the class."""
+        """The delay for torques that drive the arm's joints, its negative for their measured efforts, else zero [s]."""
         quantity, _, joint = channel.partition(".") if channel.startswith("torque.") else channel.rpartition(".")
         if joint not in self.joints:
             return ca.SX(0)
@@ -233,18 +233,18 @@ class EffortLag(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Arm joints that are driven or prescribed."""
+        """Names of arm joints that are driven or prescribed."""
         return _recorded(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """time_constant [s]."""
+        """Definition of time_constant [s]; negative values are allowed for prescribed joints."""
         text = "with which torque follows its command"
         least = -0.5 if location in system.prescribed else 0.0
         return (Quantity("time_constant", "s", 0.0, least, 0.5, (0.0, 0.05), text),)
 
     def lag(self, channel: str) -> ca.SX:
-        """See the class."""
+        """The time constant for the joint's driving torque, its negative for its measured effort, else zero [s]."""
         quantity, _, joint = channel.rpartition(".")
         if joint != self.location:
             return ca.SX(0)

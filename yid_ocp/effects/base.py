@@ -1,4 +1,4 @@
-"""What all effects share: their quantities, the neutral behaviour that each overrides in part, where they can sit."""
+"""The base class of all effects, their parameter definitions, and the places in a system where effects can act."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from yid_ocp.model.system import Grasp, MidpointState, NodeState, System, Terms
 from yid_ocp.registry import Registry
 
 SMOOTHING = 0.02
-"""v_s in sgn(v) = tanh(v/v_s) [rad/s]."""
+"""Smoothing speed v_s in sgn(v) = tanh(v/v_s) [rad/s]."""
 ASPECTS = (
     "how fast it moves",
     "how long it is held",
@@ -33,16 +33,16 @@ ASPECTS = (
     "where the camera stands",
     "how long it is",
 )
-"""What equations of the library depend on, in the order in which sentences name it."""
+"""What a motion has to vary to excite an effect of the library, in the order in which messages list it."""
 BAXTER_LIMIT = 50.0
-"""Effort limit of the joints that the ranges of arms are about [N m]; they grow with that of a stronger joint."""
+"""Effort limit of Baxter's joints [N m], on which the ranges of arm effects are based; they scale with the limit."""
 SAME_PLACE = 1e-6
-"""Points of arms that are nearer to each other than this wherever the arm stands are one [m]."""
+"""Points of arms that stay nearer to each other than this in all configurations count as one point [m]."""
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """One number of an effect.
+    """The definition of one parameter of an effect: unit, neutral value, bounds, expected range.
 
     Attributes
     ----------
@@ -53,15 +53,15 @@ class Quantity:
     lower, upper : float
         Physical bounds.
     prior_range : (float, float)
-        Where an engineer would expect it.
+        Range that an engineer would expect.
     description : str
     shape : bool
-        Whether it says nothing while the others are neutral (a relaxation time, a yield angle).
+        Whether it has no influence while the others are neutral (a relaxation time, a yield angle).
     reciprocal : str
         `name unit` under which 1/value is reported, for a stiffness whose neutral value is infinite, or a factor that
         goes through infinity when it changes its sign.
     power : int
-        p where the value is that of the reported one to the power -p.
+        p in value = reported value^-p.
     """
 
     name: str
@@ -77,24 +77,24 @@ class Quantity:
 
     @property
     def reported(self) -> tuple[str, str]:
-        """Name and unit in reports."""
+        """Name and unit under which the parameter is reported."""
         name, _, unit = self.reciprocal.partition(" ")
         return (name, unit) if self.reciprocal else (self.name, self.unit)
 
     def turned(self, value: float) -> float:
-        """The reported value behind a value that is not zero; the same as it is without a reciprocal."""
+        """The reported value for a nonzero internal value; the internal value itself where there is no reciprocal."""
         if not self.reciprocal:
             return value
         return 1 / value if self.power == 1 else value ** (-1 / self.power)
 
     def kept(self, value: float) -> float:
-        """The value behind a reported one that is not zero; the same as it is without a reciprocal."""
+        """The internal value for a nonzero reported value; the reported value itself where there is no reciprocal."""
         return value**-self.power if self.reciprocal else value
 
 
 @dataclass(frozen=True)
 class Reported:
-    """A quantity as people read it: value, standard deviation and unit."""
+    """A parameter as reported to users: value, standard deviation and unit."""
 
     value: float
     std: float
@@ -103,28 +103,28 @@ class Reported:
 
 @dataclass(frozen=True)
 class EffectBase(ABC):
-    """An effect that changes nothing; every kind overrides what it needs.
+    """The base class of effects, whose own behaviour changes nothing; every kind overrides what it needs.
 
     Attributes
     ----------
     kind, location : str
     quantities : tuple of Quantity
-        At this location; in the order of `parameters`.
+        Definitions at this location, in the order of `parameters`.
     parameters : Parameters
         Named `kind@location.quantity`.
     internal : mapping of str to casadi.SX
         Internal coordinates, named `kind@location.joint`.
     joints : tuple of str
-        Joints that an arm's name stands for.
+        Names of the arm's joints where `location` is an arm.
     equation : str
-        What the kind adds, as people read it.
+        Equation that the kind adds, as text.
     depends_on : str
-        What has to vary in a motion for the kind to be told from others: one of `ASPECTS`, or words that continue
+        What a motion has to vary to distinguish the kind from others: one of `ASPECTS`, or words that continue
         "vary ...".
     needs : frozenset of str
-        Sensors without which nothing shows it.
+        Sensors without which the effect is not observable.
     alone : bool
-        Whether it is a thing in one place, so that one place says nothing of others; a law such as friction is not.
+        Whether its presence at one location says nothing about others, as for a mass; not so for friction.
     """
 
     kind: str
@@ -142,35 +142,35 @@ class EffectBase(ABC):
     @classmethod
     @abstractmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Where in the system the effect can sit."""
+        """Names of all places in the system where the effect can act."""
 
     @classmethod
     def likely(cls, system: System) -> tuple[str, ...]:
-        """Which of these places a diagnosis tries."""
+        """Names of the places that a diagnosis tries; by default all of `locations`."""
         return cls.locations(system)
 
     @classmethod
     @abstractmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Its quantities; bounds and ranges may depend on the place."""
+        """Definitions of the effect's parameters; bounds and ranges may depend on the location."""
 
     @classmethod
     def internal_names(cls, location: str, system: System) -> tuple[str, ...]:
-        """What each of its internal coordinates belongs to, a joint for example."""
+        """Names of the effect's internal coordinates, such as the joint that each belongs to; none by default."""
         return ()
 
     @classmethod
     def joints_at(cls, location: str, system: System) -> tuple[str, ...]:
-        """Joints that it must know by name, where a location stands for several."""
+        """Names of the joints that an arm's location stands for, where the effect needs them; none by default."""
         return ()
 
     @property
     def unknown_at_start(self) -> Mapping[str, float]:
-        """Internal coordinates whose value at the start of a recording nothing tells: name to their largest size."""
+        """Internal coordinates with unknown initial value, which is estimated: name to largest absolute value."""
         return {}
 
     def elsewhere(self, start: Mapping[str, float]) -> Mapping[str, float] | None:
-        """Another place from which a search that begins at `start` should begin as well; None where one is enough."""
+        """Values of a second starting point for a search that starts at `start`; None where one start is enough."""
         return None
 
     def __getitem__(self, quantity: str) -> ca.SX:
@@ -178,33 +178,33 @@ class EffectBase(ABC):
 
     @property
     def label(self) -> str:
-        """`kind@location`."""
+        """The effect's name, `kind@location`."""
         return f"{self.kind}@{self.location}"
 
     @property
     def neutral(self) -> dict[str, float]:
-        """Value of every parameter with which the effect is absent."""
+        """Parameter values at which the effect is absent, by parameter name."""
         return {f"{self.label}.{q.name}": q.neutral for q in self.quantities}
 
     @property
     def amplitudes(self) -> tuple[str, ...]:
-        """Parameters whose neutral value alone makes the effect vanish."""
+        """Names of the parameters whose neutral values alone make the effect vanish."""
         return tuple(f"{self.label}.{q.name}" for q in self.quantities if not q.shape)
 
     @property
     def shapes(self) -> tuple[str, ...]:
-        """Parameters that say nothing while the amplitudes are neutral."""
+        """Names of the parameters without influence while the amplitudes are neutral, such as a relaxation time."""
         return tuple(f"{self.label}.{q.name}" for q in self.quantities if q.shape)
 
     @property
     def prior_range(self) -> dict[str, tuple[float, float]]:
-        """Where an engineer would expect every parameter, in the parameter's unit."""
+        """Expected range (low, high) of every parameter, in the parameter's unit."""
         return {f"{self.label}.{q.name}": q.prior_range for q in self.quantities}
 
     def reported(
         self, values: Mapping[str, float] | None = None, stds: Mapping[str, float] | None = None
     ) -> dict[str, Reported]:
-        """The quantities as people read them, a compliance as the stiffness that it is the reciprocal of.
+        """The parameters as reported to users; a compliance is reported as stiffness.
 
         The standard deviation of C^(-1/p) is C^(-1/p) std(C)/(p C) (delta method).
 
@@ -232,31 +232,31 @@ class EffectBase(ABC):
         return result
 
     def expected(self, largest: Mapping[str, float]) -> EffectBase:
-        """The effect with the ranges to expect where the joints of each segment turn so far in the data [rad]."""
+        """The effect with expected ranges that fit the segments' largest joint angles in the data [rad]."""
         return self
 
     def modify(self, system: System) -> System:
-        """The system with the effect's changes of description."""
+        """The system with the effect's changes of masses, lengths, springs, grasps, gravity or joints."""
         return system
 
     def terms(self, state: MidpointState) -> Terms:
-        """What the effect adds to the step's equations."""
+        """Energy, forces and internal equations that the effect adds to one step."""
         return Terms()
 
     def measure(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
-        """What a sensor reads where it would have read `output`."""
+        """What the sensor reads where it would read `output` without the effect."""
         return output
 
     def correct(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
-        """The true value behind the reading of an input."""
+        """The true value for a recorded input value."""
         return reading
 
     def delay(self, channel: str, camera: bool) -> ca.SX:
-        """How long before its recorded time a reading was true [s]."""
+        """How long before its recorded time a sample was true [s]; for a driving torque, how much later it acts."""
         return ca.SX(0)
 
     def lag(self, channel: str) -> ca.SX:
-        """Time constant with which an effort follows its command, or a reading an effort [s]."""
+        """Time constant with which a torque follows its command, or a recorded effort the true one [s]."""
         return ca.SX(0)
 
 
@@ -264,7 +264,7 @@ EFFECTS: Registry[type[EffectBase]] = Registry("effect")
 
 
 def build(kind: str, location: str, system: System, values: Mapping[str, float] | None = None) -> EffectBase:
-    """An effect of a registered kind at a location that fits; see `make_effect`."""
+    """An effect of a registered kind at a valid location; `make_effect` also checks the location."""
     cls = EFFECTS[kind]
     label = f"{kind}@{location}"
     quantities = cls.quantities_at(location, system)
@@ -293,24 +293,24 @@ def build(kind: str, location: str, system: System, values: Mapping[str, float] 
 
 
 def segment_names(system: System) -> tuple[str, ...]:
-    """The object's segments."""
+    """Names of the object's segments."""
     return tuple(segment.name for segment in system.segments)
 
 
 def object_joints(system: System) -> tuple[str, ...]:
-    """Joints of the object's segments."""
+    """Names of the joints of the object's segments."""
     return tuple(joint for segment in system.segments for link in segment.links for joint in link)
 
 
 def clamp_names(system: System) -> tuple[str, ...]:
-    """Floating clamps: six joints NAME_x ... NAME_rz."""
+    """Names of floating clamps, each with six joints NAME_x ... NAME_rz."""
     names = set(system.mechanism.joint_names)
     found = [name.removesuffix("_rz") for name in system.mechanism.joint_names if name.endswith("_rz")]
     return tuple(c for c in found if all(f"{c}_{part}" in names for part in ("x", "y", "z", "rx", "ry")))
 
 
 def robot_joints(system: System) -> tuple[str, ...]:
-    """Joints of arms: all but those of the object, of clamps, and of springs that effects put in."""
+    """Names of the arms' joints: all but those of the object, of clamps and of compliant mounts."""
     other = set(object_joints(system)) | set(system.compliant)
     for clamp in clamp_names(system):
         other |= {f"{clamp}_{part}" for part in ("x", "y", "z", "rx", "ry", "rz")}
@@ -318,12 +318,12 @@ def robot_joints(system: System) -> tuple[str, ...]:
 
 
 def grasp_names(system: System) -> tuple[str, ...]:
-    """All grasps, clamps' included."""
+    """Names of all grasps, those by clamps included."""
     return tuple(grasp.name for grasp in system.grasps)
 
 
 def arms(system: System) -> dict[str, tuple[str, ...]]:
-    """Joints of every arm: by grasp, else by the prefix left_ or right_, else all as `gripper`."""
+    """Joint names of every arm, by the arm's name: its grasp, else the prefix left or right, else `gripper`."""
     joints = robot_joints(system)
     tree = system.mechanism
     found: dict[str, tuple[str, ...]] = {}
@@ -344,7 +344,7 @@ def arms(system: System) -> dict[str, tuple[str, ...]]:
 
 
 def arm_tips(system: System) -> tuple[str, ...]:
-    """A frame at the end of every arm that grasps nothing, the one named after a gripper or hand where there is one."""
+    """Names of one frame at the end of every arm without a grasp, a gripper's or hand's where there is one."""
     tree = system.mechanism
     tips = []
     for name, joints in arms(system).items():
@@ -358,14 +358,14 @@ def arm_tips(system: System) -> tuple[str, ...]:
 
 
 def strength(system: System, joint: str) -> float:
-    """How much stronger a joint is than Baxter's, by its effort limit; 1 for a weaker one and where there is none."""
+    """A joint's effort limit over Baxter's; 1 for a smaller limit and for none."""
     limit = system.mechanism.joints[system.mechanism.joint_index(joint)].effort_limit
     return max(1.0, limit / BAXTER_LIMIT) if limit < NO_LIMIT else 1.0
 
 
 @dataclass(frozen=True)
 class Carried:
-    """What a joint carries, as the nominal parameters have it, in its own frame.
+    """Nominal mass, centre of mass and second moment of a joint's child bodies, in the joint's frame.
 
     Attributes
     ----------
@@ -374,7 +374,7 @@ class Carried:
     com : ndarray, shape (3,)
         Centre of mass [m]; the joint's origin where it carries none.
     spread : ndarray, shape (3, 3)
-        Integral of r r' dm about the centre of mass [kg m^2].
+        Second moment of mass, the integral of r r' dm about the centre of mass [kg m^2].
     """
 
     mass: float
@@ -383,7 +383,7 @@ class Carried:
 
 
 def carried(system: System, joint: int) -> Carried:
-    """What one joint carries, up to the next joints."""
+    """Nominal mass properties of one joint's child bodies, up to the next joints."""
     bodies = [replace(body, gravity_fraction=None) for body in system.mechanism.joints[joint].bodies]
     whole = merged(bodies)
     if whole is None:
@@ -395,10 +395,9 @@ def carried(system: System, joint: int) -> Carried:
 
 
 def link_ends(system: System) -> tuple[str, ...]:
-    """Where an arm's links end: a frame at the next joint, or at the tip; of frames that move alike the first one.
+    """Names of frames at the ends of the arms' links: at the next joint or at the tip, each point once.
 
-    A frame stands for the place where it is, whichever of two links that meet there carries it. A place on an axis that
-    no other joint moves is none.
+    A point on an axis that no other joint moves is left out.
     """
     tree = system.mechanism
     if not robot_joints(system):
@@ -424,7 +423,7 @@ def link_ends(system: System) -> tuple[str, ...]:
 
 
 def link_frames(system: System) -> tuple[str, ...]:
-    """One frame on every link of an arm that carries mass: where a grasp holds, else a gripper's, else the first.
+    """Names of one frame on every arm link with mass: the grasp's, else a gripper's, else the first.
 
     What slides on a link and carries nothing else, a finger for example, counts as part of that link.
     """
@@ -442,7 +441,7 @@ def link_frames(system: System) -> tuple[str, ...]:
 
 
 def _paths(system: System, tree: Mechanism, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Where frames are in some postures of the arms, shape (postures, 3) each [m]."""
+    """Positions of frames in some random configurations, shape (configurations, 3) each [m]."""
     if not names:
         return {}
     q = ca.SX.sym("q", len(tree.joints))
@@ -455,7 +454,7 @@ def _paths(system: System, tree: Mechanism, names: Sequence[str]) -> dict[str, n
 
 
 def roots(system: System) -> dict[str, tuple[str, ...]]:
-    """First joint of every segment that grows from no other, by what it stands on: its clamp, else `base`."""
+    """First joints of all segments without a parent, by what carries them: a clamp's name, else `base`."""
     tree, clamps = system.mechanism, clamp_names(system)
     found: dict[str, tuple[str, ...]] = {}
     for segment in system.segments:
@@ -483,7 +482,7 @@ def junctions(system: System) -> dict[str, tuple[str, ...]]:
 
 
 def segment_of_frame(system: System, frame: str) -> str | None:
-    """The segment whose link carries a frame."""
+    """Name of the segment whose link carries a frame; None for other frames."""
     index = system.mechanism.frame(frame).joint
     if index < 0:
         return None
@@ -505,7 +504,7 @@ def with_springs(system: System, changed: Mapping[str, ElasticJoint]) -> System:
 
 
 def typical_stiffness(system: System, segment: str) -> float:
-    """Mean bending stiffness of a segment's joints at the parameters' nominal values, above zero [N m/rad]."""
+    """Mean nominal bending stiffness of a segment's joints, at least 1e-6 [N m/rad]."""
     springs = segment_springs(system, segment)
     chosen = [s.stiffness for s in springs if s.kind == "bend"] or [s.stiffness for s in springs]
     if not chosen:
@@ -516,14 +515,14 @@ def typical_stiffness(system: System, segment: str) -> float:
 
 
 def on_joint(system: System, joint: str, value: ca.SX) -> ca.SX:
-    """A generalized force on one joint alone, shape (n, 1)."""
+    """Generalized force with one nonzero entry, at a joint, shape (n, 1)."""
     force = ca.SX(system.size, 1)
     force[system.mechanism.joint_index(joint)] = value
     return force
 
 
 def with_bodies(system: System, changed: Mapping[str, Sequence[Inertia]]) -> System:
-    """The system with other bodies on some joints, by joint name."""
+    """The system with the bodies of some joints replaced, by joint name."""
     tree = system.mechanism
     joints = tuple(replace(j, bodies=tuple(changed[j.name])) if j.name in changed else j for j in tree.joints)
     return replace(system, mechanism=replace(tree, joints=joints))
@@ -535,12 +534,12 @@ def with_grasp(system: System, changed: Grasp) -> System:
 
 
 def substituted(system: System, old: Collection[ca.SX], new: Collection[ca.SX]) -> System:
-    """The system with symbols replaced everywhere in its description."""
+    """The system with symbols substituted in all its expressions."""
     before, after = ca.vertcat(*old), ca.vertcat(*new)
     return system.mapped(lambda expression: ca.substitute(expression, before, after))
 
 
 def inverse(placement: Placement) -> Placement:
-    """The placement that undoes another."""
+    """The inverse of a rigid transform."""
     back = placement.rotation.T
     return Placement(back, -(back @ placement.translation))

@@ -1,4 +1,4 @@
-"""Losses inside the object: material damping, relaxation, hysteresis."""
+"""Energy losses inside the object: material damping, stress relaxation, hysteresis."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from yid_ocp.effects.base import EFFECTS, EffectBase, Quantity, segment_names, s
 from yid_ocp.model.system import MidpointState, System, Terms
 
 SLOW = 1e-3
-"""Rate below which Dahl's absolute value is rounded off [rad/s]."""
+"""Speed below which |v| in Dahl's law is smoothed [rad/s]."""
 
 
 @EFFECTS.register("kelvin_voigt")
@@ -20,16 +20,16 @@ class KelvinVoigt(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Segments."""
+        """Names of the object's segments."""
         return segment_names(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """tau [s]."""
+        """Definition of tau, damping over stiffness [s]."""
         return (Quantity("tau", "s", 0.0, 0.0, 1.0, (0.005, 0.2), "damping over stiffness"),)
 
     def terms(self, state: MidpointState) -> Terms:
-        """See the class."""
+        """The damping force -tau kappa v on the segment's elastic joints."""
         force = ca.SX(state.system.size, 1)
         for spring in segment_springs(state.system, self.location):
             index = state.system.mechanism.joint_index(spring.joint)
@@ -39,7 +39,7 @@ class KelvinVoigt(EffectBase):
 
 @EFFECTS.register("standard_linear_solid")
 class StandardLinearSolid(EffectBase):
-    """A spring and a damper in series beside every spring of a segment, bends and twists.
+    """A spring and a damper in series, parallel to every spring of a segment (bend and twist).
 
     V += 1/2 ratio kappa (q - z)^2 with the massless z creeping after q: (q - z) = relaxation_time dz/dt.
     """
@@ -49,12 +49,12 @@ class StandardLinearSolid(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Segments."""
+        """Names of the object's segments."""
         return segment_names(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Ratio [1] and relaxation_time [s]."""
+        """Definitions of ratio [1] and relaxation_time [s]."""
         return (
             Quantity("ratio", "1", 0.0, 0.0, 5.0, (0.05, 1.0), "stiffness of the branch over that of the spring"),
             Quantity("relaxation_time", "s", 0.5, 1e-3, 100.0, (0.05, 10.0), "of the branch", shape=True),
@@ -62,11 +62,11 @@ class StandardLinearSolid(EffectBase):
 
     @classmethod
     def internal_names(cls, location: str, system: System) -> tuple[str, ...]:
-        """Joints of the segment."""
+        """Names of the segment's elastic joints."""
         return sprung_joints(system, location)
 
     def terms(self, state: MidpointState) -> Terms:
-        """See the class."""
+        """The energy of the additional springs and the relaxation equations of their internal coordinates."""
         energy, equations = ca.SX(0), {}
         for spring in segment_springs(state.system, self.location):
             name = f"{self.label}.{spring.joint}"
@@ -79,7 +79,7 @@ class StandardLinearSolid(EffectBase):
 
 @EFFECTS.register("hysteresis")
 class Hysteresis(EffectBase):
-    """A Dahl element beside every spring of a segment, bends and twists.
+    """A Dahl friction element parallel to every spring of a segment (bend and twist).
 
     F = -stiffness z, dz/dt = v - |v| z / yield_angle, with |v| rounded off below `SLOW`. At the start of a recording
     z = 0: what came before is not known.
@@ -94,12 +94,12 @@ class Hysteresis(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Segments."""
+        """Names of the object's segments."""
         return segment_names(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Stiffness [N m/rad], 0.05 to 1 times that of the bends, and yield_angle [rad]."""
+        """Definitions of stiffness [N m/rad], 0.05 to 1 times the bending stiffness, and yield_angle [rad]."""
         kappa = typical_stiffness(system, location)
         text = "stiffness of the element before it yields"
         return (
@@ -109,11 +109,11 @@ class Hysteresis(EffectBase):
 
     @classmethod
     def internal_names(cls, location: str, system: System) -> tuple[str, ...]:
-        """Joints of the segment."""
+        """Names of the segment's elastic joints."""
         return sprung_joints(system, location)
 
     def terms(self, state: MidpointState) -> Terms:
-        """See the class."""
+        """The forces of the Dahl elements and the equations of their internal coordinates."""
         force, equations, start = ca.SX(state.system.size, 1), {}, {}
         for joint in sprung_joints(state.system, self.location):
             name = f"{self.label}.{joint}"
@@ -127,5 +127,5 @@ class Hysteresis(EffectBase):
 
 
 def sprung_joints(system: System, segment: str) -> tuple[str, ...]:
-    """Joints of a segment that have a spring."""
+    """Names of a segment's joints that have a spring."""
     return tuple(spring.joint for spring in segment_springs(system, segment))

@@ -1,4 +1,4 @@
-"""Springs that differ from the nominal ones, and springs where the nominal model is rigid."""
+"""Errors of the nominal springs, and springs where the nominal model is rigid."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from yid_ocp.model.mechanism import Joint, Placement
 from yid_ocp.model.system import MidpointState, System, Terms
 
 REFERENCE_ANGLE = 0.5
-"""Stands for the largest angle in the data where a range depends on it [rad]."""
+"""Default for the largest angle in the data, on which the range of k3 depends [rad]."""
 SMALLEST_ANGLE = 0.02
-"""A segment that turns less says nothing of how its springs stiffen [rad]."""
+"""Lower limit of the largest angle from which the range of k3 is computed [rad]."""
 RELAXATION = 5e-3
-"""Of mounts and junctions [s]: too short to damp any motion that is seen."""
+"""Relaxation time of mount and junction springs [s]: too short to damp any visible motion."""
 
 _SPRING = Quantity(
     "compliance",
@@ -47,28 +47,28 @@ _SPRING = Quantity(
 
 @EFFECTS.register("cubic_stiffness")
 class CubicStiffness(EffectBase):
-    """Springs of a segment that stiffen (k3 > 0) or soften with the angle: V += 1/4 k3 q^4 on every joint."""
+    """Springs of a segment that stiffen (k3 > 0) or soften (k3 < 0) with angle: V += 1/4 k3 q^4 on every joint."""
 
     equation = "V += 1/4 k3 q^4"
     depends_on = "how far it bends"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Segments."""
+        """Names of the object's segments."""
         return segment_names(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """k3 [N m/rad^3]; its range is -0.5 to 1 times stiffness over the square of the largest angle in the data.
+        """Definition of k3 [N m/rad^3], expected within -0.5 to 1 times stiffness over the squared largest angle.
 
-        That is `REFERENCE_ANGLE` until `expected` is told of another.
+        The largest angle is `REFERENCE_ANGLE` until `expected` is given the one in the data.
         """
         unit = typical_stiffness(system, location) / REFERENCE_ANGLE**2
         text = "cubic stiffness of every joint"
         return (Quantity("k3", "N m/rad^3", 0.0, -10 * unit, 50 * unit, (-0.5 * unit, unit), text),)
 
     def expected(self, largest: Mapping[str, float]) -> CubicStiffness:
-        """See `EffectBase.expected`."""
+        """The effect with the expected range of k3 scaled to the segment's largest angle in the data."""
         if self.location not in largest:
             return self
         factor = (REFERENCE_ANGLE / max(largest[self.location], SMALLEST_ANGLE)) ** 2
@@ -77,7 +77,7 @@ class CubicStiffness(EffectBase):
         return replace(self, quantities=(replace(k3, prior_range=(factor * low, factor * high)),))
 
     def terms(self, state: MidpointState) -> Terms:
-        """See the class."""
+        """The energy of the cubic springs."""
         index = state.system.mechanism.joint_index
         angles = [state.q[index(spring.joint)] for spring in segment_springs(state.system, self.location)]
         return Terms(lagrangian=-self["k3"] / 4 * sum((q**4 for q in angles), ca.SX(0)))
@@ -85,19 +85,19 @@ class CubicStiffness(EffectBase):
 
 @EFFECTS.register("rest_curvature")
 class RestCurvature(EffectBase):
-    """A segment that is bent at rest: V = 1/2 kappa (q - q_rest)^2, the same rest angles at every joint."""
+    """A segment that is bent at rest: V = 1/2 kappa (q - q_rest)^2 with equal rest angles at all its joints."""
 
     equation = "V = 1/2 kappa (q - q_rest)^2"
     depends_on = "how far it bends"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Segments."""
+        """Names of the object's segments."""
         return segment_names(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """qx and qy [rad] per joint, as far as it bends there, beside the rest angles that the model has."""
+        """Definitions of the rest angles qx and qy [rad] that are added at every joint that bends about x or y."""
         axes = {spring.axis for spring in segment_springs(system, location)}
         return tuple(
             Quantity(f"q{axis}", "rad", 0.0, -1.0, 1.0, (-0.3, 0.3), f"rest angle of every joint about {axis}")
@@ -106,7 +106,7 @@ class RestCurvature(EffectBase):
         )
 
     def modify(self, system: System) -> System:
-        """See the class."""
+        """The system with shifted rest angles of the segment's bending springs."""
         changed = {
             spring.joint: replace(spring, rest=spring.rest + self[f"q{spring.axis}"])
             for spring in segment_springs(system, self.location)
@@ -117,24 +117,24 @@ class RestCurvature(EffectBase):
 
 @EFFECTS.register("bend_anisotropy")
 class BendAnisotropy(EffectBase):
-    """A segment that bends more easily one way than the other: kappa_y = kappa_x (1 + ratio)."""
+    """A segment whose bending stiffness differs between x and y: kappa_y = kappa_x (1 + ratio)."""
 
     equation = "kappa_y = kappa_x (1 + ratio)"
     depends_on = "how far it bends"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Segments that bend about x and about y."""
+        """Names of segments that bend about both x and y."""
         bent = {(spring.segment, spring.axis) for spring in system.elastic}
         return tuple(name for name in segment_names(system) if {(name, "x"), (name, "y")} <= bent)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """ratio [1]."""
+        """Definition of ratio, the relative excess of the bending stiffness about y [1]."""
         return (Quantity("ratio", "1", 0.0, -0.9, 3.0, (-0.3, 0.3), "excess of the bending stiffness about y"),)
 
     def modify(self, system: System) -> System:
-        """See the class."""
+        """The system with the segment's stiffness about y multiplied by 1 + ratio."""
         changed = {
             spring.joint: replace(spring, stiffness=spring.stiffness * (1 + self["ratio"]))
             for spring in segment_springs(system, self.location)
@@ -152,12 +152,12 @@ class JointSpring(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Arm joints."""
+        """Names of the arms' joints."""
         return robot_joints(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Stiffness [N m/rad] and rest_angle [rad]."""
+        """Definitions of stiffness [N m/rad] and rest_angle [rad]."""
         size = strength(system, location)
         return (
             Quantity("stiffness", "N m/rad", 0.0, 0.0, 300.0 * size, (0.0, 60.0 * size), "stiffness of the spring"),
@@ -165,14 +165,14 @@ class JointSpring(EffectBase):
         )
 
     def terms(self, state: MidpointState) -> Terms:
-        """See the class."""
+        """The energy of the spring."""
         stretch = state.q[state.system.mechanism.joint_index(self.location)] - self["rest_angle"]
         return Terms(lagrangian=-self["stiffness"] / 2 * stretch**2)
 
 
 @EFFECTS.register("mount_compliance")
 class MountCompliance(EffectBase):
-    """A two-axis rotational spring under the object's foot, massless: it turns about x and y of the first link.
+    """A massless two-axis rotational spring under the object's foot, about x and y of the first link.
 
     It has the relaxation time `RELAXATION`.
     """
@@ -187,11 +187,11 @@ class MountCompliance(EffectBase):
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Compliance [rad/(N m)], reported as stiffness [N m/rad]."""
+        """Definition of the compliance [rad/(N m)], reported as stiffness [N m/rad]."""
         return (_SPRING,)
 
     def modify(self, system: System) -> System:
-        """See the class."""
+        """The system with two compliant joints before the object's first link."""
         for number, first in enumerate(roots(system)[self.location]):
             suffix = "" if number == 0 else f"_{number}"
             system = _sprung(system, (first,), None, f"{self.label}{suffix}", self["compliance"])
@@ -200,7 +200,7 @@ class MountCompliance(EffectBase):
 
 @EFFECTS.register("junction_compliance")
 class JunctionCompliance(EffectBase):
-    """A two-axis rotational spring, massless, between a segment and the branches that leave it at one place.
+    """A massless two-axis rotational spring between a segment and the branches that leave it at one junction.
 
     At `w_PARENT` all branches turn together about x and y of the parent's last link, at `junction_BRANCH` one turns
     about its own. It has the relaxation time `RELAXATION`.
@@ -211,16 +211,16 @@ class JunctionCompliance(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Junctions."""
+        """Names of the junctions."""
         return tuple(junctions(system))
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Compliance [rad/(N m)], reported as stiffness [N m/rad]."""
+        """Definition of the compliance [rad/(N m)], reported as stiffness [N m/rad]."""
         return (_SPRING,)
 
     def modify(self, system: System) -> System:
-        """See the class."""
+        """The system with two compliant joints before the junction's branches."""
         branches = junctions(system)[self.location]
         at = system.mechanism.frame(self.location).placement if self.location.startswith("w_") else None
         return _sprung(system, branches, at, self.label, self["compliance"])

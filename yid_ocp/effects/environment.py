@@ -1,4 +1,4 @@
-"""Gravity and air."""
+"""Effects of gravity and air drag."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from yid_ocp.model.rotations import symbolic_roll_pitch_yaw
 from yid_ocp.model.system import ClosedForce, MidpointState, System, Terms
 
 AIR_DENSITY = 1.2
-"""[kg/m^3]"""
+"""Density of air [kg/m^3]."""
 STILL = 1e-3
-"""Speed below which the drag's absolute value is rounded off [m/s]."""
+"""Speed below which |v_n| in the drag is smoothed [m/s]."""
 
 
 @EFFECTS.register("aerodynamic_drag")
 class AerodynamicDrag(EffectBase):
-    """Drag of a segment's links: F = -J_c' 1/2 rho_air cd 2 r l |v_n| v_n.
+    """Air drag on a segment's links: F = -J_c' 1/2 rho_air cd 2 r l |v_n| v_n.
 
     v_n is the velocity of a link's centre normal to the link, r its radius, l its length; |v_n| is rounded off below
     `STILL`.
@@ -37,16 +37,16 @@ class AerodynamicDrag(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Segments."""
+        """Names of the object's segments."""
         return segment_names(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Drag coefficient cd [1]."""
+        """Definition of the drag coefficient cd [1]."""
         return (Quantity("cd", "1", 0.0, 0.0, 20.0, (0.0, 3.0), "drag coefficient"),)
 
     def terms(self, state: MidpointState) -> Terms:
-        """See the class."""
+        """The drag force on the links with its derivatives in closed form."""
         system, kinematics = state.system, state.kinematics
         tree, segment = system.mechanism, system.segment(self.location)
         velocity = _velocities(kinematics, state.v)
@@ -69,23 +69,23 @@ class AerodynamicDrag(EffectBase):
 
 @EFFECTS.register("gravity_scale")
 class GravityScale(EffectBase):
-    """A fraction of the object's full weight added to what the model has, the inertia unchanged."""
+    """A fraction of the object's full weight added to its weight in the model; inertia is unchanged."""
 
     equation = "V += -fraction x sum of m g.x over the object"
     depends_on = "how it stands against gravity"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """`object`."""
+        """`object`, where there is one."""
         return ("object",) if system.segments else ()
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Fraction [1]."""
+        """Definition of fraction, added weight over full weight [1]."""
         return (Quantity("fraction", "1", 0.0, -2.0, 2.0, (-1.0, 1.0), "weight added over full weight"),)
 
     def modify(self, system: System) -> System:
-        """See the class."""
+        """The system with a scaled weight of the object's bodies."""
         tree, bodies = system.mechanism, {}
         for joint in object_joints(system):
             bodies[joint] = [
@@ -100,7 +100,7 @@ class GravityScale(EffectBase):
 
 @EFFECTS.register("gravity_tilt")
 class GravityTilt(EffectBase):
-    """The gravity vector turned by rx about x, then by ry about y of the world."""
+    """The gravity vector rotated by rx about the world's x axis, then by ry about its y axis."""
 
     equation = "g = Ry(ry) Rx(rx) g_0"
     depends_on = "how it stands against gravity"
@@ -112,16 +112,16 @@ class GravityTilt(EffectBase):
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Rx and ry [rad]."""
+        """Definitions of the angles rx and ry [rad]."""
         return tuple(Quantity(f"r{axis}", "rad", 0.0, -0.5, 0.5, (-0.05, 0.05), f"turn about {axis}") for axis in "xy")
 
     def modify(self, system: System) -> System:
-        """See the class."""
+        """The system with the rotated gravity vector."""
         return replace(system, gravity=symbolic_roll_pitch_yaw(self["rx"], self["ry"]) @ system.gravity)
 
 
 def _velocities(kinematics: Kinematics, v: ca.SX) -> list[ca.SX]:
-    """Spatial velocity of what each joint moves."""
+    """Spatial velocity of each joint's moving side, shape (6, 1) each."""
     result: list[ca.SX] = []
     for j, joint in enumerate(kinematics.mechanism.joints):
         own = kinematics.screws[j] * v[j]
@@ -132,7 +132,7 @@ def _velocities(kinematics: Kinematics, v: ca.SX) -> list[ca.SX]:
 def _on_bodies(
     kinematics: Kinematics, velocity: list[ca.SX], wrenches: dict[int, ca.SX], slopes: dict[int, ca.SX]
 ) -> ClosedForce:
-    """Generalized force of wrenches on bodies, that depend on nothing but their bodies' motion, and its slopes.
+    """Generalized force of wrenches that depend only on their body's motion, with its derivatives.
 
     With W_j and K_j the sum of wrenches, and of their slopes by the bodies' spatial velocity, over all that joint j
     moves, S_j its screw and D_j = V_parent(j) x S_j, for i an ancestor of j or j itself:

@@ -10,72 +10,72 @@ from yid_ocp.effects.base import EFFECTS, SMOOTHING, EffectBase, Quantity, on_jo
 from yid_ocp.model.system import MidpointState, System, Terms
 
 STILL = 1e-7
-"""Angle turned in a step below which Dahl's absolute value is rounded off [rad]."""
+"""Angle turned in a step below which |d| in Dahl's law is smoothed [rad]."""
 NEAR = 1e-2
-"""Part of the yield angle up to which a series takes the place of what would lose digits there."""
+"""Ratio of step angle to yield angle below which a power series replaces the exponential, which loses digits there."""
 
 
 @EFFECTS.register("joint_viscous")
 class JointViscous(EffectBase):
-    """F = -b v, beside the model's damping."""
+    """Viscous friction F = -b v in addition to the model's damping."""
 
     equation = "F = -b v"
     depends_on = "how fast it moves"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Arm joints."""
+        """Names of the arms' joints."""
         return robot_joints(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """b [N m s/rad]."""
+        """Definition of b [N m s/rad]."""
         size = strength(system, location)
         return (Quantity("b", "N m s/rad", 0.0, 0.0, 10.0 * size, (0.0, 2.0 * size), "viscous friction"),)
 
     def terms(self, state: MidpointState) -> Terms:
-        """See the class."""
+        """The viscous friction of the joint."""
         return _friction(self, state, lambda v: self["b"] * v)
 
 
 @EFFECTS.register("joint_coulomb")
 class JointCoulomb(EffectBase):
-    """F = -tau_c tanh(v/v_s), v_s = `SMOOTHING`."""
+    """Coulomb friction F = -tau_c tanh(v/v_s), v_s = `SMOOTHING`."""
 
     equation = "F = -tau_c tanh(v/v_s)"
     depends_on = "how fast it moves"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Arm joints."""
+        """Names of the arms' joints."""
         return robot_joints(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """tau_c [N m], up to a fifth of the joint's effort limit."""
+        """Definition of tau_c [N m], expected up to a fifth of the joint's effort limit."""
         size = strength(system, location)
         return (Quantity("tau_c", "N m", 0.0, 0.0, 10.0 * size, (0.0, 2.0 * size), "sliding friction"),)
 
     def terms(self, state: MidpointState) -> Terms:
-        """See the class."""
+        """The Coulomb friction of the joint."""
         return _friction(self, state, lambda v: self["tau_c"] * ca.tanh(v / SMOOTHING))
 
 
 @EFFECTS.register("joint_stribeck")
 class JointStribeck(EffectBase):
-    """F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s), v_s = `SMOOTHING`: what sticking adds to sliding friction."""
+    """Stribeck friction F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s), v_s = `SMOOTHING`, beside Coulomb friction."""
 
     equation = "F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s)"
     depends_on = "how fast it moves"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Arm joints."""
+        """Names of the arms' joints."""
         return robot_joints(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """tau_s [N m] and v_stribeck [rad/s]."""
+        """Definitions of tau_s [N m] and v_stribeck [rad/s]."""
         size, text = strength(system, location), "friction at low speed beside sliding friction"
         return (
             Quantity("tau_s", "N m", 0.0, 0.0, 10.0 * size, (0.0, 2.0 * size), text),
@@ -83,14 +83,14 @@ class JointStribeck(EffectBase):
         )
 
     def terms(self, state: MidpointState) -> Terms:
-        """See the class."""
+        """The Stribeck friction of the joint."""
         width = self["v_stribeck"]
         return _friction(self, state, lambda v: self["tau_s"] * ca.exp(-((v / width) ** 2)) * ca.tanh(v / SMOOTHING))
 
 
 @EFFECTS.register("joint_presliding")
 class JointPresliding(EffectBase):
-    """Friction that holds at rest (Dahl): F = -tau_c s, ds/dt = (v - |v| s) / yield_angle.
+    """Friction that also holds at rest (Dahl): F = -tau_c s, ds/dt = (v - |v| s) / yield_angle.
 
     s follows the angle, not time: over a step of d = h v
 
@@ -113,12 +113,12 @@ class JointPresliding(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Arm joints."""
+        """Names of the arms' joints."""
         return robot_joints(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """tau_c [N m], up to a fifth of the joint's effort limit, and yield_angle [rad]."""
+        """Definitions of tau_c [N m], expected up to a fifth of the effort limit, and yield_angle [rad]."""
         size = strength(system, location)
         return (
             Quantity("tau_c", "N m", 0.0, 0.0, 10.0 * size, (0.0, 2.0 * size), "friction that holds and slides"),
@@ -127,16 +127,16 @@ class JointPresliding(EffectBase):
 
     @classmethod
     def internal_names(cls, location: str, system: System) -> tuple[str, ...]:
-        """`s`, the part of tau_c that acts."""
+        """`s`, the acting fraction of tau_c, from -1 to 1."""
         return ("s",)
 
     @property
     def unknown_at_start(self) -> Mapping[str, float]:
-        """See the class."""
+        """`s` with the bound 1: its value at the start of a recording is estimated."""
         return dict.fromkeys(self.internal, 1.0)
 
     def terms(self, state: MidpointState) -> Terms:
-        """See the class."""
+        """The friction force and the update equation of s."""
         [name] = self.internal
         row, index = state.internal[name], state.system.mechanism.joint_index(self.location)
         s, rate, width = state.z[row], state.z_rate[row], self["yield_angle"]

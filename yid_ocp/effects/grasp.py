@@ -1,4 +1,4 @@
-"""Grasps that sit elsewhere, give way or slip."""
+"""Grasps that are displaced, compliant or slipping."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from yid_ocp.model.system import Grasp, MidpointState, System, Terms
 
 @EFFECTS.register("grasp_offset")
 class GraspOffset(EffectBase):
-    """The grasped point sits at (dx, dy, dz) beside its nominal place in the gripper's frame."""
+    """The grasped point displaced by (dx, dy, dz) from its nominal position, in the gripper's frame."""
 
     equation = "phi = (holder + R (dx, dy, dz)) - held"
     depends_on = "how hard it pulls at its ends"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Grasps."""
+        """Names of the grasps."""
         return grasp_names(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """dx, dy, dz [m]."""
+        """Definitions of dx, dy and dz [m]."""
         return tuple(
             Quantity(f"d{axis}", "m", 0.0, -0.1, 0.1, (-0.02, 0.02), f"shift along the gripper's {axis}")
             for axis in "xyz"
         )
 
     def modify(self, system: System) -> System:
-        """See the class."""
+        """The system with the displaced grasp."""
         grasp = _grasp(system, self.location)
         shift = ca.vertcat(*(self[f"d{axis}"] for axis in "xyz"))
         return with_grasp(system, replace(grasp, offset=grasp.offset + shift))
@@ -39,7 +39,7 @@ class GraspOffset(EffectBase):
 
 @EFFECTS.register("grasp_compliance")
 class GraspCompliance(EffectBase):
-    """A spring and a damper in place of the constraint: f = phi/C + damping dphi/dt, phi = gripper - object.
+    """A spring-damper in place of the rigid constraint: f = phi/C + damping dphi/dt, phi = gripper - object.
 
     In a step: phi(q_{k+1}) + C damping (phi(q_{k+1}) - phi(q_k))/h = C lam_k/h, regular at C = 0, where it is the rigid
     grasp. The stretch is taken at the end of the step, which by itself damps what is fast against it. Every row of the
@@ -51,12 +51,12 @@ class GraspCompliance(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Grasps."""
+        """Names of the grasps."""
         return grasp_names(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Compliance [m/N], reported as stiffness [N/m], and damping [N s/m]."""
+        """Definitions of compliance [m/N], reported as stiffness [N/m], and damping [N s/m]."""
         text = "compliance of the grasp"
         return (
             Quantity("compliance", "m/N", 0.0, 0.0, 0.1, (1e-4, 1e-2), text, reciprocal="stiffness N/m"),
@@ -64,7 +64,7 @@ class GraspCompliance(EffectBase):
         )
 
     def modify(self, system: System) -> System:
-        """See the class."""
+        """The system with the compliant grasp."""
         grasp = _grasp(system, self.location)
         compliance = grasp.compliance + self["compliance"]
         own = self["compliance"] * self["damping"]
@@ -85,27 +85,27 @@ class GraspSlip(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Grasps."""
+        """Names of the grasps."""
         return grasp_names(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """slip_per_load [m/(N s)]."""
+        """Definition of slip_per_load [m/(N s)]."""
         text = "creep rate per axial load"
         return (Quantity("slip_per_load", "m/(N s)", 0.0, 0.0, 0.1, (0.0, 0.01), text),)
 
     @classmethod
     def internal_names(cls, location: str, system: System) -> tuple[str, ...]:
-        """The offset along the tube."""
+        """`offset`, the slipped distance along the tube."""
         return ("offset",)
 
     def modify(self, system: System) -> System:
-        """See the class."""
+        """The system with the slipped distance as the grasp's slip."""
         grasp = _grasp(system, self.location)
         return with_grasp(system, replace(grasp, slip=grasp.slip - self.internal[f"{self.label}.offset"]))
 
     def terms(self, state: MidpointState) -> Terms:
-        """See the class."""
+        """The creep equation of the slipped distance."""
         name = f"{self.label}.offset"
         row, at = state.internal[name], 0
         for grasp in state.system.grasps:

@@ -1,4 +1,4 @@
-"""Masses, inertias and lengths that differ from the nominal ones."""
+"""Masses, inertias and lengths that differ from their nominal values."""
 
 from __future__ import annotations
 
@@ -30,46 +30,46 @@ from yid_ocp.model.mechanism import Inertia
 from yid_ocp.model.system import MidpointState, System, Terms
 
 REACH = 0.5
-"""How far from its frame a payload's mass may sit [m]."""
+"""Largest distance of a payload's mass from its frame [m]."""
 SHIFT = 0.05
-"""By how much the centre of a link may be elsewhere than the model has it, without any mass added [m]."""
+"""Largest shift of a link's centre of mass without added mass [m]."""
 REMOVABLE = 0.9
-"""Part of a link's mass that may turn out not to be there."""
+"""Largest fraction of a link's mass that a negative payload may remove."""
 FAR = 2.0
 """Distance beyond which a payload's own inertia is no longer that of a point [m]."""
 LIGHT = 1e-2
 """Mass below which a payload has no inertia of its own [kg]."""
 FREE = 0.95
-"""Part of a payload's moments above which the limit of its place hardly counts."""
+"""Reported fraction of a payload's moments above which the limit of its position is negligible."""
 THIN = 1e-3
-"""Least root mean square extent of a link [m]."""
+"""Smallest root mean square extent of a link [m]."""
 
 
 @EFFECTS.register("density")
 class Density(EffectBase):
-    """All masses and inertias of a segment times a factor."""
+    """All masses and inertias of a segment multiplied by a factor."""
 
     equation = "masses and inertias times scale"
     depends_on = "how hard it accelerates"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Segments."""
+        """Names of the object's segments."""
         return segment_names(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Scale [1]."""
+        """Definition of scale, the factor on masses and inertias [1]."""
         return (Quantity("scale", "1", 1.0, 0.2, 3.0, (0.7, 1.3), "factor on masses and inertias"),)
 
     def modify(self, system: System) -> System:
-        """See the class."""
+        """The system with the segment's scaled bodies."""
         return _scaled(system, [joint for link in system.segment(self.location).links for joint in link], self["scale"])
 
 
 @EFFECTS.register("link_mass")
 class LinkMass(EffectBase):
-    """Mass and inertia of what an arm joint carries, up to the next joint, times a factor."""
+    """Mass and inertia of an arm joint's child link multiplied by a factor."""
 
     equation = "mass and inertia of the child link times scale"
     depends_on = "how hard it accelerates"
@@ -77,23 +77,23 @@ class LinkMass(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Arm joints that carry mass."""
+        """Names of arm joints whose child link has mass."""
         tree = system.mechanism
         return tuple(name for name in robot_joints(system) if tree.joints[tree.joint_index(name)].bodies)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Scale [1]."""
+        """Definition of scale, the factor on mass and inertia [1]."""
         return (Quantity("scale", "1", 1.0, 0.2, 3.0, (0.8, 1.2), "factor on mass and inertia"),)
 
     def modify(self, system: System) -> System:
-        """See the class."""
+        """The system with the scaled link."""
         return _scaled(system, [self.location], self["scale"])
 
 
 @EFFECTS.register("point_mass")
 class PointMass(EffectBase):
-    """A point of some mass fixed to a frame: T += 1/2 mass |v|^2, V += -mass g.x."""
+    """A point mass fixed to a frame: T += 1/2 mass |v|^2, V += -mass g.x."""
 
     equation = "T += 1/2 mass |v|^2, V -= mass g.x"
     depends_on = "how hard it accelerates"
@@ -101,24 +101,24 @@ class PointMass(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """All named points that move."""
+        """Names of all moving frames."""
         return tuple(name for name, frame in system.mechanism.frames.items() if frame.joint >= 0)
 
     @classmethod
     def likely(cls, system: System) -> tuple[str, ...]:
-        """Tips of segments, junctions, and where an arm's links end."""
+        """Names of segment tips, junctions and ends of arm links."""
         tree = system.mechanism
         ends = (f"{prefix}_{s.name}" for s in system.segments for prefix in ("w", "junction"))
         return (*(name for name in ends if name in tree.frames), *link_ends(system))
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Mass [kg]: on the object up to the object's own, on an arm as much as that can bear."""
+        """Definition of mass [kg], up to the object's mass on the object and up to the arm's payload on an arm."""
         upper, expected = _bearable(system, location)
         return (Quantity("mass", "kg", 0.0, 0.0, upper, (0.0, expected), "mass of the point"),)
 
     def modify(self, system: System) -> System:
-        """See the class."""
+        """The system with the added point mass."""
         frame = system.mechanism.frame(self.location)
         joint = system.mechanism.joints[frame.joint]
         point = Inertia(self["mass"], frame.placement.translation, ca.SX(ca.DM.zeros(3, 3)))
@@ -127,7 +127,7 @@ class PointMass(EffectBase):
 
 @EFFECTS.register("payload")
 class Payload(EffectBase):
-    """A mass at (mx, my, mz)/mass in a frame, moving with it; a negative one is a part that the model has in excess.
+    """A mass at (mx, my, mz)/mass in a frame, moving with it; a negative mass removes excess mass of the model.
 
     The place is within `REACH` of the frame: moments beyond L = sqrt((`REACH` mass)^2 + (`SHIFT` M)^2) do not grow any
     more, s = (mx, my, mz) (1 + (|(mx, my, mz)|/L)^8)^(-1/8), and s is what is reported. M, C and Sigma are mass, centre
@@ -148,17 +148,17 @@ class Payload(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """All named points that move."""
+        """Names of all moving frames."""
         return tuple(name for name, frame in system.mechanism.frames.items() if frame.joint >= 0)
 
     @classmethod
     def likely(cls, system: System) -> tuple[str, ...]:
-        """One frame on every link of an arm: loads at two frames of one link differ in nothing but their numbers."""
+        """One frame per arm link: payloads at two frames of one link are equivalent."""
         return link_frames(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Mass [kg], down to `REMOVABLE` of the link's taken away, and mx, my, mz [kg m], `REACH` times as much."""
+        """Definitions of mass [kg], from -`REMOVABLE` times the link's, and of first moments mx, my, mz [kg m]."""
         upper, expected = _bearable(system, location)
         lower = -REMOVABLE * carried(system, system.mechanism.frame(location).joint).mass
         moments = (
@@ -176,7 +176,10 @@ class Payload(EffectBase):
         return (Quantity("mass", "kg", 0.0, lower, upper, (lower, expected), "mass added to the link"), *moments)
 
     def elsewhere(self, start: Mapping[str, float]) -> Mapping[str, float] | None:
-        """With the other sign of the mass as well, `REACH` away: next to nothing no second moment tells them apart."""
+        """A start with the opposite sign of mass, at the distance `REACH`; None where the mass is zero.
+
+        Near zero mass no second moment distinguishes the two signs.
+        """
         mass, *moments = (start.get(f"{self.label}.{quantity.name}", 0.0) for quantity in self.quantities)
         own = self.quantities[0]
         other = float(np.clip(-math.copysign(np.linalg.norm(moments) / REACH, mass), own.lower, own.upper))
@@ -185,7 +188,7 @@ class Payload(EffectBase):
     def reported(
         self, values: Mapping[str, float] | None = None, stds: Mapping[str, float] | None = None
     ) -> dict[str, Reported]:
-        """The moments as they act; without a standard deviation where the limit of their place keeps them."""
+        """Mass and acting first moments; the moments have no standard deviation where the position limit is active."""
         found = super().reported(values, stds)
         mass, *moments = (found[quantity.name].value for quantity in self.quantities)
         own = -self.quantities[0].lower / REMOVABLE
@@ -196,7 +199,7 @@ class Payload(EffectBase):
         return found
 
     def modify(self, system: System) -> System:
-        """See the class."""
+        """The system with the payload's mass, first and second moments added to its link."""
         frame = system.mechanism.frame(self.location)
         joint, link = system.mechanism.joints[frame.joint], carried(system, frame.joint)
         mass, centre = self["mass"], ca.SX(ca.DM(link.com))
@@ -215,7 +218,7 @@ class Payload(EffectBase):
 
 
 def _kept(mass: ca.SX, moment: ca.SX, own: float) -> ca.SX:
-    """Part of the first moments that acts; see `Payload`."""
+    """Fraction of the first moments that acts; see `Payload`."""
     most = (REACH * mass) ** 2 + (SHIFT * max(own, 1.0)) ** 2
     return (1 + (ca.dot(moment, moment) / most) ** 4) ** (-1 / 8)
 
@@ -235,7 +238,7 @@ def _spread(mass: ca.SX, first: ca.SX, link: Carried) -> ca.SX:
 
 
 def _bearable(system: System, frame: str) -> tuple[float, float]:
-    """Largest mass at a frame, and the largest that one would expect [kg]."""
+    """Upper bound and expected maximum of a mass at a frame [kg]."""
     tree = system.mechanism
     joint = tree.frame(frame).joint
     if segment_of_frame(system, frame) is not None:
@@ -248,47 +251,47 @@ def _bearable(system: System, frame: str) -> tuple[float, float]:
 
 @EFFECTS.register("length_scale")
 class LengthScale(EffectBase):
-    """Link lengths of a segment times a factor; its mass stays."""
+    """Link lengths of a segment multiplied by a factor; its mass is unchanged."""
 
     equation = "link lengths times scale"
     depends_on = "how long it is"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Segments whose length is a parameter."""
+        """Names of segments whose length is a parameter."""
         return tuple(name for name in segment_names(system) if _lengths(system, name))
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Scale [1]."""
+        """Definition of scale, the factor on link lengths [1]."""
         return (Quantity("scale", "1", 1.0, 0.8, 1.2, (0.97, 1.03), "factor on link lengths"),)
 
     def modify(self, system: System) -> System:
-        """See the class."""
+        """The system with scaled link lengths."""
         old = [system.parameters[name].symbol for name in _lengths(system, self.location)]
         return substituted(system, old, [symbol * self["scale"] for symbol in old])
 
 
 @EFFECTS.register("rotor_inertia")
 class RotorInertia(EffectBase):
-    """Inertia of a motor's rotor, seen at its joint: T += 1/2 armature v^2."""
+    """Inertia of a motor's rotor, reflected to its joint: T += 1/2 armature v^2."""
 
     equation = "T += 1/2 armature v^2"
     depends_on = "how hard it accelerates"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Arm joints."""
+        """Names of the arms' joints."""
         return robot_joints(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Armature [kg m^2]."""
+        """Definition of armature [kg m^2]."""
         size, text = strength(system, location), "inertia of the rotor at the joint"
         return (Quantity("armature", "kg m^2", 0.0, 0.0, 5.0 * size, (0.0, size), text),)
 
     def terms(self, state: MidpointState) -> Terms:
-        """See the class."""
+        """The kinetic energy of the rotor."""
         v = state.v[state.system.mechanism.joint_index(self.location)]
         return Terms(lagrangian=self["armature"] / 2 * v**2)
 

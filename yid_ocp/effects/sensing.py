@@ -1,4 +1,4 @@
-"""Encoders, cameras and clocks that read something else than what is.
+"""Errors of encoders, cameras and clocks.
 
 A group of points is a camera's when its sensor has a pose. Points stand in the world frame in a recording, and so do
 offsets and turns here; only the camera's place and where it looks matter of its pose.
@@ -32,27 +32,27 @@ class EncoderOffset(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Arm joints that are driven or prescribed."""
+        """Names of arm joints that are driven or prescribed."""
         known = {*system.driven, *system.prescribed}
         return tuple(name for name in robot_joints(system) if name in known)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Offset [rad]."""
+        """Definition of the offset, measured minus true angle [rad]."""
         return (Quantity("offset", "rad", 0.0, -0.3, 0.3, (-0.035, 0.035), "measured less true angle"),)
 
     def measure(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
-        """See the class."""
+        """The recorded angle: the true angle plus the offset."""
         return output + self["offset"] if channel == f"joints.position.{self.location}" else output
 
     def correct(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
-        """See the class."""
+        """The true angle: the recorded angle minus the offset."""
         return reading - self["offset"] if channel == f"joints.position.{self.location}" else reading
 
 
 @EFFECTS.register("camera_translation")
 class CameraTranslation(EffectBase):
-    """Seen point = true point + (x, y, z), along the world's axes."""
+    """Constant offset of seen points: seen = true + (x, y, z), along the world's axes."""
 
     equation = "seen point = true + (x, y, z)"
     depends_on = "where the camera stands"
@@ -60,22 +60,22 @@ class CameraTranslation(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """`camera`."""
+        """`camera`, where the system has points."""
         return _camera(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """x, y, z [m]."""
+        """Definitions of the offsets x, y and z, seen minus true [m]."""
         return tuple(Quantity(axis, "m", 0.0, -0.3, 0.3, (-0.03, 0.03), f"seen less true {axis}") for axis in "xyz")
 
     def measure(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
-        """See the class."""
+        """The seen point: the true point plus (x, y, z); other sensors' readings are unchanged."""
         return output if state.camera is None else output + ca.vertcat(*(self[axis] for axis in "xyz"))
 
 
 @EFFECTS.register("camera_rotation")
 class CameraRotation(EffectBase):
-    """Seen point = true point turned about the camera's origin, by Rz(rz) Ry(ry) Rx(rx) in the world's axes."""
+    """Seen points rotated about the camera's origin by Rz(rz) Ry(ry) Rx(rx), in the world's axes."""
 
     equation = "seen point = c + R (true - c)"
     depends_on = "where the camera stands"
@@ -83,16 +83,16 @@ class CameraRotation(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """`camera`."""
+        """`camera`, where the system has points."""
         return _camera(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Rx, ry, rz [rad]."""
+        """Definitions of the angles rx, ry and rz [rad]."""
         return tuple(Quantity(f"r{axis}", "rad", 0.0, -0.5, 0.5, (-0.06, 0.06), f"turn about {axis}") for axis in "xyz")
 
     def measure(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
-        """See the class."""
+        """The true point rotated about the camera's origin; other sensors' readings are unchanged."""
         if state.camera is None:
             return output
         turn = symbolic_roll_pitch_yaw(self["rx"], self["ry"], self["rz"])
@@ -101,7 +101,7 @@ class CameraRotation(EffectBase):
 
 @EFFECTS.register("camera_scale")
 class CameraScale(EffectBase):
-    """Depth times scale: a pixel's ray stays, so that the whole vector from the camera to the point is scaled."""
+    """Depth error: the vector from the camera to the seen point is scaled, so that its pixel stays."""
 
     equation = "seen point = c + scale (true - c)"
     depends_on = "where the camera stands"
@@ -109,16 +109,16 @@ class CameraScale(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """`camera`."""
+        """`camera`, where the system has points."""
         return _camera(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Scale [1]."""
+        """Definition of scale, seen over true depth [1]."""
         return (Quantity("scale", "1", 1.0, 0.8, 1.2, (0.97, 1.03), "seen over true depth"),)
 
     def measure(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
-        """See the class."""
+        """The point with its scaled vector from the camera; other sensors' readings are unchanged."""
         if state.camera is None:
             return output
         return state.camera.translation + self["scale"] * (output - state.camera.translation)
@@ -126,7 +126,7 @@ class CameraScale(EffectBase):
 
 @EFFECTS.register("camera_latency")
 class CameraLatency(EffectBase):
-    """Seen point = where it was delay ago."""
+    """Seen points are late: seen(t) = true(t - delay)."""
 
     equation = "seen point(t) = true point(t - delay)"
     depends_on = "when it is read"
@@ -134,16 +134,16 @@ class CameraLatency(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """`camera`."""
+        """`camera`, where the system has points."""
         return _camera(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Delay [s]."""
+        """Definition of the delay of seen points [s]."""
         return (Quantity("delay", "s", 0.0, 0.0, 0.5, (0.0, 0.15), "how long ago the point was there"),)
 
     def delay(self, channel: str, camera: bool) -> ca.SX:
-        """See the class."""
+        """The delay for cameras, zero for other sensors [s]."""
         return self["delay"] if camera else ca.SX(0)
 
 
@@ -157,16 +157,16 @@ class SurfaceOffset(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """`camera`."""
+        """`camera`, where the system has points and segments."""
         return _camera(system) if system.segments else ()
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Fraction [1]."""
+        """Definition of fraction, distance from the tube's axis over its radius [1]."""
         return (Quantity("fraction", "1", 0.0, 0.0, 1.5, (0.0, 1.0), "distance from the axis over the radius"),)
 
     def measure(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
-        """See the class."""
+        """The point shifted towards the camera by a fraction of the tube's radius; others are unchanged."""
         segment = None if state.frame is None else segment_of_frame(state.system, state.frame)
         if state.camera is None or segment is None:
             return output
@@ -176,7 +176,7 @@ class SurfaceOffset(EffectBase):
 
 @EFFECTS.register("clock_scale")
 class ClockScale(EffectBase):
-    """Recorded time = true time x scale, for a recording whose clock is only nominal."""
+    """Recorded time = true time x scale, for a recording with a nominal clock."""
 
     equation = "recorded time = true x scale"
     depends_on = "when it is read"
@@ -189,11 +189,11 @@ class ClockScale(EffectBase):
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Scale [1]."""
+        """Definition of scale, recorded over true time [1]."""
         return (Quantity("scale", "1", 1.0, 0.7, 1.4, (0.9, 1.1), "recorded over true time"),)
 
     def modify(self, system: System) -> System:
-        """See the class."""
+        """The system with its time step divided by scale."""
         return replace(system, time_scale=system.time_scale / self["scale"])
 
 

@@ -1,4 +1,4 @@
-"""Position servos that are not what their data sheet says: weaker or stronger, later, with less torque."""
+"""Position servos that deviate from their data sheet: gain, delay, torque limit."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from yid_ocp.model.system import System
 
 POSITION = frozenset({"joints.position"})
 UNKNOWN_LIMIT = 10.0
-"""What stands for the effort limit of a joint that has none [N m or N]."""
+"""Assumed effort limit of a joint that has none [N m or N]."""
 WEAKEST = 0.1
-"""Part of a joint's effort limit below which none is looked for."""
+"""Smallest torque limit that is searched, as a fraction of the joint's effort limit."""
 
 
 @EFFECTS.register("servo_gain")
 class ServoGain(EffectBase):
-    """What a servo demands times scale, of errors and rates alike: another gain, supply voltage or motor."""
+    """A servo's demanded torque multiplied by scale: another gain, supply voltage or motor."""
 
     equation = "demand = scale (gain (u - q) - damping v)"
     depends_on = "how hard it accelerates"
@@ -28,23 +28,23 @@ class ServoGain(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Joints with a servo."""
+        """Names of joints with a servo."""
         return _commanded(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Scale [1]."""
+        """Definition of scale, true over nominal servo torque [1]."""
         return (Quantity("scale", "1", 1.0, 0.05, 20.0, (0.3, 3.0), "true over nominal torque of the servo"),)
 
     def modify(self, system: System) -> System:
-        """See the class."""
+        """The system with the servo's gain and damping multiplied by scale."""
         servo, scale = system.servos[self.location], self["scale"]
         return _with(system, self.location, replace(servo, gain=servo.gain * scale, damping=servo.damping * scale))
 
 
 @EFFECTS.register("servo_delay")
 class ServoDelay(EffectBase):
-    """Commands act later than the model's servo has it."""
+    """Commands act later than the nominal servo delay."""
 
     equation = "the command that acts at t was given at t - servo_delay - delay"
     depends_on = "when it is read"
@@ -52,22 +52,22 @@ class ServoDelay(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Joints with a servo."""
+        """Names of joints with a servo."""
         return _commanded(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Delay [s]."""
+        """Definition of the delay in addition to the nominal servo delay [s]."""
         return (Quantity("delay", "s", 0.0, -0.2, 0.5, (0.0, 0.2), "how late commands act beyond the servo's delay"),)
 
     def delay(self, channel: str, camera: bool) -> ca.SX:
-        """See the class."""
+        """The added delay for the joint's command, zero for other channels [s]."""
         return self["delay"] if channel == f"torque.{self.location}" else ca.SX(0)
 
 
 @EFFECTS.register("servo_saturation")
 class ServoSaturation(EffectBase):
-    """A servo whose torque is limited further: demand / (1 + |demand/limit|^16)^(1/16).
+    """An additional torque limit of a servo: demand / (1 + |demand/limit|^16)^(1/16).
 
     Kept inside as limit^-16, which adds to the model's own limit, is neutral at zero and has a slope there: of the
     largest torques first. From a tenth beside the limit on it is within 1.2 % of a clip.
@@ -79,12 +79,12 @@ class ServoSaturation(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Joints with a servo."""
+        """Names of joints with a servo."""
         return _commanded(system)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Tightness, reported as the limit, from some per cent of the joint's effort limit on."""
+        """Definition of tightness = limit^-16, reported as limit, at least `WEAKEST` times the effort limit."""
         joint = system.mechanism.joints[system.mechanism.joint_index(location)]
         known = joint.effort_limit if 0 < joint.effort_limit < NO_LIMIT else UNKNOWN_LIMIT
         torque = "N m" if joint.unit == "rad" else "N"
@@ -97,7 +97,7 @@ class ServoSaturation(EffectBase):
         )
 
     def modify(self, system: System) -> System:
-        """See the class."""
+        """The system with the tighter torque limit of the servo."""
         servo = system.servos[self.location]
         return _with(system, self.location, replace(servo, tightness=servo.tightness + self["tightness"]))
 

@@ -1,1 +1,1 @@
-"""Recordings written in other formats; one file a format."""
+"""Export of recordings, models and equations; one file per format."""

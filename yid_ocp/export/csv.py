@@ -1,4 +1,4 @@
-"""Recordings as tables of comma-separated values."""
+"""Export of recordings as CSV tables."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def export_csv(recording: Recording, folder: str | os.PathLike[str]) -> tuple[Pa
     recording : Recording
         What to write, in SI units.
     folder : path-like
-        Where to; made where absent.
+        Target folder, created if absent.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""The equations of a step as CasADi functions: `.casadi` files, C, and the names of what goes in and comes out."""
+"""Export of the equations of a step as CasADi functions: `.casadi` files, C, and names of inputs and outputs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ARGUMENTS = ("q0", "q1", "p0", "z0", "z1", "lam", "u", "theta", "time_step")
 
 
 def step_exports(symbols: StepSymbols) -> tuple[ca.Function, ...]:
-    """The functions that `export_functions` writes.
+    """The CasADi functions of a step that `export_functions` writes.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""A LaTeX sheet of a step's equations with numbers filled in."""
+"""LaTeX document of a step's equations with parameter values filled in."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ RULES = {
         r" - \tfrac12 \left( D\varphi(q_m) - D\varphi(q_{k+1}) \right)^{T} \lambda_k",
     ),
 }
-"""Force and pull in the balance, and in the momentum after the step, by `force_split` and `constraint_force`."""
+"""LaTeX of force and constraint terms in the balance and in p1, by `force_split` and `constraint_force`."""
 
 
 def write_sheet(path: Path, symbols: StepSymbols, theta: Array, free: Sequence[str], time_step: float) -> None:
-    """Write the sheet; `OutputError` where that cannot be done.
+    """Write the LaTeX document of a step's equations; `OutputError` if the file cannot be written.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def write_sheet(path: Path, symbols: StepSymbols, theta: Array, free: Sequence[s
     theta : ndarray, shape (ntheta,)
         Values filled in for all parameters but the free ones.
     free : sequence of str
-        Parameters that stay letters; their values stand in a table.
+        Parameters that stay symbols; a table lists their values.
     time_step : float
         h [s]
     """

@@ -1,4 +1,4 @@
-"""What of a model a format can say: for every parameter and effect native, emulated or not representable."""
+"""Support of an export format for each parameter and effect: native, emulated or not representable."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ FORMAT = "yid-export/1"
 
 @dataclass(frozen=True)
 class Said:
-    """How a format takes something, and why not where it does not."""
+    """Support of a format for one parameter or effect, with its means or the reason against."""
 
     status: Status
     how: str
 
     @staticmethod
     def worst(parts: Iterable[Said]) -> Said:
-        """Of several things that belong together: the worst status, and the words of those that have it."""
+        """The worst status of several parts that belong together, with the explanations of those that have it."""
         known = list(parts)
         status = max((part.status for part in known), key=_ORDER.index)
         return Said(status, "; ".join(dict.fromkeys(part.how for part in known if part.status == status)))
@@ -75,7 +75,7 @@ TABLES: Mapping[str, Mapping[str, Said]] = {
     }
     for name, table in (("mjcf", _MJCF), ("urdf", _URDF), ("sdf", _SDF))
 }
-"""By format and aspect."""
+"""Support by format and aspect."""
 
 _READING = Said("not representable", f"{ASPECTS['reading']}: correct the readings instead")
 _NEUTRAL = Said("native", "neutral: it changes nothing and is left out")
@@ -83,7 +83,7 @@ _UNUSED = Said("native", "it enters nothing in this model")
 
 
 def said_of_effects(system: System, values: Mapping[str, float], form: str) -> dict[str, Said]:
-    """What a format makes of every effect of a system, by label.
+    """Support of a format for every effect of a system, by label.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def _neutral(effect: Any) -> dict[str, float]:
 
 
 def said_of_parameters(system: System, effects: Mapping[str, Said], form: str) -> dict[str, Said]:
-    """What a format makes of every parameter; of an effect's what it makes of the effect."""
+    """Support of a format for every parameter; an effect's parameters have the support of the effect."""
     found = {}
     for entry in system.parameters:
         owner = entry.name.rpartition(".")[0]

@@ -1,4 +1,4 @@
-"""Signals over time as messages of ROS 2 in one MCAP file, for Foxglove, PlotJuggler and whatever reads bags."""
+"""Export of signals as ROS 2 messages in one MCAP file, for Foxglove, PlotJuggler and other bag readers."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ WORLD = "world"
 
 @dataclass(frozen=True)
 class Signal:
-    """What one topic tells.
+    """Time series of one ROS topic.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class Signal:
     names : sequence of str
         Of the joints.
     frame : str
-        In which places and vectors are.
+        Coordinate frame of points and vectors.
     """
 
     topic: str
@@ -66,7 +66,7 @@ def export_mcap(signals: Sequence[Signal], path: str | os.PathLike[str]) -> floa
     Returns
     -------
     float
-        What was added to all times, because stamps cannot be negative: whole seconds, zero for most [s].
+        Shift added to all times because stamps cannot be negative: whole seconds, usually zero [s].
 
     Raises
     ------
@@ -107,7 +107,7 @@ def export_mcap(signals: Sequence[Signal], path: str | os.PathLike[str]) -> floa
 
 
 def recorded_signals(recording: Recording) -> list[Signal]:
-    """What a recording holds: `/joint_states`, `/joint_commands`, `/external_efforts` and `/points/GROUP/POINT`."""
+    """The signals of a recording: `/joint_states`, `/joint_commands`, `/external_efforts` and `/points/GROUP/POINT`."""
     found: list[Signal] = []
     for group in recording.groups:
         if isinstance(group, JointGroup):

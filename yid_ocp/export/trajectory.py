@@ -1,4 +1,4 @@
-"""Motions of joints as a message that robot controllers take."""
+"""Joint trajectories as a ROS message for robot controllers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def joint_trajectory(
     acceleration: NDArray,
     effort: NDArray,
 ) -> dict[str, Any]:
-    """A motion in the form of ROS's trajectory_msgs/JointTrajectory.
+    """A joint trajectory as a dict in the form of ROS's trajectory_msgs/JointTrajectory.
 
     Parameters
     ----------

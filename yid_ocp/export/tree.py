@@ -1,4 +1,4 @@
-"""The tree of a model as URDF or SDF: links, joints with their dynamics, inertias, frames."""
+"""Export of a system's kinematic tree as URDF or SDF: links, joints with their dynamics, inertias, frames."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from yid_ocp.model.urdf import urdf_text
 from yid_ocp.virtual.terms import Evaluator, JointTerms, joint_terms
 
 LEAST_MASS, LEAST_INERTIA = 1e-9, 1e-12
-"""Of links between two joints at one place, for engines that allow no link without [kg], [kg m^2]."""
+"""Mass [kg] and inertia [kg m^2] given to massless links, for engines that require them."""
 
 
 def urdf_model(system: System, values: Mapping[str, float]) -> str:
-    """The system's tree as URDF: joints with damping and friction, links with inertias; no springs, no grasps.
+    """The URDF text of a system: joints with damping and friction, links with inertias; no springs, no grasps.
 
     A `mujoco` element gives MuJoCo the least masses that it asks for; others read over it.
 
@@ -52,7 +52,7 @@ def urdf_model(system: System, values: Mapping[str, float]) -> str:
 
 
 def sdf_model(system: System, values: Mapping[str, float]) -> str:
-    """The system's tree as an SDF world: joints with springs, damping and friction, links with inertias; no grasps.
+    """The SDF world text of a system: joints with springs, damping, friction, links with inertias; no grasps.
 
     Parameters
     ----------

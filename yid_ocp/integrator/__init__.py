@@ -1,4 +1,4 @@
-"""How the system moves: the discrete equations, compiled code, one step, rollouts with sensitivities and adjoint, LQR.
+"""Time integration: discrete equations, compiled code, one step, rollouts with sensitivities and adjoint, LQR.
 
 The equations are in `discrete`; change them there and both the compiled and the interpreted kernel follow.
 """

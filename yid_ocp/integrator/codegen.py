@@ -48,14 +48,14 @@ class StepFunctions:
 
     @property
     def all(self) -> tuple[ca.Function, ...]:
-        """Every function, in the order of generation."""
+        """All functions, in the order of code generation."""
         return self.residual, self.linear, self.matrix, self.ending, self.pull, self.scales, self.resting
 
 
 def step_functions(equations: DiscreteEquations) -> StepFunctions:
-    """Build the functions that the stepping kernel calls.
+    """The CasADi functions that the stepping kernel calls.
 
-    The bodies' part of the Jacobians leaves as vectors per joint, from which the kernel forms the entries pair by pair
+    The bodies' part of the Jacobians comes as vectors per joint, from which the kernel forms the entries pair by pair
     (`RigidBody`), everything else as sparse nonzeros from automatic differentiation.
     """
     e = equations
@@ -148,7 +148,7 @@ def _rest_jacobians(e: DiscreteEquations, bodies: ca.SX, bodies_p: ca.SX) -> tup
 
 
 def theta_function(equations: DiscreteEquations, names: Sequence[str]) -> ca.Function:
-    """Partial derivatives of (all rows, p1, effort of prescribed coordinates) by the named parameters, sparse."""
+    """CasADi function of the sparse derivatives of (residual, p1, prescribed effort) by the named parameters."""
     e = equations
     chosen = ca.vertcat(*(e.system.parameters[name].symbol for name in names)) if names else ca.SX(0, 1)
     prescribed = list(e.system.prescribed_indices)
@@ -160,7 +160,7 @@ def theta_function(equations: DiscreteEquations, names: Sequence[str]) -> ca.Fun
 
 @dataclass(frozen=True)
 class Structure:
-    """Index tables of a step that hold for every state.
+    """Sparsity, elimination order and fill-in of a step's Jacobians, the same at every state.
 
     Attributes
     ----------
@@ -182,7 +182,7 @@ class Structure:
 
 
 def structure(functions: StepFunctions) -> Structure:
-    """Work out sparsity, elimination order and fill of a step."""
+    """The index tables of a step: sparsity, elimination order and fill-in."""
     e = functions.equations
     system = e.system
     n, nz, m = system.size, e.z0.numel(), e.lam.numel()
@@ -241,7 +241,8 @@ def kernel_source(functions: StepFunctions, tables: Structure, batched: bool = F
     functions : StepFunctions
     tables : Structure
     batched : bool
-        For several members at once, as many as `yid_lanes` says. None where a function has no form for that.
+        Whether the code handles several rollouts at once, as many as `yid_lanes` returns; None where a function has
+        no SIMD form.
     """
     e = functions.equations
     system = e.system
@@ -326,7 +327,7 @@ def _step_source(functions: Sequence[ca.Function]) -> str:
 
 
 def functions_source(name: str, functions: Sequence[ca.Function]) -> str:
-    """C source of CasADi functions, which keep their own names."""
+    """C source that CasADi generates for functions; they keep their names."""
     generator = ca.CodeGenerator(name, {"with_header": False, "indent": 0})
     for function in functions:
         generator.add(function)
@@ -334,7 +335,7 @@ def functions_source(name: str, functions: Sequence[ca.Function]) -> str:
 
 
 def triplet(sparsity: ca.Sparsity) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Row and column of every nonzero."""
+    """Row and column indices of the structural nonzeros of a sparsity pattern."""
     row, column = sparsity.get_triplet()
     return np.array(row, np.int64), np.array(column, np.int64)
 

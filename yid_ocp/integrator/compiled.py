@@ -36,11 +36,11 @@ from yid_ocp.parallel import Once, ask_together, map_threads
 Array = NDArray[np.float64]
 
 BATCH, BATCH_PER_COLUMN = 1.7, 0.11
-"""What a batch costs, however many its members: so many rollouts of one member, and more for each column."""
+"""Cost of a batch in rollouts of one member, whatever its size, and the extra cost per sensitivity column."""
 GAIN = 1.5
-"""How many times its cost a batch must save: beyond 2 it is done sooner than by two threads as well."""
+"""Minimum speed-up of a batch over single rollouts; above 2 it is also faster than two threads."""
 WORTH = 50_000
-"""Steps of members that could have marched together, from which on it is worth compiling what that takes."""
+"""Number of steps that could have been batched after which the batched kernel is compiled."""
 
 
 class _Struct(ctypes.Structure):
@@ -154,7 +154,7 @@ class _ThetaColumns:
 
 
 class CompiledKernel:
-    """The kernel in generated C; threads may share it."""
+    """Step kernel in generated C; threads may share it."""
 
     def __init__(self, model: StepModel, library: ctypes.CDLL) -> None:
         self._model = model
@@ -166,7 +166,7 @@ class CompiledKernel:
         )
 
     def of(self, model: StepModel) -> CompiledKernel:
-        """See `Kernel.of`."""
+        """A compiled kernel of the same library with another step model."""
         other = CompiledKernel(model, self._library)
         other._theta_columns, other._batched = self._theta_columns, self._batched
         return other
@@ -180,11 +180,11 @@ class CompiledKernel:
         feedback: Feedback | None,
         wanted: Directions | None,
     ) -> Rollout:
-        """See `Kernel.rollout`."""
+        """Simulate one rollout in C."""
         return self._rolled_out(self._library, [Member(theta, start, torque, path, feedback, wanted)])[0]
 
     def rollouts(self, members: Sequence[Member]) -> list[Rollout]:
-        """See `Kernel.rollouts`."""
+        """Simulate all members in C, in SIMD batches where that is faster."""
         return ask_together(self._rollouts, list(members))
 
     def _rollouts(self, members: Sequence[Member]) -> list[Rollout]:
@@ -271,7 +271,7 @@ class CompiledKernel:
         by_multipliers: Array | None,
         by_effort: Array | None,
     ) -> Gradient:
-        """See `Kernel.adjoint`."""
+        """Gradient of a cost along a rollout, computed backwards in C."""
         sizes, steps = self._model.sizes, len(rollout.multipliers)
         shapes = (len(names),), (sizes["nx"],), (steps, sizes["nu"]), (steps + 1, sizes["nc"])
         gradient = Gradient(*(np.zeros(shape) for shape in shapes))
@@ -301,7 +301,7 @@ class CompiledKernel:
         names: tuple[str, ...],
         derivatives: bool,
     ) -> StepLinearization:
-        """See `Kernel.linearize`."""
+        """Residuals and Jacobians of many steps, evaluated in C."""
         out = empty_linearization(self._model.sizes, len(torque), len(names), derivatives)
         along = [_doubles(a) for a in (state, multipliers, None, torque)]
         matrices = [getattr(out, name) if derivatives else None for name in MATRICES]
@@ -319,7 +319,7 @@ class CompiledKernel:
     def slopes(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, load_rows: Array, load_momentum: Array
     ) -> tuple[Array, Array]:
-        """See `Kernel.slopes`."""
+        """Jacobians of single steps, solved in C."""
         sizes, loads = self._model.sizes, load_rows.shape[1]
         width = sizes["nx"] + sizes["nu"] + loads
         after, effort = (np.zeros((len(torque), sizes[key], width)) for key in ("nx", "nc"))
@@ -341,7 +341,7 @@ class CompiledKernel:
     def rest(
         self, theta: Array, unknowns: Array, given: Array, held: Array, stiffness: float, tolerance: float
     ) -> tuple[Array, float, bool]:
-        """See `Kernel.rest`."""
+        """Static equilibrium by Newton's iteration in C."""
         nu, driven = len(held), np.array(self._model.system.driven_indices, np.int32)
         hold = _filled(_Feedback, nu, driven, stiffness * np.eye(nu), _doubles(given[:nu])) if nu else None
         inputs = (_doubles(theta), _doubles(held), _doubles(given[nu:]))

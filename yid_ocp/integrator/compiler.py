@@ -1,4 +1,4 @@
-"""The C compiler and the private cache of what it made."""
+"""The C compiler and the private cache of compiled libraries."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ MARK = "yid_compiled"
 
 @functools.cache
 def compiler() -> str | None:
-    """Path of the C compiler, or None with one notice; the variable CC chooses one, `CC=none` means none.
+    """Path of the C compiler, or None with one log message; the environment variable CC selects it, `none` disables.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def compiler() -> str | None:
 
 
 def cache_folder() -> Path:
-    """The private folder of compiled code, made when absent; YID_OCP_CACHE overrides its place.
+    """Path of the private folder of compiled code, created if absent; YID_OCP_CACHE overrides it.
 
     Raises
     ------
@@ -119,15 +119,15 @@ def _machine() -> str:
 
 
 def compile_library(source: str, make: Callable[[], str] | None = None) -> ctypes.CDLL | None:
-    """Shared library of a C source, from the cache where it is there; None where nothing can compile it.
+    """Shared library of a C source, from the cache if present; None if no compiler works.
 
     Parameters
     ----------
     source : str
-        C text, or what it follows from. The cache key is the hash of this text, the flags, the compiler, the processor
+        C text, or what determines it. The cache key is the hash of this text, the flags, the compiler, the processor
         and CasADi's version.
     make : callable, optional
-        Makes the C text where `source` is not it; asked only where the library is not in the cache.
+        Returns the C text if `source` is not the C text; called only if the library is not in the cache.
     """
     target = _library_file(source, LEVEL, make)
     if target is None:
@@ -140,12 +140,12 @@ def compile_library(source: str, make: Callable[[], str] | None = None) -> ctype
 
 
 def compiled_function(function: ca.Function) -> ca.Function:
-    """The same function from compiled code, or as it is where nothing can compile it; it cannot be differentiated.
+    """The function compiled to C, or unchanged if no compiler works; it cannot be differentiated.
 
     Parameters
     ----------
     function : casadi.Function
-        Compiled in a hurry: for functions of many operations that run for seconds in all.
+        Compiled without optimisation: for functions of many operations with a total run time of seconds.
     """
     generator = ca.CodeGenerator(function.name(), {"with_header": False, "indent": 0})
     generator.add(function)

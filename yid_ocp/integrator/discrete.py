@@ -36,7 +36,7 @@ ConstraintForce = Literal["node", "midpoint"]
 
 @dataclass(frozen=True)
 class ConstraintPulls:
-    """What the constraints take off the momentum in a step, with closed-form derivatives by the configuration.
+    """Constraint Jacobians that give the constraint impulses of a step, with closed-form derivatives by q.
 
     The balance loses (share_0 Dphi(q_k) + share_m Dphi(q_m))' lam, p1 loses share_m (Dphi(q_m) - Dphi(q_{k+1}))' lam.
 
@@ -61,18 +61,18 @@ class ConstraintPulls:
 
     @property
     def left(self) -> ca.SX:
-        """Rows of lam's pull in the balance, shape (m, n)."""
+        """Jacobian whose transpose times lam is subtracted in the momentum balance, shape (m, n)."""
         return self.share_0 * self.before + self.share_m * self.middle
 
     @property
     def right(self) -> ca.SX:
-        """Rows of lam's pull in p1, shape (m, n)."""
+        """Jacobian whose transpose times lam is subtracted in p1, shape (m, n)."""
         return self.share_m * (self.middle - self.after)
 
 
 @dataclass(frozen=True)
 class DiscreteEquations:
-    """One step of a system, symbolically.
+    """Symbolic DEL equations of one step of a system.
 
     Letters: n coordinates, nz internal coordinates, m constraints, nu inputs, ntheta parameters.
 
@@ -108,8 +108,8 @@ class DiscreteEquations:
     rigid : RigidBody
         Closed-form derivatives of the bodies' Lagrangian at the midpoint.
     balance_rest, p1_rest : casadi.SX, shape (n, 1)
-        What is left of `momentum_balance` and `p1` when the bodies' Lagrangian, p_k, the constraints' pull and the
-        closed force are taken out; this gives the Jacobians without differentiating the tree.
+        `momentum_balance` and `p1` without the bodies' Lagrangian, p_k, the constraint impulses and the closed force;
+        this gives the Jacobians without differentiating the tree.
     closed : ClosedForce or None
         Sum of the forces that effects give with their slopes, at the midpoint.
     closed_shares : (float, float)
@@ -167,7 +167,7 @@ class DiscreteEquations:
 
     @property
     def closure(self) -> ca.SX:
-        """phi(q) - C lam / h at (q1, z1), whatever came before, shape (m, 1)."""
+        """Constraint violation phi(q) - C lam / h at (q1, z1), without relaxation, shape (m, 1)."""
         if self.constraint_gain is None:
             return self.constraint
         return ca.substitute(self.constraint, ca.vertcat(self.q0, self.z0), ca.vertcat(self.q1, self.z1))
@@ -187,9 +187,9 @@ def discrete_equations(
     ----------
     system : System
     force_split : "symmetric" or "left"
-        How the force of a step is shared between its two ends.
+        Distribution of the force of a step between its two ends.
     constraint_force : "node" or "midpoint"
-        Where the constraints pull.
+        Configuration at which the constraint forces act.
 
     Returns
     -------
@@ -458,7 +458,7 @@ def _grasped(system: System, grasp: Grasp, side: str) -> Frame:
 
 @dataclass(frozen=True)
 class RestEquations:
-    """A system at rest at a posture: driven joints held by torques and springs, prescribed ones given.
+    """Equations of static equilibrium: driven joints held by torques and springs, prescribed joints given.
 
     Attributes
     ----------
@@ -477,7 +477,7 @@ class RestEquations:
 
 
 def rest_equations(e: DiscreteEquations) -> RestEquations:
-    """The equations of a step from a configuration to itself, with p such that it comes out again."""
+    """The static equilibrium equations: a step from a configuration to itself with unchanged momentum."""
     system, h, nu = e.system, e.h, e.u.numel()
     free, fixed, driven = (list(i) for i in (system.free_indices, system.prescribed_indices, system.driven_indices))
     given, sought = ca.SX.sym("given", nu + len(fixed)), ca.SX.sym("sought", len(free))

@@ -37,7 +37,7 @@ Evaluator = Callable[[Array], Array]
 
 
 class InterpretedKernel:
-    """The kernel by CasADi's interpreter; threads may share it.
+    """Step kernel in CasADi's interpreter and NumPy; threads may share it.
 
     A point is a column of all `DiscreteEquations.arguments`. The outputs are the rows of the balance, internal and
     constraint equations, then p1, then the effort of prescribed coordinates.
@@ -59,7 +59,7 @@ class InterpretedKernel:
         self._p1, self._effort = slice(self._rows, self._rows + sizes["n"]), slice(self._rows + sizes["n"], None)
 
     def of(self, model: StepModel) -> InterpretedKernel:
-        """See `Kernel.of`."""
+        """An interpreted kernel of the same functions with another step model."""
         other = InterpretedKernel(model)
         other._functions, other._rest = self._functions, self._rest
         return other
@@ -136,7 +136,7 @@ class InterpretedKernel:
         feedback: Feedback | None,
         wanted: Directions | None,
     ) -> Rollout:
-        """See `Kernel.rollout`."""
+        """Simulate one rollout step by step."""
         (value, slope, slopes), n, lam = self._evaluators(), self._model.sizes["n"], np.zeros(self._model.sizes["m"])
         out = empty_rollout(self._model.sizes, len(torque), None if wanted is None else wanted.count)
         state, by = out.state, [getattr(out, f"by_{name}") for name in ("state", "multipliers", "effort")]
@@ -197,7 +197,7 @@ class InterpretedKernel:
         return after, moved[at["lam"]], change[self._effort]
 
     def rollouts(self, members: Sequence[Member]) -> list[Rollout]:
-        """See `Kernel.rollouts`."""
+        """Simulate all members, one after another."""
         return [self.rollout(m.theta, m.start, m.torque, m.path, m.feedback, m.wanted) for m in members]
 
     def adjoint(
@@ -210,7 +210,7 @@ class InterpretedKernel:
         by_multipliers: Array | None,
         by_effort: Array | None,
     ) -> Gradient:
-        """See `Kernel.adjoint`."""
+        """Gradient of a cost along a rollout by the backward recursion of the costate."""
         sizes, at, steps = self._model.sizes, self._at, len(rollout.torque)
         slopes, n = self._evaluators()[-1], sizes["n"]
         by_theta, by_torque = np.zeros(len(names)), np.zeros((steps, sizes["nu"]))
@@ -241,7 +241,7 @@ class InterpretedKernel:
     def linearize(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, names: tuple[str, ...], derivatives: bool
     ) -> StepLinearization:
-        """See `Kernel.linearize`."""
+        """Residuals and Jacobians of many steps, evaluated one after another."""
         (value, _, slopes), at = self._evaluators(), self._at
         out = empty_linearization(self._model.sizes, len(torque), len(names), derivatives)
         new, old = np.concatenate([at["q1"], at["z1"], at["lam"]]), np.concatenate([at["q0"], at["z0"]])
@@ -260,7 +260,7 @@ class InterpretedKernel:
     def slopes(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, load_rows: Array, load_momentum: Array
     ) -> tuple[Array, Array]:
-        """See `Kernel.slopes`."""
+        """Jacobians of single steps from the linearized equations."""
         sizes = self._model.sizes
         point = self._point(theta, state[0], state[1], multipliers[0], torque[0])
         h = float(self._model.functions.scales(*(point[index] for index in self._at.values()))[1])
@@ -288,7 +288,7 @@ class InterpretedKernel:
     def rest(
         self, theta: Array, unknowns: Array, given: Array, held: Array, stiffness: float, tolerance: float
     ) -> tuple[Array, float, bool]:
-        """See `Kernel.rest`."""
+        """Static equilibrium by `damped_newton`."""
         function, known = self._rest(None), (given, held, stiffness, theta, self._model.time_step)
         return damped_newton(lambda w: function.call([w, *known]), unknowns, tolerance)
 
@@ -296,14 +296,16 @@ class InterpretedKernel:
 def damped_newton(
     function: Callable[[Array], Sequence[ca.DM]], w: Array, tolerance: float
 ) -> tuple[Array, float, bool]:
-    """Newton with step control: the natural monotonicity test (Deuflhard 2011, section 3.3) or a smaller residual.
+    """Find a root by Newton's iteration with the natural monotonicity test (Deuflhard 2011, section 3.3).
+
+    A damped step is also accepted if it reduces the residual.
 
     Parameters
     ----------
     function : callable
         Residual and its Jacobian at a point.
     w : ndarray, shape (n,)
-        Where it begins.
+        Initial point.
     tolerance : float
 
     Returns

@@ -67,18 +67,18 @@ _KNOWN = {ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST, *_FORMS, *_TURNS}
 
 
 LONG = 80_000
-"""Instructions of a function beyond which it is written in parts: a compiler's time and memory grow faster than it."""
+"""Number of instructions above which a function is split into parts, since compile time grows superlinearly."""
 PART = 300
-"""Of 300 instructions a step of 151 variables compiles in half the time that one of 4000 takes, and runs as fast."""
+"""Instructions per part; with 300 a step of 151 variables compiles in half the time of 4000 and runs as fast."""
 
 
 def is_long(function: ca.Function) -> bool:
-    """Whether a function is written in parts."""
+    """Whether a function is so long that its C code is split into parts."""
     return int(function.n_instructions()) > LONG
 
 
 def lane_functions_source(functions: Sequence[ca.Function]) -> str | None:
-    """C source of SX functions with the signatures of CasADi's own; None where one uses an operation without a form.
+    """SIMD C source of SX functions with CasADi's signatures; None if one uses an operation without a SIMD form.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Single steps along a rollout, linearised: what a small change of state or torque does one step later."""
+"""Linearized single steps along a rollout: derivatives of the next state by state, torque and loads."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from yid_ocp.integrator.step_model import Rollout
 Array = NDArray[np.float64]
 
 CHUNK = 50
-"""Steps that are linearised at once: their matrices are dense."""
+"""Number of steps linearised at once, limited because their matrices are dense."""
 
 FELT = 1e-12
-"""Slope by an internal state that is more than rounding."""
+"""Smallest derivative by an internal state that is not regarded as rounding error."""
 
 EVERY = slice(None)
 
 
 @dataclass(frozen=True)
 class LinearStep:
-    """The derivatives of one step by the implicit function theorem, with the torque as it was applied.
+    """Jacobians A_k, B_k, E_k of one step by the implicit function theorem, at the applied torque.
 
     Attributes
     ----------
@@ -33,7 +33,7 @@ class LinearStep:
     by_torque : ndarray, shape (nx, nu)
         B_k = dx_{k+1}/du_k
     by_load : ndarray, shape (nx, e)
-        E_k, by the further loads.
+        E_k = dx_{k+1}/d(additional loads)
     effort_by_state : ndarray, shape (nc, nx)
         Of the effort that the prescribed coordinates need at node k.
     effort_by_torque : ndarray, shape (nc, nu)
@@ -50,14 +50,14 @@ class LinearStep:
 
 @dataclass(frozen=True)
 class Loads:
-    """What else acts on every step, to first order, one column for each of e loads.
+    """First-order effect of e additional loads on the equations of every step, one column each.
 
     Attributes
     ----------
     rows : ndarray, shape (nt, e)
-        What it adds to the balance, internal and constraint rows.
+        Added to the balance, internal and constraint equations.
     momentum : ndarray, shape (n, e)
-        To p_{k+1}.
+        Added to p_{k+1}.
     """
 
     rows: Array
@@ -65,15 +65,15 @@ class Loads:
 
 
 def live_states(step: Step, steps: Sequence[LinearStep], seen: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
-    """States that move and, where they are internal, that others, efforts or sensors depend on, shape (nx,).
+    """Mask of the states that move and that affect others, efforts or sensors, shape (nx,).
 
-    What an effect adds to the state stays still, or is felt by nothing, while the effect is neutral.
+    Internal states of a neutral effect are excluded.
 
     Parameters
     ----------
     step : Step
     steps : sequence of LinearStep
-        Some that stand for all.
+        A representative sample.
     seen : ndarray of bool, shape (nx,), optional
         Those that sensors depend on.
     """
@@ -92,7 +92,7 @@ def live_states(step: Step, steps: Sequence[LinearStep], seen: NDArray[np.bool_]
 def linear_steps(
     step: Step, theta: Array, rollout: Rollout, loads: Loads | None = None, chosen: slice = EVERY
 ) -> Iterator[LinearStep]:
-    """Derivatives of steps of a finished rollout, in order; prescribed coordinates stay as they are.
+    """Iterate over the linearized steps of a finished rollout, with prescribed coordinates unchanged.
 
     Parameters
     ----------

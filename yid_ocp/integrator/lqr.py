@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 
 def proportional_filter(step: Step, measured: ArrayLike, gains: ArrayLike) -> Feedback:
-    """u_k = ubar_k - K (q_k - qbar_k) with a constant diagonal K on the driven joints.
+    """Feedback u_k = ubar_k - K (q_k - qbar_k) with a constant diagonal K on the driven joints.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def lqr_filter(
     torque_std: ArrayLike = 1.0,
     arms: Step | None = None,
 ) -> Feedback:
-    """Finite-horizon LQR of the driven arms, linearised about their measured motion.
+    """Feedback of a finite-horizon LQR of the driven arms, linearised about their measured motion.
 
     Minimises the sum of |dq|^2/angle_std^2 + |M^-1 dp|^2/rate_std^2 + |du|^2/torque_std^2 over the recording for the
     arms without the object; the gains act on the arms' angles and momenta. The reference momentum follows from the
@@ -111,7 +111,7 @@ def lqr_filter(
 
 
 def arms_alone(step: Step) -> Step:
-    """The step of the driven joints alone: everything hung on them or beside them taken away.
+    """The step of a system of the driven joints only, without the object and everything else.
 
     Raises
     ------

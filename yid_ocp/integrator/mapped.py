@@ -1,4 +1,4 @@
-"""CasADi functions at many points at once."""
+"""Evaluation of a CasADi function at many points at once."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ int yid_map(int count, const double **in, double **out) {{
 """
 
     def __call__(self, *inputs: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Evaluate.
+        """Evaluate the function at all points.
 
         Parameters
         ----------

@@ -1,7 +1,7 @@
-"""The momentum of a known motion of the driven joints, and by how much effects change it.
+"""Change of the discrete momentum of a known motion of the driven joints due to effects.
 
-In the discrete equations it has half the impulse of the step before it in it: another torque than the recorded one, or
-what an effect does with it, changes the momentum of one and the same motion.
+The discrete momentum contains half the impulse of the previous step, so a torque other than the recorded one, or an
+effect, changes the momentum of the same motion.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from yid_ocp.parallel import Once
 
 Array = NDArray[np.float64]
 ITERATIONS = 5
-"""Newton's, for a law of an internal coordinate that is not linear in its next value."""
+"""Newton iterations for a law of an internal coordinate that is nonlinear in its next value."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """How the driven joints move, and what moves them, over the steps of a recording.
+    """Angles and torques of the driven joints over the steps of a recording, with their derivatives.
 
     Attributes
     ----------
@@ -50,17 +50,16 @@ class Motion:
 
     @property
     def around(self) -> tuple[Array, Array]:
-        """Angles before and after the step that leads to every node but the last; the first node is stood at before."""
+        """Angles before and after the step to every node but the last; before the first node the joints are at rest."""
         return _one_before(self.angles[:-1]), self.angles[:-1]
 
 
 class MomentumShift:
-    """By how much a motion's momentum differs from that of what was recorded, on account of effects.
+    """Difference between the momentum of a motion with effects and that of the recorded motion without them.
 
-    `lqr_filter` works its reference out once, from recorded angles and torques without effects. Where a torque is not
-    the recorded one, or an effect adds an armature, a weight or a friction, the same motion has another momentum, and
-    the filter would pull at the difference: at a wrist, whose gain by momentum times h/2 is near one, so much that it
-    undoes half of what an effect does.
+    `lqr_filter` computes its reference once, from recorded angles and torques without effects. With a torque other
+    than the recorded one, or an effect such as an armature, the same motion has another momentum, and the feedback
+    would counteract the difference: at a wrist, whose gain by momentum times h/2 is near one, by half of the effect.
 
     Parameters
     ----------
@@ -69,7 +68,7 @@ class MomentumShift:
     Attributes
     ----------
     parameters : tuple of str
-        Those of effects on which the momentum of a motion under known torques depends.
+        Names of effect parameters on which the momentum of a motion under known torques depends.
     """
 
     def __init__(self, step: Step) -> None:
@@ -118,20 +117,20 @@ class MomentumShift:
         )
 
     def by_torque(self, theta: Array) -> Array:
-        """Derivative of the momentum by the torques of the step before it, shape (nu, nu) [s]."""
+        """Derivative of the momentum by the torques of the previous step, shape (nu, nu) [s]."""
         arguments = [np.zeros(self._impulse.numel_in(i)) for i in range(5)]
         return np.array(self._impulse(*arguments, theta, self._time_step))
 
     def along(self, recorded: Motion, true: Motion, theta: Array, names: Sequence[str]) -> tuple[Array, Array]:
-        """The shift at every node but the last, shape (N, nu), and its derivatives, (N, nu, d).
+        """Momentum with effects minus recorded, at every node but the last, (N, nu), and its derivatives, (N, nu, d).
 
         Parameters
         ----------
         recorded, true : Motion
-            What was read, and what effects say that it was; only the latter's derivatives count.
+            The recorded motion, and the motion corrected for effects; only the latter's derivatives are used.
         theta : ndarray, shape (ntheta,)
         names : sequence of str
-            Parameters that the first of d derivatives are by.
+            Parameters of the first of the d derivatives.
         """
         steps, plain_theta = len(true.torque), self.without(theta)
         still = np.zeros((steps, len(self._kept)))
@@ -175,25 +174,25 @@ class MomentumShift:
         return z, total if np.any(total) else None
 
     def without(self, theta: Array) -> Array:
-        """theta with these effects absent, at which a filter's own reference is worked out."""
+        """theta with these effects neutral, at which the feedback's reference is computed."""
         plain = theta.copy()
         plain[self._columns] = self._neutral
         return plain
 
     def active(self, theta: Array, names: Sequence[str]) -> bool:
-        """Whether any effect is at work on it, or is among the parameters to differentiate by."""
+        """Whether any effect shifts the momentum, or one of its parameters is in `names`."""
         return not set(names).isdisjoint(self.parameters) or bool(np.any(theta[self._columns] != self._neutral))
 
 
 def with_reference(gain: Array, by_torque: Array) -> Array:
-    """The torque that an error of the recorded one brings where a filter's momenta are worked out from it, (nu, nu).
+    """Derivative of the applied torque by an error of the recorded torque, feedback included, (nu, nu).
 
-    The error of the step before is taken for this step's.
+    The feedback's reference momenta follow from the recorded torque; the error is assumed equal in the previous step.
 
     Parameters
     ----------
     gain : ndarray, shape (nu, nb)
-        Of the filter in one step.
+        Feedback gain of one step.
     by_torque : ndarray, shape (nu, nu)
         See `MomentumShift.by_torque`.
     """

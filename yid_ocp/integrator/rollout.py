@@ -1,4 +1,4 @@
-"""Rollouts of a system: initial states at rest, simulation, forward sensitivities and the adjoint gradient."""
+"""Rollouts of a system: simulation, forward sensitivities and the adjoint gradient."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def simulate(
     feedback: Feedback | None = None,
     directions: Directions | None = None,
 ) -> Rollout:
-    """Roll a system out, with forward sensitivities where directions are given.
+    """Simulate a system, with forward sensitivities if directions are given.
 
-    The same system at other parameters, from other starts or with other inputs goes faster by `simulate_all`.
+    For many parameters, initial states or inputs `simulate_all` is faster.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def simulate(
 
 
 def simulate_all(step: Step, members: Sequence[Member]) -> list[Rollout]:
-    """Roll all members out, several at once where that pays; to rounding what `simulate` gives each.
+    """Simulate several rollouts, in batches where that is faster; equal to `simulate` of each but for rounding.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def rollout_member(
     feedback: Feedback | None = None,
     directions: Directions | None = None,
 ) -> Member:
-    """What a rollout is asked about, checked; arguments and errors are those of `simulate`."""
+    """The inputs of one rollout with checked shapes; arguments and errors as in `simulate`."""
     sizes = step.sizes
     if steps < 1:
         raise ModelError(f"steps = {steps}", allowed="a whole number from 1")
@@ -111,7 +111,7 @@ def rollout_member(
 
 
 def applied_torque(step: Step, theta: ArrayLike, rollout: Rollout) -> NDArray[np.float64]:
-    """Torque at driven joints in every step, shape (N, nu) [N m]: the input itself, or what servos make of it."""
+    """Torque at driven joints in every step, shape (N, nu) [N m]: the input, or the torque of position servos."""
     system, h = step.system, step.time_step
     if not system.servos:
         return rollout.torque
@@ -165,7 +165,7 @@ def adjoint_gradient(
 
 
 def momentum_of(step: Step, q: ArrayLike, v: ArrayLike, theta: ArrayLike) -> Array:
-    """Generalized momentum dL/dv at (q, v) [N m s]; of a compliant coordinate times its compliance.
+    """Generalized momentum dL/dv at (q, v) [N m s], of a compliant coordinate times its compliance.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
-"""One step as rows of a nonlinear program: the DEL equations of (x_k, x_{k+1}, lam_k, u_k, theta), nothing eliminated.
+"""One step as constraints of a nonlinear program: DEL equations of (x_k, x_{k+1}, lam_k, u_k, theta), none eliminated.
 
 With x = (q, p, z) and the letters of `discrete.py`, the rows of a stage are, all of order one,
 
     free rows of the momentum balance / h      internal equations      constraints      (p_{k+1} - p1(q_k, q_{k+1})) / h
 
-They know nothing of recordings: torques, prescribed coordinates and parameters may be data or unknowns.
+They do not depend on recordings: torques, prescribed coordinates and parameters may be data or unknowns.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from yid_ocp.model.kinematics import second_derivatives
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """One step of a system in a nonlinear program, symbolically.
+    """Symbolic equality constraints of one step in a nonlinear program, and their Jacobians.
 
     Letters: n coordinates, nz internal ones, m constraints, nu inputs, nc prescribed coordinates, nx = 2 n + nz.
 
@@ -37,13 +37,13 @@ class Stage:
         Torques that act over the step [N m].
     theta : casadi.SX, shape (ntheta, 1)
     rows : casadi.SX, shape (nr, 1)
-        Zero where the step is taken.
+        Constraint residual, zero if the step equations hold.
     names : tuple of str
-        Of the rows: `del[JOINT]`, `internal[NAME]`, `constraint[GRASP.x]`, `p1[JOINT]`.
+        Names of the rows: `del[JOINT]`, `internal[NAME]`, `constraint[GRASP.x]`, `p1[JOINT]`.
     slopes : mapping of str to casadi.SX
         Derivatives of `rows` by `x0`, `x1`, `lam` and `u`, sparse.
     effort : casadi.SX, shape (nc, 1)
-        What the prescribed coordinates need at the first node [N m].
+        Effort of the prescribed coordinates at the first node [N m].
     effort_slopes : mapping of str to casadi.SX
         Derivatives of `effort` by `x0`, `x1`, `lam` and `u`, sparse.
     """
@@ -69,10 +69,10 @@ class Stage:
 
 
 def stage(equations: DiscreteEquations, time_step: float) -> Stage:
-    """The rows of one step and their derivatives.
+    """The constraint rows of one step and their derivatives.
 
-    The bodies' second derivatives come in closed form (`RigidBody`), with a quarter of the operations that come of
-    differentiating the tree; the rest is differentiated.
+    The bodies' second derivatives have a closed form (`RigidBody`) with a quarter of the operations of automatic
+    differentiation, which gives all others.
 
     Parameters
     ----------

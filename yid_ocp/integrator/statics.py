@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rest:
-    """A static equilibrium.
+    """A static equilibrium with its derivatives.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ HOLD_LIMIT = 0.02
 
 
 class Statics:
-    """The equilibrium equations of a step's system at a known posture: driven joints held, prescribed ones given.
+    """Solver for the static equilibrium of a system with driven joints held and prescribed joints given.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ class Statics:
     Attributes
     ----------
     known, unknown : tuple of int
-        Coordinates that are given (driven, then prescribed), and those that are sought.
+        Indices of given coordinates (driven, then prescribed) and of the coordinates to solve for.
     """
 
     def __init__(self, step: Step) -> None:
@@ -101,7 +101,7 @@ class Statics:
 
     @property
     def equations(self) -> RestEquations:
-        """The equations as expressions."""
+        """Symbolic equilibrium equations."""
         return self._equations(None)
 
     def solve(
@@ -113,7 +113,7 @@ class Statics:
         names: Sequence[str] = (),
         tolerance: float = 1e-10,
     ) -> Rest:
-        """Find the equilibrium at a posture.
+        """Find the equilibrium for given driven and prescribed coordinates.
 
         Parameters
         ----------
@@ -331,7 +331,7 @@ def _servo_energy(system: System, u: ca.SX, q: ca.SX) -> ca.SX:
 
 
 def hold_stiffness(system: System, known: bool) -> float:
-    """Stiffness of what holds driven joints where they were measured, their inputs known or not [N m/rad, or 1]."""
+    """Stiffness of the springs that hold driven joints at measured angles, inputs known or not [N m/rad, or 1]."""
     if not known:
         return HOLD_STIFFNESS
     return HOLD_STIFFNESS_WITH_COMMAND if system.servos else HOLD_STIFFNESS_WITH_TORQUE
@@ -362,7 +362,7 @@ def _solved(matrix: Array, right: Array) -> Array:
 
 
 def relaxed(step: Step, q: ArrayLike, theta: ArrayLike) -> Array:
-    """Internal coordinates of an object that has long been at a configuration, shape (nz,)."""
+    """Fully relaxed internal coordinates of an object held at a configuration, shape (nz,)."""
     e = step.equations
     nz = e.z0.numel()
     if nz == 0:

@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Step(Shown):
-    """The time step of a system; made by `compile_step`.
+    """Step map of a system over one time step; made by `compile_step`.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class Step(Shown):
 
     @property
     def system(self) -> System:
-        """The system that is stepped."""
+        """System whose motion the step computes."""
         return self.model.system
 
     @property
@@ -57,12 +57,12 @@ class Step(Shown):
 
     @property
     def force_split(self) -> ForceSplit:
-        """How the force of a step is shared between its ends."""
+        """Distribution of the force of a step between its ends, `symmetric` or `left`."""
         return self.model.equations.force_split
 
     @property
     def constraint_force(self) -> ConstraintForce:
-        """Where the constraints pull."""
+        """Configuration at which the constraint forces act, `node` or `midpoint`."""
         return self.model.equations.constraint_force
 
     @property
@@ -72,12 +72,12 @@ class Step(Shown):
 
     @property
     def functions(self) -> codegen.StepFunctions:
-        """CasADi functions of these equations."""
+        """CasADi functions of the step equations."""
         return self.model.functions
 
     @property
     def sizes(self) -> dict[str, int]:
-        """n, nz, m, nu, nc, nx and ntheta."""
+        """Dimensions n, nz, m, nu, nc, nx and ntheta by name."""
         return self.model.sizes
 
     def __call__(
@@ -89,7 +89,7 @@ class Step(Shown):
         prescribed: tuple[ArrayLike, ArrayLike] | None = None,
         internal: ArrayLike | None = None,
     ) -> tuple[Array, Array, Array, StepStatus]:
-        """One DEL step.
+        """Compute one DEL step.
 
         Parameters
         ----------
@@ -187,7 +187,7 @@ def compile_step(
     use_compiler: bool = True,
     tolerance: float | None = None,
 ) -> Step:
-    """Turn a system into a time step.
+    """Build the step map of a system, compiled where possible.
 
     Parameters
     ----------
@@ -222,7 +222,7 @@ def compile_step(
 
 
 def at_time_step(step: Step, time_step: float) -> Step:
-    """The same step of another length [s], from the same equations and compiled code.
+    """A copy of a step with another time step [s], from the same equations and compiled code.
 
     Raises
     ------
@@ -234,7 +234,7 @@ def at_time_step(step: Step, time_step: float) -> Step:
 
 
 def compile_alike(step: Step, system: System, *, use_compiler: bool | None = None) -> Step:
-    """The step of another system by the same rules, with the same kind of kernel where nothing else is said."""
+    """The step of another system with the time step, integration rules and, by default, kernel type of `step`."""
     compiled = step.compiled if use_compiler is None else use_compiler
     return compile_step(system, step.time_step, step.force_split, step.constraint_force, use_compiler=compiled)
 
@@ -246,7 +246,7 @@ def _positive(time_step: float) -> float:
 
 
 def check_shape(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """The values as a contiguous float array of the given shape; `ModelError` naming it where it has another."""
+    """The values as a contiguous float array; `ModelError` with `name` if its shape is not `shape`."""
     array = np.ascontiguousarray(values, dtype=float)
     if array.size == 0 and 0 in shape:
         return np.zeros(shape)

@@ -1,4 +1,4 @@
-"""What every kernel needs: the model of a step, and what rollouts, adjoints and linearizations take and return."""
+"""Data types shared by all kernels: the model of a step, inputs and results of rollouts, adjoints, linearizations."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ TOLERANCE, RATE_TOLERANCE, ROUNDING = 1e-12, 1e-10, 1e-15
 
 @dataclass(frozen=True, eq=False)
 class StepModel:
-    """One step of a system, before any kernel computes it.
+    """Equations, functions and index tables of one step, from which a kernel is built.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ def step_model(
     constraint_force: ConstraintForce,
     tolerance: float | None = None,
 ) -> StepModel:
-    """Equations, functions and tables of a system's step; see `compile_step`."""
+    """The `StepModel` of a system; arguments as in `compile_step`."""
     e = discrete_equations(system, force_split, constraint_force)
     functions = codegen.step_functions(e)
     n, nz = system.size, e.z0.numel()
@@ -82,12 +82,12 @@ def step_model(
 
 
 def newton_tolerance(time_step: float) -> float:
-    """Newton's tolerance on the coordinates [rad or m] for a step of so many seconds."""
+    """Newton's tolerance on the coordinates [rad or m] for a time step [s]."""
     return max(ROUNDING, min(TOLERANCE, RATE_TOLERANCE * time_step))
 
 
 class StepCode(IntEnum):
-    """How Newton's iteration of a step ended."""
+    """Termination status of Newton's iteration of one step, as the C kernel numbers it."""
 
     OK = 0
     NOT_CONVERGED = 1
@@ -106,7 +106,7 @@ MESSAGES = {
 
 
 LONG = 100
-"""Steps after which a failure is one of the method rather than of the start."""
+"""Number of steps after which a failure is attributed to the integration method, not to the initial state."""
 LIMIT = (
     "the midpoint rule damps nothing by itself: without damping in the model the fastest modes grow over some hundred "
     "steps until a step of this length cannot follow them"
@@ -115,7 +115,7 @@ LIMIT = (
 
 @dataclass(frozen=True)
 class StepStatus:
-    """Outcome of a step or of a rollout.
+    """Convergence status of a step or of a rollout.
 
     Attributes
     ----------
@@ -127,7 +127,7 @@ class StepStatus:
     iterations, factorisations : int
         Totals over all steps.
     effort : ndarray, shape (nc,)
-        Of the last step: effort that the prescribed coordinates needed at its first node [N m].
+        Effort that the prescribed coordinates needed at the first node of the last step [N m].
     internal : ndarray, shape (nz,)
         Internal coordinates after the last step.
     """
@@ -147,7 +147,7 @@ class StepStatus:
 
     @property
     def message(self) -> str:
-        """The outcome in words, with the step, the residual and what to try."""
+        """The status as a sentence with the step, the last correction and a remedy."""
         if self.ok:
             return MESSAGES[self.code]
         said = f"step {self.step}: {MESSAGES[self.code]} (last correction {self.error:.2g})"
@@ -157,7 +157,7 @@ class StepStatus:
 
 @dataclass(frozen=True)
 class Directions:
-    """What to differentiate a rollout by: d columns, the first ones the named parameters.
+    """Directions of the forward sensitivities of a rollout: d columns, the first ones the named parameters.
 
     Attributes
     ----------
@@ -188,7 +188,7 @@ class Directions:
 
 @dataclass(frozen=True)
 class Feedback:
-    """The tracking filter u_k = ubar_k - K_k (x_k[index] - xbar_k).
+    """Time-varying feedback of the tracking filter, u_k = ubar_k - K_k (x_k[index] - xbar_k).
 
     Attributes
     ----------
@@ -207,7 +207,7 @@ class Feedback:
 
 @dataclass(frozen=True)
 class Member:
-    """What a rollout is asked about, one of many.
+    """Inputs of one rollout.
 
     Attributes
     ----------
@@ -232,7 +232,7 @@ class Member:
 
 @dataclass(frozen=True)
 class Rollout:
-    """A rollout and, where asked for, its forward sensitivities.
+    """A simulated trajectory and, if requested, its forward sensitivities.
 
     Attributes
     ----------
@@ -246,7 +246,7 @@ class Rollout:
     torque : ndarray, shape (N, nu)
         Applied torque [N m].
     by_state, by_multipliers, by_effort : ndarray, shape (..., d), or None
-        Derivatives by the directions; like everything else NaN after a step that failed.
+        Derivatives of state, multipliers and effort by the directions; NaN after a failed step, like all arrays.
     status : StepStatus
     """
 
@@ -262,7 +262,7 @@ class Rollout:
 
 @dataclass(frozen=True)
 class Gradient:
-    """Derivatives of a scalar cost along a rollout, from the adjoint.
+    """Gradient of a scalar cost along a rollout, from the adjoint.
 
     Attributes
     ----------
@@ -285,14 +285,14 @@ class Gradient:
 
 @dataclass(frozen=True)
 class StepLinearization:
-    """Equations of many steps at once, along a trajectory that need not satisfy them.
+    """Residuals and Jacobians of the equations of many steps, at a trajectory that need not satisfy them.
 
     Attributes
     ----------
     rows : ndarray, shape (N, nt)
-        Balance (n), internal (nz) and constraint (m) rows of every step.
+        Residual of every step: momentum balance (n), internal (nz) and constraint (m) equations.
     p1 : ndarray, shape (N, n)
-        What p_{k+1} should be.
+        p_{k+1} that follows from the other values.
     rows_new, p1_new : ndarray, shape (N, nt, nt) and (N, n, nt)
         Derivatives by (q_{k+1}, z_{k+1}, lam_k).
     rows_old, p1_old : ndarray, shape (N, nt, n + nz) and (N, n, n + nz)
@@ -316,10 +316,10 @@ class StepLinearization:
 
 
 class Kernel(Protocol):
-    """What the compiled and the interpreted implementation have in common."""
+    """Interface of the compiled and the interpreted implementation of a step."""
 
     def of(self, model: StepModel) -> Kernel:
-        """The kernel of the same equations at another length of the step."""
+        """A kernel of the same equations with another step model, which differs in the time step."""
         ...
 
     def rollout(
@@ -331,11 +331,11 @@ class Kernel(Protocol):
         feedback: Feedback | None,
         wanted: Directions | None,
     ) -> Rollout:
-        """Roll out over len(torque) steps from the state `start`."""
+        """Simulate len(torque) steps from the state `start`."""
         ...
 
     def rollouts(self, members: Sequence[Member]) -> list[Rollout]:
-        """Roll all members out, several at once where that pays; to rounding what `rollout` gives each."""
+        """Simulate all members, in batches where that is faster; equal to `rollout` of each but for rounding."""
         ...
 
     def adjoint(
@@ -360,13 +360,13 @@ class Kernel(Protocol):
         names: tuple[str, ...],
         derivatives: bool,
     ) -> StepLinearization:
-        """Equations of len(torque) steps along a trajectory, with their Jacobians where asked for."""
+        """Residuals of len(torque) steps along a trajectory and, with `derivatives`, their Jacobians."""
         ...
 
     def slopes(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, load_rows: Array, load_momentum: Array
     ) -> tuple[Array, Array]:
-        """Derivatives of single steps of a finished rollout by the implicit function theorem.
+        """Jacobians of the single steps of a finished rollout by the implicit function theorem.
 
         Parameters
         ----------
@@ -375,12 +375,12 @@ class Kernel(Protocol):
         multipliers : ndarray, shape (N, m)
         torque : ndarray, shape (N, nu)
         load_rows, load_momentum : ndarray, shape (nt, e) and (n, e)
-            What further loads add to the rows and to p_{k+1} of every step.
+            What e additional loads add to the residual and to p_{k+1} of every step.
 
         Returns
         -------
         state, effort : ndarray, shape (N, nx, nx + nu + e) and (N, nc, nx + nu + e)
-            State after the step and effort of prescribed coordinates, by (q, p, z) before it, torque and loads.
+            Derivatives of the state after the step and of the effort by (q, p, z) before it, torque and loads.
 
         Raises
         ------
@@ -392,7 +392,7 @@ class Kernel(Protocol):
     def rest(
         self, theta: Array, unknowns: Array, given: Array, held: Array, stiffness: float, tolerance: float
     ) -> tuple[Array, float, bool]:
-        """Search an equilibrium by Newton's iteration; see `RestEquations`.
+        """Solve `RestEquations` for a static equilibrium by Newton's iteration.
 
         Parameters
         ----------
@@ -417,7 +417,7 @@ class Kernel(Protocol):
 
 
 def empty_rollout(sizes: dict[str, int], steps: int, count: int | None) -> Rollout:
-    """NaN in the shapes of a rollout with `count` directions (None: without), not begun yet."""
+    """A rollout filled with NaN, with `count` directions or none, for a kernel to write into."""
     shapes: dict[str, tuple[int, ...]] = {
         "state": (steps + 1, sizes["nx"]),
         "multipliers": (steps, sizes["m"]),
@@ -433,7 +433,7 @@ def empty_rollout(sizes: dict[str, int], steps: int, count: int | None) -> Rollo
 
 
 def empty_linearization(sizes: dict[str, int], count: int, width: int, derivatives: bool) -> StepLinearization:
-    """Zeros in the shapes of `count` steps and `width` parameters, without matrices where no derivatives are wanted."""
+    """A linearization of `count` steps and `width` parameters filled with zeros; no Jacobians without `derivatives`."""
     n, nz, m, nu = sizes["n"], sizes["nz"], sizes["m"], sizes["nu"]
     nt, steps = n + nz + m, count if derivatives else 0
     shapes: dict[str, tuple[int, ...]] = {"rows": (count, nt), "p1": (count, n)}
@@ -450,7 +450,7 @@ def _arrays(what: str, shapes: Mapping[str, tuple[int, ...]], value: float) -> d
 
 
 def out_of_memory(what: str, size: int) -> ResourceError:
-    """The error for something that needs `size` bytes."""
+    """The `ResourceError` to raise when `size` bytes for `what` cannot be allocated."""
     amount = f"{size / 1e9:.3g} GB" if size >= 1e9 else f"{size / 1e6:.3g} MB"
     return ResourceError(
         f"{MESSAGES[StepCode.OUT_OF_MEMORY]} for {what}: it takes {amount}",
@@ -461,7 +461,7 @@ def out_of_memory(what: str, size: int) -> ResourceError:
 def ended(
     rollout: Rollout, sizes: dict[str, int], code: int, step: int, error: float, counts: tuple[int, int]
 ) -> Rollout:
-    """The rollout with its status: step reached, last correction, iterations and factorisations."""
+    """A copy of the rollout with its `StepStatus`; `counts` are Newton iterations and factorisations."""
     last = rollout.effort[step - 1] if step else np.zeros(sizes["nc"])
     inner = rollout.state[step, 2 * sizes["n"] :]
     return replace(rollout, status=StepStatus(StepCode(code), step, error, *counts, last, inner))

@@ -1,4 +1,4 @@
-"""What the world is made of: parameters, mechanisms, the flexible object, their symbolic mechanics and the `System`.
+"""The mechanical model: parameters, mechanisms, flexible objects, symbolic mechanics and the `System`.
 
 Everything here is description and symbols, nothing is solved; extend it with new terms through `effects`, not here.
 """

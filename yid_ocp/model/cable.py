@@ -1,4 +1,4 @@
-"""A branched cable held by two clamps: its model from measured vertices, and what an estimation on it needs.
+"""The model of a branched cable held by two clamps, built from measured vertices.
 
 The parent runs from one clamp to the other; its first and its last edge are held. Children leave it at vertices. Every
 edge is a rigid link, before each link sits a joint that bends about x and y and twists about z:
@@ -54,7 +54,7 @@ START_SPEED = "start.speed"
 
 @dataclass(frozen=True)
 class ClampPath:
-    """A prescribed clamp (`floating_clamp`) that follows two measured points.
+    """How a prescribed clamp (`floating_clamp`) follows two measured points.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class ClampPath:
 
 @dataclass(frozen=True)
 class Cable:
-    """Which vertices a cable has and how they hang together.
+    """Vertices and branches of a cable with their undeformed positions.
 
     Attributes
     ----------
@@ -117,22 +117,22 @@ class Cable:
 
     @property
     def vertices(self) -> tuple[str, ...]:
-        """All vertices, the parent's first."""
+        """Names of all vertices, the parent's first."""
         return (*self.parent, *(vertex for chain in self.children.values() for vertex in chain[1:]))
 
     @property
     def held(self) -> tuple[str, ...]:
-        """The four vertices in the clamps."""
+        """Names of the four vertices held by the clamps."""
         return (*self.parent[:2], *self.parent[-2:])
 
     @property
     def free(self) -> tuple[str, ...]:
-        """All vertices that no clamp holds; the ones that a prediction is judged by."""
+        """Names of the vertices that no clamp holds, on which predictions are evaluated."""
         return tuple(vertex for vertex in self.vertices if vertex not in self.held)
 
     @property
     def chains(self) -> dict[str, tuple[str, ...]]:
-        """Vertices of every branch, the parent first."""
+        """Names of the vertices of every branch, by segment, the parent first."""
         return {self.parent_name: self.parent, **self.children}
 
     @property
@@ -142,7 +142,7 @@ class Cable:
 
     @property
     def clamps(self) -> tuple[ClampPath, ClampPath]:
-        """What drives the two clamps."""
+        """Paths of the two clamps, start and end."""
         p = self.parent
         return ClampPath(START, p[0], p[1], "transported"), ClampPath(END, p[-2], p[-1], "transported")
 
@@ -153,7 +153,7 @@ class Cable:
 
 @dataclass(frozen=True)
 class BranchOptions:
-    """Nominal properties of one branch.
+    """Nominal properties of one branch of a cable.
 
     Attributes
     ----------
@@ -172,7 +172,7 @@ class BranchOptions:
 
 @dataclass(frozen=True)
 class CableOptions:
-    """How a cable is modelled.
+    """Options of a cable's model.
 
     With a `memory` each joint rests at (1 - memory) x undeformed + memory x (start angle - load/stiffness), the load
     being what the joint bears at the recording's start if the cable is at rest there. It becomes the parameter
@@ -213,7 +213,7 @@ class CableOptions:
 
 
 def read_vertices(path: str | Path) -> dict[str, Array]:
-    """Vertices from a CSV table with the columns point, x, y, z [m].
+    """Vertex positions [m] by name, from a CSV table with the columns point, x, y, z [m].
 
     Raises
     ------
@@ -232,7 +232,7 @@ def read_vertices(path: str | Path) -> dict[str, Array]:
 
 
 def length_values(cable: Cable, lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
-    """Values of the edge length parameters for given lengths of the edges [m]."""
+    """Values of the edge length parameters by name, from the edges' lengths [m]."""
     values = {f"{START}.length": lengths[cable.parent[0], cable.parent[1]]}
     for name, chain in cable.chains.items():
         first = 1 if name == cable.parent_name else 0
@@ -242,7 +242,7 @@ def length_values(cable: Cable, lengths: Mapping[tuple[str, str], float]) -> dic
 
 
 def free_parameters(cable: Cable, options: CableOptions | None = None) -> tuple[str, ...]:
-    """What can be estimated of a cable when only its motion is seen: stiffness, damping and rest shape, no mass."""
+    """Names of the parameters that a cable's motion alone can identify: stiffness, damping and rest shape, no mass."""
     options = options or CableOptions()
     names: list[str] = []
     for name in cable.chains:
@@ -261,7 +261,7 @@ def free_parameters(cable: Cable, options: CableOptions | None = None) -> tuple[
 
 
 def cable_system(lengths: Mapping[tuple[str, str], float], cable: Cable, options: CableOptions | None = None) -> System:
-    """The model of a cable held by two clamps.
+    """The system of a cable held by two clamps.
 
     Parameters
     ----------
@@ -337,7 +337,7 @@ def _with_memory(item: FlexibleObject, memory: float) -> FlexibleObject:
 
 
 def _with_vertices(item: FlexibleObject, cable: Cable, lengths: Mapping[tuple[str, str], float]) -> FlexibleObject:
-    """The object with its vertices as frames, the parent's line counted from clamp to clamp."""
+    """The object with its vertices as frames, the parent's arc length measured from clamp to clamp."""
     tree = item.mechanism
     frames = dict(tree.frames)
     for name, chain in cable.chains.items():

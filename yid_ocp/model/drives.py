@@ -1,4 +1,4 @@
-"""What holds and moves single joints of a robot: springs, dampers, position servos."""
+"""Springs, dampers and position servos on the joints of a robot."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from yid_ocp.model.parameters import Parameter
 
 Commands = Literal["held", "interpolated"]
 KNEE = 16
-"""Power p of a servo's torque limit, demand / (1 + |demand/limit|^p)^(1/p): a clip whose corner is rounded off."""
+"""Exponent p of a servo's smooth torque limit, demand / (1 + |demand/limit|^p)^(1/p)."""
 NO_LIMIT = 2e4
-"""Effort limits from here on are a file's way to say that there is none [N m or N]."""
+"""Effort limits from this value on mean that there is none [N m or N]."""
 FULL_TORQUE_AT = 0.05
-"""Error at which a servo that nobody knows better gives all of its torque [rad or m]."""
+"""Position error at which a servo of unknown gain reaches its torque limit [rad or m]."""
 DAMPING_TIME = 0.1
-"""Damping over gain of such a servo [s]."""
+"""Default ratio of a servo's damping to its gain [s]."""
 UNKNOWN_GAIN = 50.0
-"""Gain of a servo without an effort limit [N m/rad or N/m]."""
+"""Default gain of a servo without an effort limit [N m/rad or N/m]."""
 LONGEST_DELAY = 0.5
-"""Of a command [s]."""
+"""Upper bound of a servo's command delay [s]."""
 
 
 @dataclass(frozen=True)
 class Spring:
-    """A spring 1/2 stiffness (q - rest)^2 on one joint of a robot, in N m/rad and rad (N/m and m where it slides)."""
+    """A spring 1/2 stiffness (q - rest)^2 on one robot joint [N m/rad, rad; N/m, m for a prismatic joint]."""
 
     stiffness: float
     rest: float = 0.0
@@ -37,7 +37,7 @@ class Spring:
 
 @dataclass(frozen=True)
 class PositionServos:
-    """How an arm's controller takes commanded positions.
+    """How an arm's controller follows commanded positions.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class PositionServos:
 
 @dataclass(frozen=True)
 class Servo:
-    """A position servo on one joint, whose input is a commanded coordinate u.
+    """A position servo on one joint, whose input is the commanded coordinate u.
 
         demand = gain (u(t - delay) - q) - damping dq/dt       torque = demand / (1 + tightness demand^p)^(1/p)
 
@@ -80,7 +80,7 @@ class Servo:
     commands: Commands = "held"
 
     def torque(self, command: ca.SX, q: ca.SX, v: ca.SX) -> ca.SX:
-        """Torque at a coordinate and its rate [N m or N]."""
+        """The servo's torque for a command, a coordinate and its rate [N m or N]."""
         demand = self.gain * (command - q) - self.damping * v
         return demand / (1 + self.tightness * demand**KNEE) ** (1 / KNEE)
 
@@ -90,13 +90,13 @@ class Servo:
         return self.gain, self.damping, self.delay, self.tightness
 
     def mapped(self, change: Callable[[ca.SX], ca.SX]) -> Servo:
-        """Every expression replaced by what `change` makes of it."""
+        """The servo with `change` applied to every expression."""
         gain, damping, delay, tightness = map(change, self.parts)
         return Servo(gain, damping, delay, tightness, self.commands)
 
 
 def joint_dampers(tree: Mechanism, wanted: Mapping[str, float]) -> dict[str, Parameter]:
-    """Parameter `JOINT.damping` of every joint that is named."""
+    """Parameters `JOINT.damping` of the named joints, by joint."""
     found = {}
     for joint, value in wanted.items():
         tree.joint_index(joint)
@@ -106,7 +106,7 @@ def joint_dampers(tree: Mechanism, wanted: Mapping[str, float]) -> dict[str, Par
 
 
 def joint_spring(tree: Mechanism, joint: str, spring: Spring) -> tuple[Parameter, Parameter]:
-    """Stiffness and rest of a spring on a joint of the robot."""
+    """Stiffness and rest position parameters of a spring on a robot joint."""
     unit = tree.joints[tree.joint_index(joint)].unit
     per = "N m/rad" if unit == "rad" else "N/m"
     return (
@@ -118,7 +118,7 @@ def joint_spring(tree: Mechanism, joint: str, spring: Spring) -> tuple[Parameter
 def joint_servos(
     tree: Mechanism, joints: Sequence[str], commands: Commands = "held"
 ) -> tuple[dict[str, Servo], list[Parameter]]:
-    """A servo on every joint that is named, and their parameters `JOINT.servo_gain`, `servo_damping`, ...
+    """A servo on every named joint, and their parameters `JOINT.servo_gain`, `servo_damping`, ...
 
     Values are those of a servo that gives its joint's effort limit at an error of `FULL_TORQUE_AT`.
     """
@@ -151,7 +151,7 @@ def _servo_parameters(joint: Joint) -> list[Parameter]:
 
 
 def weightless(tree: Mechanism) -> Mechanism:
-    """The robot with its own weight carried by its servos: gravity pulls on none of its bodies."""
+    """The robot without gravity on its bodies, as when its controller compensates its own weight."""
     none = ca.SX(0)
     joints = tuple(
         replace(joint, bodies=tuple(replace(body, gravity_fraction=none) for body in joint.bodies))

@@ -22,7 +22,7 @@ AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 @dataclass(frozen=True)
 class Segment:
-    """What one tube, branch or beam is like.
+    """Description of one tube, branch or beam.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class ElasticJoint:
-    """A spring 1/2 stiffness (q - rest)^2 and a damper -damping v on one coordinate, both possibly symbolic."""
+    """A spring 1/2 stiffness (q - rest)^2 and a damper -damping v on one joint; the values may be symbolic."""
 
     joint: str
     segment: str
@@ -106,7 +106,7 @@ class ElasticJoint:
 
 @dataclass(frozen=True)
 class SegmentLayout:
-    """Where a segment stands in the mechanism: joint names link by link, link lengths [m] and radius [m].
+    """A segment's joint names link by link, link lengths [m], radius [m] and mass [kg] in the mechanism.
 
     The radius of a rectangular section is half its diagonal.
     """
@@ -121,7 +121,7 @@ class SegmentLayout:
 
 @dataclass(frozen=True, repr=False)
 class FlexibleObject(Shown):
-    """A generated object: its tree, its elastic joints and where each segment stands.
+    """A generated flexible object: its mechanism, elastic joints and segments.
 
     Frames: `SEGMENT` tip as `w_SEGMENT`, tip of link i as `SEGMENT_i_tip`, the root frame `object_root`, and points by
     arc length, independent of the number of links, as `SEGMENT:40%`.
@@ -136,7 +136,7 @@ class FlexibleObject(Shown):
         return Summary(f"{names}, {counted(len(tree.joints), 'joint')}", tree.parameters._summary().rows)
 
     def segment(self, name: str) -> SegmentLayout:
-        """Layout of a segment by name."""
+        """Layout of a segment by name; `ModelError` where there is none."""
         for entry in self.segments:
             if entry.name == name:
                 return entry
@@ -149,7 +149,7 @@ def flexible_object(
     name: str = "object",
     gravity_fraction: float = 1.0,
 ) -> FlexibleObject:
-    """Chain of rigid links with an elastic joint before each.
+    """A flexible object of rigid links with an elastic joint before each.
 
     Parameters
     ----------
@@ -186,7 +186,7 @@ def flexible_object(
 
 @dataclass(frozen=True)
 class _Parts:
-    """An object as far as it is built."""
+    """An object under construction."""
 
     frames: dict[str, Frame]
     parameters: list[Parameter] = field(default_factory=list)
@@ -196,7 +196,7 @@ class _Parts:
 
 
 def _add_segment(parts: _Parts, segment: Segment, root: Placement, gravity_fraction: ca.SX | None) -> None:
-    """Hang a segment's links on what is there already."""
+    """Append a segment's links to the object."""
     own = _segment_parameters(segment)
     parts.parameters.extend(own.values())
     mass, cross = own["mass"].symbol, _cross_section(own)
@@ -239,7 +239,7 @@ def _add_segment(parts: _Parts, segment: Segment, root: Placement, gravity_fract
 
 
 def _add_link(parts: _Parts, segment: Segment, names: Sequence[str], at: Frame, body: Inertia) -> None:
-    """The joints before a link, the last of which carries its body."""
+    """Append the joints before a link, the last of which carries its body."""
     parent, placement = at.joint, at.placement
     for name, axis in zip(names, segment.joint_order, strict=True):
         bodies = (body,) if name == names[-1] else ()
@@ -250,7 +250,7 @@ def _add_link(parts: _Parts, segment: Segment, names: Sequence[str], at: Frame, 
 def _springs(
     segment: Segment, names: Sequence[str], own: Mapping[str, Parameter], factor: ca.SX
 ) -> Iterator[ElasticJoint]:
-    """Springs and dampers of the joints before a link; `factor` makes stiffnesses of rigidities."""
+    """Springs and dampers of the joints before a link; `factor` converts rigidities to stiffnesses."""
     for name, axis in zip(names, segment.joint_order, strict=True):
         kind: Literal["bend", "twist"] = "twist" if axis == "z" else "bend"
         damping = own.get("twist_damping", own["damping"]) if kind == "twist" else own["damping"]
@@ -258,7 +258,7 @@ def _springs(
 
 
 def polyline_rotations(vertices: ArrayLike, start: ArrayLike | None = None) -> list[NDArray[np.float64]]:
-    """Rotations that turn each edge's frame into the next one's by the shortest way (no twist).
+    """Rotation from each edge's frame to the next one's by the smallest angle (no twist).
 
     Parameters
     ----------
@@ -326,7 +326,7 @@ def _per_joint(segment: Segment, length: ca.SX, before: ca.SX | None) -> ca.SX:
 
 @dataclass(frozen=True)
 class _CrossSection:
-    """Mean squares of x and y over a section [m^2], and the radius that it counts as [m]."""
+    """Mean squares of x and y over a section [m^2], and its equivalent radius [m]."""
 
     x: ca.SX
     y: ca.SX

@@ -18,7 +18,7 @@ from yid_ocp.model.rotations import about_axis
 
 @dataclass(frozen=True)
 class Kinematics:
-    """Poses of a tree at a configuration.
+    """Joint poses and screws of a mechanism at a configuration.
 
     Attributes
     ----------
@@ -37,18 +37,18 @@ class Kinematics:
     screws: tuple[ca.SX, ...]
 
     def pose(self, frame: str | Frame) -> Placement:
-        """Placement of a frame in the world."""
+        """Pose of a frame in the world."""
         entry = self.mechanism.frame(frame) if isinstance(frame, str) else frame
         if entry.joint < 0:
             return entry.placement
         return Placement(self.rotations[entry.joint], self.origins[entry.joint]) @ entry.placement
 
     def position(self, frame: str | Frame) -> ca.SX:
-        """Origin of a frame in the world, shape (3, 1) [m]."""
+        """Position of a frame's origin in the world, shape (3, 1) [m]."""
         return self.pose(frame).translation
 
     def point_jacobian(self, frame: str | Frame) -> ca.SX:
-        """Derivative of a frame's origin by the configuration, shape (3, n)."""
+        """Derivative of a frame's position by the configuration, shape (3, n)."""
         entry = self.mechanism.frame(frame) if isinstance(frame, str) else frame
         point = self.position(entry)
         columns = [ca.SX(3, 1)] * len(self.screws)
@@ -67,7 +67,7 @@ class Kinematics:
 
 @dataclass(frozen=True)
 class RigidBody:
-    """The rigid-body Lagrangian's derivatives at (q, v), and the vectors from which its second derivatives follow.
+    """First derivatives of the rigid-body Lagrangian at (q, v), and the vectors of its second derivatives.
 
     With S_j the screw of joint j, D_j = V_parent(j) x S_j, Ic_j and H_j the inertia and momentum of all that j moves:
 
@@ -101,22 +101,22 @@ class RigidBody:
 
 
 def cross(a: ca.SX, b: ca.SX) -> ca.SX:
-    """Vector product of two (3, 1) expressions."""
+    """Cross product of two (3, 1) expressions."""
     return ca.cross(a, b)
 
 
 def motion_cross(a: ca.SX, b: ca.SX) -> ca.SX:
-    """Spatial product a x b of two motions, shape (6, 1)."""
+    """Spatial cross product a x b of two motions (twists), shape (6, 1)."""
     return ca.vertcat(cross(a[:3], b[:3]), cross(a[:3], b[3:]) + cross(a[3:], b[:3]))
 
 
 def force_cross(a: ca.SX, f: ca.SX) -> ca.SX:
-    """Spatial product a x* f of a motion and a wrench, shape (6, 1)."""
+    """Spatial cross product a x* f of a motion and a wrench, shape (6, 1)."""
     return ca.vertcat(cross(a[:3], f[:3]) + cross(a[3:], f[3:]), cross(a[:3], f[3:]))
 
 
 def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
-    """Poses and screws of every joint.
+    """Poses and screws of all joints at a configuration.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
 
 
 def rigid_body(kinematics: Kinematics, v: ca.SX, gravity: ca.SX) -> RigidBody:
-    """Lagrangian derivatives of the tree's bodies.
+    """Energies and first derivatives of the Lagrangian of a mechanism's bodies.
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ def rigid_body(kinematics: Kinematics, v: ca.SX, gravity: ca.SX) -> RigidBody:
 
 @dataclass
 class _Moved:
-    """All that a joint moves: mass moments about the world origin and momentum.
+    """Mass moments about the world origin and momentum of all bodies that a joint moves.
 
     `heavy` and `heavy_first` are mass and first moment as gravity pulls at them.
     """
@@ -213,7 +213,7 @@ class _Moved:
 
 
 def _moved(kinematics: Kinematics, velocity: Sequence[ca.SX], gravity: ca.SX) -> tuple[list[_Moved], ca.SX, ca.SX]:
-    """What every joint moves, and the bodies' kinetic and potential energy [J]."""
+    """Mass moments and momentum of what every joint moves, and the kinetic and potential energy [J]."""
     joints = kinematics.mechanism.joints
     moved = [_Moved() for _ in joints]
     kinetic, potential = ca.SX(0), ca.SX(0)

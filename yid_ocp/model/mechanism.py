@@ -1,4 +1,4 @@
-"""Trees of rigid bodies: placements, inertias, joints, frames, and how trees are joined."""
+"""Trees of rigid bodies: rigid transforms, inertias, joints and frames, and how trees are combined."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ class Placement:
 
     @staticmethod
     def identity() -> Placement:
-        """No displacement."""
+        """The identity transform."""
         return Placement.of(np.eye(4))
 
     def __matmul__(self, other: Placement) -> Placement:
         return Placement(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
 
     def mapped(self, change: Callable[[ca.SX], ca.SX]) -> Placement:
-        """Both expressions replaced by what `change` makes of them."""
+        """The transform with `change` applied to both expressions."""
         return Placement(change(self.rotation), change(self.translation))
 
     def matrix(self) -> ca.SX:
@@ -73,24 +73,24 @@ class Inertia:
         return Inertia(ca.SX(mass), ca.SX(ca.DM(np.asarray(com, float))), ca.SX(ca.DM(np.asarray(about_com, float))))
 
     def scaled(self, factor: ca.SX) -> Inertia:
-        """Mass and inertia multiplied by `factor`, the centre kept."""
+        """The inertia with mass and tensor multiplied by `factor`; the centre of mass is unchanged."""
         return replace(self, mass=self.mass * factor, about_com=self.about_com * factor)
 
     def moved(self, placement: Placement) -> Inertia:
-        """The same body seen from the frame in which its own frame has `placement`."""
+        """The inertia in another frame, in which its present frame has `placement`."""
         rotation = placement.rotation
         com = rotation @ self.com + placement.translation
         return replace(self, com=com, about_com=rotation @ self.about_com @ rotation.T)
 
     def mapped(self, change: Callable[[ca.SX], ca.SX]) -> Inertia:
-        """Every expression replaced by what `change` makes of it."""
+        """The inertia with `change` applied to every expression."""
         fraction = None if self.gravity_fraction is None else change(self.gravity_fraction)
         return Inertia(change(self.mass), change(self.com), change(self.about_com), fraction)
 
 
 @dataclass(frozen=True)
 class Joint:
-    """One degree of freedom and the bodies that move with it.
+    """One degree of freedom and the bodies on its moving side.
 
     Attributes
     ----------
@@ -123,7 +123,7 @@ class Joint:
 
     @property
     def unit(self) -> str:
-        """Unit of the coordinate."""
+        """Unit of the coordinate, `rad` or `m`."""
         return "rad" if self.kind == "revolute" else "m"
 
 
@@ -137,7 +137,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Line:
-    """A chain of straight links.
+    """A chain of straight links along which points are located by arc length.
 
     Attributes
     ----------
@@ -151,7 +151,7 @@ class Line:
     parts: tuple[float, ...]
 
     def locate(self, part: float) -> tuple[str, float]:
-        """Tip of the link on which a part of the arc length ends (0 to 1), and the part of that link before it."""
+        """Tip frame of the link that contains a fraction of the arc length (0 to 1), and the fraction of that link."""
         before = 0.0
         for tip, own in zip(self.tips, self.parts, strict=True):
             # what ends a link belongs to it, not to the next one
@@ -163,7 +163,7 @@ class Line:
 
 @dataclass(frozen=True, repr=False)
 class Mechanism(Shown):
-    """A tree of joints in an order in which parents come first.
+    """A tree of joints, parents before children.
 
     Attributes
     ----------
@@ -208,7 +208,7 @@ class Mechanism(Shown):
         return names.index(name)
 
     def has_frame(self, name: str) -> bool:
-        """Whether `frame` knows a name, or would if only its percentage were right."""
+        """Whether there is a frame of a name, or a segment for a name such as `T1:40%`."""
         return name in self.frames or (":" in name and name.partition(":")[0] in self.lines)
 
     def frame(self, name: str) -> Frame:
@@ -233,7 +233,7 @@ class Mechanism(Shown):
         return Frame(end.joint, Placement(end.placement.rotation, part * end.placement.translation))
 
     def ancestors(self, index: int) -> tuple[int, ...]:
-        """Indices from the root to joint `index`, itself included; empty for the world."""
+        """Indices of the joints from the root to joint `index`, itself included; empty for the world."""
         chain = []
         while index >= 0:
             chain.append(index)
@@ -241,7 +241,7 @@ class Mechanism(Shown):
         return tuple(reversed(chain))
 
     def joined(self, other: Mechanism, frame: str | None = None, placement: ArrayLike | None = None) -> Mechanism:
-        """Hang another mechanism on a frame of this one.
+        """This mechanism with another one attached to one of its frames.
 
         Parameters
         ----------
@@ -282,7 +282,7 @@ class Mechanism(Shown):
         )
 
     def with_frame(self, name: str, frame: str | None, placement: ArrayLike) -> Mechanism:
-        """The mechanism with one more frame.
+        """The mechanism with one additional frame.
 
         Parameters
         ----------
@@ -300,7 +300,7 @@ class Mechanism(Shown):
         return replace(self, frames={**self.frames, name: added})
 
     def numeric(self, values: Mapping[str, float] | None = None) -> Mechanism:
-        """The mechanism with numbers in place of its parameters."""
+        """The mechanism with numbers in place of its parameters, which are then empty."""
         return self._evaluated(self.parameters.symbols, self.parameters.vector(values))
 
     def _evaluated(self, symbols: ca.SX, theta: NDArray[np.float64]) -> Mechanism:
@@ -311,7 +311,7 @@ class Mechanism(Shown):
         return replace(self.mapped(number), parameters=Parameters())
 
     def mapped(self, change: Callable[[ca.SX], ca.SX]) -> Mechanism:
-        """The mechanism with every expression in placements and inertias replaced by what `change` makes of it."""
+        """The mechanism with `change` applied to every expression of its placements and inertias."""
         joints = tuple(
             replace(
                 joint, placement=joint.placement.mapped(change), bodies=tuple(b.mapped(change) for b in joint.bodies)
@@ -322,7 +322,7 @@ class Mechanism(Shown):
         return replace(self, joints=joints, frames=frames)
 
     def inserted(self, index: int, chain: Sequence[Joint]) -> Mechanism:
-        """Put a chain of joints into the tree at a place in its order; nothing hangs on it yet.
+        """The mechanism with a chain of joints inserted at an index; nothing is attached to the chain yet.
 
         Parameters
         ----------
@@ -345,7 +345,7 @@ class Mechanism(Shown):
 
 
 def _fraction(name: str, said: str) -> float:
-    """Part of a length from a percentage in a frame's name."""
+    """Fraction of a length from a percentage in a frame's name."""
     number = said.strip().removesuffix("%")
     try:
         value = float(number) if said.strip().endswith("%") else math.nan
@@ -362,7 +362,7 @@ def _fraction(name: str, said: str) -> float:
 
 
 def merged(bodies: Iterable[Inertia]) -> Inertia | None:
-    """One rigid body equal to several, None for no body or no mass."""
+    """One rigid body equal to several; None for no body or zero mass."""
     entries = list(bodies)
     if not entries:
         return None

@@ -1,4 +1,4 @@
-"""Named physical parameters: value, unit, bounds and the symbol that stands for each in the equations."""
+"""Named physical parameters with value, unit, bounds and symbol."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Parameter:
 
 
 class Parameters(Shown):
-    """The ordered, immutable set of a model's parameters; fixes the order of `theta`.
+    """The ordered, immutable set of a model's parameters, which defines the order of `theta`.
 
     Parameters
     ----------
@@ -84,12 +84,12 @@ class Parameters(Shown):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names in the order of `theta`."""
+        """Parameter names in the order of `theta`."""
         return tuple(entry.name for entry in self._entries)
 
     @property
     def symbols(self) -> ca.SX:
-        """Symbols in the order of `theta`, shape (ntheta, 1)."""
+        """Parameter symbols in the order of `theta`, shape (ntheta, 1)."""
         return ca.vertcat(*(entry.symbol for entry in self._entries)) if self._entries else ca.SX(0, 1)
 
     def __len__(self) -> int:
@@ -105,13 +105,13 @@ class Parameters(Shown):
         return self._entries[self.index(name)]
 
     def index(self, name: str) -> int:
-        """Position of a name in `theta`; an unknown name raises `ConfigError` with the nearest one."""
+        """Index of a parameter in `theta`; `ConfigError` with the nearest name where there is none."""
         if name not in self._index:
             raise ConfigError(f"there is no parameter '{name}'", hint=nearest(name, self._index))
         return self._index[name]
 
     def vector(self, values: Mapping[str, float] | None = None) -> Vector:
-        """Nominal values with some replaced.
+        """The vector theta of nominal values, some of them replaced.
 
         Parameters
         ----------
@@ -153,7 +153,7 @@ class Parameters(Shown):
         )
 
     def joined(self, *others: Iterable[Parameter]) -> Parameters:
-        """This set followed by the entries of others."""
+        """These parameters followed by others."""
         return Parameters([*self._entries, *(entry for other in others for entry in other)])
 
     def bounds(self, names: Sequence[str]) -> tuple[Vector, Vector]:

@@ -17,7 +17,7 @@ SNAP = 1e-11
 
 
 def snapped(matrix: Matrix) -> Matrix:
-    """Replace entries within `SNAP` of -1, 0 and 1 by these."""
+    """The matrix with entries within `SNAP` of -1, 0 and 1 replaced by these numbers."""
     result = np.array(matrix, dtype=float)
     for exact in (-1.0, 0.0, 1.0):
         result[np.abs(result - exact) < SNAP] = exact
@@ -44,7 +44,7 @@ def roll_pitch_yaw(roll: float, pitch: float, yaw: float) -> Matrix:
 
 
 def angles_of(rotation: Matrix) -> tuple[float, float, float]:
-    """Roll, pitch and yaw [rad] with which `roll_pitch_yaw` gives a rotation matrix."""
+    """Roll, pitch and yaw [rad] of a rotation matrix, the inverse of `roll_pitch_yaw`."""
     # the roll is taken in the frame that yaw and pitch leave, which holds at and near pitch = 90 degrees too
     yaw = math.atan2(rotation[1, 0], rotation[0, 0])
     pitch = math.atan2(-rotation[2, 0], math.hypot(rotation[0, 0], rotation[1, 0]))
@@ -53,7 +53,7 @@ def angles_of(rotation: Matrix) -> tuple[float, float, float]:
 
 
 def turn(axis: ArrayLike, sine: float, cosine: float) -> Matrix:
-    """Rotation matrix about a unit axis by the angle with this sine and cosine (Rodrigues' formula)."""
+    """Rotation matrix about a unit axis, from the sine and cosine of the angle (Rodrigues' formula)."""
     skew = _skew(np.asarray(axis, float))
     return np.eye(3) + sine * skew + (1 - cosine) * skew @ skew
 
@@ -88,6 +88,6 @@ def _skew(u: Matrix) -> Matrix:
 
 
 def placement_matrix(xyz: ArrayLike = (0.0, 0.0, 0.0), rpy: ArrayLike = (0.0, 0.0, 0.0)) -> Matrix:
-    """4x4 placement from a translation [m] and roll, pitch, yaw [rad]."""
+    """Homogeneous 4x4 matrix from a translation [m] and roll, pitch, yaw [rad]."""
     angles = np.asarray(rpy, float)
     return transform(roll_pitch_yaw(*angles), xyz)

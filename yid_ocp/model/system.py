@@ -1,4 +1,4 @@
-"""The mechanical system: tree, springs, dampers, grasps, inputs, and the terms that effects add to it."""
+"""The mechanical system: mechanism, springs, dampers, grasps and inputs, and the interface of effects."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ EQUATIONS: dict[str, tuple[str, ...]] = {
     "axis": ("x", "y", "z", "tilt_x", "tilt_y"),
     "weld": ("x", "y", "z", "turn_x", "turn_y", "turn_z"),
 }
-"""What the equations of a grasp are called, by its kind."""
+"""Names of a grasp's constraint equations, by its kind."""
 
 
 @dataclass(frozen=True)
 class Grasp:
-    """A holonomic constraint between a frame of the robot (or of a clamp) and one of the object.
+    """A holonomic constraint between a frame of the robot (or a clamp) and a frame of the object.
 
     Attributes
     ----------
@@ -64,16 +64,16 @@ class Grasp:
 
     @property
     def equations(self) -> int:
-        """Number of scalar constraints."""
+        """Number of scalar constraint equations."""
         return len(EQUATIONS[self.kind])
 
     @property
     def equation_names(self) -> tuple[str, ...]:
-        """`left.x`, ..., then tilts of an axis or turns of a weld."""
+        """Names of the equations: `left.x`, ..., then tilts for `axis` or rotations for `weld`."""
         return tuple(f"{self.name}.{part}" for part in EQUATIONS[self.kind])
 
     def mapped(self, change: Callable[[ca.SX], ca.SX]) -> Grasp:
-        """Every expression replaced by what `change` makes of it."""
+        """The grasp with `change` applied to every expression."""
         return replace(
             self,
             rotation=change(self.rotation),
@@ -84,7 +84,7 @@ class Grasp:
         )
 
     def residual(self, kinematics: Kinematics) -> ca.SX:
-        """phi(q), shape (equations, 1): positions [m], then direction or orientation [rad]."""
+        """Constraint residual phi(q), shape (equations, 1): positions [m], then direction or orientation [rad]."""
         holder = kinematics.pose(self.holder) @ Placement(self.rotation, self.offset)
         held = kinematics.pose(self.held)
         point = held.translation - held.rotation[:, 2] * self.slip
@@ -98,7 +98,7 @@ class Grasp:
         return ca.vertcat(*rows)
 
     def alignment(self, kinematics: Kinematics) -> ca.SX:
-        """Differences of the axes that the grasp makes coincide, shape (0, 3 or 9; 1).
+        """Differences between the axes that the grasp aligns, shape (0, 3 or 9; 1).
 
         Redundant beside `residual`, but not zero where axes point in opposite ways: for a search that starts far off.
         """
@@ -110,7 +110,7 @@ class Grasp:
 
 @dataclass(frozen=True)
 class MidpointState:
-    """What a term may depend on: the midpoint of one step.
+    """Symbols of one step's midpoint, on which energies and forces may depend.
 
     Attributes
     ----------
@@ -145,7 +145,7 @@ class MidpointState:
 
 @dataclass(frozen=True)
 class NodeState:
-    """What a measurement may depend on: one node of the trajectory.
+    """Symbols of one trajectory node, on which measurements may depend.
 
     Attributes
     ----------
@@ -176,7 +176,7 @@ class NodeState:
 
 @dataclass(frozen=True)
 class ClosedForce:
-    """The generalized force F(q, v) of wrenches that take energy out of bodies, with its slopes in closed form.
+    """A dissipative generalized force F(q, v) of wrenches on bodies, with its derivatives in closed form.
 
     With S_j and D_j as in `RigidBody`, for i an ancestor of joint j or j itself:
 
@@ -196,7 +196,7 @@ class ClosedForce:
 
 @dataclass(frozen=True)
 class Terms:
-    """What one part of the model adds to the equations of a step.
+    """Energy, forces and equations that one effect adds to a step.
 
     Attributes
     ----------
@@ -224,7 +224,7 @@ class Terms:
 
 @runtime_checkable
 class Effect(Protocol):
-    """An unmodelled effect, or any other addition to the nominal model.
+    """Interface of an unmodelled effect or another addition to the nominal model.
 
     `modify` changes the description (masses, lengths, grasps, gravity, added joints); `terms` adds energy, force and
     equations of internal coordinates. At neutral parameters both must leave the nominal model unchanged.
@@ -232,30 +232,30 @@ class Effect(Protocol):
 
     @property
     def kind(self) -> str:
-        """Under which it is registered."""
+        """Name under which the effect's class is registered."""
         ...
 
     @property
     def location(self) -> str:
-        """Where it sits."""
+        """Name of the place where the effect acts."""
         ...
 
     @property
     def parameters(self) -> Parameters:
-        """Its parameters, named `kind@location.quantity`."""
+        """The effect's parameters, named `kind@location.quantity`."""
         ...
 
     @property
     def internal(self) -> Mapping[str, ca.SX]:
-        """Internal coordinates (without momentum) that it owns: name to the symbol that stands for it in `modify`."""
+        """The effect's internal coordinates (without momentum): name to the symbol that `modify` uses."""
         ...
 
     def modify(self, system: System) -> System:
-        """The system with the effect's changes of description."""
+        """The system with the effect's changes of masses, lengths, grasps, gravity or joints."""
         ...
 
     def terms(self, state: MidpointState) -> Terms:
-        """What the effect adds to the step's equations."""
+        """Energy, forces and internal equations that the effect adds to one step."""
         ...
 
     def measure(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
@@ -265,18 +265,18 @@ class Effect(Protocol):
 
 @runtime_checkable
 class RecordedEffect(Effect, Protocol):
-    """An effect that also says how recorded inputs and times differ from the true ones.
+    """Interface of an effect on recorded inputs and times.
 
     Recorded torques drive the model, recorded angles prescribe it or are followed: there the reading is known and the
     true value is sought, the opposite of `measure`.
     """
 
     def correct(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
-        """The true value behind a reading of `joints.position.JOINT` or `joints.effort.JOINT`, at the true `effort`."""
+        """The true value for a recorded `joints.position.JOINT` or `joints.effort.JOINT`, at the true `effort`."""
         ...
 
     def delay(self, channel: str, camera: bool) -> ca.SX:
-        """How long before its recorded time a reading was true [s].
+        """How long before its recorded time a sample was true [s].
 
         `channel` is as in `measure`, or `torque.JOINT` for a recorded torque that drives the model: it then acts so
         much later than it was recorded.
@@ -284,7 +284,7 @@ class RecordedEffect(Effect, Protocol):
         ...
 
     def lag(self, channel: str) -> ca.SX:
-        """Time constant with which what acts follows a recorded torque, or a reading follows an effort [s].
+        """Time constant with which a torque follows the recorded one, or a recorded effort the true one [s].
 
         `channel` is `torque.JOINT` or `joints.effort.JOINT`.
         """
@@ -293,7 +293,7 @@ class RecordedEffect(Effect, Protocol):
 
 @dataclass(frozen=True, repr=False)
 class System(Shown):
-    """A mechanism with everything that acts on it.
+    """A mechanism with springs, dampers, grasps, inputs and effects.
 
     Attributes
     ----------
@@ -358,7 +358,7 @@ class System(Shown):
         springs: Mapping[str, Spring] | None = None,
         servos: PositionServos | None = None,
     ) -> System:
-        """Put robot, objects, grasps and effects together.
+        """A system from a robot, objects, grasps and effects.
 
         Parameters
         ----------
@@ -429,7 +429,7 @@ class System(Shown):
         return system.with_effects(effects)
 
     def with_effects(self, effects: Sequence[Effect]) -> System:
-        """This system with more effects, whose parameters are appended to theta in the order given."""
+        """This system with additional effects, whose parameters are appended to theta in the order given."""
         system = self
         for effect in effects:
             system = replace(system, parameters=system.parameters.joined(effect.parameters))
@@ -476,14 +476,14 @@ class System(Shown):
         return {name: symbol for effect in self.effects for name, symbol in effect.internal.items()}
 
     def segment(self, name: str) -> SegmentLayout:
-        """Layout of one of the object's segments; `ModelError` with the nearest name where there is none."""
+        """Layout of a segment by name; `ModelError` with the nearest name where there is none."""
         for entry in self.segments:
             if entry.name == name:
                 return entry
         raise ModelError(f"there is no segment '{name}'", hint=nearest(name, [s.name for s in self.segments]))
 
     def mapped(self, change: Callable[[ca.SX], ca.SX]) -> System:
-        """The system with every expression of its description replaced by what `change` makes of it."""
+        """The system with `change` applied to every expression of its description."""
         elastic = tuple(
             replace(e, stiffness=change(e.stiffness), damping=change(e.damping), rest=change(e.rest))
             for e in self.elastic
@@ -506,7 +506,7 @@ class System(Shown):
         )
 
     def elastic_energy(self, q: ca.SX) -> ca.SX:
-        """Sum of 1/2 stiffness (q - rest)^2 over the elastic joints [J]."""
+        """Elastic energy, the sum of 1/2 stiffness (q - rest)^2 over the elastic joints [J]."""
         energy = ca.SX(0)
         for spring in self.elastic:
             deflection = q[self.mechanism.joint_index(spring.joint)] - spring.rest
@@ -514,7 +514,7 @@ class System(Shown):
         return energy
 
     def viscous_force(self, v: ca.SX) -> ca.SX:
-        """Force of all viscous dampers, shape (n, 1) [N m]."""
+        """Generalized force of all viscous dampers, shape (n, 1) [N m]."""
         force = [ca.SX(0)] * self.size
         for spring in self.elastic:
             index = self.mechanism.joint_index(spring.joint)
@@ -525,7 +525,7 @@ class System(Shown):
         return ca.vertcat(*force)
 
     def input_force(self, u: ca.SX, q: ca.SX, v: ca.SX) -> ca.SX:
-        """Torques of motors and servos placed on their coordinates, shape (n, 1) [N m]."""
+        """Generalized force of motor torques and servos, shape (n, 1) [N m]."""
         force = [ca.SX(0)] * self.size
         for row, (joint, index) in enumerate(zip(self.driven, self.driven_indices, strict=True)):
             servo = self.servos.get(joint)
@@ -533,11 +533,11 @@ class System(Shown):
         return ca.vertcat(*force)
 
     def constraints(self, kinematics: Kinematics) -> ca.SX:
-        """phi(q) of all grasps, shape (m, 1)."""
+        """Constraint residual phi(q) of all grasps, shape (m, 1)."""
         return ca.vertcat(*(grasp.residual(kinematics) for grasp in self.grasps)) if self.grasps else ca.SX(0, 1)
 
     def constraint_relaxation(self) -> ca.SX | None:
-        """T in phi + T dphi/dt = C lam / h, shape (m, 1) [s]; None where no grasp has any."""
+        """Relaxation times T in phi + T dphi/dt = C lam / h, shape (m, 1) [s]; None where no grasp has one."""
         if all(grasp.relaxation is None for grasp in self.grasps):
             return None
         zero = ca.SX(0)
@@ -577,7 +577,7 @@ def _check_names(
 
 
 def floating_clamp(name: str, frame: str | None = None) -> Mechanism:
-    """A massless frame with six coordinates (x, y, z, then turns about x, y, z), to be prescribed along a path.
+    """A massless mechanism of one frame with six coordinates (x, y, z, then rotations about x, y, z).
 
     Parameters
     ----------

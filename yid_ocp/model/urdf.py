@@ -1,4 +1,4 @@
-"""Mechanisms from URDF files and back."""
+"""Reading and writing mechanisms as URDF."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ MOVABLE = {"revolute", "continuous", "prismatic"}
 
 
 def robot_description_file(robot: str) -> Path:
-    """Path of a URDF that the example-robot-data package installed.
+    """Path of a robot's URDF file in the installed example-robot-data package.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def robot_description_file(robot: str) -> Path:
 
 
 def robot_file(robot: str | Path) -> Path:
-    """File of a robot as settings name it; it need not exist.
+    """Path of a robot's URDF file from its name in the settings; the file need not exist.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def robot_file(robot: str | Path) -> Path:
 
 
 def _shipped() -> dict[str, Path]:
-    """URDF files of this package by name: in the repository, or where its wheel put them."""
+    """URDF files of this package by name: from the repository or from the installed wheel."""
     folder = Path(__file__).resolve().parents[2] / "models" / "urdf"
     if folder.is_dir():
         return {path.name: path for path in folder.glob("*.urdf")}
@@ -111,7 +111,7 @@ def read_urdf(
     parametric: bool = True,
     exclude_links: Sequence[str] = (),
 ) -> Mechanism:
-    """Read a URDF; keep the chosen joints, lock the others, merge what is then fixed together.
+    """A mechanism from a URDF file with the chosen joints kept and the others locked.
 
     Parameters
     ----------
@@ -182,7 +182,7 @@ class _Link:
 
 @dataclass(frozen=True)
 class _Found:
-    """What hangs on which kept joint (None: the world), and where in that joint's frame.
+    """Carrier joint (None: the world) and placement in its frame of every kept joint, body and link.
 
     Attributes
     ----------
@@ -219,7 +219,7 @@ def _parsed(file: Path) -> Any:
 
 
 def _check_numbers(robot: ElementTree.Element, where: str) -> None:
-    """Refuse numbers that are missing, too many or none, which the reader would take as zeros or leave to chance."""
+    """Refuse missing, surplus or invalid numbers, which the URDF reader would silently replace."""
     for owner in robot:
         if owner.tag not in ("link", "joint"):
             continue
@@ -261,7 +261,7 @@ def _numbers(text: str, count: int, what: str, where: str, infinite: bool = Fals
 
 
 def _check_bodies(link: str, tensor: Matrix, where: str) -> None:
-    """Refuse moments of inertia that are negative; say it where no distribution of mass has them, as in real files."""
+    """Refuse negative moments of inertia; warn of moments that no mass distribution has."""
     least, middle, most = np.linalg.eigvalsh(0.5 * (tensor + tensor.T))
     values = ", ".join(f"{value:.3g}" for value in (least, middle, most))
     if least < -ROUNDED * max(most, -least):
@@ -282,7 +282,7 @@ def _check_bodies(link: str, tensor: Matrix, where: str) -> None:
 
 
 def _mimicked(robot: Any, wanted: Collection[str] | None, locked: dict[str, float], where: str) -> set[str]:
-    """Joints that follow others: locked where the others stand, as the model has no such couplings."""
+    """Names of joints that follow others (mimic), which are locked because couplings are not modelled."""
     joints = {joint.name: joint for joint in robot.joints}
     following = {name: joint.mimic for name, joint in joints.items() if joint.mimic is not None}
     for name, mimic in following.items():
@@ -311,7 +311,7 @@ def _mimicked(robot: Any, wanted: Collection[str] | None, locked: dict[str, floa
 
 
 def _checked(robot: Any, file: Path, wanted: Sequence[str]) -> dict[str, _Link]:
-    """The links by name, the root first, after all that could be wrong with joints and links was looked at."""
+    """The links by name, the root first, after a check of all joints and links."""
     where = str(file)
     for joint in robot.joints:
         if joint.type not in MOVABLE | {"fixed"}:
@@ -354,7 +354,7 @@ def _checked(robot: Any, file: Path, wanted: Sequence[str]) -> dict[str, _Link]:
 def _walk(
     links: Mapping[str, _Link], dropped: Set[str], kept: Collection[str], locked: Mapping[str, float], where: str
 ) -> _Found:
-    """Go through the tree from its root, the first of the links, and merge what is fixed together."""
+    """Collect joints, bodies and frames from the root on, and merge what is fixed together."""
     root = next(iter(links))
     found = _Found()
     stack: list[tuple[str, str | None, Matrix]] = [(root, None, np.eye(4))]
@@ -385,7 +385,7 @@ def _walk(
 
 
 def _parents_first(joints: Mapping[str, tuple[str | None, Matrix, Any]], wanted: Sequence[str]) -> list[str]:
-    """The joints in the wanted order as far as parents come first."""
+    """The joints in the wanted order, parents before children."""
     order: list[str] = []
     waiting = [name for name in dict.fromkeys(wanted) if name in joints]
     while waiting:
@@ -429,7 +429,7 @@ def _locked_motion(joint: Any, locked: Mapping[str, float]) -> Matrix:
 
 
 def _locked_value(joint: Any, locked: Mapping[str, float]) -> float:
-    """Where a joint is locked: as asked for, or at zero, or at the nearest bound."""
+    """Coordinate at which a joint is locked: as given, else zero or the nearest bound."""
     limit = joint.limit
     low = -math.inf if limit is None or limit.lower is None else float(limit.lower)
     high = math.inf if limit is None or limit.upper is None else float(limit.upper)
@@ -456,7 +456,7 @@ def _unit_axis(joint: Any) -> NDArray[np.float64]:
 
 
 def urdf_text(mechanism: Mechanism, values: Mapping[str, float] | None = None) -> str:
-    """The mechanism as URDF text: one link per joint, named frames as links on fixed joints.
+    """URDF text of a mechanism: one link per joint, named frames as links on fixed joints.
 
     Bodies are merged into one inertial per link. Placements keep full precision. Reading the text back with
     `read_urdf(..., parametric=False)` gives the same numbers to 1e-12.

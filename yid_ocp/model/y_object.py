@@ -1,4 +1,4 @@
-"""The source paper's foam letter Y: three tubes of four links, its trunk's foot on the ground."""
+"""The source paper's foam letter Y: three tubes of four links each, standing on the ground."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from yid_ocp.model.rotations import roll_pitch_yaw, transform
 from yid_ocp.model.urdf import urdf_text
 
 Y_FOOT = (0.85, 0.0, -0.93)
-"""Where the trunk's foot stands in the world, Baxter's `base` [m]."""
+"""Position of the trunk's foot in the world, Baxter's `base` [m]."""
 
 
 def y_segments() -> tuple[Segment, ...]:
-    """The paper's foam Y: trunk T1, branches T2 (45 degrees towards +y) and T3 (towards -y), four links each."""
+    """Segments of the paper's foam Y: trunk T1, branches T2 (45 degrees towards +y) and T3 (towards -y)."""
     lean = math.radians(45.0)
     return (
         Segment("T1", 0.813, 0.064, 0.032),
@@ -28,7 +28,7 @@ def y_segments() -> tuple[Segment, ...]:
 
 
 def y_object(links: int = 4, gravity_fraction: float = 1.0) -> FlexibleObject:
-    """The paper's Y, its trunk's foot at (0.85, 0, -0.93) m.
+    """The paper's foam Y as a flexible object, its trunk's foot at (0.85, 0, -0.93) m.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def y_object(links: int = 4, gravity_fraction: float = 1.0) -> FlexibleObject:
 
 
 def write_y_urdf(path: str | Path) -> None:
-    """Write the paper's Y object as URDF; `OutputError` where that is not possible."""
+    """Write the paper's Y object as a URDF file; `OutputError` where that fails."""
     try:
         Path(path).write_text(urdf_text(y_object().mechanism), encoding="utf-8")
     except OSError as error:

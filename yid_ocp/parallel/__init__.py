@@ -1,4 +1,4 @@
-"""The one place that starts threads, processes or a cluster's client."""
+"""Parallel work: threads, processes and cluster clients, which no other package starts."""
 
 from yid_ocp.parallel.lockstep import ask_together as ask_together
 from yid_ocp.parallel.lockstep import map_in_step as map_in_step

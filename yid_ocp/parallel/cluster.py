@@ -1,4 +1,4 @@
-"""A cluster: the workers of a Dask scheduler as an executor, once they are known to be fit for the work."""
+"""A Dask cluster as an executor, after a check that its workers can do the tasks."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from yid_ocp.errors import WorkerError
 from yid_ocp.version import differences, fingerprint
 
 CONNECTING = 15.0
-"""Time in which a scheduler has to answer [s]."""
+"""Timeout for the connection to a scheduler [s]."""
 STARTS = 3
-"""How often a client's event loop is started."""
+"""Number of attempts to start a client's event loop."""
 Function = Callable[..., Any]
 log = logging.getLogger(__name__)
 
@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 def cluster(
     scheduler: str, function: Function | None = None, folder: Path | None = None
 ) -> Iterator[tuple[Executor, Callable[[], None]]]:
-    """An executor on the workers of a Dask scheduler, and what says that there are none while tasks wait.
+    """Context manager for an executor on a Dask scheduler's workers, and a function that warns if there are none.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def cluster(
 
 
 def _client(distributed: Any, where: dict[str, str]) -> Any:
-    """A client; Dask asserts that its event loop starts within ten seconds, which a busy machine may not manage."""
+    """A Dask client; several attempts, because a busy machine may not start its event loop within ten seconds."""
     for _ in range(STARTS - 1):
         with contextlib.suppress(AssertionError):
             return distributed.Client(**where, timeout=CONNECTING, set_as_default=False)
@@ -81,7 +81,7 @@ def _client(distributed: Any, where: dict[str, str]) -> Any:
 
 
 def _refuse_unfit(client: Any, function: Function | None, folder: Path | None) -> None:
-    """Refuse workers of other versions, of several threads, or that do not see what is here.
+    """Refuse workers with other versions, with several threads, or without access to the same files.
 
     What they are asked travels whole, not by name: a worker without this package could not even read the name of a
     function of it, and would be lost for its scheduler.
@@ -122,7 +122,7 @@ def _refuse_unfit(client: Any, function: Function | None, folder: Path | None) -
 
 
 def _question(module: str, probe: str) -> Callable[[], Any]:
-    """What asks a worker for its fingerprint; it answers in words where it cannot give one."""
+    """A function that returns a worker's fingerprint, or a text where it cannot do the tasks."""
 
     def asked() -> Any:
         import importlib
@@ -151,5 +151,5 @@ def _unfit(worker: str, unlike: Sequence[str]) -> WorkerError:
 
 
 def unlike_words(worker: str, unlike: Sequence[str]) -> str:
-    """That a worker is of another version, and in what; see `version.differences`."""
+    """Error message for a worker with other versions; `unlike` comes from `version.differences`."""
     return f"the worker {worker} is of another version: {', '.join(unlike)}"

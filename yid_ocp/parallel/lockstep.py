@@ -1,4 +1,4 @@
-"""Work that goes on side by side until all of it waits for the same kind of answer, which is then given at once."""
+"""Batched evaluation: items run in parallel until all wait for a function, which is then called once for all."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from yid_ocp.parallel.threads import share_of_threads, threads
 
 MOST = 8
-"""Items at work at once: as many as the widest batch has members."""
+"""Largest number of concurrent items, equal to the largest batch size."""
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 Question = TypeVar("Question")
@@ -18,12 +18,12 @@ Answer = TypeVar("Answer")
 
 
 class _Abandoned(BaseException):
-    """Raised where an item waits for an answer that nobody will give any more."""
+    """Raised in an item that waits for an answer after another item failed."""
 
 
 @dataclass(eq=False)
 class _Request:
-    """Questions of one item to one function."""
+    """Arguments of one item for one function."""
 
     rank: int
     function: Callable[[list[Any]], list[Any]]
@@ -34,7 +34,7 @@ class _Request:
 
 @dataclass(eq=False)
 class _March:
-    """Items that are at work, and what they wait for."""
+    """Running items and their pending requests."""
 
     live: int
     running: threading.Semaphore
@@ -43,7 +43,7 @@ class _March:
     abandoned: bool = False
 
     def ask(self, request: _Request) -> list[Any]:
-        """Wait for the answers to a request, and meanwhile let another item run."""
+        """Wait for the answers to a request, and let another item run meanwhile."""
         self.running.release()
         try:
             return self._answers(request)
@@ -64,13 +64,13 @@ class _March:
         return request.answers
 
     def leave(self) -> None:
-        """One thread has no more items."""
+        """Register that one thread has no more items."""
         with self.changed:
             self.live -= 1
             self.changed.notify_all()
 
     def answer_until_done(self) -> None:
-        """Answer whenever all threads wait, until none is left."""
+        """Answer all requests whenever all threads wait, until no thread is left."""
         while True:
             with self.changed:
                 self.changed.wait_for(lambda: len(self.waiting) == self.live)
@@ -87,7 +87,7 @@ _HERE = threading.local()
 
 
 def ask_together(function: Callable[[list[Question]], list[Answer]], questions: list[Question]) -> list[Answer]:
-    """Answers of a function to some questions, asked along with those of all other items of a `map_in_step`.
+    """Results of a function for some arguments, evaluated in one call with those of other `map_in_step` items.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def ask_together(function: Callable[[list[Question]], list[Answer]], questions: 
 
 
 def map_in_step(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """Results in the order of the items, some of which are at work side by side, in threads of their own.
+    """Results of a function for all items, run concurrently so that their `ask_together` calls are batched.
 
     As many run as there are threads to use; they wait for each other wherever one calls `ask_together`, so that all are
     answered at once.
@@ -162,7 +162,7 @@ def _by_function(requests: Sequence[_Request]) -> list[list[_Request]]:
 
 
 def _answer(requests: Sequence[_Request]) -> None:
-    """Ask one function all that it is asked, and deal out what it says."""
+    """Call one function for several requests and distribute its results."""
     try:
         answers = requests[0].function([question for request in requests for question in request.questions])
     except Exception as error:

@@ -1,4 +1,4 @@
-"""Processes of this machine that leave interruptions to their parent and end with it."""
+"""Processes on this machine that ignore interrupt signals and end with their parent."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from yid_ocp.parallel.threads import THREADS, processors, threads
 
 
 class ThisProcess(Executor):
-    """Does what it is given at once, in the process that asks: for work that is less than what a process costs."""
+    """An executor that runs each call at once in the calling process, for work too small for a process."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """A future that is done."""
+        """A completed future."""
         future: Future[Any] = Future()
         try:
             future.set_result(fn(*args, **kwargs))
@@ -27,7 +27,7 @@ class ThisProcess(Executor):
 
 
 def process_pool(workers: int | None = None) -> ProcessPoolExecutor:
-    """Fresh processes, as many as there are processors when not said; they leave interruptions to their parent.
+    """A pool of spawned processes, by default one per processor; they ignore interrupt signals.
 
     They are started anew instead of forked: a fork copies the locks of threads that it does not copy. Together they use
     as many threads as this process might.
@@ -47,7 +47,7 @@ def _begin_worker(threads: int) -> None:
 
 
 def _end_with_parent() -> None:
-    """A worker whose parent was killed would wait for tasks for ever."""
+    """Exit when the parent process ends, because the worker would wait for tasks forever."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

@@ -1,4 +1,4 @@
-"""Tasks that keep what they finished, done by processes of this machine or by the workers of a scheduler.
+"""Tasks with stored results, run by processes on this machine or by a scheduler's workers.
 
 A task is a function at the top of a module with plain data and paths. Its result is one JSON file, written whole by
 whoever worked it out, under a name that is the hash of the function's name, the sources it depends on and the
@@ -41,18 +41,18 @@ from yid_ocp.version import differences, fingerprint, package_code
 
 FORMAT = "yid-task/1"
 ARRIVING = 60.0
-"""Time until a file that another machine wrote has to be seen here, as file systems of clusters are [s]."""
+"""Timeout until a result file written by another machine is visible, as on network file systems [s]."""
 SILENCE = 60.0
-"""Time without any news after which it is looked whether there are workers at all [s]."""
+"""Time without a finished task after which it is checked that there are workers [s]."""
 log = logging.getLogger(__name__)
 Function = Callable[..., Any]
 Progress = Callable[[int, int, str], None]
-"""Told how many of how many tasks are done, and which one was last."""
+"""Callback with the number of finished tasks, the number of all tasks, and the name of the last one."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """One call of a function.
+    """One function call.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class Task:
 
 @dataclass(frozen=True)
 class TaskResult:
-    """What became of a task.
+    """The result of a task.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class TaskResult:
 
 @dataclass(frozen=True)
 class Workers:
-    """Who does the tasks of a run.
+    """The workers of a run: processes on this machine or a scheduler.
 
     Attributes
     ----------
@@ -123,7 +123,7 @@ class Workers:
             )
 
     def check(self) -> None:
-        """Find out before long work whether these workers can be had at all.
+        """Check before long work that the workers are available.
 
         Raises
         ------
@@ -136,7 +136,7 @@ class Workers:
 
 
 LOCAL = Workers()
-"""Processes on this machine."""
+"""One process per processor of this machine."""
 
 
 def run_tasks(
@@ -147,7 +147,7 @@ def run_tasks(
     progress: Progress | None = None,
     code: str | None = None,
 ) -> list[TaskResult]:
-    """Run a function on every task whose result is not in the folder yet.
+    """Results of a function for all tasks; those already stored in the folder are not computed again.
 
     A task that raises leaves `HASH.error.json` and a warning, and the others go on; the next run tries it again. An
     interruption leaves the results that are finished. A worker of other sources than these does nothing.
@@ -208,7 +208,7 @@ def run_tasks(
 
 
 def values_of(results: Sequence[TaskResult]) -> list[Any]:
-    """What tasks found that are all needed.
+    """Values of tasks that must all have succeeded.
 
     Raises
     ------
@@ -244,7 +244,7 @@ def _done_by(workers: Workers | Executor, jobs: Sequence[_Job], finished: Finish
 
 
 def task_input(function: Function, task: Task, code: str) -> dict[str, Any]:
-    """What a task's result depends on, as plain data: function, hash of sources, arguments, and hashes of files.
+    """All inputs of a task as plain data: function, source hash, arguments and file hashes; its hash is the key.
 
     Raises
     ------
@@ -260,7 +260,7 @@ def task_input(function: Function, task: Task, code: str) -> dict[str, Any]:
 
 
 def _anywhere(task: Task) -> Task:
-    """The task with absolute paths: a worker may be in another folder."""
+    """The task with absolute paths, because a worker may run in another folder."""
 
     def absolute(value: Any) -> Any:
         if isinstance(value, Path):
@@ -286,7 +286,7 @@ def _described(value: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class _Job:
-    """A task, the file of its result, and what the worker has to be like that works it out."""
+    """A task with its result file and the required fingerprint of its worker."""
 
     function: Function
     task: Task
@@ -303,7 +303,7 @@ class _Job:
         return self.folder / f"{self.key}.json"
 
     def kept(self) -> TaskResult | None:
-        """The result that stands in the file, None where there is none that is whole and this task's."""
+        """The result stored in the file; None where there is no complete result of this task."""
         try:
             held = json.loads(self.file.read_text(encoding="utf-8"))
             if held["format"] == FORMAT and content_hash(held["input"]) == self.key:
@@ -317,7 +317,7 @@ Finished = Callable[[_Job, TaskResult], None]
 
 
 def _perform(job: _Job) -> str:
-    """Work a task out and write its result, in whatever process or machine; returns why that failed, or nothing."""
+    """Run a task and write its result file; returns the error message, empty on success."""
     unlike = differences(job.maker, fingerprint())
     if unlike:
         return f"WorkerError: {unlike_words(socket.gethostname(), unlike)}"
@@ -340,7 +340,7 @@ def _perform(job: _Job) -> str:
 
 
 def _give_back() -> None:
-    """Return freed memory to the system: the C library of Linux keeps it, half a gigabyte after a solve."""
+    """Return freed memory to the system; Linux's C library keeps it, half a gigabyte after a solve."""
     gc.collect()
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
     if trim is not None:
@@ -354,7 +354,7 @@ def _drain(
     finished: Finished,
     look: Callable[[], None] | None = None,
 ) -> tuple[list[_Job], list[_Job]]:
-    """Run jobs, so many at once; returns those that were lost when the executor broke, and those that never began.
+    """Run jobs, at most `at_once` concurrently; returns jobs lost with a broken executor, and jobs never started.
 
     `look` is called now and then while nothing happens.
     """
@@ -391,14 +391,14 @@ def _drain(
 
 
 def _words_of_executor(error: Exception) -> str:
-    """Why an executor gave a task up."""
+    """Error message of an executor that gave up a task."""
     if type(error).__name__ == "KilledWorker":
         return "every worker that tried it ended abruptly"
     return f"{type(error).__name__}: {error}"
 
 
 def _arrived(job: _Job, elsewhere: bool) -> TaskResult | None:
-    """The result that was written, waited for where another machine may have done that."""
+    """The stored result; waits for it where another machine may have written it."""
     until = time.monotonic() + (ARRIVING if elsewhere else 0.0)
     while (found := job.kept()) is None and time.monotonic() < until:
         os.listdir(job.folder)  # makes a network's file system look again
@@ -410,7 +410,7 @@ def _arrived(job: _Job, elsewhere: bool) -> TaskResult | None:
 
 
 def _in_own_processes(jobs: Sequence[_Job], finished: Finished, count: int) -> None:
-    """Run jobs in processes of their own, in spite of those that end their process."""
+    """Run jobs in processes, and repeat those that were lost when a process crashed."""
     rest = list(jobs)
     while rest:
         suspects, rest = _with_pool(min(len(rest), count), rest, finished)

@@ -1,4 +1,4 @@
-"""Maps over shared memory by threads, and values that threads share."""
+"""Parallel maps in threads, and cached values shared between threads."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 from yid_ocp.errors import ConfigError
 
 THREADS = "YID_OCP_THREADS"
-"""Environment variable: threads that one process may use; as many as it has processors when absent."""
+"""Environment variable with the number of threads per process; by default the number of processors."""
 _SHARE = threading.local()
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -20,7 +20,7 @@ Value = TypeVar("Value")
 
 
 def map_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """Results in the order of the items, worked out by as many threads as the process may use.
+    """Results in the order of the items, computed in as many threads as the process may use.
 
     Compiled code runs outside Python's lock, so that threads share memory and still work side by side.
     """
@@ -34,12 +34,12 @@ def map_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> li
 
 
 def processors() -> int:
-    """How many processors this process may run on."""
+    """Number of processors available to this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def threads() -> int:
-    """How many threads may be used at once from here: of the process, or a share of them within `map_threads`.
+    """Number of threads that the caller may use: the process's limit, or its share within `map_threads`.
 
     Raises
     ------
@@ -54,18 +54,18 @@ def threads() -> int:
 
 
 def share_of_threads(count: int) -> None:
-    """Leave so many threads, at most, to what the present one does."""
+    """Limit the number of threads that the current thread may use."""
     _SHARE.count = count
 
 
 # CasADi marks the nodes of expressions while it differentiates them: two threads at once on expressions that share
 # symbols give wrong derivatives. Evaluating finished functions is safe.
 SYMBOLIC = threading.RLock()
-"""Held by whoever builds or differentiates expressions that others may hold too."""
+"""Lock to be held while shared CasADi expressions are built or differentiated."""
 
 
 class Once(Generic[Key, Value]):
-    """Values that are worked out once, whichever thread asks first, one thread at a time in the whole program.
+    """Cached values by key, each computed once under the CasADi lock.
 
     For what is made of CasADi's expressions, which threads must not work on side by side.
 

@@ -1,1 +1,1 @@
-"""Motions planned with the identified model."""
+"""Planning of robot motions with the identified model."""

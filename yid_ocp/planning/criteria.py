@@ -1,7 +1,7 @@
-"""What makes a motion tell much: numbers to maximise, of the sensitivities of all that would be measured.
+"""Optimality criteria of an experiment, as functions of the sensitivities of its measurements.
 
-Beforehand every parameter counts as known to within 400 % of its value (`judgement.WEAK`), so that a number stays
-finite where nothing tells of a parameter.
+Every parameter has a prior standard deviation of 400 % of its value (`judgement.WEAK`), so that a criterion stays
+finite where no measurement informs a parameter.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ Array = NDArray[np.float64]
 
 
 class Criterion(Protocol):
-    """A number to maximise [nat], and its derivative by the sensitivities (nr, columns)."""
+    """A criterion to maximise [nat], with its gradient by the sensitivities (nr, columns)."""
 
     def value(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
-        """At sensitivities (nr, columns) to relative changes; without its derivative the second is empty."""
+        """Criterion and gradient at sensitivities (nr, columns) to relative changes; the gradient may be left empty."""
         ...
 
 
@@ -56,7 +56,7 @@ class Precision:
     parameters: tuple[int, ...]
 
     def covariance(self, rows: Array) -> Array:
-        """Of all columns, shape (columns, columns)."""
+        """Covariance of all columns' unknowns with the prior, shape (columns, columns)."""
         information = rows.T @ rows
         information[np.diag_indices_from(information)] += _prior(len(information), self.parameters)
         return np.asarray(scipy.linalg.inv(information))
@@ -75,7 +75,7 @@ class Precision:
 
 @dataclass(frozen=True)
 class Separation:
-    """How far effects' changes of the readings lie from those that others can make together with all that is free.
+    """Distance of each effect's change of the readings from what another effect and all free unknowns can imitate.
 
     d_ij^2 = min_b |J_i a - J_j b|^2, over what j and the nuisances can do; the smaller distances count most:
     -1/2 log sum_ij 1 / (1 + d_ij^2).
@@ -87,7 +87,7 @@ class Separation:
     sizes : tuple of ndarray, shape (amplitudes, cases)
         Of the amplitudes, in units of the columns: one case where they are known, else one for each.
     parameters : tuple of int
-        Columns that are bounded beforehand: of the nominal parameters and of the effects.
+        Columns with a prior: of the nominal parameters and of the effects.
     """
 
     effects: tuple[tuple[int, ...], ...]

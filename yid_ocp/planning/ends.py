@@ -1,4 +1,4 @@
-"""Where a motion begins and where it can end: equilibria of the system with its arms at rest."""
+"""Equilibria at which a planned motion begins and ends, with the arms at rest."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ REACHED = 1.5  # of that unit: beyond it a place is out of reach
 
 @dataclass(frozen=True)
 class End:
-    """A posture at which the point rests near a place.
+    """An equilibrium at which the point rests near its target.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class End:
         Moved joints [rad or m].
     rest : Rest
     distance : float
-        Of the point from the place [m].
+        Distance of the point from its target [m].
     at_limit : tuple of str
         Joints that stand at a limit of theirs.
     """
@@ -52,7 +52,7 @@ def joint_range(system: System) -> tuple[Array, Array]:
 
 
 def start_posture(system: System, posture: Mapping[str, float]) -> Array:
-    """Moved joints of a posture by name, shape (nc,).
+    """Start positions of the moved joints, given by name, as an array of shape (nc,).
 
     Raises
     ------
@@ -85,7 +85,7 @@ def start_posture(system: System, posture: Mapping[str, float]) -> Array:
 
 
 def first_rest(step: Step, theta: Array, posture: Array, guess: Array | None = None) -> Rest:
-    """The equilibrium from which a motion begins, of several the one near a configuration where that is given.
+    """Solve for the equilibrium at which a motion begins, near a configuration where one is given.
 
     Raises
     ------
@@ -104,7 +104,7 @@ def first_rest(step: Step, theta: Array, posture: Array, guess: Array | None = N
 
 
 def check_limits(step: Step, theta: Array, rest: Rest, limits: PlanLimits, when: str) -> None:
-    """Refuse limits that are passed where the arms stand still, since no motion can keep within them.
+    """Raise where efforts or spring angles exceed their limits although the arms stand still.
 
     Raises
     ------
@@ -134,7 +134,7 @@ def check_limits(step: Step, theta: Array, rest: Rest, limits: PlanLimits, when:
 
 
 def end_at(step: Step, theta: Array, start: Rest, point: Points, place: Array, tolerance: float) -> End:
-    """The posture within the joints' range, not far from the start, at which the point rests nearest to a place.
+    """Solve for joint positions within their limits, near the start, at which the point rests nearest to its target.
 
     Raises
     ------
@@ -187,7 +187,7 @@ def end_at(step: Step, theta: Array, start: Rest, point: Points, place: Array, t
 
 
 def check_reached(end: End, name: str, place: Array, tolerance: float) -> None:
-    """Refuse a place at which the point cannot rest.
+    """Raise where the point cannot rest at its target.
 
     Raises
     ------

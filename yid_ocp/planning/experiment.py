@@ -1,4 +1,4 @@
-"""An experiment that was not made yet: what the configured sensors would tell of a motion of the arms.
+"""Predicted recording and sensitivities of a planned motion of the arms with the configured sensors.
 
 Two forms of one experiment. In the first the arms are moved and the torques that this needs are measured, with a
 constant error each: one rollout tells all, so that it serves to search. Where arms are driven their motion is known as
@@ -49,18 +49,18 @@ DIFFERENCE = 1e-5  # of an unknown of the motion [rad or m]
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """A motion to come, by the unknowns of the arms' splines, and what it would tell of parameters.
+    """A planned experiment: predicted recording and parameter sensitivities as functions of spline coefficients.
 
     Attributes
     ----------
     configured : EstimationProblem
-        As the settings have it; its first recording says how the sensors are.
+        The problem of the settings; its first recording defines sensors, noise and rates.
     values : mapping of str to float
         Parameters at which the sensitivities are taken.
     mover : Mover
         Of the same system with its arms prescribed.
     names : tuple of str
-        Parameters that are free: those of the problem, and amplitudes of effects that are to be separated.
+        Free parameters: those of the problem, and amplitudes of effects that are to be discriminated.
     """
 
     configured: EstimationProblem
@@ -72,7 +72,7 @@ class Experiment:
     def of(
         problem: EstimationProblem, values: Mapping[str, float], options: PlanOptions, names: Sequence[str] = ()
     ) -> Experiment:
-        """The experiment that a plan's settings describe.
+        """The experiment described by a plan's options.
 
         Parameters
         ----------
@@ -121,14 +121,14 @@ class Experiment:
     # -- what the sensors would record --------------------------------------------------------------------------------
 
     def recording(self, w: Array, fastest: float = np.inf) -> Recording:
-        """What the sensors would record of a motion without their noise, which the recording states.
+        """Noise-free predicted recording of a motion; it states the standard deviations of its sensors.
 
         Parameters
         ----------
         w : ndarray, shape (K, nc)
             Unknowns of the motion.
         fastest : float
-            Points that are seen more often are recorded so often, their information per second kept [Hz].
+            Highest sample rate of points; those of a faster sensor are thinned, their information per second kept [Hz].
         """
         mover, base = self.mover, self.configured.episodes[0]
         rollout, system = mover.roll(w), mover.step.system
@@ -196,11 +196,11 @@ class Experiment:
 
     @property
     def still(self) -> Array:
-        """Unknowns with which nothing moves, shape (K, nc)."""
+        """Spline coefficients of no motion, shape (K, nc)."""
         return np.zeros((self.mover.path.unknowns, len(self.mover.joints)))
 
     def as_configured(self, w: Array) -> EstimationProblem:
-        """The estimation problem of the planned recording, the same in all else, at `values`."""
+        """The configured estimation problem with the planned recording in place of its own, at `values`."""
         return self._problem(self.configured.step, self.recording(w), self._options())
 
     def _problem(self, step: Step, recording: Recording, options: ProblemOptions) -> EstimationProblem:
@@ -209,7 +209,7 @@ class Experiment:
         return EstimationProblem(step, [recording], free, options, self.values, (), extra).freeing(self.names)
 
     def judged(self, w: Array) -> Array:
-        """Like `rows`, of the configured problem: of `columns` but the offsets, which its innovations know.
+        """Sensitivities of the planned recording in the configured problem, without columns of torque offsets.
 
         Raises
         ------
@@ -220,7 +220,7 @@ class Experiment:
 
     @property
     def recorded(self) -> Array:
-        """The same of the recordings that there are."""
+        """Sensitivities of the existing recordings in the configured problem."""
         return self._weighted(self.configured.at(self.values).freeing(self.names))
 
     def _weighted(self, problem: EstimationProblem) -> Array:
@@ -261,7 +261,7 @@ class Experiment:
 
     @cached_property
     def scale(self) -> Array:
-        """What a relative change of each of the problem's unknowns refers to, in the order of `columns`."""
+        """Size to which relative changes of each of the problem's unknowns refer, in the order of `columns`."""
         return _sizes(self._known)
 
     @cached_property
@@ -292,9 +292,9 @@ class Experiment:
         return np.vstack([found, np.eye(len(std))])
 
     def rows(self, w: Array) -> Array | None:
-        """Whitened sensitivity of all that is measured to relative changes of the unknowns, (nr, columns).
+        """Whitened sensitivities of all measurements to relative changes of the unknowns, (nr, columns).
 
-        With rows for what is stated of nuisances beforehand; None where the motion cannot be carried out.
+        With rows for the priors of nuisances; None where the motion cannot be simulated.
         """
         problem = self._known
         episode = replace(problem.episodes[0], path=np.asarray(self.mover.positions(w)))
@@ -349,7 +349,7 @@ class Experiment:
         return u, 1.0 - np.sqrt(np.clip(1.0 - s**2, 0.0, 1.0))
 
     def slopes(self, w: Array, rows: Array) -> Array | None:
-        """Derivative of `rows` by the unknowns of the motion by forward differences, (w.size, nr, columns)."""
+        """Derivative of `rows` by the spline coefficients, by forward differences, (w.size, nr, columns)."""
 
         def one(i: int) -> Array | None:
             moved = w.ravel().copy()

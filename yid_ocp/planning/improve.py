@@ -1,4 +1,4 @@
-"""The motion that tells most: sequential linearisation of the sensitivities within limits, from several starts.
+"""Search for the most informative motion by sequential linearisation of the sensitivities, within limits.
 
 Sensitivities J(w) of a motion w are nearly linear in it, since springs and small motions are; the criterion of J is
 not. In every round J and the limits are linearised and the criterion of the linear J is maximised within a trust
@@ -38,7 +38,7 @@ CORRECTIONS = 2  # of the linear limits where a step passes the true ones
 
 @dataclass(frozen=True)
 class Improved:
-    """Where the search from one start ended.
+    """Result of the search for an informative motion from one initial motion.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class Improved:
     first, value : float
         Criterion at the start and in the end [nat].
     finished : bool
-        Whether no round would gain more.
+        Whether no further iteration improves the criterion.
     rounds : int
     """
 
@@ -58,7 +58,7 @@ class Improved:
 
 
 class Search:
-    """Motions of one experiment within limits, by a criterion.
+    """Search for the motion of an experiment that maximises a criterion within limits.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ class Search:
         self._unit, self._low, self._high = parts[0], parts[1] / parts[0], parts[2] / parts[0]
 
     def passed(self, w: Array) -> float:
-        """By how much a motion passes its limits at most, in parts of them; infinite where it cannot be carried out."""
+        """Largest limit violation of a motion, relative to the limits; infinite where it cannot be simulated."""
         value = self.limits.limits(self.experiment.mover.roll(w), w).value / self._unit
         if not np.all(np.isfinite(value)):
             return np.inf
@@ -87,7 +87,7 @@ class Search:
         return max(float(np.max(value - self._high)), float(np.max(self._low - value)), joints)
 
     def within(self, w: Array) -> Array:
-        """The motion, made smaller until it keeps the limits."""
+        """The motion, scaled down until it keeps the limits."""
         for _ in range(60):
             if self.passed(w) <= 0.0:
                 return w
@@ -95,12 +95,12 @@ class Search:
         return np.zeros_like(w)
 
     def value(self, w: Array) -> tuple[float, Array | None]:
-        """Criterion and sensitivities; minus infinity where the motion cannot be carried out."""
+        """Criterion and sensitivities of a motion; minus infinity where it cannot be simulated."""
         rows = self.experiment.rows(w)
         return (-np.inf, None) if rows is None else (self.criterion.value(rows, False)[0], rows)
 
     def improve(self, start: Array, rounds: int, progress: Progress = SILENT) -> Improved:
-        """The best motion from a start that keeps the limits."""
+        """Improve a motion that keeps the limits until convergence."""
         w, radius = start, FIRST_RADIUS
         value, rows = self.value(w)
         first, finished, done = value, False, 0

@@ -1,4 +1,4 @@
-"""Motions that tell more: of parameters that are to be known, or of effects that look alike."""
+"""Planning of informative motions: to identify parameters, or to discriminate effects that look alike."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ VISIBLE = 1e-4
 
 @dataclass(frozen=True)
 class Start:
-    """What came of one random motion.
+    """Result of the search from one random initial motion.
 
     Attributes
     ----------
     first, value : float
-        Criterion while searching, there and in the end [nat].
+        Search criterion of the initial and of the final motion [nat].
     judged : float
-        Criterion of the configured problem in the end [nat]; minus infinity where it cannot follow the motion.
+        Criterion of the final motion in the configured problem [nat]; minus infinity where it cannot be simulated.
     finished : bool
         Whether no round would gain more.
     rounds : int
@@ -69,18 +69,18 @@ class Start:
 
 @dataclass(frozen=True)
 class Knowledge:
-    """What is known of a parameter, as relative standard deviations: infinite where nothing tells of it.
+    """Relative standard deviations of a parameter before and after a planned recording; infinite without information.
 
     Attributes
     ----------
     before : float
-        From the recordings that there are.
+        From the existing recordings.
     after : float
-        From the planned motion alone.
+        From the planned recording alone.
     together : float
         From both.
     verdict : str
-        Of the planned motion alone.
+        From the planned recording alone.
     """
 
     before: float
@@ -91,7 +91,7 @@ class Knowledge:
 
 @dataclass(frozen=True, eq=False)
 class InformationPlan:
-    """The motion that tells most.
+    """The most informative motion that was found, with predicted parameter precisions.
 
     Attributes
     ----------
@@ -100,22 +100,22 @@ class InformationPlan:
     rollout : Rollout
         By the mover.
     reached : bool
-        Whether the search ended where no round would gain more.
+        Whether the search converged.
     message : str
     parameters : mapping of str to Knowledge
     distances : mapping of (str, str) to (float, float)
-        By pairs of effects: standard deviations of the data between the change by the first and what the second and all
-        that is free can make of it; in the recordings, and in the planned motion. Empty where no effects are separated.
+        For each pair of effects, distance of the change by the first from what the second and all free unknowns can
+        imitate, in standard deviations of the data: in the recordings and in the plan. Empty without effects.
     starts : tuple of Start
-        In the order in which they were drawn.
+        Results of the random initial motions, in the order drawn.
     best : int
-        Which of them it is.
+        Index of the best one.
     active : mapping of str to tuple of str
-        Limits that the motion reaches, by what they are: whose.
+        Names of the joints, springs or frames that reach a limit, by kind of limit.
     unseen : mapping of str to str
-        Parameters that no motion informs, and what would see them.
+        Parameters that no motion informs, each with a sentence on which measurement would.
     open : tuple of str
-        What the planned recording would leave open, in words.
+        Sentences on directions that the planned recording would leave unidentifiable.
     """
 
     mover: Mover
@@ -133,37 +133,37 @@ class InformationPlan:
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """Names of what moves."""
+        """Names of the moved joints."""
         return self.mover.step.system.prescribed
 
     @property
     def t(self) -> Array:
-        """Nodes, shape (N + 1,) [s]."""
+        """Times of the nodes, shape (N + 1,) [s]."""
         return self.mover.times
 
     @property
     def position(self) -> Array:
-        """Of the joints, shape (N + 1, nc) [rad or m]."""
+        """Joint positions, shape (N + 1, nc) [rad or m]."""
         return self.mover.positions(self.unknowns)
 
     @property
     def velocity(self) -> Array:
-        """Of the joints, shape (N + 1, nc) [rad/s or m/s]."""
+        """Joint velocities, shape (N + 1, nc) [rad/s or m/s]."""
         return self.mover.path.basis(self.t, 1) @ self.unknowns
 
     @property
     def acceleration(self) -> Array:
-        """Of the joints, shape (N + 1, nc) [rad/s^2 or m/s^2]."""
+        """Joint accelerations, shape (N + 1, nc) [rad/s^2 or m/s^2]."""
         return self.mover.path.basis(self.t, 2) @ self.unknowns
 
     @property
     def effort(self) -> Array:
-        """What the joints need, the last row as the one before, shape (N + 1, nc) [N m or N]."""
+        """Required joint efforts, the last row repeated, shape (N + 1, nc) [N m or N]."""
         return np.vstack([self.rollout.effort, self.rollout.effort[-1:]])
 
     @cached_property
     def points(self) -> dict[str, Array]:
-        """Where the system's points go, (N + 1, 3) each [m]."""
+        """Trajectories of the system's points by name, each of shape (N + 1, 3) [m]."""
         system = self.mover.step.system
         at = Points(system, system.points).at(self.rollout.state[:, : system.size], self.mover.theta)[0]
         return {name: at[:, 3 * i : 3 * i + 3] for i, name in enumerate(system.points)}
@@ -176,7 +176,7 @@ def informative(
     effects: Mapping[str, Mapping[str, float]] | None = None,
     progress: Progress = SILENT,
 ) -> InformationPlan:
-    """Find the motion of the arms that tells most of parameters, or that tells effects apart, within limits.
+    """Plan the motion of the arms that best identifies parameters or discriminates effects, within limits.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The system moved along joint paths: rollouts and their derivatives by the unknowns of the splines."""
+"""Simulation of a system along spline joint paths, with derivatives by the spline coefficients."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Mover:
-    """A system at rest whose prescribed joints are to move.
+    """Simulator of a system, initially at rest, whose prescribed joints follow a spline path.
 
     Attributes
     ----------
@@ -28,10 +28,10 @@ class Mover:
         Every joint that moves is prescribed; nothing is driven.
     theta : ndarray, shape (ntheta,)
     start : Rest
-        From which the motion begins.
+        Equilibrium at which the motion begins.
     path : SplinePath
     settle : float
-        How long the joints stand still in the end [s].
+        Time for which the joints stand still at the end [s].
     """
 
     step: Step
@@ -42,24 +42,24 @@ class Mover:
 
     @property
     def joints(self) -> list[int]:
-        """Coordinates that are moved."""
+        """Configuration indices of the moved joints."""
         return list(self.step.system.prescribed_indices)
 
     @property
     def first(self) -> Array:
-        """Where they start, shape (nc,)."""
+        """Start positions of the moved joints, shape (nc,) [rad or m]."""
         return np.asarray(self.start.state[self.joints])
 
     @cached_property
     def times(self) -> Array:
-        """Nodes, shape (N + 1,) [s]."""
+        """Times of the nodes, shape (N + 1,) [s]."""
         moving = round(self.path.duration / self.step.time_step)
         standing = max(1, round(self.settle / self.step.time_step))
         return np.asarray(self.step.time_step * np.arange(moving + standing + 1))
 
     @cached_property
     def standing(self) -> NDArray[np.int64]:
-        """Nodes at which the joints stand still in the end."""
+        """Indices of the nodes at which the joints stand still at the end."""
         return np.flatnonzero(self.times >= self.path.duration - 1e-9)
 
     @cached_property
@@ -67,11 +67,11 @@ class Mover:
         return self.path.basis(self.times)
 
     def positions(self, w: Array) -> Array:
-        """Moved joints at the nodes, shape (N + 1, nc), of unknowns (K, nc)."""
+        """Positions of the moved joints at the nodes, shape (N + 1, nc), for coefficients (K, nc)."""
         return self.first + self._basis @ w
 
     def roll(self, w: Array, slopes: bool = False, names: Sequence[str] = ()) -> Rollout:
-        """The motion of unknowns (K, nc); with derivatives by named parameters, then by the unknowns, row by row."""
+        """Simulate the path of coefficients (K, nc), with derivatives by named parameters, then by the coefficients."""
         directions = None
         if slopes or names:
             size = w.size if slopes else 0
@@ -89,5 +89,5 @@ class Mover:
 
     @property
     def configuration(self) -> Array:
-        """All coordinates at the start, shape (n,)."""
+        """Configuration at the start, shape (n,)."""
         return np.asarray(self.start.state[: self.step.system.size])

@@ -1,4 +1,4 @@
-"""What a planned motion is to do, and within which limits."""
+"""Settings of a planned motion: its goal and its limits."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Goal = Literal["place", "path", "box", "information"]
 
 @dataclass(frozen=True, kw_only=True)
 class PlanLimits:
-    """What the motion keeps within; positions, velocities and efforts of joints also within those of the URDF."""
+    """Limits of the motion; joints also keep the position, velocity and effort limits of the URDF."""
 
     velocity: Annotated[float, Gt(0), Le(1), About("part of the URDF's velocity limits that is used")] = 0.9
     acceleration: Annotated[float, Gt(0), About("of every joint", "rad/s^2 or m/s^2")] = 20.0
@@ -26,7 +26,7 @@ class PlanLimits:
 
 @dataclass(frozen=True, kw_only=True)
 class PlanOptions:
-    """A motion of the arms and what it is to reach."""
+    """Goal, duration and numerics of a planned motion of the arms."""
 
     goal: Annotated[
         Goal,

@@ -1,4 +1,4 @@
-"""Joint paths as splines of few unknowns that start and end at rest.
+"""Joint paths as splines with few coefficients that start and end at rest.
 
 A spline of degree 5 with clamped ends lies within the hull of its control points, and so do its derivatives: limits on
 these hold at all times, not at nodes alone.
@@ -20,14 +20,14 @@ STILL = 3  # control points alike at either end: no velocity and no acceleration
 
 @dataclass(frozen=True)
 class SplinePath:
-    """q(t) = first + sum_k basis_k(t) w_k; after `duration` it stays.
+    """Spline path of joints from rest to rest: q(t) = first + sum_k basis_k(t) w_k, constant after `duration`.
 
     Attributes
     ----------
     duration : float
         [s]
     unknowns : int
-        K, of each joint; the last one is where it ends.
+        K, coefficients of each joint; the last one is its displacement at the end.
     """
 
     duration: float
@@ -35,7 +35,7 @@ class SplinePath:
 
     @property
     def knots(self) -> Array:
-        """Knots of the spline."""
+        """Knot vector of the spline [s]."""
         inner = np.linspace(0.0, self.duration, self._controls - DEGREE + 1)
         return np.concatenate([np.zeros(DEGREE), inner, np.full(DEGREE, self.duration)])
 
@@ -44,7 +44,7 @@ class SplinePath:
         return 2 * STILL + self.unknowns - 1
 
     def controls(self, order: int = 0) -> Array:
-        """From the unknowns to the control points of a derivative, shape (..., K)."""
+        """Matrix from the coefficients to the control points of a derivative, shape (..., K)."""
         spread = np.zeros((self._controls, self.unknowns))
         spread[STILL : STILL + self.unknowns - 1, :-1] = np.eye(self.unknowns - 1)
         spread[-STILL:, -1] = 1.0
@@ -56,7 +56,7 @@ class SplinePath:
         return spread
 
     def basis(self, t: Array, order: int = 0) -> Array:
-        """Values of basis_k, or of a derivative, at times, shape (N, K)."""
+        """Values of the basis functions, or of a derivative of them, at times, shape (N, K)."""
         knots = self.knots
         own = knots[order : len(knots) - order]
         inside = np.minimum(np.asarray(t, float), self.duration)
@@ -64,7 +64,7 @@ class SplinePath:
         return np.asarray(np.where((np.asarray(t) > self.duration)[:, None] & (order > 0), 0.0, values))
 
     def straight(self, change: Array) -> Array:
-        """Unknowns of a motion by `change` (nj,) along a straight line in joint space, shape (K, nj)."""
+        """Coefficients of a straight line in joint space with displacement `change` (nj,), shape (K, nj)."""
         t = np.linspace(0.0, self.duration, 200)
         s = t / self.duration
         smooth = s**3 * (10 - 15 * s + 6 * s**2)

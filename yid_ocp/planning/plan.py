@@ -1,4 +1,4 @@
-"""Plan a motion: its ends by statics, its middle by rollouts, and what is left of error, swing and uncertainty."""
+"""Planning of a motion that brings a point to a target: end equilibria by statics, the path by shooting."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ STEADY = 0.1  # change by halving it, in parts of what counts as reached and as 
 
 @dataclass(frozen=True)
 class Known:
-    """What is known of uncertain parameters.
+    """Covariance of uncertain model parameters.
 
     Attributes
     ----------
@@ -57,12 +57,12 @@ class Known:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A planned motion.
+    """A planned motion that brings a point to a target, with its predicted errors.
 
     Attributes
     ----------
     reached : bool
-        Whether the point arrives, by a motion within the limits.
+        Whether the point reaches its target by a motion within the limits.
     message : str
     joints : tuple of str
     t : ndarray, shape (N + 1,)
@@ -70,22 +70,22 @@ class Plan:
     position, velocity, acceleration : ndarray, shape (N + 1, nc)
         Of the joints [rad or m, per s, per s^2].
     effort : ndarray, shape (N + 1, nc)
-        What they need, the last row as the one before [N m or N].
+        Required joint efforts, the last row repeated [N m or N].
     state : ndarray, shape (N + 1, nx)
     points : mapping of str to ndarray, shape (N + 1, 3)
-        Where the system's points and the one that is to arrive go [m].
+        Trajectories of the system's points and of the one with the target [m].
     point : str
-        What is to arrive.
+        Frame that is moved to the target.
     place : ndarray, shape (3,)
-        Where [m].
+        Target position [m].
     error : float
-        Largest distance of the point from it while the arms stand still in the end [m].
+        Largest distance of the point from its target while the arms stand still at the end [m].
     swing : float
         Largest speed of a point of the object in that time [m/s].
     off_path : float or None
-        Largest distance of the point from where it is to be on its path at that time [m]; None without a path.
+        Largest distance of the point from its reference path at the same time [m]; None without a path.
     std : ndarray, shape (3,), or None
-        Of the point's place in the end, from the parameters' covariance [m]; None without one.
+        Of the point's final position, from the parameters' covariance [m]; None without one.
     unknowns : ndarray, shape (K, nc)
     evaluations : int
     mover : Mover
@@ -115,14 +115,14 @@ class Plan:
 
 @dataclass(frozen=True, eq=False)
 class PlannedMovement:
-    """A plan as the virtual robot's controller follows it (`virtual.motion.Movement`)."""
+    """A planned joint motion as reference for the virtual robot's controller (`virtual.motion.Movement`)."""
 
     joints: tuple[str, ...]
     path: SplinePath
     unknowns: Array
 
     def at(self, t: float) -> tuple[Array, Array, Array]:
-        """Offset from the start, velocity and acceleration at time t [s], three arrays of shape (nj,)."""
+        """Joint displacement from the start, velocity and acceleration at time t [s], three arrays of shape (nj,)."""
         offset, rate, bend = (self.path.basis(np.array([t]), order)[0] @ self.unknowns for order in range(3))
         return offset, rate, bend
 
@@ -134,7 +134,7 @@ def plan(
     known: Known | None = None,
     progress: Progress = SILENT,
 ) -> Plan:
-    """Plan a motion of a step's prescribed joints.
+    """Plan a motion of a step's prescribed joints that brings a point to a target.
 
     Parameters
     ----------

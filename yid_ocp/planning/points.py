@@ -1,4 +1,4 @@
-"""Frames of the system in the world, along a motion."""
+"""Positions of named frames in the world along a motion, with Jacobians."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 class Points:
-    """Positions of named frames and their derivative by the coordinates.
+    """Function for world positions of named frames and their Jacobian by the configuration.
 
     Parameters
     ----------
@@ -43,6 +43,6 @@ class Points:
             self._function = ca.Function("points", [q, theta], [ca.densify(at), ca.vec(slope.T)])
 
     def at(self, q: Array, theta: Array) -> tuple[Array, Array]:
-        """Positions (N, 3 np) and their derivative (N, 3 np, n) at configurations (N, n)."""
+        """Positions (N, 3 np) [m] and their Jacobian (N, 3 np, n) at configurations (N, n)."""
         at, slope = (np.array(x).T for x in self._function(np.asarray(q).T, np.asarray(theta)))
         return at, slope.reshape(len(at), at.shape[1], np.shape(q)[1])

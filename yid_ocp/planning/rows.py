@@ -1,4 +1,4 @@
-"""What a motion is to do and to keep within, as residuals and as bounded rows, with their derivatives."""
+"""Goal of a planned motion as residuals, and its limits as bounded rows, with Jacobians."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CALM = 1e-3  # weight of the accelerations' mean square, in parts of their limit
 
 @dataclass(frozen=True)
 class Values:
-    """Numbers and their derivative by the unknowns.
+    """A vector and its Jacobian by the spline coefficients.
 
     Attributes
     ----------
@@ -37,17 +37,17 @@ class Values:
 
 @dataclass(frozen=True, eq=False)
 class Bounded:
-    """Rows that a motion keeps within bounds.
+    """Bounds, scales and names of limit rows of one kind.
 
     Attributes
     ----------
     what : str
-        In words, with the unit.
+        Limited quantity, with its unit.
     lower, upper : ndarray, shape (rows,)
     unit : ndarray, shape (rows,)
-        By which they are divided to be of order one.
+        Divisor that scales each row to order one.
     names : tuple of str
-        Whose each row is.
+        Joint, spring or frame of each row.
     """
 
     what: str
@@ -58,7 +58,7 @@ class Bounded:
 
 
 def stacked(parts: list[Values]) -> Values:
-    """Rows one below the other."""
+    """Vectors and Jacobians stacked one below the other."""
     slopes = [part.slope for part in parts]
     known = [slope for slope in slopes if slope is not None]
     value = np.concatenate([part.value for part in parts]) if parts else np.zeros(0)
@@ -66,7 +66,7 @@ def stacked(parts: list[Values]) -> Values:
 
 
 class Rows:
-    """Residuals and bounded rows of one goal.
+    """Residuals and limit rows of a planned motion, for one set of parameters.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ class Rows:
 
     @property
     def course(self) -> Array | None:
-        """Where the point is to be at every node, shape (N + 1, 3); None where only the end counts."""
+        """Reference position of the point at every node, shape (N + 1, 3) [m]; None where only the end counts."""
         if self.options.goal != "path":
             return None
         first = self.point.at(self.mover.start.state[None, : self.mover.step.system.size], self.mover.theta)[0][0, :3]
@@ -114,7 +114,7 @@ class Rows:
         return np.array(CubicSpline(at, places, bc_type="clamped")(np.minimum(self.mover.times, at[-1])))
 
     def residual(self, rollout: Rollout, w: Array) -> Values:
-        """Distances and speeds in units of what counts as reached and as rest, mean squared; and what keeps calm."""
+        """Goal residual: distances and speeds over their tolerances, and weak regularisation of the motion."""
         mover, options, h = self.mover, self.options, self.mover.step.time_step
         n, size = mover.step.system.size, w.size
         at, by_q = self.point.at(rollout.state[:, :n], mover.theta)
@@ -148,7 +148,7 @@ class Rows:
     # -- what is kept within ------------------------------------------------------------------------------------------
 
     def limits(self, rollout: Rollout, w: Array) -> Values:
-        """The rows of `bounded`, in their own units."""
+        """Values of the limit rows of `bounded` along a motion, in their own units."""
         mover, size, nc = self.mover, w.size, w.shape[1]
         n = mover.step.system.size
         moved = rollout.by_state
@@ -193,7 +193,7 @@ class Rows:
         return found
 
     def broken(self, value: Array) -> dict[str, tuple[str, float, float]]:
-        """By how much each kind of row leaves its bounds, by what it is: whose, its value, its bound."""
+        """The worst violated row of each kind of limit: its name, value and bound."""
         found, at = {}, 0
         for rows in self.bounded:
             own = value[at : at + len(rows.names)]
@@ -208,7 +208,7 @@ class Rows:
         return found
 
     def largest(self, rollout: Rollout) -> Mapping[str, float]:
-        """Largest effort of every joint over its limit in the URDF."""
+        """Largest effort of every joint divided by its URDF limit."""
         limit = np.array([joint.effort_limit for joint in self.joints])
         top = np.max(np.abs(rollout.effort), axis=0) / limit
         return {joint.name: float(one) for joint, one in zip(self.joints, top, strict=True)}

@@ -1,4 +1,4 @@
-"""A plan's nonlinear program with the object's motion eliminated: least squares within limits.
+"""Single shooting for a planned motion: least squares over spline coefficients, within limits.
 
 Bounds of the unknowns are kept by the trust region, all other limits by an augmented Lagrangian: a row g <= u adds
 rho/2 max(0, g - u + lam/rho)^2 to the cost, and lam is raised until no row is passed.
@@ -26,14 +26,14 @@ LOST = 1e4  # residual of a motion that cannot be stepped: the trust region shri
 
 @dataclass(frozen=True)
 class Shot:
-    """Where the search ended.
+    """Result of the search for a planned motion.
 
     Attributes
     ----------
     w : ndarray, shape (K, nc)
     cost : float
     finished : bool
-        Whether it is a minimum within the limits.
+        Whether the search converged within the limits.
     message : str
     evaluations : int
     """
@@ -46,7 +46,7 @@ class Shot:
 
 
 class Shooting:
-    """Residuals of several cases (the likely parameters, and others around them) and the limits of the first.
+    """Shooting problem with the residuals of several parameter cases and the limits of the first case.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class Shooting:
         self.evaluations = 0
 
     def at(self, x: Array) -> tuple[Values, Values]:
-        """Residual, and limits divided by their units, with slopes; not finite where a rollout fails."""
+        """Residual and scaled limit values with their Jacobians; not finite where a rollout fails."""
         if self._last is None or not np.array_equal(self._last[0], x):
             self.evaluations += 1
             w = x.reshape(self._shape)
@@ -82,7 +82,7 @@ class Shooting:
         return self._last[1]
 
     def solve(self, start: Array, lower: Array, upper: Array, iterations: int) -> Shot:
-        """The best motion from a start, all (K, nc), the unknowns within bounds.
+        """Optimise a motion from initial coefficients within bounds, all of shape (K, nc).
 
         References
         ----------
@@ -145,5 +145,5 @@ class Shooting:
 
 
 def failed(rollout: Rollout) -> bool:
-    """Whether a rollout did not reach its end."""
+    """Whether a rollout failed before its end."""
     return not bool(np.all(np.isfinite(rollout.state)))

@@ -1,7 +1,4 @@
-"""What is to be estimated from what: inputs and samples on the nodes, residuals, and the `EstimationProblem`.
-
-Solvers see only `evaluate` and `gradient`; change what is compared with what here, never in a solver.
-"""
+"""The estimation problem: recordings placed on the nodes of a rollout, predictions, and residuals with derivatives."""
 
 from yid_ocp.problem.evaluation import Evaluation as Evaluation
 from yid_ocp.problem.evaluation import WarmStart as WarmStart

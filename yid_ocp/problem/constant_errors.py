@@ -1,11 +1,10 @@
-"""Errors of a sensor that are constant over a recording: part of its noise, common to all its samples.
+"""Sensor errors that are constant over a recording, as correlated noise of all its samples.
 
 With U the residual's slopes by such errors of unit variance, its covariance is I + U U', and
 
     r' (I + U U')^(-1) r = |r - Q (1 - (1 + S^2)^(-1/2)) Q' r|^2,    U = Q S V'.
 
-The same linear map belongs to the Jacobian: generalised least squares, which is what estimating the errors beside their
-priors would give.
+The same map whitens the Jacobian (generalised least squares), equivalent to estimating the errors with their priors.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ConstantErrors:
-    """The thin singular value decomposition of a residual's slopes by constant errors of unit variance.
+    """Noise model of constant sensor errors: SVD of the residual's sensitivities to errors of unit variance.
 
     Attributes
     ----------
@@ -41,23 +40,23 @@ class ConstantErrors:
 
     @staticmethod
     def of(slopes: Array) -> ConstantErrors:
-        """From slopes of rows of unit variance, shape (r, m)."""
+        """Model from the sensitivities of residuals of unit variance, shape (r, m)."""
         return ConstantErrors(*np.linalg.svd(slopes, full_matrices=False))
 
     def whitened(self, columns: Array) -> Array:
-        """A residual and columns of its derivative in units of all its noise, shape (r, c)."""
+        """Whiten columns (a residual, its derivatives) by sensor noise and constant errors, shape (r, c)."""
         along = self.basis.T @ columns
         return np.asarray(columns - self.basis @ ((1 - 1 / np.sqrt(1 + self.size**2))[:, None] * along))
 
     def estimated(self, residual: Array) -> Array:
-        """What a residual, prediction less measurement, says of the errors, shape (m,): measured is true plus error."""
+        """Estimate the errors, measured minus true, from a residual, prediction minus measurement, shape (m,)."""
         return np.asarray(-self.turn.T @ ((self.size / (1 + self.size**2)) * (self.basis.T @ residual)))
 
 
 def slopes_by_constants(samples: Sequence[Measurements]) -> Array:
-    """Slopes of one recording's rows by the constant errors of its sensors, these in standard deviations, shape (r, m).
+    """Sensitivities of whitened measurements to constant sensor errors [standard deviations], shape (r, m).
 
-    Of a measurement; those of the residual, prediction less measurement, have the other sign.
+    Those of the residual, prediction minus measurement, have the opposite sign.
     """
     parts = [(s.weight * s.bias_std)[:, :, None] * np.eye(len(s.bias_std))[:, s.bias_std > 0] for s in samples]
     count, before = sum(part.shape[2] for part in parts), 0
@@ -71,7 +70,7 @@ def slopes_by_constants(samples: Sequence[Measurements]) -> Array:
 
 
 def without_constants(samples: Sequence[Measurements], predicted: Sequence[Array]) -> tuple[Measurements, ...]:
-    """One recording's samples less what a prediction says of their constant errors, which then count no more.
+    """Measurements minus their constant errors as estimated from a prediction, with zero `bias_std`.
 
     Parameters
     ----------

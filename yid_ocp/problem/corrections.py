@@ -1,4 +1,4 @@
-"""What the model's effects say about recorded inputs: true torques, angles and times behind what was recorded."""
+"""Corrections of recorded inputs by the model's effects: true torques, angles and times."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Inputs:
-    """What drives a rollout, with derivatives by d parameters; a derivative is None where it is zero throughout.
+    """True inputs of a rollout, with derivatives by d parameters; a derivative that is zero is None.
 
     Attributes
     ----------
     torque : ndarray, shape (N, nu)
         [N m]
     first_torque : ndarray, shape (nu,)
-        That which holds the first posture [N m].
+        Torque of the initial equilibrium [N m].
     path : ndarray, shape (N + 1, nc)
     arm : ndarray, shape (N + 1, nu)
         Angles of the driven joints [rad].
     by_torque, by_first_torque, by_path, by_arm : ndarray, shape (..., d), or None
     momentum : ndarray, shape (N, nu), or None
-        What effects add to that of the driven joints along their measured motion.
+        Momentum that effects add to the driven joints along their measured motion.
     by_momentum : ndarray, shape (N, nu, d'), or None
-        By what is unknown of the start as well, where it is asked for.
+        Includes the initial state's unknowns where they are asked for.
     """
 
     torque: Array
@@ -52,16 +52,16 @@ class Inputs:
 
     @property
     def posture(self) -> Array:
-        """Known coordinates (driven, then prescribed) at node 0, shape (nk,)."""
+        """Coordinates of driven, then prescribed joints at node 0, shape (nk,)."""
         return np.concatenate([self.arm[0], self.path[0]])
 
     def by_posture(self, width: int) -> Array:
-        """Derivative of `posture`, shape (nk, d)."""
+        """Derivative of `posture` by the parameters, shape (nk, d)."""
         parts = ((self.by_arm, self.arm), (self.by_path, self.path))
         return np.vstack([np.zeros((x.shape[1], width)) if by is None else by[0] for by, x in parts])
 
     def guided(self, feedback: Feedback | None, driven: tuple[int, ...], measured: Array) -> Feedback | None:
-        """The tracking filter with the true angles in place of the measured ones, and the momenta of these effects."""
+        """Tracking filter whose reference has the true angles and the momentum shift of the effects."""
         if feedback is None or (self.by_arm is None and self.momentum is None):
             return feedback
         reference = feedback.reference.copy()
@@ -82,7 +82,7 @@ class Inputs:
         wanted: Sequence[str],
         by_internal: Array | None,
     ) -> Inputs:
-        """The same with what effects add to the momenta of the driven joints.
+        """Inputs with the momentum that effects add to the driven joints.
 
         Parameters
         ----------
@@ -106,7 +106,7 @@ class Inputs:
         return replace(self, momentum=momentum, by_momentum=slope if np.any(slope) else None)
 
     def torque_directions(self, feedback: Feedback | None, driven: tuple[int, ...], width: int) -> Array | None:
-        """Derivative of the nominal torque, that of the filter's reference included, shape (N, nu, width)."""
+        """Tangents of the nominal torque, including those of the filter's reference, shape (N, nu, width)."""
         reached = [] if self.by_torque is None else [self.by_torque]
         for slope, momenta in ((self.by_arm, False), (self.by_momentum, True)):
             if feedback is not None and slope is not None:
@@ -216,16 +216,16 @@ class InputCorrections:
         return a[:, :, 0], e[:, :, 0], a_theta, e_theta, e_reading[:, :, 0]
 
     def torque_delay(self, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array]:
-        """How long after it was recorded each driven joint's torque acts, shape (nu,) [s], and its derivative."""
+        """Delay from recorded to acting torque of each driven joint, shape (nu,) [s], and its derivative."""
         return self._evaluate(self._late, theta, wanted)
 
     def torque_lag(self, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array] | None:
-        """Time constant with which each driven joint's torque follows, (nu,) [s], and its derivative; None if none."""
+        """Time constant of each driven joint's torque lag, (nu,) [s], and its derivative; None without lags."""
         function = self._lags["torque"]
         return None if function is None else self._evaluate(function, theta, wanted)
 
     def effort_lag(self, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array] | None:
-        """The same of each prescribed joint's measured effort, shape (nc,)."""
+        """Time constant of each prescribed joint's effort lag, (nc,) [s], and its derivative; None without lags."""
         function = self._lags["joints.effort"]
         return None if function is None else self._evaluate(function, theta, wanted)
 
@@ -242,7 +242,7 @@ class InputCorrections:
         return ca.Function("lag", [theta], [expression, ca.jacobian(expression, chosen)])
 
     def sensor_delay(self, sensor: Sensor, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array] | None:
-        """How long before its recorded time each output was true, shape (k,) [s], and its derivative; None if never."""
+        """Delay from true to recorded time of each output, shape (k,) [s], and its derivative; None without delays."""
         found = self._sensor_delays(sensor)
         return None if found is None else self._evaluate(found, theta, wanted)
 

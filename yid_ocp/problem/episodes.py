@@ -1,4 +1,4 @@
-"""From recordings to episodes: everything about one recording placed on the nodes of a rollout."""
+"""Episodes: recordings placed on the nodes of a rollout (inputs, measurements, tracking filter)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Episode:
-    """One recording placed on the nodes of a rollout.
+    """One recording placed on the nodes of a rollout: inputs, measurements, tracking filter, input errors.
 
     Attributes
     ----------
@@ -50,17 +50,17 @@ class Episode:
     smooth_arm : ndarray, shape (N + 1, nu)
         Measured angles of the driven joints, smooth enough to be differenced; as measured where no filter needs them.
     feedback : Feedback or None
-        Tracking filter of the driven joints, its gains worked out at the nominal parameters.
+        Tracking filter of the driven joints with gains computed at the nominal parameters.
     values : mapping of str to float
         Known values of parameters that differ from recording to recording.
     errors : InputErrors or None
         Of the torques and angles that drive the rollout; None where there are none.
     start : FittedStart or None
-        Where the rollout begins, if it is neither at rest nor fitted at the parameters that are asked about.
+        Initial state that is given or was fitted to points; None where it is an equilibrium.
     shares_start_of : int, optional
-        Place of the episode to estimate on whose start this held-out one shares: two parts of one recording.
+        Index of the estimation episode whose initial state this held-out part of the same recording shares.
     near : ndarray, optional, shape (n,)
-        Configuration near the equilibrium at which it starts, where that is not the one of least energy.
+        Configuration near the initial equilibrium, where that is not the one of least energy.
     """
 
     recording: Recording
@@ -81,14 +81,14 @@ class Episode:
 
     @property
     def tracking(self) -> Feedback | None:
-        """The tracking filter, following the smoothed motion where that is known."""
+        """Tracking filter with the smoothed motion as its reference where that is known."""
         if self.feedback is None or self.errors is None or self.errors.followed is None:
             return self.feedback
         return replace(self.feedback, reference=self.errors.followed)
 
     @property
     def has_constant_errors(self) -> bool:
-        """Whether a sensor may be wrong by a constant all along the recording, which its noise then counts."""
+        """Whether a sensor may have a constant error over the recording, which counts as noise."""
         return any(np.any(samples.bias_std > 0) for samples in self.samples)
 
     @property
@@ -98,7 +98,7 @@ class Episode:
 
 
 def prepare_episode(functions: ModelFunctions, recording: Recording, options: ProblemOptions, theta: Array) -> Episode:
-    """Place a recording on the nodes: torques, paths, posture, samples, tracking filter.
+    """Place a recording on the nodes of a rollout: torques, paths, joint coordinates, samples, tracking filter.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def prepare_episode(functions: ModelFunctions, recording: Recording, options: Pr
     recording : Recording
     options : ProblemOptions
     theta : ndarray, shape (ntheta,)
-        Nominal parameters, at which encoder noise is turned into effort and the filter's gains are worked out.
+        Nominal parameters, at which encoder noise is converted to effort and the filter's gains are computed.
 
     Raises
     ------
@@ -164,7 +164,7 @@ def _tracked(episode: Episode, functions: ModelFunctions, options: ProblemOption
 
 
 def beginning(episode: Episode, steps: int) -> Episode:
-    """The first steps of an episode, with what was measured in them."""
+    """Truncate an episode to its first steps and the measurements in them."""
     steps = min(steps, episode.grid.steps)
     samples = []
     for entry in episode.samples:
@@ -190,7 +190,7 @@ def beginning(episode: Episode, steps: int) -> Episode:
 
 
 def apparent_inertia(step: Step, theta: Array, names: tuple[str, ...]) -> Array:
-    """Diagonal of the mass matrix at zero for the named joints [kg m^2 or kg]."""
+    """Mass matrix diagonal of the named joints at the zero configuration, shape (k,) [kg m^2 or kg]."""
     sizes = step.sizes
     n, zero = sizes["n"], np.zeros
     state = [zero(n), zero(n), zero(n), zero(sizes["nz"]), zero(sizes["nz"]), zero(sizes["m"]), zero(sizes["nu"])]
@@ -201,7 +201,7 @@ def apparent_inertia(step: Step, theta: Array, names: tuple[str, ...]) -> Array:
 
 
 def coupled_inertia(step: Step, theta: Array, names: tuple[str, ...], angles: Array) -> Array:
-    """The named joints' part of the mass matrix in several configurations, shape (K, k, k).
+    """Mass matrix block of the named joints in several configurations, shape (K, k, k).
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""A residual: how it is made up, and its value and derivative at one point."""
+"""The residual of an estimation problem: its layout, and its value and derivative at one point."""
 
 from __future__ import annotations
 
@@ -18,20 +18,18 @@ from yid_ocp.shown import Shown, Summary, counted
 
 Array = NDArray[np.float64]
 WarmStart = tuple[Array | None, ...]
-"""Configuration near the equilibrium at which each recording starts; None where it is not known."""
+"""For each recording, a configuration near the equilibrium from which it starts; None where it is not known."""
 
 
 @dataclass(frozen=True)
 class ResidualRows:
-    """How the residual of a problem is made up: measurements, then stated priors, then weak priors.
+    """Slices of the residual vector: measurements of all episodes, then stated priors, then weak priors.
 
     Attributes
     ----------
     measurements : tuple of tuple of slice
         Rows of every group of measurements of every episode, those without a measurement left out.
     data, stated_priors, weak_priors : slice
-    informing : slice
-        Data and stated priors: all that the weak priors are not.
     """
 
     measurements: tuple[tuple[slice, ...], ...]
@@ -41,12 +39,12 @@ class ResidualRows:
 
     @property
     def informing(self) -> slice:
-        """Data and stated priors: all that the weak priors are not."""
+        """Slice of the data and the stated priors, without the weak priors."""
         return slice(0, self.stated_priors.stop)
 
     @staticmethod
     def of(episodes: Sequence[Episode], stated: int, weak: int) -> ResidualRows:
-        """From the numbers of measurements and priors."""
+        """Layout from the episodes' measurements and the numbers of stated and weak priors."""
         at, groups = 0, []
         for episode in episodes:
             own = []
@@ -59,7 +57,7 @@ class ResidualRows:
 
 @dataclass(frozen=True, repr=False)
 class Evaluation(Shown):
-    """Residual of a problem at one point.
+    """Cost, residual and optional Jacobian of an estimation problem at one unknown vector.
 
     Attributes
     ----------
@@ -86,12 +84,12 @@ class Evaluation(Shown):
 
     @property
     def warm(self) -> WarmStart:
-        """Where to look for the equilibria of a point nearby."""
+        """Guesses of the initial equilibria for evaluating a nearby point."""
         return tuple(result.warm for result in self.episodes)
 
 
 def joined(measurements: Sequence[Measurements], result: EpisodeResult, threshold: float = math.inf) -> Rows:
-    """Residual of one recording in units of the sensors' noise, group after group; see `Measurements.rows`."""
+    """Residual of one recording in units of the sensors' noise, group after group."""
     slopes = result.sensitivities or (None,) * len(measurements)
     parts = [
         samples.rows(predicted, by_unknowns, threshold)
@@ -107,9 +105,9 @@ def joined(measurements: Sequence[Measurements], result: EpisodeResult, threshol
 
 
 def residual_rows(episode: Episode, whitening: Innovations | None, result: EpisodeResult, threshold: float) -> Rows:
-    """One episode's part of the residual: in units of the sensors' noise, or innovations where they are frozen.
+    """Whitened residual of one episode: by sensor noise, or by the frozen Kalman filter where one is given.
 
-    Errors that are constant over the recording are part of the noise, see `ConstantErrors`.
+    Constant sensor errors count as noise, see `ConstantErrors`.
     """
     by_constants = slopes_by_constants(episode.samples)
     if whitening is None and not by_constants.shape[1]:

@@ -1,6 +1,6 @@
-"""What a problem compiles once: sensors, statics, corrections, differentiated by all that may ever be free.
+"""Compiled functions of a model (sensors, equilibrium, input corrections) that many estimation problems share.
 
-A problem that frees part of it takes the columns that it needs, so that any number of problems share one compilation.
+They are differentiated by every parameter that may become free; each problem takes the columns that it needs.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class MaskedMap:
-    """A compiled sensor with the derivatives by some of its parameters only.
+    """A compiled sensor function that returns derivatives by a subset of its parameters.
 
     Attributes
     ----------
@@ -38,13 +38,13 @@ class MaskedMap:
     columns: tuple[int, ...]
 
     def __call__(self, *inputs: Array) -> list[Array]:
-        """See `Mapped`."""
+        """Evaluate the sensor and keep the chosen columns of the parameter derivative."""
         *rest, by_theta = self.whole(*inputs)
         return [*rest, by_theta[:, :, list(self.columns)]]
 
 
 class ModelFunctions:
-    """Compiled functions of one step's system; nothing in it depends on what was evaluated before.
+    """Compiled functions of one step's system: sensors, equilibrium, initial state fit and input corrections.
 
     Parameters
     ----------
@@ -68,26 +68,26 @@ class ModelFunctions:
 
     @property
     def statics(self) -> Statics:
-        """The equilibrium equations of the system."""
+        """Solver of the system's equilibrium equations."""
         return self._statics(None)
 
     @property
     def start_fit(self) -> StartFit:
-        """The fit of a start to points."""
+        """Fitter of an initial state to the first measured points."""
         return self._start_fit(None)
 
     @property
     def arms(self) -> Step:
-        """The step of the driven joints alone, about which the tracking filter is worked out."""
+        """Compiled step of the arms alone, for which the tracking filter's gains are computed."""
         return self._arms(None)
 
     @property
     def momentum_shift(self) -> MomentumShift:
-        """What effects add to the momenta that the tracking filter follows."""
+        """Momenta that effects add to those that the tracking filter follows."""
         return self._momentum(None)
 
     def sensor(self, sensor: Sensor, wanted: tuple[str, ...]) -> Mapped | MaskedMap:
-        """Compiled readings of a sensor, with derivatives by some of `names`."""
+        """Compiled function of a sensor's readings, with derivatives by the parameters `wanted`."""
         if not wanted or wanted == self.names:
             return self._sensors((sensor, bool(wanted)))
         return MaskedMap(self._sensors((sensor, True)), self.columns(wanted))
@@ -95,11 +95,11 @@ class ModelFunctions:
     def rest(
         self, posture: Array, theta: Array, torque: Array | None, guess: Array | None, wanted: tuple[str, ...]
     ) -> Rest:
-        """The equilibrium at a posture, differentiated by named parameters; see `Statics.solve`."""
+        """Equilibrium at known joint coordinates, differentiated by the parameters `wanted`."""
         return self.statics.solve(posture, theta, torque, guess, wanted)
 
     def columns(self, wanted: tuple[str, ...]) -> tuple[int, ...]:
-        """Places of some of `names`."""
+        """Column indices of the parameters `wanted` in `names`."""
         return tuple(self.names.index(name) for name in wanted)
 
     def _compiled(self, key: tuple[Sensor, bool]) -> Mapped:

@@ -1,4 +1,4 @@
-"""Nodes of a rollout in time."""
+"""Time grid of a rollout."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MOST_PER_SAMPLE = 500
 
 @dataclass(frozen=True)
 class Grid:
-    """Nodes of a rollout: t_k = start + k time_step, k = 0..steps."""
+    """Uniform time grid of a rollout: t_k = start + k time_step, k = 0..steps."""
 
     start: float
     time_step: float
@@ -35,7 +35,7 @@ class Grid:
         return np.asarray(self.start + self.time_step * np.arange(self.steps + 1), dtype=float)
 
     def locate(self, t: ArrayLike) -> tuple[NDArray[np.int64], Array]:
-        """Node before each time and the fraction of a step beyond it; a time within 1e-6 of a node is that node."""
+        """Return the node before each time and the fraction of a step after it, to within 1e-6 of a step."""
         position = (np.asarray(t, float) - self.start) / self.time_step
         near = np.rint(position)
         position = np.where(np.abs(position - near) < 1e-6, near, position)
@@ -44,7 +44,7 @@ class Grid:
 
 
 def make_grid(recording: Recording, time_step: float, duration: float | None = None) -> Grid:
-    """Nodes that cover the recording's driving group (its joints, else its first group of points).
+    """Time grid that covers the recording's joint samples, or its first group of points where it has no joints.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Estimated starts of recordings that nothing was fitted to."""
+"""Estimation of the initial state of held-out recordings."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from yid_ocp.problem.unknowns import start_limits
 
 Array = NDArray[np.float64]
 HELD_OUT_START = 0.2
-"""Time from which the start of a held-out recording is estimated, where starts are [s]."""
+"""Duration of the data from which a held-out recording's initial state is estimated [s]."""
 HELD_OUT_ITERATIONS = 3
-"""Gauss-Newton steps of that estimate, which is nearly linear."""
+"""Gauss-Newton iterations of this nearly linear estimate."""
 
 
 def held_out_offset(predictor: Predictor, episode: Episode, theta: Array, std: Array) -> Array:
-    """Offset of an estimated start that the first `HELD_OUT_START` seconds of an episode say, beside its prior.
+    """Offset of the initial state from equilibrium, estimated from the first `HELD_OUT_START` seconds and its prior.
 
-    Zero where the model cannot be rolled out; `std` is the prior's, (number of estimated rows,).
+    Zero where the rollout fails; `std` is the prior's, (number of estimated rows,).
     """
     offset = np.zeros(len(predictor.unknowns.start))
     if not len(offset):

@@ -1,4 +1,4 @@
-"""From a recording to what drives the model: torques held over steps, prescribed paths, the known posture."""
+"""Inputs of a rollout from a recording: torques or commands of every step, prescribed paths, joint angles."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from yid_ocp.sensors import camera_pose, joint_columns
 
 Array = NDArray[np.float64]
 SLOW = 0.1
-"""Part of the filter's cutoff below which measured loads count on gears whose efforts are compared."""
+"""Fraction of the filter's cutoff below which measured loads are used on gears whose efforts are compared."""
 
 
 def held_inputs(
@@ -31,7 +31,7 @@ def held_inputs(
     delay: Array | None = None,
     servos: Mapping[str, Servo] | None = None,
 ) -> Array:
-    """Mean over every step of what moves driven joints, shape (steps, nu): torques [N m], or commands [rad or m].
+    """Mean input of driven joints over every step, shape (steps, nu): torques [N m], or commands [rad or m].
 
     An effort that is held from sample to sample (`command`) jumps, and so do commands that are held; through samples of
     efforts goes a cubic spline, and where means over the recorded intervals are given, the derivative of one through
@@ -70,7 +70,7 @@ def held_inputs_slope(
     delay: Array,
     servos: Mapping[str, Servo] | None = None,
 ) -> Array:
-    """Derivative of `held_inputs` by each joint's delay, shape (steps, nu); at a jump the mean of two sides."""
+    """Derivative of `held_inputs` by each joint's delay, shape (steps, nu); at a jump the mean of both sides."""
     result = []
     for course, shift in zip(_courses(joints, driven, where, servos or {}), delay, strict=True):
         sides = (course(np.clip(grid.times - shift + near, *course.x[[0, -1]])) for near in (-1e-9, 1e-9))
@@ -128,14 +128,14 @@ def _summed(course: scipy.interpolate.PPoly, t: Array) -> Array:
 
 
 def measured_angles(joints: JointGroup, names: tuple[str, ...], grid: Grid, where: str, low_pass: LowPass) -> Array:
-    """Smoothed angles of joints at every node, without kinks between samples, shape (steps + 1, len(names)) [rad]."""
+    """Smoothed joint angles at every node by a cubic spline, shape (steps + 1, len(names)) [rad]."""
     values = low_pass(joints.t, joints.position[:, joint_columns(joints, names, where)])
     spline = scipy.interpolate.CubicSpline(joints.t, values, axis=0)
     return np.asarray(spline(np.clip(grid.times, *joints.t[[0, -1]])))
 
 
 def joint_loads(recording: Recording, names: tuple[str, ...], grid: Grid, low_pass: LowPass) -> Array:
-    """Smoothed recorded effort of joints at every node, shape (steps + 1, len(names)) [N m].
+    """Smoothed recorded joint efforts at every node, shape (steps + 1, len(names)) [N m].
 
     Raises
     ------
@@ -154,10 +154,7 @@ def joint_loads(recording: Recording, names: tuple[str, ...], grid: Grid, low_pa
 
 
 def own_loads(measured: Array, own: Array, nodes: NDArray[np.int64], times: Array, cutoff: float) -> Array:
-    """Loads of gears whose efforts are compared: the model's own, and the slow part of what measured ones are more.
-
-    A gear that gave way under the measured effort would bring its noise into the prediction of the same effort, and so
-    explain noise. What the model does not know of a load is slow.
+    """Gear loads: the model's own plus the slow part of measured minus own, so that effort noise is not fed back.
 
     Parameters
     ----------
@@ -174,7 +171,7 @@ def own_loads(measured: Array, own: Array, nodes: NDArray[np.int64], times: Arra
 
 
 def sensors_present(recordings: Sequence[Recording]) -> frozenset[str]:
-    """What the recordings hold, in the words of `effects.candidates`."""
+    """Sensors that the recordings contain, in the words of `effects.candidates`."""
     found = set()
     for recording in recordings:
         if recording.joints is not None:

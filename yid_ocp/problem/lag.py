@@ -1,4 +1,4 @@
-"""A value that follows another one with a time constant, T dz/dt = x - z, solved exactly from node to node."""
+"""First-order lag T dz/dt = x - z, solved exactly from node to node."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Lag:
-    """First-order lags of some channels.
+    """First-order lags of k channels, with derivatives by their time constants.
 
     With E = exp(-h/T) and f = T/h (1 - E), both zero at T = 0, where a value is followed at once. At nodes T may be
     negative: then the value follows z with the time constant -T, so that z = x - T dx/dt.
@@ -34,7 +34,7 @@ class Lag:
     time_step: float
 
     def of_steps(self, value: Array, slope: Array | None) -> tuple[Array, Array]:
-        """Means over each step of what follows values held over steps; at first both are the same.
+        """Mean over each step of the lagged output for inputs held over steps; output and input start equal.
 
         Parameters
         ----------
@@ -58,7 +58,7 @@ class Lag:
         return value + share * gap, through + mean_by_time
 
     def of_nodes(self, value: Array, slope: Array | None) -> tuple[Array, Array | None]:
-        """What follows values at nodes, straight between them, from node 1 on, before which a motion only sets in.
+        """Lagged output at nodes for an input that is linear between nodes, starting at node 1.
 
         Parameters
         ----------
@@ -85,7 +85,7 @@ class Lag:
         return followed, total
 
     def pulled(self, value: Array, pull: Array) -> tuple[Array, Array]:
-        """The pull at what follows, as `of_nodes` has it, passed on to what is followed and to the parameters.
+        """Adjoint of `of_nodes`: cost derivatives by the input and by the parameters from those by the output.
 
         Parameters
         ----------

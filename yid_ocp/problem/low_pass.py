@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 LEAST = 1e-4  # of half the sampling rate; below it the filter's sections are singular to rounding
 FILTER_ORDER = 4
 TAIL = 1e-4
-"""Part of the largest weight below which a filter's weights are left out where it is a matrix."""
+"""Fraction of the largest weight below which weights are dropped in the filter's matrix."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class LowPass:
     cutoff : float
         Frequency at which the amplitude is halved in power twice over [Hz]; infinite for no filter.
     passes : int
-        How many times values pass it.
+        How many times the filter is applied.
     """
 
     cutoff: float
@@ -59,17 +59,13 @@ class LowPass:
         return np.asarray(scipy.interpolate.CubicSpline(even, smooth, axis=0)(np.clip(t, even[0], even[-1])))
 
     def stride(self, step: float) -> int:
-        """Samples of a clock with this step [s] from one smoothed value to the next that tells something new: 1/(2 f).
-
-        Noise that was white is limited to a band of the cutoff f and correlated over about that time.
+        """Number of samples, `step` [s] apart, after which filtered white noise is about uncorrelated: 1/(2 f step).
         """
         return max(1, round(1 / (2 * self.cutoff * step))) if math.isfinite(self.cutoff) else 1
 
     @property
     def settling(self) -> float:
-        """How far from either end of a record the filter still sees what it does not hold [s].
-
-        The slowest pair of its poles has then decayed to a thousandth, pass after pass.
+        """Settling time of the filter, during which ends of a record distort it: decay to a thousandth [s].
         """
         decay = 2 * math.pi * self.cutoff * math.sin(math.pi / (2 * FILTER_ORDER))
         return float(scipy.special.gammainccinv(self.passes, 1e-3)) / decay
@@ -85,9 +81,9 @@ class LowPass:
         return float(np.linalg.norm(response)), float(np.linalg.norm(rate)), float(np.linalg.norm(second))
 
     def at(self, nodes: NDArray[np.int64], count: int, step: float) -> SmoothedNodes:
-        """The filter for values at some of `count` nodes, `step` apart [s]; nodes beyond are left out.
+        """Filter as a matrix for some of `count` nodes, `step` apart [s]; nodes beyond are left out.
 
-        Beyond node 1, where a motion sets in, and the last one values count as they are there.
+        Values before node 1 and after the last node are taken as constant.
         """
         nodes = nodes[nodes < count]
         weight = _weights(self, step)
@@ -120,7 +116,7 @@ class LowPass:
 
 @dataclass(frozen=True)
 class SmoothedNodes:
-    """What smooths values at nodes, for some of them; the others stay.
+    """Matrix that smooths values at chosen nodes and leaves the others unchanged.
 
     Attributes
     ----------
@@ -133,13 +129,13 @@ class SmoothedNodes:
     matrix: scipy.sparse.csr_array
 
     def of(self, values: Array) -> Array:
-        """Values, shape (N, ...), smoothed."""
+        """Smooth values at all nodes, shape (N, ...)."""
         smooth = values.copy()
         smooth[self.nodes] = (self.matrix @ values.reshape(len(values), -1)).reshape(len(self.nodes), *values.shape[1:])
         return smooth
 
     def pulled(self, pull: Array) -> Array:
-        """The pull at smoothed values, shape (N, k), passed on to those that are smoothed."""
+        """Adjoint of `of`: cost derivative by the input values from that by the smoothed ones, shape (N, k)."""
         passed = pull.copy()
         passed[self.nodes] = 0.0
         return np.asarray(passed + self.matrix.T @ pull[self.nodes])
@@ -156,9 +152,6 @@ def _weights(low_pass: LowPass, step: float) -> Array:
 
 
 def effort_filter(cutoff: float) -> LowPass:
-    """What measured efforts pass where paths pass `LowPass(cutoff)` once.
-
-    Their prediction from a smoothed path is smoothed as well, as friction makes steps of a smooth motion: so both sides
-    have passed it twice, and steps once at least.
+    """Filter of measured and predicted efforts: two passes of the filter that smooths prescribed paths.
     """
     return LowPass(cutoff, 2)

@@ -1,4 +1,4 @@
-"""Measured samples beside their prediction: interpolation between nodes, weights, whitening, robust loss."""
+"""Measurements of one sensor on the nodes of a rollout: interpolation, weights, whitening, robust loss."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Weighting = Literal["whitened", "paper"]
 
 @dataclass(frozen=True)
 class Rows:
-    """A part of a residual.
+    """One block of a residual: robust cost, weighted residual and Jacobian.
 
     Attributes
     ----------
@@ -30,7 +30,7 @@ class Rows:
     residual : ndarray, shape (nr,)
     jacobian : ndarray, shape (nr, d), or None
     factor : ndarray, shape (nr,)
-        That of the robust loss, which the residual and the Jacobian hold.
+        Robust weights, already multiplied into residual and Jacobian.
     """
 
     cost: float
@@ -41,7 +41,7 @@ class Rows:
 
 @dataclass(frozen=True)
 class Measurements:
-    """What one sensor measured, placed on the nodes of a rollout.
+    """Samples of one sensor, located between the nodes of a rollout, with weights and noise levels.
 
     Attributes
     ----------
@@ -76,12 +76,12 @@ class Measurements:
 
     @property
     def channel_of_column(self) -> tuple[str, ...]:
-        """Channel of each of the k outputs."""
+        """Channel name of each of the k outputs."""
         return tuple(channel for channel in self.sensor.channels for _ in range(self.sensor.width))
 
     @property
     def nodes(self) -> NDArray[np.int64]:
-        """Nodes at which the sensor's function must be evaluated, sorted."""
+        """Nodes at which the sensor function must be evaluated, sorted."""
         if self.node.ndim > 1:
             # with the neighbours that a slope needs
             low, high = int(self.node.min(initial=self.span[1])), int(self.node.max(initial=self.span[0]))
@@ -91,20 +91,20 @@ class Measurements:
 
     @property
     def seen(self) -> NDArray[np.bool_]:
-        """Where there is a measurement that counts, shape (M, k)."""
+        """Mask of measured outputs with positive weight, shape (M, k)."""
         return self.weight > 0
 
     @property
     def count(self) -> int:
-        """How many rows of a residual they make."""
+        """Number of residuals that the measurements yield."""
         return int(np.count_nonzero(self.weight > 0))
 
     @cached_property
     def mixing(self) -> scipy.sparse.csr_array | None:
-        """What makes differences over their standard deviations independent, shape (nr, nr); None where they are.
+        """Matrix R^(-1/2) that decorrelates normalized residuals, shape (nr, nr); None without correlation.
 
-        With R the correlation of what is seen of a sample, R^(-1/2): of all that whiten, the one whose rows stay
-        closest to the outputs (Kessy, Lewin and Strimmer 2018, doi:10.1080/00031305.2016.1277159).
+        R is the noise correlation of one sample's outputs; zero-phase (ZCA) whitening (Kessy, Lewin and Strimmer 2018,
+        doi:10.1080/00031305.2016.1277159).
         """
         if self.correlation is None:
             return None
@@ -117,25 +117,25 @@ class Measurements:
         return scipy.sparse.csr_array((blocks[together], (row, column)), shape=(self.count, self.count))
 
     def independent(self, rows: Any) -> Any:
-        """Rows of differences over their standard deviations, shape (nr,) or (nr, d), dense or sparse, made so."""
+        """Decorrelate rows normalized by their standard deviations, shape (nr,) or (nr, d), dense or sparse."""
         return rows if self.mixing is None else self.mixing @ rows
 
     def whitened(self, predicted: Array) -> Array:
-        """Prediction less measurement in units of the noise, zero where there is none, shape (M, k)."""
+        """Whitened residual, prediction minus measurement, zero where nothing was measured, shape (M, k)."""
         plain = np.asarray(self.weight * np.where(self.weight > 0, predicted - self.value, 0.0))
         if self.mixing is not None:
             plain[self.seen] = self.mixing @ plain[self.seen]
         return plain
 
     def pulled(self, pull: Array) -> Array:
-        """Derivative of a cost by the prediction from that by `whitened`, both of shape (M, k)."""
+        """Adjoint of `whitened`: derivative of a cost by the prediction from that by the residual, shape (M, k)."""
         if self.mixing is not None:
             pull = pull.copy()
             pull[self.seen] = self.mixing.T @ pull[self.seen]
         return np.asarray(pull * self.weight)
 
     def rows(self, predicted: Array, slopes: Array | None = None, threshold: float = math.inf) -> Rows:
-        """Their part of a residual.
+        """Residual block of these measurements with robust weights and, with slopes, its Jacobian.
 
         Parameters
         ----------
@@ -154,7 +154,7 @@ class Measurements:
         return Rows(cost, robust * raw[seen], jacobian, robust)
 
     def late(self, steps: Array) -> Measurements:
-        """The same samples, each output that of so many steps before, within the span.
+        """The same samples shifted back by a delay of each output [steps], within the span.
 
         Parameters
         ----------
@@ -167,13 +167,13 @@ class Measurements:
         return replace(self, node=node, fraction=position - node)
 
     def slope(self, at_nodes: Array, unmoved: Measurements, steps: Array) -> Array:
-        """Change of a prediction per step of time for late samples; at a node the mean of both sides, shape (M, k).
+        """Rate of change of a prediction per step for delayed samples, shape (M, k); at a node the mean of both sides.
 
         Parameters
         ----------
         at_nodes : ndarray, shape (len(nodes), k)
         unmoved : Measurements
-            Those from which they were made by `late`.
+            The measurements before the delay.
         steps : ndarray, shape (k,)
         """
         nodes, column = self.nodes, np.arange(at_nodes.shape[1])
@@ -191,7 +191,7 @@ class Measurements:
         return np.where((position < self.span[0] - 1e-9) | (position > self.span[1] + 1e-9), 0.0, rate)
 
     def interpolate(self, at_nodes: Array) -> Array:
-        """Values at the samples from values at `nodes`, shape (len(nodes), ...) to (M, ...)."""
+        """Interpolate values at `nodes`, shape (len(nodes), ...), to the samples, shape (M, ...)."""
         nodes = self.nodes
         column = () if self.node.ndim == 1 else (np.arange(at_nodes.shape[1]),)
         before = at_nodes[(np.searchsorted(nodes, self.node), *column)]
@@ -217,7 +217,7 @@ class Measurements:
 
 
 def placed(data: SensorData, grid: Grid, where: str) -> Measurements:
-    """What a sensor measured, on the nodes of a rollout; `DataError` where a noise level is not positive."""
+    """Locate a sensor's data on the nodes of a rollout; raises `DataError` where a noise level is not positive."""
     seen = np.isfinite(data.value)
     if np.any(seen & ~(data.std > 0)):
         raise DataError(
@@ -236,7 +236,7 @@ def placed(data: SensorData, grid: Grid, where: str) -> Measurements:
 
 
 def paper_weighting(samples: Measurements, grid: Grid) -> Measurements:
-    """The source paper's cost: sigma_k = 1 at the node nearest to a measurement, none at k = 0, the end counted twice.
+    """Measurements with the source paper's weights: 1 at the nearest node, 0 at k = 0, the last node counted twice.
 
     J = sum_{k=1..N} 1/2 sigma_k |w_k - wbar_k|^2 + 1/2 |w_N - wbar_N|^2 for measured points [m^2].
     """
@@ -249,7 +249,7 @@ def paper_weighting(samples: Measurements, grid: Grid) -> Measurements:
 
 
 def huber(residual: Array, scale: float) -> tuple[float, Array]:
-    """Huber's loss of whitened residuals and the factor that makes it a weighted sum of squares.
+    """Return Huber's loss of whitened residuals and the factors that turn residuals into a weighted least squares.
 
     Parameters
     ----------

@@ -61,7 +61,7 @@ seconds without correction."""
 
 @dataclass(frozen=True)
 class InputErrors:
-    """What is known of the errors of what drives one recording.
+    """Noise levels and current estimates of the torque and angle errors that drive one recording's rollout.
 
     Attributes
     ----------
@@ -70,19 +70,19 @@ class InputErrors:
     sample : ndarray of int, shape (N,)
         Recorded sample that each step's torque comes from: w is the same in all its steps.
     spread : float
-        Steps over which the noise of one encoder sample reaches through interpolation.
+        Number of steps that share one encoder sample's noise through interpolation.
     encoders : bool
         Whether the encoders are measurements.
     offset : ndarray, shape (nu,)
-        Value of b that is taken off the recorded torque [N m], so that what is linearised is small.
+        Value of b that is subtracted from the recorded torque [N m].
     white : ndarray, shape (N, nu)
-        Value of w that is taken off in every step [N m].
+        Value of w that is subtracted in every step [N m].
     read : ndarray, shape (N, nu)
-        What of the recorded torque is noise on account of w, so that effects on torques see what it was without [N m].
+        Noise of the recorded torque that w implies, subtracted before effects on torques apply [N m].
     through : ndarray, shape (N, nu)
-        What of w is off the torque that acts once `read` is off the recorded one [N m].
+        Part of w that subtracting `read` already removes from the acting torque [N m].
     followed : ndarray, shape (N, nb), or None
-        What the tracking filter follows in place of the measured motion.
+        Smoothed reference of the tracking filter in place of the measured motion.
     """
 
     torque_std: Array
@@ -99,22 +99,22 @@ class InputErrors:
 
     @property
     def taken_off(self) -> Array:
-        """Off the torque of every step, shape (N, nu) [N m]."""
+        """Total error subtracted from the torque of every step, b + w, shape (N, nu) [N m]."""
         return self.offset + self.white
 
     @property
     def after_effects(self) -> Array:
-        """Off what effects on torques make of the recorded torque less `read`, shape (N, nu) [N m]."""
+        """Error still to be subtracted after effects on torques, shape (N, nu) [N m]."""
         return self.taken_off - self.through
 
     @property
     def as_recorded(self) -> InputErrors:
-        """The same with torques and angles as they were recorded, but for the constant offset."""
+        """The same errors with the constant offset alone; torques and angles otherwise as recorded."""
         none = np.zeros_like(self.white)
         return replace(self, white=none, read=none, through=none, followed=None)
 
     def until(self, steps: int) -> InputErrors:
-        """The same of the first steps."""
+        """The errors of the first `steps` steps."""
         first = {name: getattr(self, name)[:steps] for name in ("sample", "white", "read", "through")}
         return replace(self, **first, followed=None if self.followed is None else self.followed[:steps])
 
@@ -126,7 +126,7 @@ def input_errors(
     sensors: Mapping[str, SensorOptions],
     samples: Sequence[Measurements],
 ) -> InputErrors | None:
-    """Errors of the torques and angles that drive a recording's rollout; None where there are none, as of commands.
+    """Error levels of the torques and angles that drive a recording's rollout; None where there are none.
 
     Parameters
     ----------
@@ -230,7 +230,7 @@ class _FilterStep:
 
 @dataclass(frozen=True)
 class Smoothed:
-    """What all measurements of a recording say of what drove it.
+    """Smoothed torque errors and state errors of a recording, from all its measurements.
 
     Attributes
     ----------
@@ -249,7 +249,7 @@ class Smoothed:
 
 @dataclass(frozen=True)
 class Innovations:
-    """A frozen Kalman filter along one rollout.
+    """Kalman filter, linearized along one rollout, that whitens the residual of a recording.
 
     Attributes
     ----------
@@ -272,7 +272,7 @@ class Innovations:
     bias_std: Array
 
     def whitened(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
-        """Innovations in units of their standard deviation.
+        """Whiten a residual and its derivatives: normalized innovations of the Kalman filter.
 
         Parameters
         ----------
@@ -296,7 +296,7 @@ class Innovations:
         return result, bias
 
     def smoothed(self, rows: Array, push: Array | None) -> Smoothed:
-        """What all measurements say of what drove the motion, by the costates of the filter (Bryson and Frazier 1963).
+        """Smooth torque and state errors from all measurements (Bryson and Frazier 1963).
 
         Parameters
         ----------
@@ -350,7 +350,7 @@ class Innovations:
 
 @dataclass(frozen=True)
 class Course:
-    """A rollout about which errors are small, and what was measured along it.
+    """Nominal trajectory of an episode and its measurements, about which the Kalman filter is linearized.
 
     Attributes
     ----------
@@ -358,7 +358,7 @@ class Course:
     theta : ndarray, shape (ntheta,)
     rollout : Rollout
     samples : sequence of Measurements
-        Where they are late, moved to when they were true.
+        Shifted by their delays to the times at which they were true.
     feedback : Feedback or None
     effort : ndarray, shape (N + 1, n)
         Of prescribed and driven joints.
@@ -378,7 +378,7 @@ class Course:
 
 
 def innovations(course: Course, errors: InputErrors) -> Innovations:
-    """Work out the Kalman filter along a rollout.
+    """Build the whitening Kalman filter along a trajectory.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The noise floor, and whether a residual is larger or less random than noise alone would be.
+"""Null test: whether a residual is larger or less random than noise alone explains.
 
 Under the null hypothesis the whitened residual r is noise of unit standard deviation whose colour rho is known (white,
 or that of the smoothing filter). Then r'r/n has the variance 2/n (1 + 2 sum rho_l^2), which is that of a chi-squared
@@ -22,21 +22,21 @@ from yid_ocp.problem.problem import EstimationProblem
 Array = NDArray[np.float64]
 
 WINDOW = 0.5
-"""Length of the windows in which a residual is looked at [s]."""
+"""Length of the time windows in which a residual is tested [s]."""
 
 
 @dataclass(frozen=True)
 class GapLimits:
-    """What makes a residual more than noise, for all that judge one.
+    """Criteria for a residual that exceeds noise: significance level and size.
 
     Attributes
     ----------
     level : float
         Significance below which a residual is more than noise.
     smallest_gap : float
-        chi2/n - 1 below which an excess is not worth a word, however sure.
+        chi2/n - 1 below which a significant excess is ignored.
     noise_fraction : float
-        Part of the sensors' stated standard deviations that is noise, where the rest stands for the model's error.
+        Fraction of the stated standard deviations that is noise; the rest represents model error.
     """
 
     level: float = 0.01
@@ -49,7 +49,7 @@ USUAL = GapLimits()
 
 @dataclass(frozen=True)
 class Series:
-    """One scalar output of one recording, as it stands in the residual of a problem.
+    """One scalar sensor output of one recording: its times, residual indices and noise autocorrelation.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class Series:
     t : ndarray, shape (M,)
         Times since the start of the recording [s].
     rows : ndarray of int, shape (M,)
-        Places in the residual.
+        Indices in the residual.
     colour : ndarray, shape (L + 1,)
         Autocorrelation of the noise at lags 0 to L samples.
     """
@@ -75,7 +75,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Floor:
-    """Noise of one channel.
+    """Noise standard deviation that is assumed for one channel.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class Floor:
 
 @dataclass(frozen=True)
 class Window:
-    """One channel over a stretch of time.
+    """Test of one channel's residual in one time window.
 
     Attributes
     ----------
@@ -116,7 +116,7 @@ class Window:
 
 @dataclass(frozen=True)
 class NullTest:
-    """Is there a gap?
+    """Result of the null test: chi2, p-values and whiteness of a residual.
 
     Attributes
     ----------
@@ -124,7 +124,7 @@ class NullTest:
     degrees : float
         Effective, of coloured noise.
     p_value : float
-        Of a residual this large under noise alone.
+        Probability of a residual this large under noise alone.
     channels : dict of channel to float
         Mean square of its whitened residual.
     whiteness : dict of channel to float
@@ -154,7 +154,7 @@ def noise_floor(problem: EstimationProblem) -> tuple[Floor, ...]:
 
 
 def spread(colour: Array) -> float:
-    """1 + 2 sum rho_l^2: how many coloured samples count as one in a mean square."""
+    """Variance inflation 1 + 2 sum rho_l^2 of a mean square of autocorrelated noise."""
     return float(1 + 2 * np.sum(colour[1:] ** 2))
 
 
@@ -165,7 +165,7 @@ def null_test(
     level: float = USUAL.level,
     window: float = WINDOW,
 ) -> NullTest:
-    """Compare a whitened residual with noise.
+    """Test a whitened residual against the hypothesis that it is noise alone.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ def null_test(
     residual : ndarray, shape (nr,)
         Rows that belong to no series (priors) do not count.
     parameters : int
-        Free ones, which took part of the noise with them.
+        Number of free parameters.
     level : float
         False-discovery rate of the windows.
     window : float
@@ -193,17 +193,14 @@ def null_test(
 
 
 def whitened_beside(residual: Array, spread: Array) -> Array:
-    """A residual in units of its noise and of what else may have moved it, (I + F F')^(-1/2) r.
-
-    Rows stay what they are: what no column of F could have done is left as it is.
+    """Whiten a residual by its noise and by k further independent errors, (I + F F')^(-1/2) r.
 
     Parameters
     ----------
     residual : ndarray, shape (nr,)
         In units of its noise.
     spread : ndarray, shape (nr, k)
-        F: what one standard deviation of each of k independent errors does to it; a column that overflowed says
-        nothing.
+        F: change of the residual per standard deviation of each error; non-finite columns are ignored.
     """
     spread = spread[:, np.isfinite(spread).all(axis=0)]
     columns, sizes, _ = np.linalg.svd(spread, full_matrices=False)
@@ -211,7 +208,7 @@ def whitened_beside(residual: Array, spread: Array) -> Array:
 
 
 def more_than_noise(tests: Sequence[NullTest], limits: GapLimits = USUAL) -> bool:
-    """Whether residuals of one model are more than noise, by enough to be worth a word.
+    """Whether residuals of one model exceed noise, both significantly and by a relevant size.
 
     Parameters
     ----------
@@ -223,7 +220,7 @@ def more_than_noise(tests: Sequence[NullTest], limits: GapLimits = USUAL) -> boo
 
 
 def smallest_p_value(tests: Sequence[NullTest]) -> float:
-    """The smallest p-value as the best of so many tests (Bonferroni)."""
+    """Bonferroni-corrected smallest p-value of several tests."""
     return min(1.0, len(tests) * min(test.p_value for test in tests))
 
 
@@ -266,16 +263,16 @@ def _windows(series: Sequence[Series], residual: Array, level: float, length: fl
 
 
 def discoveries(p_values: Sequence[float], tries: float, level: float) -> list[bool]:
-    """Which of some findings are more than chance among all places that were looked at.
+    """Which of several p-values are significant at a false-discovery rate.
 
     Benjamini and Hochberg (1995), doi:10.1111/j.2517-6161.1995.tb02031.x.
 
     Parameters
     ----------
     p_values : sequence of float
-        Of what was found.
+        Reported p-values.
     tries : float
-        Number of places.
+        Number of tests made, reported or not.
     level : float
         False-discovery rate.
     """
@@ -288,12 +285,12 @@ def discoveries(p_values: Sequence[float], tries: float, level: float) -> list[b
 
 
 def sample_times(episode: Episode, samples: Measurements) -> Array:
-    """Times of samples since the start of their recording, shape (M,) [s]."""
+    """Sample times since the start of the recording, shape (M,) [s]."""
     return np.asarray((samples.node + samples.fraction) * episode.grid.time_step)
 
 
 def residual_series(problem: EstimationProblem) -> tuple[Series, ...]:
-    """How the residual of a problem is made up, output by output."""
+    """Channels of a problem's residual: one entry for each scalar output of each recording."""
     series: list[Series] = []
     for episode, groups in zip(problem.episodes, problem.rows.measurements, strict=True):
         for samples, rows in zip(episode.samples, groups, strict=True):
@@ -310,7 +307,7 @@ def residual_series(problem: EstimationProblem) -> tuple[Series, ...]:
 
 
 def noise_colour(problem: EstimationProblem, episode: Episode, samples: Measurements) -> Array:
-    """Autocorrelation of a sensor's noise at lags 0, 1, ... samples: white, but for efforts, which are smoothed."""
+    """Autocorrelation of a sensor's noise at lags 0, 1, ... samples: white, except for smoothed efforts."""
     if not samples.sensor.efforts:
         return np.ones(1)
     low_pass, step = effort_filter(problem.options.path_cutoff), episode.grid.time_step
@@ -318,7 +315,7 @@ def noise_colour(problem: EstimationProblem, episode: Episode, samples: Measurem
 
 
 def smoothed_colour(low_pass: LowPass, step: float) -> Array:
-    """Autocorrelation of white noise behind a filter, at lags of so many seconds."""
+    """Autocorrelation of filtered white noise at lags 0, 1, ... times `step` [s]."""
     if not np.isfinite(low_pass.cutoff):
         return np.ones(1)
     half = int(2 * low_pass.passes / (low_pass.cutoff * step)) + 10

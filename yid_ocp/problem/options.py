@@ -1,4 +1,4 @@
-"""Everything about an estimation problem that is neither the model nor the data."""
+"""Settings of an estimation problem: initial state, noise, priors, tracking filter, sensors."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NotNegative = Annotated[float, Ge(0)]
 
 @dataclass(frozen=True)
 class SensorOptions:
-    """How one group of a recording is used: points, points_NAME, joints.position or joints.effort."""
+    """How one sensor group of a recording is used: points, points_NAME, joints.position or joints.effort."""
 
     use: Annotated[
         bool | None,
@@ -58,7 +58,7 @@ class SensorOptions:
 
 @dataclass(frozen=True)
 class JointPrior:
-    """A Gaussian prior of several shared parameters together, about their initial values: an earlier estimate.
+    """Multivariate Gaussian prior of shared parameters about their initial values, such as an earlier estimate.
 
     Attributes
     ----------
@@ -71,19 +71,19 @@ class JointPrior:
     covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)), compare=False)
 
     def scaled(self, factors: Mapping[str, float]) -> JointPrior:
-        """The prior of parameters that are so many times these; those that are not named stay."""
+        """Prior of the parameters multiplied by given factors; parameters without a factor are unchanged."""
         by = np.array([factors.get(name, 1.0) for name in self.names])
         return JointPrior(self.names, self.covariance * np.outer(by, by))
 
     def of(self, names: Sequence[str]) -> JointPrior:
-        """The prior of those of its parameters that are named, in that order, whatever the others are."""
+        """Marginal prior of the named parameters, in the given order."""
         at = [self.names.index(name) for name in names if name in self.names]
         return JointPrior(tuple(self.names[i] for i in at), self.covariance[np.ix_(at, at)])
 
 
 @dataclass(frozen=True)
 class ProblemOptions:
-    """Everything about an estimation problem that is neither the model nor the data.
+    """Settings of an estimation problem: everything but model and data.
 
     Attributes
     ----------
@@ -94,14 +94,13 @@ class ProblemOptions:
     priors : mapping of parameter to standard deviation
         Gaussian priors about the initial value, in the parameter's unit.
     joint_prior : JointPrior
-        What is known of several parameters together, in place of entries of `priors`.
+        Correlated prior of several parameters, in place of entries of `priors`.
     recording_values : mapping of recording to mapping of parameter to value
         Known values of parameters that differ from recording to recording, such as where markers sit.
     known_start : mapping of recording to array_like, shape (nx,)
-        State (q, p, z) in which a recording starts, in place of rest or of the fit; an `estimated` start is offset from
-        it.
+        State (q, p, z) in which a recording starts, in place of equilibrium or of the fit.
     doubts : tuple of Doubt
-        Why the recordings may be wrong; see `believed`.
+        Data quality issues found in the recordings.
     """
 
     initial_state: Annotated[
@@ -161,5 +160,5 @@ class ProblemOptions:
 
     @property
     def believed(self) -> bool:
-        """Whether no doubt about a recording forbids to trust what is made of it."""
+        """Whether the recordings have no data quality issue graver than a warning."""
         return all(doubt.weight == "warning" for doubt in self.doubts)

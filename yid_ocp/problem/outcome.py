@@ -1,4 +1,4 @@
-"""What predicting an episode leaves: where it begins, and what its sensors would have read."""
+"""Results of predicting an episode: its initial state, rollout and predicted sensor readings."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """Rollout of one episode and its prediction of every sample.
+    """Rollout of one episode, its predicted sensor readings and their sensitivities.
 
     Attributes
     ----------
     rollout : Rollout
     rest : Rest or None
-        The equilibrium at which it started.
+        Equilibrium from which the rollout starts.
     predicted : tuple of ndarray, shape (M, k) each
         Prediction of every sample, in the sensor's unit.
     sensitivities : tuple of ndarray, shape (M, k, d) each, or None
     warm : ndarray, shape (n,), or None
-        Configuration at `rest`, from which that of similar parameters is found quickly.
+        Configuration at `rest`, the initial guess for similar parameters.
     correction : ndarray, shape (N, nu), or None
-        What the tracking filter added to the recorded torque [N m], where encoders are measurements.
+        Torque that the tracking filter adds to the recorded one [N m], where encoders are measurements.
     by_correction : ndarray, shape (N, nu, d), or None
         Its derivative, with `sensitivities`.
     """
@@ -43,7 +43,7 @@ class EpisodeResult:
 
     @property
     def push(self) -> Array | None:
-        """`correction` and, after it, its derivative where that is known, shape (N, nu, 1 + d)."""
+        """`correction` followed by the columns of its derivative where it is known, shape (N, nu, 1 + d)."""
         if self.correction is None:
             return None
         known = self.correction[:, :, None]
@@ -52,7 +52,7 @@ class EpisodeResult:
 
 @dataclass(frozen=True)
 class Start:
-    """Where a rollout begins.
+    """Initial state of a rollout with its derivative.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What the model says about one episode: its start, its rollout, its readings, and their derivatives."""
+"""Prediction of an episode: initial state, rollout, sensor readings and their derivatives."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ from yid_ocp.problem.unknowns import Unknowns
 
 Array = NDArray[np.float64]
 MOST_AT_ONCE, MOST_MEMORY = 16, 2.0**28
-"""Episodes that are rolled out at once, and memory of their states and derivatives [bytes]."""
+"""Largest number of episodes rolled out at once, and largest memory of their states and derivatives [bytes]."""
 
 LEAST_GAIN = 0.1
-"""Least factor between a recorded torque and the one that acts at which an error of the latter is one of the former."""
+"""Smallest ratio of acting to recorded torque at which errors of one are converted into errors of the other."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class _Prepared:
 
 @dataclass(frozen=True)
 class Predictor:
-    """Predicts episodes; a function of what it is given and nothing else.
+    """Predicts episodes: initial state, rollout, sensor readings and derivatives; stateless.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class Predictor:
 
     @property
     def start_rows(self) -> tuple[int, ...]:
-        """Rows of the initial state that are estimated, in the order of `Unknowns.start`."""
+        """Indices of the estimated components of the initial state, in the order of `Unknowns.start`."""
         joints, n = self.system.mechanism.joint_index, self.system.size
         hidden = list(self.system.internal)
         split = (name.split(".", 1) for name in self.unknowns.start)
@@ -88,7 +88,7 @@ class Predictor:
         )
 
     def fitted(self, episode: Episode, theta: Array) -> Episode:
-        """The episode with its start fitted to the first measured points at given parameters, where it is fitted."""
+        """Episode with its initial state fitted to the first measured points, where the options ask for it."""
         if episode.start is not None or self.options.initial_state != "fitted_to_points":
             return episode
         samples = episode.samples
@@ -100,7 +100,7 @@ class Predictor:
         return replace(episode, start=start)
 
     def own_theta(self, episode: Episode, theta: Array) -> Array:
-        """theta with the values that belong to one recording: known ones, and those fitted along with its start."""
+        """theta with the episode's own values: known ones, and those fitted along with its initial state."""
         fitted: Mapping[str, float] = {} if episode.start is None else episode.start.values
         return self._with(theta, {**episode.values, **fitted})
 
@@ -113,7 +113,7 @@ class Predictor:
     def start(
         self, episode: Episode, theta: Array, offset: Array, wanted: tuple[str, ...], guess: Array | None = None
     ) -> Start:
-        """Where an episode's rollout begins at its own parameters.
+        """Initial state of an episode's rollout and its derivative by (wanted parameters, offset).
 
         Parameters
         ----------
@@ -121,11 +121,11 @@ class Predictor:
         theta : ndarray, shape (ntheta,)
             From `own_theta`.
         offset : ndarray, shape (number of estimated rows,)
-            Of an estimated start.
+            Of an estimated initial state from equilibrium.
         wanted : tuple of str
             Parameters by which to differentiate.
         guess : ndarray, optional, shape (n,)
-            Configuration near the equilibrium; without one `Episode.near`, or several, of which least energy is taken.
+            Configuration near the equilibrium; `Episode.near`, else a search for least energy, when absent.
         """
         nx, rows = self.step.sizes["nx"], list(self.start_rows)
         by_offset = np.zeros((nx, len(rows)))
@@ -149,7 +149,7 @@ class Predictor:
         return Start(state, np.hstack([by_theta, by_offset]), rest, "")
 
     def as_recorded(self, episode: Episode, theta: Array) -> bool:
-        """Whether no effect on an episode's inputs (what a filter follows too) or times is free or not neutral."""
+        """Whether no effect corrects the episode's inputs, times or tracked reference: none is free or non-neutral."""
         wanted = self.unknowns.parameters
         inputs = self.inputs(episode, theta, wanted)
         pairs = ((inputs.torque, episode.torque), (inputs.path, episode.path), (inputs.arm, episode.measured_arm))
@@ -171,7 +171,7 @@ class Predictor:
     def tracked(
         self, episode: Episode, theta: Array, wanted: tuple[str, ...], state: Array, by_unknowns: Array | None = None
     ) -> Inputs:
-        """What drives an episode's rollout, with the momenta that its tracking filter follows.
+        """Corrected inputs of an episode, with the momentum shift of its tracking filter's reference.
 
         Parameters
         ----------
@@ -179,9 +179,9 @@ class Predictor:
         theta : ndarray, shape (ntheta,)
         wanted : tuple of str
         state : ndarray, shape (nx,)
-            With which it begins.
+            Initial state.
         by_unknowns : ndarray, optional, shape (nx, d)
-            Derivative of that by the parameters and what is unknown of the start.
+            Derivative of the initial state by the parameters and its estimated components.
         """
         inputs = self.inputs(episode, theta, wanted)
         if not self._follows_momenta:
@@ -194,7 +194,7 @@ class Predictor:
         )
 
     def inputs(self, episode: Episode, theta: Array, wanted: tuple[str, ...]) -> Inputs:
-        """The recording's torques, angles and paths as the effects say they truly were, and derivatives by `wanted`."""
+        """True torques, angles and paths of an episode by the model's input effects, with derivatives by `wanted`."""
         corrections = self.functions.corrections
         torque, arm, path = episode.torque, episode.measured_arm, episode.path
         nu, nc, errors = torque.shape[1], path.shape[1], episode.errors
@@ -232,13 +232,13 @@ class Predictor:
     def run(
         self, episode: Episode, theta: Array, offset: Array, derivatives: bool, guess: Array | None = None
     ) -> EpisodeResult | str:
-        """Roll one episode out and predict its samples; a text says why where that is impossible."""
+        """Roll out one episode and predict its samples; returns an error message where that fails."""
         return self.run_all([(episode, theta, offset, guess)], derivatives)[0]
 
     def run_all(
         self, asked: Sequence[tuple[Episode, Array, Array, Array | None]], derivatives: bool
     ) -> list[EpisodeResult | str]:
-        """Roll several episodes out, together where that pays; each is given as (episode, theta, offset, guess)."""
+        """Roll out several episodes, each given as (episode, theta, offset, guess), and predict their samples."""
 
         def part(some: Sequence[tuple[Episode, Array, Array, Array | None]]) -> list[EpisodeResult | str]:
             prepared = map_threads(lambda one: self._prepared(*one, derivatives), some)
@@ -322,9 +322,9 @@ class Predictor:
     def weighted(
         self, episode: Episode, theta: Array, offset: Array, guess: Array | None, before: Innovations | None
     ) -> tuple[Episode, Innovations | None]:
-        """The filter that whitens an episode's residual, frozen at these unknowns, and the episode that it belongs to.
+        """Return the episode with its estimated input errors, and the filter that whitens its residual here.
 
-        None for the filter where nothing drives the motion wrong, or where the episode cannot be rolled out.
+        The filter is None without process noise, or where the rollout fails.
 
         Parameters
         ----------
@@ -335,7 +335,7 @@ class Predictor:
         guess : ndarray, shape (n,), or None
             Configuration near the equilibrium.
         before : Innovations or None
-            The episode's filter, where it has one already: the new one is about the motion and torques that it sees.
+            Filter that the episode has already; the new one is linearized about the motion that it smooths.
         """
         if episode.errors is None:
             return episode, None
@@ -379,11 +379,11 @@ class Predictor:
         return replace(errors, read=read, through=through)
 
     def torque_offset(self, episode: Episode, result: EpisodeResult, whitening: Innovations) -> Array:
-        """Constant error of every driven joint's torque, as all measurements of an episode have it, (nu,) [N m]."""
+        """Constant torque error of each driven joint, estimated from all measurements of an episode, (nu,) [N m]."""
         return whitening.whitened(_plain(episode, result)[:, None], result.push)[1][:, 0]
 
     def course(self, episode: Episode, result: EpisodeResult, theta: Array) -> Course:
-        """The rollout of an episode, about which errors of what drives it are small."""
+        """Trajectory of an episode about which its input errors are linearized."""
         own, rollout = self.own_theta(episode, theta), result.rollout
         nx, nu = self.step.sizes["nx"], self.step.sizes["nu"]
         by_angles, by_torque = np.zeros((nx, nu)), np.zeros((nx, nu))
@@ -401,7 +401,7 @@ class Predictor:
         )
 
     def along(self, samples: Measurements, state: Array, by_state: Array, theta: Array) -> tuple[Array, Array]:
-        """Readings along a given trajectory and their derivatives.
+        """Sensor readings along a given trajectory and their derivatives.
 
         Parameters
         ----------
@@ -431,12 +431,12 @@ class Predictor:
         return effort
 
     def lateness(self, samples: Measurements, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array] | None:
-        """By how many steps each output is late, shape (k,), and its derivative, (k, d); None where none ever is."""
+        """Delay of each output in steps, shape (k,), and its derivative, (k, d); None without delays."""
         found = self.functions.corrections.sensor_delay(samples.sensor, theta, wanted)
         return None if found is None else (found[0] / self.step.time_step, found[1] / self.step.time_step)
 
     def placed(self, samples: Measurements, theta: Array) -> Measurements:
-        """The samples where what they show took place."""
+        """Measurements shifted to the times at which their readings were true."""
         late = self.lateness(samples, theta, ())
         return samples if late is None else samples.late(late[0])
 
@@ -450,7 +450,7 @@ class Predictor:
         return replace(rollout, effort=effort, by_effort=slope)
 
     def smoothing(self, episode: Episode, theta: Array) -> SmoothedNodes | None:
-        """What smooths predicted efforts of prescribed joints, where they are compared, as measured ones are."""
+        """Smoother of predicted efforts of prescribed joints, the filter of the measured ones; None if not compared."""
         compared = [samples for samples in episode.samples if samples.sensor.efforts]
         if not math.isfinite(self.options.path_cutoff) or not compared:
             return None
@@ -493,7 +493,7 @@ class Predictor:
     # -- the adjoint --------------------------------------------------------------------------------------------------
 
     def pulled(self, episode: Episode, result: EpisodeResult, theta: Array, offset: Array, pulls: list[Array]) -> Array:
-        """Gradient of a cost of one episode's predictions by its (shared, local, start) unknowns, by the adjoint sweep.
+        """Gradient of a cost of an episode's predictions by its (shared, local, start) unknowns, by the adjoint.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""What a recording says of its model before anything is estimated: the shape at rest, the loads of gears."""
+"""Preparation of episodes before estimation: the observed initial equilibrium and the gear loads."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from yid_ocp.problem.prediction import Predictor
 Array = NDArray[np.float64]
 
 FIRST = 1.0
-"""How late a point may be seen for the first time and still show the shape at rest [s]."""
+"""Latest time at which a point's first sample still shows the initial equilibrium [s]."""
 ELSEWHERE = 5.0
-"""Root mean square error of first points beyond which another equilibrium is looked for [standard deviations]."""
+"""Root mean square error of first points above which another equilibrium is sought [standard deviations]."""
 NEARER = 0.5
-"""Part of that error which another equilibrium leaves at most."""
+"""Largest fraction of that error that may remain at another equilibrium."""
 
 
 def prepared(predictor: Predictor, episode: Episode, theta: Array) -> Episode:
-    """The episode with the equilibrium that it shows and with loads that carry no noise of compared efforts.
+    """Episode with the initial equilibrium that its points show and with gear loads free of effort noise.
 
     Parameters
     ----------
@@ -40,9 +40,7 @@ def prepared(predictor: Predictor, episode: Episode, theta: Array) -> Episode:
 
 
 def _at_rest(predictor: Predictor, episode: Episode, theta: Array) -> Episode:
-    """The episode with the equilibrium near its first points, where that of least energy is far from them.
-
-    What is held at both ends may rest in several shapes, and which one it is in no energy tells.
+    """Episode with the equilibrium near its first points, where that of least energy is far from them.
     """
     fitted = episode.start is not None or predictor.options.initial_state == "fitted_to_points"
     if fitted or not predictor.system.grasps:

@@ -1,4 +1,4 @@
-"""The estimation problem: recordings, a step, what is free, and the residual with its derivatives."""
+"""The estimation problem: a model and recordings, its unknowns, and the residual with its derivatives."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ Array = NDArray[np.float64]
 
 
 class EstimationProblem(Shown):
-    """Find the free parameters that make the model's sensors agree with recordings.
+    """Estimation of free parameters from recordings: residual, cost and derivatives; immutable and thread-safe.
 
-    Immutable: `evaluate`, `gradient` and `validate` depend on their arguments alone, whatever was asked before and from
-    whichever thread.
+    Methods evaluate the cost, predict held-out recordings, derive problems with other parameters, data or options,
+    whiten residuals, and pack and split the unknown vector.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ class EstimationProblem(Shown):
     values : mapping of str to float, optional
         Initial values, and values of fixed parameters, where they differ from the model's.
     held_out : sequence of Recording
-        Never touched by the fit; used by `validate`.
+        Not used by the fit, only predicted by `validate`.
     may_free : sequence of str, optional
         Further parameters that `freeing` may be asked for; the model's functions are differentiated by them as well.
 
@@ -71,12 +71,12 @@ class EstimationProblem(Shown):
     theta : ndarray, shape (ntheta,)
         Initial values of free parameters and values of fixed ones.
     unknowns : Unknowns
-        How the unknown vector is made up.
+        Layout of the unknown vector.
     episodes, held_out : tuple of Episode
     rows : ResidualRows
-        How the residual is made up.
+        Layout of the residual.
     innovations : tuple of Innovations or None
-        What turns every recording's residual into innovations; None where the sensors' noise is all, see `weighted_at`.
+        Filter that whitens each recording's residual; None where sensor noise is the only noise, see `weighted_at`.
     held_out_innovations : tuple of Innovations or None
         The same for held-out recordings, see `held_out_weighted_at`.
 
@@ -159,7 +159,7 @@ class EstimationProblem(Shown):
         self.rows = ResidualRows.of(episodes, len(self._stated), len(self._weak))
 
     def _changed(self, **changes: Any) -> EstimationProblem:
-        """Another problem that shares what is compiled and placed; nothing is prepared anew."""
+        """Changed problem that shares the compiled functions; episodes are not prepared again."""
         made = object.__new__(EstimationProblem)
         kept = ("functions", "options", "free", "theta", "episodes", "held_out")
         same = {name: getattr(self, name) for name in (*kept, "innovations", "held_out_innovations")}
@@ -203,7 +203,7 @@ class EstimationProblem(Shown):
 
     @property
     def start(self) -> Array:
-        """Initial guess of the unknown vector."""
+        """Initial guess of the unknown vector, shape (nx,)."""
         index = self.system.parameters.index
         shared, local = ([self.theta[index(name)] for name in part] for part in (self.shared, self.local))
         return self.unknowns.spread(shared, local, np.zeros(len(self.unknowns.start)))
@@ -220,7 +220,7 @@ class EstimationProblem(Shown):
 
     @property
     def scales(self) -> Array:
-        """Typical size of every unknown: its start, its prior's standard deviation, or a tenth of its range."""
+        """Typical size of each unknown: its initial value, its prior's standard deviation, or a tenth of its range."""
         lower, upper = self.bounds
         size = np.abs(self.start)
         width = np.where(np.isfinite(upper - lower), upper - lower, 10.0)
@@ -229,12 +229,12 @@ class EstimationProblem(Shown):
 
     @property
     def positive(self) -> NDArray[np.bool_]:
-        """Unknowns that are positive by nature and start above zero."""
+        """Mask of unknowns that must be positive and have a positive initial value, shape (nx,)."""
         return (self.bounds[0] >= 0) & (self.start > 0)
 
     @property
     def noise(self) -> float:
-        """Unit of the data's rows: 1 where they are whitened, else the points' root mean square noise [m]."""
+        """Noise unit of the data residuals: 1 where they are whitened, else the points' root mean square noise [m]."""
         if self.options.weighting != "paper":
             return 1.0
         found = [s.std[np.isfinite(s.std)] for episode in self.episodes for s in episode.samples]
@@ -242,27 +242,27 @@ class EstimationProblem(Shown):
 
     @property
     def start_std(self) -> Array:
-        """Standard deviation of the prior of every estimated row of an initial state."""
+        """Prior standard deviation of each estimated component of an initial state."""
         at = len(self.unknowns.parameters)
         return self._prior_std[at : at + len(self.unknowns.start)]
 
     @property
     def as_recorded(self) -> bool:
-        """Whether no effect on recorded inputs (what a filter follows too) or times is free or other than neutral."""
+        """Whether no effect corrects recorded inputs, times or the tracked reference: none is free or non-neutral."""
         return all(self.predictor.as_recorded(episode, self.theta) for episode in self.episodes)
 
     # -- the unknown vector -------------------------------------------------------------------------------------------
 
     def split(self, x: ArrayLike, episode: int) -> tuple[Array, Array]:
-        """theta and the offset of the start of one episode from the unknown vector."""
+        """Return theta and the initial state offset of one episode from the unknown vector."""
         return self.unknowns.split(x, episode, self.theta, self.system)
 
     def vector(self, values: Mapping[str, float]) -> Array:
-        """The initial unknown vector with named entries replaced, clipped to the bounds."""
+        """Initial unknown vector with named entries replaced, clipped to the bounds, shape (nx,)."""
         return np.clip(replaced(self.start, self.names, values), *self.bounds)
 
     def named(self, x: Array) -> dict[str, float]:
-        """An unknown vector as a mapping."""
+        """Unknown vector as a dictionary of name to value."""
         return dict(zip(self.names, map(float, x), strict=True))
 
     # -- evaluation ---------------------------------------------------------------------------------------------------
@@ -275,8 +275,8 @@ class EstimationProblem(Shown):
         x : array_like, shape (nx,)
         derivatives : bool
         warm : WarmStart, optional
-            Where equilibria are looked for, `Evaluation.warm` of a point nearby; without it the shape at rest is that
-            of least energy among several, which takes longer.
+            `Evaluation.warm` of a nearby point; without it the equilibrium of least energy is searched, which takes
+            longer.
 
         Returns
         -------
@@ -308,9 +308,9 @@ class EstimationProblem(Shown):
         return Evaluation(cost, residual, jacobian, True, "", done)
 
     def torque_offsets(self, x: ArrayLike) -> list[tuple[Array, Array] | None]:
-        """Constant error of driven joints' torques at `x`, of every recording: values and standard deviations [N m].
+        """Estimate each recording's constant torque errors at `x`: values and standard deviations (nu,) [N m].
 
-        None where torques are taken as true, and where nothing is frozen (`weighted_at`).
+        None where torques are taken as exact, or where no whitening filter is set (`weighted_at`).
         """
         x = np.asarray(x, float)
         found: list[tuple[Array, Array] | None] = []
@@ -325,7 +325,7 @@ class EstimationProblem(Shown):
     def gradient(
         self, x: ArrayLike, evaluation: Evaluation | None = None, warm: WarmStart | None = None
     ) -> tuple[float, Array, Evaluation]:
-        """Cost and its gradient by the adjoint sweep; by forward sensitivities where noise is more than the sensors'.
+        """Return the cost and its gradient by the adjoint; with process noise by forward sensitivities.
 
         Parameters
         ----------
@@ -364,7 +364,7 @@ class EstimationProblem(Shown):
         return evaluation.cost, gradient + prior_jacobian.T @ prior_residual, evaluation
 
     def prior(self, x: Array) -> tuple[Array, Array]:
-        """Rows of the stated and of the weak priors, and their derivative by the unknowns."""
+        """Return the residual of the stated and weak priors, and its Jacobian by the unknowns."""
         stated, weak, start = self._stated, self._weak, self.start
         rows = np.vstack([stated, np.zeros((len(weak), len(x)))])
         spread = np.log(max(self.options.weak_prior_factor, 1.0 + 1e-9))
@@ -373,10 +373,7 @@ class EstimationProblem(Shown):
         return np.concatenate([stated @ (x - start), value / spread]), rows
 
     def informing(self, evaluation: Evaluation) -> tuple[Array, Array]:
-        """What data and stated priors say, in units of their noise: residual (r,) and Jacobian (r, nx).
-
-        The weak priors, which only hold what nothing informs, are left out; see `rows`.
-        """
+        """Return the noise-scaled residual (r,) and Jacobian (r, nx) of data and stated priors, without weak priors."""
         assert evaluation.jacobian is not None
         residual, jacobian = evaluation.residual[self.rows.informing], evaluation.jacobian[self.rows.informing]
         if self.noise == 1.0:
@@ -406,11 +403,11 @@ class EstimationProblem(Shown):
     # -- held-out recordings ------------------------------------------------------------------------------------------
 
     def validate(self, x: ArrayLike, derivatives: bool = False) -> list[tuple[Episode, EpisodeResult | str]]:
-        """Predict the held-out recordings with the shared parameters of `x`; local ones stay at their initial value.
+        """Predict the held-out recordings with the shared parameters of `x`; local ones keep their initial value.
 
-        The episodes come back with the starts that were fitted to their points, as far as they are. An `estimated`
-        start is found from each recording's first `HELD_OUT_START` seconds and its prior, one that is fitted to points
-        at these parameters. Derivatives are by (free parameters, offset of the start), the start held.
+        Returns each episode, with its fitted initial state where it has one, and its prediction or an error message.
+        An `estimated` initial state is found from the first `HELD_OUT_START` seconds and its prior. Derivatives are by
+        (free parameters, initial state offset), the initial state held.
         """
         x = np.asarray(x, float)
         theta = self._held_out_theta(x)
@@ -427,7 +424,7 @@ class EstimationProblem(Shown):
         return self.predictor.fitted(held, theta)
 
     def held_out_offset(self, i: int, x: ArrayLike) -> Array:
-        """Offset of a held-out recording's start from rest at unknowns `x`, shape (number of estimated rows,)."""
+        """Offset of a held-out recording's initial state from equilibrium at `x`, shape (number of estimated rows,)."""
         x = np.asarray(x, float)
         theta = self._held_out_theta(x)
         return self._held_out_offset(self._held_out_episode(self.held_out[i], theta), theta, x)
@@ -449,7 +446,7 @@ class EstimationProblem(Shown):
     def simulate(
         self, values: Mapping[str, float] | None = None, recording: int = 0, seed: int | None = None
     ) -> Recording:
-        """What the sensors would have recorded with other parameters, moved as one of the recordings was.
+        """Simulate a synthetic recording with other parameters and the inputs of one of the recordings.
 
         Parameters
         ----------
@@ -470,32 +467,32 @@ class EstimationProblem(Shown):
     # -- problems like this one ---------------------------------------------------------------------------------------
 
     def freeing(self, names: Sequence[str]) -> EstimationProblem:
-        """The same problem with other free parameters, among those that it was made to free; shares all else."""
+        """The same problem with other free parameters among `free` and `may_free`; shares the compiled functions."""
         return self._changed(free=tuple(names))
 
     def at(self, values: Mapping[str, float]) -> EstimationProblem:
-        """The same problem with other values of parameters, filters and starts as they are."""
+        """The same problem with other parameter values; filters and initial states are unchanged."""
         theta = self.theta.copy()
         for name, value in values.items():
             theta[self.system.parameters.index(name)] = value
         return self._changed(theta=theta)
 
     def on(self, episodes: Sequence[Episode], held_out: Sequence[Episode]) -> EstimationProblem:
-        """The same problem on other episodes of its model, weighted by the sensors' noise alone."""
+        """The same problem on other episodes of its model, whitened by sensor noise alone."""
         return self._changed(
             episodes=tuple(episodes), held_out=tuple(held_out), innovations=(), held_out_innovations=()
         )
 
     @property
     def disturbed(self) -> bool:
-        """Whether errors of torques or angles drive the motion of any recording."""
+        """Whether errors of recorded torques or angles act as process noise in any recording."""
         return any(episode.errors is not None for episode in self.episodes)
 
     def weighted_at(self, x: ArrayLike, warm: WarmStart | None = None, rounds: int = 1) -> EstimationProblem:
-        """The same problem with residuals weighted by all noise, that which drives the motion too, frozen at `x`.
+        """The same problem with residuals whitened by sensor and process noise, linearized at `x`.
 
-        The problem itself where nothing is wrong with its torques and angles, or where it cannot be rolled out at `x`.
-        If it is weighted already, the new weights are about the motion and the torques that the old ones see.
+        Returns the problem itself without process noise, or where the rollout fails at `x`. Where it is whitened
+        already, the new filter is linearized about the smoothed motion and torques of the old one.
 
         Parameters
         ----------
@@ -503,7 +500,7 @@ class EstimationProblem(Shown):
         warm : WarmStart, optional
             As in `evaluate`.
         rounds : int
-            How often in a row; 2 at a fit.
+            Number of relinearizations; 2 at a fit.
         """
         x = np.asarray(x, float)
         guesses = warm or (None,) * len(self.episodes)
@@ -520,11 +517,11 @@ class EstimationProblem(Shown):
         return made_of if rounds < 2 else made_of.weighted_at(x, warm, rounds - 1)
 
     def weighted_by_sensors(self) -> EstimationProblem:
-        """The same problem with residuals in units of the sensors' noise alone, torque offsets as they are known."""
+        """The same problem whitened by sensor noise alone, with the torque offsets estimated so far."""
         return self._with_errors(lambda errors: errors.as_recorded)
 
     def without_input_errors(self) -> EstimationProblem:
-        """The same problem with torques and angles that drive the motion taken as they were recorded."""
+        """The same problem with the recorded torques and angles taken as exact."""
         return self._with_errors(lambda errors: None)
 
     def _with_errors(self, changed: Callable[[InputErrors], InputErrors | None]) -> EstimationProblem:
@@ -532,9 +529,9 @@ class EstimationProblem(Shown):
         return self.on(*([replace(e, errors=e.errors and changed(e.errors)) for e in group] for group in groups))
 
     def held_out_weighted_at(self, x: ArrayLike) -> EstimationProblem:
-        """The same problem with the residuals of held-out recordings weighted like this as well, for `held_out_rows`.
+        """The same problem with held-out residuals whitened by all noise at `x` as well, for `held_out_rows`.
 
-        One that cannot be rolled out keeps its sensors' weights.
+        A recording whose rollout fails is whitened by sensor noise alone.
         """
         x, episodes, made = np.asarray(x, float), [], []
         theta = self._held_out_theta(x)
@@ -548,13 +545,13 @@ class EstimationProblem(Shown):
         return self._changed(held_out=tuple(episodes), held_out_innovations=tuple(made))
 
     def about_torques_at(self, x: Array, frozen: Array) -> EstimationProblem:
-        """The same problem, its filters about the torques that measurements see at `x`; now they are so at `frozen`."""
+        """The same problem, its filters relinearized from the torque offsets estimated at `frozen` to those at `x`."""
         at = [(e, *self.split(x, i), self.split(frozen, i)[0]) for i, e in enumerate(self.episodes)]
         made = filters_about(self.predictor, self.innovations, at)
         return self._changed(episodes=with_errors(self.episodes, made), innovations=made)
 
     def held_out_about_torques_at(self, x: Array, frozen: Array) -> EstimationProblem:
-        """The same problem with the filters of held-out recordings about the torques seen at `x` as well."""
+        """The same problem with held-out filters relinearized from the torque offsets at `frozen` to those at `x`."""
         theta, before = self._held_out_theta(x), self._held_out_theta(frozen)
         own = (self._held_out_episode(e, theta) for e in self.held_out)
         at = [(e, theta, self._held_out_offset(e, theta, x), before) for e in own]
@@ -562,22 +559,20 @@ class EstimationProblem(Shown):
         return self._changed(held_out=with_errors(self.held_out, made), held_out_innovations=made)
 
     def held_out_rows(self, i: int, episode: Episode, result: EpisodeResult) -> Rows:
-        """Residual of a held-out recording, from its place and what `validate` says of it.
-
-        Without a robust loss, in the order of its measurements; innovations where they are frozen.
+        """Whitened residual of held-out recording `i` from its prediction by `validate`, without a robust loss.
         """
         return residual_rows(episode, self.held_out_innovations[i], result, np.inf)
 
     def shortened(self, duration: float) -> EstimationProblem:
-        """The same problem over the first seconds of every recording, prepared anew, without held-out ones."""
+        """The same problem on the first `duration` seconds of each recording, rebuilt without held-out recordings."""
         return self._prepared(options=replace(self.options, duration=duration), held_out=())
 
     def with_options(self, options: ProblemOptions) -> EstimationProblem:
-        """The same problem with other options, prepared anew."""
+        """The same problem rebuilt with other options."""
         return self._prepared(options=options)
 
     def with_free(self, free: Sequence[str], values: Mapping[str, float] | None = None) -> EstimationProblem:
-        """The same problem with other free parameters and values, prepared anew."""
+        """The same problem rebuilt with other free parameters and values."""
         keep = set(free)
         options = replace(
             self.options,

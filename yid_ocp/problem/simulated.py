@@ -1,4 +1,4 @@
-"""What a problem's sensors would have recorded at given parameters: its rollout as a recording."""
+"""Synthetic recordings: a problem's rollout at given parameters as its sensors would record it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def recorded(
     seed: int | None = None,
     description: str = "",
 ) -> Recording:
-    """The rollout of an episode as a recording with its sensors' clocks and noise levels.
+    """Convert an episode's predicted rollout into a recording with its sensors' clocks and noise levels.
 
     Parameters
     ----------
@@ -37,8 +37,7 @@ def recorded(
     theta : ndarray, shape (ntheta,)
         At which it was predicted.
     seed : int, optional
-        Of noise as the estimation takes it: by recorded or configured standard deviations, of driven joints also those
-        of torques that nobody states and of their constant offsets; none when absent.
+        Of the noise that the estimation assumes, constant torque offsets included; no noise when absent.
     """
     rng = None if seed is None else np.random.default_rng(seed)
     system, source = predictor.system, episode.recording
@@ -66,7 +65,7 @@ def recorded(
 
 
 def simulated(predictor: Predictor, episode: Episode, theta: Array, seed: int | None = None) -> Recording:
-    """What the sensors of an episode would have recorded at theta; see `EstimationProblem.simulate`."""
+    """Roll out an episode at theta and return it as a synthetic recording."""
     refit = predictor.options.initial_state == "fitted_to_points"
     fresh = predictor.fitted(replace(episode, start=None), theta) if refit else episode
     found = predictor.run(fresh, theta, np.zeros(len(predictor.unknowns.start)), False)

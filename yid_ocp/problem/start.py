@@ -1,4 +1,4 @@
-"""A start state from the first measured points, for recordings that begin in motion or away from rest."""
+"""Fit of an initial state to the first measured points, for recordings that do not start at equilibrium."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ TRIALS = 4
 
 @dataclass(frozen=True)
 class FittedStart:
-    """A start that fits the first measured points.
+    """Initial state that is given or fitted to the first measured points, independent of the unknowns.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class _Task:
 
 
 class StartFit:
-    """Fits start configurations of a step's system.
+    """Fits an initial state, and optionally parameters, to the first measured points of an episode.
 
     Minimises, by Gauss-Newton over q (and the parameters asked for) at the first frame,
 
@@ -117,7 +117,7 @@ class StartFit:
     def solve(
         self, posture: Array, samples: Sequence[Measurements], theta: Array, window: float, path: Array
     ) -> FittedStart:
-        """Configuration that fits the measured points at the first frames, and the momentum from their change.
+        """Fit the configuration to the points of the first frame and the momentum to their change within the window.
 
         Parameters
         ----------

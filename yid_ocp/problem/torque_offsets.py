@@ -1,4 +1,4 @@
-"""Constant errors of recorded torques: filters about those that all measurements see at other unknowns."""
+"""Relinearization of whitening filters about the constant torque errors estimated at other unknowns."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from yid_ocp.problem.prediction import Predictor
 
 Array = NDArray[np.float64]
 ROUNDS = 6
-"""Rollouts at most, each about what the one before says."""
+"""Largest number of rollouts, each about the torque offset estimated from the one before."""
 NEAR = 0.05
-"""Part of the stated standard deviation within which an error is of first order."""
+"""Change of the torque offset, in stated standard deviations, below which the iteration ends."""
 
 
 def filters_about(
@@ -24,10 +24,7 @@ def filters_about(
     known: Sequence[Innovations | None],
     at: Sequence[tuple[Episode, Array, Array, Array]],
 ) -> tuple[Innovations | None, ...]:
-    """Filters about the torque offsets that all measurements of their episodes see at other parameters.
-
-    A filter takes errors of torques to first order about those that it knows. Beside an effect a torque of some newton
-    metres that was an error is none, and a rollout under it is anywhere. Weights stay what they are.
+    """Filters relinearized about the torque offsets estimated at other parameters, their weights unchanged.
 
     Parameters
     ----------
@@ -35,14 +32,14 @@ def filters_about(
     known : sequence of Innovations or None
         Of every episode.
     at : sequence of (Episode, theta, start, frozen)
-        The episode with its filter's errors, theta and the offset of an estimated start, and the theta at which the
-        filter is about the right torque.
+        Episode with its filter's errors, new theta and initial state offset, and the theta of the present
+        linearization.
     """
     return tuple(own and _settled(predictor, own, *told) for own, told in zip(known, at, strict=True))
 
 
 def with_errors(episodes: Sequence[Episode], known: Sequence[Innovations | None]) -> tuple[Episode, ...]:
-    """Episodes with the errors that their filters are about."""
+    """Episodes with the input errors about which their filters are linearized."""
     pairs = zip(episodes, known, strict=True)
     return tuple(episode if own is None else replace(episode, errors=own.errors) for episode, own in pairs)
 
@@ -66,7 +63,7 @@ def _settled(
 
 
 def torques_apart(some: Sequence[Innovations | None], others: Sequence[Innovations | None]) -> float:
-    """How far the offsets are apart that filters of the same recordings are about, in stated standard deviations."""
+    """Largest difference of the torque offsets of two sets of filters, in stated standard deviations."""
     pairs = zip(some, others, strict=True)
     return max((_apart(one, other) for one, other in pairs if one and other), default=0.0)
 

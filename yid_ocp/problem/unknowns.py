@@ -1,4 +1,4 @@
-"""The unknown vector of an estimation problem: what stands where, recording by recording."""
+"""Layout of an estimation problem's unknown vector, its priors and its bounds."""
 
 from __future__ import annotations
 
@@ -18,20 +18,19 @@ from yid_ocp.problem.options import ProblemOptions
 Array = NDArray[np.float64]
 START = "start."
 SMALL_RATIO = 1e-3
-"""Part of its start below which the weak prior of an unknown is no logarithm any more."""
+"""Ratio of an unknown to its initial value below which the weak prior's logarithm is replaced by a parabola."""
 
 
 @dataclass(frozen=True)
 class Unknowns:
-    """(shared parameters | recording 1: local parameters, offset of its start | recording 2: ...).
+    """Layout of the unknown vector: (shared | recording 1: local, initial state offset | recording 2: ...).
 
     Attributes
     ----------
     shared, local : tuple of str
         Free parameters with one value for all recordings, and with a value in each.
     start : tuple of str
-        Rows of an estimated initial state, `q.JOINT` and `p.JOINT`, and of internal coordinates that nothing tells,
-        `z.NAME`.
+        Estimated components of the initial state: `q.JOINT`, `p.JOINT` and, of unobserved internal ones, `z.NAME`.
     recordings : tuple of str
     """
 
@@ -48,22 +47,22 @@ class Unknowns:
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Free parameters in the order of one recording's directions."""
+        """Free parameters, shared then local, in the order of one recording's derivative columns."""
         return (*self.shared, *self.local)
 
     def columns(self, recording: int) -> NDArray[np.int64]:
-        """Places of one recording's (shared, local, start) unknowns in the vector."""
+        """Indices of one recording's (shared, local, start) unknowns in the vector."""
         shared, own = len(self.shared), len(self.local) + len(self.start)
         return np.concatenate([np.arange(shared), shared + recording * own + np.arange(own)])
 
     def placed(self, block: Array, recording: int) -> Array:
-        """Columns by one recording's directions, (r, d), moved to their places in the unknown vector, (r, nx)."""
+        """Scatter derivative columns of one recording, (r, d), to the columns of the unknown vector, (r, nx)."""
         wide = np.zeros((len(block), len(self.names)))
         wide[:, self.columns(recording)] = block
         return wide
 
     def split(self, x: ArrayLike, recording: int, theta: Array, system: System) -> tuple[Array, Array]:
-        """theta with one recording's values in place of the nominal ones, and the offset of its start."""
+        """Return theta with one recording's values, and its initial state offset, from the unknown vector."""
         own = np.asarray(x, float)[self.columns(recording)]
         result = theta.copy()
         for name, value in zip(self.parameters, own, strict=False):
@@ -71,21 +70,21 @@ class Unknowns:
         return result, own[len(self.parameters) :]
 
     def spread(self, shared: ArrayLike, local: ArrayLike, start: ArrayLike) -> Array:
-        """An unknown vector from values for the shared parameters, each recording's local ones and its start."""
+        """Pack shared values, and local values and an initial state offset equal in all recordings, into a vector."""
         parts = [np.asarray(shared, float)]
         parts += [np.asarray(local, float), np.asarray(start, float)] * len(self.recordings)
         return np.concatenate(parts)
 
 
 def replaced(x: Array, names: Sequence[str], values: Mapping[str, float]) -> Array:
-    """An unknown vector with named entries replaced."""
+    """Copy of an unknown vector with named entries replaced."""
     return np.array([values.get(name, value) for name, value in zip(names, x, strict=True)], float)
 
 
 def stated_std(
     unknowns: Unknowns, options: ProblemOptions, system: System, inertia: Callable[[tuple[str, ...]], Array]
 ) -> Array:
-    """Standard deviation of every unknown's stated Gaussian prior about its start, infinite where there is none.
+    """Standard deviation of each unknown's stated Gaussian prior, infinite where there is none, shape (nx,).
 
     `inertia` gives the diagonal of the mass matrix for named joints, by which a start's velocity becomes a momentum. An
     internal coordinate may begin anywhere within its limits; the standard deviation is that of such a uniform prior.
@@ -109,7 +108,7 @@ def stated_std(
 
 
 def stated_rows(unknowns: Unknowns, options: ProblemOptions, std: Array) -> Array:
-    """Rows of the stated priors, (k, nx): times (x - start) they are in units of what is known, and independent.
+    """Jacobian of the stated priors' whitened residual, which is this matrix (k, nx) times (x - initial x).
 
     Parameters
     ----------
@@ -130,11 +129,10 @@ def stated_rows(unknowns: Unknowns, options: ProblemOptions, std: Array) -> Arra
 
 
 def start_names(system: System, options: ProblemOptions, free: Sequence[str], theta: Array) -> tuple[str, ...]:
-    """Estimated rows of an initial state.
+    """Names of the estimated components of an initial state.
 
     Where starts are estimated, q and p of the coordinates that are neither driven by torques, nor prescribed, nor
-    follow their load at once; in any case the internal coordinates that nothing tells, of effects that are free or not
-    neutral.
+    follow their load at once; in any case the unobserved internal coordinates of effects that are free or not neutral.
     """
     found: list[str] = []
     if options.initial_state == "estimated":
@@ -152,19 +150,19 @@ def start_names(system: System, options: ProblemOptions, free: Sequence[str], th
 
 
 def hidden_starts(system: System) -> dict[str, float]:
-    """Internal coordinates that nothing tells at the start of a recording, and how large they may be."""
+    """Unobserved initial internal coordinates of the effects, each with its largest magnitude."""
     effects = [effect for effect in system.effects if isinstance(effect, EffectBase)]
     return {name: size for effect in effects for name, size in effect.unknown_at_start.items()}
 
 
 def start_limits(system: System, names: Sequence[str]) -> Array:
-    """How far estimated rows of an initial state may be off, infinite for coordinates and momenta."""
+    """Largest offset of each estimated component of an initial state, infinite for coordinates and momenta."""
     limits = hidden_starts(system)
     return np.array([limits[name.removeprefix("z.")] if name.startswith("z.") else np.inf for name in names])
 
 
 def check_free(system: System, free: Sequence[str], options: ProblemOptions) -> None:
-    """Refuse parameters that are unknown, named twice, or local or with a prior without being free."""
+    """Raise `ConfigError` where free parameters are unknown or repeated, or local ones or priors are not free."""
     for name in [*free, *options.local, *options.priors, *options.joint_prior.names]:
         system.parameters.index(name)
     if len(set(free)) != len(free):
@@ -175,7 +173,7 @@ def check_free(system: System, free: Sequence[str], options: ProblemOptions) -> 
 
 
 def check_bounds(system: System, free: Sequence[str], theta: Array) -> None:
-    """Refuse initial values outside their bounds, and bounds without room."""
+    """Raise `ConfigError` where an initial value lies outside its bounds, or the bounds coincide."""
     for name in free:
         entry, value = system.parameters[name], theta[system.parameters.index(name)]
         if not entry.lower <= value <= entry.upper:
@@ -194,10 +192,7 @@ def check_bounds(system: System, free: Sequence[str], theta: Array) -> None:
 
 
 def soft_logarithm(ratio: Array) -> tuple[Array, Array]:
-    """log(ratio) and its slope, from `SMALL_RATIO` down the parabola that joins it twice differentiably.
-
-    A weak prior on an unknown that its bound keeps at zero then has a value and a slope like any other row, where the
-    logarithm would be a wall that nothing climbs.
+    """Return log(ratio) and its slope, below `SMALL_RATIO` those of the parabola of equal value and derivatives there.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Errors of predictions, and predictions without a model, to be beaten: nothing moves, or all with the clamps."""
+"""Prediction errors, and baseline predictions without a model: points stay or move with the clamps."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 
 def group_with(recording: Recording, points: Sequence[str]) -> PointGroup:
-    """The group of a recording that holds all the points; `DataError` where there is none."""
+    """Point group of a recording that contains all given points; raises `DataError` where there is none."""
     for group in recording.points:
         if set(points) <= set(group.names):
             return group
@@ -33,7 +33,7 @@ def group_with(recording: Recording, points: Sequence[str]) -> PointGroup:
 
 
 def stay(recording: Recording, points: Sequence[str], given: int = 2) -> Array:
-    """Every point stays where it was in the last given frame.
+    """Baseline prediction: every point stays where it was in the last given frame.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def stay(recording: Recording, points: Sequence[str], given: int = 2) -> Array:
 
 
 def move_with_clamps(recording: Recording, points: Sequence[str], clamped: Sequence[str], given: int = 2) -> Array:
-    """Every point moves by the mean displacement of the clamped points since the last given frame.
+    """Baseline prediction: every point moves by the clamped points' mean displacement since the last given frame.
 
     Parameters and errors as in `stay`; `clamped` names the points whose path is known throughout.
 
@@ -78,7 +78,7 @@ def linear_carry(
     clamped: Sequence[str] | None = None,
     given: int = 2,
 ) -> Array:
-    """Displacement interpolated linearly in arc length along the parent; children move with their junction.
+    """Baseline prediction: displacement interpolated in arc length along the parent; children move with their junction.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ def _carried(recording: Recording, points: Sequence[str], known: Sequence[str], 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Series(Shown):
-    """One channel of one recording, measured and predicted, over its M samples.
+    """Measured and predicted samples of one channel of one recording.
 
     Attributes
     ----------
@@ -206,7 +206,7 @@ class Series(Shown):
 
     @property
     def rmse(self) -> float:
-        """Root mean square of the residual; of a point, of its distance."""
+        """Root mean square error; for a point, of the Euclidean distance."""
         return float(np.sqrt(np.nanmean(np.sum(self.residual**2, axis=1))))
 
     def _summary(self) -> Summary:
@@ -214,7 +214,7 @@ class Series(Shown):
 
 
 def series(episode: Episode, result: EpisodeResult) -> tuple[Series, ...]:
-    """Every channel of an episode beside its prediction."""
+    """Measured and predicted samples of every channel of an episode."""
     found = []
     for samples, predicted in zip(episode.samples, result.predicted, strict=True):
         sensor, times = samples.sensor, episode.grid.start + episode.grid.time_step * (samples.node + samples.fraction)
@@ -249,7 +249,7 @@ def channel_errors(results: Sequence[EpisodeResult], episodes: Sequence[Episode]
 
 
 def point_errors(problem: EstimationProblem, x: ArrayLike, points: Sequence[str]) -> dict[str, float]:
-    """Prediction error of every recording of a problem, the held-out ones too, over some points [m].
+    """Root mean square position error over some points, by recording, held-out ones included [m].
 
     NaN for a recording whose rollout fails. The first two frames are given and do not count.
     """

@@ -1,4 +1,4 @@
-"""What a command has to say, once: statements, tables and commands, for the terminal and the page alike."""
+"""Building blocks of a command's summary (statements, tables, code), shared by terminal and HTML report."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Weight = Literal["note", "verdict", "conclusion"]
 
 @dataclass(frozen=True)
 class Statement:
-    """One sentence or note.
+    """One sentence of a summary, with its importance.
 
     Attributes
     ----------
@@ -28,7 +28,7 @@ class Statement:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of equal length, the first one their head; columns without an entry are not shown.
+    """A table of text cells whose first row is the header; empty columns are not shown.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Command:
-    """Lines to be typed or pasted."""
+    """Preformatted lines, such as a shell command to copy."""
 
     text: str
 
@@ -61,10 +61,10 @@ Block = Statement | Table | Command
 
 
 def statements(texts: Iterable[str], weight: Weight = "note") -> list[Block]:
-    """A statement of every text that is not empty."""
+    """Statements made from all non-empty texts."""
     return [Statement(text, weight) for text in texts if text]
 
 
 def filled(*tables: Table) -> list[Block]:
-    """Those tables that have a row below their head."""
+    """The tables that have at least one row below the header."""
     return [table for table in tables if len(table.rows) > 1]

@@ -1,4 +1,4 @@
-"""Figures with a row for each name: estimates, changes, rankings, maps over time, matrices."""
+"""Plotly figures with one row per name: estimates, changes, rankings, heat maps over time, matrices."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WORST = -50.0  # lower end of an axis of closures [%]
 
 
 def estimates(values: Mapping[str, tuple[float, float | None, float, bool]], unit: str) -> plotly.graph_objects.Figure:
-    """Values with two standard deviations, and the start, one row for each parameter: (value, std, initial, found)."""
+    """Figure of estimates ± 2 std and initial values, one row per parameter: (value, std, initial, found)."""
     import plotly.graph_objects as go
 
     names = list(values)
@@ -58,7 +58,7 @@ Beside = Mapping[str, Mapping[str, tuple[float, float | None]]]
 
 
 def side_by_side(rows: Beside, unit: str) -> plotly.graph_objects.Figure:
-    """Values of several sources with two standard deviations, one row for each parameter, a color for each source."""
+    """Figure of values ± 2 std from several sources, one row per parameter and one color per source."""
     import plotly.graph_objects as go
 
     sources = list(dict.fromkeys(source for row in rows.values() for source in row))
@@ -87,7 +87,7 @@ def side_by_side(rows: Beside, unit: str) -> plotly.graph_objects.Figure:
 def counted(
     rows: Sequence[str], columns: Sequence[str], counts: Array, row: str, column: str
 ) -> plotly.graph_objects.Figure:
-    """Counts of pairs, colored by their part of the row."""
+    """Confusion-matrix figure of counts, colored by the fraction of their row."""
     import plotly.graph_objects as go
 
     parts = counts / np.maximum(counts.sum(1, keepdims=True), 1.0)
@@ -106,7 +106,7 @@ def counted(
 
 @dataclass(frozen=True)
 class Change:
-    """A number before and after something was done, with standard deviations, and a mark for comparison.
+    """A value before and after a change, with standard deviations and an optional reference value.
 
     Attributes
     ----------
@@ -124,7 +124,7 @@ class Change:
 
 
 def changes(rows: Mapping[str, Change], axis: str, words: tuple[str, str, str]) -> plotly.graph_objects.Figure:
-    """Numbers before and after, joined by a line, one row each; bars are two standard deviations.
+    """Figure of values before and after, one row each; error bars are two standard deviations.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ def changes(rows: Mapping[str, Change], axis: str, words: tuple[str, str, str]) 
 
 @dataclass(frozen=True)
 class Row:
-    """One row of a map over time.
+    """One row of a heat map over time.
 
     Attributes
     ----------
@@ -194,7 +194,7 @@ class Row:
 
 
 def time_map(edges: Array, rows: Sequence[Row], axis: str) -> plotly.graph_objects.Figure:
-    """Colors over time, one row for each quantity, grey where there is nothing to show.
+    """Heat-map figure over time, one row per quantity; grey: not informed by the data.
 
     Parameters
     ----------
@@ -248,7 +248,7 @@ def _even(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class Ranked:
-    """A candidate in a ranking.
+    """A candidate effect in a ranking.
 
     Attributes
     ----------
@@ -264,7 +264,7 @@ class Ranked:
 
 
 def ranking(entries: Sequence[Ranked], closed: str, promised: str) -> plotly.graph_objects.Figure:
-    """Candidates from best to worst: what each was found to close, where one was tried, and what it promises.
+    """Figure that ranks candidates by refitted closure (where refitted) and by first-order predicted decrease.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Rows and sentences on other days: a baseline, the world without an effect, runs side by side."""
+"""Table rows and sentences that compare runs: baseline, counterfactual prediction, run history."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from yid_ocp.report.blocks import Rows
 
 
 def baseline_rows(result: Mapping[str, Any]) -> Rows:
-    """Parameters of `yid-diagnosis/1` then and now; only the head where there was no baseline."""
+    """Table rows of parameters in the baseline and now; only the header without a baseline."""
     rows: Rows = [("parameter", "baseline", "now", "unit", "moved by", "")]
     found = result.get("baseline") or {"parameters": {}}
     for name, entry in found["parameters"].items():
@@ -26,7 +26,7 @@ def baseline_rows(result: Mapping[str, Any]) -> Rows:
 
 
 def counterfactual_rows(result: Mapping[str, Any]) -> Rows:
-    """Errors without a diagnosis and with the effects taken away, or added; only the head where there are none."""
+    """Table rows of errors without the diagnosis and with effects removed or added; only the header without any."""
     rows: Rows = [("channel", "made", "without a diagnosis", "effects removed or added", "unit")]
     found = result.get("counterfactual") or {}
     for key, made in (("removed", "without the effects"), ("added", "with the effects")):
@@ -37,7 +37,7 @@ def counterfactual_rows(result: Mapping[str, Any]) -> Rows:
 
 
 def history_rows(result: Mapping[str, Any]) -> Rows:
-    """Parameters of `yid-history/1`, one column for each run."""
+    """Table rows of the parameters of `yid-history/1`, one column per run."""
     runs = [entry["name"] for entry in result["runs"]]
     rows: Rows = [("parameter", *runs, "together", "unit", "p", "")]
     for name, entry in result["parameters"].items():
@@ -52,7 +52,7 @@ def history_rows(result: Mapping[str, Any]) -> Rows:
 
 
 def run_rows(result: Mapping[str, Any]) -> Rows:
-    """Runs of `yid-history/1`, each against all others."""
+    """Table rows that test each run of `yid-history/1` against all others."""
     rows: Rows = [("run", "differs from the others", "p", "most in", "model explains it", "")]
     for entry in result["runs"]:
         apart = f"chi2 {entry['chi2']:.3g} of {entry['degrees']}"
@@ -63,7 +63,7 @@ def run_rows(result: Mapping[str, Any]) -> Rows:
 
 
 def history_sentences(result: Mapping[str, Any]) -> list[str]:
-    """What `yid-history/1` says in words."""
+    """Sentences that summarise a `yid-history/1` result."""
     parameters, runs = result["parameters"], result["runs"]
     drifted = [name for name, entry in parameters.items() if entry["drifted"]]
     wrong = [entry["name"] for entry in runs if entry["distrusted"]]

@@ -1,4 +1,4 @@
-"""Figures for the report, by plotly (the extra `report`)."""
+"""Plotly figures over time and colors of the report (the extra `report`)."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ ROW, SMALL, GAP, TOP, BOTTOM = 130, 76, 30, 64, 44  # heights in a figure of row
 
 
 def html(figure: plotly.graph_objects.Figure) -> str:
-    """A figure as an HTML element that the page's own script draws, in the colors of light or dark."""
+    """HTML element of a figure; the page's script draws it in light or dark colors."""
     figure.update_layout(template=None)  # all is said here; the default one is some kilobytes each
     told = str(figure.to_json()).replace("<", "\\u003c")
     return (
@@ -55,7 +55,7 @@ def html(figure: plotly.graph_objects.Figure) -> str:
 
 
 def cost_history(costs: Sequence[float], notes: Sequence[str]) -> plotly.graph_objects.Figure:
-    """Cost at every accepted point, one curve for each horizon that was solved on the way."""
+    """Figure of the cost at every accepted point, one curve per intermediate horizon."""
     import plotly.graph_objects as go
 
     figure = go.Figure()
@@ -76,7 +76,7 @@ def cost_history(costs: Sequence[float], notes: Sequence[str]) -> plotly.graph_o
 
 @dataclass(frozen=True)
 class Curve:
-    """Measured dots and the lines that should go through them.
+    """Data of one plot over time: measured points and predicted lines.
 
     Attributes
     ----------
@@ -110,7 +110,7 @@ def compared(
     lines: Mapping[str, Array],
     course: tuple[Array, Array] | None = None,
 ) -> tuple[Curve, Curve]:
-    """Two rows: what was measured and predicted, and below it what is left, with two standard deviations of the noise.
+    """Two plots: measured and predicted values, and their residual with a band of two noise standard deviations.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def compared(
 
 
 def in_pieces(t: Array, values: Array) -> tuple[Array, Array]:
-    """A line that is broken where nothing was measured for long."""
+    """Times and values with NaN inserted in long gaps between measurements."""
     steps = np.diff(t)
     breaks = np.flatnonzero(steps > 5 * np.median(steps)) + 1 if len(steps) else np.zeros(0, int)
     return np.insert(t, breaks, t[breaks]), np.insert(values, breaks, np.nan)
@@ -142,7 +142,7 @@ def in_pieces(t: Array, values: Array) -> tuple[Array, Array]:
 def over_time(
     curves: Sequence[Curve], dots: str = COLORS[1], lines: Mapping[str, str] | None = None
 ) -> plotly.graph_objects.Figure:
-    """Measured dots beside lines, one row for each curve, its title above it.
+    """Figure with measured points and lines, one row per plot.
 
     Parameters
     ----------
@@ -204,7 +204,7 @@ def over_time(
 
 
 def lines_over_time(curve: Curve) -> plotly.graph_objects.Figure:
-    """The lines of one curve, each in a color of its own."""
+    """Figure of the lines of one plot, each in its own color."""
     import plotly.graph_objects as go
 
     figure = go.Figure()
@@ -227,7 +227,7 @@ def lines_over_time(curve: Curve) -> plotly.graph_objects.Figure:
 
 
 def residual_histogram(residuals: Mapping[str, Array]) -> plotly.graph_objects.Figure:
-    """Whitened residuals of every group beside the standard normal density they should follow."""
+    """Histogram figure of whitened residuals per sensor group, with the standard normal density."""
     import plotly.graph_objects as go
 
     edge = max([4.0, *(float(np.quantile(np.abs(r), 0.995)) for r in residuals.values() if len(r))])
@@ -248,7 +248,7 @@ def residual_histogram(residuals: Mapping[str, Array]) -> plotly.graph_objects.F
 
 
 def falling(costs: Mapping[str, tuple[Sequence[float], Sequence[float]]]) -> plotly.graph_objects.Figure:
-    """Cost over the lowest of each method, less one, over its time: (seconds, cost)."""
+    """Figure of each method's relative excess cost over wall time, from (seconds, cost)."""
     import plotly.graph_objects as go
 
     figure = go.Figure()
@@ -270,7 +270,7 @@ def rates(
     log_x: bool = False,
     diagonal: bool = False,
 ) -> plotly.graph_objects.Figure:
-    """Rates between 0 and 1 with their intervals: by name, at every place, `rate`, `low` and `high`."""
+    """Figure of rates between 0 and 1 with intervals; each entry has `rate`, `low` and `high`."""
     import plotly.graph_objects as go
 
     figure = go.Figure()
@@ -299,7 +299,7 @@ def rates(
 def profiles(
     curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], level: float
 ) -> plotly.graph_objects.Figure:
-    """Chi2 above the best along each parameter, over its value relative to that of the fit: (ratio, delta chi2)."""
+    """Profile-likelihood figure: increase of chi2 over the parameter's value relative to the estimate."""
     import plotly.graph_objects as go
 
     figure = go.Figure()
@@ -331,7 +331,7 @@ def _times(t: Array) -> NDArray[np.floating]:
 def styled(
     figure: plotly.graph_objects.Figure, height: int, x: str, y: str, log_y: bool = False
 ) -> plotly.graph_objects.Figure:
-    """A figure of this height with titles of its axes, in the colors and letters of a page."""
+    """The given figure after setting height, axis titles, colors and fonts of the page."""
     layout: dict[str, Any] = {
         "height": height,
         "margin": {"l": 70, "r": 20, "t": 30, "b": 45},

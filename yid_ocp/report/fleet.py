@@ -1,4 +1,4 @@
-"""Rows and sentences on a batch: many runs side by side."""
+"""Table rows and sentences that summarise a batch of runs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ KNOWN = ("identifiable", "weak", None)
 
 
 def batch_rows(result: Mapping[str, Any], most: int | None = None) -> Rows:
-    """Runs of `yid-batch/1`, with a head; up to so many parameters, those that most runs have first."""
+    """Table rows of the runs of `yid-batch/1`; at most `most` parameters, the most common first."""
     names = _parameters(result)[:most]
     units = {name: unit for entry in result["runs"] for name, (_, _, unit, _) in _values(entry).items()}
     heads = [f"{name} [{units[name]}]" if units[name] else name for name in names]
@@ -33,7 +33,7 @@ def batch_rows(result: Mapping[str, Any], most: int | None = None) -> Rows:
 
 
 def spread_rows(result: Mapping[str, Any]) -> Rows:
-    """Median and spread of every parameter that two runs or more found; only the head where there are none."""
+    """Table rows with median and range of every parameter found in at least two runs."""
     rows: Rows = [("parameter", "runs", "smallest", "median", "largest", "unit")]
     for name in _parameters(result):
         entries = [_values(entry)[name] for entry in result["runs"] if name in _values(entry)]
@@ -45,7 +45,7 @@ def spread_rows(result: Mapping[str, Any]) -> Rows:
 
 
 def batch_sentences(result: Mapping[str, Any]) -> list[str]:
-    """How many runs ended how, and why the others did not."""
+    """Sentences on the status of the runs, failures and drifting parameters."""
     runs = result["runs"]
     ended: dict[str, int] = {}
     for entry in runs:

@@ -1,4 +1,4 @@
-"""The report: one page put together from the registered sections, for any screen, light or dark, without a network."""
+"""HTML report: one self-contained page built from the registered sections."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _NUMBER = re.compile(
 
 
 def write_report(path: Path, findings: Findings) -> bool:
-    """Write the page.
+    """Write the HTML report and return whether it was written.
 
     Plotly's script is packed into it, so that it can be sent alone and needs no network; or it refers to a copy that
     `share_script` left in its folder, or up to two above.
@@ -77,7 +77,7 @@ def write_report(path: Path, findings: Findings) -> bool:
 
 
 def share_script(folder: Path) -> None:
-    """Leave one copy of plotly's script in a folder, for all pages in it and up to two levels below.
+    """Write one copy of plotly's script to a folder, shared by pages up to two levels below.
 
     Raises
     ------
@@ -115,14 +115,14 @@ def _packed() -> str:
 
 
 def number(value: object, digits: int = 4) -> str:
-    """A number for people; what is not known is a dash."""
+    """A number formatted for display; a dash for None."""
     if value is None:
         return "–"
     return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
 
 
 def cell_class(table: Table) -> list[str]:
-    """How the columns of a table are set, those without an entry left out as None: numbers to the right."""
+    """CSS class of every column (`number`, `long` or `text`); empty for columns without an entry."""
     head, *body = table.rows
     columns = [[row[i] for row in body] for i in range(len(head))]
     kinds: list[str] = []

@@ -1,4 +1,4 @@
-"""What `check`, `inspect` and `simulate` have to say: of models and recordings before anything is estimated."""
+"""Summaries of `check`, `inspect` and `simulate`: models and recordings before estimation."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from yid_ocp.report.tables import doubt_blocks, error_words, moved_sentences
 
 
 def check_summary(result: Mapping[str, Any]) -> list[Block]:
-    """What a `yid-check/1` result says."""
+    """Summary blocks of a `yid-check/1` result."""
     model = result["model"]
     size = (
         f"model: {model['n']} coordinates, {model['m']} constraints, {model['nu']} driven, {model['nc']} prescribed, "
@@ -73,7 +73,7 @@ MOST = 12
 
 
 def inspect_summary(result: Mapping[str, Any]) -> list[Block]:
-    """What a `yid-inspect/1` result says."""
+    """Summary blocks of a `yid-inspect/1` result."""
     roles = [entry["role"] for entry in result["variables"]]
     counts = [f"{roles.count(role)} {role}" for role in ("driven", "prescribed", "free") if role in roles]
     equations, linear = result["equations"], result["linearisation"]
@@ -137,7 +137,7 @@ def _patterns(result: Mapping[str, Any]) -> list[Block]:
 
 
 def simulate_summary(result: Mapping[str, Any]) -> list[Block]:
-    """What a `yid-simulate/1` result says."""
+    """Summary blocks of a `yid-simulate/1` result."""
     if result["status"] == "failed":
         return [Statement(f"failed: {result['message']}", "verdict")]
     rows: Rows = [("group", "samples")]

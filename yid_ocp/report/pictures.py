@@ -1,4 +1,4 @@
-"""Pictures written as PNG without a display."""
+"""Matplotlib figures written as PNG files."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def draw_convergence(path: Path, comparison: Comparison) -> None:
-    """Cost of every method against iterations and against time, over the lowest cost that it reached.
+    """Write a PNG of each method's relative excess cost over iterations and over wall time.
 
     Raises
     ------
@@ -48,7 +48,7 @@ def draw_convergence(path: Path, comparison: Comparison) -> None:
 
 
 def draw_blind(folder: Path, result: Mapping[str, Any]) -> None:
-    """Pictures of a `yid-blind/1`: `detection.png`, `confusion.png` and `calibration.png`.
+    """Write `detection.png`, `confusion.png` and `calibration.png` of a `yid-blind/1` result.
 
     Detection against size with binomial 95 % intervals, what was said of what, and whether intervals and p-values keep
     what they promise.

@@ -1,4 +1,4 @@
-"""What moves, as sticks and points over time: the arms and the object, measured against predicted."""
+"""Animation data: stick figures and points of arms and object over time, measured and predicted."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SHORTEST, EARLY = 1e-6, 1e-9  # what counts as one place [m], as one time [s]
 
 @dataclass(frozen=True)
 class Stick:
-    """A straight part between two places of a skeleton.
+    """A straight line between two positions of a stick figure.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class Stick:
 
 @dataclass(frozen=True)
 class Motion:
-    """One telling of where everything is.
+    """Motion of one stick figure, measured or predicted.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Scene:
-    """Motions on one clock.
+    """Several motions on a common time axis, for one animation.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class Scene:
     motions: tuple[Motion, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """As the page's script reads it: whole numbers of a tenth of a millimetre, null where nothing is known."""
+        """JSON-ready data for the page's script: integers in units of 0.1 mm, null where unknown."""
         return {
             "title": self.title,
             "t": [round(float(t), 4) for t in self.t],
@@ -102,7 +102,7 @@ class Scene:
 
 
 class Skeleton:
-    """Places of a system's joints, tips and points at any configuration, and the sticks between them.
+    """Stick figure of a system: positions of joints, tips and points, and the lines between them.
 
     Parameters
     ----------
@@ -165,19 +165,19 @@ class Skeleton:
         self._places = ca.Function("kept", [q, system.parameters.symbols], [ca.horzcat(*(origins[k] for k in kept))])
 
     def at(self, q: Array) -> Array:
-        """Places at configurations (F, n), shape (F, K, 3) [m]."""
+        """Positions of all end points at configurations q (F, n), shape (F, K, 3) [m]."""
         stacked = np.array(self._places.map(len(q))(q.T, np.tile(self._theta[:, None], (1, len(q)))))
         return stacked.T.reshape(len(q), -1, 3)
 
     @property
     def arms(self) -> tuple[Stick, ...]:
-        """The sticks that are no part of the object."""
+        """The sticks of the robot arms."""
         return tuple(stick for stick in self.sticks if not stick.own)
 
 
 @dataclass(frozen=True)
 class Told:
-    """A motion of a system: at times t (N,) [s] its configurations q (N, n)."""
+    """Trajectory of a model: configurations q (N, n) at times t (N,) [s]."""
 
     name: str
     system: System
@@ -187,7 +187,7 @@ class Told:
 
 
 def scene(title: str, told: Sequence[Told], recording: Recording | None = None) -> Scene:
-    """Motions and what was recorded of them, at `FRAMES` moments at most.
+    """Animation of model trajectories and the recorded motion, with at most `FRAMES` frames.
 
     Parameters
     ----------
@@ -210,7 +210,7 @@ def scene(title: str, told: Sequence[Told], recording: Recording | None = None) 
 
 
 def recorded_scene(title: str, system: System, theta: Array, recording: Recording) -> Scene | None:
-    """What a recording holds alone, its arms at the recorded angles; None where it holds nothing that has a place."""
+    """Animation of a recording alone; None where it holds no positions."""
     clock = recording.groups[0].t
     for group in recording.groups:
         clock = group.t if len(group.t) > len(clock) else clock

@@ -1,4 +1,4 @@
-"""Pictures of patterns: matrices with their blocks named, as PNG without a display."""
+"""Sparsity patterns of matrices with named blocks, drawn as PNG files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ EVERY = 64  # rows or columns up to which each has its own label; beyond, those 
 
 
 def draw_patterns(path: Path, layout: Sequence[Sequence[Pattern]]) -> None:
-    """Draw patterns in rows, each with its blocks set apart and named.
+    """Write a PNG of sparsity patterns in rows, with their blocks separated and named.
 
     Parameters
     ----------

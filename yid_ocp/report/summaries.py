@@ -1,4 +1,4 @@
-"""What every command has to say of its result, by the result's format: the one source for terminal and page."""
+"""Summary of every command's result, by result format; shared by terminal and HTML report."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from yid_ocp.solvers.words import VERDICT_WORDS, fit_words, interval_words, para
 
 
 def solve_summary(result: Mapping[str, Any]) -> list[Block]:
-    """What a `yid-solve/1` result says."""
+    """Summary blocks of a `yid-solve/1` result."""
     free = {name: entry for name, entry in result["parameters"].items() if entry["free"]}
     failed = result["status"] == "failed"
     blocks: list[Block] = [] if failed else _misfit(result["fit"])
@@ -115,7 +115,7 @@ def _unsure(free: Mapping[str, Mapping[str, Any]]) -> list[Block]:
 
 
 def plan_summary(result: Mapping[str, Any]) -> list[Block]:
-    """What a `yid-plan/1` result says."""
+    """Summary blocks of a `yid-plan/1` result."""
     blocks: list[Block] = [Table(list(plan_rows(result)), "What it asks of the joints", key=True)]
     if result["goal"] == "information":
         told = (Table(list(information_rows(result)), "What it tells"), Table(list(distance_rows(result)), "Effects"))
@@ -128,7 +128,7 @@ def plan_summary(result: Mapping[str, Any]) -> list[Block]:
 
 
 def track_summary(result: Mapping[str, Any]) -> list[Block]:
-    """What a `yid-track/1` result says."""
+    """Summary blocks of a `yid-track/1` result."""
     truth = result["truth_errors"]
     heads = ("error, median [mm]", "error, largest [mm]") if truth else ("", "")
     rows: Rows = [("point", "frames", "± std [mm]", *heads)]
@@ -152,7 +152,7 @@ def track_summary(result: Mapping[str, Any]) -> list[Block]:
 
 
 def compare_summary(result: Mapping[str, Any]) -> list[Block]:
-    """What a `yid-compare/1` result says."""
+    """Summary blocks of a `yid-compare/1` result."""
     methods: dict[str, Any] = result["methods"]
     judged, disturbed = result["judged"], result["disturbed"]
     free = [name for name, entry in judged["parameters"].items() if entry["free"]]
@@ -232,7 +232,7 @@ def _efforts(methods: Mapping[str, Mapping[str, Any]]) -> Rows:
 
 
 def identifiability_summary(result: Mapping[str, Any]) -> list[Block]:
-    """What a `yid-identifiability/1` result says."""
+    """Summary blocks of a `yid-identifiability/1` result."""
     if not result["parameters"]:
         text = f"{result['status']}: {result['message']}; there is no point at which to judge"
         return [Statement(text, "verdict")]
@@ -292,7 +292,7 @@ CANDIDATES = 15
 
 
 def diagnose_summary(result: Mapping[str, Any]) -> list[Block]:
-    """What a `yid-diagnosis/1` result says."""
+    """Summary blocks of a `yid-diagnosis/1` result."""
     blocks = [*doubt_blocks(result), Statement(result["summary"], "verdict")]
     blocks += filled(Table(gap_rows(result), "Errors on held-out recordings", key=True))
     rows: Rows = [("candidate", "parameters", "closure alone", "score", "p")]
@@ -324,7 +324,7 @@ def diagnose_summary(result: Mapping[str, Any]) -> list[Block]:
 
 
 def history_summary(result: Mapping[str, Any]) -> list[Block]:
-    """What a `yid-history/1` result says."""
+    """Summary blocks of a `yid-history/1` result."""
     return [
         Table(history_rows(result), "Parameters", key=True),
         Table(run_rows(result), "Runs"),
@@ -333,7 +333,7 @@ def history_summary(result: Mapping[str, Any]) -> list[Block]:
 
 
 def planning_command(section: Mapping[str, Any]) -> str:
-    """The command that plans what a section `plan` says, with the configuration in the run folder that it names."""
+    """Shell command that plans the motion of a `plan` section with the configuration in its run folder."""
     words = ["yid-ocp", "plan", str(Path(section["run"]) / "config.yaml")]
     for key, value in section.items():
         text = f"[{', '.join(value)}]" if isinstance(value, list) else str(value)
@@ -342,14 +342,14 @@ def planning_command(section: Mapping[str, Any]) -> str:
 
 
 def blind_summary(result: Mapping[str, Any]) -> list[Block]:
-    """What a `yid-blind/1` result says."""
+    """Summary blocks of a `yid-blind/1` result."""
     score, *others, cases = (Table(rows, title) for title, rows in blind_tables(result).items())
     said = statements(blind_sentences(result), "verdict")
     return [replace(score, key=True), *filled(*others, replace(cases, long=True)), *said]
 
 
 def batch_summary(result: Mapping[str, Any]) -> list[Block]:
-    """What a `yid-batch/1` result says."""
+    """Summary blocks of a `yid-batch/1` result."""
     links = {entry["name"]: f"{entry['folder']}/report.html" for entry in result["runs"] if entry["folder"]}
     blocks: list[Block] = [Table(batch_rows(result, SHOWN), "Runs", key=True, links=links)]
     blocks += filled(Table(spread_rows(result), "Parameters over all runs"))
@@ -362,7 +362,7 @@ def batch_summary(result: Mapping[str, Any]) -> list[Block]:
 
 
 def export_summary(manifest: Mapping[str, Any]) -> list[Block]:
-    """What a `yid-export/1` manifest says."""
+    """Summary blocks of a `yid-export/1` manifest."""
     said = [*manifest["effects"].items(), *((f"grasp {name}", own) for name, own in manifest.get("grasps", {}).items())]
     effects = {name.rpartition(".")[0] for name in manifest["parameters"] if "@" in name}
     said += [

@@ -1,4 +1,4 @@
-"""Rows and sentences that summaries are made of."""
+"""Table rows and sentences used by the summaries."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ GUESSES = {
 
 
 def readable(unit: str) -> tuple[float, str]:
-    """Factor and unit in which people read errors: distances in millimetres, all else as it is."""
+    """Scale factor and unit for display: metres become millimetres, other units stay."""
     return (1e3, "mm") if unit == "m" else (1.0, unit)
 
 
 def error_words(value: float | None, unit: str, digits: int = 3) -> tuple[str, str]:
-    """An error and its unit for people; what is not known is a dash."""
+    """Formatted value and display unit of an error; a dash for None."""
     factor, shown = readable(unit)
     return ("–" if value is None else f"{factor * value:.{digits}g}"), shown
 
 
 @dataclass(frozen=True)
 class DoubtRow:
-    """One doubt about a recording; `evidence` is how many times its limit was exceeded."""
+    """One issue of a recording; `evidence` is the ratio of the statistic to its limit."""
 
     cause: str
     where: str
@@ -51,7 +51,7 @@ class DoubtRow:
 
 
 def doubt_rows(result: Mapping[str, Any]) -> list[DoubtRow]:
-    """The doubts of a result that people want to see: those of one kind up to `MOST_ALIKE`, then how many more."""
+    """Issues of a result for display: at most `MOST_ALIKE` per cause, then the number of further ones."""
     rows: list[DoubtRow] = []
     for cause in dict.fromkeys(entry["cause"] for entry in result.get("doubts", ())):
         alike = [entry for entry in result["doubts"] if entry["cause"] == cause]
@@ -64,7 +64,7 @@ def doubt_rows(result: Mapping[str, Any]) -> list[DoubtRow]:
 
 
 def doubt_blocks(result: Mapping[str, Any]) -> list[Block]:
-    """What is in doubt about the recordings, as one table, and what follows; nothing where nothing is."""
+    """Summary blocks on issues of the recordings: a table and advice; empty without issues."""
     shown = doubt_rows(result)
     if not shown:
         return []
@@ -81,7 +81,7 @@ def doubt_blocks(result: Mapping[str, Any]) -> list[Block]:
 
 @dataclass(frozen=True)
 class HeldOutRow:
-    """Error of one channel, or of a whole group of points, beside that of every baseline; [unit]."""
+    """Held-out error of one channel or group of points, with the error of every baseline [unit]."""
 
     recording: str
     channel: str
@@ -91,7 +91,7 @@ class HeldOutRow:
 
 
 def held_out_rows(result: Mapping[str, Any]) -> list[HeldOutRow]:
-    """Rows of the held-out recordings of a `yid-solve/1` result that people want to see."""
+    """Held-out errors of a `yid-solve/1` result for display."""
     units = {channel: entry["unit"] for channel, entry in result["residuals"].items()}
     rows = []
     for entry in result["held_out"]:
@@ -116,7 +116,7 @@ def _hidden(errors: Mapping[str, float]) -> set[str]:
 
 
 def medians(rows: Sequence[HeldOutRow]) -> list[HeldOutRow]:
-    """Median over recordings of every channel that several of them have."""
+    """Median error over recordings of every channel that at least three of them have."""
     channels = dict.fromkeys(row.channel for row in rows)
     result = []
     for channel in channels:
@@ -130,14 +130,14 @@ def medians(rows: Sequence[HeldOutRow]) -> list[HeldOutRow]:
 
 
 def guess_words(rows: Sequence[HeldOutRow]) -> str:
-    """What the guesses beside held-out errors are; empty where there are none."""
+    """Legend that explains the model-free baselines; empty without any."""
     named = dict.fromkeys(name for row in rows for name in row.baselines)
     said = "; ".join(f"{name}, {GUESSES[name]}" for name in named if name in GUESSES)
     return f"without a model: {said}" if said else ""
 
 
 def moved_sentences(result: Mapping[str, Any]) -> list[str]:
-    """One sentence for each refinement: which estimates it moves by more than their standard deviation."""
+    """One sentence per refinement on the estimates that it shifts by more than their standard deviation."""
     said = []
     for key, words in (("links", "twice the links"), ("time_step", "half the time step")):
         tried = {name: own for name, own in result.get("discretisation", {}).items() if own[key] is not None}
@@ -151,7 +151,7 @@ def moved_sentences(result: Mapping[str, Any]) -> list[str]:
 
 
 def offset_rows(result: Mapping[str, Any]) -> Rows:
-    """Head and rows of the torque offsets of a result, joints below each other; empty where they are no part of it."""
+    """Table rows of the torque offsets of a result, one per joint; empty without offsets."""
     offsets: Mapping[str, Mapping[str, Any]] = result.get("torque_offsets", {})
     if not offsets:
         return []
@@ -169,7 +169,7 @@ def offset_rows(result: Mapping[str, Any]) -> Rows:
 
 
 def guess_sentences(worse: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Sentences on the channels of a `yid-solve/1` result that a guess without a model predicts better."""
+    """Sentences on channels that a model-free baseline predicts better than the model."""
     lines = []
     for entry in worse[:MOST_POINTS]:
         own, other = (" ".join(error_words(entry[key], entry["unit"])).rstrip() for key in ("rmse", "guess"))
@@ -181,7 +181,7 @@ def guess_sentences(worse: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def blind_tables(result: Mapping[str, Any]) -> dict[str, Rows]:
-    """Of a `yid-blind/1` by title: the score, detection by size, the experiments, every case."""
+    """Tables of a `yid-blind/1` result by title: score, detection by size, experiments, cases."""
 
     def share(value: float | None, digits: int = 0) -> str:
         return "-" if value is None else f"{100 * value:.{digits}f} %"
@@ -266,7 +266,7 @@ def blind_markdown(result: Mapping[str, Any]) -> list[str]:
 
 
 def blind_sentences(result: Mapping[str, Any]) -> list[str]:
-    """What a `yid-blind/1` comes to."""
+    """Sentences that summarise a `yid-blind/1` result."""
     cases, right, alarms = len(result["marks"]), result["intervals"]["kind_first"], result["intervals"]["false_alarms"]
     said = [f"{cases} {'case' if cases == 1 else 'cases'} of seed {result['seed']}, drawn for {result['purpose']}"]
     if right["of"]:
@@ -277,7 +277,7 @@ def blind_sentences(result: Mapping[str, Any]) -> list[str]:
 
 
 def gap_rows(result: Mapping[str, Any]) -> Rows:
-    """Errors of a `yid-diagnosis/1` on held-out recordings: nominal, and with every effect that was added."""
+    """Table rows of held-out errors of a diagnosis: nominal model, and after each added effect."""
     before, steps = result["gap"]["before"], result.get("steps", ())
     rows: Rows = [("held-out channel", "nominal", *(f"+ {step['added']}" for step in steps), "unit")]
     for channel, error in before["rmse"].items():
@@ -288,7 +288,7 @@ def gap_rows(result: Mapping[str, Any]) -> Rows:
 
 
 def place_rows(result: Mapping[str, Any]) -> Rows:
-    """Places of a `yid-diagnosis/1` with their share of the gap, and when."""
+    """Table rows of gap locations with their share of the gap and time windows."""
     rows: Rows = [("where", "share of the gap", "when [s]")]
     for place in result.get("where", ()):
         if place["share"] > LEAST_SHARE:
@@ -299,7 +299,7 @@ def place_rows(result: Mapping[str, Any]) -> Rows:
 
 
 def event_rows(result: Mapping[str, Any]) -> Rows:
-    """Events of a `yid-diagnosis/1`."""
+    """Table rows of the events of a diagnosis."""
     rows: Rows = [("event", "recording", "from [s]", "to [s]", "peak", "impulse", "unit")]
     for own in result.get("events", ()):
         size = ("–" if own["peak"] is None else f"{own['peak']:.3g}", _impulse(own))
@@ -315,7 +315,7 @@ def _impulse(event: Mapping[str, Any]) -> str:
 
 
 def plan_rows(result: Mapping[str, Any]) -> Sequence[tuple[str, ...]]:
-    """What a `yid-plan/1` asks of every joint, with a head."""
+    """Table rows of travel, velocity and effort that a plan requires of each joint."""
 
     def percent(share: float | None) -> str:
         return "" if share is None else f"{100 * share:.0f} %"
@@ -328,7 +328,7 @@ def plan_rows(result: Mapping[str, Any]) -> Sequence[tuple[str, ...]]:
 
 
 def plan_sentences(result: Mapping[str, Any]) -> list[str]:
-    """What a `yid-plan/1` says of the point in the end."""
+    """Sentences on the accuracy of the planned point at its target."""
     if result["error"] is None or result["swing"] is None:
         return [
             "the motion at which the search ended cannot be simulated to its end; nothing is known of where it leads"
@@ -352,7 +352,7 @@ def plan_sentences(result: Mapping[str, Any]) -> list[str]:
 
 
 def information_rows(result: Mapping[str, Any]) -> Sequence[tuple[str, ...]]:
-    """What a `yid-plan/1` of goal information expects of every parameter, with a head."""
+    """Table rows of the parameter stds that an informative motion is expected to give."""
 
     def percent(std: float | None) -> str:
         return "unknown" if std is None else f"± {100 * std:.2g} %"
@@ -365,7 +365,7 @@ def information_rows(result: Mapping[str, Any]) -> Sequence[tuple[str, ...]]:
 
 
 def distance_rows(result: Mapping[str, Any]) -> Sequence[tuple[str, ...]]:
-    """How far effects lie apart in a `yid-plan/1` of goal information, with a head."""
+    """Table rows of distances between effects before and after an informative motion [std]."""
     rows = [("effect", "beside what could be", "apart in the recordings", "apart in this motion")]
     for own in result["distances"]:
         rows.append((own["effect"], own["explained_by"], *(f"{own[when]:.3g} std" for when in ("before", "after"))))
@@ -373,7 +373,7 @@ def distance_rows(result: Mapping[str, Any]) -> Sequence[tuple[str, ...]]:
 
 
 def information_sentences(result: Mapping[str, Any]) -> list[str]:
-    """What a `yid-plan/1` of goal information says of its search and of what limits it."""
+    """Sentences on the search for an informative motion and its active limits."""
     starts, best = result["starts"], result["starts"][result["best"]]
     gains = sorted((s["judged"] for s in starts if s["judged"] is not None), reverse=True)
     others = f"; {len(starts)} starts ended at {gains[0]:.3g} to {gains[-1]:.3g} nat" if len(gains) > 1 else ""

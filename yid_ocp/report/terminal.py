@@ -1,4 +1,4 @@
-"""What a terminal shows: blocks as lines, and what files hold."""
+"""Terminal output: summary blocks and file contents as lines of text."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PROSE, NOTE, LONGEST = 100, 118, 200
 
 
 def lines(blocks: Sequence[Block]) -> list[str]:
-    """Blocks in their order: tables aligned and set apart by empty lines, sentences and long notes wrapped."""
+    """Text lines of summary blocks: aligned tables, wrapped sentences and notes."""
     result: list[str] = []
     for block in blocks:
         if isinstance(block, Table):
@@ -34,7 +34,7 @@ def lines(blocks: Sequence[Block]) -> list[str]:
 
 
 def recording_summary(recording: Recording) -> list[str]:
-    """Lines that tell a person what a recording holds."""
+    """Text lines on the contents of a recording."""
     rows: Rows = [("group", "samples", "names")]
     for group in recording.groups:
         rows.append((getattr(group, "name", "joints"), str(len(group.t)), ", ".join(group.names)))
@@ -43,7 +43,7 @@ def recording_summary(recording: Recording) -> list[str]:
 
 
 def contents_summary(contents: Contents) -> list[str]:
-    """Lines that tell a person what a file of another tool holds."""
+    """Text lines on the contents of a file of another tool."""
     rows: Rows = [("source", "type", "count", "Hz", "becomes", "note")]
     for source in contents.sources:
         rate = f"{source.rate:.4g}" if math.isfinite(source.rate) else ""

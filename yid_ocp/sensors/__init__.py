@@ -1,4 +1,4 @@
-"""What is measured: each sensor turns a node of the trajectory into readings; a new kind is one file that registers."""
+"""Measurement models: each sensor computes its readings at a node of the trajectory; a new kind is one file."""
 
 from importlib import import_module
 from pkgutil import iter_modules

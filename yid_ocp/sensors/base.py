@@ -1,4 +1,4 @@
-"""What every sensor has in common: its channels, the expression of what it reads, what it takes from a recording."""
+"""The interface of all sensors: channels, symbolic readings, and how measurements are taken from a recording."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ Array = NDArray[np.float64]
 
 @runtime_checkable
 class Sensor(Protocol):
-    """A group of measured channels that share a clock; hashable.
+    """A group of measured channels with one clock; hashable.
 
     Channels are named `group.point` (three outputs each) or `joints.quantity.JOINT` (one output each).
     """
 
     @property
     def group(self) -> str:
-        """Name of the recording's group."""
+        """Name of the recording's group, such as `points_camera`."""
         ...
 
     @property
@@ -38,17 +38,17 @@ class Sensor(Protocol):
 
     @property
     def unit(self) -> str:
-        """Unit of the outputs."""
+        """Unit of the readings."""
         ...
 
     @property
     def width(self) -> int:
-        """Number of outputs of one channel."""
+        """Number of outputs per channel: 3 for a point, 1 for a joint."""
         ...
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """Frame of the mechanism that each channel marks; none for joints."""
+        """Name of the mechanism's frame that each channel marks; none for joints."""
         ...
 
     @property
@@ -58,28 +58,28 @@ class Sensor(Protocol):
 
     @property
     def efforts(self) -> tuple[str, ...]:
-        """Joints whose effort it reads, smoothed like the motion it follows from; none for other sensors."""
+        """Names of joints whose predicted effort it reads, filtered like the path; none for other sensors."""
         ...
 
     @property
     def camera(self) -> Placement | None:
-        """Pose in the world of the camera that looks; None for any other sensor."""
+        """Pose of the camera in the world; None for any other sensor."""
         ...
 
     @property
     def baseline(self) -> Literal["zero", "stays"]:
-        """What a prediction without a model says: nothing is needed, or everything stays where it was first seen."""
+        """What a trivial prediction without a model is: zero, or the first measured value."""
         ...
 
     def __hash__(self) -> int: ...
 
     def output(self, state: NodeState) -> ca.SX:
-        """What the sensor reads at a node, shape (width * len(channels), 1)."""
+        """What the sensor reads at a node without effects, shape (width * len(channels), 1)."""
         ...
 
 
 def sensor_function(system: System, sensor: Sensor, names: tuple[str, ...]) -> ca.Function:
-    """Outputs y(q, z, effort; theta) with derivatives by q, z, effort and the named parameters.
+    """A CasADi function for readings y(q, z, effort; theta), effects included, with their derivatives.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def sensor_function(system: System, sensor: Sensor, names: tuple[str, ...]) -> c
 
 
 class PointData(Protocol):
-    """A recorded group of points; see `data.recording.PointGroup`."""
+    """A recorded group of points, as in `data.recording.PointGroup`."""
 
     @property
     def name(self) -> str: ...  # noqa: D102
@@ -136,7 +136,7 @@ class PointData(Protocol):
 
 
 class JointData(Protocol):
-    """Recorded joints; see `data.recording.JointGroup`."""
+    """Recorded joints, as in `data.recording.JointGroup`."""
 
     @property
     def names(self) -> tuple[str, ...]: ...  # noqa: D102
@@ -157,7 +157,7 @@ class JointData(Protocol):
 
 
 class RecordingData(Protocol):
-    """What sensors need of a recording; see `data.recording.Recording`."""
+    """A recording as sensors need it, as in `data.recording.Recording`."""
 
     @property
     def name(self) -> str: ...  # noqa: D102
@@ -168,11 +168,11 @@ class RecordingData(Protocol):
 
 
 EffortKind = Literal["sample", "mean", "command"]
-"""What a recorded effort is of the torque that acted: its value, its mean until the next sample, or held until then."""
+"""What a recorded effort is: the sampled torque, its mean until the next sample, or a command held until then."""
 
 
 class Choice(Protocol):
-    """How one group of a recording is used; see `problem.options.SensorOptions`."""
+    """Settings of one recorded group, as in `problem.options.SensorOptions`."""
 
     @property
     def use(self) -> bool | None: ...  # noqa: D102
@@ -189,7 +189,7 @@ class Choice(Protocol):
 
 
 class Smoothing(Protocol):
-    """A zero-phase low-pass filter; see `problem.low_pass.LowPass`."""
+    """A zero-phase low-pass filter, as in `problem.low_pass.LowPass`."""
 
     @property
     def cutoff(self) -> float: ...  # noqa: D102
@@ -203,7 +203,7 @@ class Smoothing(Protocol):
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What a sensor's part of a recording is read with.
+    """What is needed to read a sensor's measurements from a recording.
 
     Attributes
     ----------
@@ -233,7 +233,7 @@ class Surroundings:
 
 @dataclass(frozen=True)
 class SensorData:
-    """What one sensor measured in one recording.
+    """The measurements of one sensor in one recording.
 
     Attributes
     ----------
@@ -260,11 +260,11 @@ class SensorData:
 
 
 SENSORS: Registry[Callable[[Surroundings], list[SensorData]]] = Registry("kind of sensor")
-"""What looks through a recording for the measurements of one kind of sensor."""
+"""Functions that take all measurements of one kind of sensor from a recording, by kind."""
 
 
 def joint_columns(joints: JointData, names: tuple[str, ...], where: str) -> list[int]:
-    """Columns of the named joints; `DataError` with the nearest recorded name where one is missing."""
+    """Column indices of the named joints in a recording; `DataError` for a joint that is not recorded."""
     for name in names:
         if name not in joints.names:
             raise DataError(

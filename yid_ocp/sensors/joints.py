@@ -1,4 +1,4 @@
-"""Sensors of the robot's joints: the encoders of driven ones, the effort of prescribed ones."""
+"""Sensors of the robot's joints: encoders of driven joints, efforts of prescribed ones, and their noise."""
 
 from __future__ import annotations
 
@@ -19,13 +19,12 @@ from yid_ocp.sensors.base import SENSORS, Array, Choice, JointData, PointData, S
 EFFORT = "joints.effort"
 POSITION = "joints.position"
 DIFFERENCES = 6
-"""Order of the differences from which a noise level is read: they leave nothing of a motion that is slow beside the
-sampling."""
+"""Order of the differences that estimate a noise level; they remove any motion that is slow against the sampling."""
 
 
 @dataclass(frozen=True)
 class _JointSensor:
-    """Sensors of named joints: one output a joint, no places."""
+    """A sensor of named joints with one output per joint and no points."""
 
     joints: tuple[str, ...]
     group: str
@@ -37,7 +36,7 @@ class _JointSensor:
 
     @property
     def width(self) -> int:
-        """One output a joint."""
+        """One output per joint."""
         return 1
 
     @property
@@ -58,7 +57,7 @@ class _JointSensor:
 
 @dataclass(frozen=True)
 class PositionSensor(_JointSensor):
-    """Encoders of the named joints, which are driven."""
+    """Encoders of named driven joints."""
 
     group: str = POSITION
 
@@ -74,7 +73,7 @@ class PositionSensor(_JointSensor):
 
     @property
     def baseline(self) -> Literal["zero", "stays"]:
-        """Every joint stays where it was."""
+        """Every joint keeps its first angle."""
         return "stays"
 
     def output(self, state: NodeState) -> ca.SX:
@@ -84,7 +83,7 @@ class PositionSensor(_JointSensor):
 
 @dataclass(frozen=True)
 class EffortSensor(_JointSensor):
-    """Effort of the named joints, which are prescribed: what the discrete inverse dynamics says they needed."""
+    """Efforts of named prescribed joints, predicted by the discrete inverse dynamics."""
 
     group: str = EFFORT
 
@@ -100,7 +99,7 @@ class EffortSensor(_JointSensor):
 
     @property
     def baseline(self) -> Literal["zero", "stays"]:
-        """No effort is needed."""
+        """Zero effort."""
         return "zero"
 
     def output(self, state: NodeState) -> ca.SX:
@@ -109,13 +108,13 @@ class EffortSensor(_JointSensor):
 
 
 def of_arm(group: PointData) -> bool:
-    """Whether the arm itself measured these points, which as a rule follow from its encoders."""
+    """Whether the arm itself measured these points, usually from its encoders."""
     return "arm" in (group.sensor, group.name.rpartition("_")[2])
 
 
 @SENSORS.register(POSITION)
 def measured_angles(around: Surroundings) -> list[SensorData]:
-    """Recorded angles of driven joints, as they are; the first is left out, from which the posture at rest is taken.
+    """Measurements of driven joints' angles without the first sample, which defines the initial configuration.
 
     Raises
     ------
@@ -144,7 +143,7 @@ def measured_angles(around: Surroundings) -> list[SensorData]:
 
 @SENSORS.register(EFFORT)
 def measured_efforts(around: Surroundings) -> list[SensorData]:
-    """Recorded efforts of prescribed joints, smoothed like the motion, at nodes far enough apart to be independent.
+    """Measurements of prescribed joints' efforts, low-pass filtered and thinned out to independent samples.
 
     Raises
     ------
@@ -187,13 +186,13 @@ def measured_efforts(around: Surroundings) -> list[SensorData]:
 
 
 def is_stated(joints: JointData, group: str, choice: Choice) -> bool:
-    """Whether the recording or the settings say the noise of `joints.effort` or `joints.position`; else see below."""
+    """Whether the recording or the settings state the noise std of `joints.effort` or `joints.position`."""
     recorded = joints.effort_std if group == EFFORT else joints.position_std
     return choice.std is not None or recorded is not None
 
 
 def angle_std(joints: JointData, names: Sequence[str], choice: Choice, where: str) -> Array:
-    """Standard deviation of the encoders of driven joints, shape (len(names),) [rad]."""
+    """Noise standard deviation of driven joints' encoders, stated or estimated, shape (len(names),) [rad]."""
     given = choice.std if choice.std is not None else joints.position_std
     if given is None:
         return estimated_std(joints.position[:, joint_columns(joints, tuple(names), where)], where, POSITION, "rad")
@@ -201,7 +200,7 @@ def angle_std(joints: JointData, names: Sequence[str], choice: Choice, where: st
 
 
 def torque_std(joints: JointData, names: Sequence[str], choice: Choice, where: str) -> Array:
-    """Standard deviation of a recorded torque of driven joints about the true one, shape (len(names),) [N m]."""
+    """Noise standard deviation of driven joints' recorded torques, stated or estimated, shape (len(names),) [N m]."""
     given = choice.std if choice.std is not None else joints.effort_std
     if given is None:
         assert joints.effort is not None
@@ -210,13 +209,13 @@ def torque_std(joints: JointData, names: Sequence[str], choice: Choice, where: s
 
 
 def torque_bias_std(joints: JointData, names: Sequence[str], choice: Choice) -> Array:
-    """Standard deviation of a constant error of recorded torques, shape (len(names),) [N m]; zero where unknown."""
+    """Standard deviation of a constant error of recorded torques, zero if unknown, shape (len(names),) [N m]."""
     given = choice.bias_std if choice.bias_std is not None else joints.effort_bias_std
     return by_joint(0.0 if given is None else given, joints.names, names, "sensors.joints.effort.bias_std")
 
 
 def estimated_std(values: Array, where: str, group: str, unit: str) -> Array:
-    """White noise of evenly sampled channels that nobody stated, from differences of high order.
+    """White-noise standard deviation of evenly sampled channels, estimated from high-order differences.
 
     Parameters
     ----------
@@ -244,7 +243,7 @@ def estimated_std(values: Array, where: str, group: str, unit: str) -> Array:
 def by_joint(
     given: float | Array | Mapping[str, float], recorded: Sequence[str], names: Sequence[str], key: str
 ) -> Array:
-    """One number for each of `names` from one for all, one for each recorded joint, or a mapping."""
+    """One value per joint in `names`, from one value for all, one per recorded joint, or a mapping."""
     if isinstance(given, Mapping):
         for name in names:
             if name not in given:
@@ -257,7 +256,7 @@ def by_joint(
 def _smoothed_effort_noise(
     around: Surroundings, names: tuple[str, ...], choice: Choice, period: float, times: Array
 ) -> tuple[Array, Array | None]:
-    """Noise of smoothed efforts at some times: the sensor's own and that of all accelerations from noisy encoders.
+    """Noise of filtered efforts at some times, from the effort sensors and from accelerations of noisy encoders.
 
     An acceleration that is wrong at one joint asks for a torque at every joint whose inertia is coupled with it, so
     that their errors are correlated: with M the mass matrix, the covariance is diag(s^2) + M diag(a^2) M.

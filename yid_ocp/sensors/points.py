@@ -1,4 +1,4 @@
-"""Sensors that see points: a camera, motion capture, or the arm that holds the point."""
+"""Sensors of points: a camera, motion capture, or the arm that holds the point."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from yid_ocp.sensors.base import SENSORS, Choice, PointData, SensorData, Surroun
 
 @dataclass(frozen=True)
 class PointSensor:
-    """Positions of named frames in the world.
+    """Measured positions of named frames in the world.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class PointSensor:
 
     @property
     def width(self) -> int:
-        """Three coordinates."""
+        """Three coordinates per point."""
         return 3
 
     @property
@@ -58,22 +58,22 @@ class PointSensor:
 
     @property
     def camera(self) -> Placement | None:
-        """Pose of the camera."""
+        """Pose of the camera; None where no camera measures."""
         return None if self.pose is None else Placement.of(self.pose)
 
     @property
     def baseline(self) -> Literal["zero", "stays"]:
-        """A point stays where it was first seen."""
+        """Every point stays where it was first seen."""
         return "stays"
 
     def output(self, state: NodeState) -> ca.SX:
-        """Positions one below the other, shape (3 np, 1) [m]."""
+        """Positions of all points, stacked, shape (3 np, 1) [m]."""
         return ca.vertcat(*(state.kinematics.position(frame) for frame in self.frames))
 
 
 @SENSORS.register("points")
 def measured_points(around: Surroundings) -> list[SensorData]:
-    """Every group of points that is used and marks a frame of the model.
+    """Measurements of every used group of points.
 
     Raises
     ------
@@ -133,7 +133,7 @@ def _points(around: Surroundings, group: PointData, choice: Choice) -> SensorDat
 
 
 def camera_pose(group: PointData) -> tuple[tuple[float, ...], ...] | None:
-    """Pose of the camera that saw a group of points, None where it was none.
+    """4x4 pose of the camera that saw a group of points; None where no camera saw it.
 
     A group is a camera's when it has a pose, or when its name or its sensor says `camera`; without a pose the camera
     then counts as standing in the world's origin.

@@ -1,4 +1,4 @@
-"""How the cost is lowered: one file for each method, registered by name; none knows what problem it solves."""
+"""Solvers of estimation problems: one file for each method, registered by name."""
 
 from yid_ocp.solvers.base import SOLVERS as SOLVERS
 from yid_ocp.solvers.base import Iterate as Iterate

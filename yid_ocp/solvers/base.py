@@ -1,4 +1,4 @@
-"""What all solvers share: the solution, its history, statuses, uncertainty and verdicts, and the entry point."""
+"""Entry point `solve`, the solver interface, and the solution with its status and history."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 
 
 class Status(str, Enum):
-    """How a solver ended."""
+    """Termination status of a solver."""
 
     CONVERGED = "converged"
     ITERATION_LIMIT = "iteration_limit"
@@ -48,7 +48,7 @@ class Status(str, Enum):
 
 @dataclass(frozen=True)
 class Iterate:
-    """One accepted point.
+    """One accepted iterate of a solver.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class Iterate:
 
 @dataclass(frozen=True, repr=False)
 class Solution(Shown):
-    """Outcome of an identification.
+    """Solution of an estimation problem: estimates, covariance, goodness of fit and history.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class Solution(Shown):
     names : tuple of str
         Unknowns, in the order of `x`.
     x : ndarray, shape (nx,)
-        Best point so far.
+        Unknown vector of lowest cost.
     covariance : ndarray, shape (nx, nx)
         From the data and stated priors (the weak prior excluded), scaled by chi2 per degree of freedom above one, and
         counting the misfit where the model does not explain the data (`judgement.counting_misfit`).
@@ -102,7 +102,7 @@ class Solution(Shown):
         At `x`.
     method : str
     problem : EstimationProblem, optional
-        As it was solved: its weights frozen at `x`.
+        Problem as solved, whitened at `x`.
     """
 
     status: Status
@@ -139,10 +139,9 @@ class Solution(Shown):
 
     @cached_property
     def predicted(self) -> tuple[EpisodeResult | str, ...]:
-        """What the model makes of every recording's torques as they are, less their offsets; empty without a point.
+        """Prediction of each recording from its recorded torques minus their offsets; empty without a result.
 
-        Weights are about torques without the noise that the measurements told of: a recording that can be followed by
-        those may not be by the torques as they are, and then has the reason in place of a prediction.
+        A recording whose rollout fails under these torques has the error message in place of a prediction.
         """
         if self.evaluation is None or self.problem is None or not self.problem.disturbed:
             return () if self.evaluation is None else self.evaluation.episodes
@@ -156,12 +155,12 @@ class Solution(Shown):
         )
 
     def residuals(self) -> tuple[Series, ...]:
-        """Every channel of the recordings beside what the model makes of it at `x`; empty without a point."""
+        """Measured and predicted samples of every channel of the recordings at `x`; empty without a result."""
         pairs = zip(() if self.problem is None else self.problem.episodes, self.predicted, strict=False)
         return tuple(s for episode, result in pairs if not isinstance(result, str) for s in series(episode, result))
 
     def to_frame(self) -> pandas.DataFrame:
-        """Parameters as a table of pandas, free ones first: value, std, lower, upper, unit, verdict, free, initial.
+        """Parameters as a pandas data frame, free ones first: value, std, lower, upper, unit, verdict, free, initial.
 
         `lower` and `upper` are the 95 % interval, infinite at an open end and where nothing is known.
 
@@ -185,10 +184,10 @@ Callback = Callable[[Iterate], None]
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a method's own loop returns: the best point, why it stopped, and how it got there.
+    """Raw result of a solver: best unknown vector, termination status, message and history.
 
-    `warm` is where the equilibria of the best point are looked for, as far as the method knows. `worn_out` says that
-    the search ended because many steps were worth nothing beside the noise, whatever the linear model promises.
+    `warm` holds guesses of the equilibria at the best point, where known. `worn_out` tells that the search ended
+    because many steps reduced the cost negligibly compared with the noise.
     """
 
     status: Status
@@ -202,11 +201,11 @@ class Outcome:
 
 @runtime_checkable
 class Solver(Protocol):
-    """A method with its settings; a frozen dataclass registered under its name."""
+    """Interface of a solver: a frozen dataclass of settings, registered under its name."""
 
     @property
     def name(self) -> str:
-        """Under which it is registered."""
+        """Name under which the solver is registered."""
         ...
 
     def run(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
@@ -216,12 +215,12 @@ class Solver(Protocol):
 
 SOLVERS: Registry[type[Solver]] = Registry("solver")
 DEFAULT = "gauss_newton"
-"""The method that is used where none is named."""
+"""Name of the default solver."""
 
 
 @dataclass
 class Recorder:
-    """Counts evaluations and time, keeps the history, and tells the callback."""
+    """Records accepted iterates, counts evaluations and time, and calls the callback."""
 
     callback: Callback | None
     begun: float = field(default_factory=time.perf_counter)
@@ -229,7 +228,7 @@ class Recorder:
     history: list[Iterate] = field(default_factory=list)
 
     def accept(self, cost: float, x: Array, gradient: float, note: str = "") -> None:
-        """Enter an accepted point."""
+        """Record an accepted iterate."""
         seconds = time.perf_counter() - self.begun
         entry = Iterate(len(self.history), cost, x.copy(), gradient, self.evaluations, seconds, note)
         self.history.append(entry)
@@ -266,7 +265,7 @@ def solve(
     limits: GapLimits = USUAL,
     restarts: bool = True,
 ) -> Solution:
-    """Run a solver on a problem and say what was found, how sure, and what was not.
+    """Solve an estimation problem and return estimates with uncertainty and verdicts.
 
     Free effects begin off their neutral value (`off_neutral`) unless a start is given. Where the rollout fails at the
     start (a soft object snaps, an arm falls), the problem is first solved over its first seconds only, and then over
@@ -284,14 +283,14 @@ def solve(
     callback : callable, optional
         Called with every `Iterate`.
     limits : GapLimits, optional
-        What makes a residual more than noise.
+        Criteria for a residual that exceeds noise.
     restarts : bool
-        Whether a poor fit is started again; in vain where the noise that makes it poor is left out on purpose.
+        Whether a poor fit is started again from other initial values.
 
     Returns
     -------
     Solution
-        Never raises for non-convergence: the status and the best point so far tell.
+        Non-convergence raises nothing: see its status and message.
     """
     # the matrices are small: threads of the linear algebra library cost more than they give
     with threadpoolctl.threadpool_limits(1):
@@ -466,12 +465,12 @@ def _other_valleys(problem: EstimationProblem, finish: Evaluation, x: Array) -> 
 
 
 def carries_covariance(solver: Solver) -> bool:
-    """Whether a method can weigh residuals by noise that drives the motion."""
+    """Whether a solver can whiten residuals by process noise."""
     return bool(getattr(solver, "carries_covariance", False))
 
 
 def carries_noise(solver: Solver) -> bool:
-    """Whether a method knows of noise that drives the motion, as a covariance or with the errors as unknowns."""
+    """Whether a solver accounts for process noise, by its covariance or with the errors as unknowns."""
     return carries_covariance(solver) or bool(getattr(solver, "errors_are_unknowns", False))
 
 
@@ -483,6 +482,6 @@ def _good_fit(problem: EstimationProblem, finish: Evaluation) -> bool:
 
 
 def projected_gradient(x: Array, gradient: Array, lower: Array, upper: Array, scale: Array) -> float:
-    """Largest component of scale * gradient that does not push against a bound."""
+    """Infinity norm of the scaled gradient without components that push against a bound."""
     free = ~(((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0)))
     return float(np.max(np.abs(scale * gradient)[free], initial=0.0))

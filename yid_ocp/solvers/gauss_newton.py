@@ -62,7 +62,7 @@ class GaussNewton:
         check(self, f"solver {self.name}")
 
     def run(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
-        """See `Solver.run`."""
+        """Minimize the problem's cost from `start` by Gauss-Newton steps."""
         lower, upper = problem.bounds
         scale = problem.scales
         recorder = Recorder(callback)

@@ -1,4 +1,4 @@
-"""A guess of node states and parameters, for methods that have states as unknowns."""
+"""Initial guess of node states and parameters for solvers with states as unknowns."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ BETWEEN_SHAPES = 0.1
 
 @dataclass(frozen=True)
 class Guess:
-    """Where to begin.
+    """Initial guess of parameters, node states and multipliers.
 
     Attributes
     ----------
     x : ndarray, shape (nx,)
         Unknowns of the problem.
     begins : tuple of Start
-        Starts of all recordings there.
+        Initial states of all recordings at `x`.
     states, multipliers : tuple of ndarray
         Of every recording, (K + 1, nx) at the nodes and (K, m) or (N, m).
     """
@@ -49,7 +49,7 @@ class Guess:
 
 
 def guess(problem: EstimationProblem, nodes: Sequence[NDArray[np.int64]], x: Array, misfit: Misfit) -> Guess:
-    """Node states near a solution, at an unknown vector or, where that is far from the data, at multiples of it.
+    """Guess node states near a solution, at an unknown vector or, where that fits poorly, at multiples of it.
 
     A recording's states are the rollout under the tracking filter, which has no defects, or, where that fails or strays
     from what was measured, every node at rest at the posture that the arms had then, which has defects but follows the

@@ -1,4 +1,4 @@
-"""How sure a fit is of each parameter, and what may be said of it: one judgement for all commands."""
+"""Uncertainty of a fit: covariance, intervals and verdicts of parameters, and goodness of fit."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ class Fit:
     chi2_per_dof : float
         Mean square of the residual in standard deviations of the noise; NaN where there is none.
     p_value : float
-        Of a residual this large under noise alone.
+        Probability of a residual this large under noise alone.
     explains : bool
         By the null test of a diagnosis, at its level and relevance; see `null_test.more_than_noise`.
     believed : bool
-        Whether there is no grave doubt about a recording; see `ProblemOptions.doubts`.
+        Whether the data have no grave quality issue; see `ProblemOptions.doubts`.
     """
 
     chi2_per_dof: float
@@ -58,12 +58,12 @@ class Fit:
 
 
 NO_FIT = Fit(math.nan, math.nan, False)
-"""Of a run that ended without a point."""
+"""Goodness of fit of a run without a result."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """One parameter after the fit.
+    """Estimate of one parameter with standard deviation, bounds and verdict.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class Estimate:
 
 
 def judge_fit(problem: EstimationProblem, evaluation: Evaluation, limits: GapLimits = USUAL) -> Fit:
-    """The null test of a fit on its own recordings; residuals count in units of their noise, whatever the weighting."""
+    """Null test of a fit on its own recordings, with residuals in noise units whatever the weighting."""
     if not evaluation.ok:
         return NO_FIT
     residual = evaluation.residual
@@ -121,7 +121,7 @@ def judge_fit(problem: EstimationProblem, evaluation: Evaluation, limits: GapLim
 
 
 def uncertainty(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, float]:
-    """Covariance of the unknowns from data and stated priors, not the weak prior, and chi2 per degree of freedom.
+    """Return the covariance of the unknowns, from data and stated priors, and chi2 per degree of freedom.
 
     Directions that the data do not inform get a variance of (1e8 x scale)^2 rather than an infinite one.
     """
@@ -132,9 +132,9 @@ def uncertainty(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Arr
 
 
 def spread_by_noise(problem: EstimationProblem, evaluation: Evaluation) -> Array:
-    """F of which F F' is the covariance of the unknowns if nothing but noise has moved them, shape (nx, nx).
+    """Factor F of the covariance F F' of the unknowns under noise alone, shape (nx, nx).
 
-    Kept apart, as a covariance with directions that nothing informs has no digits left for the others.
+    The factor keeps the digits that a covariance with uninformed directions loses.
     """
     count, scale = len(problem.start), problem.scales
     _, jacobian = problem.informing(evaluation)
@@ -160,7 +160,7 @@ def _completed(vectors: Array, count: int) -> Array:
 
 
 def counting_misfit(problem: EstimationProblem, evaluation: Evaluation, covariance: Array) -> Array:
-    """A covariance widened to what the misfit leaves: never smaller than the sandwich over blocks says.
+    """Covariance widened for model misfit, at least as large as the block-wise sandwich estimate.
 
     What a model leaves out repeats itself from sample to sample and shows in all channels at once. The sandwich
     A^-1 S A^-1 therefore takes S from the scores J' r summed over blocks of time of one recording, all channels
@@ -226,13 +226,13 @@ def _clusters(problem: EstimationProblem) -> list[list[NDArray[np.int64]]]:
 
 
 def covariance_of_fit(problem: EstimationProblem, evaluation: Evaluation, fit: Fit) -> Array:
-    """Covariance of the unknowns at a fit: of noise where the model explains the data, else counting the misfit."""
+    """Covariance of the unknowns at a fit, widened for misfit where the model does not explain the data."""
     covariance, _ = uncertainty(problem, evaluation)
     return covariance if fit.explains else counting_misfit(problem, evaluation, covariance)
 
 
 def standing_std(problem: EstimationProblem, x: Array, evaluation: Evaluation, covariance: Array) -> Array:
-    """Standard deviation of every unknown, shape (nx,), that of parameters borne out by the cost itself.
+    """Standard deviation of each unknown, shape (nx,), that of parameters checked against the cost.
 
     The covariance is that of a parabola at the fit. Where it does not fix a parameter well, the cost is worked out at
     the end of its 95 % interval, the others moved along; where it rises less than the parabola promised, the
@@ -280,7 +280,7 @@ def plain_std(covariance: Array, x: Array) -> Array:
 
 
 def known_covariance(names: Sequence[str], matrix: Array, std: Sequence[float]) -> dict[str, Any]:
-    """For result.json: names and covariance of parameters, correlated as in a matrix, with the ± that is stated.
+    """Names and covariance of parameters for result.json: correlations of a matrix, scaled to given deviations.
 
     Parameters
     ----------
@@ -308,7 +308,7 @@ def _informed_cost(problem: EstimationProblem, evaluation: Evaluation) -> float:
 
 
 def verdict(value: float, std: float, *, scale: float = 0.0, explains: bool = True, at_bound: bool = False) -> str:
-    """What may be said of a free parameter.
+    """Verdict on a free parameter from its value and standard deviation.
 
     ==================  ================================================================================================
     not_identifiable    the standard deviation is above 400 % of the value
@@ -318,7 +318,7 @@ def verdict(value: float, std: float, *, scale: float = 0.0, explains: bool = Tr
     weak                anything else
     ==================  ================================================================================================
 
-    The first one that holds is said. A value that may be zero is judged by `scale` as well: identifiable where value
+    The first that holds is returned. A value that may be zero is judged by `scale` as well: identifiable where value
     and two standard deviations stay below a tenth of it, weak where they stay below all of it.
 
     Parameters
@@ -326,7 +326,7 @@ def verdict(value: float, std: float, *, scale: float = 0.0, explains: bool = Tr
     value, std : float
         In the same unit.
     scale : float
-        Size that the parameter might have, zero where nothing is known of that.
+        Plausible size of the parameter, zero where unknown.
     explains, at_bound : bool
     """
     found = by_size(value, std, scale)
@@ -338,7 +338,7 @@ def verdict(value: float, std: float, *, scale: float = 0.0, explains: bool = Tr
 
 
 def by_size(value: float, std: float, scale: float = 0.0) -> str:
-    """identifiable, weak or not_identifiable; see `verdict`."""
+    """Verdict by relative standard deviation alone: identifiable, weak or not_identifiable."""
     if not math.isfinite(std):
         return "not_identifiable"
     relative, reach = std / max(abs(value), 1e-12), abs(value) + 2 * std
@@ -349,7 +349,7 @@ def by_size(value: float, std: float, scale: float = 0.0) -> str:
 
 
 def by_profile(entry: Estimate, interval: Interval, scale: float) -> Estimate:
-    """An estimate with its interval by profile likelihood, and no ± and no verdict that the interval contradicts.
+    """Estimate with its profile-likelihood interval, and standard deviation and verdict consistent with it.
 
     Open on both sides it is not_identifiable, on one side at best weak and without a ±. An end that is not met before
     a bound within `scale` is that bound. Else the wider side stands for two standard deviations (`by_size`), and is
@@ -383,12 +383,12 @@ def by_profile(entry: Estimate, interval: Interval, scale: float) -> Estimate:
 
 
 def stands_by_itself(entry: Estimate) -> bool:
-    """Whether a standard deviation tells all: not for a weak estimate, nor for one that is small beside others."""
+    """Whether the standard deviation describes the uncertainty, so that no profile likelihood is needed."""
     return entry.verdict == "identifiable" and entry.std <= IDENTIFIABLE * abs(entry.value)
 
 
 def typical_sizes(problem: EstimationProblem, x: Array) -> Mapping[str, float]:
-    """Size that each free parameter might have: by its prior, its bounds, the others of its kind, or its start.
+    """Plausible size of each free parameter: by its prior, its bounds, similar parameters, or its initial value.
 
     A prior counts with its standard deviation, finite bounds with half of what lies between them, the others of the
     same kind (`bend`, say, or else of the same unit) with the median of their sizes.
@@ -423,7 +423,7 @@ def _kind(name: str) -> str:
 def estimates(
     problem: EstimationProblem, x: Array, evaluation: Evaluation, covariance: Array, fit: Fit | None
 ) -> dict[str, Estimate]:
-    """Every parameter of the model, and local ones by recording, with value, standard deviation and verdict.
+    """Estimates of all parameters, local ones by recording, with value, standard deviation and verdict.
 
     Parameters
     ----------
@@ -433,7 +433,7 @@ def estimates(
         At `x`, with its Jacobian.
     covariance : ndarray, shape (nx, nx)
     fit : Fit, optional
-        None where the point is no fit, so that it says nothing of misfit and bounds.
+        None where the point is not a fit; misfit and bounds are then ignored.
     """
     known = fit is not None and evaluation.ok and evaluation.jacobian is not None
     spread = standing_std(problem, x, evaluation, covariance) if known else plain_std(covariance, x)
@@ -464,7 +464,7 @@ def estimates(
 
 
 def distrusted(known: Mapping[str, Estimate]) -> dict[str, Estimate]:
-    """Estimates of a fit that turned out to be in grave doubt: what was found or weak is not trusted."""
+    """Estimates with the verdict not_trusted in place of any but fixed and not_identifiable."""
     return {
         name: replace(entry, verdict="not_trusted") if entry.free and entry.verdict != "not_identifiable" else entry
         for name, entry in known.items()

@@ -73,7 +73,7 @@ class _Filter:
 @SOLVERS.register("lifted")
 @dataclass(frozen=True)
 class Lifted:
-    """Iterate on node states s_j and parameters x with the defects d_j = F^n(s_j, x) - s_{j+1} free to be non-zero.
+    """Lifted Gauss-Newton: iterates on node states s_j and parameters x with defects d_j = F^n(s_j, x) - s_{j+1}.
 
     A linear step closes every defect; the recursion  S_{j+1} = A_j S_j + B_j,  c_{j+1} = A_j c_j + d_j  expresses all
     node steps by the parameters' step (condensing), so that an iteration costs one sweep with one direction more
@@ -100,7 +100,7 @@ class Lifted:
         check(self, f"solver {self.name}")
 
     def run(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
-        """See `Solver.run`."""
+        """Minimize the problem's cost from `start` by condensed Gauss-Newton steps on node states."""
         # the inner steps are eliminated, so there are no multipliers among the unknowns, whatever the interval
         transcription = Transcription(problem, self.node_interval, multipliers=False)
         recorder = Recorder(callback)

@@ -1,4 +1,4 @@
-"""The linear model of a residual about a point: its bounded step, and what that step still promises."""
+"""Linear model of a residual about a point: bounded steps and the cost reduction that it predicts."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ def bounded_step(jacobian: Array, residual: Array, mu: float, lower: Array, uppe
 
 
 def promised(jacobian: Array, residual: Array, step: Array) -> float:
-    """Fall of 1/2 |r|^2 that the linear model promises for a step."""
+    """Reduction of 1/2 |r|^2 that the linear model predicts for a step."""
     return -float((jacobian.T @ residual) @ step) - 0.5 * float(np.sum((jacobian @ step) ** 2))
 
 
 def settled(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> bool:
-    """Whether a point is an end of the search: no step of up to the unknowns' size promises a cost worth the name.
+    """Whether a point is stationary: no step up to the unknowns' size predicts a relevant cost reduction.
 
     Parameters
     ----------
@@ -62,11 +62,10 @@ def settled(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> boo
 
 
 def remaining(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> float:
-    """What the linear model promises of a step of up to the unknowns' size; infinite without a Jacobian.
+    """Cost reduction that the linear model predicts for a step up to the unknowns' size; infinite without a Jacobian.
 
-    The step is undamped and within the bounds, so that neither a short step nor a wall of the cost beside a steep row
-    can pass for an end. What holds the unknowns' size is measured by their value or their typical size, whichever is
-    larger. Parameters as of `settled`.
+    The step is undamped and within the bounds; size is the larger of value and typical size. Parameters as of
+    `settled`.
     """
     if evaluation.jacobian is None:
         return math.inf

@@ -1,4 +1,4 @@
-"""A stage driven by recorded torques, under the tracking filter, with the torques' errors among its unknowns.
+"""NLP stage driven by recorded torques, under the tracking filter, with torque errors as unknowns.
 
 With the recorded torque ubar_k, its errors w (of a sample) and b (of a recording), the filter's gain K_k and reference
 xbar_k, and the errors v_k of the angles that the filter follows, the torque that acts is
@@ -24,7 +24,7 @@ from yid_ocp.solvers.terms import Local
 
 @dataclass(frozen=True, eq=False)
 class Freed:
-    """The parameters theta of a system, some of them free.
+    """Symbols of a system's parameters theta, split into free and fixed ones.
 
     Attributes
     ----------
@@ -32,9 +32,9 @@ class Freed:
         Free ones.
     free : casadi.SX, shape (len(names), 1)
     fixed : casadi.SX, shape (ntheta, 1)
-        Values of all, of which those of free ones are not used.
+        Nominal values of all parameters; those of free ones are not used.
     theta : casadi.SX, shape (ntheta, 1)
-        Each from where it belongs.
+        Free symbols where free, else nominal values.
     """
 
     names: tuple[str, ...]
@@ -45,7 +45,7 @@ class Freed:
 
 @dataclass(frozen=True, eq=False)
 class DrivenStage:
-    """A stage as a function of local variables v = (free, x_k, x_{k+1}, lam_k, errors) and data.
+    """One stage as a function of local variables v = (free, x_k, x_{k+1}, lam_k, errors) and data.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ def driven_stage(
     noisy: bool,
     use_compiler: bool,
 ) -> DrivenStage:
-    """The stage under a tracking filter and with errors, where there are such.
+    """Build the stage with its tracking filter and torque errors, where it has them.
 
     Parameters
     ----------

@@ -32,14 +32,14 @@ Array = NDArray[np.float64]
 Form = Literal["symbolic", "compiled"]
 
 MUCH = 2e9
-"""Memory from which on whoever waits is told beforehand how much it will be [bytes]."""
+"""Estimated memory above which a warning is logged before solving [bytes]."""
 SUCCESS = {"Solve_Succeeded", "Solved_To_Acceptable_Level"}
 
 
 @SOLVERS.register("multiple_shooting")
 @dataclass(frozen=True)
 class MultipleShooting:
-    """Solve  min 1/2 |r(w)|^2  subject to the DEL equations of every step (or of every interval) and bounds.
+    """Multiple shooting: min 1/2 |r(w)|^2 subject to the DEL equations of every step (or interval) and bounds.
 
     The start is that of `solvers.guess`; defects are scaled to order one, the cost by its initial value,
     and IPOPT's own scaling is off. In these units IPOPT's first bound multipliers, which are one, weigh as much as the
@@ -83,16 +83,16 @@ class MultipleShooting:
 
     @property
     def form(self) -> Form:
-        """Which transcription is used."""
+        """Transcription that is used: `transcription`, else by `node_interval`."""
         return self.transcription or ("symbolic" if self.node_interval == 1 else "compiled")
 
     @property
     def errors_are_unknowns(self) -> bool:
-        """Whether errors of torques that drive the motion are among the unknowns."""
+        """Whether the torque errors are estimated as unknowns of the program."""
         return self.form == "symbolic"
 
     def run(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
-        """See `Solver.run`."""
+        """Minimize the problem's cost from `start` with IPOPT on the chosen transcription."""
         if self.hessian not in ("gauss_newton", "exact"):
             raise SolverError(
                 f"hessian = '{self.hessian}'",

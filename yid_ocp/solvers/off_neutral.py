@@ -1,4 +1,4 @@
-"""Where the search for free effects begins: not at the value at which they are absent."""
+"""Initial values of free effects, away from the neutral values at which they are absent."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PULLS = (1.0, 0.5, 0.2, 0.05)
 
 
 def off_neutral(problem: EstimationProblem, x: Array) -> Array:
-    """A start at which every free effect is there, though little.
+    """Return an initial unknown vector at which every free effect is slightly active.
 
     At its neutral value an effect's shape (where a spring is relaxed, how fast a branch creeps) moves nothing, and the
     slope by its amplitude is that of whatever shape the settings name: a spring that would have to push from there

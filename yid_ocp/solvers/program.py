@@ -1,4 +1,4 @@
-"""A nonlinear program in CasADi, made of terms.
+"""Nonlinear program in CasADi, composed of residual and constraint terms.
 
     min f(w, p)   subject to   lower <= w <= upper,   g_lower <= g(w, p) <= g_upper
 
@@ -38,12 +38,12 @@ SIZED = ("iteration_callback", "discrete", "equality", "structure_detection", "N
 
 @dataclass(frozen=True)
 class Block:
-    """A named part of a vector.
+    """Named block of a program's variables or parameters.
 
     Attributes
     ----------
     index : ndarray of int, shape (rows, columns)
-        Places in the vector.
+        Indices in the vector.
     rows : tuple of str
         Name of every row.
     unit : str
@@ -56,7 +56,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Extra:
-    """A user's own part of a program: a term of the objective, rows of the constraints, or both."""
+    """User-defined objective term and constraint rows of a program."""
 
     objective: ca.MX
     constraints: ca.MX
@@ -65,7 +65,7 @@ class Extra:
 
 
 def free_memory() -> float:
-    """Memory that is free [bytes]; infinite where the system does not tell."""
+    """Available memory [bytes]; infinite where the system does not report it."""
     told = Path("/proc/meminfo")
     lines = told.read_text(encoding="ascii", errors="replace").splitlines() if told.is_file() else []
     found = [float(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
@@ -74,7 +74,7 @@ def free_memory() -> float:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class NonlinearProgram(Shown):
-    """min f(w, p) subject to bounds and constraints, in CasADi.
+    """Nonlinear program min f(w, p) subject to bounds and constraints, in CasADi.
 
     `nlp[name]` is a block of `variables` or `parameters` as MX of its shape; where there is one recording, `nlp["q"]`
     stands for `nlp["q[NAME]"]`.
@@ -122,7 +122,7 @@ class NonlinearProgram(Shown):
     # -- what it is made of -------------------------------------------------------------------------------------------
 
     def block(self, name: str) -> Block:
-        """A block by its name, or by what comes before the recording's name where there is one recording.
+        """Return a block by its name; with one recording, `[NAME]` may be left out.
 
         Raises
         ------
@@ -138,13 +138,13 @@ class NonlinearProgram(Shown):
         raise SolverError(f"the program has {len(alike)} blocks '{name}'", hint=nearest(name, alike or blocks))
 
     def __getitem__(self, name: str) -> ca.MX:
-        """See the class."""
+        """Block of variables or parameters as an MX matrix of its shape."""
         block = self.block(name)
         vector = self.w if any(block is own for own in self.variables.values()) else self.p
         return ca.reshape(vector[block.index.T.ravel().tolist()], *block.index.shape)
 
     def names(self) -> tuple[str, ...]:
-        """Name of every unknown: block, row and column."""
+        """Names of all unknowns: block, row and column."""
         named = np.full(self.w.numel(), "", dtype=object)
         for name, block in self.variables.items():
             for row, places in zip(block.rows, block.index, strict=True):
@@ -153,7 +153,7 @@ class NonlinearProgram(Shown):
         return tuple(named)
 
     def row_names(self) -> tuple[str, ...]:
-        """Name of every row of `g`: term, row and place; `added.I` for those of `adding`."""
+        """Names of all rows of `g`: term, row and place; `added.I` for those of `adding`."""
         terms = [f"{t.name}.{row}.{k}" for t in self.constraints for k in range(len(t.places)) for row in t.rows]
         return (*terms, *(f"added.{i}" for i in range(sum(len(extra.lower) for extra in self.extras))))
 
@@ -179,7 +179,7 @@ class NonlinearProgram(Shown):
 
     @property
     def arguments(self) -> dict[str, Array]:
-        """What a solver of it is called with: guess, parameters and bounds."""
+        """Arguments for calling a solver: initial guess, parameter values and bounds."""
         zero = np.zeros(sum(term.size for term in self.constraints))
         low, high = ([zero, *(getattr(extra, side) for extra in self.extras)] for side in ("lower", "upper"))
         bounds = {"lbx": self.lower, "ubx": self.upper, "lbg": np.concatenate(low), "ubg": np.concatenate(high)}
@@ -220,7 +220,7 @@ class NonlinearProgram(Shown):
         return self._once("lam_g", lambda: ca.MX.sym("lam_g", self.g.numel()))
 
     def hessian(self, kind: Hessian = "gauss_newton") -> ca.MX:
-        """Second derivative of lam_f f + lam_g . g, or what Gauss-Newton takes for it, sparse and symmetric.
+        """Hessian of lam_f f + lam_g . g, exact or Gauss-Newton, sparse and symmetric.
 
         Gauss-Newton leaves out the curvature of residuals and of the terms of `constraints`, not of what was added.
         """
@@ -306,7 +306,7 @@ class NonlinearProgram(Shown):
         return ca.MX(pattern, factor * 2 * cost / count / size**2)
 
     def memory(self, hessian: Hessian = "gauss_newton") -> float:
-        """About how much an interior-point method with a direct solver will need beside what there is [bytes]."""
+        """Estimated additional memory of an interior-point method with a direct linear solver [bytes]."""
         return ENTRY * float(self.jac_g.nnz() + self.hessian(hessian).nnz())
 
     # -- use ----------------------------------------------------------------------------------------------------------
@@ -318,7 +318,7 @@ class NonlinearProgram(Shown):
         lower: ArrayLike = 0.0,
         upper: ArrayLike = 0.0,
     ) -> NonlinearProgram:
-        """The program with a term more in its objective and rows more in its constraints.
+        """The program with a further objective term and further constraint rows.
 
         Parameters
         ----------
@@ -357,7 +357,7 @@ class NonlinearProgram(Shown):
         return replace(self, extras=(*self.extras, Extra(scalar, column, *bounds)), _kept={})
 
     def solver(self, plugin: str = "ipopt", hessian: Hessian = "gauss_newton", **options: Any) -> ca.Function:
-        """`casadi.nlpsol` of the program, with the placed derivatives.
+        """Make a `casadi.nlpsol` solver of the program that uses its assembled derivatives.
 
         Parameters
         ----------

@@ -37,7 +37,7 @@ class SingleShooting:
         check(self, f"solver {self.name}")
 
     def run(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
-        """See `Solver.run`."""
+        """Minimize the problem's cost from `start` by L-BFGS-B."""
         lower, upper = problem.bounds
         scale = problem.scales
         recorder = Recorder(callback)

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 @SOLVERS.register("steepest_descent")
 @dataclass(frozen=True)
 class SteepestDescent:
-    """x <- P(x - s g), P the projection on the bounds, s by backtracking until the cost falls enough.
+    """Projected steepest descent: x <- P(x - s g), P the projection on the bounds, s by Armijo backtracking.
 
     The gradient comes from the adjoint. Unscaled on purpose: this is what the paper did.
 
@@ -55,7 +55,7 @@ class SteepestDescent:
         check(self, f"solver {self.name}")
 
     def run(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
-        """See `Solver.run`."""
+        """Minimize the problem's cost from `start` by projected steepest descent."""
         lower, upper = problem.bounds
         recorder = Recorder(callback)
         x = start.copy()

@@ -1,4 +1,4 @@
-"""An estimation problem as a nonlinear program in CasADi alone: every step's equations, nothing eliminated.
+"""Symbolic transcription of an estimation problem into a CasADi program with the equations of every step.
 
 The unknowns are, in this order,
 
@@ -46,7 +46,7 @@ RIDGE = 0.1
 def transcribe(
     problem: EstimationProblem, start: ArrayLike | None = None, use_compiler: bool | None = None
 ) -> NonlinearProgram:
-    """The nonlinear program of an estimation problem, with a node at every step.
+    """Transcribe an estimation problem into a nonlinear program with a node at every step.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def _about_zero(problem: EstimationProblem) -> EstimationProblem:
 
 
 def check(problem: EstimationProblem, where: str) -> None:
-    """Refuse what no transcription with nodes does."""
+    """Raise `SolverError` for problems that no transcription with nodes supports."""
     if not problem.as_recorded:
         raise SolverError(
             "an effect changes recorded inputs, times or what the tracking filter follows",
@@ -118,7 +118,7 @@ def check(problem: EstimationProblem, where: str) -> None:
 
 
 def unknown_vector(problem: EstimationProblem, program: NonlinearProgram, w: Array) -> Array:
-    """The problem's unknown vector that belongs to a point of its program."""
+    """Problem's unknown vector at a point `w` of its program, shape (nx,)."""
     x = problem.start.copy()
     shared, own = len(problem.shared), len(problem.local)
     x[:shared] = w[program.variables["theta"].index.ravel()] if shared else 0.0

@@ -1,7 +1,6 @@
-"""Functions at many places of a nonlinear program, with their derivatives placed by hand.
+"""Terms of a nonlinear program: one local function at many places, with directly assembled derivatives.
 
-A term is one function of local variables and data, its Jacobian and its curvature, and the places at which it holds.
-CasADi would find the same derivatives of the whole by colouring its band, in many times the time.
+CasADi would find the same derivatives by colouring the whole Jacobian, many times more slowly.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ Places = NDArray[np.int64]
 
 
 class Local:
-    """A function y(v; d, s) of local variables v, data d and data s that all places share, with its derivatives.
+    """Function y(v; d, s) of local variables v, data d and shared data s, with its derivatives.
 
     Parameters
     ----------
@@ -83,7 +82,7 @@ class Local:
 
 @dataclass(frozen=True)
 class Term:
-    """One function at K places of a program.
+    """One local function applied at K places of a program.
 
     Attributes
     ----------
@@ -92,11 +91,11 @@ class Term:
         Names of the ny outputs.
     local : Local
     places : ndarray of int, shape (K, nv)
-        Where the local variables of every place stand among the unknowns; none twice in a row.
+        Indices of each place's local variables among the unknowns; none twice in a row.
     data : ndarray of int, shape (K, nd)
-        Where its data stand among the parameters.
+        Indices of each place's data among the parameters.
     shared : ndarray of int, shape (ns,)
-        Where the data stand that all places share.
+        Indices of the data that all places share.
     """
 
     name: str
@@ -112,7 +111,7 @@ class Term:
         return len(self.rows) * len(self.places)
 
     def arguments(self, w: ca.MX, p: ca.MX) -> tuple[ca.MX, ca.MX, ca.MX]:
-        """Local variables (nv, K), data (nd, K) and shared data (ns, 1)."""
+        """Gather local variables (nv, K), data (nd, K) and shared data (ns, 1)."""
 
         def gathered(vector: ca.MX, index: Places) -> ca.MX:
             return ca.reshape(vector[index.ravel().tolist()], index.shape[1], index.shape[0])
@@ -120,7 +119,7 @@ class Term:
         return gathered(w, self.places), gathered(p, self.data), p[self.shared.tolist()]
 
     def mapped(self, function: ca.Function, *arguments: ca.MX) -> ca.MX:
-        """A function of the local ones at every place, its results side by side."""
+        """Map a local function over all places, its results side by side."""
         return function.map(f"{function.name()}_{len(self.places)}", "serial", len(self.places), [2], [])(*arguments)
 
     def values(self, w: ca.MX, p: ca.MX) -> ca.MX:
@@ -128,17 +127,17 @@ class Term:
         return ca.vec(self.mapped(self.local.value, *self.arguments(w, p)))
 
     def entries(self, w: ca.MX, p: ca.MX) -> ca.MX:
-        """Entries of the Jacobian, in the order of `slots`."""
+        """Nonzero entries of the Jacobian, in the order of `slots`."""
         return nonzeros(self.mapped(self.local.jacobian, *self.arguments(w, p)))
 
     def slots(self) -> tuple[Places, Places]:
-        """Row and column of the entries of the Jacobian."""
+        """Row and column indices of the Jacobian's entries."""
         row, column = (np.array(x, np.int64) for x in self.local.jacobian.sparsity_out(0).get_triplet())
         first = len(self.rows) * np.arange(len(self.places))[:, None]
         return (first + row).ravel(), self.places[:, column].ravel()
 
     def curvature(self, w: ca.MX, p: ca.MX, weight: ca.MX) -> tuple[ca.MX, Places, Places] | None:
-        """Second derivative of weight . values: entries, rows and columns, which may repeat; None where it is zero."""
+        """Hessian of weight . values as entries, rows and columns, which may repeat; None where it is zero."""
         function = self.local.curvature
         if function is None:
             return None
@@ -150,7 +149,7 @@ class Term:
 
 @dataclass(frozen=True)
 class Residual:
-    """Weighted differences of combined values and data: r = weight (combination values - target).
+    """Residual term of a program's objective: r = weight (combination values - target).
 
     Attributes
     ----------
@@ -158,9 +157,9 @@ class Residual:
     combination : casadi.DM, shape (nr, ny K), or None
         None takes the values as they are.
     weight, target : ndarray of int, shape (nr,), or None
-        Where they stand among the parameters; None for ones and for zeros.
+        Indices among the parameters; None for weights of one and targets of zero.
     threshold : float
-        Beyond which Huber's loss is linear.
+        Residual beyond which Huber's loss is linear.
     """
 
     term: Term
@@ -175,7 +174,7 @@ class Residual:
         return self.term.size if self.combination is None else self.combination.size1()
 
     def by_values(self, p: ca.MX) -> ca.MX | None:
-        """dr/dvalues, sparse; None for the identity."""
+        """Jacobian dr/dvalues, sparse; None for the identity."""
         if self.combination is None and self.weight is None:
             return None
         combination = ca.DM.eye(self.size) if self.combination is None else self.combination
@@ -201,18 +200,18 @@ class Residual:
         return placed if matrix is None else ca.mtimes(matrix, placed)
 
     def loss(self, r: ca.MX) -> ca.MX:
-        """Half the sum of squares, or Huber's loss."""
+        """Loss of residuals r: half the sum of squares, or Huber's loss."""
         if math.isinf(self.threshold):
             return ca.sumsqr(r) / 2
         size, limit = ca.fabs(r), self.threshold
         return ca.sum1(ca.if_else(size <= limit, r**2 / 2, limit * (size - limit / 2)))
 
     def pull(self, r: ca.MX) -> ca.MX:
-        """Derivative of the loss by r."""
+        """Gradient of the loss by r."""
         return r if math.isinf(self.threshold) else ca.fmax(ca.fmin(r, self.threshold), -self.threshold)
 
     def slope_weight(self, r: ca.MX, exact: bool) -> ca.MX | None:
-        """Factor on the slopes' squares in a Hessian; None for ones.
+        """Weight of each residual in the Hessian of the loss; None for ones.
 
         Exactly it is one or zero; Gauss-Newton's, that of weighted squares with the same gradient, is never zero.
         """
@@ -226,7 +225,7 @@ class Residual:
 
 @dataclass(frozen=True)
 class Ridge:
-    """Curvature added to Gauss-Newton's Hessian: factor * mean square residual / max(|w_i|, scale_i)^2.
+    """Regularization of the Gauss-Newton Hessian by factor * mean square residual / max(|w_i|, scale_i)^2.
 
     Along unknowns that the data hardly inform the curvature that Gauss-Newton leaves out may be as large as its own.
     The factor is a number, or a function of the unknowns that gives one, which may change from iterate to iterate.
@@ -238,12 +237,12 @@ class Ridge:
 
 
 def nonzeros(matrix: ca.MX) -> ca.MX:
-    """Entries of a sparse expression as a column."""
+    """Nonzero entries of a sparse expression as a column."""
     return ca.MX(ca.Sparsity.dense(matrix.nnz(), 1), matrix.nz[:])
 
 
 def assembled(entries: ca.MX, row: Places, column: Places, shape: tuple[int, int]) -> ca.MX:
-    """A sparse matrix from its entries, each at a place of its own."""
+    """Assemble a sparse matrix from entries at distinct positions."""
     order = np.lexsort((row, column))
     start = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=shape[1]))])
     sparsity = ca.Sparsity(*shape, start.tolist(), row[order].tolist())
@@ -251,7 +250,7 @@ def assembled(entries: ca.MX, row: Places, column: Places, shape: tuple[int, int
 
 
 def summed(entries: ca.MX, row: Places, column: Places, size: int) -> ca.MX:
-    """A sparse square matrix from entries that share places."""
+    """Assemble a sparse square matrix from entries, summing those at the same position."""
     keys, place = np.unique(column * size + row, return_inverse=True)
     start = np.concatenate([[0], np.cumsum(np.bincount(keys // size, minlength=size))])
     sparsity = ca.Sparsity(size, size, start.tolist(), (keys % size).tolist())

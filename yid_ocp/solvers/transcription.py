@@ -1,4 +1,4 @@
-"""Transcription of an estimation problem with node states as unknowns: packing, defects, objective, initial guess.
+"""Compiled transcription of an estimation problem: node states as unknowns, defects, objective, initial guess.
 
 The unknown vector of the NLP is, in this order,
 
@@ -32,7 +32,7 @@ Sparse: TypeAlias = Any
 
 @dataclass(frozen=True)
 class Layout:
-    """Where one recording's unknowns stand in the NLP's vector.
+    """Indices of one recording's node states and multipliers in the NLP's vector.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class Layout:
 
 
 class Transcription:
-    """Node states of an estimation problem as unknowns.
+    """Transcription of an estimation problem with node states as unknowns, evaluated by compiled rollouts.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ class Transcription:
     # -- initial guess ------------------------------------------------------------------------------------------------
 
     def guess(self, x: Array) -> Array:
-        """Unknowns near a solution, at the parameters `x` or at multiples of them (see `solvers.guess`)."""
+        """Initial guess of the NLP's vector at the parameters `x` or at multiples of them."""
         found = guess(self.problem, [layout.nodes for layout in self.layouts], self._unknowns(x), self._misfit)
         w = np.zeros(self.size)
         w[: len(self.problem.shared)] = found.x[: len(self.problem.shared)]
@@ -159,7 +159,7 @@ class Transcription:
     # -- bounds -------------------------------------------------------------------------------------------------------
 
     def bounds(self) -> tuple[Array, Array]:
-        """Bounds of all unknowns; prescribed coordinates are fixed."""
+        """Lower and upper bounds of the NLP's vector; prescribed coordinates are fixed."""
         lower, upper = np.full(self.size, -np.inf), np.full(self.size, np.inf)
         count = len(self.problem.shared)
         low, high = self.problem.bounds
@@ -222,7 +222,7 @@ class Transcription:
         return value, matrix.tocsc()
 
     def unknowns(self, w: Array) -> Array:
-        """The problem's unknown vector that belongs to a point of the NLP."""
+        """Problem's unknown vector at a point `w` of the NLP, shape (nx,)."""
         x = self._unknowns(w[: len(self.problem.shared)])
         if self.free_start:
             at, size = len(self.problem.shared), len(self.problem.predictor.start_rows)
@@ -379,7 +379,7 @@ class Transcription:
         return value, self._assembled(np.array(blocks), column, len(keep))
 
     def interval_sweep(self, i: int, j: int, start: Array, theta: Array, directions: Directions | None) -> Rollout:
-        """Rollout over one interval of a recording, with the problem's own feedback."""
+        """Roll out one interval of a recording under its tracking feedback."""
         episode, nodes = self.problem.episodes[i], self.layouts[i].nodes
         first, last = int(nodes[j]), int(nodes[j + 1])
         feedback = episode.feedback

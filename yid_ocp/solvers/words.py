@@ -1,4 +1,4 @@
-"""Verdicts and fits in words: the one wording for the terminal, the report and the comparison of methods."""
+"""Messages about fits and verdicts for the terminal, the report and the comparison of methods."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ PREDICATES: Mapping[str, str] = {
     "at_bound": "is at its bound",
     "not_trusted": "is not to be trusted",
 }
-"""What is said of a parameter, by its verdict; see `yid_ocp.solvers.judgement.verdict`."""
+"""Sentence predicate for a parameter of each verdict."""
 VERDICT_WORDS: Mapping[str, str] = {verdict: text.removeprefix("is ") for verdict, text in PREDICATES.items()}
-"""The same for the cell of a table."""
+"""Table text of each verdict."""
 REMEDY = "run `yid-ocp diagnose`"
-"""What to do where the model does not explain the recordings."""
+"""Advice where the model does not explain the recordings."""
 
 
 def fit_words(chi2_per_dof: float | None, explains: bool) -> str:
-    """One sentence: whether a model explains its recordings, and what follows where it does not."""
+    """Sentence that tells whether a model explains its recordings, with advice where it does not."""
     if chi2_per_dof is None or chi2_per_dof != chi2_per_dof:
         return "whether the model explains the recordings is not known"
     size = f"chi2 per degree of freedom is {chi2_per_dof:.3g}"
@@ -32,7 +32,7 @@ def fit_words(chi2_per_dof: float | None, explains: bool) -> str:
 
 
 def parameter_words(value: float, std: float | None, interval: tuple[float | None, float | None] | None) -> str:
-    """A value with what is known of it: an interval where there is one, else a standard deviation, else nothing.
+    """Format a value with its 95 % interval, or else its standard deviation where it has one.
 
     Parameters
     ----------
@@ -48,17 +48,17 @@ def parameter_words(value: float, std: float | None, interval: tuple[float | Non
 
 
 def finite(value: float) -> float | None:
-    """A number, None where it is infinite or unknown, as a standard deviation is that nothing informs."""
+    """Return a finite number unchanged, and None for an infinite or NaN one."""
     return value if math.isfinite(value) else None
 
 
 def percent_words(part: float) -> str:
-    """A part in per cent, to two digits, without a power of ten as far as people read numbers."""
+    """Format a fraction as a percentage with two digits, without exponents below 10000 %."""
     return f"{100 * part:.2g}" if 100 * part < 99.5 else f"{100 * part:.0f}" if part < 100 else f"{100 * part:.2g}"
 
 
 def interval_words(lower: float | None, upper: float | None) -> str:
-    """A 95 % interval, of which ends may be open."""
+    """Format a 95 % interval, whose ends may be open."""
     if lower is None and upper is None:
         return "open"
     if lower is None:

@@ -1,1 +1,1 @@
-"""Virtual experiments: another engine (MuJoCo) plays the robot, with effects done in its own terms."""
+"""Virtual experiments: MuJoCo, an independent engine, simulates the robot and implements the effects itself."""

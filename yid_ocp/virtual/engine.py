@@ -1,4 +1,4 @@
-"""The simulation in MuJoCo: a controller makes the driven joints follow a motion, from static equilibrium.
+"""Simulation in MuJoCo: a controller moves the driven joints along a motion, from static equilibrium.
 
 The simulator shares the description of the system with the estimator and nothing else: its equations, its integrator
 and its treatment of the grasps are MuJoCo's own, so that an estimate is never checked against its own mistakes.
@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 INNER_STEP = 1e-4
-"""Step of the simulator where nothing else is said [s]."""
+"""Default time step of the simulator [s]."""
 
 _BANDWIDTH = 25.0  # of the joint controller [rad/s]; a 10 ms hold leaves it well damped
 _HOLD_STIFFNESS = 2e3  # [N m/rad] while settling; stable explicitly on the lightest wrist
@@ -42,14 +42,14 @@ _LOST = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
 
 
 class EngineTerms(Protocol):
-    """Terms that the simulator has and the system's description has not."""
+    """Forces and model changes in the simulator that are not in the system's description."""
 
     def prepare(self, model: Any) -> None:
         """Edit the compiled `mujoco.MjModel`."""
         ...
 
     def begin(self, data: Any) -> None:
-        """Called when the motion begins, at rest."""
+        """Called once when the motion begins, at rest."""
         ...
 
     def force(self, model: Any, data: Any) -> None:
@@ -59,18 +59,18 @@ class EngineTerms(Protocol):
 
 @dataclass(frozen=True)
 class Simulation:
-    """How long and how finely is simulated.
+    """Duration, rates and time step of a simulation.
 
     Attributes
     ----------
     duration : float
         [s]
     rate : float
-        Of the samples that are recorded [Hz].
+        Rate of the recorded samples [Hz].
     time_step : float
         Of the simulator [s]; must divide the controller's period.
     controller_rate : float, optional
-        Torques are computed so often and held in between [Hz], a multiple of `rate`; `rate` where absent.
+        Rate at which torques are computed, held in between [Hz], a multiple of `rate`; `rate` where absent.
     effort_kind : {'sample', 'mean', 'command'}
         What is recorded of the torque, as in `JointGroup`: a `command` is held from sample to sample, so it needs a
         controller that is no faster than the recording.
@@ -109,23 +109,23 @@ class Simulation:
 
     @property
     def controller_periods(self) -> int:
-        """Periods of the controller from sample to sample."""
+        """Number of controller periods per recorded sample."""
         return round(self._controller_rate / self.rate)
 
     @property
     def inner_steps(self) -> int:
-        """Steps of the simulator in a period of the controller."""
+        """Number of simulator steps per controller period."""
         return round(1.0 / (self._controller_rate * self.time_step))
 
     @property
     def samples(self) -> int:
-        """Recorded periods, N."""
+        """Number N of sample periods; N + 1 samples are recorded."""
         return round(self.duration * self.rate)
 
 
 @dataclass(frozen=True)
 class SimulatedRun:
-    """What happened in the simulator, free of noise.
+    """Noise-free trajectories of a simulation.
 
     Attributes
     ----------
@@ -137,11 +137,11 @@ class SimulatedRun:
         Torque at t_k, or its mean from t_k to t_{k+1}, as `effort_kind` says [N m], or what servos were commanded at
         t_k; the last row was computed and not applied.
     points : ndarray, shape (N + 1, np, 3)
-        Of `system.points` in the world [m].
+        Positions of `system.points` in the world [m].
     frame_t : ndarray, shape (M,)
         Times of the camera's frames, rounded to the simulator's step [s].
     frame_points : ndarray, shape (M, np, 3)
-        [m]
+        Positions of the points at `frame_t` [m].
     grasp_error : ndarray, shape (N + 1, number of grasps)
         Distance between the two ends of each grasp [m].
     """
@@ -167,7 +167,7 @@ def simulate_in_mujoco(
     injected: EngineTerms | None = None,
     play: Mapping[str, float] | None = None,
 ) -> SimulatedRun:
-    """Let the controller follow a motion in MuJoCo, from static equilibrium at the initial posture.
+    """Simulate the controller following a motion in MuJoCo, from static equilibrium at the initial joint angles.
 
     Position servos are MuJoCo's own: they are commanded the motion about the posture, and rest where that leaves them.
 
@@ -230,7 +230,7 @@ def simulate_in_mujoco(
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A compiled model with its state; `order` of all joints and moved ones, sites of points and of grasps' ends."""
+    """A MuJoCo model with its state and the ids of joints, moved joints, points and grasp ends in it."""
 
     mujoco: ModuleType
     model: Any
@@ -242,7 +242,7 @@ class Scene:
 
     @staticmethod
     def of(system: System, mujoco: ModuleType, model: Any) -> Scene:
-        """The scene of a system's model; moved are its driven joints, or its prescribed ones where none is driven."""
+        """The scene of a compiled model; its driven joints are moved, or its prescribed ones if none is driven."""
         # Every joint has one coordinate, so positions, velocities and joints share their addresses.
         order = np.array([model.joint(name).id for name in system.mechanism.joint_names])
         sites = [model.site(name).id for name in system.points]
@@ -266,10 +266,9 @@ def _at_work(mujoco: ModuleType, model: Any, injected: EngineTerms | None) -> It
 
 
 def settle(scene: Scene, damping: Array) -> Array:
-    """Bring the scene to static equilibrium with the driven joints where they are; return their torques [N m].
+    """Bring the scene to static equilibrium with the driven joints held; return their torques [N m].
 
-    On the way there joints damp as `damping` says: of several shapes that an object can rest in, it must not depend on
-    its own damping which is found.
+    `damping` replaces the joints' own damping meanwhile, which could decide which of several equilibria is found.
     """
     model, data, driven = scene.model, scene.data, scene.driven
     held = copy.copy(model)
@@ -307,7 +306,7 @@ def _refuse_lost(scene: Scene) -> None:
 
 
 class Controller:
-    """Torques of the driven joints: the arms' inverse dynamics along the motion, the grasps' load at rest, feedback.
+    """Computed-torque controller: the arms' inverse dynamics along the motion, the grasps' load at rest, feedback.
 
     Parameters
     ----------
@@ -328,7 +327,7 @@ class Controller:
         self._load = balance - self._arm_torque(self._rest[scene.driven], zero, zero)
 
     def act(self, t: float) -> Array:
-        """Apply the torques of time t [s] and return them, shape (nu,) [N m]."""
+        """Apply the torques at time t [s] and return them, shape (nu,) [N m]."""
         torque = self.torque(t)
         self._scene.data.qfrc_applied[self._scene.driven] = torque
         return torque
@@ -351,7 +350,7 @@ class Controller:
 
 
 class Commander:
-    """Commands of position servos: a motion about the posture in which the scene is now.
+    """Controller that commands position servos along a motion about the scene's present joint angles.
 
     Parameters
     ----------
@@ -365,14 +364,14 @@ class Commander:
         self.first = scene.data.qpos[scene.driven].copy()
 
     def act(self, t: float) -> Array:
-        """Give the commands of time t [s] and return them, shape (nu,) [rad or m]."""
+        """Apply the commands at time t [s] and return them, shape (nu,) [rad or m]."""
         commands = np.asarray(self.first + self._motion.at(t)[0])
         self._scene.data.ctrl[:] = commands
         return commands
 
 
 def command_always(scene: Scene, commands: Array) -> None:
-    """Let actuators have been commanded the same for long, those that act late as well."""
+    """Set the commands of all actuators and fill the history of delayed ones with them."""
     model, data = scene.model, scene.data
     data.ctrl[:] = commands
     if hasattr(scene.mujoco, "mj_initCtrlHistory") and hasattr(model, "actuator_delay"):
@@ -382,7 +381,7 @@ def command_always(scene: Scene, commands: Array) -> None:
 
 
 def settle_servos(scene: Scene, damping: Array, commands: Array) -> None:
-    """Bring the scene to rest under what its servos are commanded; joints damp as `damping` says, only more."""
+    """Bring the scene to rest under constant servo commands, with `damping` increased meanwhile."""
     model, data = scene.model, scene.data
     data.ctrl[:] = commands
     held = copy.copy(model)

@@ -1,4 +1,4 @@
-"""Virtual experiments: a robot moves the flexible object in MuJoCo, and sensors with known noise record it."""
+"""Virtual experiments: a robot moves a flexible object in MuJoCo, recorded with known sensor noise."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _TRUE_QUANTITIES = ("bend", "twist", "damping", "twist_damping", "mass")
 
 
 def paper_system(arms: int) -> System:
-    """Baxter with one or two arms holding the foam Y by point grasps.
+    """The paper's system: Baxter with one or two arms that hold the foam Y by point grasps.
 
     Parameters
     ----------
@@ -61,14 +61,13 @@ class ArmNoise:
     Attributes
     ----------
     position, velocity : float
-        Of a joint [rad], [rad/s].
+        Standard deviation of a joint's reading [rad], [rad/s].
     effort, effort_bias : float or tuple of float, length nj
-        Of a recorded, not of the applied, torque, and of what is added to a joint's torque in the whole recording alike
-        [N m].
+        Standard deviation of the white noise, and of the constant offset, of a recorded (not the applied) torque [N m].
     points : float
-        Of each coordinate of a grasped point [m].
+        Standard deviation of each coordinate of a grasped point [m].
     stated : bool
-        Whether the recording says the noise of the torques; it says all other noise in any case.
+        Whether the recording states the standard deviation of torques; it always states the others.
     """
 
     position: float = 2e-4
@@ -81,12 +80,12 @@ class ArmNoise:
 
 @dataclass(frozen=True)
 class PointCamera:
-    """A slow camera that sees points of the object.
+    """A slow camera that measures positions of the object's points.
 
     Attributes
     ----------
     points : tuple of str, optional
-        What it can see; all points that no arm holds where absent.
+        Points it can see; all points that no arm holds where absent.
     std : float
         Standard deviation of the white noise on each coordinate of a point [m].
     rate : float
@@ -109,7 +108,7 @@ class PointCamera:
 
 @dataclass(frozen=True)
 class VirtualExperiment:
-    """What is done, and what is recorded of it.
+    """Settings of a virtual experiment: motion, simulation, sensors and noise.
 
     Attributes
     ----------
@@ -123,13 +122,13 @@ class VirtualExperiment:
     camera : PointCamera, optional
         None for no camera.
     injected : EngineTerms, optional
-        What is at work beside the system's description.
+        Forces and model changes that are not in the system's description.
     seed : int
-        Of all noise; each sensor has its own stream, so that leaving one out changes no other.
+        Seed of all noise; each sensor has its own stream, so that leaving one out changes no other.
     name, description : str
-        Of the recording; how it was made is appended to the description.
+        Name and description of the recording; how it was made is appended to the description.
     play : mapping of joint to float
-        Width of the play of gears behind servos [rad].
+        Backlash of gears behind servos, full width [rad].
     """
 
     motion: Motion | None = None
@@ -147,7 +146,7 @@ class VirtualExperiment:
 def virtual_experiment(
     system: System, values: Mapping[str, float] | None = None, experiment: VirtualExperiment | None = None
 ) -> Recording:
-    """Record a virtual robot moving the object: joint encoders, torques, grasped points and a slow camera.
+    """Simulate a robot moving the object and return the recording of encoders, torques, points and camera.
 
     Parameters
     ----------

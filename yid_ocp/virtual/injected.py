@@ -1,4 +1,4 @@
-"""Effects put into a virtual experiment in the other engine's own terms, for a diagnosis that does not know of them.
+"""Unmodelled effects added to a virtual experiment in MuJoCo's own terms, independently of `yid_ocp.effects`.
 
 Whatever MuJoCo has a term of its own for (joint damping, armature, inertias, sites) is set in its model; other forces
 are worked out here in NumPy at every inner step; errors of sensors and clocks are put into the finished recording. None
@@ -80,12 +80,12 @@ SENSOR_ERRORS: tuple[str, ...] = (
     "surface_offset",
 )
 KINDS = (*DESCRIBED, *MODELLED, *FORCED, *SENSOR_ERRORS)
-"""Kinds of the vocabulary that can be done in the other engine."""
+"""Effect kinds of the library that can be simulated in MuJoCo."""
 
 
 @dataclass(frozen=True)
 class InjectedEffect:
-    """An effect that the data have and the model has not.
+    """An effect present in the data and absent from the model.
 
     Attributes
     ----------
@@ -112,7 +112,7 @@ def injected_experiment(
     effects: Sequence[InjectedEffect],
     experiment: VirtualExperiment | None = None,
 ) -> Recording:
-    """A virtual experiment with effects that are not in the system's description.
+    """Simulate a virtual experiment with effects that are absent from the system's description.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def injected_experiment(
 
 
 class InjectedTerms:
-    """Terms of effects inside MuJoCo: `prepare` edits its model, `force` is called by it at every step.
+    """Effects as MuJoCo terms: `prepare` edits the model, MuJoCo calls `force` at every step.
 
     Parameters
     ----------
@@ -203,7 +203,7 @@ class InjectedTerms:
                 self._forces.append(getattr(self, f"_{effect.kind}")(model, place, size))
 
     def begin(self, data: Any) -> None:
-        """The motion begins: effects with a memory start to remember."""
+        """Start the memory of effects that have one."""
         self._scene.running = True
 
     def force(self, model: Any, data: Any) -> None:
@@ -381,7 +381,7 @@ class InjectedTerms:
 
 
 def with_sensor_error(recording: Recording, system: System, effect: InjectedEffect) -> Recording:
-    """The recording as sensors with an error would have made it.
+    """The recording as sensors with one given error would have measured it.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Pushes and snags in MuJoCo: what happens once, for a short time, and is in nobody's model."""
+"""Brief unmodelled disturbances in MuJoCo: force pulses and temporary springs at one coordinate."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Push:
-    """A force on one coordinate: size sin^2(pi (t - begin)/(end - begin)).
+    """A force pulse on one coordinate: size sin^2(pi (t - begin)/(end - begin)).
 
     Attributes
     ----------
@@ -28,13 +28,13 @@ class Push:
 
     @property
     def impulse(self) -> float:
-        """Its integral over time [N m s or N s]."""
+        """Integral of the force over time [N m s or N s]."""
         return self.size * (self.end - self.begin) / 2
 
 
 @dataclass(frozen=True)
 class Snag:
-    """Something that holds one coordinate where it was caught, by a spring that is there for a while.
+    """A temporary spring that holds one coordinate at its value when the spring sets in.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Snag:
 
 
 class Interruptions:
-    """Pushes and snags as terms of the simulator; see `engine.EngineTerms`.
+    """Disturbances as simulator terms (`engine.EngineTerms`).
 
     Parameters
     ----------
@@ -66,15 +66,15 @@ class Interruptions:
         self._caught: dict[Snag, float] = {}
 
     def prepare(self, model: Any) -> None:
-        """Nothing of the model changes."""
+        """Leave the model unchanged."""
 
     def begin(self, data: Any) -> None:
-        """Times count from here."""
+        """Set the time origin of all disturbances."""
         self._start = float(data.time)
         self._caught = {}
 
     def force(self, model: Any, data: Any) -> None:
-        """Add what acts now to `data.qfrc_passive`."""
+        """Add the forces acting now to `data.qfrc_passive`."""
         t = float(data.time) - self._start
         for push in self.pushes:
             if push.begin < t < push.end:

@@ -1,4 +1,4 @@
-"""A system as a MuJoCo model: for virtual experiments in an engine that is not ours, and to export it."""
+"""A system as a MuJoCo model (MJCF), for virtual experiments and for export."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ NATIVE = frozenset(
         *("gravity", "grasp", "sprung_joint", "armature", "cubic_stiffness", "servo"),
     }
 )
-"""Aspects of an effect for which MuJoCo has a term of its own."""
+"""Aspects of an effect for which MuJoCo has an equivalent term."""
 EMULATED = frozenset({"dry_friction", "grasp_compliance"})
-"""Those that it has something like."""
+"""Aspects that MuJoCo can only approximate."""
 IGNORED = frozenset({"reading", "torque_gain", "torque_offset", "torque_delay", "torque_lag"})
-"""Those between sensors, or recorded torques, and the mechanics."""
+"""Aspects of sensors and recorded torques that do not enter the mechanics."""
 
 _JOINTS_PER_BODY = 6  # as many as MuJoCo allows
 _ROTOR = 5e-4  # [kg m^2] of a motor behind play, as little as lets it rest at a stop
@@ -49,7 +49,7 @@ def mujoco_xml(
     actuators: bool = False,
     play: Mapping[str, float] | None = None,
 ) -> str:
-    """The system as a MuJoCo model (MJCF).
+    """The MJCF text of a system.
 
     Joints keep their names. Consecutive joints that carry no mass and sit at one place become one body with several
     joints, which is the same kinematics. Every point and every end of a grasp is a site: points under their own name,
@@ -67,14 +67,14 @@ def mujoco_xml(
         `implicitfast`, `implicit`, `Euler` or `RK4`; the twist of a thin tube has a damping time of some 10 us,
         which an explicit one cannot follow.
     emulate : bool
-        Whether what MuJoCo has only something like is taken: dry friction that sticks for one that is rounded off, a
-        tendon for a compliant point grasp. Refused otherwise.
+        Whether approximations are allowed: sticking dry friction for a smoothed one, a tendon for a compliant point
+        grasp. Refused otherwise.
     actuators : bool
         Whether every driven joint has an actuator of its name whose control is the recorded torque, with gain, offset,
         delay and lag between that and the torque that acts; without, true torques go in as `qfrc_applied`. A servo
         always is an actuator, whose control is the command.
     play : mapping of joint name to float, optional
-        Width of the play of gears [rad]: the joint is then the motor's side, and a joint `NAME_play` follows it.
+        Backlash of gears, full width [rad]: the joint is then the motor's side, and a joint `NAME_play` follows it.
 
     Returns
     -------
@@ -265,7 +265,7 @@ def _add_actuators(system: System, value: Evaluator, actuator: ElementTree.Eleme
 
 
 def mujoco_module() -> ModuleType:
-    """The mujoco package; `DataError` where it is not installed."""
+    """The imported mujoco package; `DataError` if it is not installed."""
     try:
         import mujoco
     except ImportError as error:
@@ -276,7 +276,7 @@ def mujoco_module() -> ModuleType:
 
 
 def compiled_model(text: str) -> Any:
-    """A `mujoco.MjModel` from MJCF text; `ModelError` where MuJoCo does not accept it."""
+    """A `mujoco.MjModel` compiled from MJCF text; `ModelError` if MuJoCo rejects it."""
     try:
         return mujoco_module().MjModel.from_xml_string(text)
     except ValueError as error:

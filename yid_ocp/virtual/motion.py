@@ -1,4 +1,4 @@
-"""Motions of the driven joints: sums of sines with a smooth start, scaled to how far the grippers shall travel."""
+"""Multisine motions of the driven joints with a smooth start, scaled to a given travel of the grippers."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ Array = NDArray[np.float64]
 
 
 class Movement(Protocol):
-    """How driven joints move about their initial posture, from rest."""
+    """Interface of a motion of the driven joints about their initial angles, from rest."""
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """Their names."""
+        """Names of the joints."""
         ...
 
     def at(self, t: float) -> tuple[Array, Array, Array]:
-        """Offset, velocity and acceleration at time t [s], three arrays of shape (nj,)."""
+        """Offset from the initial angles, velocity and acceleration at time t [s], three arrays of shape (nj,)."""
         ...
 
 
 @dataclass(frozen=True)
 class Motion:
-    """A smooth motion of the driven joints about their initial posture, starting at rest.
+    """A multisine motion of the driven joints about their initial angles, starting at rest.
 
     offset_j(t) = r(t) sum_i amplitude_ji sin(2 pi frequency_ji t + phase_ji), with the ramp
     r = 10 s^3 - 15 s^4 + 6 s^5, s = min(t / ramp, 1), twice continuously differentiable.
@@ -54,7 +54,7 @@ class Motion:
     ramp: float = 1.0
 
     def at(self, t: float) -> tuple[Array, Array, Array]:
-        """Offset, velocity and acceleration at time t [s], three arrays of shape (nj,)."""
+        """Offset from the initial angles, velocity and acceleration at time t [s], three arrays of shape (nj,)."""
         omega = 2 * math.pi * self.frequency
         angle = omega * t + self.phase
         sine, cosine = self.amplitude * np.sin(angle), self.amplitude * np.cos(angle)
@@ -68,7 +68,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Excitation:
-    """How far, how fast and at which frequencies a random motion goes.
+    """Amplitude, speed and frequency limits of a random multisine motion.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class Excitation:
         Largest distance of a gripper from its start [m]; every arm is scaled to it by itself. Much more than the
         default, on two arms, lets the foam Y snap from one shape to another.
     speed : float
-        No joint is asked to travel faster [rad/s]; an arm that would be is slowed by travelling less.
+        Largest joint speed [rad/s]; an arm that would exceed it travels less.
     components : int
         Sines per joint, one in each of as many equal parts (in log frequency) of `band`, and as many that shake.
     band : (float, float)
@@ -111,7 +111,7 @@ def multisine(
     posture: Mapping[str, float] | None = None,
     excitation: Excitation | None = None,
 ) -> Motion:
-    """Draw a motion at random and scale it to the wanted travel of the grippers.
+    """Draw a random multisine motion, scaled to the requested travel of the grippers.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Effects that are in no library, done in MuJoCo: what a diagnosis should call unknown.
+"""Effects outside the library, implemented in MuJoCo, whose correct verdict is `unknown`.
 
 Each is a function of the scene, MuJoCo's model, a place and a size that gives the force it adds at every inner step.
 """
@@ -20,26 +20,26 @@ Array = NDArray[np.float64]
 Force = Callable[[Any, Any], None]
 
 CREASED_LINK, CREASE_ANGLE = 1, 0.03
-"""The link before which a tube is creased, and the angle from which the crease gives way [rad]."""
+"""Index of the link before which a tube is creased, and the angle beyond which it softens [rad]."""
 CORD = 0.3
 """Length of a tether's cord [m]."""
 MAGNET_AT, MAGNET_SIZE = 0.06, 0.04
 """Distance of a magnet from the tip at rest, and the size of its pole [m]."""
 DRIFT_TIME = 5.0
-"""In which a drifting stiffness loses what it loses [s]."""
+"""Time over which a drifting stiffness decreases [s]."""
 SLIPS, SLIP_TIME = (1.5, 3.5), 0.05
-"""When a grasp slips, and how long a slip takes [s]."""
+"""Times at which a grasp slips, and the duration of a slip [s]."""
 LOAD_ANGLE, LOAD_TIME = 0.02, 0.2
-"""By which a joint turns until a loose load slides, and the time it takes [rad, s]."""
+"""Joint angle after which a loose load slides [rad], and the time constant of sliding [s]."""
 WALL_AT = 0.01
 """Distance of a soft wall from the tip at rest [m]."""
 WARM = 1.5
-"""Time in which a cold gear loses most of its friction [s]."""
+"""Time constant with which a cold gear loses its friction [s]."""
 
 
 @dataclass
 class Scene:
-    """What an effect knows of the experiment.
+    """State of the experiment that out-of-library effects read.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class Scene:
     running: bool = False
 
     def springs(self, model: Any, segment: str) -> tuple[Array, Array, Array]:
-        """Addresses, stiffnesses and rest angles of a segment's elastic joints."""
+        """Ids, stiffnesses and rest angles of a segment's elastic joints."""
         links = self.system.segment(segment).links
         joints = [joint for link in links for joint in link if joint in self.stiffness]
         return (
@@ -66,7 +66,7 @@ class Scene:
         )
 
     def bends(self, model: Any, segment: str) -> tuple[Array, Array]:
-        """Addresses of the joints that bend a segment about x and about y."""
+        """Ids of the joints that bend a segment about x and about y."""
         links = self.system.segment(segment).links
         return (
             np.array([model.joint(link[0]).id for link in links]),
@@ -74,7 +74,7 @@ class Scene:
         )
 
     def last_body(self, model: Any, place: str) -> int:
-        """Body at the end of a segment, or the one that an arm's joint carries."""
+        """Id of the body at the end of a segment, or of the body on an arm's joint."""
         named = {segment.name: segment.links[-1][-1] for segment in self.system.segments}
         return int(model.jnt_bodyid[model.joint(named.get(place, place)).id])
 
@@ -293,4 +293,4 @@ OUTSIDE: Mapping[str, Callable[[Scene, Any, str, float], Force]] = {
         slipping_grasp,
     )
 }
-"""Effects that are in no library, by name."""
+"""Effects outside the library, by kind."""

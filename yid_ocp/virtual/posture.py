@@ -1,4 +1,4 @@
-"""Where the arms stand at the start: a search for joint angles with which the grippers meet what they hold."""
+"""Inverse kinematics of the start: joint angles at which the grippers meet the points that they hold."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ELBOW_UP: Mapping[str, float] = {
     for side, sign in (("left", 1.0), ("right", -1.0))
     for joint, value in zip(BAXTER_JOINTS, (-0.40, -1.13, -0.15, 1.19, -0.08, 1.13, 0.0), strict=True)
 }
-"""Where the search for Baxter's initial posture starts [rad]: elbow above the hand, the right arm mirrored."""
+"""Initial guess of Baxter's joint angles [rad]: elbow above the hand, the right arm mirrored."""
 
 _PULL = 1e-5  # [m/rad]; moves the gripper by less than 1e-9 m
 
@@ -37,9 +37,9 @@ def initial_posture(
     seed: Mapping[str, float] | None = None,
     offsets: Mapping[str, ArrayLike] | None = None,
 ) -> dict[str, float]:
-    """Arm joint angles with which every gripper meets the end of the undeformed object, or a point beside it.
+    """Arm joint angles at which every gripper meets the end of the undeformed object, or a point beside it.
 
-    Only positions are asked for; of the solutions the search takes one near its start.
+    Only positions are matched; of several solutions one near the initial guess is returned.
 
     Parameters
     ----------

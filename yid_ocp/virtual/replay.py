@@ -1,4 +1,4 @@
-"""A recording played again by a model in MuJoCo, with what the model then gets wrong."""
+"""Replay of a recording by an exported model in MuJoCo, with the deviation from the recorded signals."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from yid_ocp.virtual.mjcf import compiled_model, mujoco_module
 Array = NDArray[np.float64]
 
 BANDWIDTH = 5.0
-"""Of what keeps driven joints from drifting away [rad/s]: slow, so that the recorded torque moves them."""
+"""Bandwidth of the feedback against drift of driven joints [rad/s]; low, so that recorded torque dominates."""
 _SMOOTHED = 2.0  # samples over which recorded angles are smoothed before they are followed
 _START = 5  # samples of which the first posture is the mean
 _AT_ENDS = 0.2  # of a recording in which what moves prescribed joints is not compared [s]: it begins anew there
@@ -28,14 +28,14 @@ _INERTIA_EVERY = 20  # steps; an arm's inertia hardly changes meanwhile
 
 @dataclass(frozen=True)
 class Error:
-    """How far a model is from what was recorded, over one channel or group.
+    """Deviation of a replayed model from the recording in one channel or group.
 
     Attributes
     ----------
     rmse : float
-        Root mean square, of points that of the distance.
+        Root mean square deviation; of points that of the distance.
     noise : float
-        What noise alone would give, zero where the recording does not say.
+        Root mean square expected from sensor noise alone, zero if the recording does not state it.
     unit : str
     """
 
@@ -45,12 +45,12 @@ class Error:
 
     @property
     def beyond_noise(self) -> float:
-        """Root of the mean square that noise does not explain, zero where it explains all."""
+        """Root mean square deviation in excess of the noise, zero if noise explains all."""
         return float(np.sqrt(max(self.rmse**2 - self.noise**2, 0.0)))
 
 
 def replay(text: str, system: System, recording: Recording) -> dict[str, Error]:
-    """Let a model that was exported play a recording.
+    """Replay a recording with an exported model and return its deviations by channel.
 
     Driven joints get the recorded torque as the control of their actuators, and beside it a weak pull to the recorded
     angles (`BANDWIDTH`), without which any error of a torque lets an arm drift away. Position servos get what they were

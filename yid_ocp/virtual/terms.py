@@ -1,7 +1,7 @@
-"""What a system and its effects are in the terms of an engine for rigid bodies: springs, dampers, friction, actuators.
+"""A system and its effects in terms of a rigid-body engine: springs, dampers, friction, actuators.
 
-Nothing here depends on a format. An effect is looked at through what it does to the description and through its
-equations, so that kinds from outside the package are treated like those of the library.
+Nothing here depends on a format. An effect is classified by the parts of the description it changes and by its
+equations, so kinds from outside the package are treated like those of the library.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ ASPECTS: Mapping[str, str] = {
     "memory": "forces with a memory",
     "force": "forces that no joint, spring or damper makes",
 }
-"""What an engine may be able to express or not, in words."""
+"""Aspects of a model that an engine may or may not represent, with their descriptions."""
 
 DRY_FRICTION: Mapping[str, str] = {"joint_coulomb": "tau_c", "joint_presliding": "tau_c"}
-"""Kinds that are dry friction up to a rounded corner, and their quantity of the friction [N m]."""
+"""Kinds that are smoothed dry friction, and the parameter with their friction torque [N m]."""
 
 _POINTS = 3  # at which equations are compared
 _ROUNDING = 1e-9
@@ -53,7 +53,7 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class JointTerms:
-    """What effects add at one joint, in SI units of its coordinate.
+    """Spring, damping, inertia and friction at one joint, in SI units of its coordinate.
 
     Attributes
     ----------
@@ -76,9 +76,9 @@ class JointTerms:
 
 @dataclass(frozen=True)
 class Actuation:
-    """What acts at a driven joint: gain x recorded - offset, so late, following with a time constant [s].
+    """Applied torque of a driven joint from the recorded one: gain x recorded - offset, delay [s], first-order lag [s].
 
-    It is a torque, or what the joint's servo is commanded.
+    With a position servo it is the commanded position instead.
     """
 
     gain: float = 1.0
@@ -88,7 +88,7 @@ class Actuation:
 
 
 class Evaluator:
-    """Numbers of expressions in a system's parameters, each flattened column by column.
+    """Evaluator of expressions in a system's parameters; values are flattened column by column.
 
     Parameters
     ----------
@@ -101,20 +101,20 @@ class Evaluator:
         self._symbols, self._theta = system.parameters.symbols, system.parameters.vector(values)
 
     def __call__(self, expression: ca.SX) -> Array:
-        """Values of an expression in nothing but parameters."""
+        """Values of an expression that depends on parameters only."""
         return np.array(ca.densify(ca.Function("value", [self._symbols], [expression])(self._theta))).ravel(order="F")
 
     def vanishes(self, expression: ca.SX) -> bool:
-        """Whether an expression, of other symbols as well, is zero whatever these are."""
+        """Whether an expression is zero for all values of its other symbols."""
         return bool(ca.sparsify(self.numeric(expression)).is_zero())
 
     def numeric(self, expression: ca.SX) -> ca.SX:
-        """An expression with numbers in place of parameters."""
+        """The expression with parameters replaced by their values."""
         return ca.substitute(expression, self._symbols, ca.DM(self._theta))
 
 
 def description_aspects(system: System, symbols: ca.SX) -> set[str]:
-    """What of the description some parameters enter, by the keys of `ASPECTS`."""
+    """Keys of `ASPECTS` for the parts of the description that depend on given parameters."""
     tree = system.mechanism
     bodies = [body for joint in tree.joints for body in joint.bodies]
     held = system.grasps
@@ -146,7 +146,7 @@ def description_aspects(system: System, symbols: ca.SX) -> set[str]:
 
 
 def effect_aspects(system: System, effect: Effect, value: Evaluator) -> tuple[dict[str, JointTerms], set[str]]:
-    """What an effect is in an engine's terms.
+    """Joint terms and aspects of an effect in a rigid-body engine.
 
     Parameters
     ----------
@@ -158,9 +158,9 @@ def effect_aspects(system: System, effect: Effect, value: Evaluator) -> tuple[di
     Returns
     -------
     terms : dict of joint name to JointTerms
-        What its equations add at single joints.
+        Terms that its equations add at single joints.
     aspects : set of str
-        Keys of `ASPECTS`, all that it does.
+        Keys of `ASPECTS` of everything it changes.
     """
     aspects = description_aspects(system, effect.parameters.symbols)
     terms: dict[str, JointTerms] = {}
@@ -189,9 +189,9 @@ def effect_aspects(system: System, effect: Effect, value: Evaluator) -> tuple[di
 
 
 def joint_terms(system: System, value: Evaluator) -> dict[str, JointTerms]:
-    """Springs, dampers, rotors and friction of every joint that has any: the description's and those of effects.
+    """Springs, dampers, rotor inertia and friction by joint, from the description and from effects.
 
-    Effects that are more than that count as far as they are that; `effect_aspects` says which.
+    Of other effects only these parts are included; the aspects of `effect_aspects` show what is missing.
     """
     found: dict[str, JointTerms] = {}
 
@@ -214,7 +214,7 @@ def joint_terms(system: System, value: Evaluator) -> dict[str, JointTerms]:
 
 
 def actuation(system: System, value: Evaluator) -> dict[str, Actuation]:
-    """What lies between the recorded torque of every driven joint and the torque that acts."""
+    """Relation between the recorded and the applied torque, by driven joint."""
     return {joint: _actuation(system, system.effects, joint, value) for joint in system.driven}
 
 

@@ -1,4 +1,4 @@
-"""What is common to all frames of a sequence: where the camera stands, how it scales depth, and its clock.
+"""Calibration of the camera of a sequence: pose, depth scale and offset, and clock.
 
 The robot is the calibration target: all ten numbers are estimated together from the arm in a sample of the frames
 (`registration`), from starts that are looked for about what is told. Priors about that are wide; they decide where the
@@ -58,7 +58,7 @@ _CONTRADICTED = 3.0  # standard deviations
 
 @dataclass(frozen=True)
 class CalibrationOptions:
-    """What is known of the camera beforehand, and how the arm that it sees is used to know better."""
+    """Priors of the camera calibration, and how the visible arm is used for it."""
 
     fix_pose: Annotated[
         bool,
@@ -88,7 +88,7 @@ class CalibrationOptions:
         check(self, "calibration options")
 
     def precision(self, clock: ClockOptions) -> Array:
-        """Inverse covariance of what is told, shape (10, 10)."""
+        """Inverse covariance of the prior, shape (10, 10)."""
         std = [*[self.turn_std] * 3, *[self.shift_std] * 3, self.scale_std, self.depth_std]
         # a uniform distribution over what is searched; taken as it is where nothing is
         return np.diag(np.array([*std, max(clock.search / math.sqrt(3.0), 1e-6), clock.drift_std]) ** -2)
@@ -96,7 +96,7 @@ class CalibrationOptions:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """The camera of a sequence.
+    """Calibrated camera of a sequence.
 
     Attributes
     ----------
@@ -132,7 +132,7 @@ class Calibration:
         return self.state.pose[:3, 3]
 
     def common_std(self, points: Array, velocity: Array, stamps: Array) -> Array:
-        """Standard deviations of points that come with the camera's pose, depth and clock.
+        """Standard deviations of points due to uncertainty of the camera's pose, depth and clock.
 
         Parameters
         ----------
@@ -161,7 +161,7 @@ class Calibration:
 
 
 def as_given(pose: Array, options: ClockOptions, reason: str = "") -> Calibration:
-    """The camera as the frames and the settings have it, where nothing can be estimated for a reason."""
+    """Camera calibration taken from the frames and settings without estimation, with the reason."""
     text = f"clock offset {1e3 * options.offset:.0f} ms as given" + (f": {reason}" if reason else "")
     state = CameraState(pose, offset=options.offset)
     return Calibration(state, state, None, np.zeros((SIZE, SIZE)), np.zeros(SIZE), None, 0, text)
@@ -176,7 +176,7 @@ def calibrate(
     clock: ClockOptions,
     source: str = "sequence",
 ) -> Calibration:
-    """Estimate what is common to a sequence from some of its frames.
+    """Calibrate the camera of a sequence from some of its frames.
 
     Parameters
     ----------

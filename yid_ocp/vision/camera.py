@@ -81,7 +81,7 @@ class DepthCamera:
         return np.asarray(z**2 / (self.pinhole.fx * self.baseline) * spread)
 
     def measure(self, depth: Array, cosine: Array, rng: np.random.Generator) -> Array:
-        """Measured depth image.
+        """Simulated measurement of a depth image, with noise and lost pixels.
 
         Parameters
         ----------
@@ -136,7 +136,7 @@ class DepthCamera:
 
 @dataclass(frozen=True)
 class FrameTiming:
-    """When a camera takes frames, and what happens to them and to their time stamps.
+    """Timing model of a camera: frame rate, dropped frames and errors of time stamps.
 
     Attributes
     ----------
@@ -177,7 +177,7 @@ class FrameTiming:
 
 @dataclass(frozen=True, eq=False)
 class VirtualFrames:
-    """A virtual camera's frame sequence with what really was.
+    """Frame sequence of a virtual camera with the true times and configurations.
 
     Attributes
     ----------
@@ -201,13 +201,13 @@ class VirtualFrames:
 
 @dataclass(frozen=True)
 class Background:
-    """What stands around the robot: a floor at z and a wall at x [m], None for neither."""
+    """Floor at height z and wall at position x around the robot [m]; None leaves one out."""
 
     floor: float | None = -0.93
     wall: float | None = -0.6
 
     def mesh(self) -> Mesh | None:
-        """Thin boxes."""
+        """Mesh of floor and wall as thin boxes; None if there is neither."""
         parts = []
         if self.floor is not None:
             at = np.eye(4)
@@ -246,7 +246,7 @@ class _Images(Sequence[Array]):
 
 @dataclass(frozen=True, eq=False)
 class VirtualCamera:
-    """A depth camera, where it stands and when it looks.
+    """Virtual depth camera: sensor model, pose and frame timing.
 
     Attributes
     ----------
@@ -269,7 +269,7 @@ class VirtualCamera:
 
 
 def virtual_frames(scene: Scene, t: ArrayLike, q: ArrayLike, camera: VirtualCamera) -> VirtualFrames:
-    """Let a virtual camera look at a motion.
+    """Render the frames that a virtual camera takes of a motion.
 
     Parameters
     ----------

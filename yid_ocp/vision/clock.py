@@ -1,4 +1,4 @@
-"""How the camera's clock is compared with the joints', and which frames were stamped late.
+"""Comparison of the camera's clock with the joints' clock, and detection of late time stamps.
 
 The common offset of the two clocks and its drift are part of the calibration. Here a frame is taken by itself: its own
 offset is where the robot's surface lies best on its points, and a frame whose own offset is another than the common one
@@ -41,7 +41,7 @@ _LARGEST_CHANGE = 0.05  # of an offset in one iteration [s]
 
 @dataclass(frozen=True)
 class ClockOptions:
-    """How the camera's clock is compared with the joints'."""
+    """Settings of the comparison of the camera's clock with the joints' clock."""
 
     offset: Annotated[float, About("stamp minus joint time, as far as known", "s")] = 0.0
     search: Annotated[
@@ -67,7 +67,7 @@ class ClockOptions:
 
 @dataclass(frozen=True)
 class OwnOffset:
-    """One frame by itself.
+    """Delay of one frame's time stamp beyond the common clock offset.
 
     Attributes
     ----------
@@ -92,7 +92,7 @@ def own_offset(
     rng: np.random.Generator,
     usual: float = 0.0,
 ) -> OwnOffset | None:
-    """The offset of one frame's own.
+    """Estimate the delay of one frame's time stamp beyond the common offset.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ def _mean_square(error: Array, count: int) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Usual:
-    """What is usual among frames.
+    """Frames that agree on one clock offset, and their median misfit.
 
     Attributes
     ----------
@@ -181,7 +181,7 @@ class Usual:
 
 
 def agreed(own: Sequence[OwnOffset | None]) -> Usual:
-    """Frames whose own offsets agree: those stamped late must not pull the others."""
+    """Frames whose delays agree, so that frames stamped late do not bias the others."""
     known = [(i, entry) for i, entry in enumerate(own) if entry is not None and math.isfinite(entry.std)]
     if not known:
         return Usual((), 0.0)
@@ -193,5 +193,5 @@ def agreed(own: Sequence[OwnOffset | None]) -> Usual:
 
 
 def is_late(own: OwnOffset, options: ClockOptions) -> bool:
-    """Whether a frame was stamped late, beyond doubt."""
+    """Whether a frame's time stamp is significantly late."""
     return abs(own.delay) > max(options.late, _LATE * own.std)

@@ -1,4 +1,4 @@
-"""Files that hold one frame: clouds with or without colours, and depth images."""
+"""Reading and writing of files of one frame: clouds with or without colours, and depth images."""
 
 from __future__ import annotations
 

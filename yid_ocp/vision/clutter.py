@@ -1,4 +1,4 @@
-"""What stands about the object: left out where it is known, and named where it is not.
+"""Clutter around the object: removal of the known background, and a list of other foreign objects.
 
 Known are the robot, meshes fixed to its links or to the world (`ExtraMesh`), and a background: what an empty scene
 showed, or what stood still through most frames away from every shape that was fitted.
@@ -39,7 +39,7 @@ _TO_SIGMA = 1.4826
 
 @dataclass(frozen=True, eq=False)
 class Background:
-    """Places that were not the object's.
+    """Background points that do not belong to the object.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class Background:
         return cKDTree(self.points)
 
     def contains(self, points: Array, beyond: float = 0.0) -> Mask:
-        """Which points, shape (N, 3), lie within its distance and so much more [m], shape (N,)."""
+        """Whether points, shape (N, 3), lie within `within + beyond` [m] of the background, shape (N,)."""
         if not len(self.points) or not len(points):
             return np.zeros(len(points), bool)
         reach = self.within + beyond
@@ -65,7 +65,7 @@ class Background:
 
     @staticmethod
     def empty_scene(clouds: Sequence[Array], voxel: float, noise: float) -> Background:
-        """What frames of the scene without robot and object show: clouds in the world [m]."""
+        """Background from clouds of the scene without robot and object, in the world [m]."""
         if not clouds:
             return Background()
         cells = np.unique(np.floor(np.concatenate(clouds) / voxel).astype(np.int64), axis=0)
@@ -73,7 +73,7 @@ class Background:
 
     @staticmethod
     def still(clouds: Sequence[Array], shapes: Sequence[Tubes], voxel: float, noise: float, near: float) -> Background:
-        """What stands in most frames where no fitted shape ever came.
+        """Background from points that stay in most frames away from every fitted shape.
 
         Parameters
         ----------
@@ -101,7 +101,7 @@ class Background:
 
 
 def extra_meshes(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> dict[int, list[Mesh]]:
-    """Meshes of things that the URDF does not have, by the joint that carries them, -1 for the world.
+    """Meshes that the URDF does not have, by the index of the joint that carries them, -1 for the world.
 
     Raises
     ------
@@ -148,7 +148,7 @@ def _shape(entry: ExtraMesh, where: str) -> Mesh:
 
 @dataclass(frozen=True, eq=False)
 class Foreign:
-    """A thing that is not the object, over the frames.
+    """Foreign object seen in several frames.
 
     Attributes
     ----------
@@ -182,7 +182,7 @@ def foreign(
     coloured: bool,
     background: bool = False,
 ) -> tuple[Foreign, ...]:
-    """Put together what the frames saw of the same things, and say what helps.
+    """Group the foreign clusters of all frames into foreign objects, each with advice.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What is common to all frames of a sequence, found from some of them before any is judged."""
+"""Calibration shared by all frames of a sequence, estimated from a subset of them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from yid_ocp.vision.doubt import Sizes
 
 @dataclass(frozen=True, eq=False)
 class Common:
-    """Camera, object and surroundings of a sequence.
+    """Camera calibration, object dimensions and background of a sequence.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Are the tubes as long and as thick as the model says? Asked of the clouds of many frames together.
+"""Check of the model's tube lengths and radii against the clouds of many frames.
 
 Every frame has a least cost about the sizes x (logarithms of lengths and radii, relative to the model's), the bends
 following: g_f'x + x'S_f x/2 (`SizeRows`). Together, with a wide prior P,
@@ -41,7 +41,7 @@ _TO_SIGMA = 1.4826
 
 @dataclass(frozen=True, eq=False)
 class Sizes:
-    """What the frames say of the tubes' lengths and radii.
+    """Tube lengths and radii estimated from the frames, compared with the model.
 
     Attributes
     ----------
@@ -68,12 +68,12 @@ class Sizes:
 
     @property
     def std(self) -> Array:
-        """Of `change`, shape (2 s,)."""
+        """Standard deviation of `change`, shape (2 s,)."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Which sizes the frames say anything of, shape (2 s,)."""
+        """Which dimensions the frames determine, shape (2 s,)."""
         return np.asarray((self.std < _KNOWN) & (self.frames > 0))
 
     @property
@@ -110,7 +110,7 @@ class Sizes:
         return tuple(lines)
 
     def std_of(self, points: Array) -> Array:
-        """What wrong and uncertain sizes do to points.
+        """Standard deviations of points due to wrong and uncertain dimensions.
 
         Parameters
         ----------
@@ -141,7 +141,7 @@ def ask_sizes(
     std: tuple[float, float],
     fitted: Callable[[Mapping[str, float], Sequence[Array]], list[Fit]],
 ) -> Sizes:
-    """Ask some frames about the sizes.
+    """Estimate the tubes' dimensions from some frames and compare them with the model.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Which end of an object is its root, where its model does not say where it stands; told over all frames."""
+"""Selection of the object's root end from all frames, for a model without a fixed root."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _HANGING = 0.2  # of the length between the ends, by which one is higher
 
 
 def told(frames: Sequence[FrameReport], options: TrackOptions) -> tuple[list[FrameReport], str]:
-    """The frames with one end as the root in all of them, and how it was told from the other, in words.
+    """Frames with the same end as root in all of them, and the criterion in words.
 
     Where a shape fits as well with its root at another end, the ends are followed from frame to frame first. Then the
     root is the one that stays in its place, if it is fixed, or the higher one.
@@ -92,7 +92,7 @@ def _fixed(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameRe
 
 
 def touching(centre_line: Array, radius: Array) -> bool:
-    """Whether parts of a shape that are far apart along it touch.
+    """Whether a shape touches itself at parts that are far apart along it.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a frame's cloud says for and against a shape: which points are its own, which foreign, and where it has none.
+"""Assessment of a shape by a frame's cloud: own points, foreign points, and links without points.
 
 Points within three standard deviations of the tubes' surface lie on the shape. Of the others, those that hang together
 and are as many as a piece of tube as long as it is wide would have are a thing. Where a thing's surface goes on from
@@ -43,7 +43,7 @@ _AHEAD = 0.5  # of its length, by which a tube may be too short and its end stil
 
 @dataclass(frozen=True, eq=False)
 class Tubes:
-    """The links of a shape in the world.
+    """Links of a shape as cylinders in the world.
 
     Attributes
     ----------
@@ -64,12 +64,12 @@ class Tubes:
 
     @property
     def lengths(self) -> Array:
-        """Of the links, shape (K,) [m]."""
+        """Length of each link, shape (K,) [m]."""
         return np.asarray(np.linalg.norm(self.corners[:, 1] - self.corners[:, 0], axis=1))
 
 
 def nearest(corners: Array, radius: Array, points: Array, share: float = 1.0) -> tuple[Integers, Array, Array, Array]:
-    """Nearest place of tubes to points.
+    """Nearest place on tubes for each point.
 
     Parameters
     ----------
@@ -107,13 +107,13 @@ def nearest(corners: Array, radius: Array, points: Array, share: float = 1.0) ->
 
 
 def away_from(normal: Array, sight: Array) -> Mask:
-    """Which points would lie on the side that is turned away from the camera, by normal and line of sight (N, 3)."""
+    """Whether surface normals (N, 3) face away from the camera, by lines of sight (N, 3)."""
     return np.asarray(np.einsum("ij,ij->i", normal, sight) > -_AWAY * np.linalg.norm(sight, axis=1))
 
 
 @dataclass(frozen=True, eq=False)
 class Thing:
-    """Points that hang together and belong to no tube.
+    """Cluster of points that belong to no tube.
 
     Attributes
     ----------
@@ -131,7 +131,7 @@ class Thing:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What the points say of a shape.
+    """Classification of a frame's points by a shape, and how much of the shape they cover.
 
     Attributes
     ----------
@@ -170,7 +170,7 @@ class Evidence:
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What one frame knows: processed points and how they were seen.
+    """Processed points of one frame with the camera and occlusion that they were seen with.
 
     Attributes
     ----------
@@ -199,7 +199,7 @@ class Sight:
 
     @cached_property
     def tree(self) -> cKDTree:
-        """Of the points."""
+        """Search tree of the points."""
         return cKDTree(self.points)
 
     @cached_property
@@ -210,7 +210,7 @@ class Sight:
         return max(float(np.median(self.tree.query(self.points, k=2)[0][:, 1])), 1e-4)
 
     def hidden(self, places: Array, radius: Array, margin: float) -> Mask:
-        """Which places the camera or the filters leave no points of, shape (S,)."""
+        """Whether places are hidden from the camera or removed by filters, shape (S,)."""
         hidden = np.zeros(len(places), bool)
         if self.view is not None:
             hidden |= self.view.hidden(places, radius, margin)
@@ -220,7 +220,7 @@ class Sight:
 
 
 def gather(tubes: Tubes, seen: Sight, near: float) -> Evidence:
-    """Ask a frame's points about a shape.
+    """Assess a shape by a frame's points.
 
     Parameters
     ----------
@@ -285,7 +285,7 @@ def gather(tubes: Tubes, seen: Sight, near: float) -> Evidence:
 
 
 def slender(sight: Sight, radius: float) -> tuple[Mask, Mask]:
-    """Which nodes and points lie where the surface is no wider than tubes are.
+    """Whether nodes and points lie where the surface is as narrow as a tube.
 
     About a tube points spread by its length in one direction and by r/sqrt(3) across; on a table, a wall or a body they
     spread as far in two.

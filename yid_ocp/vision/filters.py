@@ -1,4 +1,4 @@
-"""From a camera's cloud to the points of the object: pass-through, voxels, robot self-filter, statistical outliers."""
+"""Filters that keep the object's points: pass-through, voxel grid, robot self-filter, statistical outliers."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _TO_SIGMA = 1.4826  # from the median absolute deviation of a normal distributio
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Points with weights.
+    """Point cloud with weights.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Cloud:
 
 @dataclass(frozen=True)
 class FilterOptions:
-    """What counts as the object."""
+    """Settings of the filters that select the object's points."""
 
     voxel: Annotated[float, Gt(0), About("edge of the cubes in which points are averaged", "m")] = 0.008
     padding: Annotated[
@@ -119,7 +119,7 @@ class FilterOptions:
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Where the object can be at all.
+    """Bounds of the region that the object can reach.
 
     Attributes
     ----------
@@ -143,7 +143,7 @@ class Region:
     limit: float
 
     def contains(self, points: Array) -> Mask:
-        """Which points, shape (N, 3), lie inside, shape (N,)."""
+        """Whether points, shape (N, 3), lie inside, shape (N,)."""
         inside = np.ones(len(points), bool)
         for axis in range(3):  # column by column, which is quicker than whole rows on large clouds
             inside &= (points[:, axis] >= self.lower[axis]) & (points[:, axis] <= self.upper[axis])
@@ -156,7 +156,7 @@ class Region:
 
 
 class ObjectRegion:
-    """Works out where the object can be, from how far its branches reach and what it stands on.
+    """Region that the object can reach, from the length of its branches and the floor.
 
     Parameters
     ----------
@@ -248,12 +248,12 @@ def voxel_grid(points: Array, size: float) -> Cloud:
 
 
 def without_robot(cloud: Cloud, robot: Surfaces, q: ArrayLike, padding: float) -> Mask:
-    """Which points are not the robot's: further than `padding` [m] from its surface at a configuration, shape (N,)."""
+    """Whether points are further than `padding` [m] from the robot's surface, shape (N,)."""
     return ~robot.within(cloud.points, q, padding)
 
 
 def without_outliers(cloud: Cloud, neighbours: int, ratio: float, asked: Mask | None = None) -> Mask:
-    """Which points have company: statistical outlier removal.
+    """Whether points are inliers of statistical outlier removal.
 
     A point stays where the mean distance d to its nearest neighbours satisfies  d <= median(d) + ratio s,  with s the
     median absolute deviation turned into a standard deviation. Both are weighted, so that wrong points, each alone in
@@ -291,7 +291,7 @@ def without_outliers(cloud: Cloud, neighbours: int, ratio: float, asked: Mask | 
 
 
 def of_colours(colours: ArrayLike, wanted: ArrayLike, angle: float) -> Mask:
-    """Which points have one of some colours.
+    """Whether points have one of the given colours.
 
     Parameters
     ----------
@@ -318,7 +318,7 @@ def _light(colours: Array) -> Array:
 
 
 def weighted_median(values: Array, weight: Array) -> float:
-    """Value below and above which lies half of the weight."""
+    """Weighted median of values."""
     order = np.argsort(values)
     total = np.cumsum(weight[order])
     return float(values[order[np.searchsorted(total, 0.5 * total[-1])]])

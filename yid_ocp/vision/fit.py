@@ -39,7 +39,7 @@ Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 NODE_FACTOR = math.pi / 4
-"""Where the mean of a tube's visible half lies, as a share of its radius."""
+"""Distance of the mean of a tube's visible half from its axis, as a fraction of its radius."""
 
 _SIGMAS = 3.0  # of a point, beyond which an end stands elsewhere than the shape has it
 _NEAR = 3.0  # times the last scale, beyond which a point says nothing of the shape
@@ -51,7 +51,7 @@ _TOLERANCE = 1e-4  # of a bend [rad] and, relative, of the cost, at which a pass
 
 @dataclass(frozen=True)
 class FitOptions:
-    """How a shape is fitted."""
+    """Settings of the shape fit."""
 
     scales: Annotated[
         tuple[Annotated[float, Gt(0)], ...],
@@ -101,7 +101,7 @@ class FitOptions:
 
 
 class ShapeFit:
-    """Fits the shape of a system's object to what a camera saw.
+    """Fitter of the shape of a system's object to a camera's points.
 
     Parameters
     ----------
@@ -436,7 +436,7 @@ class ShapeFit:
         return np.asarray(covered.any(axis=0) | np.array([name in held for name in self.system.points]))
 
     def starts(self) -> Starts:
-        """What finds starts for a system whose root is sought (`starts.loosened`)."""
+        """Finder of initial shapes for a system with a free root (`starts.loosened`)."""
         lengths = np.linalg.norm(np.diff(np.array(self._corners(self.rest)[0]).reshape(-1, 2, 3), axis=1)[:, 0], axis=1)
         by_owner = {name: lengths[[name == owner for owner in self.owner]] for name in dict.fromkeys(self.owner)}
         return Starts(self.system, self._tree, self.rest, self.bends, by_owner)
@@ -495,16 +495,16 @@ class ShapeFit:
         return SizeRows(pull, curvature, moved.reshape(-1, 3, 2 * many))
 
     def tubes(self, q: Array) -> Tubes:
-        """The tubes at a configuration."""
+        """Tube links in the world at a configuration."""
         corners = np.array(self._corners(q)[0]).reshape(-1, 2, 3)
         return Tubes(corners, self.radius, self.free_ends, self.reach)
 
     def grips(self, q: ArrayLike) -> Array:
-        """Where the grippers are at a configuration, shape (grasps, 3) [m]."""
+        """Gripper positions at a configuration, shape (grasps, 3) [m]."""
         return np.array(self._holders(np.asarray(q, float))).reshape(-1, 3)
 
     def place(self, q: ArrayLike) -> Array:
-        """The system's points at a configuration, shape (np, 3) [m]."""
+        """Positions of the system's points at a configuration, shape (np, 3) [m]."""
         return np.array(self._seen(np.asarray(q, float))[0]).reshape(-1, 3)
 
 

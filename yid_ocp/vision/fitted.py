@@ -1,4 +1,4 @@
-"""What one frame's fit leaves: the shape, how well it is known, what speaks against it. Small and plain data."""
+"""Result of one frame's shape fit: shape, uncertainty and quality measures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class SizeRows:
-    """What one frame says of the tubes' sizes, the bends following as they like best.
+    """Quadratic cost of the tubes' dimensions in one frame, minimised over the bends.
 
     The sizes are the logarithms of all lengths and then of all radii, segment by segment, relative to the values of the
     fit. About these the least cost is  g'x + x'Sx/2.
@@ -34,7 +34,7 @@ class SizeRows:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A shape and how good it is.
+    """Fitted shape of one frame with its uncertainty and quality.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class Fit:
 
     @property
     def covered(self) -> float:
-        """Share of the shape's visible length that has points of its own."""
+        """Fraction of the shape's visible length that has points."""
         lengths = np.linalg.norm(self.centre_line[:, 1] - self.centre_line[:, 0], axis=1)
         there, bare = float(lengths @ self.filled), float(lengths @ self.empty)
         return there / max(there + bare, 1e-12)

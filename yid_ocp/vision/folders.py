@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 FORMAT = "yid-frames/1"
 CAMERA_FILE, STAMP_FILE = "camera.json", "timestamps.csv"
 UNITS: Mapping[str, float] = {"m": 1.0, "mm": 1e-3}
-"""Units in which clouds may be, and their size in metres."""
+"""Allowed units of clouds and their size in metres."""
 
 _KEYS = ("format", "pose", "frame", "unit", "intrinsics", "depth_unit", "description")
 

@@ -38,7 +38,7 @@ def open3d_module() -> ModuleType:
 
 @dataclass(frozen=True, eq=False)
 class FrameSequence:
-    """Clouds of one camera, loaded one at a time.
+    """Sequence of clouds of one camera, loaded one at a time.
 
     Attributes
     ----------

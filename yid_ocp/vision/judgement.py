@@ -1,4 +1,4 @@
-"""Which frames are good, and how well their points are known: judged over the small results of all frames."""
+"""Selection of good frames and uncertainty of their points, from the fit results of all frames."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _MEAN_ABS = math.sqrt(2.0 / math.pi)  # of a normal variable, in standard deviat
 
 
 def unfit(fit: Fit, shape: ShapeFit, options: TrackOptions) -> str:
-    """Why a frame's fit cannot be used, by itself; empty for a good one."""
+    """Reason why a frame's fit is rejected on its own; empty for a good one."""
     if not np.isfinite(fit.q).all():
         return "the fit failed"
     # a mean distance of normal noise is 0.8 of its standard deviation
@@ -48,7 +48,7 @@ def unfit(fit: Fit, shape: ShapeFit, options: TrackOptions) -> str:
 
 
 def judged(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameReport]:
-    """Drop those of the good frames that are unlike the others."""
+    """Frames, with those that deviate from the other good frames marked as dropped."""
     fits = [frame.fit for frame in frames if frame.good and frame.fit is not None]
     if not fits:
         return list(frames)
@@ -72,7 +72,7 @@ def _compared(frame: FrameReport, usual: float, gap: Array, options: TrackOption
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Points of the good frames.
+    """Tracked points of the good frames.
 
     Attributes
     ----------
@@ -98,7 +98,7 @@ def measured(
     options: TrackOptions,
     source: str,
 ) -> Measured:
-    """Points of the good frames with standard deviations.
+    """Tracked points of the good frames with standard deviations.
 
     Parameters
     ----------

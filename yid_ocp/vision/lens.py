@@ -79,13 +79,13 @@ class Pinhole:
 
     @staticmethod
     def of_view(width: int, height: int, horizontal: float) -> Pinhole:
-        """Square pixels, the principal point in the middle, and a horizontal angle of view [rad]."""
+        """Intrinsics with square pixels and a centred principal point, from a horizontal field of view [rad]."""
         focal = 0.5 * width / math.tan(0.5 * horizontal)
         return Pinhole(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1))
 
     @property
     def distorted(self) -> bool:
-        """Whether straight lines look bent."""
+        """Whether the lens has distortion."""
         return any(self.coefficients)
 
     @property
@@ -125,7 +125,7 @@ class Pinhole:
         return points
 
     def seen(self, depth: Array) -> NDArray[np.bool_]:
-        """Pixels of a depth image that become points, shape (height, width); `DataError` for one of another size."""
+        """Whether each pixel of a depth image is measured, shape (height, width); `DataError` for another size."""
         if depth.shape != (self.height, self.width):
             raise DataError(f"the depth image has shape {depth.shape}", allowed=f"({self.height}, {self.width})")
         measured = np.isfinite(depth) & (depth > 0)

@@ -42,7 +42,7 @@ _NEAR = 0.05  # [m]; closer than this a box is not projected but taken to fill t
 
 @dataclass(frozen=True)
 class ExtraMesh:
-    """Something that the robot's URDF does not have: a gripper's body, a table, a camera's stand."""
+    """Mesh that the robot's URDF does not have, such as a gripper's body, a table or a camera stand."""
 
     frame: Annotated[str | None, About("link of the robot that carries it; null for the world")] = None
     mesh: Annotated[str | None, About("file that trimesh reads, in metres: STL, OBJ, DAE", path=True)] = None
@@ -90,7 +90,7 @@ class Mesh:
     faces: NDArray[np.int64]
 
     def moved(self, pose: ArrayLike) -> Mesh:
-        """The mesh seen from the frame in which its own has this pose, shape (4, 4)."""
+        """Mesh transformed by a pose, shape (4, 4)."""
         matrix = np.asarray(pose, float)
         return Mesh(self.vertices @ matrix[:3, :3].T + matrix[:3, 3], self.faces)
 
@@ -175,7 +175,7 @@ class _Cells:
 
 
 class Surfaces:
-    """Meshes on the joints of a mechanism, and what rays and points find of them.
+    """Meshes on the joints of a mechanism, with ray and distance queries.
 
     Parameters
     ----------
@@ -260,7 +260,7 @@ class Surfaces:
         return inside
 
     def within(self, points: Array, q: ArrayLike, reach: float) -> NDArray[np.bool_]:
-        """Which points are no further from a surface than `reach` [m], shape (N,); the same as by `distance`, quicker.
+        """Whether points lie within `reach` [m] of a surface, shape (N,); faster than `distance`.
 
         No distance differs from that of a place by more than the way there: the cell in which a point lies, whose
         centre's distance is kept, mostly tells.
@@ -282,7 +282,7 @@ class Surfaces:
         return result
 
     def closest(self, points: Array, q: ArrayLike, within: float) -> tuple[Array, Array, NDArray[np.int64]]:
-        """Nearest moving surface of points, and the way there.
+        """Distance, normal and part of the nearest moving surface for each point.
 
         Parameters
         ----------
@@ -326,7 +326,7 @@ class Surfaces:
         return distance, normal, owner
 
     def cast(self, pinhole: Pinhole, pose: ArrayLike, q: ArrayLike) -> tuple[Array, Array, NDArray[np.int64]]:
-        """Depth image without noise, how squarely each pixel's ray meets the surface, and whose surface it is.
+        """Noise-free depth image, cosine of incidence and surface part of each pixel.
 
         Parameters
         ----------
@@ -372,7 +372,7 @@ class Surfaces:
         return depth, cosine, owner
 
     def meet(self, origin: Array, directions: Array, q: ArrayLike) -> tuple[Array, Array, NDArray[np.int64]]:
-        """Where rays first meet a surface, the fixed ones among them.
+        """First intersection of rays with moving or fixed surfaces.
 
         Parameters
         ----------
@@ -494,7 +494,7 @@ def file_mesh(file: Path) -> Mesh:
 
 
 def mesh_file(name: str, urdf: Path) -> Path:
-    """File that a URDF means by a mesh's name: `package://`, `file://`, absolute or beside the URDF.
+    """Path of a mesh file named in a URDF: `package://`, `file://`, absolute or beside the URDF.
 
     Raises
     ------

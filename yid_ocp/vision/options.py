@@ -1,4 +1,4 @@
-"""Settings of the whole way from frames to measured points."""
+"""Settings of tracking, from frames to measured points."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ RootPlace = Literal["model", "fixed", "free"]
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """How a frame sequence is turned into measured points, and which of its frames are good."""
+    """Settings that turn a frame sequence into measured points and select its good frames."""
 
     filters: Annotated[FilterOptions, About("what counts as the object")] = field(default_factory=FilterOptions)
     walk: Annotated[WalkOptions, About("how a cloud is thinned")] = field(default_factory=WalkOptions)

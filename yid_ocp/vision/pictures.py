@@ -1,4 +1,4 @@
-"""Pictures of a frame's stages and of a whole track, drawn without a display."""
+"""Figures of a frame's processing stages and of a whole track."""
 
 from __future__ import annotations
 

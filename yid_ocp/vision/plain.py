@@ -1,4 +1,4 @@
-"""Results as plain data and back, so that other processes can make them and files can keep them."""
+"""Conversion of result dataclasses to JSON data and back."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Result = TypeVar("Result")
 
 
 def plain(value: Any) -> Any:
-    """A dataclass of numbers, texts, arrays and other such dataclasses as JSON can hold it, numbers to the last bit.
+    """Nested dataclass of numbers, texts and arrays as JSON data, without loss of precision.
 
     JSON has no infinities: what is not finite becomes text.
     """
@@ -34,7 +34,7 @@ def plain(value: Any) -> Any:
 
 
 def remade(kind: type[Result], data: Mapping[str, Any]) -> Result:
-    """The dataclass that `plain` was given."""
+    """Dataclass instance restored from the data that `plain` returned."""
     return kind(**{name: _value(hint, data[name]) for name, hint in _hints(typing.cast(typing.Hashable, kind)).items()})
 
 

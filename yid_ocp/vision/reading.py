@@ -1,4 +1,4 @@
-"""Frames from whatever a camera's software wrote: a folder of files, a bag, or an Azure Kinect's film."""
+"""Opening of frame sequences: a folder of files, a bag, or an Azure Kinect recording."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A camera's pose, depth and clock against the robot that it sees: equations of single frames, search, and steps.
+"""Registration of a camera's pose, depth and clock to the robot that it sees.
 
 A point p that the camera measured at its time s should lie on the robot's surface at the joint angles of that time:
 
@@ -43,10 +43,10 @@ Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 TURN, SHIFT, SCALE, DEPTH, CLOCK, DRIFT = slice(0, 3), slice(3, 6), 6, 7, 8, 9
-"""Where a change of a `CameraState` has its parts."""
+"""Positions of the parts of a `CameraState` change in its vector."""
 SIZE = 10
 FEWEST = 40
-"""Points of the arm without which a frame says nothing."""
+"""Fewest points of the arm in a usable frame."""
 
 _LOOK = Pinhole.of_view(160, 120, math.radians(80.0))  # through which the robot's visible surface is sampled
 _SAMPLES = 150  # of it, in every frame
@@ -67,7 +67,7 @@ _LEAST_CURVATURE = 0.2  # of the robust sum, of that of its weights
 
 @dataclass(frozen=True, eq=False)
 class CameraState:
-    """What is estimated.
+    """Estimated camera state: pose, depth scale and offset, clock offset and drift.
 
     Attributes
     ----------
@@ -101,7 +101,7 @@ class CameraState:
         return placed
 
     def measured(self, points: Array) -> Array:
-        """Where the camera would measure points of the world, both shape (N, 3) [m]."""
+        """World points as the camera would measure them, both shape (N, 3) [m]."""
         own = (points - self.pose[:3, 3]) @ self.pose[:3, :3]
         return np.asarray(own * ((1.0 - self.depth / own[:, 2:3]) / self.factor))
 
@@ -111,7 +111,7 @@ class CameraState:
         return np.asarray(at - self.offset - self.drift * (at - self.about))
 
     def slopes(self, points: Array) -> Array:
-        """Derivatives of points of the world, shape (N, 3), by pose and depth, shape (N, 3, 8)."""
+        """Jacobian of world points, shape (N, 3), with respect to pose and depth, shape (N, 3, 8)."""
         away = points - self.pose[:3, 3]
         ahead = away @ self.pose[:3, 2]
         result = np.zeros((len(points), 3, CLOCK))
@@ -124,7 +124,7 @@ class CameraState:
         return result
 
     def moved(self, change: Array) -> CameraState:
-        """After a change of turn about the camera (world axes), shift, log of the factor, depth, offset, drift."""
+        """State after a change: rotation (world axes), translation, log depth scale, depth and clock offset, drift."""
         pose = self.pose.copy()
         pose[:3, :3] = Rotation.from_rotvec(change[TURN]).as_matrix() @ pose[:3, :3]
         pose[:3, 3] += change[SHIFT]
@@ -138,7 +138,7 @@ class CameraState:
         )
 
     def minus(self, other: CameraState) -> Array:
-        """The change from another state, shape (10,)."""
+        """Difference from another state (this minus other), shape (10,)."""
         turn = Rotation.from_matrix(self.pose[:3, :3] @ other.pose[:3, :3].T).as_rotvec()
         rest = (self.depth - other.depth, self.offset - other.offset, self.drift - other.drift)
         return np.array([*turn, *(self.pose[:3, 3] - other.pose[:3, 3]), math.log(self.factor / other.factor), *rest])
@@ -154,7 +154,7 @@ class Glimpse:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Linear equations of the points of one frame near the arm.
+    """Linearised calibration equations of one frame's points near the arm.
 
     Attributes
     ----------
@@ -172,7 +172,7 @@ class Rows:
 
 
 class Arm:
-    """The robot's surface along its recorded motion.
+    """Surface of the robot along its recorded motion.
 
     Parameters
     ----------
@@ -208,7 +208,7 @@ class Arm:
         return points @ state.pose[:3, :3].T + state.pose[:3, 3], part[seen]
 
     def near(self, points: Array, t: float, within: float) -> Mask:
-        """Which points of the world are near a moving surface, and not near a grasp."""
+        """Whether world points are near a moving surface and not near a grasp."""
         q = self.posture(t)
         result = np.isfinite(self.robot.distance(points, q, within, moving_only=True))
         for held in self.grasps(q):
@@ -216,7 +216,7 @@ class Arm:
         return np.asarray(result)
 
     def met(self, points: Array, origin: Array, t: float, reach: float, along: bool) -> Met:
-        """Where points of the world lie beside the arm: along rays from the camera, or at the nearest surface."""
+        """Matches of world points to the arm's surface, along camera rays or at the nearest surface."""
         q = self.posture(t)
         if along:
             ahead = points - origin
@@ -239,7 +239,7 @@ class Arm:
         return Met(chosen, error, normal[chosen], rate, part[chosen], local)
 
     def rows(self, state: CameraState, glimpse: Glimpse, reach: float, along: bool) -> Rows:
-        """Equations of a frame's points within reach."""
+        """Linearised equations of a frame's points within reach of the arm."""
         points = state.world(glimpse.points)
         met = self.met(points, state.pose[:3, 3], float(state.time(glimpse.stamp)), reach, along)
         slope = np.empty((len(met.chosen), SIZE))
@@ -252,7 +252,7 @@ class Arm:
 
 @dataclass(frozen=True, eq=False)
 class Met:
-    """Points beside the arm: which ones, e [m], the surface's normal, velocity along that [m/s], part, place there."""
+    """Points matched to the arm: indices, normal distance e [m], normal, normal velocity [m/s], part, local place."""
 
     chosen: Integers
     error: Array
@@ -267,7 +267,7 @@ class Met:
 
 @dataclass(frozen=True, eq=False)
 class RobustSum:
-    """The robust sum about a state.
+    """Quadratic model of the robust cost at a camera state.
 
     Attributes
     ----------
@@ -293,7 +293,7 @@ class RobustSum:
     count: int
 
     def tempered(self, precision: Array) -> tuple[Array, Array, float]:
-        """Hessian and gradient of the data by a weight for how much they know, and that; `precision`: the prior's."""
+        """Weighted Hessian and gradient of the data, and the weight; `precision`: inverse covariance of the prior."""
         scale = 1.0 / np.sqrt(np.diag(self.hessian) + np.diag(precision))
         whole = (self.hessian + 1e-6 * precision) * np.outer(scale, scale)
         excess = np.linalg.solve(whole, self.blocks * np.outer(scale, scale))
@@ -301,14 +301,14 @@ class RobustSum:
         return weight * self.hessian, weight * self.gradient, weight
 
     def covariance(self, precision: Array) -> Array:
-        """Of the minimum of data and prior, shape (10, 10)."""
+        """Covariance of the minimum of data and prior, shape (10, 10)."""
         hessian, _, weight = self.tempered(precision)
         bread = np.linalg.inv(self.curvature * hessian + precision)
         return np.asarray(bread @ (weight**2 * self.blocks + precision) @ bread)
 
 
 def robust_sum(rows: Sequence[Rows], reach: float) -> RobustSum:
-    """Sum over all points of all frames, its scale from the median of their errors."""
+    """Robust cost over all points of all frames, scaled by their median error."""
     size = np.abs(np.concatenate([r.error for r in rows]))
     sigma = max(_TO_SIGMA * float(np.median(size)) if len(size) else reach, _LEAST_SIGMA)
     scale = min(_CUT * sigma, reach)
@@ -348,7 +348,7 @@ def _at_least(least: Array, matrix: Array) -> Array:
 
 
 def improved(state: CameraState, found: RobustSum, told: CameraState, precision: Array) -> tuple[CameraState, Array]:
-    """The state after one step, and the step; `precision`: of what is told, shape (10, 10)."""
+    """Camera state after one Gauss-Newton step, and the step; `precision`: of the prior, shape (10, 10)."""
     hessian, gradient, _ = found.tempered(precision)
     step = np.asarray(-np.linalg.solve(hessian + precision, gradient + precision @ state.minus(told)), float)
     return state.moved(step), step
@@ -358,7 +358,7 @@ def improved(state: CameraState, found: RobustSum, told: CameraState, precision:
 
 
 def starts(arm: Arm, glimpses: Sequence[Glimpse], told: CameraState, search: float, most: int) -> list[CameraState]:
-    """Shifts of the camera and offsets of its clock at which the arm's visible surface lies on the clouds.
+    """Candidate camera states at which the arm's visible surface lies on the clouds, best first.
 
     Parameters
     ----------
@@ -482,7 +482,7 @@ class Presence:
 
 
 class Clouds:
-    """Some frames, made ready to be asked how much of the arm they show.
+    """Search trees of some frames, to measure how much of the arm they show.
 
     Parameters
     ----------
@@ -495,7 +495,7 @@ class Clouds:
         self._rays = [cKDTree(g.points[:, :2] / g.points[:, 2:]) for g in glimpses]
 
     def presence(self, arm: Arm, state: CameraState, within: float) -> Presence:
-        """How much of the arm's visible surface has a point within a distance [m]."""
+        """Fractions of the arm's visible surface that have a point within a distance [m], or have none."""
         counts = np.zeros(4)
         for glimpse, places, rays in zip(self._glimpses, self._places, self._rays, strict=True):
             points, _ = arm.visible(state, glimpse.stamp)

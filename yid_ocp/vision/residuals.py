@@ -1,4 +1,4 @@
-"""How far points lie from the tubes' surface, and how that changes as the tubes move: two ways of measuring it."""
+"""Distances of points from the tubes' surface and their derivatives, by two measures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _RIM = 0.85  # of the radius to either side, within which a tube's depth is comp
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """Points against the tubes.
+    """Signed distances of points from the tubes' surface, with derivatives.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class Residuals:
 
 
 def nearest_way(corners: Array, radius: Array, points: Array, camera: Array, share: float = 1.0) -> Residuals:
-    """Errors along the nearest way to the surface,  e = |p - c| - f r.
+    """Residuals along the nearest way to the surface,  e = |p - c| - f r.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def nearest_way(corners: Array, radius: Array, points: Array, camera: Array, sha
 
 
 def along_sight(corners: Array, radius: Array, points: Array, camera: Array) -> Residuals:
-    """Errors along the lines of sight, where the camera's noise is; parameters as of `nearest_way`.
+    """Residuals along the lines of sight, where the camera's noise is; parameters as of `nearest_way`.
 
     Across the sight a point stands where its pixel does, by u from the axis; towards the camera the surface lies at
     sqrt(r^2 - u^2). The nearest way turns with the noise, which does little to where a tube is found, but makes it

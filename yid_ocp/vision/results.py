@@ -1,4 +1,4 @@
-"""What a track leaves: what became of every frame, shapes and points of the good ones, stages for pictures."""
+"""Results of tracking: a report of every frame, shapes and points of the good ones, and stages for figures."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ GROUP = "points_camera"
 
 @dataclass(frozen=True, eq=False)
 class FrameReport:
-    """What became of one frame.
+    """Report of one frame: why it was dropped, or its fitted shape.
 
     Attributes
     ----------
@@ -63,18 +63,18 @@ class FrameReport:
 
     @property
     def good(self) -> bool:
-        """Whether it was used."""
+        """Whether the frame was used."""
         return not self.reason
 
 
 def dropped(frames: Iterable[FrameReport]) -> dict[str, int]:
-    """How often each reason dropped a frame; numbers in the reasons are left out."""
+    """Number of frames dropped for each reason; numbers in the reasons are left out."""
     return dict(Counter(frame.reason.partition(":")[0] for frame in frames if not frame.good).most_common())
 
 
 @dataclass(frozen=True, eq=False)
 class Stages:
-    """One frame on its way, for pictures; what a dropped frame did not come to is None.
+    """Processing stages of one frame, for figures; stages that a dropped frame did not reach are None.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class Stages:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Shapes and points of the good frames.
+    """Result of tracking: shapes and points of the good frames.
 
     Attributes
     ----------
@@ -152,17 +152,17 @@ class Track:
         return self.q[0].copy() if len(self.t) < 2 else np.asarray(CubicSpline(self.t, self.q, axis=0)(at))
 
     def points(self, t: float) -> Array:
-        """The written points at any time, by the kinematics of `shape`, shape (np, 3) [m]."""
+        """Positions of the tracked points at any time, by the kinematics of `shape`, shape (np, 3) [m]."""
         return self._place(self.shape(t))[[self._system_points.index(name) for name in self.names]]
 
     @property
     def dropped(self) -> dict[str, int]:
-        """How often each reason dropped a frame."""
+        """Number of frames dropped for each reason."""
         return dropped(self.frames)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the frames say of the object's sizes and of things about it, in words."""
+        """Messages about the object's dimensions and foreign objects."""
         return (*self.sizes.messages, *(thing.text for thing in self.things))
 
     def group(self) -> PointGroup:

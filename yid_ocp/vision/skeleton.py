@@ -1,4 +1,4 @@
-"""The walk that thins a cloud to nodes along the tubes, and the graph that joins them."""
+"""Skeleton of a cloud: nodes along the tubes, and the graph that joins them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Integers = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class WalkOptions:
-    """How a cloud is thinned."""
+    """Settings of the skeleton extraction."""
 
     neighbours: Annotated[int, Ge(2), About("points of a segment, k1 in the source paper")] = 50
     radius: Annotated[
@@ -69,7 +69,7 @@ class Skeleton:
 
     @property
     def connected(self) -> NDArray[np.bool_]:
-        """Which points of the cloud belong to a node, shape (N,)."""
+        """Whether each point of the cloud belongs to a node, shape (N,)."""
         return self.label >= 0
 
 
@@ -179,7 +179,7 @@ def connect(nodes: Array, options: WalkOptions | None = None) -> tuple[Integers,
 def skeleton(
     cloud: Cloud, rng: np.random.Generator, options: WalkOptions | None = None, down: ArrayLike = (0.0, 0.0, -1.0)
 ) -> Skeleton:
-    """Walk, connect, and leave out connected parts that hold too few points.
+    """Skeleton of a cloud, without connected parts that hold too few points.
 
     Parameters
     ----------

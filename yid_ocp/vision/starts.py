@@ -1,4 +1,4 @@
-"""Where the search for a shape begins, read off the course of the object in the cloud.
+"""Initial shapes for the shape fit, from the centerline of the object in the cloud.
 
 The ends of the course are given to the root and the tips of the object in every way in which their distances along it
 are about those along the object; each way is a start whose links follow the course.
@@ -25,7 +25,7 @@ from yid_ocp.vision.trace import Trace
 Array = NDArray[np.float64]
 
 ROOT = "found_root"
-"""Joints that `loosened` adds begin with this."""
+"""Prefix of the joints that `loosened` adds."""
 _MOST_ENDS = 7  # of a course; more are clutter, and there are too many ways
 _ALIKE = 1.3  # a way whose distances are off by so many times the best one's is tried as well
 _WHOLE = 0.08  # of the object, by which a course may be off that shows all of it
@@ -33,7 +33,7 @@ _WHOLE = 0.08  # of the object, by which a course may be off that shows all of i
 
 @dataclass(frozen=True, eq=False)
 class Anchor:
-    """How far along itself an object reaches at one of its ends.
+    """Observed position of one end of an object along its own direction.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Anchor:
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A shape to begin with, shape (n,), where its root is, shape (3,) [m], and ends of the course that are its own."""
+    """Initial shape: configuration (n,), root position (3,) [m] and observed ends."""
 
     q: Array
     root: Array
@@ -63,7 +63,7 @@ class Start:
 
 
 def loosened(system: System, values: Mapping[str, float] | None = None) -> tuple[System, tuple[str, ...]]:
-    """The system with its object's root anywhere: six more joints carry all of it, and nothing holds it.
+    """System with its object on six additional free joints, without grasps.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ class _Link:
 
 
 class Starts:
-    """Finds starts for an object.
+    """Finder of initial shapes for an object.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ class Starts:
 
     @property
     def ends(self) -> int:
-        """How many ends the object has, its root among them."""
+        """Number of ends of the object, including its root."""
         return len(self.apart)
 
     def _way(self, joint: int) -> set[int]:
@@ -161,7 +161,7 @@ class Starts:
         return way
 
     def of(self, trace: Trace) -> list[Start]:
-        """Starts that follow a course, those whose ends are as far apart as the object's.
+        """Initial shapes that follow a centerline whose ends are as far apart as the object's.
 
         Parameters
         ----------

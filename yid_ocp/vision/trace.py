@@ -1,4 +1,4 @@
-"""The course of a thin object in a cloud: how its points hang together, without knowing where it begins.
+"""Centerline of a thin object in a cloud, without knowing where the object begins.
 
 The graph of a cloud's nearest points is cut into slices of equal distance along it from one end. Connected parts of
 neighbouring slices that touch make a graph of their own (Reeb's), in which a branch is a chain, a branching a vertex of
@@ -37,7 +37,7 @@ _MOST = 2500  # points
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """The course of an object in a cloud.
+    """Centerline of an object in a cloud, as a tree of nodes.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class Trace:
 
     @property
     def skeleton(self) -> Skeleton:
-        """The same as a skeleton, to which no points belong."""
+        """Skeleton with the same nodes and edges, without points."""
         count = len(self.nodes)
         none = np.empty(0, dtype=np.int64)
         return Skeleton(self.nodes, np.ones(count), none, self.edges, np.zeros(count, dtype=np.int64))
@@ -77,12 +77,12 @@ class Trace:
         return np.asarray(way / max(float(np.linalg.norm(way)), 1e-12))
 
     def distances(self, start: int) -> tuple[Array, Integers]:
-        """Length of the way from a node to every other one [m], and the node before each on it."""
+        """Path length from a node to every other one [m], and the predecessor of each."""
         far, before = dijkstra(_graph(self.nodes, self.edges), directed=False, indices=start, return_predecessors=True)
         return np.asarray(far), np.asarray(before, dtype=np.int64)
 
     def course(self, start: int, end: int) -> Array:
-        """Nodes on the way from one to another, shape (., 3) [m]."""
+        """Positions of the nodes on the path between two nodes, shape (., 3) [m]."""
         _, before = self.distances(start)
         way = [end]
         while way[-1] != start:
@@ -91,7 +91,7 @@ class Trace:
 
 
 def traced(cloud: Cloud, diameter: float, gap: float, rng: np.random.Generator) -> Trace:
-    """Trace an object in a cloud.
+    """Trace the centerline of an object in a cloud.
 
     Parameters
     ----------

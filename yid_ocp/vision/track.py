@@ -1,4 +1,4 @@
-"""From a frame sequence and the joints' recording to measured points: filter, thin, fit, judge, and write them down.
+"""Tracking of an object's points in a frame sequence: filter, skeleton, shape fit and selection of frames.
 
 A first pass over some frames finds what is common to the sequence (`calibration`). A second one takes frame by frame
 and keeps no cloud; every frame ends as a fitted shape or with the reason why it was dropped, and nothing in one frame
@@ -63,7 +63,7 @@ def track(
     empty: FrameSequence | None = None,
     progress: Progress | None = None,
 ) -> Track:
-    """Measure the object's points in a sequence.
+    """Track the object's points in a frame sequence.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ class _Look:
 
 
 class Tracker:
-    """What is needed for any frame of a sequence, whichever process works on it.
+    """Tracker of single frames of a sequence, in any process.
 
     Parameters
     ----------
@@ -194,14 +194,14 @@ class Tracker:
         self.sample = _spread(usable, options.calibration.frames) if self.arm is not None else []
 
     def posture(self, t: float) -> Array:
-        """Configuration at a time on the joints' clock, the object at rest; it stays at the recording's ends beyond."""
+        """Configuration at a time on the joints' clock with the object at rest; constant beyond the recording."""
         q = self.shape.rest.copy()
         if self.angles is not None:
             q[[self.system.mechanism.joint_index(name) for name in self.shape.known]] = self.angles(t)
         return q
 
     def common(self, progress: Callable[[int, str], None] = lambda done, text: None) -> Common:
-        """What is common to the sequence, from some of its frames."""
+        """Calibration shared by the sequence, estimated from some of its frames."""
         calibration = self._calibration(progress)
         progress(len(self.sample), "comparing the object's sizes")
         background = Background()
@@ -325,11 +325,11 @@ class Tracker:
         return voxel_grid(points[inside], filters.voxel), points
 
     def frame(self, index: int, common: Common) -> FrameReport:
-        """What became of a frame by itself: nothing of any other frame enters."""
+        """Report of one frame, independent of other frames."""
         return self._work(index, common).report
 
     def stages(self, frame: FrameReport, common: Common) -> Stages | None:
-        """A frame once more, for pictures; None where its cloud cannot be read."""
+        """Processing stages of a frame, for figures; None if its cloud cannot be read."""
         try:
             cloud = common.calibration.state.world(self.sequence.load(frame.index))
         except DataError:
@@ -341,18 +341,18 @@ class Tracker:
         )
 
     def unread(self, index: int, calibration: Calibration, reason: str) -> FrameReport:
-        """A frame of which nothing is known but why it is dropped, empty if it is not."""
+        """Report of a frame before processing, with the reason if it is dropped."""
         stamp = float(self.sequence.t[index])
         t = float(calibration.state.time(stamp))
         return FrameReport(index, self.sequence.names[index], stamp, t, reason, 0, 0, 0, math.nan, 0.0, None)
 
     def judged(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
-        """The frames with those dropped that are unlike the others, and how the root was told from other ends."""
+        """Frames with outlying ones dropped, and how the root end was chosen."""
         rooted, note = told(frames, self.options)
         return judged(rooted, self.options), note
 
     def finished(self, frames: Sequence[FrameReport], note: str, common: Common) -> Track:
-        """The track of judged frames; `DataError` where none is good."""
+        """Tracking result of the frames; `DataError` if none is good."""
         columns = [self.system.points.index(name) for name in self.names]
         things = self.things(frames)
         points = measured(frames, columns, common, things, self.options, self.sequence.source)
@@ -374,7 +374,7 @@ class Tracker:
         )
 
     def things(self, frames: Sequence[FrameReport]) -> tuple[Foreign, ...]:
-        """What stood about the object in the frames that were fitted."""
+        """Foreign objects seen in the fitted frames."""
         fitted = [(frame.t, frame.fit) for frame in frames if frame.fit is not None]
         if not fitted:
             return ()

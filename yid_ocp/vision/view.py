@@ -1,4 +1,4 @@
-"""What stands in a camera's line of sight: whether a place that has no points is hidden, or is seen to be empty.
+"""Occlusion in a camera's view: whether a place without points is hidden or visibly empty.
 
 A depth camera that measures something behind a place has looked through it: nothing was there. Something measured
 before it hides it. Without any point in that direction the place counts as empty, unless something nearer stands so
@@ -33,7 +33,7 @@ _LEAST_DEPTH = 0.05  # [m]; nearer to the camera's plane there is no picture
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """All points of a frame as the camera saw them.
+    """Occlusion map of a frame, from all points that the camera saw.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class View:
     _kept: list[tuple[Array, Array, float, cKDTree, Array]] = field(default_factory=list, repr=False)
 
     def hidden(self, places: Array, radius: Array, margin: float) -> Mask:
-        """Which places cannot be seen from the camera.
+        """Whether places are hidden from the camera.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Earlier runs as a run's baseline: what their folders say of parameters and effects, and their recordings."""
+"""Baseline of a run: estimates, effects and recordings read from earlier run folders."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ALIKE = ("robot", "arms", "clamps", "object", "grasp", "springs", "gravity")
 
 
 def read_estimates(folder: str | Path) -> Estimates:
-    """What a run folder of `solve` or `diagnose` says of the free parameters.
+    """Estimates and covariance of the free parameters, read from a run folder of `solve` or `diagnose`.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def read_estimates(folder: str | Path) -> Estimates:
 
 
 def run_result(folder: str | Path) -> dict[str, Any]:
-    """Contents of result.json of a run of `solve` or `diagnose` that did not fail; errors as `read_estimates`."""
+    """Contents of result.json of a successful `solve` or `diagnose`; errors as `read_estimates`."""
     file = Path(folder) / "result.json"
     result = _result(file)
     if result.get("format") not in FORMATS:
@@ -104,7 +104,7 @@ def _result(file: Path) -> dict[str, Any]:
 
 
 def earlier_runs(run: Run) -> tuple[Estimates, ...]:
-    """What the runs of `diagnosis.baseline` say, in that order.
+    """Estimates of the runs listed in `diagnosis.baseline`, in that order.
 
     Raises
     ------
@@ -148,7 +148,7 @@ def _dependent(folders: Sequence[str | Path]) -> str:
 
 
 def refuse_unlike(folders: Sequence[Path]) -> None:
-    """Refuse run folders whose models are not one and the same, or one of which has another as its baseline.
+    """Raise an error unless all run folders have the same model and none is the baseline of another.
 
     Raises
     ------
@@ -189,7 +189,7 @@ def _settings(folder: str | Path) -> Run | None:
 
 
 def with_effects_of(run: Run, runs: Sequence[Estimates]) -> Run:
-    """The run with the effects that its baseline had, at their values, and what was estimated there free."""
+    """The run with the effects of its baseline at their estimated values; their estimated parameters are free."""
     if not runs:
         return run
     known, _, _ = together(runs)
@@ -211,7 +211,7 @@ def with_effects_of(run: Run, runs: Sequence[Estimates]) -> Run:
 
 
 def recordings_without(run: Run) -> tuple[tuple[Recording, ...], str]:
-    """Recordings made without what is looked for, and why there are none.
+    """Reference recordings made without the sought effect, and a message where there are none.
 
     Those of `recordings.without`, else those on which the baseline was estimated and which it held out.
 
@@ -247,7 +247,7 @@ def _named(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
 
 
 def refuse_same(run: Run, problem: EstimationProblem, runs: Sequence[Estimates], without: Sequence[Recording]) -> None:
-    """Refuse recordings of today that the baseline was estimated on: they would count twice, or be made without it.
+    """Raise an error where a recording of the run is also a baseline or reference recording.
 
     Raises
     ------

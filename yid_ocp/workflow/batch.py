@@ -1,4 +1,4 @@
-"""The command `batch`: a fleet, many recordings or robots, each a run folder; one table and report of all."""
+"""The command `batch`: one run per configuration or recording, with a common table and report."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Member:
-    """One run of a batch.
+    """Configuration and overrides of one run of a batch.
 
     Attributes
     ----------
@@ -57,25 +57,25 @@ class Member:
     settings: tuple[str, ...]
 
     def load(self) -> Run:
-        """The settings; errors as `load_config`."""
+        """Load the run's settings; errors as `load_config`."""
         return load_config(self.config, self.settings)
 
 
 @dataclass(frozen=True)
 class BatchOutcome:
-    """What `run_batch` leaves: the folder and the contents of its batch.json."""
+    """Result of `run_batch`: the folder and the contents of its batch.json."""
 
     folder: Path
     result: dict[str, Any]
 
     @property
     def ok(self) -> bool:
-        """Whether every run ended well."""
+        """Whether every run succeeded."""
         return all(entry["ok"] for entry in self.result["runs"])
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """The command."""
+    """Run the command and return its exit code."""
     members = batch_members(arguments.configs, arguments.recordings, arguments.overrides)
     workers = given_workers(arguments) or LOCAL
     out = arguments.out or Path("runs") / f"batch-{time.strftime('%Y%m%d-%H%M%S')}"
@@ -97,7 +97,7 @@ def _again(arguments: argparse.Namespace, out: str | Path) -> str:
 def batch_members(
     configs: Sequence[str | Path], recordings: str | None = None, overrides: Sequence[str] = ()
 ) -> list[Member]:
-    """The runs of a batch: one for each configuration, or for each with each recording that a pattern matches.
+    """Runs of a batch: one per configuration, or one per configuration and matching recording.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def run_batch(
     progress: Progress = SILENT,
     again: str = "",
 ) -> BatchOutcome:
-    """Run a command on every member of a batch; what the folder holds of them is not done again.
+    """Run a command for every run of a batch; finished runs in the folder are reused.
 
     Parameters
     ----------
@@ -234,7 +234,7 @@ def run_batch(
 def run_member(
     name: str, config: Path, settings: Sequence[str], inputs: Sequence[Path], command: str, folder: str
 ) -> dict[str, Any]:
-    """Run one member in a folder of its name; what stands there of an earlier attempt goes."""
+    """Task: run one member in its own folder, replacing an earlier attempt; returns its entry for batch.json."""
     del inputs  # they are part of what the result is kept by
     target = Path(folder) / name
     if target.exists():

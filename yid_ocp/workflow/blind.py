@@ -1,4 +1,4 @@
-"""The command `blind`: make an ensemble, commit to its labels, diagnose every case without them, open them, score."""
+"""The command `blind`: diagnoses synthetic cases without their labels, then opens the labels and scores."""
 
 from __future__ import annotations
 
@@ -55,14 +55,14 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class BlindOutcome:
-    """What `run_blind` leaves: the folder and the contents of its result.json."""
+    """Result of `run_blind`: the folder and the contents of its result.json."""
 
     folder: Path
     result: dict[str, Any]
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """The command."""
+    """Run the command and return its exit code."""
     given = arguments.configs or [None]
     runs = [load_config(path, arguments.overrides, DIAGNOSIS_DEFAULT) for path in given]
     if not arguments.configs and arguments.cases >= TWO_ARMS:
@@ -91,7 +91,7 @@ def run_blind(
     workers: Workers | Executor = LOCAL,
     purpose: str = PURPOSES[0],
 ) -> BlindOutcome:
-    """Prove a diagnosis blind, in several processes; what a folder of the same name holds is not done again.
+    """Run a blind validation of the diagnosis in several processes; finished parts in the folder are reused.
 
     Parameters
     ----------
@@ -276,7 +276,7 @@ def _done(
 
 
 def prepared(config: Path, variation: str, seed: int, purpose: str, folder: str, name: str) -> dict[str, int]:
-    """Write an experiment's first recording, and how large every candidate has to be to show."""
+    """Task: write an experiment's first recording and the detectable size of every candidate."""
     experiment = Experiment(config, variation, seed, purpose)
     first = Path(folder) / f"{name}.h5"
     experiment.begin(first)
@@ -296,7 +296,7 @@ def drawn(
     planned: Mapping[str, Any],
     folder: str,
 ) -> dict[str, Any]:
-    """Make a case: write its recordings, and say its label and what its diagnosis is told."""
+    """Task: write the recordings of a case; returns its label and the data given to its diagnosis."""
     _, ensemble = Experiment(config, variation, seed, purpose).ensemble(first)
     ensemble.knowing(json.loads(detectable.read_text("utf-8")))
     case, label = ensemble.draw(Planned(**planned))
@@ -324,7 +324,7 @@ def diagnosed(
     held_out: Path,
     without: Sequence[str],
 ) -> dict[str, Any]:
-    """The answer to a case, from its recordings alone: {seconds, result}, result as `yid-diagnosis/1`.
+    """Task: diagnose a case from its recordings alone; returns {seconds, result} with a `yid-diagnosis/1` result.
 
     For calibration, one without a gap has `open` too: the statistics of a diagnosis that takes anything for a gap.
     """
@@ -356,7 +356,7 @@ def closed_at_best(
     held_out: Path,
     label: Mapping[str, Any],
 ) -> float | None:
-    """What of a case's gap its true effects close, refitted; None where that cannot be worked out."""
+    """Task: fraction of a case's gap closed by its refitted true effects; None where it cannot be computed."""
     run, ensemble = Experiment(config, variation, seed, purpose).ensemble(first)
     case = _case(name, estimate, held_out, ())
     try:

@@ -1,4 +1,4 @@
-"""From settings to objects: the system, the compiled step, recordings, the estimation problem."""
+"""Builds system, compiled step, recordings and estimation problem from the settings."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ Placed = tuple[FlexibleObject, str | None, np.ndarray | None]
 
 @contextlib.contextmanager
 def located(run: Run, *path: str | int) -> Iterator[None]:
-    """Say in errors of the block which setting they come from."""
+    """Context manager that adds the location of a setting to errors raised in its block."""
     try:
         yield
     except YidError as error:
@@ -126,7 +126,7 @@ def build_system(run: Run, finer: int = 1) -> System:
 
 
 def tracked(run: Run) -> bool:
-    """Whether prescribed arms are states that their encoders correct, driven by the torques that they measured.
+    """Whether prescribed arms become estimated states, driven by measured torques and corrected by encoders.
 
     So it is where they hold an object and torques are recorded. The encoders' noise reaches the torques through the
     arm's whole inertia, from joint to joint and from sample to sample, which a rollout that takes the angles as true
@@ -358,7 +358,7 @@ def _set_parameters(run: Run, parameters: Parameters, finer: int) -> Parameters:
 
 
 def finer_factor(run: Run, name: str, finer: int) -> int:
-    """By what a parameter per joint is multiplied where each link is divided, so that it means the same tube."""
+    """Factor on a per-joint parameter that keeps the tube's stiffness when each link is divided."""
     item, (owner, _, quantity) = run.model.object, name.rpartition(".")
     if quantity not in PER_JOINT or isinstance(item, CableObject):
         return 1
@@ -377,7 +377,7 @@ def _key_of(run: Run, name: str) -> str:
 
 
 def recording_file(path: str) -> Path:
-    """File of a recording in the settings; `default:NAME` is one that ships with the package."""
+    """Path of a recording named in the settings; `default:NAME` is one shipped with the package."""
     if not path.startswith("default:"):
         return Path(path)
     return Path(str(resources.files("yid_ocp.data").joinpath("defaults", path.removeprefix("default:"))))
@@ -411,7 +411,7 @@ def build_step(run: Run, system: System | None = None) -> Step:
 
 
 def problem_options(run: Run, system: System, recordings: Sequence[Recording] = ()) -> ProblemOptions:
-    """What the settings say about the estimation problem.
+    """`ProblemOptions` of a run, with values that depend on system and recordings.
 
     Parameters
     ----------
@@ -509,7 +509,7 @@ def build_problem(run: Run, step: Step | None = None, without: Sequence[Recordin
 
 
 def first_gaps(problem: EstimationProblem, episode: Episode) -> dict[str, float]:
-    """Distance to which every grasp can be closed at the first posture of a recording [m]."""
+    """Remaining gap of every grasp at the first configuration of a recording, by grasp name [m]."""
     system = problem.system
     if not system.grasps:
         return {}
@@ -521,7 +521,7 @@ def first_gaps(problem: EstimationProblem, episode: Episode) -> dict[str, float]
 
 
 def check_grasps(run: Run, problem: EstimationProblem) -> None:
-    """Refuse recordings at whose first posture a grasp cannot be closed, however the object bends.
+    """Raise an error for recordings at whose first configuration a grasp cannot be closed.
 
     Raises
     ------

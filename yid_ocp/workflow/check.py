@@ -1,4 +1,4 @@
-"""The command `check`: everything that can be wrong before a long run, and how fine the model is."""
+"""The command `check`: validates a run without solving it and checks its discretisation."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ FORMAT = "yid-check/1"
 
 @dataclass(frozen=True)
 class CheckOutcome:
-    """What `run_check` leaves: the run folder and the contents of its result.json."""
+    """Result of `run_check`: the run folder and the contents of its result.json."""
 
     folder: Path
     result: dict[str, Any]
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """The command."""
+    """Run the command and return its exit code."""
     settings = load_config(arguments.config, arguments.overrides)
     outcome = carry_out(lambda shown: run_check(settings, arguments.out, shown), check_summary, arguments)
     return WRONG_INPUT if settings.recordings.strict and outcome.result["warnings"] else DONE

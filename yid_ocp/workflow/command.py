@@ -1,4 +1,4 @@
-"""What commands do around their work: progress while it runs, the table for people, and where the run folder is."""
+"""Common shell of all commands: progress display, printed summary, run folder location and exit codes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ DONE, FAILED, WRONG_INPUT = 0, 1, 2
 
 
 class Outcome(Protocol):
-    """What the work of a command leaves."""
+    """Result of a command: its run folder and result data."""
 
     @property
     def folder(self) -> Path:
@@ -43,7 +43,7 @@ def carry_out(
     summary: Callable[[Mapping[str, Any]], Sequence[Block]],
     arguments: argparse.Namespace,
 ) -> Left:
-    """Do the work of a command and print what it found and where it is, as `tell` does.
+    """Do the work of a command, print its summary and run folder as `tell` does, and return its result.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def tell(
     place: str,
     path: str,
 ) -> None:
-    """Print what a command found: for a person, for a script that needs the place alone, or for a program.
+    """Print a command's result: summary text, the path alone (`quiet`) or JSON (`json`).
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def tell(
 
 
 def given_workers(arguments: argparse.Namespace) -> Workers | None:
-    """The workers that a command is given by `--workers` or `--scheduler`, known to be there; None for neither.
+    """Available workers from `--workers` or `--scheduler`; None where neither is given.
 
     Raises
     ------

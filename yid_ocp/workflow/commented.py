@@ -1,4 +1,4 @@
-"""A configuration as text whose every line says what it is and when to change it."""
+"""Text of a generated configuration file with a comment on every line."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ COLUMN = 44
 
 @dataclass(frozen=True)
 class Object:
-    """What is held: its kind (cable, beam, tree or y), its branches (none for the foam Y) and links of each."""
+    """User's description of the object: kind (cable, beam, tree or y), branches, and links per branch."""
 
     kind: str
     branches: tuple[Branch, ...]
@@ -38,7 +38,7 @@ def configuration(
     imports: Mapping[str, Any],
     schema: str,
 ) -> str:
-    """The text of a configuration file.
+    """Commented YAML text of a configuration file.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The command `compare`: several methods on one problem, one table, and whether they agree."""
+"""The command `compare`: runs several solvers on one problem and tests whether they agree."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FORMAT = "yid-compare/1"
 
 @dataclass(frozen=True)
 class CompareOutcome:
-    """What `run_compare` leaves: the run folder, result.json's contents and the comparison."""
+    """Result of `run_compare`: the run folder, result.json's contents and the comparison."""
 
     folder: Path
     result: dict[str, Any]
@@ -41,7 +41,7 @@ class CompareOutcome:
 
 
 def chosen_solvers(run: Run) -> list[Solver]:
-    """The methods of a configuration with their settings.
+    """Solvers listed in `compare.methods`, with their settings.
 
     Raises
     ------
@@ -54,7 +54,7 @@ def chosen_solvers(run: Run) -> list[Solver]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """The command."""
+    """Run the command and return its exit code."""
     settings = load_config(arguments.config, arguments.overrides)
     outcome = carry_out(lambda shown: run_compare(settings, arguments.out, shown), compare_summary, arguments)
     return DONE if outcome.ok else FAILED
@@ -141,7 +141,7 @@ def compare_result(problem: EstimationProblem, comparison: Comparison) -> dict[s
 
 
 def published_answers(run: Run) -> dict[str, float]:
-    """The paper's answers for the experiment that `compare.published` names; none where it names none."""
+    """The paper's estimates for the experiment named by `compare.published`; empty where none is named."""
     name = run.compare.published
     if name is None:
         return {}

@@ -1,4 +1,4 @@
-"""The command `completion`, and the answers to a shell that completes: commands, options, files, keys of `--set`."""
+"""The command `completion`, and shell completion of commands, options, files and `--set` keys."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ FORMATS = ("mjcf", "urdf", "sdf", "yaml", "csv", "mcap")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """The command."""
+    """Run the command and return its exit code."""
     try:
         library = importlib.import_module("argcomplete")
     except ImportError as error:
@@ -24,7 +24,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def answer(parser: argparse.ArgumentParser) -> None:
-    """Tell the shell that asks what may stand next, and end; without the package nothing is told.
+    """Print completions for the calling shell and exit; does nothing without the package argcomplete.
 
     Parameters
     ----------

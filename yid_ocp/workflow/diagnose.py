@@ -1,4 +1,4 @@
-"""The command `diagnose`: is there a gap, where, which effect makes it; writes the run folder."""
+"""The command `diagnose`: detects, locates and explains the gap, and writes the run folder."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class DiagnoseOutcome:
-    """What `run_diagnose` leaves.
+    """Result of `run_diagnose`.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class DiagnoseOutcome:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """The command."""
+    """Run the command and return its exit code."""
     settings = load_config(arguments.config, arguments.overrides, DIAGNOSIS_DEFAULT)
     if arguments.baseline:
         said = tuple(str(Path(folder).expanduser().resolve()) for folder in arguments.baseline)
@@ -66,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def run_diagnose(run: Run, out: str | Path | None = None, progress: Progress = SILENT) -> DiagnoseOutcome:
-    """Diagnose and write the run folder; finished refits of an interrupted run of the same kind are used again.
+    """Diagnose and write the run folder; finished refits of an interrupted, identical run are reused.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ def _flags(run: Run) -> list[str]:
 
 
 def in_units_of_noise(problem: EstimationProblem, run: Run) -> EstimationProblem:
-    """The same problem with the noise alone as the sensors' standard deviations, by `diagnosis.noise_fraction`.
+    """The problem with all stated standard deviations scaled by `diagnosis.noise_fraction` to noise alone.
 
     Errors of torques and angles that drive the motion, priors and weak prior shrink alike, so that every fit stays what
     it is; what changes is when a gap counts as one.
@@ -243,7 +243,7 @@ def _times(share: float, std: float | Mapping[str, float]) -> float | Mapping[st
 
 
 def predictions(finding: Finding) -> list[Prediction]:
-    """Held-out recordings that can be predicted both before and after."""
+    """Held-out episodes with predictions of the nominal and of the final model; failed ones are left out."""
     before, after = (
         fit.problem.weighted_by_sensors().validate(fit.problem.vector(fit.values))
         for fit in (finding.nominal, finding.last)

@@ -1,4 +1,4 @@
-"""The doctor of recordings: all checks of a run's recordings, what is left out, and what stops a run.
+"""Data-quality checks of a run's recordings: issues found, data left out, and errors that stop a run.
 
 Recordings given twice count once, gaps are cut out; everything else is said and left as it is.
 """
@@ -53,7 +53,7 @@ MOST_BLAMED = 3
 
 @dataclass(frozen=True)
 class Examined:
-    """Recordings of a run as they are used, and all doubts about them."""
+    """Checked recordings of a run as they are used, and all issues found."""
 
     estimate: tuple[Recording, ...]
     held_out: tuple[Recording, ...]
@@ -68,7 +68,7 @@ def examined(
     estimate: Sequence[Recording],
     held_out: Sequence[Recording],
 ) -> Examined:
-    """Check recordings before a model is moved by them; leave out what was given twice, and gaps.
+    """Check the recordings of a run, remove duplicates and cut them at gaps.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def examined(
 
 
 def of_one(run: Run, system: System, recording: Recording) -> list[Doubt]:
-    """All doubts about one recording that is used as it is; errors as `examined`."""
+    """All issues of one recording, which is not cut; errors as `examined`."""
     found = check_recording(recording, _choice(run))
     stop_at(run, found)
     found += _beside_the_model(run, system, Arm.of(system, system.parameters.vector()), None, recording)
@@ -193,7 +193,7 @@ def _excitation(run: Run, arm: Arm, free: Sequence[str], recordings: Sequence[Re
 
 
 def is_modelled(system: System, doubt: Doubt) -> bool:
-    """Whether the model has as an effect what the doubt is about."""
+    """Whether an effect of the model already accounts for the issue."""
     kinds = MODELLED.get(doubt.cause, ())
     places = {effect.location for effect in system.effects if effect.kind in kinds}
     if "camera_latency" in kinds and "camera_latency" not in doubt.setting:  # no camera's clock
@@ -203,7 +203,7 @@ def is_modelled(system: System, doubt: Doubt) -> bool:
 
 
 def object_doubts(problem: EstimationProblem) -> list[Doubt]:
-    """Doubts about points of the object, from one rollout of every recording with the initial parameters."""
+    """Issues of measured object points, from one rollout per recording with the initial parameters."""
     lengths = ca.vertcat(ca.SX(0), *(length for segment in problem.system.segments for length in segment.lengths))
     size = float(ca.Function("size", [problem.system.parameters.symbols], [ca.sum1(lengths)])(problem.theta))
     wanted = any(samples.sensor.points for episode in problem.episodes for samples in episode.samples)
@@ -218,7 +218,7 @@ def object_doubts(problem: EstimationProblem) -> list[Doubt]:
 
 
 def stop_at(run: Run, doubts: Sequence[Doubt]) -> None:
-    """Raise `DataError` for what no run may begin with: with `recordings.strict`, for any doubt."""
+    """Raise `DataError` for issues that forbid a run; with `recordings.strict`, for any issue."""
     grave = [doubt for doubt in doubts if run.recordings.strict or doubt.weight == "refused"]
     if not grave:
         return
@@ -233,7 +233,7 @@ def stop_at(run: Run, doubts: Sequence[Doubt]) -> None:
 
 @contextlib.contextmanager
 def blaming(doubts: Sequence[Doubt]) -> Iterator[None]:
-    """Say in errors of the block what is in doubt about the recordings, which may be why."""
+    """Context manager that adds known issues of the recordings to a `DataError` raised in its block."""
     try:
         yield
     except DataError as error:
@@ -245,10 +245,10 @@ def blaming(doubts: Sequence[Doubt]) -> Iterator[None]:
 
 
 def ordered(doubts: Sequence[Doubt]) -> list[Doubt]:
-    """Those that weigh most first."""
+    """The issues sorted by severity, most severe first."""
     return sorted(doubts, key=lambda doubt: (doubt.weight == "warning", -doubt.evidence))
 
 
 def doubts_result(doubts: Sequence[Doubt]) -> list[dict[str, Any]]:
-    """`doubts` of a result."""
+    """Issues as plain data for the key `doubts` of a result."""
     return [{**asdict(doubt), "sure": doubt.sure, "where": doubt.where} for doubt in ordered(doubts)]

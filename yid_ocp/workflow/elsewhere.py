@@ -1,4 +1,4 @@
-"""Parts of an analysis of identifiability that workers do: they build the problem again from its configuration."""
+"""Identifiability analysis as tasks for worker processes, which rebuild the problem from its configuration."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from yid_ocp.workflow.second_arm import second_arm
 
 @dataclass(frozen=True)
 class Elsewhere:
-    """Workers, and what they have to be told to judge at the same point of the same problem.
+    """Workers and common task arguments of the identifiability analysis of one run.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class Elsewhere:
         grasp_std: float | None,
         progress: Progress,
     ) -> Elsewhere:
-        """Workers for a run whose folder has its configuration.
+        """Tasks for a run whose folder contains its configuration.
 
         Parameters
         ----------
@@ -94,7 +94,7 @@ class Elsewhere:
         return Elsewhere(workers, folder.partial / "tasks", told, progress)
 
     def with_profiles(self, information: Identifiability, names: Sequence[str]) -> Identifiability:
-        """An analysis with the profile likelihoods of some parameters, each of which is one task.
+        """The analysis with profile likelihoods of the named parameters, one task per parameter.
 
         Raises
         ------
@@ -110,7 +110,7 @@ class Elsewhere:
         return replace(information, parameters=parameters, profiles=profiles)
 
     def judge(self) -> Judge:
-        """What works sets of changes out, those of one mechanics in one task, which its rollout dominates."""
+        """Function that evaluates sets of experiment changes on the workers, one task per changed mechanics."""
 
         def judged(sets: Sequence[Sequence[Change]], inflation: float) -> list[Outcome]:
             groups: dict[tuple[str, ...], list[int]] = {}
@@ -132,7 +132,7 @@ class Elsewhere:
         return judged
 
     def clear(self) -> None:
-        """Remove what was kept for a run that was interrupted."""
+        """Delete the stored task results."""
         with contextlib.suppress(OSError):
             shutil.rmtree(self.results)
             self.results.parent.rmdir()
@@ -154,7 +154,7 @@ def profiled(
     grasp_std: float | None,
     name: str,
 ) -> dict[str, Any]:
-    """One parameter's profile likelihood and what it leaves to say of it."""
+    """Task: profile likelihood of one parameter and its updated verdict, as plain data."""
     del inputs  # they are part of what the result is kept by
     run, problem = _problem(config, remembers)
     found = identifiability(
@@ -174,7 +174,7 @@ def outcomes(
     sets: Sequence[Sequence[str]],
     inflation: float,
 ) -> list[dict[str, Any]]:
-    """What an experiment with each of several sets of changes would tell."""
+    """Task: expected information of the experiment with each set of changes, as plain data."""
     del inputs
     run, problem = _problem(config, remembers)
     other = second_arm(run, build_system(run))

@@ -1,4 +1,4 @@
-"""Experiments of a blind proof: how each differs from a configuration, and its ensemble in whatever process."""
+"""Experiments of a blind validation: variations of a configuration and the ensemble of each."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ WHITE, OFFSET = 0.1, 0.3
 
 @dataclass(frozen=True)
 class Variation:
-    """How an experiment differs from its configuration.
+    """How an experiment of a blind validation differs from its configuration.
 
     Attributes
     ----------
@@ -57,14 +57,14 @@ class Variation:
     prescribed: bool = False
 
     def simulated(self) -> tuple[str, ...]:
-        """Settings, over those of the configuration, of what moves."""
+        """Setting overrides of the model that simulates the recordings."""
         if not self.bare:
             return ()
         # what is said of the object and of what sees it means nothing here
         return ("model.object=null", "model.grasp={}", "model.points=null", "sensors={}", "parameters={}")
 
     def diagnosed(self, driven: Sequence[str]) -> tuple[str, ...]:
-        """Settings, over those of the configuration, of what is diagnosed."""
+        """Setting overrides of the model that is diagnosed."""
         own = list(self.simulated())
         if self.bare:
             free = {f"{name}.damping": {"free": True, "bounds": [0.0, 50.0]} for name in driven}
@@ -104,23 +104,23 @@ class Experiment:
 
     @property
     def told(self) -> dict[str, Any]:
-        """As the arguments of a task."""
+        """The experiment as task arguments."""
         return {"config": self.config, "variation": self.variation, "seed": self.seed, "purpose": self.purpose}
 
     @property
     def conditions(self) -> Conditions:
-        """How its recordings are made, but for the camera."""
+        """Conditions under which the recordings are simulated, without the camera."""
         varied = VARIATIONS[self.variation]
         noise = ArmNoise(effort=WHITE, effort_bias=OFFSET) if varied.noisy else ArmNoise()
         simulation = Simulation(time_step=INNER_STEP * varied.step)
         return Conditions(varied.recordings, noise, simulation, purpose=self.purpose)
 
     def simulated(self) -> Run:
-        """The run of what moves."""
+        """Settings of the model that simulates the recordings."""
         return load_config(self.config, VARIATIONS[self.variation].simulated())
 
     def begin(self, file: Path) -> None:
-        """Make a first recording, which says where the arms begin and what is seen.
+        """Write the first recording, which fixes initial configuration and sensors.
 
         Raises
         ------
@@ -152,7 +152,7 @@ class Experiment:
         )
 
     def ensemble(self, first: Path) -> tuple[Run, Ensemble]:
-        """The run that is diagnosed and its ensemble, from the first recording.
+        """Settings of the diagnosed model and the ensemble, built from the first recording.
 
         Raises
         ------
@@ -183,7 +183,7 @@ def _ensemble(experiment: Experiment, first: Path, written: int) -> tuple[Run, E
 
 
 def refuse_unfit(run: Run) -> None:
-    """Refuse configurations that no blind proof can be made of.
+    """Raise an error for configurations that a blind validation does not support.
 
     Raises
     ------
@@ -207,7 +207,7 @@ def refuse_unfit(run: Run) -> None:
 def experiments_of(
     configs: Mapping[str, Path], seed: int, purpose: str
 ) -> tuple[dict[str, Experiment], frozenset[str]]:
-    """All experiments of some configurations by name, and those whose object can be made of finer links.
+    """All experiments by name, and the names of those whose object has divisible links.
 
     Variations that a configuration does not allow, as one whose frames sit on the object that is taken away, are left
     out.

@@ -1,4 +1,4 @@
-"""The command `export`: recordings as CSV or MCAP, what a run predicted as MCAP, its model for other engines."""
+"""The command `export`: recordings as CSV or MCAP, predictions of a run as MCAP, models for other engines."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MCAP = "mcap"
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """The command."""
+    """Run the command and return its exit code."""
     source, form = Path(arguments.source), arguments.format
     if source.is_dir():
         if form == "csv":

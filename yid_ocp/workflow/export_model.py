@@ -1,4 +1,4 @@
-"""The model that a run ended with, for other engines and as a configuration, with what each format can say of it."""
+"""Export of a run's final model to other engines or as a configuration, with a manifest of what was kept."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FORMATS = ("mjcf", "urdf", "sdf", "yaml")
 
 @dataclass(frozen=True)
 class Calibrated:
-    """The model that a run ended with.
+    """Final model of a run: settings with found effects, parameter values and stds.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class Calibrated:
 
 
 def read_model(folder: str | Path) -> Calibrated:
-    """The model of a run folder of `solve` or `diagnose`.
+    """The final model read from a run folder of `solve` or `diagnose`.
 
     Raises
     ------
@@ -82,7 +82,7 @@ def read_model(folder: str | Path) -> Calibrated:
 def export_model(
     folder: str | Path, out: str | Path, form: str = "mjcf", progress: Progress = SILENT
 ) -> dict[str, Any]:
-    """Write the model of a run, and beside it `OUT.manifest.json` with what the format makes of it.
+    """Write the final model of a run and `OUT.manifest.json`, which lists what the format represents.
 
     Parameters
     ----------
@@ -148,12 +148,12 @@ def export_model(
 
 
 def manifest_file(out: Path) -> Path:
-    """Where the manifest of an exported file stands."""
+    """Path of the manifest of an exported file."""
     return out.with_name(f"{out.name}.manifest.json")
 
 
 def calibrated_settings(calibrated: Calibrated) -> Run:
-    """The run's settings with the effects that it found, and the estimates as initial values."""
+    """Settings of the run with found effects, and estimates as initial values."""
     system = build_system(calibrated.run)
     chosen = dict(parameter_settings(calibrated.run, system.parameters))
     for name in calibrated.std:

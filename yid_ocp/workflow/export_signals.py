@@ -1,4 +1,4 @@
-"""What a run measured, predicted and could not explain, as signals over time."""
+"""Export of measured, predicted and residual signals of a run as MCAP."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Run folders: written under a temporary name, renamed when complete, never half there."""
+"""Run folders: written under a temporary name and renamed when complete."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _UNFINISHED, _LOCK, _NAMES = ".partial", "lock", 1000
 
 @dataclass
 class RunFolder:
-    """A folder of results in the making.
+    """A run folder while it is being written.
 
     Attributes
     ----------
@@ -346,12 +346,12 @@ def _clear(temporary: Path | None, made: Sequence[Path]) -> None:
 
 
 def now() -> str:
-    """The time of day, with the zone, to the second."""
+    """Local date and time with UTC offset, as text."""
     return datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
 
 
 def reproducing(run: Run, folder: Path, command: str, flags: Sequence[str] = ()) -> str:
-    """The command that gives a result again; the resolved configuration in its folder, where `--set` changed one."""
+    """Shell command that reproduces a result; it names the resolved configuration where `--set` was used."""
     origins = list(run.places.values())
     if any(origin.startswith("--set") for origin in origins):
         near = os.path.relpath(folder)

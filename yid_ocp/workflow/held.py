@@ -1,4 +1,4 @@
-"""What holds an object without a robot, and frames that the settings add: clamps that follow points, markers."""
+"""Clamps that hold an object without a robot, and additional frames such as markers."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ AXES = "xyz"
 
 
 def clamp_paths(run: Run, cable: Cable | None) -> tuple[ClampPath, ...]:
-    """Which clamps follow which measured points: those of the settings, or a cable's own."""
+    """Clamps and the measured points that they follow, from the settings or from the cable."""
     if cable is not None:
         return cable.clamps
     return tuple(ClampPath(name, s.origin, s.towards, s.roll) for name, s in run.model.clamps.items())
 
 
 def clamped_points(paths: Sequence[ClampPath]) -> tuple[str, ...]:
-    """The points that clamps follow."""
+    """Names of the points that clamps follow, without duplicates."""
     return tuple(dict.fromkeys(point for path in paths for point in (path.origin, path.towards)))
 
 
 def clamps(run: Run) -> Mechanism | None:
-    """The clamps that move an object without a robot, None where there are none.
+    """Mechanism of the clamps that move an object without a robot; None without clamps.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def clamps(run: Run) -> Mechanism | None:
 def with_frames(
     run: Run, carrier: Mechanism | None, items: Sequence[FlexibleObject]
 ) -> tuple[Mechanism | None, list[FlexibleObject]]:
-    """Robot (or clamps) and objects with the frames that the settings add to them.
+    """Robot (or clamps) and objects with the additional frames of the settings.
 
     A frame whose place each recording's `straight` tells has the parameters NAME.x, .y, .z; see `straight_values`.
 
@@ -123,7 +123,7 @@ def _marked(tree: Mechanism, name: str, frame: str) -> Mechanism:
 
 
 def straight_values(run: Run, system: System, recordings: Sequence[Recording]) -> dict[str, dict[str, float]]:
-    """Where each recording's markers sit on the object, by their positions while it was held straight [m].
+    """Marker positions on the object per recording, as parameter values, from its straight reference pose [m].
 
     Parameters
     ----------

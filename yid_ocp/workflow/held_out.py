@@ -1,4 +1,4 @@
-"""How well held-out recordings are predicted, beside predictions that need no model."""
+"""Prediction errors of recordings, compared with model-free baselines."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ GIVEN = 2  # frames from which the baselines of a cable start, as its own start 
 def held_out_entry(
     problem: EstimationProblem, episode: Episode, outcome: EpisodeResult | str, cable: Cable | None = None
 ) -> dict[str, Any]:
-    """One entry of `held_out` in a result: recording, rmse per channel, the same for every baseline.
+    """Prediction errors of one recording: RMSE per channel for the model and for every baseline.
 
     A group of several points has an entry of its own beside its channels: the square root of the mean squared distance
     over all its points and frames but those that fixed the start.
@@ -55,7 +55,7 @@ def held_out_entry(
 
 
 def worse_than_guess(entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]) -> list[dict[str, Any]]:
-    """Channels of `held_out_entry` entries that a guess without a model predicts better, by more than a little."""
+    """Channels that a model-free baseline predicts clearly better than the model, from `held_out_entry` entries."""
     worse = []
     for entry in entries:
         for channel, error in entry["rmse"].items():
@@ -73,7 +73,7 @@ def worse_than_guess(entries: Sequence[Mapping[str, Any]], units: Mapping[str, s
 
 
 def guess_doubts(entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]) -> list[Doubt]:
-    """Doubts for every sensor of a recording that a guess without a model predicts better, all its channels together.
+    """Issues for sensors that a model-free baseline predicts better than the model, over all their channels.
 
     Single channels that say little of what the model is about may well be worse; see `worse_than_guess`.
     """

@@ -1,4 +1,4 @@
-"""The command `identifiability`: what the recordings of a run can tell, and what another experiment would."""
+"""The command `identifiability`: Fisher information of a run's recordings and of changed experiments."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ FORMAT = "yid-identifiability/1"
 
 @dataclass(frozen=True)
 class Question:
-    """What is asked of a run beyond its settings.
+    """Options of an identifiability analysis beyond the run's settings.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class Question:
 
     @property
     def flags(self) -> list[str]:
-        """The same on a command line."""
+        """The options as command-line flags."""
         names = self.intervals if isinstance(self.intervals, str) else ",".join(self.intervals) or "none"
         said = {
             "--what-if": self.what_if,
@@ -80,7 +80,7 @@ class Question:
 
 @dataclass(frozen=True)
 class IdentifiabilityOutcome:
-    """What `run_identifiability` leaves: the run folder, result.json's contents, the analysis where there is one."""
+    """Result of `run_identifiability`: run folder, result.json's contents and the analysis (None if it failed)."""
 
     folder: Path
     result: dict[str, Any]
@@ -88,12 +88,12 @@ class IdentifiabilityOutcome:
 
     @property
     def ok(self) -> bool:
-        """Whether there was a point at which to judge."""
+        """Whether the analysis was possible."""
         return self.information is not None
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """The command."""
+    """Run the command and return its exit code."""
     settings = load_config(arguments.config, arguments.overrides)
     names = [name for name in arguments.intervals.split(",") if name]
     asked = Question(
@@ -120,7 +120,7 @@ def run_identifiability(
     question: Question | None = None,
     workers: Workers | Executor | None = None,
 ) -> IdentifiabilityOutcome:
-    """Solve, judge and write the run folder.
+    """Solve, analyse identifiability and write the run folder.
 
     Parameters
     ----------

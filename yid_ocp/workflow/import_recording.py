@@ -1,4 +1,4 @@
-"""The command `import`: files of other tools as a recording, or what there is in them."""
+"""The command `import`: converts files of other tools to a recording, or previews their contents."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _SWITCHES = {("header", False): "--no-header", ("skip_bad_lines", True): "--skip
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """The command."""
+    """Run the command and return its exit code."""
     if arguments.preview:
         with shown(arguments) as progress:
             progress.stage(f"reading {arguments.file}")
@@ -59,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def recording_result(recording: Recording) -> dict[str, Any]:
-    """What a recording holds, for programs."""
+    """Contents of a recording as plain data: duration, groups and notes."""
     return {
         "duration": recording.duration,
         "groups": {
@@ -71,7 +71,7 @@ def recording_result(recording: Recording) -> dict[str, Any]:
 
 
 def imported(file: str | Path, options: Mapping[str, Any], progress: Progress = SILENT) -> Recording:
-    """A recording of a file of another tool, whose `source` says the file's hash.
+    """Recording read from a file of another tool, with the file's hash in `source`.
 
     Parameters
     ----------
@@ -93,18 +93,18 @@ def imported(file: str | Path, options: Mapping[str, Any], progress: Progress = 
 
 
 def own(file: str | Path) -> bool:
-    """Whether a file is a recording already, by its name."""
+    """Whether a file is a recording of this package, judged by its suffix."""
     return Path(file).suffix.lower() in (".h5", ".hdf5")
 
 
 def options_of_settings(settings: ImportSettings) -> dict[str, Any]:
-    """What a section `import` says, as named options of a reader."""
+    """Reader options from the section `import` of the settings."""
     said = ((entry.name, getattr(settings, entry.name)) for entry in fields(settings))
     return {name: value for name, value in said if value is not None}
 
 
 def given_options(arguments: argparse.Namespace) -> dict[str, Any]:
-    """What flags of the command line say, as named options of a reader.
+    """Reader options from the command-line flags.
 
     Raises
     ------
@@ -145,7 +145,7 @@ def _pairs(entries: Sequence[str], flag: str, kind: Callable[[str], Any], number
 
 
 def command_line(file: str | Path, options: Mapping[str, Any]) -> str:
-    """The command that imports a file with these options of its reader, to be pasted into a shell."""
+    """Shell command that imports a file with the given reader options."""
     words = ["yid-ocp", "import", str(file)]
     for key, value in options.items():
         if isinstance(value, bool):

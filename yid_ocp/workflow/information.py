@@ -1,4 +1,4 @@
-"""The goal `information` of the command `plan`: from settings and run folders to the motion that tells most."""
+"""The goal `information` of the command `plan`: plans the most informative motion."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def run_result(run: Run, commands: Sequence[str]) -> tuple[dict[str, Any], Path]
 
 
 def informed(run: Run, progress: Progress) -> tuple[InformationPlan, dict[str, Any]]:
-    """The motion that tells most, and where the parameters come from: the settings, or a folder of solve or diagnose.
+    """The most informative motion, and the source of its parameters: settings or a run folder.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def informed(run: Run, progress: Progress) -> tuple[InformationPlan, dict[str, A
 
 
 def refuse_other_effects(run: Run, found: Iterable[str], own: Collection[str]) -> None:
-    """Refuse a run whose parameters belong to effects that the plan's model lacks: the others made up for nothing."""
+    """Raise an error where the run has parameters of effects that the plan's model lacks."""
     lacking = sorted({name.rpartition(".")[0] for name in found if "@" in name and name not in own})
     if lacking:
         raise run.refuse(
@@ -94,7 +94,7 @@ def refuse_other_effects(run: Run, found: Iterable[str], own: Collection[str]) -
 
 
 def found_values(result: Mapping[str, Any]) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
-    """Parameters of a `yid-solve/1` or `yid-diagnosis/1`, and in the latter sizes of effects, as people read them."""
+    """Parameter values of a solve or diagnosis result, and effect sizes of a diagnosis, in display units."""
     if "parameters" in result:
         return {name: entry["value"] for name, entry in result["parameters"].items()}, {}
     sizes = {
@@ -107,7 +107,7 @@ def found_values(result: Mapping[str, Any]) -> tuple[dict[str, float], dict[str,
 
 
 def information_result(run: Run, found: InformationPlan) -> dict[str, Any]:
-    """What `yid-plan/1` says of a motion that tells much."""
+    """Entries of `yid-plan/1` for an informative motion."""
     pairs = [
         {"effect": first, "explained_by": second, "before": before, "after": after}
         for (first, second), (before, after) in found.distances.items()
@@ -143,7 +143,7 @@ def information_result(run: Run, found: InformationPlan) -> dict[str, Any]:
 
 
 def next_plan(confusable: Sequence[Sequence[Mapping[str, str]]], folder: Path) -> dict[str, Any] | None:
-    """The section `plan` that would separate the first effects of a diagnosis which look alike; None without any."""
+    """Settings of `plan` for a motion that discriminates confusable effects; None without any."""
     if not confusable:
         return None
     labels = [f"{entry['kind']}@{entry['location']}" for entry in confusable[0]]

@@ -1,4 +1,4 @@
-"""The command `init`: a commented configuration from a robot, recordings of it and a few numbers of the object."""
+"""The command `init`: writes a commented configuration from robot, recordings and object dimensions."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MEANING = {"length": "its length [m]", "mass": "its mass [kg]", "radius": "its r
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """The command."""
+    """Run the command and return its exit code."""
     out = Path(arguments.out)
     if out.suffix not in (".yaml", ".yml"):
         raise ConfigError(f"the configuration is called '{out.name}'", where="--out", allowed="NAME.yaml")
@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def described(arguments: argparse.Namespace) -> Object:
-    """The object that the options of the command describe.
+    """Object description from the command-line options.
 
     Raises
     ------
@@ -232,7 +232,7 @@ def _write(out: Path, text: str, made: Mapping[Path, Recording]) -> None:
 
 
 def summary(proposal: Proposal, out: Path) -> list[str]:
-    """Lines that tell a person what was found and what comes next."""
+    """Text lines on the proposed configuration and the next commands."""
     held = ", ".join(dict.fromkeys([proposal.holder, *proposal.grasps]))
     lines = [
         f"joints: {', '.join(proposal.joints)}",

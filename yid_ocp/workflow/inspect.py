@@ -1,4 +1,4 @@
-"""The command `inspect`: the equations of a run's model by name, as patterns, in numbers, and as files."""
+"""The command `inspect`: equations, sparsity patterns and linearisation of a run's model."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class InspectOutcome:
-    """What `run_inspect` leaves: the run folder and the contents of its result.json."""
+    """Result of `run_inspect`: the run folder and the contents of its result.json."""
 
     folder: Path
     result: dict[str, Any]
@@ -49,7 +49,7 @@ class InspectOutcome:
 
 @dataclass(frozen=True)
 class Point:
-    """Where the equations are linearised.
+    """State and inputs at which the equations are linearised.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class Point:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """The command."""
+    """Run the command and return its exit code."""
     settings = load_config(arguments.config, arguments.overrides)
     asked = (tuple(arguments.entries), arguments.export)
     carry_out(lambda shown: run_inspect(settings, arguments.out, shown, *asked), inspect_summary, arguments)

@@ -1,4 +1,4 @@
-"""The command `plan`: a motion of the arms by the identified model, written for simulation and for a robot."""
+"""The command `plan`: plans an arm motion with the identified model and writes it for simulation and robot."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PlanOutcome:
-    """What `run_plan` leaves: the finished run folder, the contents of result.json, the plan."""
+    """Result of `run_plan`: the run folder, the contents of result.json and the plan."""
 
     folder: Path
     result: dict[str, Any]
@@ -49,12 +49,12 @@ class PlanOutcome:
 
     @property
     def ok(self) -> bool:
-        """Whether the search ended well, within all limits."""
+        """Whether the goal was reached within all limits."""
         return self.plan.reached
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """The command."""
+    """Run the command and return its exit code."""
     settings = load_config(arguments.config, arguments.overrides)
     outcome = carry_out(lambda shown: run_plan(settings, arguments.out, shown), plan_summary, arguments)
     return DONE if outcome.ok else FAILED
@@ -107,7 +107,7 @@ def run_plan(run: Run, out: str | Path | None = None, progress: Progress = SILEN
 
 
 def planning_step(run: Run) -> Step:
-    """The compiled step of a run with its arms prescribed: what a plan decides is where they go."""
+    """The compiled step of a run with prescribed arms, for planning."""
     arms = replace(run.model.arms, mode="prescribed")
     model = replace(run.model, arms=arms)
     recordings = run.recordings if run.model.robot is None else replace(run.recordings, estimate=(), held_out=())
@@ -115,7 +115,7 @@ def planning_step(run: Run) -> Step:
 
 
 def start_posture(run: Run, step: Step) -> Mapping[str, float] | None:
-    """Moved joints where the motion begins: as the settings say, else as the first recording begins.
+    """Joint positions at the start of the motion: from the settings, else from the first recording.
 
     None where neither says it: then it begins where the arms first grasp the undeformed object. Two arms that hold a
     straight object are at its full stretch, from which it snaps to either side; a recording rarely begins there.
@@ -166,7 +166,7 @@ def identified(run: Run, step: Step) -> tuple[Array, Known, dict[str, Any]]:
 
 
 def as_recording(run: Run, found: Plan | InformationPlan) -> Recording:
-    """The plan as if it had been recorded: joints, and the points of the object as the model predicts them."""
+    """The planned motion as a recording: joints, and object points predicted by the model."""
     joints = JointGroup(
         found.joints, found.t, found.position, found.velocity, found.effort,
         position_command=found.position, velocity_command=found.velocity, effort_kind="sample",
@@ -184,7 +184,7 @@ def as_recording(run: Run, found: Plan | InformationPlan) -> Recording:
 
 
 def motion_result(run: Run, found: Plan | InformationPlan, source: dict[str, Any]) -> dict[str, Any]:
-    """What `yid-plan/1` says of any goal's motion, without inputs and versions."""
+    """Entries of `yid-plan/1` common to all goals, without inputs and versions."""
     joints = found.mover.step.system.mechanism.joints
     limits = [joints[i] for i in found.mover.joints]
     shares = {
@@ -208,7 +208,7 @@ def motion_result(run: Run, found: Plan | InformationPlan, source: dict[str, Any
 
 
 def plan_result(run: Run, found: Plan) -> dict[str, Any]:
-    """What `yid-plan/1` says of a point that is to arrive."""
+    """Entries of `yid-plan/1` for a point that is moved to a target."""
     return {
         "point": run.plan.point,
         "place": found.place.tolist(),

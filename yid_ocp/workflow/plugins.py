@@ -1,4 +1,4 @@
-"""Effects and sensors from outside the package: files that a configuration names, and installed distributions."""
+"""Plug-ins: effects and sensors from files named in a configuration and from installed packages."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _loaded: dict[str, str] = {}  # what this process has run: file or entry point, 
 
 
 def load_plugins(run: Run) -> None:
-    """Run the files of `plugins` and the entry points of `GROUP`, each once in a process.
+    """Import the files of `plugins` and the entry points of `GROUP`, each once per process.
 
     Parameters
     ----------
@@ -56,12 +56,12 @@ def load_plugins(run: Run) -> None:
 
 
 def plugin_files(run: Run) -> list[tuple[Path, str]]:
-    """Files of `plugins`, each with the place that names it."""
+    """Plug-in files, each with the location of its setting."""
     return [(Path(path), run.where("plugins", i)) for i, path in enumerate(run.plugins)]
 
 
 def plugin_versions() -> dict[str, str]:
-    """Distribution and version behind every entry point of `GROUP`."""
+    """Package and version of every entry point of `GROUP`."""
     return {f"entry point {entry.name}": _distribution(entry) for entry in _installed()}
 
 

@@ -1,4 +1,4 @@
-"""How a long run is doing, as a command shows it: bars, lines, and the time that is left."""
+"""Progress display of commands: bars on a terminal, lines elsewhere, and the remaining time."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ SOON = 2.0
 
 
 class TimeLeft:
-    """How long the rest of a stage will take, from what its parts took so far."""
+    """Estimator of the remaining time of a stage from its finished parts."""
 
     def __init__(self) -> None:
         self._first: tuple[int, float] | None = None
 
     def words(self, done: int, total: int) -> str:
-        """Of the time left, once there is something to tell it from; empty before, and for short stages."""
+        """Text with the remaining time; empty for short stages or before an estimate exists."""
         now = time.monotonic()
         if self._first is None:
             # what stood there before this run began took no time
@@ -39,7 +39,7 @@ class TimeLeft:
 
 
 def duration_words(seconds: float) -> str:
-    """A time for people: seconds, minutes or hours."""
+    """A duration as text in seconds, minutes or hours."""
     for unit, size in (("h", 3600.0), ("min", 60.0)):
         if seconds >= 1.5 * size:
             return f"{seconds / size:.1f} h" if unit == "h" else f"{seconds / size:.0f} min"
@@ -47,7 +47,7 @@ def duration_words(seconds: float) -> str:
 
 
 class PlainProgress:
-    """Lines on standard error for logs and pipes.
+    """Progress as lines on standard error, for logs and pipes.
 
     One for every stage and iterate, for every tenth of a stage, and for what else is done `OFTEN` after the last line.
     """
@@ -73,7 +73,7 @@ class PlainProgress:
 
 
 class BarProgress:
-    """A moving bar for the stage that runs, under a line for each that is done: of many bars the last is not seen."""
+    """Progress as one bar for the running stage, below a line for each finished stage."""
 
     def __init__(self, bars: rich.progress.Progress) -> None:
         self._bars = bars
@@ -98,7 +98,7 @@ class BarProgress:
             self._bars.update(self._task, description=words, completed=done, total=total)
 
     def close(self) -> None:
-        """End the running stage."""
+        """Finish the running stage and print its duration."""
         if self._task is not None:
             self._bars.remove_task(self._task)
             self._task = None
@@ -107,14 +107,14 @@ class BarProgress:
 
 
 def iterate_words(entry: Point) -> str:
-    """An accepted point in a line."""
+    """One line of text on an accepted point."""
     note = f", {entry.note}" if entry.note else ""
     return f"iteration {entry.iteration}, cost {entry.cost:.6g}, {entry.seconds:.1f} s{note}"
 
 
 @contextlib.contextmanager
 def shown(arguments: argparse.Namespace) -> Iterator[Progress]:
-    """Progress on standard error while the block runs.
+    """Context manager that yields a progress display on standard error.
 
     Bars on a terminal. Elsewhere lines, for logs, or nothing where a program reads the result (`--json`); nothing where
     it is asked to be quiet.

@@ -1,4 +1,4 @@
-"""What robot and recordings say about a configuration that nobody has written yet: arms, mode, places, noise, rates."""
+"""Proposes a configuration from robot and recordings: arms, mode, marker positions, noise, rates."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ SEEN_STEP = 5
 
 @dataclass(frozen=True)
 class Branch:
-    """One segment of an object as its user describes it: lengths in m, mass in kg, turns in rad."""
+    """User's description of one segment of an object, in m, kg and rad."""
 
     name: str
     length: float
@@ -59,7 +59,7 @@ class Branch:
 
 @dataclass(frozen=True)
 class Arm:
-    """A chain of recorded joints, base to tip, and the frames at its end, the likeliest tool first."""
+    """A chain of recorded joints, base to tip, and the frames at its end, most likely tool first."""
 
     joints: tuple[str, ...]
     frames: tuple[str, ...]
@@ -67,7 +67,7 @@ class Arm:
 
 @dataclass(frozen=True)
 class Place:
-    """A recorded point, the frame of the model that it probably marks (empty for none), and why."""
+    """Assignment of a recorded point to a model frame (empty for none), with the reason."""
 
     point: str
     frame: str
@@ -76,7 +76,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviation of a group (None where the recording states it), its unit and where it comes from."""
+    """Noise standard deviation of a group (None where the recording states it), unit and source."""
 
     std: float | None
     unit: str
@@ -85,7 +85,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class Proposal:
-    """Everything that a generated configuration says.
+    """Proposed contents of a generated configuration.
 
     Attributes
     ----------
@@ -128,7 +128,7 @@ class Proposal:
 
     @property
     def seen(self) -> tuple[str, ...]:
-        """Frames that recorded points mark, each once."""
+        """Model frames marked by recorded points, without duplicates."""
         return tuple(dict.fromkeys(p.frame for places in self.places.values() for p in places if p.frame))
 
 
@@ -141,7 +141,7 @@ def propose(
     grasps: Mapping[str, str] | None = None,
     standing: bool = False,
 ) -> Proposal:
-    """Look at a robot and at recordings of it.
+    """Propose a configuration from a robot and its recordings.
 
     Parameters
     ----------
@@ -305,7 +305,7 @@ def _start(recordings: Sequence[Recording], joints: Sequence[str]) -> tuple[str,
 
 
 def moving_at(recording: Recording, joints: Sequence[str], time: float) -> str:
-    """A joint or point that moves just after a time, by a line through its first samples; nothing where all rest."""
+    """Name of a joint or point that moves just after a time, from a line fit; empty where all rest."""
     group = recording.joints
     if group is not None:
         values = group.position[:, [group.names.index(name) for name in joints]]
@@ -337,7 +337,7 @@ def _speeds(t: Array, values: Array, time: float, window: float) -> tuple[Array,
 
 
 def split_at_rest(recording: Recording, joints: Sequence[str]) -> float | None:
-    """A time in the later part of a recording from which on everything rests for a while; None where there is none.
+    """Time in the later part of a recording at which everything is at rest; None if there is none [s].
 
     What comes after it can be predicted from rest, so that it shows, held out, whether a model is right.
     """
@@ -508,5 +508,5 @@ def _clock(t: Array, clock: str) -> str:
 
 
 def relative(path: str | Path, folder: Path) -> str:
-    """A path as a file of a folder writes it."""
+    """POSIX path relative to a folder."""
     return Path(os.path.relpath(Path(path).resolve(), folder.resolve())).as_posix()

@@ -1,4 +1,4 @@
-"""A run with finer links or shorter steps: what its lowest frequencies and its estimates then are."""
+"""Discretisation check: shifts of estimates and frequencies with finer links or shorter time steps."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ WORTH_COMPILING = 2000  # steps of one evaluation from which on compiling a fine
 
 @dataclass(frozen=True)
 class Discretisation:
-    """How far estimates move with a finer model.
+    """Shifts of the estimates with a finer discretisation.
 
     Attributes
     ----------
@@ -49,12 +49,12 @@ class Discretisation:
     notes: tuple[str, ...] = ()
 
     def result(self, std: Mapping[str, float]) -> dict[str, Any]:
-        """For result.json: moves in the parameter's unit, beside the standard deviation that the data alone give."""
+        """Shifts for result.json in the parameter's unit, with the standard deviation from the data alone."""
         return {name: {**asdict(own), "std": std.get(name)} for name, own in self.moves.items()}
 
 
 def wanted(run: Run) -> tuple[What, ...]:
-    """What a run's settings ask to refine after a solve.
+    """Refinements that a run's settings request after a solve.
 
     Where they do not say: the time step, and the links too where they stand for something that bends everywhere; the
     links of the paper's Y are its definition.
@@ -75,7 +75,7 @@ def discretisation(
     *,
     models_alone: bool = False,
 ) -> Discretisation:
-    """How far estimates move when every link is divided in two, and when the time step is halved.
+    """Shifts of the estimates when every link is divided in two and when the time step is halved.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def discretisation(
 
 
 def counted(solution: Solution, found: Discretisation) -> Solution:
-    """The solution with standard deviations and verdicts that count how far discretisation moves its estimates."""
+    """The solution with stds and verdicts that include the discretisation shifts."""
     sizes = {} if solution.problem is None else typical_sizes(solution.problem, solution.x)
     return replace(solution, parameters=counting(solution.parameters, found.moves, sizes))
 
@@ -139,7 +139,7 @@ def _with_half_the_step(problem: EstimationProblem) -> Refined:
 
 
 def steadied(problem: EstimationProblem, solution: Solution) -> tuple[Solution, dict[str, Any]]:
-    """A solution that has not converged where its step is not stable, and for result.json what was found.
+    """The solution, marked as not converged where the step is unstable, and stability data for result.json.
 
     Along the recorded motions, at the start of the search and at the estimate. A search may begin where the step is not
     stable and leave that place; one that ends there has followed the step's own errors.
@@ -158,7 +158,7 @@ def steadied(problem: EstimationProblem, solution: Solution) -> tuple[Solution, 
 
 
 def refine(run: Run, problem: EstimationProblem | None, warnings: list[str]) -> dict[str, Any]:
-    """Lowest frequencies at twice the links, and at half and a quarter of the time step.
+    """Lowest natural frequencies with twice the links and with half and a quarter of the time step.
 
     Returns
     -------
@@ -202,7 +202,7 @@ def refine(run: Run, problem: EstimationProblem | None, warnings: list[str]) -> 
 
 
 def object_links(run: Run) -> int | None:
-    """Number of links of each of the object's tubes, of all together where they differ; None without such links."""
+    """Number of links per tube of the object, in total where tubes differ; None without divisible links."""
     item = run.model.object
     if isinstance(item, YObject):
         return item.links

@@ -1,4 +1,4 @@
-"""Finished refits of a diagnosis, kept beside its run folder so that an interrupted one does not begin again."""
+"""Store of finished refits, kept beside the run folder so that an interrupted diagnosis can resume."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ class Refits:
         return len(self._known)
 
     def get(self, name: str) -> Refitted | None:
-        """See `yid_ocp.diagnosis.refit.Store`; what is resumed is said in the log."""
+        """The stored refit of that name, or None; a reused refit is logged."""
         found = self._known.get(name)
         if found is not None:
             self._folder.log("resumed", refit=name)
         return found
 
     def put(self, name: str, refitted: Refitted) -> None:
-        """See `yid_ocp.diagnosis.refit.Store`."""
+        """Store a refit and rewrite the file."""
         with self._lock:
             self._known[name] = refitted
             refits = {
@@ -72,7 +72,7 @@ class Refits:
                 self._warned = True
 
     def clear(self) -> None:
-        """Remove the file, what a killed run left of it, and its folder where nothing else is in it."""
+        """Delete the file, its temporary copies and its folder if empty."""
         with contextlib.suppress(OSError):
             for file in self.file.parent.glob(f"*{self.file.name}*"):
                 file.unlink()

@@ -1,4 +1,4 @@
-"""The command `report`: runs of one model side by side, which parameter drifted, which run to distrust."""
+"""The command `report`: compares runs of one model and tests for drifting parameters and outlier runs."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FORMAT = "yid-history/1"
 
 @dataclass(frozen=True)
 class ReportOutcome:
-    """What `run_report` leaves: the folder, contents of history.json, the history."""
+    """Result of `run_report`: the folder, contents of history.json and the history."""
 
     folder: Path
     result: dict[str, Any]
@@ -35,7 +35,7 @@ class ReportOutcome:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """The command."""
+    """Run the command and return its exit code."""
     carry_out(lambda shown: run_report(arguments.runs, arguments.out, shown), history_summary, arguments)
     return DONE
 

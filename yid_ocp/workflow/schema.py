@@ -12,7 +12,7 @@ from yid_ocp.workflow.command import DONE
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """The command."""
+    """Run the command and return its exit code."""
     text = json.dumps(schema(), indent=1)
     if arguments.out is None:
         print(text)

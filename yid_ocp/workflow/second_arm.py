@@ -1,4 +1,4 @@
-"""A run's robot with its other arm at the object too."""
+"""Variant of a run's system in which the second arm grasps the object too."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ OTHER_SIDE = {"left": "right", "right": "left"}
 
 
 def second_arm(run: Run, system: System) -> System | None:
-    """The run's system with the robot's other arm at a free end of the object; None where there is no such thing."""
+    """The run's system with the second arm at a free end of the object; None where impossible."""
     model = run.model
     joints = model.arms.joints
     if joints is None or model.arms.mode != "driven" or len(model.grasp) != 1:

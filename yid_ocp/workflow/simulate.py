@@ -1,4 +1,4 @@
-"""The command `simulate`: what the model says a robot and its sensors would record, written as a recording."""
+"""The command `simulate`: simulates robot and sensors and writes a recording."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SimulateOutcome:
-    """What `run_simulate` leaves.
+    """Result of `run_simulate`.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class SimulateOutcome:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """The command."""
+    """Run the command and return its exit code."""
     settings = load_config(arguments.config, arguments.overrides)
 
     def simulated(shown: Progress) -> SimulateOutcome:

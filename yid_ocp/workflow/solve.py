@@ -1,4 +1,4 @@
-"""The command `solve`: estimate the free parameters, predict the held-out recordings, write the run folder."""
+"""The command `solve`: estimates the free parameters, predicts held-out recordings, writes the run folder."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ FORMAT = "yid-solve/1"
 
 @dataclass(frozen=True)
 class SolveOutcome:
-    """What `run_solve` leaves.
+    """Result of `run_solve`.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class SolveOutcome:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """The command."""
+    """Run the command and return its exit code."""
     settings = load_config(arguments.config, arguments.overrides)
     outcome = carry_out(lambda shown: run_solve(settings, arguments.out, shown), solve_summary, arguments)
     return DONE if outcome.ok else FAILED
@@ -135,7 +135,7 @@ def doubted(
     held_out: Sequence[tuple[Episode, EpisodeResult | str]],
     cable: Cable | None = None,
 ) -> tuple[Solution, tuple[Doubt, ...]]:
-    """A solution as far as it is to be believed, and all doubts, those that only its fit shows among them.
+    """The solution with untrusted verdicts where its fit raises issues, and all issues of the data.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ def doubted(
 
 
 def covariance_result(solution: Solution, data_std: Mapping[str, float]) -> dict[str, Any]:
-    """What the data say of the shared free parameters together.
+    """Covariance of the shared free parameters as plain data, from the data alone.
 
     How far a finer model is counts in the reported ±, not here: another run of this model is as far from it.
     """
@@ -176,7 +176,7 @@ def solve_result(
     held_out: Sequence[tuple[Episode, EpisodeResult | str]],
     cable: Cable | None = None,
 ) -> dict[str, Any]:
-    """`yid-solve/1` without inputs and versions; a cable has baselines of its own."""
+    """Entries of `yid-solve/1` without inputs and versions."""
     fitted, predicted, residuals = _predictions(problem, solution, held_out, cable)
     return {
         "format": FORMAT,

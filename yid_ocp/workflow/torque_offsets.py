@@ -1,4 +1,4 @@
-"""Constant errors of recorded torques, recording by recording, as a result holds them."""
+"""Estimated constant torque errors per recording, as plain data for results."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Offsets = dict[str, dict[str, dict[str, float]]]
 
 
 def torque_offsets(problem: EstimationProblem, x: Array) -> Offsets:
-    """By recording and joint the `value` of the offset, its `std` and its `prior_std` [N m], held-out ones included.
+    """Estimated torque offset by recording and joint: `value`, `std`, `prior_std` [N m], held-out included.
 
     Parameters
     ----------

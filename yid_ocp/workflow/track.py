@@ -1,4 +1,4 @@
-"""The command `track`: points measured in a depth camera's frames, written into a recording that `solve` reads."""
+"""The command `track`: tracks points in depth-camera frames and writes them to a recording."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TrackOutcome:
-    """What `run_track` leaves.
+    """Result of `run_track`.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class TrackOutcome:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """The command."""
+    """Run the command and return its exit code."""
     overrides = (*arguments.overrides, *(["track.options.calibration.fix_pose=true"] if arguments.fix_pose else ()))
     settings = load_config(arguments.config, overrides)
     workers = given_workers(arguments)
@@ -247,7 +247,7 @@ def track_result(
 
 
 def sizes_result(sizes: Sizes) -> dict[str, Any]:
-    """Lengths and radii: the model's, the values that fit the frames with their standard deviations, and what of it."""
+    """Lengths and radii as plain data: model value, value fitted to the frames, and its standard deviation."""
     fits = sizes.told * np.exp(sizes.change)
     return {
         "frames": sizes.frames,
@@ -266,7 +266,7 @@ def sizes_result(sizes: Sizes) -> dict[str, Any]:
 
 
 def camera_result(calibration: Calibration) -> dict[str, Any]:
-    """The camera of a sequence: what is used, what was told, how well it is known."""
+    """Camera calibration as plain data: estimated and specified pose, depth and clock, with stds."""
     state, told, change = calibration.state, calibration.told, calibration.state.minus(calibration.told)
     std = np.sqrt(np.diag(calibration.covariance))
     return {
@@ -305,7 +305,7 @@ def _points(found: Track) -> dict[str, Any]:
 
 
 def truth_errors(system: System, found: Track, made: VirtualFrames) -> Mapping[str, Mapping[str, float]]:
-    """Median and largest distance of every point from where it really was at the time written down [m]."""
+    """Median and largest error of every tracked point against the simulated truth [m]."""
     shape = ShapeFit(system)
     columns = [system.points.index(name) for name in found.names]
     truth = np.array([shape.place(made.course(t))[columns] for t in found.t])
@@ -318,7 +318,7 @@ def truth_errors(system: System, found: Track, made: VirtualFrames) -> Mapping[s
 
 
 def simulated_frames(run: Run, system: System, settings: VirtualFramesSettings) -> tuple[Recording, VirtualFrames]:
-    """A virtual experiment with the parameters' initial values as the truth, and its frames by a virtual camera.
+    """Recording and camera frames of a virtual experiment, with initial parameter values as truth.
 
     Raises
     ------

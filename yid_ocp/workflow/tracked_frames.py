@@ -1,4 +1,4 @@
-"""Frames of `track` as tasks: what is common to a sequence and then every frame are kept as soon as they are done."""
+"""Frame tracking as tasks: sequence calibration and each frame are stored as soon as they are done."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ CONFIG, DONE = "config.yaml", "done"
 
 @dataclass(frozen=True, eq=False)
 class FrameTasks:
-    """Where and how the frames of one run are worked on.
+    """Tracking tasks of one run: settings, work folder and input hashes.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class FrameTasks:
 
     @staticmethod
     def of(run: Run, frames: Path, joints: Path | None, partial: Path) -> FrameTasks:
-        """The tasks of a run whose frames and joints stand in files.
+        """Tracking tasks for frames and joints stored in files.
 
         Raises
         ------
@@ -77,7 +77,7 @@ class FrameTasks:
         return FrameTasks(own, folder, inputs)
 
     def common(self) -> Common:
-        """What is common to the frames; worked out in this process."""
+        """Sequence calibration common to all frames, computed in this process."""
         task = Task("what is common", {"config": self.folder / CONFIG, "inputs": self.inputs})
         [found] = values_of(run_tasks(found_common, [task], self.folder / DONE, ThisProcess()))
         if "refused" in found:
@@ -91,7 +91,7 @@ class FrameTasks:
         workers: Workers | Executor | None = None,
         progress: Progress = SILENT,
     ) -> list[FrameReport]:
-        """All frames by their stamps, worked on by this process alone where no workers are given.
+        """Tracking results of all frames, ordered by stamp; computed in this process without workers.
 
         One that ended the process that worked on it is dropped.
         """
@@ -109,7 +109,7 @@ class FrameTasks:
         return [found[i] for i in tracker.order]
 
     def clear(self) -> None:
-        """Remove what is done, once the run is complete."""
+        """Delete the stored results of a complete run."""
         shutil.rmtree(self.folder, ignore_errors=True)
         with contextlib.suppress(OSError):
             self.folder.parent.rmdir()
@@ -120,7 +120,7 @@ def _but(entries: tuple[int, ...], without: list[int]) -> list[int]:
 
 
 def opened(run: Run) -> tuple[FrameSequence, Recording | None]:
-    """The frames of `track.frames` and the recording that was made with them, None where none is listed.
+    """Frame sequence of `track.frames` and its recording, None where none is listed.
 
     Raises
     ------
@@ -139,12 +139,12 @@ def opened(run: Run) -> tuple[FrameSequence, Recording | None]:
 
 
 def scene_of(run: Run, system: System) -> Scene:
-    """What the camera looks at."""
+    """The scene seen by the camera: system, robot meshes and extra meshes."""
     return Scene(system, run.model.robot, extra=run.model.extra_meshes)
 
 
 def empty_scene(run: Run) -> FrameSequence | None:
-    """Frames of the scene without robot and object, None where the settings have none."""
+    """Background frames without robot and object; None where the settings have none."""
     if run.track.background is None:
         return None
     with located(run, "track", "background"):
@@ -152,7 +152,7 @@ def empty_scene(run: Run) -> FrameSequence | None:
 
 
 def found_common(config: Path, inputs: Mapping[str, str]) -> dict[str, Any]:
-    """Task: what is common to the frames of a run, as `plain` gives it, or why they do not tell."""
+    """Task: sequence calibration of a run as plain data, or the reason why it failed."""
     del inputs  # they belong to what the result depends on
     try:
         made: dict[str, Any] = plain(_tracker(config.read_text(encoding="utf-8"), config).common())
@@ -162,7 +162,7 @@ def found_common(config: Path, inputs: Mapping[str, str]) -> dict[str, Any]:
 
 
 def one_frame(config: Path, inputs: Mapping[str, str], common: Mapping[str, Any], index: int) -> dict[str, Any]:
-    """Task: what became of one frame, as `plain` gives it."""
+    """Task: tracking result of one frame as plain data."""
     del inputs
     tracker = _tracker(config.read_text(encoding="utf-8"), config)
     made: dict[str, Any] = plain(tracker.frame(index, remade(Common, common)))

@@ -1,4 +1,4 @@
-"""Trajectories and predictions of a run as HDF5."""
+"""HDF5 files with trajectories and predictions of a run."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Prediction = tuple[Episode, EpisodeResult, EpisodeResult]
 def write_trajectories(
     path: Path, problem: EstimationProblem, solution: Solution, held_out: Sequence[tuple[Episode, EpisodeResult | str]]
 ) -> None:
-    """Trajectories, predictions and the unknowns with their covariance, as `yid-trajectories/1`.
+    """Write trajectories, predictions and unknowns with covariance as `yid-trajectories/1`.
 
     `unknowns/`: names, x, covariance. `recordings/NAME/`: `t` (N+1,) [s], `q`, `p` (N+1, n), `multipliers` (N, m)
     [N s], `torque` (N, nu) [N m] or what servos are commanded, `command` (N, nu) [rad or m], `effort` (N, nc) [N m],
@@ -71,7 +71,7 @@ def write_trajectories(
 
 
 def write_diagnosis_trajectories(path: Path, finding: Finding, predicted: Sequence[Prediction]) -> None:
-    """Predictions and what the smoother found, as `yid-diagnosis-trajectories/1`.
+    """Write held-out predictions and smoothed unknowns as `yid-diagnosis-trajectories/1`.
 
     `RECORDING/GROUP/` for every held-out recording: `t` (M,) [s], `measured`, `before`, `after`, `std` (M, k) and the
     attributes `channels`, `unit`.

@@ -1,4 +1,4 @@
-"""What a model says against a recording: limits of joints, efforts, places of points."""
+"""Data-quality checks of recordings against a model: joint limits, efforts, point positions, clocks, excitation."""
 
 from yid_ocp.analysis.plausibility.arm import Arm as Arm
 from yid_ocp.analysis.plausibility.arm import check_limits as check_limits

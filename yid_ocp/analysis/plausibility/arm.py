@@ -1,4 +1,4 @@
-"""The part of a system that recorded angles tell the place of, in numbers; and recorded angles beside its limits."""
+"""Numeric kinematics and dynamics of the joints with recorded angles, and checks of angles against joint limits."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ MOTION_BAND = 5.0
 
 @dataclass(frozen=True)
 class Arm:
-    """The joints of a system whose angles are recorded: kinematics and inverse dynamics in numbers.
+    """Numeric kinematics and inverse dynamics of the joints whose angles are recorded.
 
-    What hangs on them and is not known, such as a beam's bending, stands at zero.
+    Unknown coordinates beyond them, such as a beam's bending, are zero.
 
     Attributes
     ----------
@@ -52,12 +52,12 @@ class Arm:
 
     @staticmethod
     def of(system: System, theta: Array) -> Arm | None:
-        """None where the model has no known coordinates."""
+        """The model of a system's driven and prescribed joints; None where it has none."""
         names = (*system.driven, *system.prescribed)
         return Arm(system, theta, names) if names else None
 
     def is_in(self, recording: Recording) -> bool:
-        """Whether all its joints are recorded, which those of clamps that follow points are not."""
+        """Whether a recording has the angles of all joints; those of clamps that follow points are not recorded."""
         return all(name in recording.joint_names for name in self.names)
 
     @property
@@ -68,25 +68,25 @@ class Arm:
 
     @property
     def indices(self) -> tuple[int, ...]:
-        """Their places in the configuration."""
+        """Indices of the joints in the configuration."""
         return tuple(self.system.mechanism.joint_index(name) for name in self.names)
 
     def carries(self, frame: str) -> bool:
-        """Whether a frame's place follows from the known angles alone."""
+        """Whether a frame's position follows from the recorded angles alone."""
         mechanism = self.system.mechanism
         known = set(self.indices)
         return all(i in known for i in mechanism.ancestors(mechanism.frame(frame).joint))
 
     @cached_property
     def complete(self) -> bool:
-        """Whether nothing that is not known hangs on the joints."""
+        """Whether no joint of unknown angle depends on the recorded joints."""
         known = set(self.indices)
         return not any(
             i not in known and set(self.system.mechanism.ancestors(i)) & known for i in range(self.system.size)
         )
 
     def places(self, frames: tuple[str, ...], q: Array) -> tuple[Array, Array]:
-        """Positions of frames and their derivative by the angles.
+        """Positions of frames and their Jacobian by the recorded angles.
 
         Parameters
         ----------
@@ -106,7 +106,7 @@ class Arm:
         return place.T.reshape(len(q), count, 3), by_angle.reshape(len(q), count, 3, width)
 
     def inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
-        """Efforts that the bodies alone need, without dampers, springs and grasps, shape (N, k) [N m]."""
+        """Joint efforts by rigid-body inverse dynamics, without dampers, springs and grasps, shape (N, k) [N m]."""
         return np.array(self._effort.map(len(q)).call([q.T, v.T, a.T])[0]).T
 
     @cached_property
@@ -145,7 +145,7 @@ class Arm:
 
 @dataclass(frozen=True)
 class Motion:
-    """Recorded motion of an arm, smoothed and differentiated; both ends are left out.
+    """Smoothed recorded joint motion with its derivatives; both ends are left out.
 
     Attributes
     ----------
@@ -163,7 +163,7 @@ class Motion:
 
 
 def recorded_motion(joints: JointGroup, names: tuple[str, ...], most: int = 300) -> Motion | None:
-    """Motion of the named joints at up to `most` times, None for too short a recording.
+    """Smoothed motion of the named joints at up to `most` times; None where the recording is too short.
 
     Parameters
     ----------
@@ -188,7 +188,7 @@ def recorded_motion(joints: JointGroup, names: tuple[str, ...], most: int = 300)
 
 
 def check_limits(arm: Arm, recording: Recording) -> Iterator[Doubt]:
-    """Recorded angles and their rates beside what the joints can do."""
+    """Issues where recorded angles or speeds exceed the joint limits."""
     joints = recording.joints
     if joints is None:
         return
@@ -241,5 +241,5 @@ def check_limits(arm: Arm, recording: Recording) -> Iterator[Doubt]:
 
 
 def effect_line(kind: str, location: str, quantity: str, value: float) -> str:
-    """The line of configuration that describes an error as a known effect."""
+    """The configuration line that models an error as a known effect."""
     return f"model.effects: [{{kind: {kind}, location: {location}, values: {{{quantity}: {value:.3g}}}}}]"

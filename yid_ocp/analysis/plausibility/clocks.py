@@ -1,4 +1,4 @@
-"""Clocks of points beside that of the joints: how late one is, and how much faster it runs.
+"""Offset and drift of point clocks relative to the joint clock.
 
 A point that is seen at the stamp t is where it was at t - late - drift (t - middle), so that to first order
 
@@ -43,18 +43,18 @@ FRAME, ZERO = 0.02, 0.02
 
 @dataclass(frozen=True)
 class ClockError:
-    """How the times of one group are beside another clock, with standard deviations.
+    """Offset and drift of one point group's clock relative to the joint clock, with standard deviations.
 
     Attributes
     ----------
     begin, end : float
         First and last time of the group [s].
     late, late_std : float
-        By how much its stamps are late, in the middle [s].
+        Recorded stamp minus true time, in the middle of the group [s].
     drift, drift_std : float
-        By how much faster they run; 0.001 is a part per thousand.
+        Relative rate by which the group's clock runs faster; 0.001 is one part per thousand.
     excess : float
-        Part of the sum of squares beyond the noise's that goes away with both; NaN where there is none beyond.
+        Fraction of the residual sum of squares above the noise level that both explain; NaN where none is above.
     """
 
     begin: float
@@ -67,34 +67,34 @@ class ClockError:
 
     @property
     def apart(self) -> float:
-        """By how much the clocks run apart from begin to end [s]."""
+        """Drift accumulated from the first to the last time [s]."""
         return self.drift * (self.end - self.begin)
 
     @property
     def drifts(self) -> bool:
-        """Whether it is sure that the clocks run apart."""
+        """Whether the drift is significant."""
         return abs(self.drift) > SURE * self.drift_std
 
     @property
     def lags(self) -> bool:
-        """Whether it is sure that stamps are late or early."""
+        """Whether the offset is significant."""
         return abs(self.late) > SURE * self.late_std
 
 
 def allowed(joints: JointGroup, group: PointGroup) -> float:
-    """By how much stamps may differ because a sample stands for a period, and nobody says for which part of it [s]."""
+    """Clock offset that cannot be resolved below the sample periods [s]."""
     return 0.5 * (period(joints.t) + min(period(group.t), SHUTTER))
 
 
 def by_clock(t: Array, speed: Array, span: tuple[float, float]) -> Array:
-    """Derivatives of what is expected by the offset of a clock and by how far it runs apart, shape (R, 2)."""
+    """Derivatives of predicted values by the clock offset and by the accumulated drift, shape (R, 2)."""
     return np.stack([speed, speed * (t - 0.5 * sum(span)) / max(span[1] - span[0], 1e-9)], axis=1)
 
 
 def clock_error(
     t: Array, residual: Array, own: Array, others: Array, size: Array, span: tuple[float, float]
 ) -> ClockError | None:
-    """Fit an offset and a drift of a clock to a residual, beside other unknowns.
+    """Estimate a clock's offset and drift from a residual by least squares, together with other unknowns.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def clock_error(
     Returns
     -------
     ClockError or None
-        None where the motion does not tell.
+        None where the motion is not informative.
     """
     begin, end = span
     length, data = max(end - begin, 1e-9), len(t)
@@ -145,7 +145,7 @@ def clock_error(
 def check_held_clock(
     joints: JointGroup, group: PointGroup, t: Array, seen: Array, by_angle: Array, std: float, path: Path
 ) -> Iterator[Doubt]:
-    """Points that follow from the angles, late or early by less than would show in their places.
+    """Issues of clock offset or drift of points whose positions follow from the joint angles.
 
     Parameters
     ----------
@@ -211,7 +211,7 @@ def _said(found: ClockError, joints: JointGroup, group: PointGroup, matters: boo
 
 
 def drift_doubt(found: ClockError, group: str, limit: float, matters: bool) -> Doubt:
-    """The doubt that two clocks run apart."""
+    """The data-quality issue of a drifting point clock."""
     first, last = found.late - 0.5 * found.apart, found.late + 0.5 * found.apart
     return Doubt(
         "clock_drift",
@@ -229,7 +229,7 @@ def drift_doubt(found: ClockError, group: str, limit: float, matters: bool) -> D
 
 
 def remedy(late: float, drift: float, middle: float) -> str:
-    """What to do with times that are late and drift."""
+    """Advice on how to correct time stamps with an offset and a drift."""
     return f"replace its times t by t {-late:+.4g} {-drift:+.4g} (t - {middle:.6g})"
 
 
@@ -239,7 +239,7 @@ def remedy(late: float, drift: float, middle: float) -> str:
 def best_clock(
     path: Path, knots: tuple[float, float], t: Array, seen: Array, drifts: bool = False
 ) -> tuple[float, float]:
-    """Offset [s], and where asked for drift, with which points are nearest to a path: a coarse search, then finer ones.
+    """Clock offset [s] and relative drift that bring points nearest to a path, by a coarse-to-fine search.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Recorded efforts beside the inverse dynamics of the arm: sign, gain, zero and lag by joint.
+"""Checks of recorded efforts against inverse dynamics: sign, gain, zero and lag of each joint.
 
 With measured effort e_j of joint j and the effort w_j that bodies and gravity need (Newton and Euler),
 
@@ -74,7 +74,7 @@ class _Fit:
 
 
 def check_efforts(arm: Arm, recording: Recording) -> list[Doubt]:
-    """Doubts about recorded efforts, as far as an arm in motion under gravity tells.
+    """Issues of recorded efforts that disagree with the inverse dynamics of the recorded motion.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Motion beside the noise of what measures it: whether it can tell what depends on how the arm moves at all."""
+"""Checks whether recorded motion is strong enough, relative to sensor noise, to be informative."""
 
 from __future__ import annotations
 
@@ -23,11 +23,10 @@ SEEN = 5.0
 
 
 def check_motion(arm: Arm, recording: Recording, effort: Choice) -> Iterator[Doubt]:
-    """Efforts that speed and acceleration ask for, beside the noise of the efforts.
+    """Issue where efforts due to speed and acceleration do not exceed the noise of measured efforts.
 
-    What is the same however slowly the arm moves, such as weight and stiffness, is found from postures; dampings,
-    frictions and inertias only from what speed and acceleration add, by the bodies' inverse dynamics and by friction of
-    a usual size.
+    Weight and stiffness can be found from static configurations; damping, friction and inertia only from these efforts,
+    taken from inverse dynamics and friction of a typical size.
 
     Parameters
     ----------
@@ -83,14 +82,14 @@ def _noise(joints: JointGroup, names: Sequence[str], effort: Choice) -> Array:
 def check_asked(
     recordings: Sequence[Recording], asked: Mapping[str, Sequence[str]], position: Choice
 ) -> Iterator[Doubt]:
-    """Joints with free parameters of their own that hardly turn in any recording.
+    """Issues of joints that have free parameters but hardly move in any recording.
 
     Parameters
     ----------
     recordings : sequence of Recording
         All that are estimated on.
     asked : mapping of str to sequence of str
-        By joint the free parameters that are its own.
+        Free parameters of each joint.
     position : Choice
         How angles are used.
     """

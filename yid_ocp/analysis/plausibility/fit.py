@@ -1,4 +1,4 @@
-"""What only a fit shows of its recordings: clocks that run apart, and less noise than stated."""
+"""Data-quality checks on the residuals of a fit: drifting clocks and overstated noise."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ EXPLAINS = 0.5
 
 
 def check_fit(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> list[Doubt]:
-    """Doubts about recordings from what a fit leaves of them, beside those that the problem has already.
+    """New data-quality issues found in the residuals of a fit: drifting clocks and overstated noise.
 
     A constant offset of a camera's clock looks like damping that the model lacks; to tell the two is a diagnosis's task
     (effect `camera_latency`). One that grows over a recording is a clock's.
@@ -32,9 +32,9 @@ def check_fit(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> l
     ----------
     problem : EstimationProblem
     x : ndarray, shape (nx,)
-        Where it ended.
+        The fitted unknowns.
     evaluation : Evaluation
-        There.
+        At `x`.
     """
     if not evaluation.ok or evaluation.jacobian is None or problem.noise != 1.0:
         return []

@@ -1,4 +1,4 @@
-"""Measured points beside the places where robot and object can be: mirrored, exchanged, scaled, late, out of reach."""
+"""Checks of measured points against a model: mirrored, exchanged, scaled, delayed or out of reach."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class _Change:
 
 
 def held_frames(system: System, group: PointGroup, choice: Choice) -> dict[str, str]:
-    """Frame of the model whose place each point of a group marks; of a grasped one, that of the arm that holds it."""
+    """Model frame that each point of a group marks; for a grasped point, the frame of the arm that holds it."""
     holders = {grasp.held: grasp.holder for grasp in system.grasps}
     wanted = group.names if choice.points is None else choice.points
     frames = {name: choice.frames.get(name, name) for name in wanted if name in group.names}
@@ -66,7 +66,7 @@ def held_frames(system: System, group: PointGroup, choice: Choice) -> dict[str, 
 
 
 def check_held_points(arm: Arm, recording: Recording, choice: Choices) -> Iterator[Doubt]:
-    """Points that follow from the recorded angles alone, beside where those put them."""
+    """Issues of points whose positions disagree with the forward kinematics of the recorded angles."""
     joints = recording.joints
     if joints is None or period(joints.t) <= 0:
         return
@@ -268,9 +268,9 @@ def _way(arm: Arm | None, system: System, theta: Array, frame: str) -> _Way | No
 def check_reach(
     arm: Arm | None, system: System, theta: Array, recording: Recording, choice: Choices
 ) -> Iterator[Doubt]:
-    """Points of the object beside its length: how far they are from its root, from what the arm holds, and each other.
+    """Issues of object points that are farther from the root or from each other than the length along the object.
 
-    What bends does not stretch, so no point is farther from another than the way along the object.
+    The object bends but does not stretch.
     """
     mechanism = system.mechanism
     for group in recording.points:
@@ -321,9 +321,9 @@ def _fixed(system: System, theta: Array, joint: int) -> list[float]:
 
 
 def check_object(episode: Episode, result: EpisodeResult, size: float) -> Iterator[Doubt]:
-    """Points of the object beside a rollout with the parameters' initial values.
+    """Issues of object points that disagree grossly with a rollout at the parameters' initial values.
 
-    Stiffnesses need not be right for it to tell a mirror image from the object.
+    Gross errors, such as a mirror image, show even where the stiffnesses are wrong.
 
     Parameters
     ----------
@@ -378,7 +378,7 @@ def _changed_pose(seen: Array, place: Array, pose: Array) -> Iterator[_Change]:
 
 
 def check_cable(cable: Cable, recording: Recording, gravity: Array) -> Iterator[Doubt]:
-    """Measured edges of a cable beside those of its undeformed shape, and on which side of its clamps it hangs."""
+    """Issues of cable points whose edge lengths differ from the undeformed shape, or that lie above the clamps."""
     for group in recording.points:
         at = {name: group.position[:, group.names.index(name)] for name in cable.vertices if name in group.names}
         edges = [edge for edge in cable.edges if edge[0] in at and edge[1] in at]

@@ -62,7 +62,7 @@ def read_any(path: str | os.PathLike[str], *, progress: Progress = SILENT, **opt
 
 
 def preview(path: str | os.PathLike[str], progress: Progress = SILENT) -> Contents:
-    """Look into a file of any known format: what it holds, and the options with which `read_any` makes a recording.
+    """List the contents of a file of any known format, and the options for `read_any`.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The tables of readers and previews, and what all readers share: choosing, renaming, units, torques from currents."""
+"""Registries of readers and previews, and their shared steps: selection, renaming, units, torques from currents."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Reader = Callable[..., Recording]
 
 @dataclass(frozen=True)
 class Source:
-    """One thing that a file of another tool holds: a topic, a column, a marker.
+    """One data source in a file of another tool: a topic, a column or a marker.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Contents:
-    """What a file of another tool holds, and the options with which its reader makes a recording of it.
+    """Contents of a file of another tool, and the reader options that import it.
 
     Attributes
     ----------
@@ -65,10 +65,10 @@ READERS: Registry[Reader] = Registry("recording format")
 """Readers by file suffix, and by word for what is stored as a folder; each takes a path, then named options."""
 
 PREVIEWS: Registry[Callable[..., Contents]] = Registry("recording format with a preview")
-"""What looks into a file without importing it, by the same keys; each takes a path."""
+"""Functions that list a file's contents without importing it, by the same keys; each takes a path."""
 
 SKIP = "skip"
-"""What a column is said to mean that is left out."""
+"""Column meaning that leaves the column out."""
 
 _TO_SI: Mapping[str, Mapping[str, float]] = {
     "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
@@ -80,11 +80,11 @@ _TO_SI: Mapping[str, Mapping[str, float]] = {
 _CURRENTS = ("A", "mA")
 _QUANTITIES: Mapping[str, str] = {"t": "s", **JOINT_CHANNELS, "points": "m"}
 LARGEST_PLAUSIBLE = {"position": 2.1 * math.pi, "points": 20.0}
-"""Beyond this, values in a preview look like degrees [rad] or millimetres [m]."""
+"""Largest plausible angle [rad] and coordinate [m]; larger values look like degrees or millimetres."""
 
 
 def units_of(words: Iterable[str]) -> dict[str, str]:
-    """Quantities and their units from `quantity=unit`, or from a unit alone, for every quantity that it measures.
+    """Unit of each quantity, parsed from `quantity=unit` or from a unit alone.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def _factors(units: Mapping[str, str], where: str) -> dict[str, float]:
 
 
 def renamings(entries: Iterable[str], noun: str, where: str) -> dict[str, str]:
-    """Recorded name to name in the recording, from `name` or `recorded=name` each.
+    """Mapping from recorded names to new names, parsed from `name` or `recorded=name`.
 
     Raises
     ------
@@ -166,7 +166,7 @@ def finished(
     torque_constants: Mapping[str, float] | None = None,
     gears: Mapping[str, float] | None = None,
 ) -> Recording:
-    """A checked recording in SI units from what a file holds.
+    """Convert a raw recording to SI units, select its joints and points, and validate it.
 
     Parameters
     ----------
@@ -245,7 +245,7 @@ def _chosen_points(groups: Sequence[PointGroup], chosen: Mapping[str, str], wher
 
 
 def check_point_names(chosen: Mapping[str, str], where: str) -> None:
-    """Refuse sources that give points of the same name."""
+    """Raise `DataError` if two sources give points of the same name."""
     names = list(chosen.values())
     shared = [source for source, name in chosen.items() if names.count(name) > 1]
     if shared:
@@ -298,7 +298,7 @@ def rate_of(t: Array) -> float:
 
 
 def guessed_units(recording: Recording) -> tuple[dict[str, str], tuple[str, ...]]:
-    """Units that the values of a raw recording look like where they cannot be SI, and why, in words."""
+    """Units guessed from values of a raw recording that cannot be SI, and the reasons in words."""
     units: dict[str, str] = {}
     notes = []
     joints = recording.joints

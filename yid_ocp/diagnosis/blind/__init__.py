@@ -1,4 +1,4 @@
-"""The blind proof: recordings whose effect is kept back, answers given without it, labels opened only by the scorer."""
+"""Blind validation: diagnoses of synthetic recordings whose true effects stay sealed until they are scored."""
 
 from yid_ocp.diagnosis.blind.answers import answer as answer
 from yid_ocp.diagnosis.blind.answers import best_closure as best_closure

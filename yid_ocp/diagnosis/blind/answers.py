@@ -1,4 +1,4 @@
-"""Answers to cases from their recordings alone, and the best that could have been answered."""
+"""Diagnoses of blind cases, and the best closure a diagnosis could reach."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def answer(
     thresholds: Thresholds | None = None,
     progress: Progress | None = None,
 ) -> Finding:
-    """The diagnosis of a case, from its recordings alone."""
+    """Diagnose a blind case from its recordings alone."""
     problem = ensemble.of(case.estimate)
     return diagnose(
         problem, candidates, [case.held_out], thresholds=thresholds, progress=progress, leave_out=case.without
@@ -32,7 +32,7 @@ def answer(
 
 
 def best_closure(ensemble: Ensemble, case: Case, label: Label, candidates: Choice = "all") -> float:
-    """Held-out closure of the true effects, refitted: the most that a diagnosis could reach."""
+    """Return the held-out closure of the true effects after a refit, the best a diagnosis could reach."""
     problem = ensemble.of(case.estimate)
     effects = chosen_effects(problem.system, case.estimate, candidates)
     composed = CandidateProblem.of(problem, effects, [case.held_out])

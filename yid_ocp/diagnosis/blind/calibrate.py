@@ -1,4 +1,4 @@
-"""Thresholds from an ensemble whose labels are known: quantiles of what clean recordings, and true effects, show.
+"""Calibration of thresholds from an ensemble with known labels: quantiles over clean cases and true effects.
 
 With n values of a statistic on cases of one kind, a further such case stays at or below the k-th smallest of them with
 probability k/(n + 1) at least (split conformal prediction: Vovk, Gammerman and Shafer 2005, doi:10.1007/b106715).
@@ -17,13 +17,13 @@ from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
 
 FORMAT = "yid-calibration/1"
 COVERAGE = 0.95
-"""Part of the cases of its kind which a threshold is to leave on their side."""
+"""Fraction of the cases that a threshold is to leave on their side."""
 
 Statistics = Mapping[str, Any]
 
 
 def opened_wide(limits: Thresholds) -> Thresholds:
-    """Thresholds by which anything is a gap and the best candidate is added, whatever it brings.
+    """Return thresholds by which any residual is a gap and the best candidate is always added.
 
     A diagnosis of clean recordings with these shows how far chance alone goes.
     """
@@ -34,7 +34,7 @@ def opened_wide(limits: Thresholds) -> Thresholds:
 
 @dataclass(frozen=True)
 class Rule:
-    """How a threshold follows from cases.
+    """Rule that derives one threshold from a statistic of the cases.
 
     Attributes
     ----------
@@ -134,7 +134,7 @@ RULES: Mapping[str, Rule] = {
 def conformal(
     sample: Sequence[float], side: Literal["most", "least"], coverage: float = COVERAGE
 ) -> tuple[float, float]:
-    """The value that a further case like those of the sample does not exceed (or fall below), and how surely.
+    """Return the conformal quantile of a sample and its coverage.
 
     Parameters
     ----------
@@ -163,7 +163,7 @@ def calibrate(
     limits: Thresholds = DEFAULTS,
     coverage: float = COVERAGE,
 ) -> dict[str, Any]:
-    """Quantiles by which thresholds can be set, and what each of them would do to the effects of the ensemble.
+    """Return conformal quantiles for thresholds, and how each would treat the effects of the ensemble.
 
     Parameters
     ----------
@@ -219,7 +219,7 @@ def calibrate(
 
 
 def advised(rules: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
-    """Thresholds that follow: the quantile, outwards to two digits, within what is of use; of two rules the wider.
+    """Return the recommended settings: quantiles rounded outwards to two digits, within each rule's limit.
 
     Parameters
     ----------

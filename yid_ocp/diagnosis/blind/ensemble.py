@@ -1,4 +1,4 @@
-"""Cases of one experiment drawn at random, and their labels.
+"""Random blind cases of one experiment, and their labels.
 
 What sort a case is of stands in the plan. Labels are written apart from the recordings and their hash is published
 before any recording is looked at.
@@ -60,7 +60,7 @@ TRAVEL, TRAVEL_TOGETHER = 0.15, 0.08
 
 @dataclass(frozen=True)
 class Label:
-    """What is true of a case; sealed until it is scored.
+    """True effects and parameters of a case, sealed until scoring.
 
     Attributes
     ----------
@@ -97,7 +97,7 @@ class Label:
 
 @dataclass(frozen=True)
 class Case:
-    """What a diagnosis is given of a case.
+    """Recordings and candidate exclusions of a case, as given to the diagnosis.
 
     Attributes
     ----------
@@ -115,13 +115,13 @@ class Case:
 
 
 def seal(labels: Sequence[Label]) -> tuple[str, str]:
-    """Labels as text, and the hash by which they are committed to before the run."""
+    """Return the labels as JSON text and its SHA-256 hash, published before the diagnosis."""
     text = json.dumps([label.to_dict() for label in labels], indent=1, sort_keys=True, allow_nan=False)
     return text, hashlib.sha256(text.encode()).hexdigest()
 
 
 def opened(text: str, commitment: str) -> list[Label]:
-    """Labels from their text.
+    """Read sealed labels after checking their hash.
 
     Raises
     ------
@@ -135,7 +135,7 @@ def opened(text: str, commitment: str) -> list[Label]:
 
 @dataclass(frozen=True)
 class Conditions:
-    """How the recordings of an experiment are made.
+    """Settings of the synthetic recordings of an experiment.
 
     Attributes
     ----------
@@ -159,7 +159,7 @@ class Conditions:
 
 @dataclass(frozen=True)
 class Detectable:
-    """How large an effect has to be to show in an experiment.
+    """Sensitivity of an experiment to an effect, which gives its detectable size.
 
     Attributes
     ----------
@@ -176,7 +176,7 @@ class Detectable:
 
     @staticmethod
     def of(signature: Signature) -> Detectable:
-        """From a candidate's signature on a clean recording."""
+        """Build from a candidate's signature on a clean recording."""
         return Detectable(signature.effect, signature.shape, np.asarray(np.linalg.qr(signature.columns, mode="r")))
 
     def to_dict(self) -> dict[str, Any]:
@@ -185,7 +185,7 @@ class Detectable:
 
 
 class Ensemble:
-    """Draws cases of one experiment.
+    """Generator of random blind cases of one experiment.
 
     Parameters
     ----------
@@ -248,7 +248,7 @@ class Ensemble:
         return np.random.default_rng([self.seed, PURPOSES.index(self.conditions.purpose), *path])
 
     def truth(self, rng: np.random.Generator) -> dict[str, float]:
-        """True values of the free parameters, log-uniform about their start."""
+        """Draw true values of the free parameters, log-uniform about their start."""
         start = dict(zip(self.problem.system.parameters.names, self.problem.theta, strict=True))
         return {name: float(start[name] * SPREAD ** rng.uniform(-1, 1)) for name in self.problem.free}
 
@@ -260,7 +260,7 @@ class Ensemble:
         name: str,
         links: int = 1,
     ) -> Recording:
-        """One recording, without a word on what is in it."""
+        """Simulate one recording with injected effects; it carries no description or truth."""
         system = self.simulated
         if links > 1:
             assert self._finer is not None
@@ -270,7 +270,7 @@ class Ensemble:
         return replace(made, name=name, description="", source="", truth={})
 
     def point(self) -> Linearisation:
-        """The candidates' signatures on clean recordings: what of each would be detectable."""
+        """Return the candidates' signatures on clean recordings."""
         rng = self._rng(0)
         names = [f"clean_{i}" for i in range(self.conditions.recordings)]
         clean = tuple(self.record(self.truth(rng), (), rng, name) for name in names)
@@ -284,13 +284,13 @@ class Ensemble:
 
     @property
     def detectable(self) -> tuple[Detectable, ...]:
-        """How large every candidate has to be, worked out once."""
+        """Detectable size of every candidate, computed once."""
         if self._detectable is None:
             self._detectable = tuple(Detectable.of(signature) for signature in self.point().signatures)
         return self._detectable
 
     def knowing(self, detectable: Sequence[Mapping[str, Any]]) -> None:
-        """Take what is detectable from `Detectable.to_dict`, as another process worked it out."""
+        """Load detectable sizes computed by another process, from `Detectable.to_dict`."""
         by_label = {effect.label: effect for effect in self._effects}
         self._detectable = tuple(
             Detectable(
@@ -300,13 +300,13 @@ class Ensemble:
         )
 
     def of(self, recordings: Sequence[Recording]) -> EstimationProblem:
-        """The nominal problem of recordings."""
+        """Return the nominal estimation problem of some recordings."""
         nominal = self.problem
         values = dict(zip(nominal.system.parameters.names, map(float, nominal.theta), strict=True))
         return EstimationProblem(nominal.step, list(recordings), nominal.free, nominal.options, values)
 
     def draw(self, wanted: Planned) -> tuple[Case, Label]:
-        """A case as planned; the same for the same seed and purpose, whatever was drawn before.
+        """Draw a planned case; the same seed and purpose give the same case.
 
         Raises
         ------
@@ -429,7 +429,7 @@ def recorded(
     rng: np.random.Generator,
     conditions: Conditions,
 ) -> Recording:
-    """A recording of a motion that is drawn for the nominal system, made with the simulated one.
+    """Simulate a recording of a random motion planned for the nominal system.
 
     Parameters
     ----------
@@ -458,7 +458,7 @@ def recorded(
 
 
 def first_posture(system: System, recording: Recording) -> dict[str, float]:
-    """Where the driven joints begin in a recording.
+    """Return the initial positions of the driven joints of a recording.
 
     Raises
     ------
@@ -478,7 +478,7 @@ def first_posture(system: System, recording: Recording) -> dict[str, float]:
 
 
 def finer_values(nominal: System, finer: System, truth: Mapping[str, float]) -> dict[str, float]:
-    """Values that make the same tubes of more links: springs and dampers of a joint as many times as strong.
+    """Return the parameters of the same tubes with more links: joint springs and dampers scaled by their number.
 
     A segment whose links did not change, or whose stiffness is that of its cross section, keeps its values.
     """

@@ -1,4 +1,4 @@
-"""Which cases an ensemble has: sorts and sizes, dealt to experiments so that each has its part of every sort."""
+"""Plan of an ensemble: categories and effect sizes of its cases, distributed over the experiments."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ SHARES: Mapping[str, float] = {
     "left_out": 0.06,
     "finer_chain": 0.06,
 }
-"""What an ensemble is made of."""
+"""Fraction of the cases in every category."""
 PURPOSES = ("report", "calibration")
-"""What an ensemble is for; the same seed draws other cases for each, so that none is both."""
+"""Purposes of an ensemble; the same seed draws different cases for each."""
 FEWEST = 3
 """Cases below which an experiment is not worth its compiled step."""
 
 
 @dataclass(frozen=True)
 class Planned:
-    """What is to be made as a case.
+    """A planned case: experiment, category and effect size.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ def planned(
     chains: frozenset[str] = frozenset(),
     purpose: str = PURPOSES[0],
 ) -> list[Planned]:
-    """The cases of an ensemble, in an order that the seed decides.
+    """Return the planned cases of an ensemble, in an order given by the seed.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""How answers compare with their labels, and the rates over an ensemble."""
+"""Scores of blind diagnoses against their labels, and rates over an ensemble."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from yid_ocp.effects import EFFECTS
 FORMAT = "yid-blind/1"
 SORTS = tuple(SHARES)
 STRANGE = ("outside", "left_out")
-"""Sorts whose effect no candidate is."""
+"""Categories whose true effect is not among the candidates."""
 SET = 3
-"""How many a set may have to be right; more is no answer."""
+"""Largest confusable set that counts as correct."""
 VERDICTS = ("no_gap", "unknown", "insufficient_data", "effect", "confusable")
 
 
 @dataclass(frozen=True)
 class Mark:
-    """How one answer compares with its label.
+    """Score of one diagnosis against its label.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class Mark:
 
     @property
     def named(self) -> tuple[str, ...]:
-        """What the effect may be by the answer: the set that is not separable, or what was added first alone."""
+        """Labels the diagnosis names: the confusable set, or the first effect added."""
         return self.confusable or tuple(self.answer.split(" + ")[:1])
 
     @property
@@ -84,12 +84,12 @@ class Mark:
 
     @property
     def said(self) -> str:
-        """Its column: the kind of the effect that was added first, else the verdict."""
+        """The column of the confusion matrix: kind of the first effect added, else the verdict."""
         return self.verdict if self.answer == "-" else self.answer.partition("@")[0]
 
 
 def mark(label: Label, result: Mapping[str, Any], best: float = math.nan, seconds: float = math.nan) -> Mark:
-    """Compare a `yid-diagnosis/1` result with its label.
+    """Score a `yid-diagnosis/1` result against its label.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ def _found(true: Sequence[str], named: Sequence[str], groups: Sequence[tuple[str
 
 
 def proportion(hits: Sequence[bool]) -> dict[str, float | int | None]:
-    """How many of how many, and the 95 % interval of the rate (Clopper and Pearson 1934, doi:10.1093/biomet/26.4.404).
+    """Return count, total, rate and its 95 % interval (Clopper and Pearson 1934, doi:10.1093/biomet/26.4.404).
 
     Parameters
     ----------
@@ -184,7 +184,7 @@ def proportion(hits: Sequence[bool]) -> dict[str, float | int | None]:
 
 
 def score(marks: Sequence[Mark]) -> dict[str, Any]:
-    """Rates over an ensemble; None where there was no case of the sort."""
+    """Return the rates over an ensemble; None for a rate without cases."""
 
     def mean(values: Sequence[float]) -> float | None:
         return float(np.mean(values)) if len(values) else None
@@ -252,7 +252,7 @@ def _by_experiment(marks: Sequence[Mark]) -> dict[str, dict[str, Any]]:
 
 
 def confusion(marks: Sequence[Mark]) -> dict[str, Any]:
-    """How often what was said of what: true sorts (rows), answers (columns) and counts."""
+    """Return the confusion matrix: true classes (rows), answers (columns) and counts."""
     rows = sorted({m.sort for m in marks}, key=lambda name: (name in SORTS, name))
     columns = sorted({m.said for m in marks}, key=lambda name: (name in VERDICTS, name))
     counts = [[sum((m.sort, m.said) == (row, column) for m in marks) for column in columns] for row in rows]
@@ -260,7 +260,7 @@ def confusion(marks: Sequence[Mark]) -> dict[str, Any]:
 
 
 def calibration(marks: Sequence[Mark]) -> dict[str, Any]:
-    """What is promised and what is kept: intervals of the effects' parameters, p-values of clean recordings.
+    """Return the empirical coverage of parameter intervals and of p-values of clean recordings.
 
     Of each nominal level: how many intervals of that level hold the truth, how many clean cases have a smaller p-value.
     """

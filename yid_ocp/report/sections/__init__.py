@@ -1,4 +1,4 @@
-"""Report sections: each is one file here that registers a function, with a template of the same name.
+"""Report sections: each file registers one function; its template has the name of the section.
 
 A file outside the package does as well, once it is imported; its template `NAME.html` stands beside it.
 """

@@ -1,4 +1,4 @@
-"""What every report section has in common: what it is told, how it registers, how it is drawn.
+"""Common parts of all report sections: input data, registration and rendering.
 
 A section's function turns `Findings` into what its template needs, or into None where it has nothing to say.
 """
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Findings:
-    """All that a report can be about.
+    """Input data of a report: result, problem, solution and further objects of one run.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Findings:
 
     @property
     def episodes(self) -> list[tuple[str, Episode, EpisodeResult]]:
-        """Role (estimate, held_out), episode and prediction of all that could be predicted."""
+        """Tuples (role, episode, prediction) of all episodes with a prediction; role is estimate or held_out."""
         found: list[tuple[str, Episode, EpisodeResult]] = []
         if self.problem is not None and self.solution is not None and self.solution.evaluation is not None:
             done = self.solution.predicted
@@ -67,7 +67,7 @@ Prepare = Callable[[Findings], Mapping[str, Any] | None]
 
 @dataclass(frozen=True)
 class Section:
-    """One part of the page: place, heading and the function that prepares its template."""
+    """One registered section: order, title and the function that prepares its template context."""
 
     order: int
     title: str
@@ -75,7 +75,7 @@ class Section:
 
     @property
     def folder(self) -> Path:
-        """Where a template may stand beside the function; those of the package have a folder of their own."""
+        """Folder of the function's file, in which a plug-in's template is looked up."""
         return Path(inspect.getfile(self.prepare)).parent
 
 
@@ -83,7 +83,7 @@ SECTIONS: Registry[Section] = Registry("report section")
 
 
 def section(name: str, order: int, title: str) -> Callable[[Prepare], Prepare]:
-    """Register a function as the section `name`, drawn by the template `NAME.html`, lower orders first."""
+    """Decorator that registers a function as the section `name`, rendered by `NAME.html`, lower orders first."""
 
     def enter(prepare: Prepare) -> Prepare:
         SECTIONS.register(name)(Section(order, title, prepare))
@@ -97,7 +97,7 @@ SLIDING = {"position": "m", "velocity": "m/s", "effort": "N", "position_command"
 
 
 def joint_unit(system: System | None, names: Sequence[str], channel: str) -> str:
-    """Unit of what joints do, one for all of them; joints that no system knows are taken to turn."""
+    """Unit of a joint channel; joints unknown to the system count as revolute."""
     kinds = {} if system is None else {joint.name: joint.kind for joint in system.mechanism.joints}
     sliding = [kinds.get(name) == "prismatic" for name in names]
     if any(sliding) and not all(sliding):
@@ -106,7 +106,7 @@ def joint_unit(system: System | None, names: Sequence[str], channel: str) -> str
 
 
 def written_sections(findings: Findings, environment: jinja2.Environment) -> list[dict[str, str]]:
-    """The sections that have something to say: name, title and HTML, in order."""
+    """Name, title and HTML of every section with content, in order."""
     result = []
     for name in sorted(SECTIONS, key=lambda entry: SECTIONS[entry].order):
         context = SECTIONS[name].prepare(findings)

@@ -1,4 +1,4 @@
-"""Parameters of several runs beside each other."""
+"""Section: parameters of several runs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from yid_ocp.report.sections.base import Findings, section
 
 @section("days", 10, "From run to run")
 def prepare(findings: Findings) -> Mapping[str, Any] | None:
-    """Values with two standard deviations, run by run, of a history or of a batch of one model."""
+    """Template context: parameter values ± 2 std per run, of a history or a batch of one model."""
     result = findings.result if findings.result.get("format") == "yid-history/1" else findings.result.get("history")
     if not result or result.get("format") != "yid-history/1":
         return None

@@ -1,4 +1,4 @@
-"""What a diagnosis says: in words first, then the gap, the places and the candidates, each as a picture."""
+"""Section: gap, locations, candidates and predictions of a diagnosis, as sentences and figures."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ Prediction = tuple[Episode, EpisodeResult, EpisodeResult]
 
 @dataclass(frozen=True)
 class Chapter:
-    """A part of the page: what is seen, and the pictures.
+    """A titled part of the section: sentences and figures.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Chapter:
 
 @section("diagnosis", 5, "The gap and what makes it")
 def prepare(findings: Findings) -> Mapping[str, Any] | None:
-    """Words, then the gap, the places, the candidates, curves and where stiffnesses go; tables beside them."""
+    """Template context: chapters on gap, events, locations, candidates, curves and changed parameters."""
     result = findings.result
     if result.get("format") != "yid-diagnosis/1":
         return None

@@ -1,4 +1,4 @@
-"""Estimates beside their starts."""
+"""Section: estimates and their initial values."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from yid_ocp.report.sections.base import Findings, section
 
 @section("estimates", 10, "Estimates")
 def prepare(findings: Findings) -> Mapping[str, Any] | None:
-    """Free parameters with two standard deviations, those that cannot be trusted apart; one figure for each unit."""
+    """Template context: free parameters ± 2 std, untrusted ones marked; one figure per unit."""
     result = findings.result
     by_unit: dict[str, dict[str, tuple[float, float | None, float, bool]]] = {}
     for name, entry in result.get("parameters", {}).items():

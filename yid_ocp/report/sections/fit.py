@@ -1,4 +1,4 @@
-"""How well the model predicts what was measured, channel by channel, held-out recordings included."""
+"""Section: measured and predicted channels, held-out recordings included."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MOST_PICTURES = 24  # a page with more is too heavy to open; result.json and tra
 
 @section("fit", 20, "How well it fits")
 def prepare(findings: Findings) -> Mapping[str, Any] | None:
-    """Measured and predicted over time with what is left, and the histogram of whitened residuals."""
+    """Template context: measured and predicted values with residuals over time, and a residual histogram."""
     if findings.problem is None or not findings.episodes:
         return None
     pictures: list[tuple[str, str]] = []

@@ -1,4 +1,4 @@
-"""What the recordings can tell, and which experiment would tell more."""
+"""Section: profile likelihoods and the effect of changed experiments."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from yid_ocp.report.sections.base import Findings, section
 
 @section("identifiability", 10, "What can be told")
 def prepare(findings: Findings) -> Mapping[str, Any] | None:
-    """Profiles of the parameters, and what every change of the experiment makes of each."""
+    """Template context: profile likelihoods, and predicted parameter stds for every changed experiment."""
     result = findings.result
     if result.get("format") != "yid-identifiability/1":
         return None

@@ -1,4 +1,4 @@
-"""The motion that tells most, over time."""
+"""Section: the most informative motion over time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from yid_ocp.report.sections.base import Findings, joint_unit, section
 
 @section("information", 10, "The motion that tells most")
 def prepare(findings: Findings) -> Mapping[str, Any] | None:
-    """Joints over time: angles, velocities and efforts."""
+    """Template context: joint positions, velocities and efforts over time."""
     found = findings.more.get("information")
     if found is None:
         return None

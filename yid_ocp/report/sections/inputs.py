@@ -1,4 +1,4 @@
-"""What the run was made from: when, by which command, inputs with hashes, versions."""
+"""Section: provenance of the run (date, command, input hashes, versions)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from yid_ocp.report.sections.base import Findings, section
 
 @section("inputs", 90, "What it was made from")
 def prepare(findings: Findings) -> Mapping[str, Any] | None:
-    """Date and command line, inputs with their hashes, versions, and notes on values that are not numbers."""
+    """Template context: date, command line, input hashes, versions and notes on non-finite values."""
     result = findings.result
     if "versions" not in result:
         return None

@@ -1,4 +1,4 @@
-"""Methods beside each other: how their costs fell, and what they estimate."""
+"""Section: estimates and convergence of the compared methods."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from yid_ocp.report.sections.base import Findings, section
 
 @section("methods", 10, "Methods")
 def prepare(findings: Findings) -> Mapping[str, Any] | None:
-    """Estimates of every method, and its cost over time."""
+    """Template context: estimates of every method and its cost over time."""
     comparison: Comparison | None = findings.more.get("comparison")
     if comparison is None:
         return None

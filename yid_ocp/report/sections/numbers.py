@@ -1,4 +1,4 @@
-"""All else that a command said: its other tables and notes."""
+"""Section: remaining tables and notes of a command's summary."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from yid_ocp.report.sections.verdict import key, summary, without_verdicts
 
 @section("numbers", 60, "In numbers")
 def prepare(findings: Findings) -> Mapping[str, Any] | None:
-    """What follows the key table, without the verdicts that the page began with."""
+    """Template context: summary blocks after the key table, without verdicts."""
     blocks = summary(findings)
     rest = without_verdicts(blocks[key(blocks) :])
     return {"blocks": rest} if rest else None

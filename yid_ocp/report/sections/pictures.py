@@ -1,4 +1,4 @@
-"""Pictures that a command drew into its folder."""
+"""Section: image files of the run folder."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from yid_ocp.report.sections.base import Findings, section
 
 @section("pictures", 50, "Pictures")
 def prepare(findings: Findings) -> Mapping[str, Any] | None:
-    """The files that the command names, as part of the page."""
+    """Template context: the command's image files, base64-encoded."""
     files = findings.more.get("pictures", ())
     shown = [(path.name, base64.b64encode(path.read_bytes()).decode("ascii")) for path in files]
     return {"pictures": shown} if shown else None

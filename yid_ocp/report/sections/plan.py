@@ -1,4 +1,4 @@
-"""A planned motion over time."""
+"""Section: a planned motion over time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from yid_ocp.report.sections.base import Findings, joint_unit, section
 
 @section("plan", 10, "The planned motion")
 def prepare(findings: Findings) -> Mapping[str, Any] | None:
-    """How far the point is from its place, and the joints, over time."""
+    """Template context: distance of the point from its target, and joints over time."""
     found = findings.more.get("plan")
     if found is None:
         return None

@@ -1,4 +1,4 @@
-"""Pictures of a blind proof: what is detected, and whether intervals and p-values keep what they promise."""
+"""Section: detection rates, confusion matrix and calibration of a blind validation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CALIBRATED = {"intervals": "intervals of effects' parameters", "p_values": "p-va
 
 @section("proof", 10, "What was seen and named")
 def prepare(findings: Findings) -> Mapping[str, Any] | None:
-    """Detection against size, what was said of what, and calibration, as far as there are cases for them."""
+    """Template context: detection rate by effect size, confusion matrix and calibration."""
     result = findings.result
     if result.get("format") != "yid-blind/1":
         return None

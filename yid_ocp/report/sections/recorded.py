@@ -1,4 +1,4 @@
-"""What recordings hold, group by group."""
+"""Section: recorded signals by group."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CHANNELS = ("position", "velocity", "effort", "position_command")
 
 @section("recorded", 30, "What was recorded")
 def prepare(findings: Findings) -> Mapping[str, Any] | None:
-    """Joints' channels and points over time."""
+    """Template context: recorded joint channels and points over time."""
     recordings: list[Recording] = findings.more.get("recordings", [])[:MOST]
     system: System | None = findings.more.get("system")
     pictures = [

@@ -1,4 +1,4 @@
-"""The arm and the object in motion, measured against predicted, with a slider over time."""
+"""Section: animation of arm and object, measured and predicted."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ROLES = {"estimate": "estimated on", "held_out": "held out"}
 
 @section("scene", 3, "In motion")
 def prepare(findings: Findings) -> Mapping[str, Any] | None:
-    """What the command made to be shown, else what was predicted of every recording; held-out ones first."""
+    """Template context: the command's animations, else the predicted motion of each recording, held-out first."""
     scenes = [entry for entry in findings.scenes or _predicted(findings) if len(entry.t) > 1]
     told = json.dumps([entry.to_dict() for entry in scenes[:MOST]], separators=(",", ":")).replace("<", "\\u003c")
     both = any(

@@ -1,4 +1,4 @@
-"""How the solver got there."""
+"""Section: convergence history of the solver."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from yid_ocp.report.sections.base import Findings, section
 
 @section("search", 40, "How it was found")
 def prepare(findings: Findings) -> Mapping[str, Any] | None:
-    """Cost history of the solver."""
+    """Template context: the solver's cost history."""
     solution = findings.solution
     if solution is None or len(solution.history) < 2:
         return None

@@ -1,4 +1,4 @@
-"""What a command found, first of all: its verdict in the words of the terminal, and the table beside it."""
+"""Section: verdict and key table of a command's summary."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from yid_ocp.report.summaries import SUMMARIES
 
 @section("verdict", 0, "What was found")
 def prepare(findings: Findings) -> Mapping[str, Any] | None:
-    """Conclusions and verdicts, and all up to the table that stands beside them."""
+    """Template context: conclusions, verdicts and the blocks up to the key table."""
     blocks = summary(findings)
     if not blocks:
         return None
@@ -22,16 +22,16 @@ def prepare(findings: Findings) -> Mapping[str, Any] | None:
 
 
 def summary(findings: Findings) -> list[Block]:
-    """All that is said of a result; nothing of a format that is not known."""
+    """Summary blocks of a result; empty for an unknown format."""
     known = SUMMARIES.get(str(findings.result.get("format")))
     return [] if known is None else known(findings.result)
 
 
 def key(blocks: list[Block]) -> int:
-    """Where what stands beside the verdict ends."""
+    """Index after the key table in a list of blocks; 0 without a key table."""
     return next((i + 1 for i, block in enumerate(blocks) if isinstance(block, Table) and block.key), 0)
 
 
 def without_verdicts(blocks: list[Block]) -> list[Block]:
-    """What is left when the verdicts have been said."""
+    """The blocks without verdict and conclusion statements."""
     return [block for block in blocks if not (isinstance(block, Statement) and block.weight != "note")]
