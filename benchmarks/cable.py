@@ -5,7 +5,7 @@
 Free vertices are all but the two held at each end. A prediction knows the held vertices throughout and the free ones in
 the first two frames; its error is the root mean square Euclidean distance over free vertices and later frames. Values
 are per unit weight: the linear density is nominal, as no force was measured. `nominal` and `undeformed rest` are the
-model with the measured undeformed shape as its rest shape, at guessed and at fitted stiffness and damping; for `fitted`
+model with the measured undeformed shape as its rest shape, at guessed and at fitted stiffness and damping; for `with_fitted_initial_state`
 the rest shape was estimated as well.
 """
 
@@ -25,20 +25,27 @@ from rich.console import Console
 from rich.table import Table
 
 import yid_ocp as yid
-from yid_ocp.data.edges import edge_lengths
-from yid_ocp.data.hdf5 import read_recording
+from yid_ocp.data.edge_lengths import median_edge_lengths
 from yid_ocp.data.recording import Recording
+from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.model.cable import (
-    BranchOptions,
-    Cable,
+    CableBranchOptions,
     CableOptions,
+    CableTopology,
     cable_system,
-    free_parameters,
-    length_values,
-    read_vertices,
+    edge_length_parameters,
+    estimable_parameters,
+    read_vertex_positions,
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.validation import linear_carry, move_with_clamps, point_errors, positions, prediction_error, stay
+from yid_ocp.problem.prediction_errors import (
+    clamp_displacement_baseline,
+    constant_position_baseline,
+    interpolated_displacement_baseline,
+    measured_positions,
+    point_rmse_by_recording,
+    position_rmse,
+)
 from yid_ocp.solvers import GaussNewton, solve
 
 FOLDER = Path(__file__).resolve().parents[2] / "shared" / "recordings" / "deft"
@@ -48,45 +55,49 @@ TIME_STEP = 0.01  # [s]
 NOISE = 2e-4  # of motion capture, from the scatter of third differences (0.10 to 0.20 mm) [m]
 MODEL_ERROR = 0.1  # about 15 mm that last for some fifty frames [m]
 GRAVITY = 9.81  # [m/s^2]
-BRANCH = BranchOptions(bend=1.5e-3, twist=1e-3, damping=1e-3, twist_damping=True)  # a guess
-OPTIONS = CableOptions(default=BRANCH, memory=0.5, rest_angles=True)
+BRANCH = CableBranchOptions(
+    bend_rigidity=1.5e-3, twist_rigidity=1e-3, bend_damping=1e-3, separate_twist_damping=True
+)  # a guess
+OPTIONS = CableOptions(default_branch=BRANCH, shape_memory=0.5, has_rest_angle_parameters=True)
 
 
-def branched_cable(folder: Path = FOLDER) -> Cable:
+def branched_cable(folder: Path = FOLDER) -> CableTopology:
     """The cable of the recordings: thirteen vertices of the parent, children leaving at the fifth and the ninth."""
-    return Cable(
+    return CableTopology(
         tuple(f"p{i}" for i in range(13)),
         {"a": ("p4", "a1", "a2", "a3", "a4"), "b": ("p8", "b1", "b2", "b3")},
-        read_vertices(folder / "bdlo1_undeformed.csv"),
+        read_vertex_positions(folder / "bdlo1_undeformed.csv"),
     )
 
 
-def cable_options(cable: Cable, recordings: list[Recording], options: CableOptions) -> ProblemOptions:
+def cable_options(cable: CableTopology, recordings: list[Recording], options: CableOptions) -> ProblemOptions:
     """Of each recording what a prediction may use: the clamps throughout, free vertices in the first two frames."""
-    known = {r.name: length_values(cable, edge_lengths(cable.edges, [r], 2)) for r in recordings}
-    names = [name for name in free_parameters(cable, options) if name.endswith(".rest")]
+    known = {r.name: edge_length_parameters(cable, median_edge_lengths(cable.edges, [r], 2)) for r in recordings}
+    names = [name for name in estimable_parameters(cable, options) if name.endswith(".rest")]
     return ProblemOptions(
         initial_state="fitted_to_points",
         path_cutoff=8.0,
-        sensors={"points": SensorOptions(std=MODEL_ERROR, points=cable.free)},
-        clamps=cable.clamps,
-        priors=dict.fromkeys(names, 0.2),
-        start_window=TIME_STEP,
-        start_std=NOISE,
-        start_parameters=("clamp_start.roll",),
-        recording_values=known,
+        sensors={"points": SensorOptions(std=MODEL_ERROR, points=cable.free_vertices)},
+        clamp_paths=cable.clamp_paths,
+        prior_stds=dict.fromkeys(names, 0.2),
+        start_fit_window=TIME_STEP,
+        start_point_noise_std=NOISE,
+        start_fit_parameters=("clamp_start.roll",),
+        parameters_by_recording=known,
     )
 
 
-def baselines(recording: Recording, cable: Cable) -> dict[str, float]:
+def baselines(recording: Recording, cable: CableTopology) -> dict[str, float]:
     """Prediction errors without a model [m]."""
-    free, measured = cable.free, positions(recording, cable.free)
+    free, measured = cable.free_vertices, measured_positions(recording, cable.free_vertices)
     predictions = {
-        "stay": stay(recording, free),
-        "move_with_clamps": move_with_clamps(recording, free, cable.held),
-        "linear_carry": linear_carry(recording, free, cable.parent, cable.children, cable.held),
+        "stay": constant_position_baseline(recording, free),
+        "move_with_clamps": clamp_displacement_baseline(recording, free, cable.clamped_vertices),
+        "linear_carry": interpolated_displacement_baseline(
+            recording, free, cable.parent_vertices, cable.child_vertices, cable.clamped_vertices
+        ),
     }
-    return {name: prediction_error(predicted, measured) for name, predicted in predictions.items()}
+    return {name: position_rmse(predicted, measured) for name, predicted in predictions.items()}
 
 
 def run(folder: Path = FOLDER, iterations: int = 15) -> dict[str, Any]:
@@ -95,30 +106,30 @@ def run(folder: Path = FOLDER, iterations: int = 15) -> dict[str, Any]:
     recordings = {name: read_recording(folder / f"bdlo1_train_{name}.h5") for name in (*ESTIMATE, *HELD_OUT)}
     estimate, held_out = [recordings[n] for n in ESTIMATE], [recordings[n] for n in HELD_OUT]
     clock = time.perf_counter()
-    system = cable_system(edge_lengths(cable.edges, estimate), cable, OPTIONS)
+    system = cable_system(median_edge_lengths(cable.edges, estimate), cable, OPTIONS)
     step = yid.compile_step(system, TIME_STEP)
     seconds = {"build_and_compile": time.perf_counter() - clock}
     options = cable_options(cable, estimate + held_out, OPTIONS)
     plain = {name: 0.0 for name in system.parameters.names if name.endswith(".memory")}
-    names = free_parameters(cable, CableOptions(default=BRANCH))
-    undeformed = EstimationProblem(step, estimate, names, replace(options, priors={}), plain, held_out)
-    problem = EstimationProblem(step, estimate, free_parameters(cable, OPTIONS), options, None, held_out)
+    names = estimable_parameters(cable, CableOptions(default_branch=BRANCH))
+    undeformed = EstimationProblem(step, estimate, names, replace(options, prior_stds={}), plain, held_out)
+    problem = EstimationProblem(step, estimate, estimable_parameters(cable, OPTIONS), options, None, held_out)
     clock = time.perf_counter()
-    nominal = point_errors(undeformed, undeformed.start, cable.free)
-    point_errors(problem, problem.start, cable.free)
+    nominal = point_rmse_by_recording(undeformed, undeformed.initial_unknowns, cable.free_vertices)
+    point_rmse_by_recording(problem, problem.initial_unknowns, cable.free_vertices)
     seconds["starts"] = time.perf_counter() - clock
-    episode, (theta, offset) = problem.episodes[0], problem.split(problem.start, 0)
+    episode, (theta, offset) = problem.episodes[0], problem.split(problem.initial_unknowns, 0)
     clock = time.perf_counter()
-    problem.predictor.run(episode, theta, offset, False)
+    problem.predictor.predict_episode(episode, theta, offset, False)
     seconds["rollout"] = time.perf_counter() - clock
     clock = time.perf_counter()
-    solution = solve(problem, GaussNewton(iterations=iterations))
+    solution = solve(problem, GaussNewton(max_iterations=iterations))
     seconds["fit"] = time.perf_counter() - clock
-    fitted = point_errors(problem, solution.x, cable.free)
+    fitted = point_rmse_by_recording(problem, solution.x, cable.free_vertices)
     clock = time.perf_counter()
-    simple = solve(undeformed, GaussNewton(iterations=iterations))
+    simple = solve(undeformed, GaussNewton(max_iterations=iterations))
     seconds["fit_undeformed_rest"] = time.perf_counter() - clock
-    by_simple = point_errors(undeformed, simple.x, cable.free)
+    by_simple = point_rmse_by_recording(undeformed, simple.x, cable.free_vertices)
     files = {}
     for recording in (*estimate, *held_out):
         errors = baselines(recording, cable)
@@ -129,18 +140,18 @@ def run(folder: Path = FOLDER, iterations: int = 15) -> dict[str, Any]:
             "nominal": nominal[recording.name],
             "undeformed_rest": by_simple[recording.name],
             "baselines": errors,
-            "ratio_to_linear_carry": errors["linear_carry"] / model,
+            "ratio_to_linear_carry": errors["interpolated_displacement_baseline"] / model,
         }
     return {
         "format": "yid-cable/1",
         "unit": "m",
         "given": "held vertices throughout, free vertices in the first two frames",
-        "free_vertices": list(cable.free),
+        "free_vertices": list(cable.free_vertices),
         "files": files,
         "held_out_median": medians([entry for entry in files.values() if entry["held_out"]]),
-        "parameters": parameters(cable, solution.x, solution.covariance, problem.names),
+        "parameters": parameters(cable, solution.x, solution.covariance, problem.unknown_names),
         "status": solution.status.value,
-        "iterations": solution.iterations,
+        "iterations": solution.n_iterations,
         "seconds": seconds,
     }
 
@@ -149,19 +160,19 @@ def medians(files: list[dict[str, Any]]) -> dict[str, float]:
     """Medians over files of every error, and the ratio of the strongest baseline's median to the model's."""
     result = {key: statistics.median(entry[key] for entry in files) for key in ("error", "nominal", "undeformed_rest")}
     result |= {name: statistics.median(e["baselines"][name] for e in files) for name in files[0]["baselines"]}
-    result["ratio_to_linear_carry"] = result["linear_carry"] / result["error"]
+    result["ratio_to_linear_carry"] = result["interpolated_displacement_baseline"] / result["error"]
     return result
 
 
-def parameters(cable: Cable, x: Any, covariance: Any, names: tuple[str, ...]) -> dict[str, dict[str, Any]]:
+def parameters(cable: CableTopology, x: Any, covariance: Any, names: tuple[str, ...]) -> dict[str, dict[str, Any]]:
     """Values, standard deviations, and values per unit weight (density times gravity) of rigidities and dampings."""
     units = {"bend": "m^3", "twist": "m^3", "damping": "m^3 s", "twist_damping": "m^3 s"}
     result: dict[str, dict[str, Any]] = {}
     for i, name in enumerate(names):
         branch, _, quantity = name.partition(".")
         result[name] = {"value": float(x[i]), "std": float(covariance[i, i]) ** 0.5}
-        if branch in cable.chains and quantity in units:
-            weight = OPTIONS.branches.get(branch, OPTIONS.default).density * GRAVITY
+        if branch in cable.branch_vertices and quantity in units:
+            weight = OPTIONS.branches.get(branch, OPTIONS.default_branch).linear_density * GRAVITY
             result[name] |= {"per_weight": float(x[i]) / weight, "per_weight_unit": units[quantity]}
     return result
 
@@ -174,7 +185,11 @@ def show(result: Mapping[str, Any], console: Console) -> None:
         table.add_column(column, justify="left" if column == "file" else "right", no_wrap=column == "file")
 
     def row(name: str, entry: Mapping[str, Any], plain: Mapping[str, float]) -> None:
-        errors = [plain["stay"], plain["move_with_clamps"], plain["linear_carry"]]
+        errors = [
+            plain["constant_position_baseline"],
+            plain["clamp_displacement_baseline"],
+            plain["interpolated_displacement_baseline"],
+        ]
         errors += [entry["nominal"], entry["undeformed_rest"], entry["error"]]
         table.add_row(name, *(f"{1e3 * e:.1f}" for e in errors), f"{entry['ratio_to_linear_carry']:.2f}")
 

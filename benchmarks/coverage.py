@@ -32,19 +32,19 @@ from make_recordings import OFFSETS, SNAP, TRUTH, within_limits
 
 import yid_ocp
 from yid_ocp.config.reader import load_config
-from yid_ocp.data.hdf5 import write_recording
+from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.errors import ModelError
-from yid_ocp.files import content_hash, write_json
+from yid_ocp.files import json_sha256, write_json
 from yid_ocp.model.system import System
-from yid_ocp.parallel import Task, TaskResult, Workers, run_tasks
+from yid_ocp.parallel import Task, TaskResult, WorkerConfig, run_tasks
 from yid_ocp.report.summaries import solve_summary
-from yid_ocp.report.terminal import lines, table
+from yid_ocp.report.terminal import aligned_table_lines, terminal_lines
 from yid_ocp.sensors.base import EffortKind
-from yid_ocp.version import code_hash
-from yid_ocp.virtual.engine import Simulation, simulate_in_mujoco
-from yid_ocp.virtual.experiment import ArmNoise, VirtualExperiment, paper_system, virtual_experiment
-from yid_ocp.virtual.motion import Excitation, Motion, multisine
-from yid_ocp.virtual.posture import initial_posture
+from yid_ocp.version import source_hash
+from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperiment, baxter_foam_y_system, run_virtual_experiment
+from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
+from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
+from yid_ocp.virtual.multisine_motion import MultisineMotion, MultisineOptions, random_multisine
 from yid_ocp.workflow.solve import run_solve
 
 PACKAGE = Path(yid_ocp.__file__).parent
@@ -137,25 +137,27 @@ def make_twin(cell: str, recipe: Mapping[str, Any], number: int, folder: str, co
     assert made.recipe == recipe
     rng = np.random.default_rng([zlib.crc32(cell.encode()), number])
     truth = {name: value * math.exp(rng.uniform(-SPREAD, SPREAD)) for name, value in TRUTH.items()}
-    system = paper_system(made.arms)
-    posture = initial_posture(system, truth, offsets={} if made.undeformed else OFFSETS[made.arms])
-    simulation = Simulation(
+    system = baxter_foam_y_system(made.arms)
+    posture = grasping_joint_angles(system, truth, offsets={} if made.undeformed else OFFSETS[made.arms])
+    simulation = SimulationOptions(
         DURATION, time_step=INNER_STEP, controller_rate=made.controller_rate, effort_kind=made.effort_kind
     )
     noise_seed = int(rng.integers(2**31))
     motion, motion_seed = gentle_enough(system, truth, posture, simulation, made.undeformed, rng)
     experiment = VirtualExperiment(
         motion=motion,
-        posture=posture,
+        initial_joint_angles=posture,
         simulation=simulation,
-        noise=ArmNoise(effort=made.effort, effort_bias=made.effort_bias, stated=made.stated),
+        arm_noise=ArmSensorNoise(
+            effort_std=made.effort, effort_bias_std=made.effort_bias, records_effort_std=made.stated
+        ),
         seed=noise_seed,
-        name=f"{cell}_{number:03d}",
+        recording_name=f"{cell}_{number:03d}",
         description=f"Twin {number} of the cell {cell} (motion seed {motion_seed}).",
     )
-    recording = virtual_experiment(system, truth, experiment)
+    recording = run_virtual_experiment(system, truth, experiment)
     recording = replace(recording, points=tuple(group for group in recording.points if group.name in made.sees))
-    path = Path(folder) / f"{recording.name}_{content_hash([recipe, code])[:8]}.h5"
+    path = Path(folder) / f"{recording.name}_{json_sha256([recipe, code])[:8]}.h5"
     write_recording(recording, path)
     assert recording.joints is not None
     assert recording.joints.effort is not None
@@ -167,17 +169,19 @@ def gentle_enough(
     system: System,
     truth: Mapping[str, float],
     posture: Mapping[str, float],
-    simulation: Simulation,
+    simulation: SimulationOptions,
     undeformed: bool,
     rng: np.random.Generator,
-) -> tuple[Motion, int]:
+) -> tuple[MultisineMotion, int]:
     """The first of many motions drawn that stays within the robot's limits and does not let the object snap."""
-    excitation = Excitation(travel=TRAVEL[undeformed], duration=simulation.duration, shake=SHAKE)
+    excitation = MultisineOptions(
+        gripper_travel=TRAVEL[undeformed], duration=simulation.duration, shake_torque_rms=SHAKE
+    )
     trial = replace(simulation, time_step=TRIAL_STEP)
     for _ in range(ATTEMPTS):
         seed = int(rng.integers(2**31))
-        motion = multisine(system, truth, seed=seed, posture=posture, excitation=excitation)
-        if within_limits(system, simulate_in_mujoco(system, truth, motion, trial, posture=posture)):
+        motion = random_multisine(system, truth, seed=seed, initial_joint_angles=posture, excitation=excitation)
+        if within_limits(system, simulate_in_mujoco(system, truth, motion, trial, initial_joint_angles=posture)):
             return motion, seed
     raise ModelError(f"none of {ATTEMPTS} motions stays within the limits", hint="let the arms travel less")
 
@@ -187,7 +191,11 @@ def gentle_enough(
 
 def solve_twin(config: Path, recording: Path, settings: Sequence[str]) -> dict[str, Any]:
     """What the command `solve` says of a twin."""
-    given = [f"recordings.estimate=[{json.dumps(str(recording))}]", "recordings.held_out=[]", "output.report=false"]
+    given = [
+        f"recordings.estimate=[{json.dumps(str(recording))}]",
+        "recordings.held_out=[]",
+        "output.write_report=false",
+    ]
     with tempfile.TemporaryDirectory() as folder:
         result = run_solve(load_config(config, [*given, *settings]), Path(folder) / "run").result
     return {
@@ -200,7 +208,7 @@ def solve_twin(config: Path, recording: Path, settings: Sequence[str]) -> dict[s
             for name, entry in result["parameters"].items()
             if entry["free"]
         },
-        "diagnose": any("diagnose" in line for line in lines(solve_summary(result))),
+        "diagnose": any("diagnose" in line for line in terminal_lines(solve_summary(result))),
     }
 
 
@@ -350,7 +358,7 @@ def report(twins: Mapping[str, Sequence[Twin]]) -> list[str]:
     stated = [pooled(cell, entries) for cell, entries in twins.items() if CELLS[cell].stated]
     if len(stated) > 1:
         rows += [(f"all of {len(group.cells)} cells", "", "", *_numbers(group), "", "") for group in grouped(stated)]
-    lines = table(rows)
+    lines = aligned_table_lines(rows)
     lines += ["", "Of a parameter: rms of z and how many twins call it found or weak; * outside its 99.9 % band.", ""]
     errors = dict.fromkeys(f"{cell}: {twin.error}" for cell, entries in twins.items() for twin in entries if twin.error)
     return [*lines, *errors, *shortcomings(twins)]
@@ -373,11 +381,13 @@ def _median(values: Sequence[float]) -> str:
 # -- the run ----------------------------------------------------------------------------------------------------------
 
 
-def record(names: Sequence[str], numbers: Sequence[int], workers: Workers, out: Path) -> dict[str, list[TaskResult]]:
+def record(
+    names: Sequence[str], numbers: Sequence[int], workers: WorkerConfig, out: Path
+) -> dict[str, list[TaskResult]]:
     """Record twins of some cells by their numbers; what stands in the folder is not done again."""
     recordings = out.resolve() / "recordings"
     recordings.mkdir(parents=True, exist_ok=True)
-    code = code_hash(PACKAGE / "virtual")
+    code = source_hash(PACKAGE / "virtual")
     tasks = [
         Task(
             f"recording {k} of {name}",
@@ -390,7 +400,7 @@ def record(names: Sequence[str], numbers: Sequence[int], workers: Workers, out: 
     return {name: made[i * len(numbers) : (i + 1) * len(numbers)] for i, name in enumerate(names)}
 
 
-def solve(made: Mapping[str, Sequence[TaskResult]], workers: Workers, out: Path) -> dict[str, list[Twin]]:
+def solve(made: Mapping[str, Sequence[TaskResult]], workers: WorkerConfig, out: Path) -> dict[str, list[Twin]]:
     """Solve the twins that were recorded; what stands in the folder is not done again."""
     whole = [(name, entry) for name, entries in made.items() for entry in entries if not entry.error]
     tasks = [
@@ -452,7 +462,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--first", type=int, default=0, help="number of the first twin, to add to those of another run")
     chosen = parser.parse_args(arguments)
     names = asked_for(parser, chosen.names, CELLS, "cell")
-    workers = Workers(chosen.workers, chosen.scheduler)
+    workers = WorkerConfig(chosen.workers, chosen.scheduler)
     made = record(names, range(chosen.first, chosen.first + chosen.twins), workers, chosen.out)
     if chosen.record_only:
         return 1 if any(entry.error for entries in made.values() for entry in entries) else 0

@@ -23,19 +23,19 @@ from pathlib import Path
 import threadpoolctl
 from make_recordings import TRAVEL, TRUTH
 
-from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
+from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG, load_config
 from yid_ocp.data.recording import Recording
-from yid_ocp.diagnosis import Finding, Thresholds, diagnose
-from yid_ocp.diagnosis.blind import finer_values
-from yid_ocp.diagnosis.carry_over import disagreeing
-from yid_ocp.diagnosis.hypotheses import CandidateProblem, chosen_effects
-from yid_ocp.diagnosis.refit import refit
-from yid_ocp.parallel import Task, Workers, run_tasks
+from yid_ocp.diagnosis import DiagnosisResult, Thresholds, diagnose
+from yid_ocp.diagnosis.blind import finer_chain_parameters
+from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
+from yid_ocp.diagnosis.refit import refit_with_effects
+from yid_ocp.diagnosis.transfer_check import failed_transfer_checks
+from yid_ocp.parallel import Task, WorkerConfig, run_tasks
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.virtual.experiment import VirtualExperiment
-from yid_ocp.virtual.injected import InjectedEffect, injected_experiment
-from yid_ocp.virtual.motion import Excitation, multisine
-from yid_ocp.virtual.posture import initial_posture
+from yid_ocp.virtual.injected import InjectedEffect, run_injected_experiment
+from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
+from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 from yid_ocp.workflow.build import build_problem, build_system
 
 NOISE_SEEDS = (401, 402)
@@ -145,54 +145,64 @@ CASES: Mapping[str, Case] = {
 
 
 def record(case: Case, motion_seed: int, noise_seed: int) -> Recording:
-    run = load_config(None, (), DIAGNOSIS_DEFAULT)
+    run = load_config(None, (), DEFAULT_DIAGNOSIS_CONFIG)
     nominal = build_system(run)
-    links = len(nominal.segments[0].links) * case.links
+    links = len(nominal.segment_layouts[0].link_joints) * case.links
     system = nominal if case.links == 1 else build_system(run, links)
-    values = TRUTH if case.links == 1 else finer_values(nominal, system, TRUTH)
-    posture = initial_posture(nominal, TRUTH)
-    motion = multisine(nominal, TRUTH, seed=motion_seed, posture=posture, excitation=Excitation(travel=TRAVEL[1]))
-    experiment = VirtualExperiment(motion=motion, posture=posture, seed=noise_seed, name=f"motion_{motion_seed}")
-    return injected_experiment(system, values, case.withheld, experiment)
+    values = TRUTH if case.links == 1 else finer_chain_parameters(nominal, system, TRUTH)
+    posture = grasping_joint_angles(nominal, TRUTH)
+    motion = random_multisine(
+        nominal,
+        TRUTH,
+        seed=motion_seed,
+        initial_joint_angles=posture,
+        excitation=MultisineOptions(gripper_travel=TRAVEL[1]),
+    )
+    experiment = VirtualExperiment(
+        motion=motion, initial_joint_angles=posture, seed=noise_seed, recording_name=f"motion_{motion_seed}"
+    )
+    return run_injected_experiment(system, values, case.withheld, experiment)
 
 
-def found(name: str, seeds: Sequence[int], truth: bool = True) -> tuple[Finding, float, float]:
+def found(name: str, seeds: Sequence[int], truth: bool = True) -> tuple[DiagnosisResult, float, float]:
     """The diagnosis of a case, how long it took [s], and held-out chi2/n with the true effects in the model.
 
     NaN instead of the last one without `truth`.
     """
     case = CASES[name]
     estimate, held_out = (record(case, *pair) for pair in zip(seeds, NOISE_SEEDS, strict=True))
-    nominal = build_problem(load_config(None, (), DIAGNOSIS_DEFAULT))
+    nominal = build_problem(load_config(None, (), DEFAULT_DIAGNOSIS_CONFIG))
     problem = EstimationProblem(nominal.step, [estimate], nominal.free, nominal.options)
-    everything = [effect.label for effect in chosen_effects(problem.system, [estimate], "all")]
+    everything = [effect.label for effect in make_candidate_effects(problem.system, [estimate], "all")]
     library = [label for label in everything if label.partition("@")[0] not in case.without]
     begun = time.perf_counter()
-    finding = diagnose(problem, library, [held_out], thresholds=Thresholds(effects=2))
+    finding = diagnose(problem, library, [held_out], thresholds=Thresholds(max_effects=2))
     seconds = time.perf_counter() - begun
     if not truth:
         return finding, seconds, math.nan
-    composed = CandidateProblem.of(problem, chosen_effects(problem.system, [estimate], "all"), [held_out])
-    true = [effect for effect in composed.effects if effect.label in {w.label for w in case.withheld}]
+    composed = AllCandidatesProblem.from_problem(
+        problem, make_candidate_effects(problem.system, [estimate], "all"), [held_out]
+    )
+    true = [effect for effect in composed.candidate_effects if effect.label in {w.label for w in case.withheld}]
     with threadpoolctl.threadpool_limits(1):
-        fit = refit(composed, true, finding.nominal.values) if true else None
-    return finding, seconds, math.nan if fit is None else fit.loss.mean
+        fit = refit_with_effects(composed, true, finding.nominal_model.values) if true else None
+    return finding, seconds, math.nan if fit is None else fit.held_out_loss.chi2_per_sample
 
 
-def right(case: Case, finding: Finding) -> bool:
+def right(case: Case, finding: DiagnosisResult) -> bool:
     """Whether the verdict is what the case deserves: the effect first, or in a set of no more than three."""
     true = {effect.label for effect in case.withheld}
     if case.verdict == "unknown":
         places = {effect.location for effect in case.withheld}
         # places that the data cannot tell apart are said together
-        said = {finding.where[0].location, *finding.where[0].also}
+        said = {finding.gap_locations[0].location, *finding.gap_locations[0].indistinguishable_from}
         return finding.verdict == "unknown" and bool(said & places)
     if case.verdict == "no_gap":
         return finding.verdict == "no_gap"
-    named = [effect.label for effect in finding.effects]
+    named = [effect.label for effect in finding.accepted_effects]
     if len(true) > 1:
         return true <= set(named)
-    rivals = {r.label for r in finding.added[0].rivals} if finding.effects else set()
+    rivals = {r.label for r in finding.selected_effects[0].equivalent_effects} if finding.accepted_effects else set()
     return set(named[:1]) == true or (bool(true & rivals) and len(rivals) <= 3)
 
 
@@ -200,23 +210,34 @@ def run(name: str, seeds: Sequence[int]) -> dict[str, str]:
     case = CASES[name]
     finding, seconds, best = found(name, seeds)
     truth = " + ".join(effect.label for effect in case.withheld) or "-"
-    rivals = "; ".join(", ".join(r.label for r in a.rivals) for a in finding.added if len(a.rivals) > 1)
+    rivals = "; ".join(
+        ", ".join(r.label for r in a.equivalent_effects)
+        for a in finding.selected_effects
+        if len(a.equivalent_effects) > 1
+    )
     judged = "-" if case.verdict == "-" else "yes" if right(case, finding) else "no"
     return {
         "case": name,
         "truth": truth,
         "verdict": finding.verdict,
         "right": judged,
-        "added": ", ".join(effect.label for effect in finding.effects) or "-",
-        "nameless": "-" if finding.effects else ", ".join(entry.effect.label for entry in finding.added) or "-",
-        "why": finding.reason or "-",
-        "explained": f"{100 * finding.explained:.0f} %" if finding.added else "-",
-        "apart": ", ".join(f"{entry.effect}.{entry.name}" for entry in disagreeing(finding.carried)) or "-",
-        "not separable": rivals if finding.effects and rivals else "-",
-        "where": " or ".join([finding.where[0].location, *finding.where[0].also]) if finding.where else "-",
-        "chi2/n held out": f"{finding.held_out_before.chi2_per_dof:.3g}",
+        "added": ", ".join(effect.label for effect in finding.accepted_effects) or "-",
+        "nameless": "-"
+        if finding.accepted_effects
+        else ", ".join(entry.effect.label for entry in finding.selected_effects) or "-",
+        "why": finding.unknown_reason or "-",
+        "explained": f"{100 * finding.explained_fraction:.0f} %" if finding.selected_effects else "-",
+        "apart": ", ".join(
+            f"{entry.effect_label}.{entry.parameter}" for entry in failed_transfer_checks(finding.transfer_checks)
+        )
+        or "-",
+        "not separable": rivals if finding.accepted_effects and rivals else "-",
+        "where": " or ".join([finding.gap_locations[0].location, *finding.gap_locations[0].indistinguishable_from])
+        if finding.gap_locations
+        else "-",
+        "chi2/n held out": f"{finding.nominal_held_out_test.chi2_per_dof:.3g}",
         "with the truth": "-" if math.isnan(best) else f"{best:.3g}",
-        "closure": f"{100 * finding.closure.value:.0f} %" if finding.effects else "-",
+        "closure": f"{100 * finding.gap_closure.fraction:.0f} %" if finding.accepted_effects else "-",
         "time": f"{seconds:.0f} s",
     }
 
@@ -231,7 +252,7 @@ def main() -> int:
     arguments = parser.parse_args()
     tasks = [Task(name, {"name": name, "seeds": list(arguments.seeds)}) for name in arguments.cases]
     with tempfile.TemporaryDirectory() as folder:
-        results = run_tasks(run, tasks, arguments.keep or Path(folder), Workers(arguments.workers), show)
+        results = run_tasks(run, tasks, arguments.keep or Path(folder), WorkerConfig(arguments.workers), show)
     rows = [result.value for result in results if not result.error]
     for i, row in enumerate(rows):
         if i == 0:

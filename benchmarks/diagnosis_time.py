@@ -15,7 +15,7 @@ import time
 from rich.console import Console
 from rich.table import Table
 
-from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
+from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG, load_config
 from yid_ocp.diagnosis import diagnose
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.workflow.build import build_problem
@@ -28,26 +28,28 @@ def main() -> int:
     parser.add_argument("--runs", type=int, default=2)
     given = parser.parse_args()
     for config in given.configs or [None]:
-        show(build_problem(load_config(config, (), DIAGNOSIS_DEFAULT)), given.runs)
+        show(build_problem(load_config(config, (), DEFAULT_DIAGNOSIS_CONFIG)), given.runs)
     return 0
 
 
 def show(problem: EstimationProblem, runs: int) -> None:
     """Diagnose one problem so many times and print one table."""
-    table = Table(title=f"{problem.system.size} variables, {problem.episodes[0].grid.steps} steps, all candidates")
+    table = Table(
+        title=f"{problem.system.n_coordinates} variables, {problem.episodes[0].grid.steps} steps, all candidates"
+    )
     for title in ("run", "stage", "wall [s]", "/ nominal fit"):
         table.add_column(title, justify="left" if title == "stage" else "right")
     for run in range(runs):
         wall, cpu = time.perf_counter(), time.process_time()
         finding = diagnose(problem, "all")
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-        reference = finding.seconds["nominal"]
-        stages = dict(finding.seconds) | {"whole": wall, "whole, CPU": cpu}
+        reference = finding.stage_seconds["nominal"]
+        stages = dict(finding.stage_seconds) | {"whole": wall, "whole, CPU": cpu}
         for stage, seconds in stages.items():
             table.add_row(str(run + 1), stage, f"{seconds:.2f}", f"{seconds / reference:.1f}")
-        named = ", ".join(effect.label for effect in finding.effects)
+        named = ", ".join(effect.label for effect in finding.accepted_effects)
         table.add_section()
-        table.caption = f"{len(finding.visibility)} candidates; {finding.verdict}: {named}"
+        table.caption = f"{len(finding.detectability)} candidates; {finding.verdict}: {named}"
     Console(width=None if sys.stdout.isatty() else 100).print(table)
 
 

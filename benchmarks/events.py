@@ -20,8 +20,8 @@ from statistics import median
 from typing import Any
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.diagnosis import Finding, diagnose
-from yid_ocp.diagnosis.events import Event
+from yid_ocp.diagnosis import DiagnosisResult, diagnose
+from yid_ocp.diagnosis.events import DisturbanceEvent
 from yid_ocp.workflow.build import build_problem
 
 ROOT = Path(__file__).parents[1]
@@ -71,14 +71,14 @@ class Score:
         return said + ([f"{self.false_calm} false events in calm runs"] if self.false_calm > BARS["calm"] else [])
 
 
-def matches(event: Event, label: Mapping[str, Any]) -> bool:
+def matches(event: DisturbanceEvent, label: Mapping[str, Any]) -> bool:
     """Same joint and sign, windows that overlap."""
-    overlap = event.begin < label["t_to"] and label["t_from"] < event.end
-    return event.channel == label["joint"] and overlap and event.peak * label["peak"] > 0
+    overlap = event.start_time < label["t_to"] and label["t_from"] < event.end_time
+    return event.channel == label["joint"] and overlap and event.peak_value * label["peak"] > 0
 
 
 def scored(
-    events: Sequence[Event],
+    events: Sequence[DisturbanceEvent],
     falls: Mapping[str, float],
     labels: Mapping[str, Sequence[Mapping[str, Any]]],
     apart: tuple[str, float, float] | None = None,
@@ -103,11 +103,11 @@ def scored(
     return Score(total, len(found), false, calm, aside, median(errors) if errors else float("nan"))
 
 
-def _inside(event: Event, joint: str, begin: float, end: float) -> bool:
-    return event.channel == joint and begin < event.begin and event.end < end and event.peak > 0
+def _inside(event: DisturbanceEvent, joint: str, begin: float, end: float) -> bool:
+    return event.channel == joint and begin < event.start_time and event.end_time < end and event.peak_value > 0
 
 
-def diagnosed(machine: str, folder: Path, sets: Sequence[str] = ()) -> Finding:
+def diagnosed(machine: str, folder: Path, sets: Sequence[str] = ()) -> DiagnosisResult:
     """All runs of one machine in one diagnosis, with one candidate effect, which is not what is asked here."""
     files = ",".join(str(path) for path in sorted(folder.glob(f"{machine}_*.h5")))
     run = load_config(CONFIG, [f"recordings.estimate=[{files}]", "recordings.held_out=[]", *sets])
@@ -126,16 +126,16 @@ def main() -> int:
     result, bad = {}, []
     for machine in arguments.machines:
         events = diagnosed(machine, arguments.recordings, arguments.sets).events
-        falls = {fall.recording: fall.time for fall in events.falls}
+        falls = {fall.recording: fall.start_time for fall in events.overspeeds}
         own = {name: entry for name, entry in labels.items() if name.startswith(machine)}
-        for event in events.found:
+        for event in events.disturbances:
             hits = [label for label in own.get(event.recording, ()) if matches(event, label)]
             said = f"true {hits[0]['impulse']:+.3f}" if hits else ""
             print(
-                f"{event.recording:20} {event.channel:9} {event.begin:5.2f} to {event.end:5.2f} s  {event.peak:+.2f} "
-                f"{event.unit}  {event.impulse:+.3f} ± {event.std:.3f} {event.unit} s  {said}"
+                f"{event.recording:20} {event.channel:9} {event.start_time:5.2f} to {event.end_time:5.2f} s  {event.peak_value:+.2f} "
+                f"{event.unit}  {event.impulse:+.3f} ± {event.impulse_std:.3f} {event.unit} s  {said}"
             )
-        score = scored(events.found, falls, own, UNLABELLED.get(machine))
+        score = scored(events.disturbances, falls, own, UNLABELLED.get(machine))
         print(
             f"{machine}: {score.found} of {score.labels} found, {score.false} false ({score.false_calm} in calm runs), "
             f"{score.apart} apart; recall {score.recall:.2f}, precision {score.precision:.2f}, impulse within "

@@ -37,16 +37,16 @@ from coverage import (
 )
 from make_recordings import OFFSETS, TRUTH
 
-from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
-from yid_ocp.data.hdf5 import write_recording
-from yid_ocp.files import content_hash, jsonable, write_json
-from yid_ocp.parallel import Task, TaskResult, Workers, run_tasks
-from yid_ocp.report.terminal import table
-from yid_ocp.version import code_hash
-from yid_ocp.virtual.engine import Simulation
-from yid_ocp.virtual.experiment import ArmNoise, VirtualExperiment, paper_system
-from yid_ocp.virtual.injected import InjectedEffect, injected_experiment
-from yid_ocp.virtual.posture import initial_posture
+from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG, load_config
+from yid_ocp.data.recording_hdf5 import write_recording
+from yid_ocp.files import json_sha256, to_json_types, write_json
+from yid_ocp.parallel import Task, TaskResult, WorkerConfig, run_tasks
+from yid_ocp.report.terminal import aligned_table_lines
+from yid_ocp.version import source_hash
+from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperiment, baxter_foam_y_system
+from yid_ocp.virtual.injected import InjectedEffect, run_injected_experiment
+from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
+from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.workflow.diagnose import run_diagnose
 
 ALARMS = 0.05  # part of clean twins in which a gap may be found
@@ -90,9 +90,9 @@ def make_pair(name: str, recipe: Mapping[str, Any], number: int, folder: str, co
     assert json.loads(json.dumps(kind.recipe)) == json.loads(json.dumps(recipe))
     rng = np.random.default_rng([zlib.crc32(name.encode()), number])
     truth = {tube: value * math.exp(rng.uniform(-SPREAD, SPREAD)) for tube, value in TRUTH.items()}
-    system = paper_system(cell.arms)
-    posture = initial_posture(system, truth, offsets={} if cell.undeformed else OFFSETS[cell.arms])
-    simulation = Simulation(
+    system = baxter_foam_y_system(cell.arms)
+    posture = grasping_joint_angles(system, truth, offsets={} if cell.undeformed else OFFSETS[cell.arms])
+    simulation = SimulationOptions(
         DURATION, time_step=INNER_STEP, controller_rate=cell.controller_rate, effort_kind=cell.effort_kind
     )
     files = []
@@ -101,16 +101,18 @@ def make_pair(name: str, recipe: Mapping[str, Any], number: int, folder: str, co
         motion, motion_seed = gentle_enough(system, truth, posture, simulation, cell.undeformed, rng)
         experiment = VirtualExperiment(
             motion=motion,
-            posture=posture,
+            initial_joint_angles=posture,
             simulation=simulation,
-            noise=ArmNoise(effort=cell.effort, effort_bias=cell.effort_bias, stated=cell.stated),
+            arm_noise=ArmSensorNoise(
+                effort_std=cell.effort, effort_bias_std=cell.effort_bias, records_effort_std=cell.stated
+            ),
             seed=noise_seed,
-            name=f"{name}_{number:03d}_{purpose}",
+            recording_name=f"{name}_{number:03d}_{purpose}",
             description=f"Twin {number} of {name} (motion seed {motion_seed}).",
         )
-        recording = injected_experiment(system, truth, kind.effects, experiment)
+        recording = run_injected_experiment(system, truth, kind.effects, experiment)
         recording = replace(recording, points=tuple(group for group in recording.points if group.name in cell.sees))
-        path = Path(folder) / f"{recording.name}_{content_hash([recipe, code])[:8]}.h5"
+        path = Path(folder) / f"{recording.name}_{json_sha256([recipe, code])[:8]}.h5"
         write_recording(recording, path)
         files.append(str(path))
     return files
@@ -125,29 +127,31 @@ def diagnose_twin(config: Path, estimate: Path, held_out: Path, settings: Sequen
         f"recordings.{key}=[{json.dumps(str(path))}]" for key, path in zip(USES, (estimate, held_out), strict=True)
     ]
     with tempfile.TemporaryDirectory() as folder:
-        made = load_config(config, [*given, "output.report=false", *settings], DIAGNOSIS_DEFAULT)
-        finding = run_diagnose(made, Path(folder) / "run").finding
+        made = load_config(config, [*given, "output.write_report=false", *settings], DEFAULT_DIAGNOSIS_CONFIG)
+        finding = run_diagnose(made, Path(folder) / "run").diagnosis
     detectable = {
         f"{entry.effect.label}.{name}": value
-        for entry in finding.visibility
-        for name, value in entry.detectable.items()
+        for entry in finding.detectability
+        for name, value in entry.detectable_amplitudes.items()
     }
     told = {
         "verdict": finding.verdict,
-        "chi2_per_dof": finding.before.chi2_per_dof,
-        "held_out_chi2_per_dof": finding.held_out_before.chi2_per_dof,
-        "p_value": finding.before.p_value,
-        "held_out_p_value": finding.held_out_before.p_value,
-        "channels": finding.held_out_before.channels,
-        "best": [[score.effect.label, score.p_value] for score in finding.scores[:3]],
-        "candidates": len(finding.scores),
-        "named": [effect.label for effect in finding.effects],
-        "rivals": [[rival.label for rival in added.rivals] for added in finding.added],
-        "values": {name: finding.last.values[name] for e in finding.effects for name in e.parameters.names},
+        "chi2_per_dof": finding.nominal_test.chi2_per_dof,
+        "held_out_chi2_per_dof": finding.nominal_held_out_test.chi2_per_dof,
+        "p_value": finding.nominal_test.p_value,
+        "held_out_p_value": finding.nominal_held_out_test.p_value,
+        "channels": finding.nominal_held_out_test.channel_chi2,
+        "best": [[score.effect.label, score.p_value] for score in finding.candidate_scores[:3]],
+        "candidates": len(finding.candidate_scores),
+        "named": [effect.label for effect in finding.accepted_effects],
+        "rivals": [[rival.label for rival in added.equivalent_effects] for added in finding.selected_effects],
+        "values": {
+            name: finding.final_model.values[name] for e in finding.accepted_effects for name in e.parameters.names
+        },
         "detectable": detectable,
-        "seconds": sum(finding.seconds.values()),
+        "seconds": sum(finding.stage_seconds.values()),
     }
-    found: dict[str, Any] = jsonable(told)  # what cannot be seen has no detectable size
+    found: dict[str, Any] = to_json_types(told)  # what cannot be seen has no detectable size
     return found
 
 
@@ -203,7 +207,7 @@ def report(twins: Mapping[str, Sequence[Twin]]) -> list[str]:
         for number, twin in enumerate(entries):
             if not twin.right(KINDS[name]):
                 lines.append(f"{name} {number}: {twin.error or _said(twin.found)}")
-    return [*table(rows), "", *lines, *shortcomings(twins)]
+    return [*aligned_table_lines(rows), "", *lines, *shortcomings(twins)]
 
 
 def _said(found: Mapping[str, Any]) -> str:
@@ -218,11 +222,11 @@ def _said(found: Mapping[str, Any]) -> str:
 # -- the run ----------------------------------------------------------------------------------------------------------
 
 
-def record(names: Sequence[str], number: int, workers: Workers, out: Path) -> dict[str, list[TaskResult]]:
+def record(names: Sequence[str], number: int, workers: WorkerConfig, out: Path) -> dict[str, list[TaskResult]]:
     """Record so many twins of some kinds; what stands in the folder is not done again."""
     recordings = out.resolve() / "recordings"
     recordings.mkdir(parents=True, exist_ok=True)
-    code = code_hash(PACKAGE / "virtual")
+    code = source_hash(PACKAGE / "virtual")
     tasks = [
         Task(
             f"recordings {k} of {name}",
@@ -236,7 +240,7 @@ def record(names: Sequence[str], number: int, workers: Workers, out: Path) -> di
 
 
 def diagnosed(
-    made: Mapping[str, Sequence[TaskResult]], candidates: str, workers: Workers, out: Path
+    made: Mapping[str, Sequence[TaskResult]], candidates: str, workers: WorkerConfig, out: Path
 ) -> dict[str, list[Twin]]:
     """Diagnose the twins that were recorded; what stands in the folder is not done again."""
     whole = [(name, k) for k in range(max(map(len, made.values()))) for name in made if not made[name][k].error]
@@ -266,7 +270,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--candidates", default="all", help="`all`, or a list such as [kelvin_voigt, effort_offset]")
     chosen = parser.parse_args(arguments)
     names = asked_for(parser, chosen.names, KINDS, "kind")
-    workers = Workers(chosen.workers, chosen.scheduler)
+    workers = WorkerConfig(chosen.workers, chosen.scheduler)
     made = record(names, chosen.twins, workers, chosen.out)
     if chosen.record_only:
         return 1 if any(entry.error for entries in made.values() for entry in entries) else 0

@@ -37,14 +37,14 @@ def main(arguments: list[str] | None = None) -> int:
     system = System.build(None, objects=[(beam, None, None)])
     names = ("B.bend", "B.twist")
     theta = system.parameters.vector()
-    start = np.zeros(2 * system.size)
-    start[: system.size] = 0.2
+    start = np.zeros(2 * system.n_coordinates)
+    start[: system.n_coordinates] = 0.2
     step = compile_step(system, TIME_STEP)
     truth = simulate(step, theta, start, options.steps).state
-    measured = truth[:, : system.size]
+    measured = truth[:, : system.n_coordinates]
 
     e = discrete_equations(system)
-    n, count = system.size, len(names)
+    n, count = system.n_coordinates, len(names)
     free = ca.vertcat(*(system.parameters[name].symbol for name in names))
     fixed = [entry for entry in system.parameters if entry.name not in names]
     known = ca.vertcat(*(entry.symbol for entry in fixed))

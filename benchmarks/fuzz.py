@@ -41,7 +41,7 @@ from yid_ocp.data.readers import read_any
 from yid_ocp.errors import YidError
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.vision import FrameSequence, look_at, read_frames, write_frames
+from yid_ocp.vision import FrameSequence, look_at_pose, read_frames, write_frame_folder
 
 PATIENCE = 20.0  # [s]
 MEMORY = 2 << 30
@@ -83,7 +83,7 @@ SETTINGS = (
     "model.springs.shoulder.stiffness",
     "model.robot",
     "model.locked",
-    "solver.iterations",
+    "solver.max_iterations",
     "parameters.elbow.damping.bounds",
     "recordings.estimate",
     "sensors.joints.std",
@@ -113,7 +113,9 @@ def originals(folder: Path) -> None:
     rows += [",".join(f"{value:.6g}" for value in (0.01 * i, *np.sin(np.arange(7) + 0.1 * i))) for i in range(40)]
     (folder / "table.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
     cloud = np.random.default_rng(0).normal((0.0, 0.0, 2.0), size=(30, 3))
-    write_frames(FrameSequence.of([0.1, 0.2], [cloud, cloud], look_at([2, 0, 0], [0, 0, 0])), folder / "frames")
+    write_frame_folder(
+        FrameSequence.from_clouds([0.1, 0.2], [cloud, cloud], look_at_pose([2, 0, 0], [0, 0, 0])), folder / "frames"
+    )
     write_bag(folder / "bag")
 
 
@@ -309,7 +311,7 @@ def probe_frames(folder: Path, rng: Random) -> None:
     damage_folder(folder / "frames", rng)
     sequence = read_frames(folder / "frames")
     for index in range(len(sequence)):
-        sequence.world(index)
+        sequence.load_world_cloud(index)
 
 
 KINDS: Mapping[str, Callable[[Path, Random], None]] = {

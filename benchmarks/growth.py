@@ -29,16 +29,16 @@ from unittest import mock
 import numpy as np
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.data.hdf5 import read_recording, write_recording
-from yid_ocp.diagnosis.diagnose import nominal_fit
-from yid_ocp.diagnosis.hypotheses import CandidateProblem, chosen_effects
-from yid_ocp.diagnosis.screening import linearise
-from yid_ocp.diagnosis.thresholds import DEFAULTS
+from yid_ocp.data.recording_hdf5 import read_recording, write_recording
+from yid_ocp.diagnosis.diagnose import fit_nominal_model
+from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
+from yid_ocp.diagnosis.screening import linearize_candidates
+from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS
 from yid_ocp.files import write_json
 from yid_ocp.integrator import compiled
-from yid_ocp.parallel import Task, Workers, process_pool, run_tasks
+from yid_ocp.parallel import Task, WorkerConfig, process_pool, run_tasks
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.report.terminal import table
+from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.solvers import GaussNewton, solve
 from yid_ocp.workflow.build import build_problem
 
@@ -72,7 +72,7 @@ def settings_of(links: int, quick: bool, files: Sequence[Path] = (RECORDING,), s
         "recordings.held_out=[]",
         f"problem.time_step={step}",
     ]
-    return [*given, "problem.compiler=false", "problem.duration=0.1"] if quick else given
+    return [*given, "problem.use_compiler=false", "problem.duration=0.1"] if quick else given
 
 
 def problem_of(settings: Sequence[str]) -> EstimationProblem:
@@ -82,11 +82,11 @@ def problem_of(settings: Sequence[str]) -> EstimationProblem:
 def evaluation(settings: Sequence[str]) -> dict[str, float]:
     """An evaluation with its derivatives, after one that compiles and warms up."""
     problem = problem_of(settings)
-    x = problem.start
+    x = problem.initial_unknowns
     short = problem.with_options(replace(problem.options, duration=5 * problem.step.time_step))
     # many recordings march together as they do in a solve of some iterations, which is worth the compilation
-    with mock.patch.object(compiled, "WORTH", 0):
-        warm = short.evaluate(short.start)  # compiles, and needs next to no memory
+    with mock.patch.object(compiled, "MIN_STEPS_TO_COMPILE_BATCH", 0):
+        warm = short.evaluate(short.initial_unknowns)  # compiles, and needs next to no memory
         assert warm.ok, warm.message
         before = peak()
         begun = time.process_time()
@@ -95,7 +95,7 @@ def evaluation(settings: Sequence[str]) -> dict[str, float]:
     return {
         "cpu": time.process_time() - begun,
         "memory": peak() - before,
-        "variables": problem.system.size,
+        "variables": problem.system.n_coordinates,
         "steps": sum(episode.grid.steps for episode in problem.episodes),
     }
 
@@ -104,13 +104,13 @@ def screening(settings: Sequence[str], count: int) -> dict[str, float]:
     """The composed problem of so many candidates, and one sweep of all their sensitivities."""
     problem = problem_of(settings)
     recording = problem.episodes[0].recording
-    effects = chosen_effects(problem.system, [recording], "all")[:count]
+    effects = make_candidate_effects(problem.system, [recording], "all")[:count]
     before = peak()
-    composed = CandidateProblem.of(problem, effects)
-    nominal = nominal_fit(problem, composed)
-    linearise(composed, (), nominal.values, DEFAULTS.shape_values)  # compiles
+    composed = AllCandidatesProblem.from_problem(problem, effects)
+    nominal = fit_nominal_model(problem, composed)
+    linearize_candidates(composed, (), nominal.values, DEFAULT_THRESHOLDS.shape_grid_size)  # compiles
     begun = time.process_time()
-    linearise(composed, (), nominal.values, DEFAULTS.shape_values)
+    linearize_candidates(composed, (), nominal.values, DEFAULT_THRESHOLDS.shape_grid_size)
     return {"cpu": time.process_time() - begun, "memory": peak() - before, "candidates": len(effects)}
 
 
@@ -119,8 +119,13 @@ def case(settings: list[str], seed: int) -> dict[str, float]:
     begun = time.process_time()
     problem = problem_of(settings)
     rng = np.random.default_rng(seed)
-    values = {name: float(x * math.exp(rng.uniform(-0.3, 0.3))) for name, x in zip(problem.names, problem.start)}  # noqa: B905
-    solution = solve(problem, GaussNewton(iterations=6), start=problem.vector(values).tolist(), restarts=False)
+    values = {
+        name: float(x * math.exp(rng.uniform(-0.3, 0.3)))
+        for name, x in zip(problem.unknown_names, problem.initial_unknowns)
+    }
+    solution = solve(
+        problem, GaussNewton(max_iterations=6), initial_unknowns=problem.vector(values).tolist(), restarts=False
+    )
     return {"cpu": time.process_time() - begun, "cost": float(solution.cost)}
 
 
@@ -215,7 +220,7 @@ def shared(settings: list[str], count: int, cases: int) -> tuple[dict[str, float
     with tempfile.TemporaryDirectory() as folder:
         tasks = [Task(f"case {k}", {"settings": settings, "seed": k}) for k in range(cases)]
         progress = lambda *_: ends.append(time.monotonic())  # noqa: E731
-        results = run_tasks(case, tasks, Path(folder), Workers(processes=count), progress)
+        results = run_tasks(case, tasks, Path(folder), WorkerConfig(n_processes=count), progress)
     failed = [entry.error for entry in results if entry.error]
     assert not failed, failed[0]
     # processes start once, however many tasks there are: the time counts from when the first task began
@@ -245,7 +250,7 @@ def report(found: Mapping[str, Sequence[Mapping[str, float]]], slopes: Mapping[s
             rows += [(f"{p[by]:g}", f"{p['cpu']:.3g}", f"{p['memory']:.3g}") for p in points]
             rows.append(("slope", *(f"{slopes[axis][of]:.2f}" for of in ("cpu", "memory"))))
             rows.append(("at the end", *(f"{slope(points[-2:], by, of):.2f}" for of in ("cpu", "memory"))))
-        lines += [*table(rows), ""]
+        lines += [*aligned_table_lines(rows), ""]
     return lines
 
 

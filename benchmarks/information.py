@@ -22,48 +22,53 @@ from pathlib import Path
 from diagnosis_cases import CASES, record
 from make_recordings import ROUGH, TRUTH
 
-from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
+from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG, load_config
 from yid_ocp.data.recording import Recording
-from yid_ocp.diagnosis import Finding, Thresholds, diagnose
+from yid_ocp.diagnosis import DiagnosisResult, Thresholds, diagnose
 from yid_ocp.effects import make_effect
-from yid_ocp.planning.information import InformationPlan, informative
+from yid_ocp.planning.information_plan import InformativeMotionPlan, plan_informative_motion
+from yid_ocp.planning.motion_plan import PlannedMovement
 from yid_ocp.planning.options import PlanLimits, PlanOptions
-from yid_ocp.planning.plan import PlannedMovement
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.report.terminal import table
+from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.solvers import GaussNewton, Solution, solve
-from yid_ocp.virtual.engine import Simulation
-from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, paper_system, virtual_experiment
-from yid_ocp.virtual.injected import InjectedEffect, injected_experiment
+from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, baxter_foam_y_system, run_virtual_experiment
+from yid_ocp.virtual.injected import InjectedEffect, run_injected_experiment
+from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.workflow.build import build_problem
-from yid_ocp.workflow.information import found_values
-from yid_ocp.workflow.progress import PlainProgress
+from yid_ocp.workflow.information_planning import parameter_and_effect_values
+from yid_ocp.workflow.progress_display import LineProgress
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "single_arm_vision.yaml"
 SOUGHT = "T3.bend"
 OPTIONS = PlanOptions(
-    goal="information", inform=(SOUGHT,), duration=3.5, settle=0.5, knots=28, limits=PlanLimits(spring_angle=0.5)
+    goal="information",
+    identify=(SOUGHT,),
+    duration=3.5,
+    hold_duration=0.5,
+    n_spline_coefficients=28,
+    limits=PlanLimits(max_spring_angle=0.5),
 )
 NOISE_SEED = 500
 
 
-def recorded(plan: InformationPlan, seed: int) -> Recording:
+def recorded(plan: InformativeMotionPlan, seed: int) -> Recording:
     """The planned motion as the virtual robot carries it out and its sensors see it."""
-    movement = PlannedMovement(plan.joints, plan.mover.path, plan.unknowns)
-    posture = dict(zip(plan.joints, map(float, plan.mover.first), strict=True))
+    movement = PlannedMovement(plan.joint_names, plan.simulator.path, plan.spline_coefficients)
+    posture = dict(zip(plan.joint_names, map(float, plan.simulator.start_positions), strict=True))
     simulation = replace(ROUGH.simulation, duration=float(plan.t[-1]))
     experiment = VirtualExperiment(
-        motion=movement, posture=posture, simulation=simulation, noise=ROUGH.noise(1), camera=PointCamera(), seed=seed,
-        name=f"planned_{seed}",
+        motion=movement, initial_joint_angles=posture, simulation=simulation, arm_noise=ROUGH.noise(1), camera=PointCamera(), seed=seed,
+        recording_name=f"planned_{seed}",
     )  # fmt: skip
-    return virtual_experiment(paper_system(1), TRUTH, experiment)
+    return run_virtual_experiment(baxter_foam_y_system(1), TRUTH, experiment)
 
 
 def parameter(starts: int, recordings: int) -> None:
     problem = build_problem(load_config(CONFIG))
     solution = solve(problem, GaussNewton(cost_tolerance=1e-5))
     values = {name: entry.value for name, entry in solution.parameters.items() if name in problem.free}
-    plan = informative(problem, replace(OPTIONS, starts=starts), values, None, PlainProgress())
+    plan = plan_informative_motion(problem, replace(OPTIONS, n_random_starts=starts), values, None, LineProgress())
     rows: list[tuple[str, ...]] = [("", SOUGHT, "± std", "of it", "true value off by")]
     rows.append(_row("the configuration's recording, 5 s", solution))
     for i in range(recordings):
@@ -75,11 +80,13 @@ def parameter(starts: int, recordings: int) -> None:
                 solve(alone, GaussNewton(cost_tolerance=1e-5)),
             )
         )
-    print("\n".join(table(rows)))
-    known = plan.parameters[SOUGHT]
-    print(f"expected: {100 * known.before:.3g} % before, {100 * known.after:.3g} % after, verdict {known.verdict}")
-    print(f"starts, nat as judged: {', '.join(f'{start.judged:.3g}' for start in plan.starts)}")
-    print(f"limits reached: {dict(plan.active)}; unseen: {', '.join(plan.unseen)}")
+    print("\n".join(aligned_table_lines(rows)))
+    known = plan.parameter_precisions[SOUGHT]
+    print(
+        f"expected: {100 * known.std_recorded:.3g} % before, {100 * known.std_planned:.3g} % after, verdict {known.verdict}"
+    )
+    print(f"starts, nat as judged: {', '.join(f'{start.configured_criterion:.3g}' for start in plan.start_results)}")
+    print(f"limits reached: {dict(plan.active_limits)}; unseen: {', '.join(plan.unobservable_parameters)}")
 
 
 def _row(words: str, solution: Solution) -> tuple[str, ...]:
@@ -97,43 +104,53 @@ def _row(words: str, solution: Solution) -> tuple[str, ...]:
 def pair(name: str, starts: int, share: float) -> None:
     case = CASES[name]
     case = replace(case, withheld=tuple(_share(effect, share) for effect in case.withheld))
-    run = load_config(None, (), DIAGNOSIS_DEFAULT)
+    run = load_config(None, (), DEFAULT_DIAGNOSIS_CONFIG)
     nominal = build_problem(run)
     made = [record(case, 1, 401), record(case, 7, 402)]
     before = _diagnosed(nominal, made[:1], made[1:])
-    labels = tuple(rival.label for rival in before.added[0].rivals) if before.effects else ()
+    labels = (
+        tuple(rival.label for rival in before.selected_effects[0].equivalent_effects) if before.accepted_effects else ()
+    )
     print(f"withheld: {', '.join(effect.label for effect in case.withheld)}")
     print(f"before: {before.verdict}, {', '.join(labels)}")
     problem = EstimationProblem(nominal.step, made[:1], nominal.free, nominal.options)
-    values, sizes = found_values(before.to_dict())
+    values, sizes = parameter_and_effect_values(before.to_dict())
     planned = []
     for seed in (0, 100):
-        options = replace(OPTIONS, inform=None, separate=labels, starts=starts, seed=seed)
-        plan = informative(problem, options, values, sizes, PlainProgress())
-        for (first, second), (then, now) in plan.distances.items():
+        options = replace(OPTIONS, identify=None, discriminate=labels, n_random_starts=starts, seed=seed)
+        plan = plan_informative_motion(problem, options, values, sizes, LineProgress())
+        for (first, second), (then, now) in plan.effect_distances.items():
             print(f"seed {seed}: {first} beside {second}: {then:.3g} std in the recording, {now:.3g} in the plan")
-        movement = PlannedMovement(plan.joints, plan.mover.path, plan.unknowns)
-        posture = dict(zip(plan.joints, map(float, plan.mover.first), strict=True))
+        movement = PlannedMovement(plan.joint_names, plan.simulator.path, plan.spline_coefficients)
+        posture = dict(zip(plan.joint_names, map(float, plan.simulator.start_positions), strict=True))
         experiment = VirtualExperiment(
-            motion=movement, posture=posture, simulation=Simulation(float(plan.t[-1])), seed=NOISE_SEED + seed,
-            name=f"planned_{seed}",
+            motion=movement, initial_joint_angles=posture, simulation=SimulationOptions(float(plan.t[-1])), seed=NOISE_SEED + seed,
+            recording_name=f"planned_{seed}",
         )  # fmt: skip
-        planned.append(injected_experiment(paper_system(1), TRUTH, case.withheld, experiment))
+        planned.append(run_injected_experiment(baxter_foam_y_system(1), TRUTH, case.withheld, experiment))
     after = _diagnosed(nominal, [made[0], planned[0]], [made[1], planned[1]])
-    rivals = [rival.label for rival in after.added[0].rivals] if after.effects else []
+    rivals = [rival.label for rival in after.selected_effects[0].equivalent_effects] if after.accepted_effects else []
     print(f"after: {after.verdict}, {', '.join(rivals)}")
     print(
         "\n".join(
-            table([("effect", "held-out chi2/n"), *((f.effects[-1].label, f"{f.loss.mean:.4f}") for f in after.fits)])
+            aligned_table_lines(
+                [
+                    ("effect", "held-out chi2/n"),
+                    *(
+                        (f.effects[-1].label, f"{f.held_out_loss.chi2_per_sample:.4f}")
+                        for f in after.single_effect_models
+                    ),
+                ]
+            )
         )
     )
 
 
 def _share(effect: InjectedEffect, share: float) -> InjectedEffect:
     """The same effect, its amplitudes that part of the way from neutral."""
-    kind = make_effect(effect.kind, effect.location, paper_system(1))
-    names = {name.removeprefix(f"{kind.label}."): name for name in kind.amplitudes}
-    neutral = {short: kind.neutral[name] for short, name in names.items()}
+    kind = make_effect(effect.kind, effect.location, baxter_foam_y_system(1))
+    names = {name.removeprefix(f"{kind.label}."): name for name in kind.amplitude_names}
+    neutral = {short: kind.neutral_values[name] for short, name in names.items()}
     values = {
         name: neutral[name] + share * (value - neutral[name]) if name in neutral else value
         for name, value in effect.values.items()
@@ -141,9 +158,9 @@ def _share(effect: InjectedEffect, share: float) -> InjectedEffect:
     return replace(effect, values=values)
 
 
-def _diagnosed(nominal: EstimationProblem, estimate: list[Recording], held_out: list[Recording]) -> Finding:
+def _diagnosed(nominal: EstimationProblem, estimate: list[Recording], held_out: list[Recording]) -> DiagnosisResult:
     problem = EstimationProblem(nominal.step, estimate, nominal.free, nominal.options)
-    return diagnose(problem, "all", held_out, thresholds=Thresholds(), progress=PlainProgress())
+    return diagnose(problem, "all", held_out, thresholds=Thresholds(), progress=LineProgress())
 
 
 def main() -> None:

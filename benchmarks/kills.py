@@ -49,7 +49,7 @@ TRACK = """\
 model:
   robot: package:baxter
   arms: {{joints: [left_s0, left_s1, left_e0, left_e1, left_w0, left_w1, left_w2]}}
-  object: {{kind: y}}
+  object: {{kind: foam_y}}
   grasp: {{left: {{holder: left_gripper, held: w_T2}}}}
 recordings: {{estimate: [{data}/joints.h5]}}
 track: {{frames: {data}/frames, pictures: 1}}
@@ -133,7 +133,7 @@ class Room:
         return (self.folder / "said.txt").read_text(errors="replace")[-600:]
 
     def look(self, after: str, hidden: bool) -> None:
-        """Whether what stands in the room is whole; `hidden`: whether a killed run may have left its hidden folder."""
+        """Whether what stands in the room is whole; `is_hidden`: whether a killed run may have left its hidden folder."""
         for path in self.folder.iterdir():
             if path.name.startswith(".") and path.is_dir() and not hidden:
                 self.wrong.append(f"after {after}, {path.name} is left")
@@ -288,7 +288,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         driven = text.replace("mode: prescribed", "mode: driven")
         (room.folder / "driven.yaml").write_text(driven + "diagnosis: {candidates: [joint_viscous]}\n")
         (room.folder / "track.yaml").write_text(TRACK.format(data=REPOSITORY / "tests" / "vision" / "data"))
-        text += "compare: {methods: {gauss_newton: {}, steepest_descent: {iterations: 20}}}\n"
+        text += "compare: {methods: {gauss_newton: {}, steepest_descent: {max_iterations: 20}}}\n"
         (room.folder / "pendulum.yaml").write_text(text.replace("held_out: []", "held_out: [held_out.h5]"))
         for command in COMMANDS:
             room.run(command)

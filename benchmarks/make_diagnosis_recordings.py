@@ -15,15 +15,15 @@ from pathlib import Path
 from make_recordings import TRAVEL, TRUTH, compress
 
 import yid_ocp
-from yid_ocp.data.hdf5 import write_recording
+from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.model import Grasp, System, flexible_object
-from yid_ocp.model.rotations import placement_matrix
+from yid_ocp.model.rotations import transform_from_xyz_rpy
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.model.y_object import y_segments
-from yid_ocp.virtual.engine import Simulation
-from yid_ocp.virtual.experiment import VirtualExperiment, virtual_experiment
-from yid_ocp.virtual.motion import Excitation, multisine
-from yid_ocp.virtual.posture import BAXTER_JOINTS, initial_posture
+from yid_ocp.virtual.experiment import VirtualExperiment, run_virtual_experiment
+from yid_ocp.virtual.inverse_kinematics import BAXTER_ARM_JOINTS, grasping_joint_angles
+from yid_ocp.virtual.mujoco_simulation import SimulationOptions
+from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 
 TAU = 0.05
 NOMINAL_DAMPING = 0.05
@@ -44,11 +44,11 @@ def damped(segment: str, tau: float) -> dict[str, float]:
 
 def experiment() -> System:
     """The paper's single arm, with a damping of its own for the twists of every tube."""
-    names = [f"left_{joint}" for joint in BAXTER_JOINTS]
+    names = [f"left_{joint}" for joint in BAXTER_ARM_JOINTS]
     segments = [replace(segment, damping=NOMINAL_DAMPING, twist_damping=NOMINAL_DAMPING) for segment in y_segments()]
     return System.build(
         read_urdf("package:baxter", joints=names),
-        objects=[(flexible_object(segments, placement_matrix((0.85, 0.0, -0.93))), None, None)],
+        objects=[(flexible_object(segments, transform_from_xyz_rpy((0.85, 0.0, -0.93))), None, None)],
         grasps=[Grasp("left", "left_gripper", "w_T2")],
         driven=names,
         damping=NOMINAL_DAMPING,
@@ -58,20 +58,20 @@ def experiment() -> System:
 def make(folder: Path) -> None:
     system = experiment()
     values = damped(SEGMENT, TAU)
-    posture = initial_posture(system, TRUTH)
+    posture = grasping_joint_angles(system, TRUTH)
     for purpose, seed in MOTION_SEEDS.items():
-        excitation = Excitation(travel=TRAVEL[1])
-        motion = multisine(system, TRUTH, seed=seed, posture=posture, excitation=excitation)
+        excitation = MultisineOptions(gripper_travel=TRAVEL[1])
+        motion = random_multisine(system, TRUTH, seed=seed, initial_joint_angles=posture, excitation=excitation)
         name = f"diagnosis_{purpose}"
         described = VirtualExperiment(
             motion=motion,
-            posture=posture,
-            simulation=Simulation(time_step=INNER_STEP),
+            initial_joint_angles=posture,
+            simulation=SimulationOptions(time_step=INNER_STEP),
             seed=NOISE_SEEDS[purpose],
-            name=name,
+            recording_name=name,
             description=f"Baxter moves a foam Y whose trunk damps more than the model says (motion seed {seed}).",
         )
-        recording = virtual_experiment(system, values, described)
+        recording = run_virtual_experiment(system, values, described)
         path = folder / f"{name}.h5"
         write_recording(recording, path)
         compress(path)

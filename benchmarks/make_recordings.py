@@ -20,13 +20,19 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from yid_ocp.data.hdf5 import write_recording
-from yid_ocp.files import new_file
+from yid_ocp.data.recording_hdf5 import write_recording
+from yid_ocp.files import atomic_write
 from yid_ocp.model.system import System
-from yid_ocp.virtual.engine import SimulatedRun, Simulation
-from yid_ocp.virtual.experiment import ArmNoise, PointCamera, VirtualExperiment, paper_system, virtual_experiment
-from yid_ocp.virtual.motion import Excitation, multisine
-from yid_ocp.virtual.posture import initial_posture
+from yid_ocp.virtual.experiment import (
+    ArmSensorNoise,
+    PointCamera,
+    VirtualExperiment,
+    baxter_foam_y_system,
+    run_virtual_experiment,
+)
+from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
+from yid_ocp.virtual.mujoco_simulation import SimulationOptions, SimulationResult
+from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 
 # the paper's answer for one arm with vision, the only one of its four in which no stiffness is zero, rounded
 TRUTH = {
@@ -77,20 +83,20 @@ class Torques:
     motion_seeds: Mapping[tuple[int, str], int]
     travel: Mapping[int, float]
     shake: float
-    simulation: Simulation
+    simulation: SimulationOptions
     white: tuple[float, ...]
     offset: tuple[float, ...]
 
-    def noise(self, arms: int) -> ArmNoise:
+    def noise(self, arms: int) -> ArmSensorNoise:
         """What the arms measure."""
-        return ArmNoise(effort=arms * self.white or 0.0, effort_bias=arms * self.offset or 0.0)
+        return ArmSensorNoise(effort_std=arms * self.white or 0.0, effort_bias_std=arms * self.offset or 0.0)
 
 
 CLEAN = Torques(
     motion_seeds={(1, "estimate"): 1, (1, "held_out"): 7, (2, "estimate"): 7, (2, "held_out"): 2},
     travel=TRAVEL,
     shake=0.0,
-    simulation=Simulation(time_step=INNER_STEP),
+    simulation=SimulationOptions(time_step=INNER_STEP),
     white=(),
     offset=(),
 )
@@ -98,24 +104,24 @@ ROUGH = Torques(
     motion_seeds={(1, "estimate"): 7, (1, "held_out"): 2, (2, "estimate"): 7, (2, "held_out"): 2},
     travel={1: 0.11, 2: 0.13},
     shake=0.3,
-    simulation=Simulation(time_step=INNER_STEP, controller_rate=1000.0, effort_kind="sample"),
+    simulation=SimulationOptions(time_step=INNER_STEP, controller_rate=1000.0, effort_kind="sample"),
     white=WHITE,
     offset=OFFSET,
 )
 
 
-def within_limits(system: System, run: SimulatedRun) -> bool:
+def within_limits(system: System, run: SimulationResult) -> bool:
     """Whether no arm joint exceeds its torque or velocity, and no joint of the object is as fast as in a snap."""
     driven = list(system.driven_indices)
     torque = np.array([system.mechanism.joints[j].effort_limit for j in driven])
     speed = np.array([system.mechanism.joints[j].velocity_limit for j in driven])
-    of_object = np.setdiff1d(np.arange(system.size), driven)
+    of_object = np.setdiff1d(np.arange(system.n_coordinates), driven)
     strong = np.all(np.abs(run.effort) <= torque) and np.all(np.abs(run.v[:, driven]) <= speed)
     return bool(strong and np.abs(run.v[:, of_object]).max() <= SNAP)
 
 
 def compress(path: Path) -> None:
-    with new_file(path) as temporary, h5py.File(path) as source, h5py.File(temporary, "x") as target:
+    with atomic_write(path) as temporary, h5py.File(path) as source, h5py.File(temporary, "x") as target:
         target.attrs.update(source.attrs)
 
         def copy(name: str, item: h5py.Group | h5py.Dataset) -> None:
@@ -130,25 +136,25 @@ def compress(path: Path) -> None:
 
 def make(folder: Path, torques: Torques) -> None:
     for arms, word, hands in ((1, "single", "one arm"), (2, "dual", "two arms")):
-        system = paper_system(arms)
-        posture = initial_posture(system, TRUTH, offsets=OFFSETS[arms])
+        system = baxter_foam_y_system(arms)
+        posture = grasping_joint_angles(system, TRUTH, offsets=OFFSETS[arms])
         for purpose in ("estimate", "held_out"):
             seed = torques.motion_seeds[arms, purpose]
-            excitation = Excitation(travel=torques.travel[arms], shake=torques.shake)
-            motion = multisine(system, TRUTH, seed=seed, posture=posture, excitation=excitation)
+            excitation = MultisineOptions(gripper_travel=torques.travel[arms], shake_torque_rms=torques.shake)
+            motion = random_multisine(system, TRUTH, seed=seed, initial_joint_angles=posture, excitation=excitation)
             for vision in (False, True):
                 name = f"{word}_arm_{'vision' if vision else 'no_vision'}_{purpose}"
                 experiment = VirtualExperiment(
                     motion=motion,
-                    posture=posture,
+                    initial_joint_angles=posture,
                     simulation=torques.simulation,
-                    noise=torques.noise(arms),
+                    arm_noise=torques.noise(arms),
                     camera=PointCamera() if vision else None,
                     seed=NOISE_SEEDS[arms, purpose],
-                    name=name,
+                    recording_name=name,
                     description=f"Baxter moves the foam Y with {hands} (motion seed {seed}).",
                 )
-                recording = virtual_experiment(system, TRUTH, experiment)
+                recording = run_virtual_experiment(system, TRUTH, experiment)
                 path = folder / f"{name}.h5"
                 write_recording(recording, path)
                 compress(path)

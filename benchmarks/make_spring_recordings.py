@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.data.hdf5 import write_recording
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.data.recording_hdf5 import write_recording
 
 Array = NDArray[np.float64]
 GRAVITY = 9.81
@@ -77,7 +77,7 @@ def recording(name: str, motor: str, points: tuple[str, ...], truth: dict[str, f
         made,
         "yid_ocp closed-form statics",
         name,
-        truth=truth,
+        true_parameters=truth,
     )
 
 

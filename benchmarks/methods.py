@@ -14,12 +14,12 @@ from rich.console import Console
 from rich.table import Table
 from workloads import CLEAN, STIFFNESSES, TIME_STEP
 
-from yid_ocp.analysis.compare import compare
-from yid_ocp.data.hdf5 import read_recording
+from yid_ocp.analysis.compare import compare_methods
+from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import GaussNewton, Lifted, MultipleShooting, SingleShooting, SteepestDescent
-from yid_ocp.virtual.experiment import paper_system
+from yid_ocp.virtual.experiment import baxter_foam_y_system
 
 RECORDINGS = {1: "single_arm_vision_estimate.h5", 2: "dual_arm_vision_estimate.h5"}
 
@@ -31,9 +31,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, metavar="FILE", help="store the ratios of CPU time")
     options = parser.parse_args(arguments)
     recording = read_recording(CLEAN / RECORDINGS[options.arms])
-    step = compile_step(paper_system(options.arms), TIME_STEP)
+    step = compile_step(baxter_foam_y_system(options.arms), TIME_STEP)
     problem = EstimationProblem(step, [recording], STIFFNESSES)
-    problem.evaluate(problem.start * 4.0)  # compiles what is compiled once
+    problem.evaluate(problem.initial_unknowns * 4.0)  # compiles what is compiled once
     methods = {
         "gauss_newton": GaussNewton(),
         "single_shooting": SingleShooting(),
@@ -44,7 +44,7 @@ def main(arguments: list[str] | None = None) -> int:
         "multiple_shooting, compiled": MultipleShooting(transcription="compiled"),
         "steepest_descent, as in the paper": SteepestDescent(),
         "steepest_descent, spectral": SteepestDescent(
-            trial="spectral", memory=10, iterations=800, gradient_tolerance=1e-4
+            first_trial_step="spectral", nonmonotone_memory=10, max_iterations=800, gradient_tolerance=1e-4
         ),
     }
     table = Table(title=f"{recording.name}: 500 steps, from 3 N m/rad")
@@ -64,19 +64,19 @@ def main(arguments: list[str] | None = None) -> int:
     ratios: dict[str, float] = {}
     reference = 0.0
     for name, method in methods.items():
-        run = compare(problem, [method]).runs[0]
+        run = compare_methods(problem, [method]).method_results[0]
         reference = reference or run.cpu_seconds
         ratios[name] = run.cpu_seconds / reference
         table.add_row(
             name,
             run.solution.status.value,
             f"{run.whitened_cost:.2f}",
-            str(run.solution.iterations),
-            str(run.solution.evaluations),
+            str(run.solution.n_iterations),
+            str(run.solution.n_evaluations),
             f"{run.wall_seconds:.2f}",
             f"{run.cpu_seconds:.2f}",
             f"{ratios[name]:.1f}",
-            f"{run.peak_memory:.0f}",
+            f"{run.peak_memory_mib:.0f}",
         )
     Console(width=None if sys.stdout.isatty() else 120).print(table)
     if options.json is not None:

@@ -23,12 +23,12 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import Run
-from yid_ocp.data.hdf5 import read_recording, write_recording
+from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.errors import DataError, YidError
 from yid_ocp.solvers import solve
-from yid_ocp.workflow.build import build_problem, recording_file
+from yid_ocp.workflow.build import build_problem, recording_path
 
 Damage = Callable[[Recording], Recording]
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -284,7 +284,7 @@ def renamed(old: str, new: str) -> Damage:
 
 def other_arm(recording: Recording) -> Recording:
     """The right arm's recording under the left arm's names."""
-    other = read_recording(recording_file("default:dual_arm_vision_held_out.h5"))
+    other = read_recording(recording_path("default:dual_arm_vision_held_out.h5"))
     group = other.joints
     assert group is not None
     columns = [i for i, name in enumerate(group.names) if name.startswith("right")]
@@ -458,10 +458,10 @@ def clean_recording(case: Case) -> Path | None:
     """The recording that a case damages, None where it is not here."""
     if case.config in REAL:
         return _real(case.config) if _real(case.config).is_file() else None
-    return Path(recording_file(f"default:{case.config}_estimate.h5"))
+    return Path(recording_path(f"default:{case.config}_estimate.h5"))
 
 
-def prepared(case: Case, folder: Path) -> Run:
+def prepared(case: Case, folder: Path) -> RunSettings:
     """The settings of a case; its recordings are written into the folder."""
     clean = clean_recording(case)
     assert clean is not None
@@ -480,7 +480,7 @@ def prepared(case: Case, folder: Path) -> Run:
         for key, own in zip(("estimate", "held_out"), files, strict=True)
     ]
     if case.config == "deft_bdlo1":
-        chosen.append(f"model.object.undeformed={_FOLDER / 'deft' / 'bdlo1_undeformed.csv'}")
+        chosen.append(f"model.object.undeformed_shape_file={_FOLDER / 'deft' / 'bdlo1_undeformed.csv'}")
     return load_config(CONFIGS / f"{case.config}.yaml", [*chosen, *case.settings])
 
 
@@ -493,21 +493,21 @@ def tried(case: Case, folder: Path, solving: bool = True) -> dict[str, Any]:
     except (DataError, YidError) as error:
         named = bool(case.refused) and case.refused in str(error)
         return {"outcome": "refused", "named": named, "causes": [], "found": [], "error": str(error)}
-    doubts = problem.options.doubts
+    doubts = problem.options.data_issues
     causes = sorted({doubt.cause for doubt in doubts})
     found: list[str] = []
     wrong: list[str] = []
-    if solving and problem.options.believed:
-        outcome = solve(problem, run.solver, limits=run.diagnosis.of_a_fit)
+    if solving and problem.options.has_trusted_data:
+        outcome = solve(problem, run.solver, limits=run.diagnosis.fit_gap_limits)
         verdicts = {name: entry for name, entry in outcome.parameters.items() if entry.verdict == "identifiable"}
         found = list(verdicts)
-        truth = problem.episodes[0].recording.truth
+        truth = problem.episodes[0].recording.true_parameters
         wrong = [n for n, e in verdicts.items() if n in truth and abs(e.value - truth[n]) > 3 * e.std]
     return {
         "outcome": "doubted" if doubts else "believed",
         "named": bool(set(causes) & set(case.causes)),
         "causes": causes,
-        "harmless": problem.options.believed and bool(doubts),
+        "harmless": problem.options.has_trusted_data and bool(doubts),
         "found": found,
         "wrong": wrong,
         "doubts": [f"{doubt.where}: {doubt.what}" for doubt in doubts],

@@ -27,22 +27,22 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import EffectSettings, ParameterSettings, Run
-from yid_ocp.data.hdf5 import write_recording
+from yid_ocp.config.settings import EffectSettings, ParameterSettings, RunSettings
+from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.effects import make_effect
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model.system import System
-from yid_ocp.planning.ends import end_at, first_rest
-from yid_ocp.planning.path import SplinePath
-from yid_ocp.planning.plan import Plan, PlannedMovement, plan
-from yid_ocp.planning.points import Points
-from yid_ocp.virtual.engine import Simulation, simulate_in_mujoco
-from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, paper_system
-from yid_ocp.virtual.injected import InjectedEffect, injected_experiment
-from yid_ocp.virtual.motion import Excitation, multisine
-from yid_ocp.virtual.posture import initial_posture
+from yid_ocp.planning.end_equilibria import solve_end_equilibrium, solve_start_equilibrium
+from yid_ocp.planning.frame_positions import FramePositions
+from yid_ocp.planning.motion_plan import MotionPlan, PlannedMovement, plan_motion
+from yid_ocp.planning.spline_path import SplinePath
+from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, baxter_foam_y_system
+from yid_ocp.virtual.injected import InjectedEffect, run_injected_experiment
+from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
+from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
+from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 from yid_ocp.workflow.diagnose import run_diagnose
-from yid_ocp.workflow.plan import identified, planning_step, start_posture
+from yid_ocp.workflow.plan import compile_planning_step, identified_parameters, start_configuration
 from yid_ocp.workflow.solve import run_solve
 
 Array = NDArray[np.float64]
@@ -51,7 +51,7 @@ CONFIG = Path(__file__).resolve().parents[1] / "configs" / "plan_place.yaml"
 GUESS: Mapping[str, float] = dict.fromkeys(TRUTH, 3.0)
 TIP, GRIPPER = "w_T3", "left_gripper"
 TRAVEL = 0.6  # of a joint [rad]
-CAMERA = PointCamera(rate=30.0, gaps=False)  # 5 mm of noise, one frame in ten without the point
+CAMERA = PointCamera(frame_rate=30.0, has_dropouts=False)  # 5 mm of noise, one frame in ten without the point
 MOTIONS = (7, 2)  # their seeds
 NOISE = 501  # seed of the first recording's noise, the next one's is one more
 RECORDED = 10.0  # [s]
@@ -66,16 +66,19 @@ def goals(step: Step, count: int = 10) -> list[tuple[float, float, float]]:
     turned by more than `TRAVEL`.
     """
     system, rng = step.system, np.random.default_rng(11)
-    theta, tip = system.parameters.vector(TRUTH), Points(system, [TIP])
-    posture = initial_posture(system, TRUTH)
-    start = first_rest(step, theta, np.array([posture[name] for name in system.prescribed]))
-    begin = tip.at(start.state[None, : system.size], theta)[0][0]
+    theta, tip = system.parameters.vector(TRUTH), FramePositions(system, [TIP])
+    posture = grasping_joint_angles(system, TRUTH)
+    start = solve_start_equilibrium(step, theta, np.array([posture[name] for name in system.prescribed]))
+    begin = tip.positions_and_jacobian(start.state[None, : system.n_coordinates], theta)[0][0]
     found: list[tuple[float, float, float]] = []
     while len(found) < count:
         way = rng.normal(size=3)
         x, y, z = way / np.linalg.norm(way) * rng.uniform(0.04, 0.08)
-        end = end_at(step, theta, start, tip, begin + np.array((x, y, z)), 1e-3)
-        if end.distance < 1e-4 and np.abs(end.posture - start.state[list(system.prescribed_indices)]).max() < TRAVEL:
+        end = solve_end_equilibrium(step, theta, start, tip, begin + np.array((x, y, z)), 1e-3)
+        if (
+            end.target_distance < 1e-4
+            and np.abs(end.joint_positions - start.state[list(system.prescribed_indices)]).max() < TRAVEL
+        ):
             found.append((float(x), float(y), float(z)))
     return found
 
@@ -83,14 +86,14 @@ def goals(step: Step, count: int = 10) -> list[tuple[float, float, float]]:
 def straight(step: Step, posture: Array, shift: Array, path: SplinePath) -> PlannedMovement:
     """The gripper along a straight line, its orientation as little changed as the arm allows."""
     system = step.system
-    gripper, n = Points(system, [GRIPPER]), system.size
+    gripper, n = FramePositions(system, [GRIPPER]), system.n_coordinates
     joints = list(system.prescribed_indices)
     theta = system.parameters.vector()
 
     def at(x: Array) -> tuple[Array, Array]:
         q = np.zeros((1, n))
         q[0, joints] = x
-        where, slope = gripper.at(q, theta)
+        where, slope = gripper.positions_and_jacobian(q, theta)
         return where[0], slope[0][:, joints]
 
     first = at(posture)[0]
@@ -104,7 +107,7 @@ def straight(step: Step, posture: Array, shift: Array, path: SplinePath) -> Plan
             lambda y, place=place: np.append(1e3 * (at(y)[0] - place), 1e-2 * (y - posture)), x, xtol=1e-14, ftol=1e-14
         ).x
         way.append(x - posture)
-    unknowns = np.linalg.lstsq(path.basis(times), np.array(way), rcond=None)[0]
+    unknowns = np.linalg.lstsq(path.basis_values(times), np.array(way), rcond=None)[0]
     return PlannedMovement(system.prescribed, path, unknowns)
 
 
@@ -118,7 +121,7 @@ class Servo:
 
     STIFFNESS, DAMPING = 5e3, 300.0  # [N m/rad], [N m s/rad]
 
-    def __init__(self, movement: PlannedMovement, planned: Plan | None) -> None:
+    def __init__(self, movement: PlannedMovement, planned: MotionPlan | None) -> None:
         self._movement, self._planned = movement, planned
         self._joints, self._first = np.zeros(0, int), np.zeros(0)
         self._kept: tuple[float, Array, Array | None] | None = None
@@ -139,7 +142,7 @@ class Servo:
         if self._kept is None or t == 0.0:
             return
         if t - self._kept[0] >= 1e-3 - 1e-9 or t < self._kept[0]:
-            self._kept = (t, np.array(self._movement.at(t)), self._fed_forward(t))
+            self._kept = (t, np.array(self._movement.offset_and_derivatives(t)), self._fed_forward(t))
         (offset, rate, _bend), torque = self._kept[1:]
         push = self.STIFFNESS * (offset - data.qpos[self._joints] + self._first) + self.DAMPING * rate
         if torque is not None:
@@ -150,60 +153,62 @@ class Servo:
         if self._planned is None:
             return None
         # an effort is the mean over its step
-        middle = self._planned.t[:-1] + self._planned.mover.step.time_step / 2
-        return np.array([np.interp(t, middle, one) for one in self._planned.effort[:-1].T])
+        middle = self._planned.t[:-1] + self._planned.simulator.step.time_step / 2
+        return np.array([np.interp(t, middle, one) for one in self._planned.joint_efforts[:-1].T])
 
 
 def carried_out(
-    system: System, values: Mapping[str, float], movement: PlannedMovement, planned: Plan | None, by: Plan
+    system: System, values: Mapping[str, float], movement: PlannedMovement, planned: MotionPlan | None, by: MotionPlan
 ) -> tuple[float, float]:
     """Error [m] and swing [m/s] of a plan's point in the simulator, where the plan begins and as long as it takes."""
-    duration, settle = by.mover.path.duration, by.mover.settle
-    simulation = Simulation(duration + settle, time_step=5e-5, controller_rate=500.0, effort_kind="mean")
+    duration, settle = by.simulator.path.duration, by.simulator.hold_duration
+    simulation = SimulationOptions(duration + settle, time_step=5e-5, controller_rate=500.0, effort_kind="mean")
     # all coordinates, so that what hangs between two hands is in their hold when it settles
-    posture = dict(zip(system.mechanism.joint_names, map(float, by.state[0, : system.size]), strict=True))
+    posture = dict(
+        zip(system.mechanism.joint_names, map(float, by.state_trajectory[0, : system.n_coordinates]), strict=True)
+    )
     terms = Servo(movement, planned)
-    run = simulate_in_mujoco(system, values, movement, simulation, posture=posture, injected=terms)
-    tip = run.points[run.t >= duration - 1e-9, system.points.index(by.point)]
-    speed = np.linalg.norm(np.diff(tip, axis=0), axis=1) * simulation.rate
-    return float(np.max(np.linalg.norm(tip - by.place, axis=1))), float(np.max(speed))
+    run = simulate_in_mujoco(system, values, movement, simulation, initial_joint_angles=posture, injected=terms)
+    tip = run.point_positions[run.t >= duration - 1e-9, system.point_frames.index(by.target_point)]
+    speed = np.linalg.norm(np.diff(tip, axis=0), axis=1) * simulation.sample_rate
+    return float(np.max(np.linalg.norm(tip - by.target_position, axis=1))), float(np.max(speed))
 
 
-def movement(planned: Plan) -> PlannedMovement:
-    return PlannedMovement(planned.joints, planned.mover.path, planned.unknowns)
+def movement(planned: MotionPlan) -> PlannedMovement:
+    return PlannedMovement(planned.joint_names, planned.simulator.path, planned.spline_coefficients)
 
 
-def settings(**recordings: Sequence[Path]) -> Run:
+def settings(**recordings: Sequence[Path]) -> RunSettings:
     """The configuration with recordings by purpose."""
     files = [f"recordings.{purpose}=[{', '.join(map(str, paths))}]" for purpose, paths in recordings.items()]
-    return load_config(CONFIG, [*files, "output.report=false", "output.discretisation=none"])
+    return load_config(CONFIG, [*files, "output.write_report=false", "output.discretisation_check=none"])
 
 
 def record(folder: Path, noise: int = NOISE, effects: Sequence[InjectedEffect] = ()) -> list[Path]:
     """Two recordings of what the arm with its noisy torques and a camera see of the Y."""
     folder.mkdir(parents=True)
-    system = paper_system(1)
-    posture = initial_posture(system, TRUTH)
+    system = baxter_foam_y_system(1)
+    posture = grasping_joint_angles(system, TRUTH)
     simulation = replace(ROUGH.simulation, duration=RECORDED)
     files = []
     for i, motion_seed in enumerate(MOTIONS):
-        excitation = Excitation(travel=ROUGH.travel[1], shake=ROUGH.shake, duration=RECORDED)
-        motion = multisine(system, TRUTH, seed=motion_seed, posture=posture, excitation=excitation)
+        excitation = MultisineOptions(gripper_travel=ROUGH.travel[1], shake_torque_rms=ROUGH.shake, duration=RECORDED)
+        motion = random_multisine(system, TRUTH, seed=motion_seed, initial_joint_angles=posture, excitation=excitation)
         experiment = VirtualExperiment(motion, posture, simulation, ROUGH.noise(1), CAMERA, seed=noise + i)
         files.append(folder / f"motion_{motion_seed}.h5")
-        write_recording(injected_experiment(system, TRUTH, effects, experiment), files[-1])
+        write_recording(run_injected_experiment(system, TRUTH, effects, experiment), files[-1])
     return files
 
 
-def found(run: Run, folder: Path) -> tuple[Array, Step]:
+def found(run: RunSettings, folder: Path) -> tuple[Array, Step]:
     """Parameters that `solve` finds, as a plan takes them, and the step that plans."""
     solved = run_solve(run, folder)
     for name, entry in solved.result["parameters"].items():
         if entry["free"]:
             std = "unknown" if entry["std"] is None else f"{entry['std']:.2g}"
             print(f"  {name}: {entry['value']:.4g} +- {std} {entry['unit']} (true {TRUTH.get(name, HANGING.values)})")
-    step = planning_step(run)
-    return identified(replace(run, plan=replace(run.plan, run=str(folder))), step)[0], step
+    step = compile_planning_step(run)
+    return identified_parameters(replace(run, plan=replace(run.plan, parameter_run=str(folder))), step)[0], step
 
 
 def ten_goals(folder: Path, count: int, noise: int) -> None:
@@ -212,20 +217,20 @@ def ten_goals(folder: Path, count: int, noise: int) -> None:
     print("found by solve:")
     theta, step = found(run, folder / "solved")
     true, guess = (step.system.parameters.vector(values) for values in (TRUTH, GUESS))
-    twin, posture = paper_system(1), initial_posture(step.system)
+    twin, posture = baxter_foam_y_system(1), grasping_joint_angles(step.system)
     names = ("identified", "true stiffness", "3 N m/rad", "straight")
     print(f"| goal | shift [mm] | {names[0]}: error [mm], swing [mm/s] | {' | '.join(names[1:])} |")
     print("|" + "---|" * (2 + len(names)))
     ratios = []
     for i, shift in enumerate(goals(step, count)):
-        options = replace(run.plan, shift=shift, posture=posture)
-        best = plan(step, options, true)
+        options = replace(run.plan, target_offset=shift, start_joint_positions=posture)
+        best = plan_motion(step, options, true)
         # the same place in the world, whatever a model believes of where the tip rests
-        there = replace(options, shift=None, place=tuple(best.place))
-        plans = [plan(step, there, theta), best, plan(step, there, guess)]
+        there = replace(options, target_offset=None, target_position=tuple(best.target_position))
+        plans = [plan_motion(step, there, theta), best, plan_motion(step, there, guess)]
         cells = [carried_out(twin, TRUTH, movement(one), one, one) for one in plans]
         first = np.array([posture[name] for name in step.system.prescribed])
-        cells.append(carried_out(twin, TRUTH, straight(step, first, np.array(shift), best.mover.path), None, best))
+        cells.append(carried_out(twin, TRUTH, straight(step, first, np.array(shift), best.simulator.path), None, best))
         text = [f"{1e3 * error:.2f}, {1e3 * swing:.1f}" for error, swing in cells]
         print(f"| {i + 1} | {', '.join(f'{1e3 * x:.0f}' for x in shift)} | {' | '.join(text)} |", flush=True)
         ratios.append([np.array(cell) / np.array(cells[0]) for cell in cells[2:]])
@@ -234,7 +239,7 @@ def ten_goals(folder: Path, count: int, noise: int) -> None:
         print(f"{name}: error {error:.1f} to {most_error:.1f} times, swing {swing:.1f} to {most_swing:.1f}")
 
 
-def with_effects(run: Run, effects: Sequence[Mapping[str, Any]]) -> Run:
+def with_effects(run: RunSettings, effects: Sequence[Mapping[str, Any]]) -> RunSettings:
     """The run whose model has effects, their parameters free."""
     said = tuple(EffectSettings(kind=one["kind"], location=one["location"]) for one in effects)
     own = {f"{one.kind}@{one.location}.*": ParameterSettings(free=True) for one in said}
@@ -247,16 +252,22 @@ def withheld_effect(folder: Path) -> None:
     run = settings(estimate=[estimate], held_out=[held_out])
     result = run_diagnose(run, folder / "diagnosed").result
     print(f"diagnosis: {result['verdict']}, {result['effects']}, confusable {result['confusable']}")
-    twin = paper_system(1).with_effects([make_effect(HANGING.kind, HANGING.location, paper_system(1), HANGING.values)])
-    posture = initial_posture(twin, TRUTH)
-    tip, theta = Points(twin, [TIP]), twin.parameters.vector(TRUTH)
+    twin = baxter_foam_y_system(1).with_effects(
+        [make_effect(HANGING.kind, HANGING.location, baxter_foam_y_system(1), HANGING.values)]
+    )
+    posture = grasping_joint_angles(twin, TRUTH)
+    tip, theta = FramePositions(twin, [TIP]), twin.parameters.vector(TRUTH)
     true = compile_step(replace(twin, driven=(), prescribed=twin.driven), 0.01)
-    rest = first_rest(true, theta, np.array(list(posture.values()))).state[None, : twin.size]
-    x, y, z = map(float, tip.at(rest, theta)[0][0] + HANGING_SHIFT)
+    rest = solve_start_equilibrium(true, theta, np.array(list(posture.values()))).state[None, : twin.n_coordinates]
+    x, y, z = map(float, tip.positions_and_jacobian(rest, theta)[0][0] + HANGING_SHIFT)
     print("| model | error [mm] | swing [mm/s] |\n|---|---|---|")
     for name, chosen in (("before", run), ("after", with_effects(run, result["effects"]))):
         values, step = found(chosen, folder / name)
-        made = plan(step, replace(run.plan, shift=None, place=(x, y, z), posture=posture), values)
+        made = plan_motion(
+            step,
+            replace(run.plan, target_offset=None, target_position=(x, y, z), start_joint_positions=posture),
+            values,
+        )
         error, swing = carried_out(twin, TRUTH, movement(made), made, made)
         print(f"| {name} | {1e3 * error:.2f} | {1e3 * swing:.1f} |", flush=True)
 
@@ -264,18 +275,21 @@ def withheld_effect(folder: Path) -> None:
 def two_hands() -> None:
     """Print what becomes of plans for two arms, beside a smooth motion of every joint to the same posture."""
     truth = ", ".join(f"{name}: {{initial: {value}}}" for name, value in TRUTH.items())
-    way = "plan={point: w_T1, shift: [0.03, 0.03, 0.0], duration: 0.8}"
+    way = "plan={point: w_T1, target_offset: [0.03, 0.03, 0.0], duration: 0.8}"
     print("| held by two arms | plan: error [mm], swing [mm/s] | same posture, smoothly |\n|---|---|---|")
     for name, config, more in (
         ("junction of the Y", "dual_arm_vision", ["parameters={}", f"parameters={{{truth}}}", way]),
         ("middle of a cable", "plan_cable", []),
     ):
         run = load_config(CONFIG.with_name(f"{config}.yaml"), more)
-        step = planning_step(run)
-        made = plan(step, replace(run.plan, posture=start_posture(run, step)))
-        points = tuple(dict.fromkeys((*step.system.points, made.point)))
-        twin = replace(step.system, driven=step.system.prescribed, prescribed=(), points=points)
-        smooth = replace(movement(made), unknowns=made.mover.path.straight(made.unknowns[-1]))
+        step = compile_planning_step(run)
+        made = plan_motion(step, replace(run.plan, start_joint_positions=start_configuration(run, step)))
+        points = tuple(dict.fromkeys((*step.system.point_frames, made.target_point)))
+        twin = replace(step.system, driven=step.system.prescribed, prescribed=(), point_frames=points)
+        smooth = replace(
+            movement(made),
+            spline_coefficients=made.simulator.path.straight_line_coefficients(made.spline_coefficients[-1]),
+        )
         cells = [carried_out(twin, {}, one, made, made) for one in (movement(made), smooth)]
         print(
             f"| {name} | {' | '.join(f'{1e3 * error:.2f}, {1e3 * swing:.1f}' for error, swing in cells)} |", flush=True

@@ -104,7 +104,7 @@ def main(arguments: list[str] | None = None) -> int:
     seconds, compiles = {}, {}
     for size in SIZES:
         bench = Bench.of(size)
-        if not bench.step.compiled:
+        if not bench.step.is_compiled:
             console.print("there is no C compiler, so there is nothing to compare")
             return 1
         seconds[size] = measure(bench, 5 if options.quick else 25)

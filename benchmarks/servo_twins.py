@@ -24,14 +24,14 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import ParameterSettings, Run
-from yid_ocp.data.hdf5 import write_recording
+from yid_ocp.config.settings import ParameterSettings, RunSettings
 from yid_ocp.data.recording import PointGroup, Recording
+from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.model.system import System
-from yid_ocp.virtual.engine import Simulation
-from yid_ocp.virtual.experiment import ArmNoise, PointCamera, VirtualExperiment
-from yid_ocp.virtual.injected import InjectedEffect, injected_experiment
-from yid_ocp.virtual.motion import Excitation, multisine
+from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperiment
+from yid_ocp.virtual.injected import InjectedEffect, run_injected_experiment
+from yid_ocp.virtual.mujoco_simulation import SimulationOptions
+from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.diagnose import run_diagnose
 from yid_ocp.workflow.solve import run_solve
@@ -81,17 +81,19 @@ class Found:
 def recorded(system: System, seed: int, effects: Sequence[InjectedEffect] = ()) -> Recording:
     """One motion of the arm in MuJoCo: commands, noisy angles, markers."""
     posture = UPRIGHT if any(effect.kind == "backlash" for effect in effects) else POSTURE
-    excitation = Excitation(speed=2.5, duration=DURATION, band=(0.3, 2.0))
+    excitation = MultisineOptions(max_joint_speed=2.5, duration=DURATION, frequency_band=(0.3, 2.0))
     experiment = VirtualExperiment(
-        motion=multisine(system, TRUTH, seed=seed, posture=posture, excitation=excitation),
-        posture=posture,
-        simulation=Simulation(DURATION, rate=RATE, time_step=INNER_STEP),
-        noise=ArmNoise(position=ANGLE_STD),
-        camera=PointCamera(std=POINT_STD, rate=RATE, gaps=False, missing=0.0, pose=np.eye(4)),
+        motion=random_multisine(system, TRUTH, seed=seed, initial_joint_angles=posture, excitation=excitation),
+        initial_joint_angles=posture,
+        simulation=SimulationOptions(DURATION, sample_rate=RATE, time_step=INNER_STEP),
+        arm_noise=ArmSensorNoise(position_std=ANGLE_STD),
+        camera=PointCamera(
+            point_std=POINT_STD, frame_rate=RATE, has_dropouts=False, hidden_probability=0.0, pose=np.eye(4)
+        ),
         seed=seed,
-        name=f"servo_arm_{seed}",
+        recording_name=f"servo_arm_{seed}",
     )
-    made = injected_experiment(system, TRUTH, effects, experiment)
+    made = run_injected_experiment(system, TRUTH, effects, experiment)
     [seen] = made.points
     markers = PointGroup("points", seen.names, seen.t, seen.position, seen.std, "motion capture")
     assert made.joints is not None
@@ -109,11 +111,11 @@ def written(folder: Path, effects: Sequence[InjectedEffect] = ()) -> list[str]:
     return files
 
 
-def settings(files: Sequence[str], parameters: Mapping[str, ParameterSettings] | None = None) -> Run:
+def settings(files: Sequence[str], parameters: Mapping[str, ParameterSettings] | None = None) -> RunSettings:
     """The shipped configuration on these recordings."""
     run = load_config(CONFIG)
     recordings = replace(run.recordings, estimate=tuple(files[:-1]), held_out=tuple(files[-1:]))
-    made = replace(run, recordings=recordings, output=replace(run.output, report=False))
+    made = replace(run, recordings=recordings, output=replace(run.output, write_report=False))
     return made if parameters is None else replace(made, parameters=parameters)
 
 

@@ -26,10 +26,10 @@ from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.solvers import GaussNewton, solve
-from yid_ocp.virtual.engine import SimulatedRun, Simulation, simulate_in_mujoco
-from yid_ocp.virtual.experiment import paper_system
-from yid_ocp.virtual.motion import Excitation, multisine
-from yid_ocp.virtual.posture import initial_posture
+from yid_ocp.virtual.experiment import baxter_foam_y_system
+from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
+from yid_ocp.virtual.mujoco_simulation import SimulationOptions, SimulationResult, simulate_in_mujoco
+from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 
 Array = NDArray[np.float64]
 
@@ -51,15 +51,17 @@ class Estimate:
     message: str
 
 
-def played(system: System, seed: int, duration: float) -> SimulatedRun:
+def played(system: System, seed: int, duration: float) -> SimulationResult:
     """The twin in MuJoCo, sampled at the controller's rate."""
-    posture = initial_posture(system, TRUTH)
-    motion = multisine(system, TRUTH, seed=seed, posture=posture, excitation=Excitation(duration=duration))
-    simulation = Simulation(duration=duration, rate=CONTROLLER, time_step=1e-4)
-    return simulate_in_mujoco(system, TRUTH, motion, simulation, posture=posture)
+    posture = grasping_joint_angles(system, TRUTH)
+    motion = random_multisine(
+        system, TRUTH, seed=seed, initial_joint_angles=posture, excitation=MultisineOptions(duration=duration)
+    )
+    simulation = SimulationOptions(duration=duration, sample_rate=CONTROLLER, time_step=1e-4)
+    return simulate_in_mujoco(system, TRUTH, motion, simulation, initial_joint_angles=posture)
 
 
-def recorded(system: System, run: SimulatedRun, every: int, noise: float, name: str) -> Recording:
+def recorded(system: System, run: SimulationResult, every: int, noise: float, name: str) -> Recording:
     """Every n-th sample of joints, torque (its mean) and grasped points, and the junction ten times a second."""
     rng = np.random.default_rng(11)
     driven = list(system.driven_indices)
@@ -81,7 +83,7 @@ def recorded(system: System, run: SimulatedRun, every: int, noise: float, name: 
     )
     groups = []
     for group, points, pick, std in (("arm", ("w_T2", "w_T3"), 20, ARM), ("camera", ("w_T1",), 200, CAMERA)):
-        clean = run.points[::pick][:, [system.points.index(point) for point in points]]
+        clean = run.point_positions[::pick][:, [system.point_frames.index(point) for point in points]]
         spread = np.full(clean.shape, std)
         groups.append(PointGroup(f"points_{group}", points, run.t[::pick], noisy(clean, std), spread, group))
     return Recording(joints, tuple(groups), name=name)
@@ -91,7 +93,7 @@ def estimated(system: System, recording: Recording, time_step: float) -> Estimat
     """Gauss-Newton from the truth; the unseen twists stay at theirs."""
     step = compile_step(system, time_step)
     problem = EstimationProblem(step, [recording], FREE, ProblemOptions(feedback="lqr"), TRUTH)
-    found = solve(problem, GaussNewton(cost_tolerance=1e-12, iterations=15))
+    found = solve(problem, GaussNewton(cost_tolerance=1e-12, max_iterations=15))
     std = np.array([found.std[name] for name in FREE])
     return Estimate(found.x[: len(FREE)], std, found.chi2_per_dof, found.message)
 
@@ -125,7 +127,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--duration", type=float, default=3.0)
     parser.add_argument("--json", type=Path)
     chosen = parser.parse_args(arguments)
-    system = paper_system(2)
+    system = baxter_foam_y_system(2)
     run = played(system, chosen.seed, chosen.duration)
     fine = recorded(system, run, 1, 0.0, "fine")
     clean = {step: estimated(system, fine, step) for step in STEPS}

@@ -22,16 +22,16 @@ import numpy as np
 from coverage import CONFIGS, PACKAGE, print_progress, solve_twin, working
 from make_recordings import OFFSET, OFFSETS, ROUGH, TRUTH, WHITE
 
-from yid_ocp.analysis.published import PUBLISHED, explained
-from yid_ocp.data.hdf5 import write_recording
+from yid_ocp.analysis.paper_comparison import PAPER_ESTIMATES, is_within_ensemble
+from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.errors import ModelError
-from yid_ocp.files import content_hash, write_json
-from yid_ocp.parallel import Task, Workers, run_tasks
-from yid_ocp.report.terminal import table
-from yid_ocp.version import code_hash
-from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, paper_system, virtual_experiment
-from yid_ocp.virtual.motion import Excitation, multisine
-from yid_ocp.virtual.posture import initial_posture
+from yid_ocp.files import json_sha256, write_json
+from yid_ocp.parallel import Task, WorkerConfig, run_tasks
+from yid_ocp.report.terminal import aligned_table_lines
+from yid_ocp.version import source_hash
+from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, baxter_foam_y_system, run_virtual_experiment
+from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
+from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 
 ERRORS: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
     "none": ((), ()),
@@ -40,39 +40,45 @@ ERRORS: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
     "both": (WHITE, OFFSET),
 }
 """White noise and constant offset of one arm's torques, standard deviations [N m]; empty for none."""
-METHOD = ("solver={name: steepest_descent, iterations: 200}", "problem.weighting=paper", "compare.published=null")
+METHOD = (
+    "solver={name: steepest_descent, max_iterations: 200}",
+    "problem.weighting=paper",
+    "compare.paper_experiment=null",
+)
 
 
 def make_member(experiment: str, errors: Sequence[Sequence[float]], number: int, folder: str, code: str) -> str:
     """Record one member of an experiment's ensemble; returns its file."""
     arms, vision = (1 if experiment.startswith("single") else 2), not experiment.endswith("no_vision")
-    system = paper_system(arms)
-    posture = initial_posture(system, TRUTH, offsets=OFFSETS[arms])
-    excitation = Excitation(travel=ROUGH.travel[arms], shake=ROUGH.shake)
-    motion = multisine(system, TRUTH, seed=ROUGH.motion_seeds[arms, "estimate"], posture=posture, excitation=excitation)
+    system = baxter_foam_y_system(arms)
+    posture = grasping_joint_angles(system, TRUTH, offsets=OFFSETS[arms])
+    excitation = MultisineOptions(gripper_travel=ROUGH.travel[arms], shake_torque_rms=ROUGH.shake)
+    motion = random_multisine(
+        system, TRUTH, seed=ROUGH.motion_seeds[arms, "estimate"], initial_joint_angles=posture, excitation=excitation
+    )
     torques = replace(ROUGH, white=tuple(errors[0]), offset=tuple(errors[1]))
     described = VirtualExperiment(
         motion=motion,
-        posture=posture,
+        initial_joint_angles=posture,
         simulation=torques.simulation,
-        noise=torques.noise(arms),
+        arm_noise=torques.noise(arms),
         camera=PointCamera() if vision else None,
         seed=1000 + number,
-        name=f"{experiment}_{number:03d}",
+        recording_name=f"{experiment}_{number:03d}",
     )
-    recording = virtual_experiment(system, TRUTH, described)
-    path = Path(folder) / f"{recording.name}_{content_hash([[list(entry) for entry in errors], code])[:8]}.h5"
+    recording = run_virtual_experiment(system, TRUTH, described)
+    path = Path(folder) / f"{recording.name}_{json_sha256([[list(entry) for entry in errors], code])[:8]}.h5"
     write_recording(recording, path)
     return str(path)
 
 
 def run(
-    experiments: Sequence[str], kinds: Sequence[str], members: int, workers: Workers, out: Path
+    experiments: Sequence[str], kinds: Sequence[str], members: int, workers: WorkerConfig, out: Path
 ) -> dict[str, dict[str, Any]]:
     """What steepest descent finds: experiment, errors of the torques, parameter to the members' values."""
     recordings = out.resolve() / "recordings"
     recordings.mkdir(parents=True, exist_ok=True)
-    maker = code_hash(PACKAGE / "virtual")
+    maker = source_hash(PACKAGE / "virtual")
     keys = [(experiment, errors, k) for experiment in experiments for errors in kinds for k in range(members)]
     tasks = [
         Task(
@@ -118,10 +124,10 @@ def report(found: Mapping[str, Mapping[str, Any]]) -> list[str]:
     for experiment, by_errors in found.items():
         rows: list[Sequence[str]] = [(experiment, "truth", "published", *by_errors)]
         for name, truth in TRUTH.items():
-            published = PUBLISHED[experiment][name]
+            published = PAPER_ESTIMATES[experiment][name]
             cells = [_range(entry[name], published) for entry in by_errors.values()]
             rows.append((name, f"{truth:g}", f"{published:g}", *cells))
-        lines += [*table(rows), ""]
+        lines += [*aligned_table_lines(rows), ""]
     return [*lines, "smallest .. median .. largest value; * holds the published one"]
 
 
@@ -129,24 +135,24 @@ def _range(values: Sequence[float], published: float) -> str:
     if not values:
         return "-"
     low, middle, high = np.quantile(values, [0.0, 0.5, 1.0])
-    return f"{low:.3g} .. {middle:.3g} .. {high:.3g}{'*' if explained(published, values) else ''}"
+    return f"{low:.3g} .. {middle:.3g} .. {high:.3g}{'*' if is_within_ensemble(published, values) else ''}"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="What errors of the torques do to the paper's own method.")
     parser.add_argument(
-        "experiments", nargs="*", metavar="EXPERIMENT", help=f"of {', '.join(PUBLISHED)}; all if absent"
+        "experiments", nargs="*", metavar="EXPERIMENT", help=f"of {', '.join(PAPER_ESTIMATES)}; all if absent"
     )
     parser.add_argument("--errors", nargs="+", choices=list(ERRORS), default=list(ERRORS), help="of the torques")
     parser.add_argument("--members", type=int, default=8, help="of each ensemble")
     working(parser)
     parser.add_argument("--out", type=Path, required=True, help="folder of recordings and solutions")
     chosen = parser.parse_args()
-    unknown = sorted(set(chosen.experiments) - set(PUBLISHED))
+    unknown = sorted(set(chosen.experiments) - set(PAPER_ESTIMATES))
     if unknown:
-        parser.error(f"there is no experiment '{unknown[0]}'; choose from {', '.join(PUBLISHED)}")
-    experiments = [name for name in PUBLISHED if name in chosen.experiments or not chosen.experiments]
-    found = run(experiments, chosen.errors, chosen.members, Workers(chosen.workers, chosen.scheduler), chosen.out)
+        parser.error(f"there is no experiment '{unknown[0]}'; choose from {', '.join(PAPER_ESTIMATES)}")
+    experiments = [name for name in PAPER_ESTIMATES if name in chosen.experiments or not chosen.experiments]
+    found = run(experiments, chosen.errors, chosen.members, WorkerConfig(chosen.workers, chosen.scheduler), chosen.out)
     write_json(chosen.out / "torque_ensemble.json", found)
     print("\n".join(report(found)))
 

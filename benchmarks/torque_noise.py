@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.data import Recording, read_recording
-from yid_ocp.report.terminal import table
+from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.workflow.solve import run_solve
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "baxter_arm.yaml"
@@ -65,7 +65,7 @@ def offsets(config: Path, recording: str, joints: Sequence[str]) -> Array:
         f"model.effects=[{', '.join(effects)}]",
         "parameters={}",
         f"parameters={{{', '.join(f'{json.dumps(name)}: {{free: true}}' for name in free)}}}",
-        "output.report=false",
+        "output.write_report=false",
     ]
     with tempfile.TemporaryDirectory() as folder:
         found = run_solve(load_config(config, settings), Path(folder) / "run").result["parameters"]
@@ -86,7 +86,7 @@ def main() -> None:
     heads = ("joint", "white [N m]", "second difference [N m]", "offset, rms [N m]", "offset, spread [N m]")
     columns = (white, rough, np.sqrt((constant**2).mean(0)), constant.std(0, ddof=1))
     rows = [(name, *(f"{column[i]:.3f}" for column in columns)) for i, name in enumerate(joints)]
-    print("\n".join(table([heads, *rows])))
+    print("\n".join(aligned_table_lines([heads, *rows])))
 
 
 if __name__ == "__main__":

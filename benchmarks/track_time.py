@@ -30,15 +30,15 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import Run
-from yid_ocp.data.hdf5 import write_recording
+from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.recording import JointGroup, Recording
-from yid_ocp.report.terminal import table
-from yid_ocp.vision.folders import read_folder, write_frames
-from yid_ocp.vision.track import Tracker
+from yid_ocp.data.recording_hdf5 import write_recording
+from yid_ocp.report.terminal import aligned_table_lines
+from yid_ocp.vision.frame_folder import read_frame_folder, write_frame_folder
+from yid_ocp.vision.track import FrameTracker
 from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.track import simulated_frames
-from yid_ocp.workflow.tracked_frames import scene_of
+from yid_ocp.workflow.frame_tasks import camera_scene
+from yid_ocp.workflow.track import simulate_frames
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 SHIPPED = (CONFIGS / "track_single_arm.yaml", CONFIGS / "track_dual_arm.yaml")
@@ -59,14 +59,14 @@ def main() -> int:
             return _long(said.configs[0], said.long, said.workers, place)
         rows = [("configuration", "frames", "good", "common [s]", "a frame [s]", "fit alone [s]", "frames/s")]
         rows += [_speed(config, place / config.stem) for config in said.configs]
-    print("\n".join(table(rows)))
+    print("\n".join(aligned_table_lines(rows)))
     return 0
 
 
-def _film(run: Run, folder: Path, count: int = 0) -> Recording:
+def _film(run: RunSettings, folder: Path, count: int = 0) -> Recording:
     """Write a virtual film as depth images, over and over until it has so many frames; the joints' recording."""
-    recording, made = simulated_frames(run, build_system(run), run.track.virtual)
-    write_frames(made.sequence, folder, depth=made.depth)
+    recording, made = simulate_frames(run, build_system(run), run.track.virtual_frames)
+    write_frame_folder(made.sequence, folder, depth=made.depth_images)
     joints = recording.joints
     assert joints is not None
     with (folder / "timestamps.csv").open(newline="") as file:
@@ -86,14 +86,16 @@ def _film(run: Run, folder: Path, count: int = 0) -> Recording:
 def _speed(config: Path, folder: Path) -> tuple[str, ...]:
     run = load_config(config)
     recording = _film(run, folder)
-    tracker = Tracker(scene_of(run, build_system(run)), recording, read_folder(folder), run.track.options)
+    tracker = FrameTracker(
+        camera_scene(run, build_system(run)), recording, read_frame_folder(folder), run.track.options
+    )
     begun = time.process_time()
-    common = tracker.common()
+    common = tracker.calibrate_sequence()
     shared, begun = time.process_time() - begun, time.process_time()
-    frames = [tracker.frame(i, common) for i in tracker.order]
+    frames = [tracker.track_frame(i, common) for i in tracker.frame_order]
     each = (time.process_time() - begun) / len(frames)
-    fits = [frame.seconds for frame in frames if frame.fit is not None]
-    good = sum(frame.good for frame in frames)
+    fits = [frame.cpu_seconds for frame in frames if frame.shape_fit is not None]
+    good = sum(frame.is_good for frame in frames)
     numbers = (f"{shared:.1f}", f"{each:.3f}", f"{np.mean(fits):.3f}", f"{1 / each:.1f}")
     return config.stem, str(len(frames)), str(good), *numbers
 
@@ -102,9 +104,9 @@ def _long(config: Path, count: int, workers: int, folder: Path) -> int:
     film = folder / "film"
     if not (film / "timestamps.csv").exists():
         write_recording(_film(load_config(config), film, count), folder / "film.h5")
-    settings = [f"track.frames={film}", f"recordings.estimate=[{folder / 'film.h5'}]", "track.pictures=0"]
+    settings = [f"track.frames_path={film}", f"recordings.estimate=[{folder / 'film.h5'}]", "track.n_drawn_frames=0"]
     command = [sys.executable, "-m", "yid_ocp", "track", str(config), "--quiet"]
-    command += [word for said in (*settings, "output.report=false") for word in ("--set", said)]
+    command += [word for said in (*settings, "output.write_report=false") for word in ("--set", said)]
     whole = [*command, "--out", str(folder / "whole"), "--workers", str(workers)]
     most, seconds = _watched(whole if workers > 1 else whole[:-2], count)
     broken = [*command, "--out", str(folder / "broken")]
@@ -114,7 +116,7 @@ def _long(config: Path, count: int, workers: int, folder: Path) -> int:
     rows = [("film", "frames", "largest [MiB]", "without a break [s]", "after the kill [s]", "the same")]
     memory = max(most, first, second) / 2**20
     rows.append((config.stem, str(count), f"{memory:.0f}", f"{seconds:.0f}", f"{rest:.0f}", "yes" if same else "NO"))
-    print("\n".join(table(rows)))
+    print("\n".join(aligned_table_lines(rows)))
     return 0 if same and memory < 1024 else 1
 
 

@@ -23,8 +23,8 @@ from diagnosis_cases import CASES, found, show
 
 from yid_ocp import cli
 from yid_ocp.config.reader import load_config
-from yid_ocp.parallel import Task, Workers, run_tasks
-from yid_ocp.workflow.build import recording_file
+from yid_ocp.parallel import Task, WorkerConfig, run_tasks
+from yid_ocp.workflow.build import recording_path
 
 REPOSITORY = Path(__file__).parents[1]
 RECORDED = Path(__file__).with_suffix(".json")
@@ -43,7 +43,7 @@ def solved(name: str) -> dict[str, Any]:
     """Parameters, status and cost of a configuration; empty where its recordings are not here."""
     file = configurations()[name]
     run = load_config(file)
-    if not all(recording_file(path).is_file() for path in (*run.recordings.estimate, *run.recordings.held_out)):
+    if not all(recording_path(path).is_file() for path in (*run.recordings.estimate, *run.recordings.held_out)):
         return {}
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
@@ -119,7 +119,7 @@ def main() -> int:
     recorded = json.loads(RECORDED.read_text(encoding="utf-8")) if RECORDED.is_file() else {}
     with tempfile.TemporaryDirectory() as folder:
         tasks = [Task(name, {"name": name}) for name in arguments.names]
-        results = run_tasks(work, tasks, arguments.keep or Path(folder), Workers(arguments.workers), show)
+        results = run_tasks(work, tasks, arguments.keep or Path(folder), WorkerConfig(arguments.workers), show)
     failed = 0
     for name, result in zip(arguments.names, results, strict=True):
         if result.error or not result.value:

@@ -30,7 +30,7 @@ from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import YidError
 from yid_ocp.problem.options import ProblemOptions
-from yid_ocp.report.terminal import table
+from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.vision import TrackOptions
 
 ROW = Row(turn=1.5, shift=0.015, scale=1.01, latency=0.06)
@@ -51,18 +51,18 @@ def one_film(number: int, frames: int, camera: str) -> dict[str, Any]:
         return entry
     entry["largest_error"] = float(np.nanmax(outcome.error))
     system, start = made.scene.system, dict.fromkeys(TRUTH, 3.0)
-    group = found.group()
+    group = found.to_point_group()
     free, priors = list(TRUTH), {}
     if camera == "free":
         # one error of all frames: a shift of the camera, and the rest of the standard deviation for each by itself
-        common = np.nanmedian(found.common, axis=(0, 1))
+        common = np.nanmedian(found.shared_std, axis=(0, 1))
         system = system.with_effects([make_effect("camera_translation", "camera", system)])
         names = [f"camera_translation@camera.{axis}" for axis in AXES]
         free += names
         priors = dict(zip(names, map(float, common), strict=True))
-        own = np.sqrt(np.maximum(found.std**2 - found.common**2, 1e-6))
+        own = np.sqrt(np.maximum(found.std**2 - found.shared_std**2, 1e-6))
         group = replace(group, std=own)
-    options = ProblemOptions(priors=priors, feedback="lqr", initial_state="equilibrium")
+    options = ProblemOptions(prior_stds=priors, feedback="lqr", initial_state="equilibrium")
     recording = Recording(joints_of(play, number), (play.arm_points(number), group), name=f"film {number}")
     try:
         problem = yid.EstimationProblem(yid.compile_step(system, 0.01), [recording], free, options, start)
@@ -117,7 +117,7 @@ def main() -> int:
         if given.out is not None:
             with given.out.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(entry) + "\n")
-    print("\n".join(table(rows)))
+    print("\n".join(aligned_table_lines(rows)))
     print(f"all identifiable parameters within two standard deviations in {right} of {solved} films")
     return 0
 

@@ -1,4 +1,4 @@
-"""What `track` makes of cameras and objects that are not as it is told: one row a disturbance.
+"""What `track_object` makes of cameras and objects that are not as it is told: one row a disturbance.
 
     python benchmarks/vision_table.py [ROW ...] [--arms 1 2] [--seeds 0 1] [--frames 14] [--motions FOLDER]
 
@@ -6,7 +6,7 @@ The camera is independent of the own one: MuJoCo moves a chain, twice as fine as
 is a smooth rod (a circle swept along a spline through its joints), the robot its own meshes where MuJoCo puts
 them, all in one scene of Open3D's ray caster. Depth errors grow with z^2 and are alike in neighbouring pixels, edges
 fly, depth is quantised, holes are blobs; exposed for longer, a pixel sees one of several instants or their mean. What
-`track` is told of the camera's pose, its clock, the object and the surroundings is wrong as the row says.
+`track_object` is told of the camera's pose, its clock, the object and the surroundings is wrong as the row says.
 
 A row: median error of the accepted points, share of frames accepted, accepted frames in which a point is more than
 40 mm off, share of coordinates within two standard deviations, median standard deviation; or the refusal.
@@ -36,22 +36,30 @@ from yid_ocp.errors import YidError
 from yid_ocp.model.system import Grasp, System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.model.y_object import y_object
-from yid_ocp.report.terminal import table
-from yid_ocp.virtual.engine import Simulation, simulate_in_mujoco
-from yid_ocp.virtual.mjcf import compiled_model, mujoco_xml
-from yid_ocp.virtual.motion import Excitation, multisine
-from yid_ocp.virtual.posture import BAXTER_JOINTS, initial_posture
-from yid_ocp.vision import FrameSequence, Pinhole, Scene, Track, TrackOptions, look_at, track
-from yid_ocp.vision.frames import open3d_module
-from yid_ocp.vision.meshes import Mesh, numeric_mechanism, robot_meshes
+from yid_ocp.report.terminal import aligned_table_lines
+from yid_ocp.virtual.inverse_kinematics import BAXTER_ARM_JOINTS, grasping_joint_angles
+from yid_ocp.virtual.mjcf import compile_mjcf, mujoco_xml
+from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
+from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
+from yid_ocp.vision import (
+    CameraIntrinsics,
+    CameraScene,
+    FrameSequence,
+    TrackOptions,
+    TrackResult,
+    look_at_pose,
+    track_object,
+)
+from yid_ocp.vision.frames import import_open3d
+from yid_ocp.vision.surface_meshes import TriangleMesh, load_robot_meshes, numeric_mechanism
 
 Array = NDArray[np.float64]
 
 TRUTH = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T3.bend": 11.5, "T3.twist": 9.7}
 """Stiffness of every joint of a tube of four links [N m/rad]."""
 
-POSE = look_at([2.6, 0.0, 0.45], [0.85, 0.0, -0.1])
-LENS = Pinhole.of_view(424, 318, math.radians(58.0))
+POSE = look_at_pose([2.6, 0.0, 0.45], [0.85, 0.0, -0.1])
+LENS = CameraIntrinsics.from_field_of_view(424, 318, math.radians(58.0))
 WRONG = 0.04  # [m]; an accepted frame with a point that is further off is the worst that can happen
 SIDES = 32  # of a rod's cross section
 INSTANTS = 6  # that an exposure mixes
@@ -87,7 +95,7 @@ class Row:
     duration: float = 5.0  # [s]
     travel: float = 1.0  # of the arms, over the usual
     noise: Noise = field(default_factory=Noise)
-    options: Mapping[str, Any] = field(default_factory=dict)  # of `track`
+    options: Mapping[str, Any] = field(default_factory=dict)  # of `track_object`
 
 
 ROWS: dict[str, Row] = {
@@ -123,7 +131,7 @@ ROWS: dict[str, Row] = {
 def y_system(arms: int, links: int, damping: float = 0.05) -> System:
     """Baxter with one or two arms holding the foam Y, of so many links a tube."""
     sides = ("left", "right")[:arms]
-    names = [f"{side}_{joint}" for side in sides for joint in BAXTER_JOINTS]
+    names = [f"{side}_{joint}" for side in sides for joint in BAXTER_ARM_JOINTS]
     grasps = [Grasp(side, f"{side}_gripper", held) for side, held in zip(sides, ("w_T2", "w_T3"), strict=False)]
     robot = read_urdf("package:baxter", joints=names)
     return System.build(robot, objects=[(y_object(links), None, None)], grasps=grasps, driven=names, damping=damping)
@@ -156,8 +164,8 @@ class Played:
 
     def arm_points(self, seed: int) -> PointGroup:
         """What the arms know of the points that they hold."""
-        names = tuple(grasp.held for grasp in self.system.grasps)
-        seen = self.points[:, [self.system.points.index(name) for name in names]]
+        names = tuple(grasp.held_frame for grasp in self.system.grasps)
+        seen = self.points[:, [self.system.point_frames.index(name) for name in names]]
         noise = 1e-3 * np.random.default_rng([seed, 6]).standard_normal(seen.shape)
         return PointGroup("points_arm", names, self.t, seen + noise, 1e-3, sensor="arm")
 
@@ -181,14 +189,16 @@ def played(
     if kept is not None and kept.is_file():
         with np.load(kept) as file:
             return Played(arms, system, values, file["t"], file["q"], file["effort"], file["points"])
-    posture = initial_posture(system, values)
-    excitation = Excitation(travel=TRAVEL[arms] * travel, duration=duration)
-    motion = multisine(system, values, seed=seed, posture=posture, excitation=excitation)
-    run = simulate_in_mujoco(system, values, motion, Simulation(duration, time_step=step), posture=posture)
+    posture = grasping_joint_angles(system, values)
+    excitation = MultisineOptions(gripper_travel=TRAVEL[arms] * travel, duration=duration)
+    motion = random_multisine(system, values, seed=seed, initial_joint_angles=posture, excitation=excitation)
+    run = simulate_in_mujoco(
+        system, values, motion, SimulationOptions(duration, time_step=step), initial_joint_angles=posture
+    )
     if kept is not None:
         kept.parent.mkdir(parents=True, exist_ok=True)
-        np.savez(kept, t=run.t, q=run.q, effort=run.effort, points=run.points)
-    return Played(arms, system, values, run.t, run.q, run.effort, run.points)
+        np.savez(kept, t=run.t, q=run.q, effort=run.effort, points=run.point_positions)
+    return Played(arms, system, values, run.t, run.q, run.effort, run.point_positions)
 
 
 class Stage:
@@ -197,16 +207,16 @@ class Stage:
     def __init__(self, play: Played, clutter: str, seed: int) -> None:
         self.play, self.course = play, play.course
         system = play.system
-        self.model = compiled_model(mujoco_xml(system, play.values))
+        self.model = compile_mjcf(mujoco_xml(system, play.values))
         self.data = mujoco.MjData(self.model)
         names = system.mechanism.joint_names
         self.order = [self.model.joint(name).id for name in names]
         tree = numeric_mechanism(system, play.values)
-        self.robot = robot_meshes("package:baxter", tree)
+        self.robot = load_robot_meshes("package:baxter", tree)
         theta = dict(zip(system.parameters.names, system.parameters.vector(play.values), strict=True))
         self.rods = []
-        for segment in system.segments:
-            bodies = [int(self.model.jnt_bodyid[self.model.joint(links[0]).id]) for links in segment.links]
+        for segment in system.segment_layouts:
+            bodies = [int(self.model.jnt_bodyid[self.model.joint(links[0]).id]) for links in segment.link_joints]
             site = self.model.site(f"w_{segment.name}").id
             self.rods.append((bodies, site, theta[f"{segment.name}.radius"]))
         self.clutter = clutter
@@ -218,13 +228,13 @@ class Stage:
     def place(self, t: float) -> Array:
         """The true points at a time, shape (np, 3) [m]."""
         self._pose(t)
-        return np.array([self.data.site_xpos[self.model.site(name).id] for name in self.play.system.points])
+        return np.array([self.data.site_xpos[self.model.site(name).id] for name in self.play.system.point_frames])
 
     def _pose(self, t: float) -> None:
         self.data.qpos[self.order] = self.course(float(np.clip(t, self.play.t[0], self.play.t[-1])))
         mujoco.mj_kinematics(self.model, self.data)
 
-    def meshes(self, t: float) -> list[Mesh]:
+    def meshes(self, t: float) -> list[TriangleMesh]:
         """Everything in the world at a time."""
         self._pose(t)
         data, found = self.data, list(self.still)
@@ -233,19 +243,19 @@ class Stage:
             if joint >= 0:
                 body = int(self.model.jnt_bodyid[self.model.joint(self.play.system.mechanism.joint_names[joint]).id])
                 pose[:3, :3], pose[:3, 3] = data.xmat[body].reshape(3, 3), data.xpos[body]
-            found.append(mesh.moved(pose))
+            found.append(mesh.transformed(pose))
         for bodies, site, radius in self.rods:
             found.append(swept(np.vstack([data.xpos[bodies], data.site_xpos[site]]), radius))
         if self.clutter == "gripper":
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = data.site_xmat[self.gripper].reshape(3, 3), data.site_xpos[self.gripper]
-            found.append(Mesh.box([0.09, 0.14, 0.12]).moved(pose))
+            found.append(TriangleMesh.box([0.09, 0.14, 0.12]).transformed(pose))
         if self.clutter == "person":
             found += _person(t)
         return found
 
 
-def swept(joints: Array, radius: float) -> Mesh:
+def swept(joints: Array, radius: float) -> TriangleMesh:
     """A closed tube about a spline through points, shape (K, 3) [m]."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(joints, axis=0), axis=1))])
     line = CubicSpline(along, joints, axis=0)
@@ -269,20 +279,20 @@ def swept(joints: Array, radius: float) -> Mesh:
     foot, last = len(rings) * SIDES, (len(rings) - 1) * SIDES
     faces += [np.column_stack([i, j, np.full(SIDES, foot)])]
     faces += [np.column_stack([j + last, i + last, np.full(SIDES, foot + 1)])]
-    return Mesh(vertices, np.concatenate(faces))
+    return TriangleMesh(vertices, np.concatenate(faces))
 
 
-def _slab(size: Sequence[float], at: Sequence[float], turn: float = 0.0) -> Mesh:
+def _slab(size: Sequence[float], at: Sequence[float], turn: float = 0.0) -> TriangleMesh:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = Rotation.from_euler("z", turn).as_matrix(), at
-    return Mesh.box(list(size)).moved(pose)
+    return TriangleMesh.box(list(size)).transformed(pose)
 
 
-def _limb(start: Sequence[float], stop: Sequence[float], radius: float) -> Mesh:
+def _limb(start: Sequence[float], stop: Sequence[float], radius: float) -> TriangleMesh:
     return swept(np.linspace(start, stop, 4), radius)
 
 
-def _person(t: float) -> list[Mesh]:
+def _person(t: float) -> list[TriangleMesh]:
     """Somebody beside the object, swaying, with an arm stretched out towards it."""
     sway = 0.04 * math.sin(1.7 * t)
     x, y = 1.0 + sway, -1.1
@@ -291,7 +301,7 @@ def _person(t: float) -> list[Mesh]:
     return [*legs, _limb([x, y, -0.15], [x, y, 0.5], 0.17), _limb([x, y, 0.55], [x, y, 0.75], 0.1), arm]
 
 
-def _clutter(kind: str) -> list[Mesh]:
+def _clutter(kind: str) -> list[TriangleMesh]:
     """What stands still within the object's reach and is told to nobody."""
     return {
         "table": [_slab([0.6, 0.9, 0.04], [1.05, 0.55, -0.45], 0.2), _slab([0.05, 0.05, 0.46], [1.3, 0.9, -0.7])],
@@ -301,15 +311,15 @@ def _clutter(kind: str) -> list[Mesh]:
     }.get(kind, [])
 
 
-def cast(meshes: Sequence[Mesh], pose: Array) -> tuple[Array, Array]:
+def cast(meshes: Sequence[TriangleMesh], pose: Array) -> tuple[Array, Array]:
     """Depth along the axis [m], infinite for nothing, and the cosine of ray and normal; shapes (height, width)."""
-    o3d = open3d_module()
-    scene, whole = o3d.t.geometry.RaycastingScene(nthreads=1), Mesh.joined(meshes)
+    o3d = import_open3d()
+    scene, whole = o3d.t.geometry.RaycastingScene(nthreads=1), TriangleMesh.concatenate(meshes)
     scene.add_triangles(
         o3d.core.Tensor(np.ascontiguousarray(whole.vertices, dtype=np.float32)),
         o3d.core.Tensor(np.ascontiguousarray(whole.faces, dtype=np.uint32)),
     )
-    directions = LENS.rays @ pose[:3, :3].T
+    directions = LENS.pixel_rays @ pose[:3, :3].T
     rays = np.concatenate([np.broadcast_to(pose[:3, 3], directions.shape), directions], axis=-1)
     answer = scene.cast_rays(o3d.core.Tensor(np.ascontiguousarray(rays, dtype=np.float32)), nthreads=1)
     normals = answer["primitive_normals"].numpy()
@@ -347,9 +357,9 @@ def measured(depths: Sequence[Array], cosines: Sequence[Array], noise: Noise, rn
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """What `track` is given, and what was true."""
+    """What `track_object` is given, and what was true."""
 
-    scene: Scene
+    scene: CameraScene
     recording: Recording
     sequence: FrameSequence
     place: Callable[[float], Array]
@@ -357,11 +367,11 @@ class Film:
 
 
 def told_system(arms: int, row: Row) -> tuple[System, dict[str, float]]:
-    """The system of four links that `track` and `solve` know, and its values where they are not true."""
+    """The system of four links that `track_object` and `solve` know, and its values where they are not true."""
     system = y_system(arms, 4)
     theta = dict(zip(system.parameters.names, system.parameters.vector(), strict=True))
     values = dict(TRUTH)
-    for segment in system.segments:
+    for segment in system.segment_layouts:
         values[f"{segment.name}.length"] = row.length * float(theta[f"{segment.name}.length"])
         values[f"{segment.name}.radius"] = row.radius * float(theta[f"{segment.name}.radius"])
     return system, values
@@ -386,13 +396,13 @@ def film(play: Played, row: Row, seed: int, frames: int) -> Film:
         spread = np.linspace(-0.5, 0.5, INSTANTS) * row.exposure if row.exposure > 0 else np.zeros(1)
         seen = [cast(stage.meshes(float(taken[index]) + s), POSE) for s in spread]
         depth = measured([d for d, _ in seen], [c for _, c in seen], row.noise, np.random.default_rng([seed, 2, index]))
-        return LENS.cloud(depth * row.scale)
+        return LENS.points_from_depth(depth * row.scale)
 
     system, values = told_system(play.arms, row)
     names = tuple(f"frame {i}" for i in range(frames))
     sequence = FrameSequence(stamps, names, told, load, LENS, "independent camera")
     recording = Recording(play.joints(seed), (play.arm_points(seed),), source="MuJoCo", name="table")
-    return Film(Scene(system, "package:baxter", values), recording, sequence, stage.place, taken)
+    return Film(CameraScene(system, "package:baxter", values), recording, sequence, stage.place, taken)
 
 
 @dataclass(frozen=True, eq=False)
@@ -415,26 +425,34 @@ class Outcome:
         return int((np.nan_to_num(self.error) > WRONG).any(axis=1).sum()) if len(self.error) else 0
 
 
-def tracked(made: Film, options: TrackOptions) -> tuple[Track | None, Outcome]:
+def tracked(made: Film, options: TrackOptions) -> tuple[TrackResult | None, Outcome]:
     """Track a film and compare with the truth."""
     count = len(made.sequence)
     for i in range(count):
-        made.sequence.load(i)
+        made.sequence.load_cloud(i)
     drawn = time.process_time()
     nothing = np.empty((0, 1))
     try:
-        found = track(made.scene, made.recording, made.sequence, options)
+        found = track_object(made.scene, made.recording, made.sequence, options)
     except YidError as error:
         spent = time.process_time() - drawn
         return None, Outcome(nothing, nothing, nothing, 0, count, error.what, spent, "", {})
-    columns = [made.scene.system.points.index(name) for name in found.names]
+    columns = [made.scene.system.point_frames.index(name) for name in found.point_names]
     truth = np.array([made.place(float(t))[columns] for t in found.t])
     apart = found.position - truth
     error = np.linalg.norm(apart, axis=2)
     size = np.linalg.norm(found.std, axis=2) / math.sqrt(3)
     spent = time.process_time() - drawn
     return found, Outcome(
-        error, apart / found.std, size, len(found.t), count, "", spent, found.calibration.message, found.dropped
+        error,
+        apart / found.std,
+        size,
+        len(found.t),
+        count,
+        "",
+        spent,
+        found.camera_calibration.message,
+        found.drop_reason_counts,
     )
 
 
@@ -488,7 +506,7 @@ def main() -> int:
                     print(f"    {outcome.dropped} {outcome.refusal}", flush=True)
             rows.append((str(arms), name, *summary(outcomes)))
             print("  ".join(rows[-1]), file=sys.stderr, flush=True)
-    print("\n".join(table(rows)))
+    print("\n".join(aligned_table_lines(rows)))
     return 0
 
 

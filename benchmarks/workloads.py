@@ -18,19 +18,19 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from yid_ocp.data.hdf5 import read_recording
 from yid_ocp.data.recording import Recording
+from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.integrator import compiled
-from yid_ocp.integrator.lqr import lqr_filter
-from yid_ocp.integrator.statics import Statics
-from yid_ocp.integrator.step import Directions, Feedback, Rollout, Step, compile_step
-from yid_ocp.integrator.step_model import Member
+from yid_ocp.integrator.lqr import lqr_feedback
+from yid_ocp.integrator.statics import EquilibriumSolver
+from yid_ocp.integrator.step import Rollout, SensitivityDirections, Step, TrackingFeedback, compile_step
+from yid_ocp.integrator.step_model import RolloutInputs
 from yid_ocp.model import System
-from yid_ocp.model.urdf import urdf_text
+from yid_ocp.model.urdf import mechanism_to_urdf
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.evaluation import WarmStart
-from yid_ocp.solvers.linear_model import bounded_step
-from yid_ocp.virtual.experiment import paper_system
+from yid_ocp.problem.evaluation import EquilibriumGuesses
+from yid_ocp.solvers.linear_model import bounded_least_squares_step
+from yid_ocp.virtual.experiment import baxter_foam_y_system
 
 Array = NDArray[np.float64]
 
@@ -55,7 +55,7 @@ class Bench:
     start: Array
     torque: Array
     path: Array
-    feedback: Feedback
+    feedback: TrackingFeedback
     trajectory: Rollout
     model: Any
     data: Any
@@ -66,8 +66,8 @@ class Bench:
     def of(size: int) -> Bench:
         """Set up the system with 43 or 50 coordinates; nothing here is timed."""
         arms, name = SIZES[size]
-        system = paper_system(arms)
-        assert system.size == size
+        system = baxter_foam_y_system(arms)
+        assert system.n_coordinates == size
         recording = read_recording(CLEAN / name)
         joints = recording.joints
         assert joints is not None
@@ -76,13 +76,13 @@ class Bench:
         angles, torque = joints.position, np.ascontiguousarray(joints.effort[:-1])
         step = compile_step(system, TIME_STEP)
         theta = system.parameters.vector(VALUES)
-        rest = Statics(step).solve(angles[0], theta)
-        feedback = lqr_filter(step, angles, torque, theta)
+        rest = EquilibriumSolver(step).solve(angles[0], theta)
+        feedback = lqr_feedback(step, angles, torque, theta)
         path = np.zeros((len(torque) + 1, 0))
         trajectory = step.kernel.rollout(theta, rest.state, torque, path, feedback, None)
-        assert trajectory.status.ok, trajectory.status.message
+        assert trajectory.status.is_converged, trajectory.status.message
         values = dict(zip(system.parameters.names, theta, strict=True))
-        tree = urdf_text(system.mechanism, {name: values[name] for name in system.mechanism.parameters.names})
+        tree = mechanism_to_urdf(system.mechanism, {name: values[name] for name in system.mechanism.parameters.names})
         model = pin.buildModelFromXML(tree)
         assert model.nv == size
         rng = np.random.default_rng(1)
@@ -106,18 +106,18 @@ class Bench:
             points,
         )
 
-    def directions(self, key: str, names: tuple[str, ...], everything: bool) -> Directions:
+    def directions(self, key: str, names: tuple[str, ...], everything: bool) -> SensitivityDirections:
         """Sensitivity directions, made once: the named parameters, or all of the state and the torque."""
         if key not in self.keep:
             sizes = self.step.sizes
             nx, nu, d = sizes["nx"], sizes["nu"], len(names)
             if not everything:
-                self.keep[key] = Directions(names, np.zeros((nx, d)))
+                self.keep[key] = SensitivityDirections(names, np.zeros((nx, d)))
             else:
                 start = np.hstack([np.eye(nx), np.zeros((nx, nu))])
                 torque = np.zeros((len(self.torque), nu, nx + nu))
                 torque[:, :, nx:] = np.eye(nu)
-                self.keep[key] = Directions((), start, torque)
+                self.keep[key] = SensitivityDirections((), start, torque)
         return self.keep[key]
 
     def problem(self) -> EstimationProblem:
@@ -126,13 +126,13 @@ class Bench:
             self.keep["problem"] = EstimationProblem(self.step, [self.recording], STIFFNESSES)
         return self.keep["problem"]
 
-    def warm(self, x: Array) -> WarmStart:
+    def warm(self, x: Array) -> EquilibriumGuesses:
         """Where the equilibrium at `x` is, found once: solvers know it from the point before, so they do not search."""
         if "warm" not in self.keep:
-            self.keep["warm"] = self.problem().evaluate(x, False).warm
+            self.keep["warm"] = self.problem().evaluate(x, False).equilibrium_guesses
         return self.keep["warm"]
 
-    def members(self, count: int, directions: Directions | None = None) -> list[Member]:
+    def members(self, count: int, directions: SensitivityDirections | None = None) -> list[RolloutInputs]:
         """Members that differ in their stiffnesses, each from its own equilibrium, over all steps; made once."""
         key = f"members {count} {directions is None}"
         if key not in self.keep:
@@ -142,12 +142,12 @@ class Bench:
                 self.system.parameters.vector({name: x * rng.uniform(0.6, 1.6) for name, x in VALUES.items()})
                 for _ in range(count)
             ]
-            starts = [Statics(self.step).solve(posture.position[0], theta).state for theta in thetas]
+            starts = [EquilibriumSolver(self.step).solve(posture.position[0], theta).state for theta in thetas]
             common = self.torque, self.path, self.feedback, directions
-            self.keep[key] = [Member(*pair, *common) for pair in zip(thetas, starts, strict=True)]
+            self.keep[key] = [RolloutInputs(*pair, *common) for pair in zip(thetas, starts, strict=True)]
         return self.keep[key]
 
-    def rollout(self, steps: int, directions: Directions | None = None) -> Rollout:
+    def rollout(self, steps: int, directions: SensitivityDirections | None = None) -> Rollout:
         """Track the recording over the first steps."""
         torque, path = self.torque[:steps], self.path[: steps + 1]
         return self.step.kernel.rollout(self.theta, self.start, torque, path, self.feedback, directions)
@@ -163,8 +163,10 @@ def step_with_a_and_b(bench: Bench) -> int:
     """One step with its derivatives by the whole state and the torque, in compiled code."""
     steps = 25
     directions = bench.directions("everything", (), everything=True)
-    assert directions.torque is not None
-    bench.rollout(steps, Directions((), directions.start, directions.torque[:steps]))
+    assert directions.torque_tangents is not None
+    bench.rollout(
+        steps, SensitivityDirections((), directions.initial_state_tangents, directions.torque_tangents[:steps])
+    )
     return steps
 
 
@@ -208,11 +210,13 @@ def step_of_eight_with_sensitivities(bench: Bench) -> int:
     return _together(bench, bench.directions("six", STIFFNESSES, everything=False))
 
 
-def _together(bench: Bench, directions: Directions | None) -> int:
+def _together(bench: Bench, directions: SensitivityDirections | None) -> int:
     members = bench.members(8, directions)
-    with mock.patch.object(compiled, "WORTH", 0):  # so few steps would not be worth the compilation
-        found = bench.step.kernel.rollouts(members)
-    assert all(rollout.status.ok for rollout in found)
+    with mock.patch.object(
+        compiled, "MIN_STEPS_TO_COMPILE_BATCH", 0
+    ):  # so few steps would not be worth the compilation
+        found = bench.step.kernel.rollout_batch(members)
+    assert all(rollout.status.is_converged for rollout in found)
     return sum(len(member.torque) for member in members)
 
 
@@ -224,7 +228,7 @@ def sensitivities_of_one(bench: Bench) -> int:
 
 def adjoint_500(bench: Bench) -> int:
     """The gradient by six stiffnesses from the adjoint sweep back over 500 steps (the rollout not included)."""
-    bench.step.kernel.adjoint(
+    bench.step.kernel.adjoint_gradient(
         bench.theta, bench.trajectory, bench.feedback, STIFFNESSES, bench.trajectory.state, None, None
     )
     return 1
@@ -233,19 +237,19 @@ def adjoint_500(bench: Bench) -> int:
 def gradient_500(bench: Bench) -> int:
     """Cost and gradient of an estimation problem of 500 steps: equilibrium, rollout, residual and adjoint sweep."""
     problem = bench.problem()
-    x = problem.start * 4.0
-    problem.gradient(x, warm=bench.warm(x))
+    x = problem.initial_unknowns * 4.0
+    problem.cost_and_gradient(x, equilibrium_guesses=bench.warm(x))
     return 1
 
 
 def gauss_newton_iteration(bench: Bench) -> int:
     """One iteration of Gauss-Newton over 500 steps: residual, Jacobian by six stiffnesses, and the bounded step."""
     problem = bench.problem()
-    x = problem.start * 4.0
-    now = problem.evaluate(x, warm=bench.warm(x))
+    x = problem.initial_unknowns * 4.0
+    now = problem.evaluate(x, equilibrium_guesses=bench.warm(x))
     assert now.jacobian is not None
-    wide = np.full(len(problem.start), np.inf)
-    bounded_step(now.jacobian, now.residual, 1e-6, -wide, wide)
+    wide = np.full(len(problem.initial_unknowns), np.inf)
+    bounded_least_squares_step(now.jacobian, now.residual, 1e-6, -wide, wide)
     return 1
 
 

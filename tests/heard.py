@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 class Heard:
-    """See `yid_ocp.progress.Progress`."""
+    """See `yid_ocp.progress_display.Progress`."""
 
     def __init__(self) -> None:
         self.stages: list[str] = []

@@ -7,16 +7,16 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from yid_ocp.problem.null_test import Series
+from yid_ocp.problem.null_test import ResidualChannel
 
 WHITE = (1.0,)
 
 
-def series(rows, t=None, recording="run", channel="points.tip", colour=WHITE, period=0.01) -> Series:
+def series(rows, t=None, recording="run", channel="points.tip", colour=WHITE, period=0.01) -> ResidualChannel:
     """One output of one recording; times at even intervals unless given."""
     rows = np.asarray(rows)
     t = period * np.arange(len(rows)) if t is None else np.asarray(t, float)
-    return Series(recording, channel, "points", "m", t, rows, np.asarray(colour, float))
+    return ResidualChannel(recording, channel, "points", "m", t, rows, np.asarray(colour, float))
 
 
 def samples(channels: Sequence[str], std, unit="m", width=1, **more):

@@ -30,7 +30,7 @@ parameters:
   elbow.damping: {{free: true}}
 problem:
   path_cutoff: .inf
-  compiler: false
+  use_compiler: false
 solver:
   name: gauss_newton
 """

@@ -12,8 +12,8 @@ from yid_ocp.effects import make_effect
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
-from yid_ocp.model.drives import Spring
 from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.sensors.joints import EffortSensor
@@ -71,10 +71,12 @@ PENDULUM = ("shoulder", "elbow")
 def pendulum_step(folder, effects=(), **how):
     """A double pendulum with springs and dampers; effects as (kind, location, values)."""
     robot = read_urdf(folder / "double_pendulum.urdf")
-    springs = {joint: Spring(stiffness, 0.1) for joint, stiffness in zip(PENDULUM, (6.0, 3.0), strict=True)}
+    springs = {joint: RobotJointSpring(stiffness, 0.1) for joint, stiffness in zip(PENDULUM, (6.0, 3.0), strict=True)}
     loose = {joint: spring for joint, spring in springs.items() if joint not in how.get("driven", ())}
     loose = {joint: spring for joint, spring in loose.items() if joint not in how.get("prescribed", ())}
-    system = System.build(robot, springs=loose, damping=dict.fromkeys(PENDULUM, 0.2), points=["tip", "lower"], **how)
+    system = System.build(
+        robot, springs=loose, damping=dict.fromkeys(PENDULUM, 0.2), point_frames=["tip", "lower"], **how
+    )
     made = [make_effect(kind, place, system, values) for kind, place, values in effects]
     return compile_step(system.with_effects(made), H, use_compiler=False)
 
@@ -109,15 +111,15 @@ def taken(step, seed, *, efforts=True, camera=True, name=None, steps=STEPS):
 def swinging_pendulum(folder):
     """The step of a damped double pendulum, and a function that records a free swing of it, its lower points seen.
 
-    `record(seed, steps, bend, noise)` starts with angles of `bend` times a standard normal number and adds `noise`
+    `simulate_recording(seed, steps, bend, noise)` starts with angles of `bend` times a standard normal number and adds `noise`
     metres to what is seen; the standard deviation said is 1 mm.
     """
     system = System.build(read_urdf(str(folder / "double_pendulum.urdf")), damping={"shoulder": 0.1, "elbow": 0.1})
     step = compile_step(system, H, use_compiler=False)
     frames = list(system.mechanism.frames)[-2:]
-    q = ca.SX.sym("q", system.size)
+    q = ca.SX.sym("q", system.n_coordinates)
     kinematics = forward_kinematics(system.mechanism, q)
-    place = ca.Function("place", [q], [ca.horzcat(*(kinematics.position(frame) for frame in frames))])
+    place = ca.Function("place", [q], [ca.horzcat(*(kinematics.frame_position(frame) for frame in frames))])
 
     def record(seed, steps, bend, noise=0.0):
         rng = np.random.default_rng(seed)

@@ -17,10 +17,10 @@ from here import Here
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.errors import WorkerError
-from yid_ocp.parallel import Task, Workers, run_tasks
-from yid_ocp.parallel.cluster import cluster as connected
-from yid_ocp.progress import Silent
-from yid_ocp.version import fingerprint
+from yid_ocp.parallel import Task, WorkerConfig, run_tasks
+from yid_ocp.parallel.dask_cluster import dask_executor as connected
+from yid_ocp.progress import NullProgress
+from yid_ocp.version import software_fingerprint
 from yid_ocp.workflow.blind import run_blind
 
 distributed = pytest.importorskip("distributed", reason="clusters need Dask: pip install 'yid-ocp[cluster]'")
@@ -94,7 +94,9 @@ def test_a_killed_worker_loses_nothing_and_nothing_counts_twice(scheduler, tmp_p
                 os.kill(killed[0], signal.SIGKILL)
                 return
 
-    found = run_tasks(squared, tasks(marks), tmp_path / "there", Workers(scheduler=scheduler.address), kill_one)
+    found = run_tasks(
+        squared, tasks(marks), tmp_path / "there", WorkerConfig(scheduler_address=scheduler.address), kill_one
+    )
     assert len(killed) == 1
     assert [entry.error for entry in found] == [""] * 12
     begun, ended = ([path.stem.partition(".")[0] for path in marks.glob(f"*.{what}")] for what in ("begun", "ended"))
@@ -108,12 +110,15 @@ def test_a_killed_worker_loses_nothing_and_nothing_counts_twice(scheduler, tmp_p
     again = run_tasks(
         squared, [Task("", {"number": i, "marks": str(marks)}) for i in range(12)], tmp_path / "there"
     )  # whoever did them, they are done
-    assert all(entry.resumed for entry in again)
+    assert all(entry.was_resumed for entry in again)
 
 
 def test_a_task_that_ends_every_worker_fails_alone(scheduler, tmp_path, caplog):
     found = run_tasks(
-        deadly, [Task(str(i), {"number": i}) for i in range(3)], tmp_path, Workers(scheduler=scheduler.address)
+        deadly,
+        [Task(str(i), {"number": i}) for i in range(3)],
+        tmp_path,
+        WorkerConfig(scheduler_address=scheduler.address),
     )
     assert [entry.value for entry in found] == [0, None, 2]
     assert found[1].error == "every worker that tried it ended abruptly"
@@ -121,13 +126,15 @@ def test_a_task_that_ends_every_worker_fails_alone(scheduler, tmp_path, caplog):
 
 
 def test_a_worker_of_another_version_is_refused(scheduler, tmp_path, monkeypatch):
-    other = {**fingerprint(), "yid-ocp": "99.0", "code": "b" * 64}
-    monkeypatch.setattr("yid_ocp.parallel.cluster.fingerprint", lambda: other)
+    other = {**software_fingerprint(), "yid-ocp": "99.0", "code": "b" * 64}
+    monkeypatch.setattr("yid_ocp.parallel.dask_cluster.software_fingerprint", lambda: other)
     with pytest.raises(WorkerError, match=r"of another version: yid-ocp \S+ instead of 99.0, code \w+ instead of bbb"):
-        Workers(scheduler=scheduler.address).check()
-    monkeypatch.setattr("yid_ocp.parallel.cluster.fingerprint", lambda: {**fingerprint(), "python": "2.7"})
+        WorkerConfig(scheduler_address=scheduler.address).check_available()
+    monkeypatch.setattr(
+        "yid_ocp.parallel.dask_cluster.software_fingerprint", lambda: {**software_fingerprint(), "python": "2.7"}
+    )
     with pytest.raises(WorkerError, match=r"python 3\.\S+ instead of 2.7"):
-        Workers(scheduler=scheduler.address).check()
+        WorkerConfig(scheduler_address=scheduler.address).check_available()
 
 
 def test_what_a_worker_cannot_import_or_see_is_said(scheduler, tmp_path, monkeypatch):
@@ -137,8 +144,8 @@ def test_what_a_worker_cannot_import_or_see_is_said(scheduler, tmp_path, monkeyp
         connected(scheduler.address, squared_elsewhere, tmp_path),
     ):
         pass
-    monkeypatch.setattr("yid_ocp.parallel.cluster.Path.write_text", lambda *_, **__: 0)
-    monkeypatch.setattr("yid_ocp.parallel.cluster.Path.unlink", lambda *_, **__: None)
+    monkeypatch.setattr("yid_ocp.parallel.dask_cluster.Path.write_text", lambda *_, **__: 0)
+    monkeypatch.setattr("yid_ocp.parallel.dask_cluster.Path.unlink", lambda *_, **__: None)
     with pytest.raises(WorkerError, match=f"does not see {tmp_path}"), connected(scheduler.address, squared, tmp_path):
         pass
 
@@ -148,7 +155,7 @@ def test_workers_of_several_threads_are_refused():
         distributed.LocalCluster(n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None) as cluster,
         pytest.raises(WorkerError, match="2 tasks at once in one process"),
     ):
-        Workers(scheduler=cluster.scheduler_address).check()
+        WorkerConfig(scheduler_address=cluster.scheduler_address).check_available()
 
 
 @pytest.mark.parametrize(
@@ -156,9 +163,9 @@ def test_workers_of_several_threads_are_refused():
     [("127.0.0.1:1", "no scheduler answers"), ("nowhere", "no scheduler answers"), ("a:b:c", "no scheduler answers")],
 )
 def test_a_scheduler_that_is_not_there_is_said(address, words, monkeypatch):
-    monkeypatch.setattr("yid_ocp.parallel.cluster.CONNECTING", 0.5)
+    monkeypatch.setattr("yid_ocp.parallel.dask_cluster._CONNECT_TIMEOUT", 0.5)
     with pytest.raises(WorkerError, match=words) as caught:
-        Workers(scheduler=address).check()
+        WorkerConfig(scheduler_address=address).check_available()
     assert address in str(caught.value)
     assert "dask scheduler" in str(caught.value)
 
@@ -166,14 +173,16 @@ def test_a_scheduler_that_is_not_there_is_said(address, words, monkeypatch):
 def test_dask_is_optional(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(WorkerError, match=r"pip install 'yid-ocp\[cluster\]'"):
-        Workers(scheduler="localhost:8786").check()
+        WorkerConfig(scheduler_address="localhost:8786").check_available()
 
 
 def test_a_scheduler_file_will_do(scheduler, tmp_path):
     file = tmp_path / "scheduler.json"
     with distributed.Client(scheduler.address, set_as_default=False) as client:
         client.write_scheduler_file(str(file))
-    found = run_tasks(deadly, [Task("", {"number": 5})], tmp_path / "results", Workers(scheduler=str(file)))
+    found = run_tasks(
+        deadly, [Task("", {"number": 5})], tmp_path / "results", WorkerConfig(scheduler_address=str(file))
+    )
     assert found[0].value == 5
 
 
@@ -200,16 +209,16 @@ def test_an_event_loop_that_has_no_time_to_start_is_tried_again(scheduler, monke
 CASES = 12
 
 
-class Killing(Silent):
+class Killing(NullProgress):
     """Ends a worker in the middle of the diagnoses, as soon as a third of them is done."""
 
     def __init__(self, scheduler: Any) -> None:
         self.scheduler, self.diagnosing, self.killed = scheduler, False, 0
 
-    def stage(self, text: str) -> None:
+    def begin_stage(self, text: str) -> None:
         self.diagnosing = text.startswith("diagnosing")
 
-    def advance(self, done: int, total: int, text: str) -> None:
+    def report_parts_done(self, done: int, total: int, text: str) -> None:
         if self.diagnosing and not self.killed and 3 * done >= total:
             self.killed = processes(self.scheduler)[0]
             os.kill(self.killed, signal.SIGKILL)
@@ -218,10 +227,15 @@ class Killing(Silent):
 @pytest.mark.slow
 def test_a_blind_proof_survives_a_killed_worker(scheduler, pendulum, tmp_path):
     pytest.importorskip("mujoco", reason="blind proofs need MuJoCo: pip install 'yid-ocp[blind]'")
-    settings = ("model.arms.mode=driven", "recordings.held_out=[]", "output.report=false", "problem.compiler=true")
+    settings = (
+        "model.arms.mode=driven",
+        "recordings.held_out=[]",
+        "output.write_report=false",
+        "problem.use_compiler=true",
+    )
     run = load_config(pendulum, (*settings, "diagnosis.candidates=[joint_viscous, joint_coulomb]"))
     killing = Killing(scheduler)
-    there = run_blind([run], tmp_path / "there", CASES, 3, killing, Workers(scheduler=scheduler.address))
+    there = run_blind([run], tmp_path / "there", CASES, 3, killing, WorkerConfig(scheduler_address=scheduler.address))
     assert killing.killed
     here = run_blind([run], tmp_path / "here", CASES, 3, workers=Here())
     for own in (there.result, here.result):

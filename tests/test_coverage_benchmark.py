@@ -135,7 +135,7 @@ def test_errors_that_nobody_states_must_not_pass_for_findings(coverage: ModuleTy
             "twins warn" in line for line in coverage.shortcomings({"offsets_unstated": entries(38, **changed)})
         )
     assert "white_0.1" in coverage.CELLS
-    assert not coverage.CELLS["offsets_unstated"].stated
+    assert not coverage.CELLS["offsets_unstated"].records_effort_std
 
 
 def test_every_cell_has_its_row(coverage: ModuleType) -> None:

@@ -9,7 +9,7 @@ from types import ModuleType
 import pytest
 from test_coverage_benchmark import loaded
 
-from yid_ocp.diagnosis.events import Event
+from yid_ocp.diagnosis.events import DisturbanceEvent
 
 
 @pytest.fixture(scope="module")
@@ -18,8 +18,8 @@ def benchmark(repository: Path) -> ModuleType:
     return loaded(repository / "benchmarks", "events")
 
 
-def event(begin: float, peak: float, joint: str = "elbow", recording: str = "run_pushed_01") -> Event:
-    return Event(recording, joint, joint, "force", begin, begin + 0.5, peak, 0.25 * peak, 0.01, "N m")
+def event(begin: float, peak: float, joint: str = "elbow", recording: str = "run_pushed_01") -> DisturbanceEvent:
+    return DisturbanceEvent(recording, joint, joint, "force", begin, begin + 0.5, peak, 0.25 * peak, 0.01, "N m")
 
 
 LABEL = {"joint": "elbow", "t_from": 1.0, "t_to": 1.5, "peak": 0.6, "impulse": 0.12}

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from test_coverage_benchmark import loaded
 
-from yid_ocp.parallel import Workers
+from yid_ocp.parallel import WorkerConfig
 
 pytest.importorskip("mujoco", reason="twins are made in MuJoCo: pip install 'yid-ocp[blind]'")
 
@@ -56,7 +56,7 @@ def test_three_alarms_of_sixty_are_as_many_as_there_may_be(benchmark: ModuleType
 @pytest.mark.slow
 def test_noise_is_no_gap_and_an_offset_beyond_what_is_stated_is_named(benchmark: ModuleType, tmp_path: Path) -> None:
     names = ["one_arm_encoders", "offset_beyond"]
-    workers = Workers(processes=2)
+    workers = WorkerConfig(n_processes=2)
     made = benchmark.record(names, 1, workers, tmp_path)
     twins = benchmark.diagnosed(made, "[kelvin_voigt, joint_viscous, effort_offset]", workers, tmp_path)
     assert [twin.error for entries in twins.values() for twin in entries] == ["", ""]

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from yid_ocp.errors import DataError, OutputError
-from yid_ocp.files import content_hash, file_sha256, is_file, jsonable, new_file, write_json
+from yid_ocp.files import atomic_write, file_sha256, is_file, json_sha256, to_json_types, write_json
 
 
 def test_an_interruption_leaves_nothing(tmp_path: Path) -> None:
     def interrupted() -> None:
-        with new_file(tmp_path / "run.h5") as temporary:
+        with atomic_write(tmp_path / "run.h5") as temporary:
             temporary.write_text("half")
             raise KeyboardInterrupt
 
@@ -71,15 +71,15 @@ def test_the_hash_of_a_folder_is_that_of_its_files(tmp_path: Path) -> None:
 
 
 def test_the_hash_of_data_is_that_of_its_content() -> None:
-    assert content_hash({"a": 1, "b": [1, 2]}) == content_hash({"b": [1, 2], "a": 1})
-    assert content_hash({"a": [1, 2]}) != content_hash({"a": [2, 1]})
-    assert content_hash({"a": 1}) != content_hash({"a": "1"})
+    assert json_sha256({"a": 1, "b": [1, 2]}) == json_sha256({"b": [1, 2], "a": 1})
+    assert json_sha256({"a": [1, 2]}) != json_sha256({"a": [2, 1]})
+    assert json_sha256({"a": 1}) != json_sha256({"a": "1"})
 
 
 def test_numbers_that_json_lacks_become_null_and_a_note() -> None:
     notes: list[str] = []
     data = {"a": np.array([1.0, np.nan]), "b": {"c": np.float64(np.inf)}, "d": (np.int64(3), Path("x"))}
-    assert jsonable(data, notes) == {"a": [1.0, None], "b": {"c": None}, "d": [3, "x"]}
+    assert to_json_types(data, notes) == {"a": [1.0, None], "b": {"c": None}, "d": [3, "x"]}
     assert notes == ["a[1] is not known", "b.c is infinite"]
 
 

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from yid_ocp.errors import DataError
-from yid_ocp.vision.frames import open3d_module
+from yid_ocp.vision.frames import import_open3d
 
 pytest.importorskip("rosbags", reason="bags need rosbags: pip install 'yid-ocp[bags]'")
 try:
-    open3d_module()
+    import_open3d()
 except DataError as error:
     pytest.skip(str(error), allow_module_level=True)
 

@@ -74,9 +74,9 @@ def test_a_deferred_block_ends_first(tmp_path):
 def test_handlers_are_put_back_and_a_second_use_is_new():
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     for _ in range(2):
-        with pytest.raises(interruption.Interrupted), interruption.signals_raised():
+        with pytest.raises(interruption.InterruptedBySignal), interruption.raise_on_signals():
             signal.raise_signal(signal.SIGTERM)
-        assert interruption.asked() == signal.SIGTERM
+        assert interruption.received_signal() == signal.SIGTERM
     assert {number: signal.getsignal(number) for number in before} == before
     assert signal.set_wakeup_fd(-1) == -1
 
@@ -85,7 +85,7 @@ def test_other_threads_do_without():
     done = []
 
     def work():
-        with interruption.signals_raised():
+        with interruption.raise_on_signals():
             done.append(True)
 
     thread = threading.Thread(target=work)

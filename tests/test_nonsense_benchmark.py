@@ -9,7 +9,7 @@ import pytest
 from test_coverage_benchmark import loaded
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.workflow.build import build_problem, recording_file
+from yid_ocp.workflow.build import build_problem, recording_path
 
 QUICK = {
     "single_arm_vision": ["effort x 0.1", "gap of 2 s", "camera mirrored", "wrist angles x 20", "a link renamed"],
@@ -54,11 +54,11 @@ def test_a_wrong_recording_is_named(benchmark: ModuleType, tmp_path: Path, confi
 @pytest.mark.parametrize("config", CONFIGS)
 def test_shipped_recordings_are_not_in_doubt(repository: Path, config: str) -> None:
     run = load_config(repository / "configs" / f"{config}.yaml")
-    files = [recording_file(path) for path in (*run.recordings.estimate, *run.recordings.held_out)]
+    files = [recording_path(path) for path in (*run.recordings.estimate, *run.recordings.held_out)]
     missing = [file for file in files if not file.is_file()]
     if missing:
         pytest.skip(f"its recordings are not here: {missing[0]}")
-    assert build_problem(run).options.doubts == ()
+    assert build_problem(run).options.data_issues == ()
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_shipped_recordings_are_not_in_doubt(repository: Path, config: str) -> N
 def test_exact_torques_are_not_in_doubt(repository: Path, clean: Path, config: str) -> None:
     files = [f"recordings.{role}=[{clean / config}_{role}.h5]" for role in ("estimate", "held_out")]
     run = load_config(repository / "configs" / f"{config}.yaml", files)
-    assert build_problem(run).options.doubts == ()
+    assert build_problem(run).options.data_issues == ()
 
 
 @SLOW

@@ -10,7 +10,7 @@ import pytest
 from annotated_types import Ge, Gt, Le, Len, Lt
 
 from yid_ocp.errors import ConfigError
-from yid_ocp.options import About, check, options_of, words
+from yid_ocp.options import OptionInfo, check_option_bounds, dataclass_options, describe_type
 from yid_ocp.solvers import GaussNewton, Lifted, SteepestDescent
 
 
@@ -18,25 +18,25 @@ from yid_ocp.solvers import GaussNewton, Lifted, SteepestDescent
 class Wheel:
     """An example."""
 
-    radius: Annotated[float, Gt(0), Le(2), About("of the tyre", "m")]
-    spokes: Annotated[int | None, Ge(3), About("none when absent")] = None
-    wear: Annotated[tuple[Annotated[float, Ge(0), Lt(1)], ...], Len(1), About("of each tread")] = (0.5,)
-    tyre: Annotated[Literal["slick", "grooved"], About("kind of tyre")] = "slick"
-    load: Annotated[Annotated[float, Ge(0)] | Mapping[str, float], About("by axle", "N")] = 0.0
+    radius: Annotated[float, Gt(0), Le(2), OptionInfo("of the tyre", "m")]
+    spokes: Annotated[int | None, Ge(3), OptionInfo("none when absent")] = None
+    wear: Annotated[tuple[Annotated[float, Ge(0), Lt(1)], ...], Len(1), OptionInfo("of each tread")] = (0.5,)
+    tyre: Annotated[Literal["slick", "grooved"], OptionInfo("kind of tyre")] = "slick"
+    load: Annotated[Annotated[float, Ge(0)] | Mapping[str, float], OptionInfo("by axle", "N")] = 0.0
     serial: int = -1
 
     def __post_init__(self) -> None:
-        check(self, "wheel")
+        check_option_bounds(self, "wheel")
 
 
 def test_options_are_the_fields_that_say_what_they_are():
-    options = options_of(Wheel)
+    options = dataclass_options(Wheel)
     assert list(options) == ["radius", "spokes", "wear", "tyre", "load"]
-    assert (options["radius"].default, options["spokes"].default) == (MISSING, None)
+    assert (options["radius"].default_value, options["spokes"].default_value) == (MISSING, None)
 
 
 def test_words():
-    told = {name: words(option.hint) for name, option in options_of(Wheel).items()}
+    told = {name: describe_type(option.type_hint) for name, option in dataclass_options(Wheel).items()}
     assert told == {
         "radius": "a number above 0 up to 2 [m]",
         "spokes": "a whole number from 3",

@@ -17,10 +17,19 @@ from typing import Any
 import pytest
 
 from yid_ocp.errors import ConfigError, DataError, OutputError, WorkerError
-from yid_ocp.parallel import Task, TaskResult, Workers, map_threads, process_pool, processors, run_tasks, values_of
-from yid_ocp.parallel import tasks as parallel_tasks
-from yid_ocp.parallel.threads import threads as threads_of_process
-from yid_ocp.version import fingerprint
+from yid_ocp.parallel import (
+    Task,
+    TaskResult,
+    WorkerConfig,
+    map_in_threads,
+    process_pool,
+    processor_count,
+    require_task_values,
+    run_tasks,
+)
+from yid_ocp.parallel import resumable_tasks as parallel_tasks
+from yid_ocp.parallel.threads import max_threads as threads_of_process
+from yid_ocp.version import software_fingerprint
 
 # -- what tasks do ----------------------------------------------------------------------------------------------------
 
@@ -88,7 +97,7 @@ def threads():
 def test_results_come_in_the_order_of_the_tasks(tmp_path, threads):
     found = run_tasks(slow, tasks_of(5), tmp_path, threads)
     assert [(entry.name, entry.value) for entry in found] == [(f"task {i}", i) for i in range(5)]
-    assert not any(entry.error or entry.resumed for entry in found)
+    assert not any(entry.error or entry.was_resumed for entry in found)
     assert found[0].seconds >= 0.1
 
 
@@ -97,7 +106,7 @@ def test_what_is_done_is_not_done_again(tmp_path, threads):
     first = run_tasks(counted, tasks_of(3, calls=str(calls)), folder, threads)
     again = run_tasks(counted, tasks_of(4, calls=str(calls)), folder, threads)
     assert sorted(calls.read_text().split()) == ["0", "1", "2", "3"]
-    assert [entry.resumed for entry in again] == [True, True, True, False]
+    assert [entry.was_resumed for entry in again] == [True, True, True, False]
     assert [entry.value for entry in again[:3]] == [entry.value for entry in first]
     assert again[2].value == {"twice": 4, "pair": [2, None]}
     assert again[0].seconds == first[0].seconds
@@ -134,7 +143,7 @@ def test_a_result_that_is_not_whole_is_not_taken(tmp_path, threads, spoiled):
     file.write_text(spoiled(file.read_text()))
     (folder / f".{file.name}.1234.tmp").write_text("{")
     again = run_tasks(counted, tasks, folder, threads)
-    assert [entry.resumed for entry in again] == [False, True]
+    assert [entry.was_resumed for entry in again] == [False, True]
     assert [entry.value["twice"] for entry in again] == [0, 2]
     assert sorted(calls.read_text().split()) == ["0", "0", "1"]
 
@@ -148,7 +157,7 @@ def test_a_changed_input_is_done_again(tmp_path, threads):
     def resumed(file: Path, **arguments: Any) -> bool:
         (result,) = run_tasks(length, [Task("", {"file": file, **arguments})], tmp_path / "results", threads)
         assert result.value == f"{file.name}: {len(file.read_text())} {arguments.get('unit', 'characters')}"
-        return result.resumed
+        return result.was_resumed
 
     assert [resumed(file), resumed(file)] == [False, True]
     file.write_text("five!")
@@ -163,25 +172,27 @@ def test_a_changed_input_is_done_again(tmp_path, threads):
 def test_other_sources_and_another_function_do_not_count(tmp_path, threads, monkeypatch):
     def resumed(function: Any) -> bool:
         (result,) = run_tasks(function, tasks_of(1), tmp_path, threads)
-        return result.resumed
+        return result.was_resumed
 
     assert [resumed(slow), resumed(slow), resumed(fragile)] == [False, True, False]
-    monkeypatch.setattr("yid_ocp.parallel.tasks.package_code", lambda: "99")
+    monkeypatch.setattr("yid_ocp.parallel.resumable_tasks.package_source_hash", lambda: "99")
     assert [resumed(slow), resumed(slow)] == [False, True]
 
 
 def test_results_may_depend_on_less_than_the_whole_package(tmp_path, threads, monkeypatch):
     run_tasks(slow, tasks_of(1), tmp_path, threads, code="of a folder")
-    monkeypatch.setattr("yid_ocp.parallel.tasks.package_code", lambda: "99")
-    assert run_tasks(slow, tasks_of(1), tmp_path, threads, code="of a folder")[0].resumed
-    assert not run_tasks(slow, tasks_of(1), tmp_path, threads, code="of another")[0].resumed
+    monkeypatch.setattr("yid_ocp.parallel.resumable_tasks.package_source_hash", lambda: "99")
+    assert run_tasks(slow, tasks_of(1), tmp_path, threads, code="of a folder")[0].was_resumed
+    assert not run_tasks(slow, tasks_of(1), tmp_path, threads, code="of another")[0].was_resumed
 
 
 def test_a_worker_of_other_sources_does_nothing(tmp_path, threads, monkeypatch):
     calls = tmp_path / "calls"
-    here = fingerprint()
-    monkeypatch.setattr("yid_ocp.parallel.tasks.fingerprint", lambda: {**here, "code": "a" * 64})
-    monkeypatch.setattr("yid_ocp.parallel.tasks._perform", perform_with(here, parallel_tasks._perform, monkeypatch))
+    here = software_fingerprint()
+    monkeypatch.setattr("yid_ocp.parallel.resumable_tasks.software_fingerprint", lambda: {**here, "code": "a" * 64})
+    monkeypatch.setattr(
+        "yid_ocp.parallel.resumable_tasks._perform", perform_with(here, parallel_tasks._perform, monkeypatch)
+    )
     (found,) = run_tasks(counted, tasks_of(1, calls=str(calls)), tmp_path / "results", threads)
     assert "is of another version: code" in found.error
     assert f"{here['code'][:12]} instead of aaaaaaaaaaaa" in found.error
@@ -194,7 +205,7 @@ def perform_with(fingerprint, perform, monkeypatch):
 
     def performed(job):
         with monkeypatch.context() as patch:
-            patch.setattr("yid_ocp.parallel.tasks.fingerprint", lambda: fingerprint)
+            patch.setattr("yid_ocp.parallel.resumable_tasks.software_fingerprint", lambda: fingerprint)
             return perform(job)
 
     return performed
@@ -236,7 +247,7 @@ def test_a_failed_task_is_tried_again_and_its_record_goes(tmp_path, threads):
     assert failed.error
     broken.unlink()
     (done,) = run_tasks(fragile, tasks_of(1, broken=str(broken)), folder, threads)
-    assert (done.value, done.error, done.resumed) == (0, "", False)
+    assert (done.value, done.error, done.was_resumed) == (0, "", False)
     assert [path.name.count(".") for path in folder.iterdir()] == [1]
 
 
@@ -249,12 +260,12 @@ def test_a_result_that_json_cannot_hold_is_a_failure(tmp_path, threads):
 
 def test_what_all_tasks_found_or_why_one_did_not():
     good, bad = TaskResult("a", 1), TaskResult("b", error="ZeroDivisionError: no b")
-    assert values_of([good, good]) == [1, 1]
+    assert require_task_values([good, good]) == [1, 1]
     with pytest.raises(RuntimeError, match="1 of 2 tasks failed, b with ZeroDivisionError: no b; the same command"):
-        values_of([good, bad])
+        require_task_values([good, bad])
     ours = TaskResult("c", error="DataError: no such file\n  where: here\n  try: there")
     with pytest.raises(WorkerError, match="c with DataError: no such file; where: here; try: there"):
-        values_of([good, ours])
+        require_task_values([good, ours])
 
 
 def test_what_cannot_be_a_task_is_refused_before_any_runs(tmp_path, threads):
@@ -314,7 +325,7 @@ def test_tasks_run_in_processes_of_their_own(tmp_path):
 
 def test_processes_share_the_threads_of_the_machine(tmp_path, monkeypatch):
     monkeypatch.setenv("YID_OCP_THREADS", "4")
-    found = run_tasks(thread_count, tasks_of(2), tmp_path, Workers(processes=2))
+    found = run_tasks(thread_count, tasks_of(2), tmp_path, WorkerConfig(n_processes=2))
     assert [entry.value for entry in found] == [2, 2]
 
 
@@ -322,15 +333,15 @@ def test_processes_share_the_threads_of_the_machine(tmp_path, monkeypatch):
 def test_a_wrong_number_of_threads_is_refused(said, monkeypatch):
     monkeypatch.setenv("YID_OCP_THREADS", said)
     with pytest.raises(ConfigError, match="YID_OCP_THREADS is"):
-        map_threads(abs, [1, 2])
+        map_in_threads(abs, [1, 2])
 
 
 def test_no_workers_and_workers_in_two_places_are_refused():
-    assert processors() >= 1
+    assert processor_count() >= 1
     with pytest.raises(ConfigError, match="0 workers"):
-        Workers(processes=0)
+        WorkerConfig(n_processes=0)
     with pytest.raises(ConfigError, match="here and of a scheduler"):
-        Workers(processes=2, scheduler="localhost:8786")
+        WorkerConfig(n_processes=2, scheduler_address="localhost:8786")
 
 
 def test_a_task_that_ends_its_process_takes_no_other_with_it(tmp_path, caplog):
@@ -407,4 +418,4 @@ def test_an_interrupted_or_killed_run_leaves_its_results_and_no_process(tmp_path
 
 
 def test_threads_keep_the_order():
-    assert map_threads(lambda x: x * x, range(7)) == [x * x for x in range(7)]
+    assert map_in_threads(lambda x: x * x, range(7)) == [x * x for x in range(7)]

@@ -9,14 +9,14 @@ import pytest
 from small_problems import joints, pendulum_step, recording, seen, taken
 
 import yid_ocp as yid
+from yid_ocp.display import _MAX_TABLE_ROWS, ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.model import Segment, flexible_object
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.shown import MOST, Shown, Summary, counted
 
 
-class Thing(Shown):
+class Thing(ReprMixin):
     def __init__(self, line, rows=()):
-        self.said = Summary(line, rows)
+        self.said = ReprSummary(line, rows)
 
     def _summary(self):
         return self.said
@@ -31,14 +31,18 @@ def test_a_line_and_a_table():
 
 
 def test_long_tables_are_cut():
-    rows = [("name", "value"), *((f"r{i}", "") for i in range(MOST + 5))]
+    rows = [("name", "value"), *((f"r{i}", "") for i in range(_MAX_TABLE_ROWS + 5))]
     text = Thing("long", rows)._repr_html_()
-    assert text.count("<tr>") == MOST + 2
+    assert text.count("<tr>") == _MAX_TABLE_ROWS + 2
     assert "<td>and 5 more</td><td></td>" in text
 
 
 def test_one_thing_and_several():
-    assert (counted(1, "joint"), counted(0, "joint"), counted(2, "joint")) == ("1 joint", "0 joints", "2 joints")
+    assert (count_with_noun(1, "joint"), count_with_noun(0, "joint"), count_with_noun(2, "joint")) == (
+        "1 joint",
+        "0 joints",
+        "2 joints",
+    )
 
 
 def test_recordings_show_what_they_hold():
@@ -65,7 +69,11 @@ def shown(urdf_folder):
     tube = flexible_object([Segment("tube", length=0.4, mass=0.1, radius=0.01, links=2)])
     system = step.system
     things = [made, step, system, system.mechanism, system.parameters, tube, problem, solution, solution.evaluation]
-    things += [*solution.residuals()[:1], yid.identifiability(problem, solution), yid.StepSymbols.of(step.equations)]
+    things += [
+        *solution.channel_predictions()[:1],
+        yid.identifiability(problem, solution),
+        yid.StepSymbols.from_equations(step.equations),
+    ]
     return {type(thing).__name__: thing for thing in things}
 
 
@@ -93,11 +101,11 @@ def test_public_objects_are_short(shown, name, words):
     assert "\n" not in text
     html = shown[name]._repr_html_()
     assert html.startswith(f"<p><b>{name}</b>: ")
-    assert len(re.findall("<tr>", html)) <= MOST + 2
+    assert len(re.findall("<tr>", html)) <= _MAX_TABLE_ROWS + 2
 
 
 def test_all_public_classes_that_hold_arrays_show_themselves():
     exempt = {"Status", "YidError", "Grasp", "Segment", "ProblemOptions", "SensorOptions"}
     exempt |= {"GaussNewton", "Lifted", "MultipleShooting", "SingleShooting", "SteepestDescent"}
     classes = {name for name in yid.__all__ if isinstance(getattr(yid, name), type)}
-    assert {name for name in classes - exempt if not issubclass(getattr(yid, name), Shown)} == set()
+    assert {name for name in classes - exempt if not issubclass(getattr(yid, name), ReprMixin)} == set()

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from yid_ocp.analysis.identifiability import identifiability as identifiability
-    from yid_ocp.analysis.symbols import StepSymbols as StepSymbols
+    from yid_ocp.analysis.step_symbols import StepSymbols as StepSymbols
     from yid_ocp.analysis.what_if import what_if as what_if
     from yid_ocp.config.reader import load_config as load_config
     from yid_ocp.data import Recording as Recording
     from yid_ocp.data import read_any as read_any
     from yid_ocp.data import read_recording as read_recording
     from yid_ocp.data import write_recording as write_recording
-    from yid_ocp.diagnosis import Finding as Finding
+    from yid_ocp.diagnosis import DiagnosisResult as DiagnosisResult
     from yid_ocp.diagnosis import diagnose as diagnose
     from yid_ocp.errors import YidError as YidError
     from yid_ocp.integrator.rollout import simulate as simulate
@@ -39,9 +39,9 @@ if TYPE_CHECKING:
     from yid_ocp.solvers import Status as Status
     from yid_ocp.solvers import SteepestDescent as SteepestDescent
     from yid_ocp.solvers import solve as solve
-    from yid_ocp.solvers.program import NonlinearProgram as NonlinearProgram
-    from yid_ocp.solvers.symbolic import transcribe as transcribe
-    from yid_ocp.workflow.baseline import read_estimates as read_estimates
+    from yid_ocp.solvers.nonlinear_program import NonlinearProgram as NonlinearProgram
+    from yid_ocp.solvers.symbolic_transcription import transcribe as transcribe
+    from yid_ocp.workflow.baseline_runs import read_estimates as read_estimates
     from yid_ocp.workflow.build import load_problem as load_problem
     from yid_ocp.workflow.build import load_system as load_system
 
@@ -51,19 +51,19 @@ if TYPE_CHECKING:
 # here and imported above.
 _HOMES: dict[str, tuple[str, ...]] = {
     "analysis.identifiability": ("identifiability",),
-    "analysis.symbols": ("StepSymbols",),
+    "analysis.step_symbols": ("StepSymbols",),
     "analysis.what_if": ("what_if",),
     "config.reader": ("load_config",),
     "data": ("Recording", "read_any", "read_recording", "write_recording"),
-    "diagnosis": ("Finding", "diagnose"),
+    "diagnosis": ("DiagnosisResult", "diagnose"),
     "errors": ("YidError",),
     "integrator.rollout": ("simulate",),
     "integrator.step": ("compile_step",),
     "model": ("FlexibleObject", "Grasp", "Mechanism", "Segment", "System", "flexible_object"),
     "problem": ("EstimationProblem", "ProblemOptions", "SensorOptions"),
-    "solvers.program": ("NonlinearProgram",),
-    "solvers.symbolic": ("transcribe",),
-    "workflow.baseline": ("read_estimates",),
+    "solvers.nonlinear_program": ("NonlinearProgram",),
+    "solvers.symbolic_transcription": ("transcribe",),
+    "workflow.baseline_runs": ("read_estimates",),
     "workflow.build": ("load_problem", "load_system"),
     "solvers": (
         "GaussNewton",
@@ -79,8 +79,8 @@ _HOMES: dict[str, tuple[str, ...]] = {
 _MODULE_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
+    "DiagnosisResult",
     "EstimationProblem",
-    "Finding",
     "FlexibleObject",
     "GaussNewton",
     "Grasp",

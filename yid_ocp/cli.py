@@ -20,29 +20,29 @@ from importlib import import_module
 from typing import Any, NoReturn
 
 from yid_ocp import interruption
-from yid_ocp.errors import ConfigError, OutputError, ResourceError, YidError, choices
+from yid_ocp.errors import ConfigError, OutputError, ResourceError, YidError, unknown_name_details
 
-WRONG_INPUT, BUG, INTERRUPTED = 2, 3, 130
-ERROR = "yid-error/1"
+_EXIT_WRONG_INPUT, _EXIT_BUG, _EXIT_INTERRUPTED = 2, 3, 130
+_ERROR_FORMAT = "yid-error/1"
 
 
 @dataclass(frozen=True)
-class Command:
+class CliCommand:
     """A command of the command line: name, help, implementing module, arguments.
 
     Attributes
     ----------
     name, help : str
-    module : str
+    workflow_module : str
         File of `workflow` whose `run` takes the parsed arguments and returns the exit code.
-    arguments : callable
+    add_arguments : callable
         Adds the command's arguments to its parser.
     """
 
     name: str
     help: str
-    module: str
-    arguments: Callable[[argparse.ArgumentParser], None]
+    workflow_module: str
+    add_arguments: Callable[[argparse.ArgumentParser], None]
 
 
 # -- arguments --------------------------------------------------------------------------------------------------------
@@ -59,7 +59,7 @@ def _configured(parser: argparse.ArgumentParser, optional: bool = False) -> None
         action="append",
         default=[],
         dest="overrides",
-        help="set a setting, for example problem.time_step=0.005; a section, 'solver={iterations: 9}', merges with "
+        help="set a setting, for example problem.time_step=0.005; a section, 'solver={max_iterations: 9}', merges with "
         "what stands there, an empty one empties it; may be repeated",
     )
     _printing(parser, "run folder's path")
@@ -207,7 +207,7 @@ def _init(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("files", metavar="FILE", nargs="+", help=text)
     parser.add_argument("--out", metavar="CONFIG.yaml", required=True, help="configuration to write")
     parser.add_argument("--replace", action="store_true", help="write over files that are there")
-    kinds = ("cable", "beam", "tree", "y")
+    kinds = ("cable", "beam", "tree", "foam_y")
     parser.add_argument("--object", choices=kinds, required=True, help="what is held; y is the foam Y of the paper")
     for name, text in (("length", "[m]"), ("mass", "[kg]"), ("radius", "[m]")):
         parser.add_argument(
@@ -251,44 +251,46 @@ def _schema(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="FILE", help="file to write; printed when absent")
 
 
-COMMANDS: tuple[Command, ...] = (
-    Command("init", "write a commented configuration from a robot and recordings of it", "init", _init),
-    Command("solve", "estimate the free parameters from recordings", "solve", _doubting_or_embedded),
-    Command("compare", "run several methods on one problem and say whether they agree", "compare", _doubting),
-    Command(
+COMMANDS: tuple[CliCommand, ...] = (
+    CliCommand("init", "write a commented configuration from a robot and recordings of it", "init", _init),
+    CliCommand("solve", "estimate the free parameters from recordings", "solve", _doubting_or_embedded),
+    CliCommand("compare", "run several methods on one problem and say whether they agree", "compare", _doubting),
+    CliCommand(
         "identifiability",
         "say which parameters the recordings determine, and which experiment would tell more",
         "identifiability",
         _identifiability,
     ),
-    Command(
+    CliCommand(
         "diagnose",
         "find the gap between model and recordings, and what makes it",
         "diagnose",
         _diagnose,
     ),
-    Command(
+    CliCommand(
         "blind",
         "prove the diagnosis on virtual recordings whose effect is withheld; goes on where it was interrupted",
         "blind",
         _blind,
     ),
-    Command("batch", "solve or diagnose many recordings or robots, one table and report of all", "batch", _batch),
-    Command("report", "compare runs of one model: what drifted, which run to distrust", "report", _report),
-    Command("plan", "plan a motion of the arms with the identified model", "plan", _configured),
-    Command("simulate", "write what the model says would be recorded", "simulate", _simulate),
-    Command("check", "validate a configuration, its recordings and the model before a long run", "check", _doubting),
-    Command("inspect", "show the model's equations: names, patterns, single entries, numbers", "inspect", _inspect),
-    Command("track", "measure the object's points in the frames of a depth camera", "track", _track),
-    Command("import", "turn a file of another tool into a recording", "import_recording", _import),
-    Command("export", "turn a recording into CSV or MCAP, a run into MJCF, URDF, SDF, YAML or MCAP", "export", _export),
-    Command(
+    CliCommand("batch", "solve or diagnose many recordings or robots, one table and report of all", "batch", _batch),
+    CliCommand("report", "compare runs of one model: what drifted, which run to distrust", "report", _report),
+    CliCommand("plan", "plan a motion of the arms with the identified model", "plan", _configured),
+    CliCommand("simulate", "write what the model says would be recorded", "simulate", _simulate),
+    CliCommand("check", "validate a configuration, its recordings and the model before a long run", "check", _doubting),
+    CliCommand("inspect", "show the model's equations: names, patterns, single entries, numbers", "inspect", _inspect),
+    CliCommand("track", "measure the object's points in the frames of a depth camera", "track", _track),
+    CliCommand("import", "turn a file of another tool into a recording", "import_recording", _import),
+    CliCommand(
+        "export", "turn a recording into CSV or MCAP, a run into MJCF, URDF, SDF, YAML or MCAP", "export", _export
+    ),
+    CliCommand(
         "completion",
         "print what makes a shell complete commands, options, files and settings",
         "completion",
         _completion,
     ),
-    Command("schema", "print the JSON Schema of configuration files, for editors", "schema", _schema),
+    CliCommand("schema", "print the JSON Schema of configuration files, for editors", "schema", _schema),
 )
 
 
@@ -305,7 +307,7 @@ class _Parser(argparse.ArgumentParser):
             flag, flags = rest[0].partition("=")[0], [name for name in self._option_string_actions if name[:2] == "--"]
             if not flag.startswith("-"):
                 raise ConfigError(f"'{rest[0]}' is one argument too many", where=self.prog, hint=self._help())
-            raise ConfigError(f"there is no option '{flag}'", where=self.prog, **choices(flag, flags))
+            raise ConfigError(f"there is no option '{flag}'", where=self.prog, **unknown_name_details(flag, flags))
         return found, rest
 
     def error(self, message: str) -> NoReturn:
@@ -314,14 +316,16 @@ class _Parser(argparse.ArgumentParser):
         if chosen:
             known = [name.strip(" '") for name in chosen[3].split(",")]
             noun = "command" if chosen[1] == "COMMAND" else f"choice of {chosen[1]}"
-            raise ConfigError(f"there is no {noun} '{chosen[2]}'", where=self.prog, **choices(chosen[2], known))
+            raise ConfigError(
+                f"there is no {noun} '{chosen[2]}'", where=self.prog, **unknown_name_details(chosen[2], known)
+            )
         raise ConfigError(message, where=self.prog, hint=self._help())
 
     def _help(self) -> str:
         return f"{self.prog} --help says what it takes"
 
 
-def parser() -> argparse.ArgumentParser:
+def build_argument_parser() -> argparse.ArgumentParser:
     """The argument parser of all commands; its errors are `ConfigError`."""
     from yid_ocp import __version__
 
@@ -330,22 +334,22 @@ def parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for row in COMMANDS:
         added = commands.add_parser(row.name, help=row.help, description=row.help[0].upper() + row.help[1:] + ".")
-        row.arguments(added)
-        added.set_defaults(module=row.module)
+        row.add_arguments(added)
+        added.set_defaults(module=row.workflow_module)
     return top
 
 
 def _wrong(error: YidError, as_json: bool) -> int:
     print(f"error: {error}", file=sys.stderr)
     parts = {"where": error.where, "allowed": error.allowed, "hint": error.hint}
-    _told(as_json, type(error).__name__, error.what, WRONG_INPUT, **parts)
-    return WRONG_INPUT
+    _told(as_json, type(error).__name__, error.what, _EXIT_WRONG_INPUT, **parts)
+    return _EXIT_WRONG_INPUT
 
 
 def _told(as_json: bool, kind: str, what: str, code: int, **parts: str) -> None:
     """Print an error as JSON on standard output, where `--json` is set."""
     if as_json and sys.stdout is not None:
-        print(json.dumps({"format": ERROR, "kind": kind, "what": what, **parts, "exit_code": code}, indent=1))
+        print(json.dumps({"format": _ERROR_FORMAT, "kind": kind, "what": what, **parts, "exit_code": code}, indent=1))
 
 
 @contextlib.contextmanager
@@ -381,20 +385,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         printed as `yid-error/1` as well: kind, what, where, allowed, hint and exit_code.
     """
     if "_ARGCOMPLETE" in os.environ:
-        import_module("yid_ocp.workflow.completion").answer(parser())
+        import_module("yid_ocp.workflow.completion").complete_arguments(build_argument_parser())
     as_json = "--json" in (sys.argv[1:] if argv is None else argv)
     try:
-        arguments = parser().parse_args(argv)
+        arguments = build_argument_parser().parse_args(argv)
     except SystemExit as error:
         return int(error.code or 0)
     except ConfigError as error:
         return _wrong(error, as_json)
     try:
-        with interruption.signals_raised(), _notices():
+        with interruption.raise_on_signals(), _notices():
             return _carried_out(arguments, as_json)
     except KeyboardInterrupt as error:
         what = f"interrupted ({str(error) or 'SIGINT'}); nothing half-finished was left"
-        code = error.number + 128 if isinstance(error, interruption.Interrupted) else INTERRUPTED
+        code = error.signal_number + 128 if isinstance(error, interruption.InterruptedBySignal) else _EXIT_INTERRUPTED
         print(what, file=sys.stderr)
         _told(as_json, "Interrupted", what, code)
         return code
@@ -414,9 +418,9 @@ def _carried_out(arguments: argparse.Namespace, as_json: bool) -> int:
         sys.stdout.flush()
         return code
     except Exception as error:
-        number = interruption.asked()
+        number = interruption.received_signal()
         if number is not None:  # what a library makes of being interrupted is no cause
-            raise interruption.Interrupted(number) from error
+            raise interruption.InterruptedBySignal(number) from error
         return _failed(error, as_json)
 
 
@@ -441,5 +445,5 @@ def _failed(error: Exception, as_json: bool) -> int:
         traceback.print_exception(error, file=file)
     what = f"{type(error).__name__}: {error}"
     print(f"bug: {what}\n  please report it with {file.name}", file=sys.stderr)
-    _told(as_json, "bug", what, BUG, where=file.name)
-    return BUG
+    _told(as_json, "bug", what, _EXIT_BUG, where=file.name)
+    return _EXIT_BUG

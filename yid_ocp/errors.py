@@ -58,18 +58,18 @@ class ResourceError(YidError):
     """The machine has too little memory."""
 
 
-MANY, FEW = 40, 8
+_MAX_LISTED_NAMES, _N_NEAREST_NAMES = 40, 8
 """Largest number of names listed in full where none is similar, and number of names listed otherwise."""
 
 
-class Choices(TypedDict):
+class UnknownNameDetails(TypedDict):
     """Allowed names and hint for an error about an unknown name."""
 
     allowed: str
     hint: str
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
+def nearest_name_hint(name: str, known: Iterable[str]) -> str:
     """Hint for an error about an unknown name: the most similar known name, or a list of known names.
 
     Parameters
@@ -82,19 +82,19 @@ def nearest(name: str, known: Iterable[str]) -> str:
     Returns
     -------
     str
-        A sentence for the `hint` of an error that does not say what is allowed; beside a list, see `choices`.
+        A sentence for the `hint` of an error that does not say what is allowed; beside a list, see `unknown_name_details`.
     """
     names = [str(entry) for entry in known]
     return _meant(name, names) or f"known: {_listed(name, sorted(names)) or 'none'}"
 
 
-def choices(name: str, known: Iterable[str]) -> Choices:
+def unknown_name_details(name: str, known: Iterable[str]) -> UnknownNameDetails:
     """Allowed names and hint for an error about an unknown name; long lists are cut.
 
     Parameters
     ----------
     name, known
-        As in `nearest`.
+        As in `nearest_name_hint`.
 
     Returns
     -------
@@ -118,8 +118,8 @@ def _meant(name: str, names: Sequence[str]) -> str:
 
 def _listed(name: str, names: Sequence[str]) -> str:
     """All names, or the most similar ones of many."""
-    close = _close(name, names, FEW)
-    if len(names) <= FEW or (not close and len(names) <= MANY):
+    close = _close(name, names, _N_NEAREST_NAMES)
+    if len(names) <= _N_NEAREST_NAMES or (not close and len(names) <= _MAX_LISTED_NAMES):
         return ", ".join(names)
-    shown = [*close, *(entry for entry in names if entry not in close)][:FEW]
-    return f"{', '.join(shown)} and {len(names) - FEW} more"
+    shown = [*close, *(entry for entry in names if entry not in close)][:_N_NEAREST_NAMES]
+    return f"{', '.join(shown)} and {len(names) - _N_NEAREST_NAMES} more"

@@ -18,7 +18,7 @@ from yid_ocp.errors import DataError, OutputError
 
 
 @contextlib.contextmanager
-def new_file(path: Path) -> Iterator[Path]:
+def atomic_write(path: Path) -> Iterator[Path]:
     """Context manager that writes a file atomically: the yielded temporary file replaces `path` on success.
 
     Parameters
@@ -47,7 +47,7 @@ def new_file(path: Path) -> Iterator[Path]:
         os.replace(temporary, path)
     except (OSError, RuntimeError) as error:
         what, hint = (
-            f"the file cannot be written ({reason(error)})",
+            f"the file cannot be written ({os_error_reason(error)})",
             "choose a writable folder on a disk with room",
         )
         raise OutputError(what, where=str(path), hint=hint) from error
@@ -57,13 +57,13 @@ def new_file(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a UTF-8 text file atomically; errors as `new_file`."""
-    with new_file(path) as temporary:
+    """Write a UTF-8 text file atomically; errors as `atomic_write`."""
+    with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, data: Any) -> None:
-    """Write plain data as indented JSON atomically; errors as `new_file`, and ValueError for infinities and NaN."""
+    """Write plain data as indented JSON atomically; errors as `atomic_write`, and ValueError for infinities and NaN."""
     write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
 
 
@@ -99,21 +99,21 @@ def file_sha256(path: Path) -> str:
     except FileNotFoundError as error:
         raise DataError("there is no such file", where=str(path), hint="check the path") from error
     except OSError as error:
-        raise DataError(f"the file cannot be read ({reason(error)})", where=str(path)) from error
+        raise DataError(f"the file cannot be read ({os_error_reason(error)})", where=str(path)) from error
     return digest.hexdigest()
 
 
-def content_hash(data: Any) -> str:
+def json_sha256(data: Any) -> str:
     """SHA-256 of plain data as JSON, independent of key order; 64 hexadecimal digits."""
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
-def jsonable(value: Any, notes: list[str] | None = None, path: str = "") -> Any:
+def to_json_types(value: Any, notes: list[str] | None = None, path: str = "") -> Any:
     """A value converted to JSON types; numbers that are not finite become None, with a line in `notes`."""
     if isinstance(value, Mapping):
-        return {str(k): jsonable(v, notes, f"{path}.{k}" if path else str(k)) for k, v in value.items()}
+        return {str(k): to_json_types(v, notes, f"{path}.{k}" if path else str(k)) for k, v in value.items()}
     if isinstance(value, (list, tuple, np.ndarray)):
-        return [jsonable(v, notes, f"{path}[{i}]") for i, v in enumerate(value)]
+        return [to_json_types(v, notes, f"{path}[{i}]") for i, v in enumerate(value)]
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):
@@ -123,7 +123,7 @@ def jsonable(value: Any, notes: list[str] | None = None, path: str = "") -> Any:
     return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)
 
 
-def reason(error: Exception) -> str:
+def os_error_reason(error: Exception) -> str:
     """Reason of an error of the operating system or HDF5, in words."""
     number = getattr(error, "errno", None)
     return os.strerror(number) if number else str(error).strip("'\"")

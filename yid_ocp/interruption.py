@@ -12,28 +12,30 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
 
-PATIENCE = 2.0
+_RERAISE_INTERVAL = 2.0
 """Time after which a suppressed interruption is raised again [s]."""
 
-LAST_RESORT = 10.0
+_FORCED_EXIT_DELAY = 10.0
 """Time after which a process that does not end is killed [s]."""
 
-SIGNALS = tuple(signal.Signals[name] for name in ("SIGINT", "SIGTERM", "SIGHUP") if name in signal.Signals.__members__)
+_TERMINATION_SIGNALS = tuple(
+    signal.Signals[name] for name in ("SIGINT", "SIGTERM", "SIGHUP") if name in signal.Signals.__members__
+)
 """Signals that end a command, as far as the system has them."""
 
 
-class Interrupted(KeyboardInterrupt):
+class InterruptedBySignal(KeyboardInterrupt):
     """Exception raised when a signal ends the command.
 
     Parameters
     ----------
-    number : int
+    signal_number : int
         The signal's.
     """
 
-    def __init__(self, number: int) -> None:
-        super().__init__(signal.Signals(number).name)
-        self.number = number
+    def __init__(self, signal_number: int) -> None:
+        super().__init__(signal.Signals(signal_number).name)
+        self.signal_number = signal_number
 
 
 class _State:
@@ -48,13 +50,13 @@ class _State:
 _STATE = _State()
 
 
-def asked() -> int | None:
+def received_signal() -> int | None:
     """Number of the signal that requested the command's end; None if there was none."""
     return _STATE.asked
 
 
 @contextlib.contextmanager
-def deferred() -> Iterator[None]:
+def defer_interruption() -> Iterator[None]:
     """Context manager that delays an interruption until its short block has ended."""
     _STATE.deferring += 1
     before = _STATE.asked
@@ -63,11 +65,11 @@ def deferred() -> Iterator[None]:
     finally:
         _STATE.deferring -= 1
     if not _STATE.deferring and _STATE.asked is not None and before is None:
-        raise Interrupted(_STATE.asked)
+        raise InterruptedBySignal(_STATE.asked)
 
 
 @contextlib.contextmanager
-def removed_by_force(folder: Path) -> Iterator[None]:
+def remove_on_forced_exit(folder: Path) -> Iterator[None]:
     """Context manager that removes a folder if the process is killed during its block."""
     _STATE.unfinished.add(folder)
     try:
@@ -77,18 +79,18 @@ def removed_by_force(folder: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def signals_raised() -> Iterator[None]:
-    """Context manager that raises `Interrupted` for SIGINT, SIGTERM and SIGHUP during its block.
+def raise_on_signals() -> Iterator[None]:
+    """Context manager that raises `InterruptedBySignal` for SIGINT, SIGTERM and SIGHUP during its block.
 
     An exception can get lost: in what collects garbage, in callbacks of libraries, in a call that does not come back.
-    So it is raised again every `PATIENCE` seconds, and after `LAST_RESORT` seconds the process is ended with the exit
-    code that shells expect, when nothing but the folders of `removed_by_force` has to be cleared away. Signals that the
+    So it is raised again every `_RERAISE_INTERVAL` seconds, and after `_FORCED_EXIT_DELAY` seconds the process is ended with the exit
+    code that shells expect, when nothing but the folders of `remove_on_forced_exit` has to be cleared away. Signals that the
     parent had ignored stay so, as under `nohup`. Outside the main thread nothing is changed.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = {number: signal.getsignal(number) for number in SIGNALS}
+    before = {number: signal.getsignal(number) for number in _TERMINATION_SIGNALS}
     taken = {number: handler for number, handler in before.items() if handler not in (signal.SIG_IGN, None)}
     told, tell = socket.socketpair()
     tell.setblocking(False)
@@ -114,7 +116,7 @@ def signals_raised() -> Iterator[None]:
 def _raise(number: int, frame: FrameType | None) -> None:
     _STATE.asked = number
     if not _STATE.deferring:
-        raise Interrupted(number)
+        raise InterruptedBySignal(number)
 
 
 def _watch(told: socket.socket, ended: threading.Event, main: int) -> None:
@@ -124,11 +126,11 @@ def _watch(told: socket.socket, ended: threading.Event, main: int) -> None:
         received = told.recv(64)
         if not received:
             return
-        number = next((int(entry) for entry in SIGNALS if entry in received), None)
+        number = next((int(entry) for entry in _TERMINATION_SIGNALS if entry in received), None)
     waited = 0.0
-    while not ended.wait(PATIENCE):
-        waited += PATIENCE
-        if waited >= LAST_RESORT or not hasattr(signal, "pthread_kill"):
+    while not ended.wait(_RERAISE_INTERVAL):
+        waited += _RERAISE_INTERVAL
+        if waited >= _FORCED_EXIT_DELAY or not hasattr(signal, "pthread_kill"):
             for folder in tuple(_STATE.unfinished):
                 shutil.rmtree(folder, ignore_errors=True)
             os._exit(128 + number)

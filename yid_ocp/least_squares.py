@@ -10,35 +10,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-Rows = Callable[[Array], tuple[Array, Array]]
-Project = Callable[[Array], Array]
+_ResidualFunction = Callable[[Array], tuple[Array, Array]]
+_Projection = Callable[[Array], Array]
 
 _FIRST_DAMPING, _MOST_DAMPING = 1e-3, 1e8
 
 
 @dataclass(frozen=True)
-class SmallFit:
+class LeastSquaresResult:
     """Result of a least-squares minimisation.
 
     Attributes
     ----------
     x : ndarray, shape (n,)
-    cost : float
+    sum_of_squares : float
         Sum of squares there.
     jacobian : ndarray, shape (m, n)
-    iterations : int
-    converged : bool
+    n_iterations : int
+    has_converged : bool
     """
 
     x: Array
-    cost: float
+    sum_of_squares: float
     jacobian: Array
-    iterations: int
-    converged: bool
+    n_iterations: int
+    has_converged: bool
 
 
 @dataclass(frozen=True)
-class Quadratic:
+class LocalQuadraticModel:
     """A local quadratic model of a cost, for costs that are not a plain sum of squares or have many residuals.
 
     Attributes
@@ -53,44 +53,44 @@ class Quadratic:
     gradient: Array
     hessian: Array
 
-    def change(self, damping: float) -> Array:
+    def damped_step(self, damping: float) -> Array:
         """The step that minimises the model with Levenberg-Marquardt damping, shape (n,)."""
         damped = self.hessian + damping * np.diag(np.diag(self.hessian))
         return np.asarray(-np.linalg.solve(damped, self.gradient))
 
 
 @dataclass(frozen=True)
-class QuadraticFit:
-    """Result of `damped_newton`: minimiser `x` (n,), the model there, iterations, convergence."""
+class DampedNewtonResult:
+    """Result of `minimize_by_damped_newton`: minimiser `x` (n,), the model there, iterations, convergence."""
 
     x: Array
-    model: Quadratic
-    iterations: int
-    converged: bool
+    final_model: LocalQuadraticModel
+    n_iterations: int
+    has_converged: bool
 
 
 def levenberg_marquardt(
-    rows: Rows,
-    start: Array,
+    residual_function: _ResidualFunction,
+    initial_guess: Array,
     *,
-    project: Project | None = None,
-    largest_step: float = 0.5,
-    iterations: int = 200,
+    projection: _Projection | None = None,
+    max_step: float = 0.5,
+    max_iterations: int = 200,
     step_tolerance: float = 1e-9,
     cost_tolerance: float = 1e-10,
-) -> SmallFit:
+) -> LeastSquaresResult:
     """Minimise |r(x)|^2 by damped Gauss-Newton steps, the damping in units of the columns' norms.
 
     Parameters
     ----------
-    rows : callable
+    residual_function : callable
         From x to residual (m,) and Jacobian (m, n).
-    start : ndarray, shape (n,)
-    project : callable, optional
+    initial_guess : ndarray, shape (n,)
+    projection : callable, optional
         Brings a trial point back to where it may be.
-    largest_step : float
+    max_step : float
         No component moves by more in one step.
-    iterations : int
+    max_iterations : int
     step_tolerance, cost_tolerance : float
         Converged when no component would move by more, or when the cost falls by less than this part.
 
@@ -98,35 +98,37 @@ def levenberg_marquardt(
     ----------
     Nocedal and Wright (2006), Numerical Optimization, section 10.3, doi:10.1007/978-0-387-40065-5.
     """
-    limits = _Limits(largest_step, iterations, step_tolerance, cost_tolerance, 1e-12)
-    x, model, used, converged = _descend(lambda x: _SumOfSquares(*rows(x)), start, project, limits)
-    return SmallFit(x, model.cost, model.jacobian, used, converged)
+    limits = _Limits(max_step, max_iterations, step_tolerance, cost_tolerance, 1e-12)
+    x, model, used, converged = _descend(
+        lambda x: _SumOfSquares(*residual_function(x)), initial_guess, projection, limits
+    )
+    return LeastSquaresResult(x, model.cost, model.jacobian, used, converged)
 
 
-def damped_newton(
-    quadratic: Callable[[Array], Quadratic],
-    start: Array,
+def minimize_by_damped_newton(
+    quadratic_model: Callable[[Array], LocalQuadraticModel],
+    initial_guess: Array,
     *,
-    largest_step: float = 0.5,
-    iterations: int = 200,
+    max_step: float = 0.5,
+    max_iterations: int = 200,
     step_tolerance: float = 1e-9,
     cost_tolerance: float = 1e-10,
-    least_damping: float = 1e-9,
-) -> QuadraticFit:
+    min_damping: float = 1e-9,
+) -> DampedNewtonResult:
     """Minimise a cost given by local quadratic models, with the loop of `levenberg_marquardt`.
 
     Parameters
     ----------
-    quadratic : callable
+    quadratic_model : callable
         From x to the cost about it.
-    start : ndarray, shape (n,)
+    initial_guess : ndarray, shape (n,)
     largest_step, iterations, step_tolerance, cost_tolerance
         As for `levenberg_marquardt`.
-    least_damping : float
+    min_damping : float
         Of every step; some damping keeps a search on a robust cost from leaping out of its valley.
     """
-    limits = _Limits(largest_step, iterations, step_tolerance, cost_tolerance, least_damping)
-    return QuadraticFit(*_descend(quadratic, start, None, limits))
+    limits = _Limits(max_step, max_iterations, step_tolerance, cost_tolerance, min_damping)
+    return DampedNewtonResult(*_descend(quadratic_model, initial_guess, None, limits))
 
 
 @dataclass(frozen=True)
@@ -144,7 +146,7 @@ class _Model(Protocol):
     @property
     def cost(self) -> float: ...
 
-    def change(self, damping: float) -> Array: ...
+    def damped_step(self, damping: float) -> Array: ...
 
 
 _M = TypeVar("_M", bound=_Model)
@@ -157,7 +159,7 @@ class _SumOfSquares:
         self.residual, self.jacobian = residual, jacobian
         self.cost = float(residual @ residual)
 
-    def change(self, damping: float) -> Array:
+    def damped_step(self, damping: float) -> Array:
         scale = np.sqrt(damping) * np.maximum(np.linalg.norm(self.jacobian, axis=0), 1e-9)
         stacked = np.vstack([self.jacobian, np.diag(scale)])
         return np.asarray(
@@ -166,13 +168,13 @@ class _SumOfSquares:
 
 
 def _descend(
-    model_at: Callable[[Array], _M], start: Array, project: Project | None, limits: _Limits
+    model_at: Callable[[Array], _M], start: Array, project: _Projection | None, limits: _Limits
 ) -> tuple[Array, _M, int, bool]:
     """The minimiser, its model, iterations used, and whether it converged."""
     x = np.array(start, float)
     model, damping = model_at(x), _FIRST_DAMPING
     for iteration in range(1, limits.iterations + 1):
-        change = model.change(damping)
+        change = model.damped_step(damping)
         size = float(np.max(np.abs(change), initial=0.0))
         change = change * min(1.0, limits.largest_step / max(size, 1e-12))
         trial = x + change if project is None else project(x + change)

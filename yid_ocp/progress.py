@@ -7,7 +7,7 @@ import threading
 from typing import Protocol
 
 
-class Point(Protocol):
+class AcceptedIterate(Protocol):
     """A point that a search accepted: iteration, cost, elapsed time [s] and a note."""
 
     @property
@@ -34,48 +34,48 @@ class Point(Protocol):
 class Progress(Protocol):
     """Receiver of progress reports; called by one thread at a time."""
 
-    def stage(self, text: str) -> None:
+    def begin_stage(self, text: str) -> None:
         """Report that a new stage of the work begins."""
         ...
 
-    def iterate(self, entry: Point) -> None:
+    def report_iterate(self, entry: AcceptedIterate) -> None:
         """Report that a search accepted a point."""
         ...
 
-    def advance(self, done: int, total: int, text: str) -> None:
+    def report_parts_done(self, done: int, total: int, text: str) -> None:
         """Report that `done` of `total` parts of the stage are finished; `text` names the last or next one."""
         ...
 
 
-class Silent:
+class NullProgress:
     """Progress that is not reported."""
 
-    def stage(self, text: str) -> None:
+    def begin_stage(self, text: str) -> None:
         """Ignore the report."""
 
-    def iterate(self, entry: Point) -> None:
+    def report_iterate(self, entry: AcceptedIterate) -> None:
         """Ignore the report."""
 
-    def advance(self, done: int, total: int, text: str) -> None:
+    def report_parts_done(self, done: int, total: int, text: str) -> None:
         """Ignore the report."""
 
 
-class Logged(Silent):
+class LoggingProgress(NullProgress):
     """Progress as log messages."""
 
     def __init__(self, log: logging.Logger) -> None:
         self._log = log
 
-    def stage(self, text: str) -> None:
+    def begin_stage(self, text: str) -> None:
         """Log the name of the stage."""
         self._log.info("%s", text)
 
-    def advance(self, done: int, total: int, text: str) -> None:
+    def report_parts_done(self, done: int, total: int, text: str) -> None:
         """Log the number of finished parts."""
         self._log.info("%d of %d, %s", done, total, text)
 
 
-class Parts:
+class ParallelProgress:
     """Progress of a stage whose parts run in parallel; counts them as they finish.
 
     Parameters
@@ -89,13 +89,13 @@ class Parts:
 
     def __init__(self, progress: Progress, total: int, first: str) -> None:
         self._progress, self._total, self._count, self._lock = progress, total, 0, threading.Lock()
-        progress.advance(0, total, first)
+        progress.report_parts_done(0, total, first)
 
-    def done(self, text: str) -> None:
+    def count_done(self, text: str) -> None:
         """Report one more finished part; may be called from any thread."""
         with self._lock:
             self._count += 1
-            self._progress.advance(self._count, self._total, text)
+            self._progress.report_parts_done(self._count, self._total, text)
 
 
-SILENT = Silent()
+NULL_PROGRESS = NullProgress()

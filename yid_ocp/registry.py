@@ -5,31 +5,31 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from typing import Generic, TypeVar
 
-from yid_ocp.errors import ConfigError, choices
+from yid_ocp.errors import ConfigError, unknown_name_details
 
-T = TypeVar("T")
+_Entry = TypeVar("_Entry")
 
 
-class Registry(Generic[T]):
+class Registry(Generic[_Entry]):
     """A table from name to implementation, filled by decorators.
 
     Parameters
     ----------
-    noun : str
+    entry_noun : str
         What the entries are, used in error messages.
     """
 
-    def __init__(self, noun: str) -> None:
-        self.noun = noun
-        self._entries: dict[str, T] = {}
+    def __init__(self, entry_noun: str) -> None:
+        self.entry_noun = entry_noun
+        self._entries: dict[str, _Entry] = {}
 
-    def register(self, name: str) -> Callable[[T], T]:
+    def register(self, name: str) -> Callable[[_Entry], _Entry]:
         """A decorator that registers its argument under `name`."""
 
-        def enter(entry: T) -> T:
+        def enter(entry: _Entry) -> _Entry:
             if name in self._entries:
                 raise ConfigError(
-                    f"the name '{name}' is taken: another {self.noun} has it",
+                    f"the name '{name}' is taken: another {self.entry_noun} has it",
                     hint="register it under another name",
                 )
             self._entries[name] = entry
@@ -37,14 +37,14 @@ class Registry(Generic[T]):
 
         return enter
 
-    def forget(self, names: Iterable[str]) -> None:
+    def unregister(self, names: Iterable[str]) -> None:
         """Remove entries, such as those of a module whose import failed."""
         for name in names:
             self._entries.pop(name, None)
 
-    def __getitem__(self, name: str) -> T:
+    def __getitem__(self, name: str) -> _Entry:
         if name not in self._entries:
-            raise ConfigError(f"there is no {self.noun} '{name}'", **choices(name, self))
+            raise ConfigError(f"there is no {self.entry_noun} '{name}'", **unknown_name_details(name, self))
         return self._entries[name]
 
     def __contains__(self, name: object) -> bool:

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
 
-SOURCES = (".py", ".c")
-NUMERICAL = ("casadi", "numpy", "scipy", "h5py")
+_SOURCE_SUFFIXES = (".py", ".c")
+_NUMERICAL_PACKAGES = ("casadi", "numpy", "scipy", "h5py")
 """Packages whose versions are stored with every result."""
 
 
@@ -19,35 +19,35 @@ def package_version() -> str:
     return _version("yid-ocp", "0+unknown")
 
 
-def versions() -> dict[str, str]:
+def installed_versions() -> dict[str, str]:
     """Versions of Python, this package and its numerical dependencies, by name."""
     result = {"python": platform.python_version(), "platform": f"{platform.system()} {platform.machine()}"}
-    return result | {name: _version(name, "not installed") for name in ("yid-ocp", *NUMERICAL)}
+    return result | {name: _version(name, "not installed") for name in ("yid-ocp", *_NUMERICAL_PACKAGES)}
 
 
-def code_hash(folder: Path) -> str:
+def source_hash(folder: Path) -> str:
     """SHA-256 of all source files in a folder and its subfolders; 64 hexadecimal digits."""
     digest = hashlib.sha256()
-    for file in sorted(path for path in folder.rglob("*") if path.suffix in SOURCES):
+    for file in sorted(path for path in folder.rglob("*") if path.suffix in _SOURCE_SUFFIXES):
         content = hashlib.sha256(file.read_bytes()).hexdigest()
         digest.update(f"{file.relative_to(folder).as_posix()} {content}\n".encode())
     return digest.hexdigest()
 
 
 @functools.cache
-def package_code() -> str:
-    """`code_hash` of this package at the first call in this process."""
-    return code_hash(Path(__file__).parent)
+def package_source_hash() -> str:
+    """`source_hash` of this package at the first call in this process."""
+    return source_hash(Path(__file__).parent)
 
 
-def fingerprint() -> dict[str, str]:
+def software_fingerprint() -> dict[str, str]:
     """Versions and source hash that two processes must share to produce the same numbers."""
     python = ".".join(platform.python_version_tuple()[:2])
-    own = {name: text for name, text in versions().items() if name in ("yid-ocp", *NUMERICAL)}
-    return {"python": python, **own, "code": package_code()}
+    own = {name: text for name, text in installed_versions().items() if name in ("yid-ocp", *_NUMERICAL_PACKAGES)}
+    return {"python": python, **own, "code": package_source_hash()}
 
 
-def differences(here: Mapping[str, str], there: Mapping[str, str]) -> list[str]:
+def fingerprint_differences(here: Mapping[str, str], there: Mapping[str, str]) -> list[str]:
     """Descriptions of the entries in which two fingerprints differ."""
 
     def shown(name: str, value: str) -> str:

@@ -12,7 +12,7 @@ from yid_ocp.data import Recording
 from yid_ocp.data.recording import JointGroup, PointGroup
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Grasp, Segment, System, flexible_object
-from yid_ocp.model.drives import Spring
+from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.workflow.build import load_problem
@@ -41,7 +41,7 @@ def golden_problem(golden, paper_systems, single_step, dual_step):
             names, seen = [f"w_T{i + 1}" for i in free], trep.w[at - 1][:, free]
             groups.append(PointGroup("points_camera", names, t[at], seen, 5e-3, sensor="camera", pose=np.eye(4)))
         start = np.concatenate([trep.q[0], trep.p[0]])
-        options = ProblemOptions(feedback="proportional", known_start={"golden": start}, path_cutoff=math.inf)
+        options = ProblemOptions(feedback="proportional", known_initial_states={"golden": start}, path_cutoff=math.inf)
         values = dict(zip(STIFFNESSES, map(float, trep.rho), strict=True))
         recording = Recording(joints, tuple(groups), name="golden")
         return EstimationProblem(steps[name], [recording], STIFFNESSES, options, values)
@@ -71,7 +71,7 @@ def pendulum(urdf_folder):
     """pendulum(recording=None): a shoulder moved as measured, a springy elbow, the tip seen to 2 mm at 25 Hz."""
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     system = System.build(
-        robot, prescribed=["shoulder"], springs={"elbow": Spring(3.0, 0.0)}, damping=0.1, points=["tip"]
+        robot, prescribed=["shoulder"], springs={"elbow": RobotJointSpring(3.0, 0.0)}, damping=0.1, point_frames=["tip"]
     )
     step = compile_step(system, 0.01)
     t = 0.01 * np.arange(201)

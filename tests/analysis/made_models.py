@@ -11,9 +11,9 @@ from made_series import samples
 
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem.evaluation import Evaluation, ResidualRows
-from yid_ocp.problem.options import JointPrior
+from yid_ocp.problem.options import MultivariateGaussianPrior
 from yid_ocp.solvers.base import Solution, Status
-from yid_ocp.solvers.judgement import Estimate, Fit
+from yid_ocp.solvers.uncertainty import GoodnessOfFit, ParameterEstimate
 
 
 class Formula:
@@ -66,7 +66,7 @@ class Formula:
             known_start={},
             recording_values={},
             priors={},
-            joint_prior=JointPrior(),
+            joint_prior=MultivariateGaussianPrior(),
             path_cutoff=np.inf,
         )
         everything = samples(
@@ -115,20 +115,20 @@ class Formula:
         return Evaluation(cost, residual, jacobian if derivatives else None, True, "", done)
 
     def informing(self, evaluation: Evaluation) -> tuple[np.ndarray, np.ndarray]:
-        rows = self.rows.informing
+        rows = self.rows.without_weak_priors
         unit = np.ones(rows.stop)
         unit[self.rows.data] = self.noise
         return evaluation.residual[rows] / unit, evaluation.jacobian[rows] / unit[:, None]
 
 
-GOOD = Fit(1.0, 0.5, True)
+GOOD = GoodnessOfFit(1.0, 0.5, True)
 
 
-def estimate(value, std=0.1, verdict="identifiable", free=True, initial=1.0) -> Estimate:
-    return Estimate(value, std, "N m/rad", initial, 0.0, np.inf, free, verdict)
+def estimate(value, std=0.1, verdict="identifiable", free=True, initial=1.0) -> ParameterEstimate:
+    return ParameterEstimate(value, std, "N m/rad", initial, 0.0, np.inf, free, verdict)
 
 
-def solution(method="gauss_newton", status=Status.CONVERGED, cost=1.0, **parameters: Estimate) -> Solution:
+def solution(method="gauss_newton", status=Status.CONVERGED, cost=1.0, **parameters: ParameterEstimate) -> Solution:
     """What a method found; names are written with underscores for dots."""
     named = {name.replace("_", "."): entry for name, entry in parameters.items()}
     x = np.array([entry.value for entry in named.values()])

@@ -7,17 +7,17 @@ from types import SimpleNamespace
 import casadi as ca
 import numpy as np
 
-from yid_ocp.analysis.layouts import (
-    Setting,
+from yid_ocp.analysis.experiment_design import (
+    BaseExperiment,
 )
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import ProblemOptions
-from yid_ocp.problem.grid import Grid
+from yid_ocp.problem.time_grid import TimeGrid
 
-GRID = Grid(10.0, 0.1, 20)
+GRID = TimeGrid(10.0, 0.1, 20)
 
 
 def group(name="points_camera", names=("a", "b"), t=(10.0, 10.5, 11.0), std=2e-3, **more):
@@ -33,14 +33,14 @@ def setting(*groups, sensors=None, frames=("a", "b", "tip"), **more):
         options=ProblemOptions(sensors=sensors or {}),
         system=SimpleNamespace(mechanism=Mechanism("made", (), dict.fromkeys(frames))),
     )
-    return Setting(problem, np.zeros(1), **more), episode
+    return BaseExperiment(problem, np.zeros(1), **more), episode
 
 
 def places(system, frames, q):
     """Positions of frames at a configuration."""
-    symbol = ca.SX.sym("q", system.size)
+    symbol = ca.SX.sym("q", system.n_coordinates)
     kinematics = forward_kinematics(system.mechanism, symbol)
-    expression = ca.horzcat(*(kinematics.position(frame) for frame in frames))
+    expression = ca.horzcat(*(kinematics.frame_position(frame) for frame in frames))
     function = ca.Function("at", [symbol, system.parameters.symbols], [expression])
     return np.array(function(q, system.parameters.vector())).T
 

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from yid_ocp.analysis.compare import compare
+from yid_ocp.analysis.compare import compare_methods
 from yid_ocp.cli import main
 from yid_ocp.data import read_recording
 from yid_ocp.integrator.step import compile_step
@@ -25,41 +25,43 @@ def problem(paper_systems, clean):
 
 def test_methods_agree_on_what_the_data_inform(problem):
     told = []
-    found = compare(problem, [GaussNewton(), SingleShooting()], {"T3.twist": 9.7}, lambda name, _: told.append(name))
-    assert found.agree
-    assert {run.method for run in found.runs} == set(told) == {"gauss_newton", "single_shooting"}
-    assert any("T3.twist (truth 9.7) cannot be found: where it ends" in sentence for sentence in found.explained)
-    for run in found.runs:
+    found = compare_methods(
+        problem, [GaussNewton(), SingleShooting()], {"T3.twist": 9.7}, lambda name, _: told.append(name)
+    )
+    assert found.is_consistent
+    assert {run.method for run in found.method_results} == set(told) == {"gauss_newton", "single_shooting"}
+    assert any("T3.twist (truth 9.7) cannot be found: where it ends" in sentence for sentence in found.explanations)
+    for run in found.method_results:
         assert run.wall_seconds > 0
-        assert run.peak_memory > 10
-        assert len(run.held_out) == 1
+        assert run.peak_memory_mib > 10
+        assert len(run.held_out_predictions) == 1
 
 
 def test_a_method_that_stops_early_is_said_to_differ(problem):
-    found = compare(problem, [GaussNewton(), SteepestDescent(iterations=2)])
-    assert found.reference == "gauss_newton"
-    assert not found.agree
-    assert any("iteration_limit" in sentence for sentence in found.agreement["steepest_descent"])
+    found = compare_methods(problem, [GaussNewton(), SteepestDescent(max_iterations=2)])
+    assert found.reference_method == "gauss_newton"
+    assert not found.is_consistent
+    assert any("iteration_limit" in sentence for sentence in found.disagreements["steepest_descent"])
 
 
 def test_steepest_descent_goes_wrong_exactly_where_nothing_is_found(problem):
     """The core of the paper's effect on a quick case; docs/comparison.md has its four experiments."""
     truth = {"T1.bend": 22.0, "T2.bend": 10.7, "T3.twist": 9.7}
-    descent = SteepestDescent(trial="spectral", memory=10, gradient_tolerance=1e-4)
-    found = compare(problem, [GaussNewton(), descent], truth)
-    assert found.agree
-    sentence = found.explained[-1]
+    descent = SteepestDescent(first_trial_step="spectral", nonmonotone_memory=10, gradient_tolerance=1e-4)
+    found = compare_methods(problem, [GaussNewton(), descent], truth)
+    assert found.is_consistent
+    sentence = found.explanations[-1]
     assert "T3.twist (3 for 9.7, cannot be found)" in sentence
     assert "T1.bend" not in sentence
     assert "T2.bend" not in sentence
     assert "exactly the parameters that are not found" in sentence
-    short = compare(problem, [GaussNewton(), SteepestDescent(iterations=2)], truth)
-    assert "could be found: the method stopped short (iteration_limit)" in short.explained[-1]
+    short = compare_methods(problem, [GaussNewton(), SteepestDescent(max_iterations=2)], truth)
+    assert "could be found: the method stopped short (iteration_limit)" in short.explanations[-1]
 
 
 def test_nothing_to_agree_on(repository, tmp_path, capsys):
     config = repository / "configs" / "springs_series_ends.yaml"
-    methods = "compare.methods={gauss_newton: {}, lifted: {iterations: 3}, multiple_shooting: {iterations: 2}}"
+    methods = "compare.methods={gauss_newton: {}, lifted: {max_iterations: 3}, multiple_shooting: {max_iterations: 2}}"
     assert main(["compare", str(config), "--out", str(tmp_path / "run"), "--set", methods]) == 0
     text = capsys.readouterr().out
     assert "lifted did not converge: no convergence in 3 iterations" in text

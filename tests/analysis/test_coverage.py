@@ -29,11 +29,11 @@ def judged(config: Path, seed: int) -> dict[str, Any]:
     """Of a twin: which of the intervals hold the truth, and which parameters are called identifiable."""
     exact = config.parents[1] / "tests" / "data" / "clean" / "single_arm_vision_estimate.h5"
     made = load_problem(config, ["problem.duration=3.0", f"recordings.estimate=[{exact}]"])
-    recording = twin_recording(made, np.array([TRUTH[name] for name in made.names]), seed)
+    recording = twin_recording(made, np.array([TRUTH[name] for name in made.unknown_names]), seed)
     problem = EstimationProblem(made.step, [recording], made.free, made.options, dict.fromkeys(TRUTH, 10.0))
     info = identifiability(problem, solve(problem, GaussNewton()), start="known", intervals=list(SEEN))
     held = [holds(info.parameters[name].interval, TRUTH[name]) for name in SEEN]
-    return {"held": held, "identifiable": list(info.identifiable)}
+    return {"held": held, "identifiable": list(info.identifiable_parameters)}
 
 
 def report(record_property, hits: dict[str, list[bool]]) -> float:

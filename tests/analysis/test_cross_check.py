@@ -8,13 +8,18 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from yid_ocp.analysis.cross_check import TOLERANCE, CrossCheck, check_file, check_system
-from yid_ocp.analysis.inspection import in_numbers
+from yid_ocp.analysis.pinocchio_comparison import (
+    _RELATIVE_TOLERANCE,
+    PinocchioComparison,
+    compare_system_with_pinocchio,
+    compare_urdf_with_pinocchio,
+)
+from yid_ocp.analysis.step_diagnostics import with_numeric_parameters
 from yid_ocp.effects import make_effect
 from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.model.mechanism import Mechanism
-from yid_ocp.model.rotations import roll_pitch_yaw
-from yid_ocp.model.urdf import read_urdf, robot_description_file
+from yid_ocp.model.rotations import rotation_from_rpy
+from yid_ocp.model.urdf import example_robot_urdf, read_urdf
 
 GRAVITY = np.array([0.3, -0.2, -9.81])
 
@@ -23,9 +28,9 @@ def branched(urdf_folder) -> System:
     """A pendulum and an object of three branches, the branches' joints one after the other in turn."""
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     soft = {"radius": 0.02, "links": 2, "bend": 4.0, "twist": 3.0}
-    turns = {"T2": roll_pitch_yaw(0.7, 0.0, 0.0), "T3": roll_pitch_yaw(-0.7, 0.2, 0.0)}
+    turns = {"T2": rotation_from_rpy(0.7, 0.0, 0.0), "T3": rotation_from_rpy(-0.7, 0.2, 0.0)}
     parts = [Segment("T1", 0.6, 0.1, **soft)]
-    parts += [Segment(name, 0.3, 0.05, parent="T1", rotation=turn, **soft) for name, turn in turns.items()]
+    parts += [Segment(name, 0.3, 0.05, parent="T1", rest_rotation=turn, **soft) for name, turn in turns.items()]
     grasps = [Grasp("hand", "tip", "w_T2")]
     return System.build(robot, objects=[(flexible_object(parts), None, None)], grasps=grasps, gravity=GRAVITY)
 
@@ -39,16 +44,18 @@ def interleaved(system: System) -> System:
     for i in range(6):
         order += [names.index(f"{tube}_{i // 3}_{'xyz'[i % 3]}") for tube in ("T2", "T3")]
     new = {old: i for i, old in enumerate(order)} | {-1: -1}
-    joints = tuple(replace(mechanism.joints[i], parent=new[mechanism.joints[i].parent]) for i in order)
-    frames = {name: replace(frame, joint=new[frame.joint]) for name, frame in mechanism.frames.items()}
-    return replace(system, mechanism=Mechanism("mixed", joints, frames, mechanism.parameters, mechanism.lines))
+    joints = tuple(replace(mechanism.joints[i], parent_index=new[mechanism.joints[i].parent_index]) for i in order)
+    frames = {name: replace(frame, joint_index=new[frame.joint_index]) for name, frame in mechanism.frames.items()}
+    return replace(system, mechanism=Mechanism("mixed", joints, frames, mechanism.parameters, mechanism.link_chains))
 
 
 @pytest.mark.parametrize("mixed", [False, True], ids=["in order", "branches in turn"])
 def test_a_built_model_is_pinocchios(urdf_folder, mixed):
     system = interleaved(branched(urdf_folder)) if mixed else branched(urdf_folder)
     rng = np.random.default_rng(2)
-    found = check_system(system, system.parameters.vector({"T2.mass": 0.4}), rng.uniform(-1, 1, system.size))
+    found = compare_system_with_pinocchio(
+        system, system.parameters.vector({"T2.mass": 0.4}), rng.uniform(-1, 1, system.n_coordinates)
+    )
     assert found.agrees
     assert max(found.mass, found.weight, found.motion) < 1e-12
     assert found.words.startswith("the built model: mass matrix, weight and inverse dynamics are Pinocchio's within ")
@@ -64,32 +71,35 @@ def test_effects_are_compared_as_well(urdf_folder, kind, location, value):
     names = effect.parameters.names
     system = system.with_effects([effect])
     theta = system.parameters.vector({names[0]: value})
-    found = check_system(system, theta, np.zeros(system.size))
+    found = compare_system_with_pinocchio(system, theta, np.zeros(system.n_coordinates))
     assert found.agrees, found.words
     # the effect is there
     plain = check_against(system, theta, system.parameters.vector())
     assert not plain.agrees
 
 
-def check_against(system, theta, other) -> CrossCheck:
+def check_against(system, theta, other) -> PinocchioComparison:
     """The system at `theta` beside Pinocchio's model of it at `other`."""
-    from yid_ocp.analysis import cross_check
+    from yid_ocp.analysis import pinocchio_comparison
 
     gravity = np.array(ca.DM(system.gravity)).ravel()
-    wrong = in_numbers(system, other).mechanism
-    models = [cross_check._assembled(wrong, gravity, weight) for weight in (False, True)]
-    mechanism = in_numbers(system, theta).mechanism
-    return cross_check._compared("it", mechanism, gravity, *models, np.zeros(system.size))
+    wrong = with_numeric_parameters(system, other).mechanism
+    models = [pinocchio_comparison._assembled(wrong, gravity, weight) for weight in (False, True)]
+    mechanism = with_numeric_parameters(system, theta).mechanism
+    return pinocchio_comparison._compared("it", mechanism, gravity, *models, np.zeros(system.n_coordinates))
 
 
 def test_a_wrong_number_is_said(urdf_folder):
     system = branched(urdf_folder)
     found = check_against(system, system.parameters.vector(), system.parameters.vector({"T2.mass": 0.0501}))
     assert not found.agrees
-    assert min(found.mass, found.weight, found.motion) > TOLERANCE
+    assert min(found.mass, found.weight, found.motion) > _RELATIVE_TOLERANCE
     assert found.words.startswith("it differs from Pinocchio's: mass matrix by ")
-    assert CrossCheck("it", 0.0, 0.02, 0.0).words == "it differs from Pinocchio's: weight by 2 % of the largest entry"
-    assert CrossCheck("it", 0.0, float("nan"), 0.0).agrees is False
+    assert (
+        PinocchioComparison("it", 0.0, 0.02, 0.0).words
+        == "it differs from Pinocchio's: weight by 2 % of the largest entry"
+    )
+    assert PinocchioComparison("it", 0.0, float("nan"), 0.0).agrees is False
 
 
 @pytest.mark.parametrize(
@@ -106,9 +116,9 @@ def test_a_wrong_number_is_said(urdf_folder):
 )
 def test_a_file_is_read_as_pinocchio_reads_it(urdf_folder, file, joints, locked):
     package = file.startswith("package:")
-    path = robot_description_file(file.removeprefix("package:")) if package else urdf_folder / file
+    path = example_robot_urdf(file.removeprefix("package:")) if package else urdf_folder / file
     robot = read_urdf(file if package else path, joints=joints, locked=locked)
-    found = check_file(path, robot, GRAVITY, joints, locked)
+    found = compare_urdf_with_pinocchio(path, robot, GRAVITY, joints, locked)
     assert found.agrees, found.words
     assert found.words.startswith(f"{path.name} as read: ")
 
@@ -119,7 +129,7 @@ def test_a_file_read_wrongly_is_said(urdf_folder):
     joint = robot.joints[-1]
     placement = replace(joint.placement, translation=joint.placement.translation + ca.SX(ca.DM([0.0, 0.0, 0.001])))
     wrong = replace(robot, joints=(*robot.joints[:-1], replace(joint, placement=placement)))
-    found = check_file(path, wrong, GRAVITY)
+    found = compare_urdf_with_pinocchio(path, wrong, GRAVITY)
     assert not found.agrees
     assert found.words.startswith("mixed_joints.urdf as read differs from Pinocchio's: ")
 
@@ -128,8 +138,8 @@ def test_a_lock_at_another_value_is_noticed(urdf_folder):
     path = urdf_folder / "mixed_joints.urdf"
     kept = ["extend", "hinge", "spin", "swing"]
     robot = read_urdf(path, joints=kept, locked={"nod": 0.7})
-    assert check_file(path, robot, GRAVITY, kept, {"nod": 0.7}).agrees
-    assert not check_file(path, robot, GRAVITY, kept, {"nod": 0.6}).agrees
+    assert compare_urdf_with_pinocchio(path, robot, GRAVITY, kept, {"nod": 0.7}).agrees
+    assert not compare_urdf_with_pinocchio(path, robot, GRAVITY, kept, {"nod": 0.6}).agrees
 
 
 @pytest.mark.parametrize(
@@ -137,15 +147,15 @@ def test_a_lock_at_another_value_is_noticed(urdf_folder):
     [("package:panda", ["panda_hand"], None), ("double_pendulum.urdf", ["lower"], ["shoulder"])],
 )
 def test_what_is_left_out_of_a_file_is_left_out_of_both(urdf_folder, file, left_out, joints):
-    path = robot_description_file("panda") if file.startswith("package:") else urdf_folder / file
+    path = example_robot_urdf("panda") if file.startswith("package:") else urdf_folder / file
     robot = read_urdf(path, joints=joints, exclude_links=left_out)
-    found = check_file(path, robot, GRAVITY, joints, None, left_out)
+    found = compare_urdf_with_pinocchio(path, robot, GRAVITY, joints, None, left_out)
     assert found.agrees, found.words
     whole = read_urdf(path, joints=robot.joint_names)
-    assert not check_file(path, whole, GRAVITY, robot.joint_names, None, left_out).agrees
+    assert not compare_urdf_with_pinocchio(path, whole, GRAVITY, robot.joint_names, None, left_out).agrees
 
 
 def test_a_file_that_pinocchio_does_not_read_is_said(tmp_path, urdf_folder):
     (tmp_path / "odd.urdf").write_text("<robot name='odd'><link name='a'/><link name='b'/></robot>")
     with pytest.raises(ValueError, match="valid URDF"):
-        check_file(tmp_path / "odd.urdf", read_urdf(urdf_folder / "double_pendulum.urdf"), GRAVITY)
+        compare_urdf_with_pinocchio(tmp_path / "odd.urdf", read_urdf(urdf_folder / "double_pendulum.urdf"), GRAVITY)

@@ -8,15 +8,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.analysis.dependence import SEEN, Dependence, _Linear, _readings, dependence, listing
-from yid_ocp.analysis.inspection import linearised_rows
-from yid_ocp.analysis.symbols import StepSymbols
+from yid_ocp.analysis.parameter_dependence import (
+    _MIN_RELATIVE_RESPONSE,
+    ParameterDependence,
+    _Linear,
+    _readings,
+    _summarize_rows,
+    parameter_dependences,
+)
+from yid_ocp.analysis.step_diagnostics import linearise_step_equations
+from yid_ocp.analysis.step_symbols import StepSymbols
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
-from yid_ocp.integrator.statics import Statics
+from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Segment, System, flexible_object
-from yid_ocp.model.drives import Spring
-from yid_ocp.model.rotations import roll_pitch_yaw, transform
+from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
+from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 
@@ -33,12 +40,12 @@ def judged(problem):
     """By parameter: its dependence about the rest at the first posture; the rest besides."""
     step, episode = problem.step, problem.episodes[0]
     system = step.system
-    rest = Statics(step).solve(episode.posture, problem.theta, episode.torque[0] if system.driven else None)
-    assert rest.converged
+    rest = EquilibriumSolver(step).solve(episode.posture, problem.theta, episode.torque[0] if system.driven else None)
+    assert rest.is_converged
     path = episode.posture[len(system.driven) :]
-    rows = linearised_rows(step, rest.state, rest.torque, problem.theta, path)
-    symbols = StepSymbols.of(step.equations)
-    found = dependence(step, symbols, episode, rest.state, problem.theta, rows)
+    rows = linearise_step_equations(step, rest.state, rest.holding_torque, problem.theta, path)
+    symbols = StepSymbols.from_equations(step.equations)
+    found = parameter_dependences(step, symbols, episode, rest.state, problem.theta, rows)
     return {entry.parameter: entry for entry in found}, rest, rows
 
 
@@ -49,7 +56,9 @@ def hanging():
     t = 0.01 * np.arange(STEPS + 1)
 
     def build(gravity=(0.0, 0.0, -9.81), turned=(math.pi, 0.0, 0.0)):
-        system = System.build(objects=[(rod, None, transform(roll_pitch_yaw(*turned), np.zeros(3)))], gravity=gravity)
+        system = System.build(
+            objects=[(rod, None, homogeneous_transform(rotation_from_rpy(*turned), np.zeros(3)))], gravity=gravity
+        )
         step = compile_step(system, 0.01, use_compiler=False)
         recording = Recording(None, (camera(t, ["w_T1"]),), name="hanging")
         return EstimationProblem(step, [recording], ("T1.bend", "T1.twist"), ProblemOptions())
@@ -60,7 +69,7 @@ def hanging():
 @pytest.mark.parametrize("turned", [(math.pi, 0.0, 0.0), (2.8, 0.3, 0.7), (2.0, -0.5, 1.1)])
 def test_the_twist_of_a_straight_rod_is_seen_by_nobody(hanging, turned):
     """Also where it hangs along no axis of the world, so that its rest is straight within rounding only."""
-    along = np.array(roll_pitch_yaw(*turned))[:, 2]
+    along = np.array(rotation_from_rpy(*turned))[:, 2]
     found, _, _ = judged(hanging(gravity=9.81 * along, turned=turned))
     twist, bend = found["T1.twist"], found["T1.bend"]
     rows = tuple(f"{row}[T1_{i}_z]" for row in ("del", "p1") for i in range(3))
@@ -120,7 +129,11 @@ def swinging(request, urdf_folder):
     """A pendulum on a springy elbow, its tip seen; the shoulder follows its torque under the filter, or its path."""
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     system = System.build(
-        robot, **{request.param: ["shoulder"]}, springs={"elbow": Spring(3.0, 0.4)}, damping=0.1, points=["tip"]
+        robot,
+        **{request.param: ["shoulder"]},
+        springs={"elbow": RobotJointSpring(3.0, 0.4)},
+        damping=0.1,
+        point_frames=["tip"],
     )
     step = compile_step(system, 0.01, use_compiler=False)
     t = 0.01 * np.arange(STEPS + 1)
@@ -181,9 +194,9 @@ def test_a_push_on_rows_is_a_kick_of_the_motor(swinging):
     """With the symmetric split a torque over one step adds h/2 of it to the balance and to the momentum after it."""
     _, rest, rows = judged(swinging)
     step, episode = swinging.step, swinging.episodes[0]
-    symbols = StepSymbols.of(step.equations)
+    symbols = StepSymbols.from_equations(step.equations)
     push = np.zeros((len(symbols.row_names), 1))
-    push[[symbols.row("del[shoulder]"), symbols.row("p1[shoulder]")]] = step.time_step / 2
+    push[[symbols.row_index("del[shoulder]"), symbols.row_index("p1[shoulder]")]] = step.time_step / 2
     sensors = _readings(step, episode, rest.state, swinging.theta)
     answers = _Linear.of(step, rows, episode.feedback).answers(push, sensors, STEPS, held=False)
     size = 1e-4
@@ -208,11 +221,11 @@ def test_efforts_of_joints_moved_as_measured_feel_their_own_rows(swinging):
 
 def test_without_sensors_only_rows_are_said(hanging):
     step = hanging().step
-    symbols = StepSymbols.of(step.equations)
+    symbols = StepSymbols.from_equations(step.equations)
     theta = step.system.parameters.vector()
-    rest = Statics(step).solve(np.zeros(0), theta, None)
-    rows = linearised_rows(step, rest.state, rest.torque, theta, np.zeros(0))
-    found = {e.parameter: e for e in dependence(step, symbols, None, rest.state, theta, rows)}
+    rest = EquilibriumSolver(step).solve(np.zeros(0), theta, None)
+    rows = linearise_step_equations(step, rest.state, rest.holding_torque, theta, np.zeros(0))
+    found = {e.parameter: e for e in parameter_dependences(step, symbols, None, rest.state, theta, rows)}
     assert found["T1.twist"].seen is None
     assert found["T1.twist"].moved is None
     assert found["T1.bend"].words == "T1.bend enters 12 rows (6 of del, 6 of p1)."
@@ -247,12 +260,12 @@ SEES = "sensors see to first order"
     ],
 )
 def test_words(changes, words):
-    made = Dependence("k", "N", ("del[a]", "p1[a]"), ("del[a]", "p1[a]"), "tip", (), None, 0.5)
+    made = ParameterDependence("k", "N", ("del[a]", "p1[a]"), ("del[a]", "p1[a]"), "tip", (), None, 0.5)
     assert replace(made, **changes).words == words
 
 
 def test_many_rows_are_counted_by_kind():
     names = [f"del[{i}]" for i in range(5)] + [f"p1[{i}]" for i in range(4)]
-    assert listing(names) == "5 of del, 4 of p1"
-    assert listing(names[:8]) == ", ".join(names[:8])
-    assert SEEN < 1e-6
+    assert _summarize_rows(names) == "5 of del, 4 of p1"
+    assert _summarize_rows(names[:8]) == ", ".join(names[:8])
+    assert _MIN_RELATIVE_RESPONSE < 1e-6

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.analysis.plausibility import Arm, check_asked, check_motion
+from yid_ocp.analysis.data_quality import RecordedJointsModel, check_dynamic_excitation, check_joint_excitation
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
@@ -17,13 +17,13 @@ USUAL = SensorOptions()
 
 
 @pytest.fixture(scope="module")
-def arm(urdf_folder) -> Arm:
+def arm(urdf_folder) -> RecordedJointsModel:
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     system = System.build(robot, prescribed=robot.joint_names)
-    return Arm.of(system, system.parameters.vector())
+    return RecordedJointsModel.from_system(system, system.parameters.vector())
 
 
-def moved(arm: Arm, hertz: float, size: float = 0.3, noise: float = 0.05, seed: int = 0) -> Recording:
+def moved(arm: RecordedJointsModel, hertz: float, size: float = 0.3, noise: float = 0.05, seed: int = 0) -> Recording:
     """Both joints to and fro, with the efforts that they need and noise."""
     rng = np.random.default_rng(seed)
     t = 0.01 * np.arange(3001)
@@ -31,21 +31,21 @@ def moved(arm: Arm, hertz: float, size: float = 0.3, noise: float = 0.05, seed: 
     rate = 2 * np.pi * hertz
     q, v, a = size * np.sin(phase), size * rate * np.cos(phase), -size * rate**2 * np.sin(phase)
     effort = arm.inverse_dynamics(q, v, a) + noise * rng.standard_normal(q.shape)
-    return Recording(JointGroup(arm.names, t, q, effort=effort, effort_std=noise), name="run")
+    return Recording(JointGroup(arm.joint_names, t, q, effort=effort, effort_std=noise), name="run")
 
 
 @pytest.mark.parametrize(("hertz", "said"), [(0.02, True), (0.5, False), (1.0, False)])
 def test_a_motion_so_slow_that_only_postures_tell(arm, hertz, said):
     for seed in range(3):
-        found = list(check_motion(arm, moved(arm, hertz, 0.03, seed=seed), USUAL))
+        found = list(check_dynamic_excitation(arm, moved(arm, hertz, 0.03, seed=seed), USUAL))
         assert [(d.cause, d.weight) for d in found] == ([("weak_excitation", "warning")] if said else [])
 
 
 def test_less_noise_sees_more_and_efforts_that_nobody_uses_do_not_count(arm):
     slow = moved(arm, 0.02, 0.03)
-    assert list(check_motion(arm, slow, replace(USUAL, std=1e-4))) == []
-    assert len(list(check_motion(arm, slow, replace(USUAL, std=10.0)))) == 1
-    assert list(check_motion(arm, slow, replace(USUAL, use=False))) == []
+    assert list(check_dynamic_excitation(arm, slow, replace(USUAL, std=1e-4))) == []
+    assert len(list(check_dynamic_excitation(arm, slow, replace(USUAL, std=10.0)))) == 1
+    assert list(check_dynamic_excitation(arm, slow, replace(USUAL, use=False))) == []
 
 
 def test_a_joint_that_never_turns_tells_nothing_of_its_own_spring(arm):
@@ -53,10 +53,10 @@ def test_a_joint_that_never_turns_tells_nothing_of_its_own_spring(arm):
     recording = moved(arm, 0.5)
     still = replace(recording.joints, position=recording.joints.position * [1.0, 0.01])
     held = replace(recording, joints=still, name="held")
-    (doubt,) = check_asked([held], asked, USUAL)
+    (doubt,) = check_joint_excitation([held], asked, USUAL)
     assert (doubt.cause, doubt.channel, doubt.recording) == ("weak_excitation", "position.elbow", "held")
     assert doubt.setting == "parameters.elbow.stiffness.free: false; parameters.elbow.damping.free: false"
-    assert list(check_asked([held, recording], asked, USUAL)) == []
-    assert list(check_asked([held], {"shoulder": ("shoulder.damping",)}, USUAL)) == []
+    assert list(check_joint_excitation([held, recording], asked, USUAL)) == []
+    assert list(check_joint_excitation([held], {"shoulder": ("shoulder.damping",)}, USUAL)) == []
     coarse = replace(USUAL, std=0.2)
-    assert len(list(check_asked([recording], asked, coarse))) == 1
+    assert len(list(check_joint_excitation([recording], asked, coarse))) == 1

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.analysis.plausibility import check_fit
+from yid_ocp.analysis.data_quality import check_fit_residuals
 from yid_ocp.config.reader import load_config
 from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.solvers import solve
@@ -17,7 +17,7 @@ from yid_ocp.workflow.build import build_problem
 
 @pytest.fixture(scope="module")
 def springs(repository):
-    run = load_config(repository / "configs" / "springs_series_joint.yaml", ["problem.compiler=false"])
+    run = load_config(repository / "configs" / "springs_series_joint.yaml", ["problem.use_compiler=false"])
     return run, build_problem(run)
 
 
@@ -35,7 +35,7 @@ def doubts(springs, late=0.0, drift=0.0, std=None):
         options = replace(options, sensors={**options.sensors, group.name: own})
     made = EstimationProblem(problem.step, [replace(recording, points=(moved,))], problem.free, options)
     solution = solve(made, run.solver)
-    return check_fit(solution.problem or made, solution.x, solution.evaluation)
+    return check_fit_residuals(solution.problem or made, solution.x, solution.evaluation)
 
 
 def test_a_fit_of_a_sound_recording_raises_nothing(springs):

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from formula_reader import FUNCTIONS, read, read_latex
 
-from yid_ocp.analysis.formulas import Name, formula, operations
+from yid_ocp.analysis.formula_text import SymbolName, count_operations, format_expressions
 
 X = ca.SX.sym("x", 4)
 A, B, C, D = ca.vertsplit(X)
-NAMES = [Name(f"v[{i}]", f"v_{{{i}}}") for i in range(4)]
+NAMES = [SymbolName(f"v[{i}]", f"v_{{{i}}}") for i in range(4)]
 POINT = np.array([0.7, -1.3, 2.1, 0.4])
 EXPRESSIONS = {
     "sums": A - (B - C) - (-D) + 2.5,
@@ -34,9 +34,9 @@ EXPRESSIONS = {
 
 def evaluate(made, reader) -> list[float]:
     known = {**FUNCTIONS, "v": POINT}
-    for name, text in made.shared:
+    for name, text in made.shared_subexpressions:
         known[reader(name)] = eval(reader(text), {"__builtins__": {}}, known)
-    return [float(eval(reader(value), {"__builtins__": {}}, known)) for value in made.values]
+    return [float(eval(reader(value), {"__builtins__": {}}, known)) for value in made.expression_texts]
 
 
 @pytest.mark.parametrize("latex", [False, True], ids=["text", "latex"])
@@ -44,28 +44,28 @@ def evaluate(made, reader) -> list[float]:
 def test_formulas_have_the_value_of_their_expression(name, latex):
     expression = EXPRESSIONS[name]
     expected = float(ca.Function("f", [X], [expression])(POINT))
-    made = formula([expression, 2 * expression], X, NAMES, latex)
+    made = format_expressions([expression, 2 * expression], X, NAMES, latex)
     found = evaluate(made, read_latex if latex else read)
     assert found == pytest.approx([expected, 2 * expected], rel=1e-9)
 
 
 def test_parts_that_occur_twice_are_written_once():
-    made = formula([EXPRESSIONS["shared"]], X, NAMES)
-    assert [text for _, text in made.shared] == ["v[0] + v[1]", "sin(c1)"]
-    assert made.values == ("c2*c1 + c2^2",)
+    made = format_expressions([EXPRESSIONS["shared"]], X, NAMES)
+    assert [text for _, text in made.shared_subexpressions] == ["v[0] + v[1]", "sin(c1)"]
+    assert made.expression_texts == ("c2*c1 + c2^2",)
     # a sum, a sine, a product, a square, a sum
-    assert made.operations == operations([EXPRESSIONS["shared"]], X) == 5
-    assert made.variables == (0, 1)
+    assert made.n_operations == count_operations([EXPRESSIONS["shared"]], X) == 5
+    assert made.variable_indices == (0, 1)
 
 
 def test_long_fractions_can_be_broken_into_lines():
     long = sum((ca.sin(A * i) for i in range(2, 12)), ca.SX(0)) / (B + C)
-    made = formula([long], X, NAMES, latex=True)
-    assert r"\frac" not in made.values[0]
-    assert ")/(" in made.values[0]
-    assert formula([A / B], X, NAMES, latex=True).values == (r"\frac{v_{0}}{v_{1}}",)
+    made = format_expressions([long], X, NAMES, latex=True)
+    assert r"\frac" not in made.expression_texts[0]
+    assert ")/(" in made.expression_texts[0]
+    assert format_expressions([A / B], X, NAMES, latex=True).expression_texts == (r"\frac{v_{0}}{v_{1}}",)
 
 
 def test_nothing_is_left_of_what_cancels():
-    made = formula([A - A], X, NAMES)
-    assert (made.values, made.operations, made.variables) == (("0",), 0, ())
+    made = format_expressions([A - A], X, NAMES)
+    assert (made.expression_texts, made.n_operations, made.variable_indices) == (("0",), 0, ())

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.analysis.combinations import Component, combination_words, sparse_basis
-from yid_ocp.analysis.identifiability import identifiability, with_grasp_offsets
+from yid_ocp.analysis.identifiability import identifiability, with_grasp_offset_effects
+from yid_ocp.analysis.parameter_combinations import DirectionComponent, describe_combination, sparse_basis
 from yid_ocp.errors import ConfigError, SolverError
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem
@@ -26,11 +26,11 @@ def test_the_papers_four_experiments(golden_problem, name, vision):
     problem = golden_problem(name, vision)
     known = identifiability(problem, start="known")
     unknown = identifiability(problem, start="unknown")
-    assert known.nuisances == ()
-    assert len(unknown.nuisances) == 72
+    assert known.nuisance_names == ()
+    assert len(unknown.nuisance_names) == 72
     for info in (known, unknown):
         assert {n for n, e in info.parameters.items() if e.verdict == "not_identifiable"} == TWISTS
-        words = [direction.words for direction in info.unseen]
+        words = [direction.words for direction in info.unidentifiable_directions]
         assert set(words) == {f"{twist} is not seen by any sensor" for twist in TWISTS}
         for twist in TWISTS:
             assert info.parameters[twist].std_relative > 1e3
@@ -39,7 +39,7 @@ def test_the_papers_four_experiments(golden_problem, name, vision):
         assert others["T2.bend"] < 0.006
         if name == "dual":
             assert max(others.values()) < 0.04
-            assert set(info.identifiable) == set(others)
+            assert set(info.identifiable_parameters) == set(others)
         else:
             assert info.parameters["T3.bend"].verdict == "weak"
     for parameter, entry in known.parameters.items():
@@ -54,7 +54,7 @@ def test_the_papers_four_experiments(golden_problem, name, vision):
 
 def test_the_independent_figures_leave_the_unseen_twists_out(golden_problem):
     for vision, stated in ((True, 0.34), (False, 1.17)):
-        problem = golden_problem("single", vision).with_free(("T1.bend", "T1.twist", "T2.bend", "T3.bend"))
+        problem = golden_problem("single", vision).with_free_parameters(("T1.bend", "T1.twist", "T2.bend", "T3.bend"))
         found = identifiability(problem, start="known").parameters["T3.bend"]
         assert found.std_relative == pytest.approx(stated, rel=0.03)
 
@@ -71,13 +71,13 @@ def test_a_start_that_nothing_is_known_of(golden_problem):
 
 def test_correlations_and_information(golden_problem):
     info = identifiability(golden_problem("dual", True), start="known")
-    known = [i for i, name in enumerate(info.names) if name not in TWISTS]
+    known = [i for i, name in enumerate(info.parameter_names) if name not in TWISTS]
     block = info.correlations[np.ix_(known, known)]
     np.testing.assert_allclose(np.diag(block), 1.0, atol=1e-12)
     assert np.all(np.abs(block) <= 1 + 1e-9)
     # with the unseen twists known, deviations are a little smaller
-    stds = np.sqrt(np.diag(np.linalg.inv(info.information[np.ix_(known, known)])))
-    stated = np.array([info.parameters[info.names[i]].std_relative for i in known])
+    stds = np.sqrt(np.diag(np.linalg.inv(info.fisher_information[np.ix_(known, known)])))
+    stated = np.array([info.parameters[info.parameter_names[i]].std_relative for i in known])
     assert np.all(stds <= stated)
     np.testing.assert_allclose(stds, stated, rtol=0.1)
     values = [direction.singular_value for direction in info.directions]
@@ -91,10 +91,13 @@ def test_two_springs_in_series_seen_at_the_ends_only(springs):
     problem = springs("series_ends")
     solution = solve(problem, GaussNewton())
     info = identifiability(problem, solution, intervals="all")
-    assert info.identifiable == ()
+    assert info.identifiable_parameters == ()
     assert [entry.verdict for entry in info.parameters.values()] == ["not_identifiable"] * 2
-    assert len(info.unseen) == 1
-    assert "1/spring_1.stiffness + 1/spring_2.stiffness, as springs in series are" in info.unseen[0].words
+    assert len(info.unidentifiable_directions) == 1
+    assert (
+        "1/spring_1.stiffness + 1/spring_2.stiffness, as springs in series are"
+        in info.unidentifiable_directions[0].words
+    )
     assert info.correlations[0, 1] == pytest.approx(-1, abs=1e-6)
     total = 1 / (1 / 200.0 + 1 / 300.0)
     for entry in info.parameters.values():
@@ -102,7 +105,7 @@ def test_two_springs_in_series_seen_at_the_ends_only(springs):
         assert entry.interval[0] == pytest.approx(total, rel=0.03)
         assert entry.interval[1] is None
         assert entry.std_alone < 0.01
-    found = [info.parameters[name].value for name in info.names]
+    found = [info.parameters[name].value for name in info.parameter_names]
     assert 1 / (1 / found[0] + 1 / found[1]) == pytest.approx(total, rel=0.02)
 
 
@@ -110,8 +113,8 @@ def test_two_springs_in_series_with_the_joint_seen(springs):
     problem = springs("series_joint")
     solution = solve(problem, GaussNewton())
     info = identifiability(problem, solution, intervals="all")
-    assert info.identifiable == ("spring_1.stiffness", "spring_2.stiffness")
-    assert info.unseen == ()
+    assert info.identifiable_parameters == ("spring_1.stiffness", "spring_2.stiffness")
+    assert info.unidentifiable_directions == ()
     for name, truth in (("spring_1.stiffness", 200.0), ("spring_2.stiffness", 300.0)):
         lower, upper = info.parameters[name].interval
         assert lower < truth < upper
@@ -130,8 +133,8 @@ def test_two_torsional_springs_under_a_known_torque(springs, points, verdict):
     problem = springs("torsion", f"sensors.points_camera.points={points}")
     info = identifiability(problem, solve(problem, GaussNewton()))
     assert {entry.verdict for entry in info.parameters.values()} == {verdict}
-    assert bool(info.unseen) == (verdict == "not_identifiable")
-    for direction in info.unseen:
+    assert bool(info.unidentifiable_directions) == (verdict == "not_identifiable")
+    for direction in info.unidentifiable_directions:
         assert "as springs in series are" in direction.words
 
 
@@ -162,7 +165,7 @@ def test_intervals_of_weak_parameters_are_lopsided_and_agree_with_chi2(golden_pr
     assert 5.5 < lower < 7.5
     assert upper - entry.value > 2 * (entry.value - lower)
     assert info.parameters["T3.twist"].interval == (None, None)
-    at = problem.with_free([name for name in problem.free if name != "T3.bend"], {"T3.bend": lower})
+    at = problem.with_free_parameters([name for name in problem.free if name != "T3.bend"], {"T3.bend": lower})
     refit = solve(at, GaussNewton())
     assert 2 * refit.cost == pytest.approx(3.84, abs=0.1)
 
@@ -180,15 +183,15 @@ def test_nothing_is_called_identifiable_whose_interval_is_open(springs, name):
 
 def test_where_the_grasp_sits_is_a_nuisance(held_tube):
     base = identifiability(held_tube, start="known")
-    system = with_grasp_offsets(held_tube.system)
-    assert with_grasp_offsets(system).parameters.names == system.parameters.names
+    system = with_grasp_offset_effects(held_tube.system)
+    assert with_grasp_offset_effects(system).parameters.names == system.parameters.names
     step = compile_step(system, held_tube.step.time_step, use_compiler=False)
     recordings = [episode.recording for episode in held_tube.episodes]
     problem = EstimationProblem(step, recordings, held_tube.free, held_tube.options)
     fixed = identifiability(problem, start="known", grasp_std=None)
     tight = identifiability(problem, start="known", grasp_std=1e-9)
     loose = identifiability(problem, start="known", grasp_std=0.01)
-    assert loose.nuisances == tuple(f"grasp_offset@hand.d{axis}" for axis in "xyz")
+    assert loose.nuisance_names == tuple(f"grasp_offset@hand.d{axis}" for axis in "xyz")
     for name, entry in base.parameters.items():
         for other in (fixed, tight):
             assert other.parameters[name].std == pytest.approx(entry.std, rel=1e-4)
@@ -204,7 +207,7 @@ def test_an_estimated_start_can_be_judged_as_known(held_tube):
     )
     wide, other = identifiability(estimated), identifiability(held_tube, start="unknown")
     assert wide.parameters["T1.bend"].std == pytest.approx(other.parameters["T1.bend"].std)
-    assert identifiability(estimated, start="known").nuisances == ()
+    assert identifiability(estimated, start="known").nuisance_names == ()
 
 
 def test_a_start_fitted_to_points_becomes_the_centre_of_a_prior(pendulum, twin):
@@ -214,8 +217,8 @@ def test_a_start_fitted_to_points_becomes_the_centre_of_a_prior(pendulum, twin):
     options = replace(made.options, initial_state="fitted_to_points", start_window=0.05)
     given = EstimationProblem(made.step, recordings, made.free, options)
     known, unknown = identifiability(given, start="known"), identifiability(given, start="unknown")
-    assert known.nuisances == ()
-    assert unknown.nuisances == ("start.q.elbow[twin]", "start.p.elbow[twin]")
+    assert known.nuisance_names == ()
+    assert unknown.nuisance_names == ("start.q.elbow[twin]", "start.p.elbow[twin]")
     for name, entry in known.parameters.items():
         assert entry.std < unknown.parameters[name].std
 
@@ -244,20 +247,20 @@ def moved_by(function):
 )
 def test_plain_combinations_have_names(function, direction, words):
     unit = np.array(direction) / np.linalg.norm(direction)
-    parts = [Component("k1", unit[0], 2.0, "N/m"), Component("k2", unit[1], 5.0, "N/m")]
-    assert combination_words(parts, moved_by(function)) == f"k1 and k2 are seen only as {words}"
+    parts = [DirectionComponent("k1", unit[0], 2.0, "N/m"), DirectionComponent("k2", unit[1], 5.0, "N/m")]
+    assert describe_combination(parts, moved_by(function)) == f"k1 and k2 are seen only as {words}"
 
 
 def test_other_combinations_are_described():
-    parts = [Component("k1", 0.8, 2.0, "N/m"), Component("k2", -0.6, 5.0, "N/m")]
+    parts = [DirectionComponent("k1", 0.8, 2.0, "N/m"), DirectionComponent("k2", -0.6, 5.0, "N/m")]
     words = "k1 and k2 are seen only together: k1 +10 % with k2 -7.5 % changes nothing that is measured"
-    assert combination_words(parts, moved_by(lambda a, b: a**0.6 * b**0.8)) == words
-    assert combination_words(parts, None) == words
+    assert describe_combination(parts, moved_by(lambda a, b: a**0.6 * b**0.8)) == words
+    assert describe_combination(parts, None) == words
 
 
 def test_many_parameters_are_counted():
-    parts = [Component(f"k{i}", 0.1 * (i + 1), 1.0, "N/m") for i in range(7)]
-    words = combination_words(parts, None)
+    parts = [DirectionComponent(f"k{i}", 0.1 * (i + 1), 1.0, "N/m") for i in range(7)]
+    words = describe_combination(parts, None)
     assert words.startswith("k0, k1, k2, k3 and 3 more are seen only together: k6 +10 % with k5 +8.6 % with")
     assert words.endswith("and the others to match changes nothing that is measured")
 

@@ -10,24 +10,24 @@ import numpy as np
 import pytest
 from made_recordings import holding_pendulum
 
-from yid_ocp.analysis.inspection import linearised_rows
-from yid_ocp.analysis.patterns import (
-    Pattern,
-    Span,
-    inverse_mask,
+from yid_ocp.analysis.sparsity_patterns import (
+    NamedRange,
+    SparsityPattern,
+    _inverse_sparsity,
+    _nlp_sparsity_masks,
     kkt_pattern,
     kkt_size,
-    nlp_masks,
-    stages,
-    step_patterns,
+    nlp_stage_sparsity,
+    step_sparsity_patterns,
 )
-from yid_ocp.analysis.symbols import StepSymbols
+from yid_ocp.analysis.step_diagnostics import linearise_step_equations
+from yid_ocp.analysis.step_symbols import StepSymbols
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.effects import make_effect
-from yid_ocp.integrator.statics import Statics
+from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.solvers.transcription import Transcription
+from yid_ocp.solvers.compiled_transcription import CompiledTranscription
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -41,7 +41,7 @@ def test_an_inverse_can_differ_from_zero_where_it_does(seed):
         if np.linalg.cond(values) < 1e6:
             break
     exact = np.abs(np.linalg.inv(values)) > 1e-12
-    found = inverse_mask(mask)
+    found = _inverse_sparsity(mask)
     assert not np.any(exact & ~found)
     # with random values nothing cancels, so that the pattern is the exact one
     np.testing.assert_array_equal(found, exact)
@@ -50,8 +50,8 @@ def test_an_inverse_can_differ_from_zero_where_it_does(seed):
 
 def test_the_inverse_of_a_singular_pattern_is_anything():
     mask = np.array([[True, True, False], [False, False, True], [False, False, True]])
-    assert np.all(inverse_mask(mask))
-    assert inverse_mask(np.zeros((0, 0), bool)).shape == (0, 0)
+    assert np.all(_inverse_sparsity(mask))
+    assert _inverse_sparsity(np.zeros((0, 0), bool)).shape == (0, 0)
 
 
 # -- a step -----------------------------------------------------------------------------------------------------------
@@ -72,57 +72,57 @@ def test_patterns_of_a_step_hold_its_matrices(step):
     """At a state like any other, where nothing vanishes by chance."""
     sizes, n = step.sizes, step.sizes["n"]
     rng = np.random.default_rng(5)
-    symbols = StepSymbols.of(step.equations)
+    symbols = StepSymbols.from_equations(step.equations)
     theta = step.system.parameters.vector()
-    rest = Statics(step).solve(np.array([0.3, -0.6]), theta, None)
-    assert rest.converged
+    rest = EquilibriumSolver(step).solve(np.array([0.3, -0.6]), theta, None)
+    assert rest.is_converged
     state = rest.state + 1e-3 * rng.normal(size=sizes["nx"])
     path = state[list(step.system.prescribed_indices)]
-    torque = rest.torque + rng.normal(size=sizes["nu"])
+    torque = rest.holding_torque + rng.normal(size=sizes["nu"])
     pair = (path, path) if len(path) else None
     a, b_input, b_theta = step.jacobians(state[:n], state[n : 2 * n], torque, theta, pair, state[2 * n :])
-    rows = linearised_rows(step, state, torque, theta, path)
-    kept = np.setdiff1d(np.arange(rows.rows_new.shape[1]), step.system.prescribed_indices)
-    found = step_patterns(symbols)
+    rows = linearise_step_equations(step, state, torque, theta, path)
+    kept = np.setdiff1d(np.arange(rows.residual_by_new.shape[1]), step.system.prescribed_indices)
+    found = step_sparsity_patterns(symbols)
     for name, matrix in (
         ("A", a),
         ("B_u", b_input),
         ("B_theta", b_theta),
-        ("dR_dtheta", np.vstack([rows.rows_theta[0], rows.p1_theta[0]])),
-        ("dR_dy", rows.rows_new[0][np.ix_(kept, kept)]),
+        ("dR_dtheta", np.vstack([rows.residual_by_theta[0], rows.p1_by_theta[0]])),
+        ("dR_dy", rows.residual_by_new[0][np.ix_(kept, kept)]),
     ):
         pattern = found[name]
         assert np.all(np.isfinite(matrix))
-        assert pattern.mask.shape == matrix.shape, name
-        outside = (np.abs(matrix) > 1e-13 * np.abs(matrix).max(initial=0.0)) & ~pattern.mask
+        assert pattern.nonzero_mask.shape == matrix.shape, name
+        outside = (np.abs(matrix) > 1e-13 * np.abs(matrix).max(initial=0.0)) & ~pattern.nonzero_mask
         assert not np.any(outside), [(pattern.row_labels[i], pattern.column_labels[j]) for i, j in np.argwhere(outside)]
-        marked = pattern.with_values(matrix, "here")
-        assert np.count_nonzero(marked.marked & pattern.mask) > 0.5 * pattern.nonzeros
-        assert marked.marked_as == "not zero at here"
-    assert not np.any(found["A"].mask[list(step.system.prescribed_indices)])
+        marked = pattern.with_marked_nonzeros(matrix, "here")
+        assert np.count_nonzero(marked.marked_mask & pattern.nonzero_mask) > 0.5 * pattern.n_nonzeros
+        assert marked.mark_label == "not zero at here"
+    assert not np.any(found["A"].nonzero_mask[list(step.system.prescribed_indices)])
 
 
 def test_blocks_cover_rows_and_columns(step):
-    symbols = StepSymbols.of(step.equations)
+    symbols = StepSymbols.from_equations(step.equations)
     names = {"dR_dy": ("del", "q1"), "A": ("q1", "q0"), "B_u": ("q1", "u"), "B_theta": ("q1", "theta")}
-    for name, pattern in step_patterns(symbols).items():
+    for name, pattern in step_sparsity_patterns(symbols).items():
         for spans, labels, count in (
-            (pattern.rows, pattern.row_labels, pattern.mask.shape[0]),
-            (pattern.columns, pattern.column_labels, pattern.mask.shape[1]),
+            (pattern.row_blocks, pattern.row_labels, pattern.nonzero_mask.shape[0]),
+            (pattern.column_blocks, pattern.column_labels, pattern.nonzero_mask.shape[1]),
         ):
             assert spans[0].start == 0
             assert spans[-1].stop == count == len(labels)
             assert all(a.stop == b.start for a, b in pairwise(spans))
         if name in names:
-            assert (pattern.rows[0].name, pattern.columns[0].name) == names[name]
+            assert (pattern.row_blocks[0].name, pattern.column_blocks[0].name) == names[name]
     free = [name for name in step.system.mechanism.joint_names if name not in step.system.prescribed]
-    assert step_patterns(symbols)["dR_dy"].column_labels[: len(free)] == tuple(free)
+    assert step_sparsity_patterns(symbols)["dR_dy"].column_labels[: len(free)] == tuple(free)
 
 
 def test_a_stiffness_enters_the_rows_of_its_joints_alone(step):
-    found = step_patterns(StepSymbols.of(step.equations))["dR_dtheta"]
+    found = step_sparsity_patterns(StepSymbols.from_equations(step.equations))["dR_dtheta"]
     column = found.column_labels.index("T1.twist")
-    rows = {found.row_labels[i] for i in np.flatnonzero(found.mask[:, column])}
+    rows = {found.row_labels[i] for i in np.flatnonzero(found.nonzero_mask[:, column])}
     relaxing = {name for name in step.system.internal if name.endswith("_z")}
     assert rows - relaxing == {"T1_0_z", "T1_1_z", "T1_2_z"}
 
@@ -150,33 +150,33 @@ def made_problem(urdf_folder, feedback, start):
 @pytest.mark.parametrize(("feedback", "start"), [("lqr", "equilibrium"), ("none", "equilibrium"), ("lqr", "estimated")])
 def test_the_nlp_has_the_pattern_that_is_shown(urdf_folder, feedback, start):
     problem = made_problem(urdf_folder, feedback, start)
-    transcription = Transcription(problem, 1)
+    transcription = CompiledTranscription(problem, 1)
     episode = problem.episodes[0]
-    symbols = StepSymbols.of(problem.step.equations)
+    symbols = StepSymbols.from_equations(problem.step.equations)
     followed = () if episode.feedback is None else tuple(episode.feedback.index)
     sensors = [samples.sensor for samples in episode.samples]
-    stage = stages(symbols, problem.shared, sensors, followed, problem.predictor.start_rows)
-    jacobian, hessian, measured = nlp_masks(stage, episode.grid.steps)
+    stage = nlp_stage_sparsity(symbols, problem.shared, sensors, followed, problem.predictor.estimated_state_indices)
+    jacobian, hessian, measured = _nlp_sparsity_masks(stage, episode.grid.steps)
     rng = np.random.default_rng(0)
-    w = transcription.guess(problem.start)
+    w = transcription.initial_guess(problem.start)
     w = w + 1e-3 * rng.normal(size=w.shape)
     exact = transcription.constraints(w, True)[1].toarray()
     assert exact.shape == jacobian.shape
     assert not np.any((np.abs(exact) > 1e-12) & ~jacobian)
     # random states leave hardly anything at zero that can differ from it; the start is a rest at any parameter
-    begun = len(stage.fixed)
+    begun = len(stage.fixed_start_rows)
     assert np.mean(exact[begun:][jacobian[begun:]] != 0) > 0.95
     slope = transcription.residual(w, True)[1].toarray()
     gauss_newton = np.abs(slope.T @ slope) > 0
-    curvature = transcription.curvature(w, rng.normal(size=len(exact))).toarray()
+    curvature = transcription.constraint_hessian(w, rng.normal(size=len(exact))).toarray()
     size = kkt_size(stage, [episode.grid.steps])
-    assert (size.variables, size.constraints) == (transcription.size, len(exact))
+    assert (size.variables, size.constraints) == (transcription.n_variables, len(exact))
     assert size.jacobian_nonzeros == np.count_nonzero(jacobian)
     assert size.hessian_nonzeros == np.count_nonzero(hessian)
     outside = (np.abs(curvature) > 1e-5 * np.abs(curvature).max()) & ~hessian
     assert not np.any(outside)
     # a reading between two nodes couples them; each node's own block is the one shown
-    f, nx, m = stage.free, problem.step.sizes["nx"], stage.multipliers
+    f, nx, m = stage.n_free_parameters, problem.step.sizes["nx"], stage.n_multipliers
     for k in range(episode.grid.steps + 1):
         here = np.concatenate([np.arange(f), f + k * (nx + m) + np.arange(nx)])
         block = np.ix_(here, here)
@@ -185,11 +185,11 @@ def test_the_nlp_has_the_pattern_that_is_shown(urdf_folder, feedback, start):
 
 def test_the_size_of_many_steps_is_that_of_the_masks(urdf_folder):
     problem = made_problem(urdf_folder, "lqr", "equilibrium")
-    symbols = StepSymbols.of(problem.step.equations)
-    stage = stages(symbols, ("T1.bend",), [], (0, 1))
-    one, two = nlp_masks(stage, 5), nlp_masks(stage, 7)
+    symbols = StepSymbols.from_equations(problem.step.equations)
+    stage = nlp_stage_sparsity(symbols, ("T1.bend",), [], (0, 1))
+    one, two = _nlp_sparsity_masks(stage, 5), _nlp_sparsity_masks(stage, 7)
     size = kkt_size(stage, [5, 7])
-    shared = stage.free
+    shared = stage.n_free_parameters
     assert size.variables == one[0].shape[1] + two[0].shape[1] - shared
     assert size.constraints == len(one[0]) + len(two[0])
     assert size.jacobian_nonzeros == np.count_nonzero(one[0]) + np.count_nonzero(two[0])
@@ -199,21 +199,21 @@ def test_the_size_of_many_steps_is_that_of_the_masks(urdf_folder):
 
 def test_the_kkt_matrix_is_symmetric_and_its_blocks_are_named(urdf_folder):
     problem = made_problem(urdf_folder, "lqr", "equilibrium")
-    symbols = StepSymbols.of(problem.step.equations)
+    symbols = StepSymbols.from_equations(problem.step.equations)
     sensors = [samples.sensor for samples in problem.episodes[0].samples]
-    stage = stages(symbols, problem.shared, sensors, ())
+    stage = nlp_stage_sparsity(symbols, problem.shared, sensors, ())
     kkt = kkt_pattern(stage, problem.shared, 2)
-    np.testing.assert_array_equal(kkt.mask, kkt.mask.T)
-    assert [span.name for span in kkt.rows] == [
+    np.testing.assert_array_equal(kkt.nonzero_mask, kkt.nonzero_mask.T)
+    assert [span.name for span in kkt.row_blocks] == [
         "theta", "q0", "p0", "lam0", "q1", "p1", "lam1", "q2", "p2",
         "start", "del0", "constraint0", "p1 rule", "del1", "constraint1", "p2 rule",
     ]  # fmt: skip
-    assert kkt.rows[-1].stop == len(kkt.mask) == len(kkt.row_labels)
+    assert kkt.row_blocks[-1].stop == len(kkt.nonzero_mask) == len(kkt.row_labels)
     assert kkt.row_labels[:2] == problem.shared
-    at = {span.name: span for span in kkt.rows}
+    at = {span.name: span for span in kkt.row_blocks}
 
     def block(row, column):
-        return kkt.mask[at[row].start : at[row].stop, at[column].start : at[column].stop]
+        return kkt.nonzero_mask[at[row].start : at[row].stop, at[column].start : at[column].stop]
 
     n = problem.step.sizes["n"]
     np.testing.assert_array_equal(block("del1", "p1"), np.eye(n, dtype=bool))
@@ -223,14 +223,16 @@ def test_the_kkt_matrix_is_symmetric_and_its_blocks_are_named(urdf_folder):
     assert np.any(block("constraint0", "q1"))
     assert not np.any(block("constraint0", "q0"))
     # encoders read the motors, the camera's point hangs on the rod's first joints and does not feel the twist
-    seen = kkt.marked[at["q1"].start : at["q1"].stop, at["q1"].start : at["q1"].stop]
+    seen = kkt.marked_mask[at["q1"].start : at["q1"].stop, at["q1"].start : at["q1"].stop]
     joints = problem.system.mechanism.joint_names
     assert {joints[i] for i in np.flatnonzero(seen.any(axis=0))} == {"shoulder", "elbow", "T1_0_x", "T1_0_y"}
 
 
 def test_a_pattern_counts_what_can_differ():
     mask = np.array([[True, False], [True, True]])
-    pattern = Pattern("p", "made up", mask, (Span("r", 0, 2),), (Span("c", 0, 2),), ("a", "b"), ("c", "d"))
-    assert pattern.nonzeros == 3
-    marked = pattern.with_values(np.array([[2.0, 0.0], [1e-15, -1.0]]), "rest")
-    np.testing.assert_array_equal(marked.marked, [[True, False], [False, True]])
+    pattern = SparsityPattern(
+        "p", "made up", mask, (NamedRange("r", 0, 2),), (NamedRange("c", 0, 2),), ("a", "b"), ("c", "d")
+    )
+    assert pattern.n_nonzeros == 3
+    marked = pattern.with_marked_nonzeros(np.array([[2.0, 0.0], [1e-15, -1.0]]), "rest")
+    np.testing.assert_array_equal(marked.marked_mask, [[True, False], [False, True]])

@@ -8,22 +8,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.analysis.plausibility import (
-    Arm,
-    check_cable,
+from yid_ocp.analysis.data_quality import (
+    RecordedJointsModel,
+    check_cable_points,
     check_efforts,
     check_held_points,
-    check_limits,
-    check_reach,
+    check_joint_limits,
+    check_point_distances,
 )
-from yid_ocp.analysis.plausibility.clocks import by_clock, clock_error
+from yid_ocp.analysis.data_quality.clock_synchronization import clock_sensitivities, estimate_clock_error
 from yid_ocp.data import read_recording
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
-from yid_ocp.model.cable import Cable
+from yid_ocp.model.cable import CableTopology
 from yid_ocp.model.system import System
-from yid_ocp.model.urdf import read_urdf, robot_description_file
+from yid_ocp.model.urdf import example_robot_urdf, read_urdf
 from yid_ocp.problem.options import SensorOptions
-from yid_ocp.virtual.experiment import paper_system
+from yid_ocp.virtual.experiment import baxter_foam_y_system
 
 
 def usual(_group: str) -> SensorOptions:
@@ -31,9 +31,11 @@ def usual(_group: str) -> SensorOptions:
 
 
 @pytest.fixture(scope="module")
-def arms() -> dict[int, Arm]:
-    systems = {count: paper_system(count) for count in (1, 2)}
-    return {count: Arm.of(system, system.parameters.vector()) for count, system in systems.items()}
+def arms() -> dict[int, RecordedJointsModel]:
+    systems = {count: baxter_foam_y_system(count) for count in (1, 2)}
+    return {
+        count: RecordedJointsModel.from_system(system, system.parameters.vector()) for count, system in systems.items()
+    }
 
 
 @pytest.fixture(scope="module")
@@ -59,8 +61,8 @@ def test_inverse_dynamics_are_pinocchios():
     pin = pytest.importorskip("pinocchio")
     robot = read_urdf("package:baxter", joints=[f"left_{j}" for j in ("s0", "s1", "e0", "e1", "w0", "w1", "w2")])
     system = System.build(robot, prescribed=robot.joint_names)
-    arm = Arm.of(system, system.parameters.vector())
-    whole = pin.buildModelFromUrdf(str(robot_description_file("baxter")))
+    arm = RecordedJointsModel.from_system(system, system.parameters.vector())
+    whole = pin.buildModelFromUrdf(str(example_robot_urdf("baxter")))
     others = [whole.getJointId(name) for name in whole.names[1:] if name not in robot.joint_names]
     model = pin.buildReducedModel(whole, others, pin.neutral(whole))
     data = model.createData()
@@ -72,12 +74,12 @@ def test_inverse_dynamics_are_pinocchios():
 def test_slopes_of_places_are_their_derivatives(arms):
     arm, frames = arms[2], ("left_gripper", "right_gripper")
     q, step = np.random.default_rng(2).uniform(-1, 1, (3, 14)), 1e-6
-    _, slope = arm.places(frames, q)
+    _, slope = arm.frame_positions(frames, q)
     for j in range(14):
         up, down = q.copy(), q.copy()
         up[:, j] += step
         down[:, j] -= step
-        difference = (arm.places(frames, up)[0] - arm.places(frames, down)[0]) / (2 * step)
+        difference = (arm.frame_positions(frames, up)[0] - arm.frame_positions(frames, down)[0]) / (2 * step)
         assert np.max(np.abs(difference - slope[..., j])) < 1e-8
 
 
@@ -135,7 +137,7 @@ def test_a_joint_of_which_nothing_is_asked_may_swing(repository, kind, least, ex
     """Friction and what the model lacks are all that it then seems to need; what holds an arm up is more."""
     robot = read_urdf(str(repository / "models" / "urdf" / "two_drives.urdf"))
     system = System.build(robot, prescribed=robot.joint_names)
-    arm = Arm.of(system, system.parameters.vector())
+    arm = RecordedJointsModel.from_system(system, system.parameters.vector())
     t = np.arange(0.0, 6.0, 0.005)
     q = np.stack([np.sin(2 * t), 0.4 * np.sin(3 * t)], axis=1)
     v = np.stack([2 * np.cos(2 * t), 1.2 * np.cos(3 * t)], axis=1)
@@ -155,22 +157,22 @@ def test_a_counterbalance_that_the_urdf_does_not_have_is_no_wrong_zero(arms, run
 
 def test_motion_that_belongs_to_other_efforts_is_not_this_robots(arms, runs):
     quick = with_joints(runs[1], t=lambda j: j.t / 10)
-    robot = read_urdf("package:baxter", joints=arms[1].names)
+    robot = read_urdf("package:baxter", joints=arms[1].joint_names)
     system = System.build(robot, prescribed=robot.joint_names)
-    free = Arm.of(system, system.parameters.vector())
+    free = RecordedJointsModel.from_system(system, system.parameters.vector())
     # nothing else can load an arm that holds nothing
     assert "effort_unlike" in {doubt.cause for doubt in check_efforts(free, quick)}
 
 
 def test_limits_of_joints(arms, runs):
     arm, run = arms[1], runs[1]
-    assert list(check_limits(arm, run)) == []
+    assert list(check_joint_limits(arm, run)) == []
     wide = with_joints(run, position=lambda j: j.position + 3.0 * (np.arange(7) == 3))
-    assert [(d.cause, d.channel) for d in check_limits(arm, wide)] == [("angle_limits", "position.left_e1")]
+    assert [(d.cause, d.channel) for d in check_joint_limits(arm, wide)] == [("angle_limits", "position.left_e1")]
     degrees = with_joints(run, position=lambda j: np.degrees(j.position))
-    assert [(d.cause, d.weight) for d in check_limits(arm, degrees)] == [("degrees", "refused")]
+    assert [(d.cause, d.weight) for d in check_joint_limits(arm, degrees)] == [("degrees", "refused")]
     quick = with_joints(run, t=lambda j: j.t / 30)
-    assert "speed_limits" in {d.cause for d in check_limits(arm, quick)}
+    assert "speed_limits" in {d.cause for d in check_joint_limits(arm, quick)}
 
 
 # -- points -----------------------------------------------------------------------------------------------------------
@@ -202,7 +204,7 @@ def test_points_that_the_arm_holds(arms, runs, case):
 def test_an_encoder_whose_zero_is_off_is_named_with_its_size(arms, runs, joint, offset):
     moved = with_joints(runs[1], position=lambda j: j.position + offset * (np.arange(7) == joint))
     (doubt,) = check_held_points(arms[1], moved, usual)
-    name = arms[1].names[joint]
+    name = arms[1].joint_names[joint]
     assert (doubt.cause, name in doubt.setting) == ("encoder_offset", True)
     assert f"with {-offset:+.3g}"[:9] in doubt.what.replace("+0.0499", "+0.05").replace("-0.0499", "-0.05")
 
@@ -269,7 +271,7 @@ def test_a_zero_that_is_a_little_off_is_no_clock(arms, runs):
 def test_at_rest_nothing_tells_of_clocks(arms, runs):
     joints = runs[1].joints
     still = with_joints(runs[1], position=lambda j: np.repeat(j.position[:1], len(j.t), axis=0))
-    place = arms[1].places(("left_gripper",), joints.position[:1])[0]
+    place = arms[1].frame_positions(("left_gripper",), joints.position[:1])[0]
     rng = np.random.default_rng(0)
     at_rest = with_points(still, "points_arm", lambda p: place + 1e-3 * rng.standard_normal(p.shape))
     assert list(check_held_points(arms[1], stamped(at_rest, 0.5), usual)) == []
@@ -282,13 +284,13 @@ def test_the_error_of_a_clock_and_its_standard_deviation():
     for _ in range(60):
         true = np.sin(2 * (t - 0.01 - 0.002 * (t - 5)))
         residual = (np.sin(2 * t) - true - 0.3 + noise * rng.standard_normal(len(t))) / noise
-        own = by_clock(t, 2 * np.cos(2 * t) / noise, (0.0, 10.0))
-        found.append(clock_error(t, residual, own, np.full((len(t), 1), 1 / noise), np.ones(1), (0.0, 10.0)))
-    for name, std, truth in (("late", "late_std", 0.01), ("drift", "drift_std", 0.002)):
+        own = clock_sensitivities(t, 2 * np.cos(2 * t) / noise, (0.0, 10.0))
+        found.append(estimate_clock_error(t, residual, own, np.full((len(t), 1), 1 / noise), np.ones(1), (0.0, 10.0)))
+    for name, std, truth in (("stamp_delay", "stamp_delay_std", 0.01), ("relative_drift", "relative_drift_std", 0.002)):
         values, stated = (np.array([getattr(one, key) for one in found]) for key in (name, std))
         assert np.mean(values) == pytest.approx(truth, abs=4 * np.std(values) / 60**0.5 + 0.02 * truth)
         assert 0.75 < np.std(values) / np.mean(stated) < 1.25
-    assert all(one.excess > 0.5 for one in found)
+    assert all(one.explained_excess_fraction > 0.5 for one in found)
 
 
 def test_what_no_change_explains_is_said_so(arms, runs):
@@ -303,14 +305,14 @@ def test_what_no_change_explains_is_said_so(arms, runs):
 )
 def test_the_object_does_not_stretch(arms, runs, factor, cause):
     recording = with_points(runs[1], "points_camera", lambda p: factor * p)
-    found = check_reach(arms[1], arms[1].system, arms[1].theta, recording, usual)
+    found = check_point_distances(arms[1], arms[1].system, arms[1].theta, recording, usual)
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
 
 
 # -- a cable ----------------------------------------------------------------------------------------------------------
 
 REST = {f"p{i}": (0.1 * i, 0.0, 0.0) for i in range(9)} | {f"a{i}": (0.4, 0.07 * i, 0.0) for i in (1, 2, 3)}
-CABLE = Cable(tuple(f"p{i}" for i in range(9)), {"a": ("p4", "a1", "a2", "a3")}, REST)
+CABLE = CableTopology(tuple(f"p{i}" for i in range(9)), {"a": ("p4", "a1", "a2", "a3")}, REST)
 GRAVITY = np.array([0.0, 0.0, -9.81])
 
 
@@ -337,7 +339,7 @@ def hanging(seed: int = 0) -> Recording:
     ],
 )
 def test_a_cable_keeps_its_lengths_and_hangs(change, cause, words):
-    found = list(check_cable(CABLE, with_points(hanging(), "points", change), GRAVITY))
+    found = list(check_cable_points(CABLE, with_points(hanging(), "points", change), GRAVITY))
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
     assert not found or words in found[0].what
 
@@ -345,5 +347,5 @@ def test_a_cable_keeps_its_lengths_and_hangs(change, cause, words):
 def test_joints_of_another_name_leave_nothing_to_compare(arms, runs):
     joints = runs[1].joints
     other = JointGroup(tuple(name.replace("left", "right") for name in joints.names), joints.t, joints.position)
-    assert not arms[1].is_in(replace(runs[1], joints=other))
-    assert arms[1].is_in(runs[1])
+    assert not arms[1].is_recorded_in(replace(runs[1], joints=other))
+    assert arms[1].is_recorded_in(runs[1])

@@ -9,19 +9,28 @@ import numpy as np
 import pytest
 from made_models import estimate
 
-from yid_ocp.analysis.published import CHOSEN, NAMES, PUBLISHED, Ends, ensemble, explained, published_sentences, reason
+from yid_ocp.analysis.paper_comparison import (
+    _PAPER_PARAMETERS,
+    _TRUTH_EXPERIMENT,
+    PAPER_ESTIMATES,
+    _DescentEndpoints,
+    _discrepancy_reason,
+    _load_torque_ensemble,
+    explain_paper_estimates,
+    is_within_ensemble,
+)
 
 
 def test_the_papers_answers():
     """Tables of the source paper [N m/rad], thousandths as whole numbers."""
-    told = {name: [round(1000 * value) for value in values.values()] for name, values in PUBLISHED.items()}
+    told = {name: [round(1000 * value) for value in values.values()] for name, values in PAPER_ESTIMATES.items()}
     assert told == {
         "single_arm_no_vision": [23780, 0, 18357, 11103, 3200, 3059],
         "single_arm_vision": [22270, 13593, 10735, 8202, 11511, 9692],
         "dual_arm_no_vision": [19559, 4965, 8575, 10374, 0, 11287],
         "dual_arm_vision": [24840, 0, 12373, 30775, 1406, 24900],
     }
-    for values in PUBLISHED.values():
+    for values in PAPER_ESTIMATES.values():
         assert tuple(values) == ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twist")
 
 
@@ -29,12 +38,12 @@ def test_the_papers_answers():
 
 
 def test_the_ensemble_covers_every_published_value():
-    found = ensemble()
-    assert set(found) == set(PUBLISHED)
+    found = _load_torque_ensemble()
+    assert set(found) == set(PAPER_ESTIMATES)
     for by_errors in found.values():
         assert {"none", "offsets"} <= set(by_errors)
         for values in by_errors.values():
-            assert tuple(values) == NAMES
+            assert tuple(values) == _PAPER_PARAMETERS
             assert all(np.all(np.isfinite(members)) and min(members) >= 0 for members in values.values())
         assert {len(members) for members in by_errors["offsets"].values()} == {len(by_errors["offsets"]["T1.bend"])}
         assert len(by_errors["offsets"]["T1.bend"]) >= 4
@@ -55,12 +64,12 @@ def test_the_ensemble_covers_every_published_value():
     ],
 )
 def test_a_published_value_is_explained_by_members_around_it(published, values, expected):
-    assert explained(published, values) is expected
+    assert is_within_ensemble(published, values) is expected
 
 
 # -- the decision -----------------------------------------------------------------------------------------------------
 
-ENDS = Ends(start=3.0, stopped=5.0, offsets=(6.0, 14.0))
+ENDS = _DescentEndpoints(start=3.0, stopped=5.0, offsets=(6.0, 14.0))
 FOUND, LOST = estimate(10.0), estimate(10.0, math.inf, "not_identifiable")
 WEAK = estimate(10.0, 2.0, "weak")
 OPEN = replace(WEAK, interval=(8.0, None))
@@ -92,10 +101,10 @@ OPEN = replace(WEAK, interval=(8.0, None))
     ],
 )
 def test_why_a_published_value_is_what_it_is(published, entry, truth, ends, expected):
-    assert reason(published, entry, truth, ends) == expected
+    assert _discrepancy_reason(published, entry, truth, ends) == expected
 
 
-TRUTH = dict(zip(NAMES, (22.0, 13.6, 10.7, 8.2, 11.5, 9.7), strict=True))
+TRUTH = dict(zip(_PAPER_PARAMETERS, (22.0, 13.6, 10.7, 8.2, 11.5, 9.7), strict=True))
 
 
 def judged(**verdicts):
@@ -105,37 +114,43 @@ def judged(**verdicts):
 
 
 def test_each_published_value_has_one_sentence():
-    for experiment, values in PUBLISHED.items():
-        said = published_sentences(experiment, judged(T2_twist=LOST, T3_twist=LOST), TRUTH)
-        assert [text.split(" = ")[0] for text in said] == list(NAMES)
+    for experiment, values in PAPER_ESTIMATES.items():
+        said = explain_paper_estimates(experiment, judged(T2_twist=LOST, T3_twist=LOST), TRUTH)
+        assert [text.split(" = ")[0] for text in said] == list(_PAPER_PARAMETERS)
         for text, value in zip(said, values.values(), strict=True):
             assert f" = {value:.4g} of the paper: " in text
         assert all("not informed; in such an experiment it cannot be found" in said[i] for i in (3, 5))
 
 
 def test_the_truth_was_chosen_from_one_answer_and_this_is_said():
-    assert all(0 not in values.values() for name, values in PUBLISHED.items() if name == CHOSEN)
-    assert all(0 in values.values() for name, values in PUBLISHED.items() if name != CHOSEN)
-    assert all("which was chosen from it" in text for text in published_sentences(CHOSEN, judged(), TRUTH))
-    other = published_sentences("single_arm_no_vision", judged(), TRUTH)
+    assert all(0 not in values.values() for name, values in PAPER_ESTIMATES.items() if name == _TRUTH_EXPERIMENT)
+    assert all(0 in values.values() for name, values in PAPER_ESTIMATES.items() if name != _TRUTH_EXPERIMENT)
+    assert all(
+        "which was chosen from it" in text for text in explain_paper_estimates(_TRUTH_EXPERIMENT, judged(), TRUTH)
+    )
+    other = explain_paper_estimates("single_arm_no_vision", judged(), TRUTH)
     assert other[0] == "T1.bend = 23.78 of the paper: near the truth of these recordings, 22"
-    elsewhere = published_sentences(CHOSEN, judged(), {name: 1.05 * value for name, value in TRUTH.items()})
+    elsewhere = explain_paper_estimates(
+        _TRUTH_EXPERIMENT, judged(), {name: 1.05 * value for name, value in TRUTH.items()}
+    )
     assert not any("chosen" in text for text in elsewhere)
 
 
 def test_weak_parameters_are_said_with_their_interval():
-    said = published_sentences("single_arm_no_vision", judged(T3_bend=replace(OPEN, interval=(0.84, None))), TRUTH)
+    said = explain_paper_estimates("single_arm_no_vision", judged(T3_bend=replace(OPEN, interval=(0.84, None))), TRUTH)
     assert said[4].endswith(
         "hardly informed; in such an experiment it is weakly determined, above 0.84, where the value lies"
     )
-    said = published_sentences("single_arm_no_vision", judged(T1_twist=replace(OPEN, interval=(8.65, 109.7))), TRUTH)
+    said = explain_paper_estimates(
+        "single_arm_no_vision", judged(T1_twist=replace(OPEN, interval=(8.65, 109.7))), TRUTH
+    )
     assert said[1].startswith(
         "T1.twist = 0 of the paper: unexplained; such recordings leave 8.65 to 109.7 open and not this, it is not slow"
     )
 
 
 def test_nothing_is_said_where_the_recordings_are_not_explained_or_a_parameter_is_not_free():
-    assert published_sentences(CHOSEN, judged(T1_bend=estimate(1.0, 1.0, "not_trusted")), TRUTH) == ()
+    assert explain_paper_estimates(_TRUTH_EXPERIMENT, judged(T1_bend=estimate(1.0, 1.0, "not_trusted")), TRUTH) == ()
     fixed = estimate(10.7, 0.0, "fixed", free=False)
-    assert len(published_sentences(CHOSEN, judged(T2_bend=fixed), TRUTH)) == 5
-    assert len(published_sentences(CHOSEN, {"T1.bend": FOUND, "else": FOUND}, TRUTH)) == 1
+    assert len(explain_paper_estimates(_TRUTH_EXPERIMENT, judged(T2_bend=fixed), TRUTH)) == 5
+    assert len(explain_paper_estimates(_TRUTH_EXPERIMENT, {"T1.bend": FOUND, "else": FOUND}, TRUTH)) == 1

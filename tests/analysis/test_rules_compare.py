@@ -12,13 +12,20 @@ import pytest
 from made_models import estimate, solution
 
 from yid_ocp.analysis import compare as module
-from yid_ocp.analysis.compare import Comparison, MethodRun, _descent_errors, _differences, _explanations, compare
+from yid_ocp.analysis.compare import (
+    MethodComparison,
+    MethodResult,
+    _descent_errors,
+    _differences,
+    _explanations,
+    compare_methods,
+)
 from yid_ocp.problem import ProblemOptions
 from yid_ocp.solvers import Status
 
 
 def run(method="gauss_newton", cost=1.0, status=Status.CONVERGED, **parameters):
-    return MethodRun(method, solution(method, status, **parameters), cost, [], 1.0, 1.0, 50.0)
+    return MethodResult(method, solution(method, status, **parameters), cost, [], 1.0, 1.0, 50.0)
 
 
 def differences(here, best):
@@ -82,8 +89,8 @@ def test_parameters_that_are_not_found_need_not_agree():
 def test_methods_agree_where_nothing_is_said_against_it():
     runs = (run(), run("lifted"))
     judged = ("gauss_newton", False, runs[0].solution, [])
-    assert Comparison(runs, *judged, {"gauss_newton": [], "lifted": []}, ()).agree
-    assert not Comparison(runs, *judged, {"gauss_newton": [], "lifted": ["a differs"]}, ()).agree
+    assert MethodComparison(runs, *judged, {"gauss_newton": [], "lifted": []}, ()).is_consistent
+    assert not MethodComparison(runs, *judged, {"gauss_newton": [], "lifted": ["a differs"]}, ()).is_consistent
 
 
 # -- what is said -----------------------------------------------------------------------------------------------------
@@ -201,24 +208,28 @@ def test_methods_run_one_by_one_and_the_lowest_cost_is_the_reference(monkeypatch
     monkeypatch.setattr(module, "solve", solve)
     solvers = [SimpleNamespace(name=name) for name in answers]
     problem = Problem(weighting)
-    found = compare(problem, solvers, {"a": 2.0}, lambda name, entry: told.append((name, entry)))
+    found = compare_methods(problem, solvers, {"a": 2.0}, lambda name, entry: told.append((name, entry)))
     assert solved == [("lifted", weighting), ("gauss_newton", weighting), ("steepest_descent", "paper")]
     assert told == [(name, "step") for name in answers]
-    assert found.reference == "gauss_newton"
-    assert [r.whitened_cost for r in found.runs] == [3.0, 2.0, 5.0]
+    assert found.reference_method == "gauss_newton"
+    assert [r.whitened_cost for r in found.method_results] == [3.0, 2.0, 5.0]
     assert problem.asked == [(weighting, x, False) for x in (3.0, 2.0, 5.0)]
-    assert [r.held_out for r in found.runs] == [[(weighting, 3.0)], [(weighting, 2.0)], [("paper", 5.0)]]
-    assert set(found.agreement) == set(answers)
-    assert found.agreement["gauss_newton"] == []
-    assert found.agreement["lifted"]
-    assert len(found.explained) == 1
-    for entry in found.runs:
+    assert [r.held_out_predictions for r in found.method_results] == [
+        [(weighting, 3.0)],
+        [(weighting, 2.0)],
+        [("paper", 5.0)],
+    ]
+    assert set(found.disagreements) == set(answers)
+    assert found.disagreements["gauss_newton"] == []
+    assert found.disagreements["lifted"]
+    assert len(found.explanations) == 1
+    for entry in found.method_results:
         assert 0 <= entry.wall_seconds < 5
         assert 0 <= entry.cpu_seconds < 5
-        assert 10 < entry.peak_memory < 1e5
-    assert not found.disturbed
-    assert found.judged is found.runs[1].solution
-    assert compare(problem, solvers[:1]).explained == ()
+        assert 10 < entry.peak_memory_mib < 1e5
+    assert not found.has_process_noise
+    assert found.verdict_solution is found.method_results[1].solution
+    assert compare_methods(problem, solvers[:1]).explanations == ()
 
 
 def test_verdicts_count_the_noise_that_drives_the_motion(monkeypatch):
@@ -226,27 +237,27 @@ def test_verdicts_count_the_noise_that_drives_the_motion(monkeypatch):
     solved, told = [], []
 
     def solve(problem, solver, callback, limits, restarts=True):
-        solved.append((solver.name, problem.disturbed, restarts))
+        solved.append((solver.name, problem.has_process_noise, restarts))
         callback("step")
-        verdict = "identifiable" if problem.disturbed else "not_trusted"
-        value = 10.0 if problem.disturbed else {"able": 7.0, "lifted": 7.5}[solver.name]
+        verdict = "identifiable" if problem.has_process_noise else "not_trusted"
+        value = 10.0 if problem.has_process_noise else {"able": 7.0, "lifted": 7.5}[solver.name]
         return solution(solver.name, a=estimate(value, 0.1, verdict))
 
     monkeypatch.setattr(module, "solve", solve)
     able, other = SimpleNamespace(name="able", carries_covariance=True), SimpleNamespace(name="lifted")
-    found = compare(Problem(disturbed=True), [other, able], {"a": 10.0}, lambda *entry: told.append(entry))
+    found = compare_methods(Problem(disturbed=True), [other, able], {"a": 10.0}, lambda *entry: told.append(entry))
     # by the sensors' noise alone every fit is poor, from wherever it starts
     assert solved == [("lifted", False, False), ("able", False, False), ("able", True, True)]
     assert told == [("lifted", "step"), ("able", "step"), ("all noise", "step")]
-    assert found.disturbed
-    assert found.judged.parameters["a"] == estimate(10.0)
-    assert found.judged_held_out == [("whitened", 10.0)]
-    assert found.reference == "able"
+    assert found.has_process_noise
+    assert found.verdict_solution.parameters["a"] == estimate(10.0)
+    assert found.verdict_held_out_predictions == [("whitened", 10.0)]
+    assert found.reference_method == "able"
     # found by the likelihood, so the methods have to agree on it
-    assert not found.agree
-    assert found.agreement["lifted"][0].startswith("a = 7.5, while able finds 7")
+    assert not found.is_consistent
+    assert found.disagreements["lifted"][0].startswith("a = 7.5, while able finds 7")
     solved.clear()
-    compare(Problem(disturbed=True), [other])
+    compare_methods(Problem(disturbed=True), [other])
     assert solved == [("lifted", False, False), ("gauss_newton", True, True)]
 
 

@@ -10,7 +10,14 @@ import numpy as np
 import pytest
 from made_models import Formula, estimate
 
-from yid_ocp.analysis.discretisation import Moves, Refined, counting, divided_joints, lower_of, moves
+from yid_ocp.analysis.discretisation_shift import (
+    DiscretisationShift,
+    RefinedProblem,
+    _worse_verdict,
+    discretisation_shifts,
+    inflate_estimates,
+    joint_subdivision,
+)
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Segment, System, flexible_object
 from yid_ocp.problem import EstimationProblem
@@ -39,7 +46,7 @@ def test_an_estimate_moves_to_where_a_linear_finer_model_fits_best(factor):
         bounds=OPEN,
     )
     at = coarse.evaluate(coarse.start)
-    found = moves(Refined(finer, {"a": factor}), coarse, coarse.start, at)
+    found = discretisation_shifts(RefinedProblem(finer, {"a": factor}), coarse, coarse.start, at)
     assert found == pytest.approx({"a": 0.3, "b": -0.2})
 
 
@@ -48,53 +55,61 @@ def test_a_point_that_is_no_estimate_counts_the_difference_of_the_models_alone()
     coarse = problem(lambda x: [2 * (x["a"] - 3.0)], {"a": 2.0}, bounds=OPEN)
     finer = problem(lambda x: [2 * (x["a"] - 3.3)], {"a": 2.0}, bounds=OPEN)
     at = coarse.evaluate(coarse.start)
-    assert moves(Refined(finer), coarse, coarse.start, at) == pytest.approx({"a": 1.3})
-    assert moves(Refined(finer), coarse, coarse.start, at, models_alone=True) == pytest.approx({"a": 0.3})
+    assert discretisation_shifts(RefinedProblem(finer), coarse, coarse.start, at) == pytest.approx({"a": 1.3})
+    assert discretisation_shifts(
+        RefinedProblem(finer), coarse, coarse.start, at, model_difference_only=True
+    ) == pytest.approx({"a": 0.3})
 
 
 def test_a_move_ends_at_the_bound():
     coarse = problem(lambda x: [x["a"] - 1.0], {"a": 1.0})
     finer = problem(lambda x: [x["a"] + 5.0], {"a": 1.0})
     at = coarse.evaluate(coarse.start)
-    assert moves(Refined(finer), coarse, coarse.start, at) == pytest.approx({"a": -1.0})
+    assert discretisation_shifts(RefinedProblem(finer), coarse, coarse.start, at) == pytest.approx({"a": -1.0})
 
 
 def test_a_finer_model_that_cannot_be_rolled_out_says_why():
     coarse = problem(lambda x: [x["a"] - 1.0], {"a": 1.0})
     finer = problem(lambda x: [x["a"]], {"a": 1.0}, fails=lambda values: True)
-    assert moves(Refined(finer), coarse, coarse.start, coarse.evaluate(coarse.start)) == "it snaps"
+    assert (
+        discretisation_shifts(RefinedProblem(finer), coarse, coarse.start, coarse.evaluate(coarse.start)) == "it snaps"
+    )
 
 
 def test_models_that_are_compared_at_other_samples_have_no_difference():
     coarse = problem(lambda x: [x["a"] - 1.0], {"a": 1.0})
     finer = problem(lambda x: [x["a"], x["a"]], {"a": 1.0})
     at = coarse.evaluate(coarse.start)
-    assert "other samples" in moves(Refined(finer), coarse, coarse.start, at, models_alone=True)
+    assert "other samples" in discretisation_shifts(
+        RefinedProblem(finer), coarse, coarse.start, at, model_difference_only=True
+    )
 
 
 # -- what stands for what ---------------------------------------------------------------------------------------------
 
 
 def chain(links):
-    tube = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=links, joint_order="xy")])
+    tube = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=links, joint_axes="xy")])
     return System.build(None, objects=[(tube, None, None)])
 
 
 def test_divided_links_share_their_angle():
     coarse, fine = chain(2), chain(4)
-    divided = divided_joints(coarse, fine)
+    divided = joint_subdivision(coarse, fine)
     assert divided == {
         "T1_0_x": ("T1_0_x", "T1_1_x"),
         "T1_0_y": ("T1_0_y", "T1_1_y"),
         "T1_1_x": ("T1_2_x", "T1_3_x"),
         "T1_1_y": ("T1_2_y", "T1_3_y"),
     }
-    assert divided_joints(coarse, coarse) == divided_joints(fine, coarse) == {}
+    assert joint_subdivision(coarse, coarse) == joint_subdivision(fine, coarse) == {}
     made = problem(lambda x: [x["a"]], {"a": 1.0})
     made.system = fine
-    [warm] = Refined(made, divided=divided).warm(coarse, (np.array([0.2, -0.4, 0.6, 0.8]),))
+    [warm] = RefinedProblem(made, subdivided_joints=divided).equilibrium_guesses_from_coarse(
+        coarse, (np.array([0.2, -0.4, 0.6, 0.8]),)
+    )
     np.testing.assert_allclose(warm, [0.1, -0.2, 0.1, -0.2, 0.3, 0.4, 0.3, 0.4])
-    assert Refined(made, divided=divided).warm(coarse, (None,)) == (None,)
+    assert RefinedProblem(made, subdivided_joints=divided).equilibrium_guesses_from_coarse(coarse, (None,)) == (None,)
 
 
 def test_a_start_is_carried_to_the_finer_chain():
@@ -102,8 +117,10 @@ def test_a_start_is_carried_to_the_finer_chain():
     coarse = ("a", "c[run]", "start.q.T1_0_x[run]", "start.p.T1_0_x[run]", "gone")
     start = {"a": 1.0, "c[run]": 1.0, "b": 7.0, **dict.fromkeys(names, 0.0)}
     made = problem(lambda x: [x["a"]], start, bounds=dict.fromkeys(names, (-9.0, 9.0)))
-    refined = Refined(made, {"a": 2.0, "c": 3.0}, {"T1_0_x": ("T1_0_x", "T1_1_x")})
-    point = dict(zip(made.names, refined.point(coarse, np.array([1.5, 2.0, 0.4, 0.9, 5.0])), strict=True))
+    refined = RefinedProblem(made, {"a": 2.0, "c": 3.0}, {"T1_0_x": ("T1_0_x", "T1_1_x")})
+    point = dict(
+        zip(made.names, refined.unknowns_from_coarse(coarse, np.array([1.5, 2.0, 0.4, 0.9, 5.0])), strict=True)
+    )
     assert point == {"a": 3.0, "c[run]": 6.0, "b": 7.0, **dict(zip(names, (0.2, 0.2, 0.0, 0.0), strict=True))}
 
 
@@ -122,7 +139,7 @@ def test_a_start_is_carried_to_the_finer_chain():
     ids=["not tried", "within it", "links", "time step", "both"],
 )
 def test_a_move_larger_than_the_standard_deviation_widens_it_to_where_the_limit_is(links, time_step, std):
-    assert Moves(links, time_step).counted(0.1) == pytest.approx(std)
+    assert DiscretisationShift(links, time_step).inflated_std(0.1) == pytest.approx(std)
 
 
 @pytest.mark.parametrize(
@@ -141,7 +158,7 @@ def test_a_move_larger_than_the_standard_deviation_widens_it_to_where_the_limit_
 def test_a_verdict_is_lowered_by_moves_and_never_raised(move, before, after):
     """Of a value of 10 and a standard deviation of 0.02: ten percent are reached by a move of half of them."""
     said = {"a": estimate(10.0, 0.02, verdict=before), "b": estimate(10.0, 0.02), "c": estimate(3.0, 0.0, free=False)}
-    found = counting(said, {"c": Moves(9.0), "a": Moves(move)})
+    found = inflate_estimates(said, {"c": DiscretisationShift(9.0), "a": DiscretisationShift(move)})
     assert found["a"].verdict == after
     assert found["a"].std == (0.02 if move < 0.02 else pytest.approx(math.hypot(0.02, 2 * move)))
     assert found["b"] == said["b"]
@@ -162,7 +179,7 @@ def test_a_verdict_is_lowered_by_moves_and_never_raised(move, before, after):
 )
 def test_an_interval_grows_at_its_ends_by_what_the_move_adds(interval, expected):
     said = replace(estimate(10.0, 0.2), interval=interval, lower=0.0, upper=20.0)
-    found = counting({"a": said}, {"a": Moves(0.3)})["a"].interval
+    found = inflate_estimates({"a": said}, {"a": DiscretisationShift(0.3)})["a"].interval
     if expected is None:
         assert found is None
     else:
@@ -171,12 +188,12 @@ def test_an_interval_grows_at_its_ends_by_what_the_move_adds(interval, expected)
 
 def test_what_nothing_informs_stays_unknown():
     said = {"a": estimate(10.0, math.inf, verdict="not_identifiable")}
-    assert counting(said, {"a": Moves(5.0, 5.0)}) == said
+    assert inflate_estimates(said, {"a": DiscretisationShift(5.0, 5.0)}) == said
 
 
 def test_the_worse_of_two_verdicts():
-    assert lower_of("identifiable", "weak") == lower_of("weak", "identifiable") == "weak"
-    assert lower_of("not_trusted", "weak") == "not_trusted"
+    assert _worse_verdict("identifiable", "weak") == _worse_verdict("weak", "identifiable") == "weak"
+    assert _worse_verdict("not_trusted", "weak") == "not_trusted"
 
 
 # -- on a real chain --------------------------------------------------------------------------------------------------
@@ -192,8 +209,8 @@ def test_half_the_step_of_a_pendulum_is_where_its_own_fit_goes(pendulum, twin):
         step, [recording], coarse.free, coarse.options, dict(zip(coarse.free, coarse.start, strict=True))
     )
     found = solve(coarse, GaussNewton())
-    finer = solve(fine, GaussNewton(), start=found.x)
-    own = moves(Refined(fine), coarse, found.x, found.evaluation)
+    finer = solve(fine, GaussNewton(), initial_unknowns=found.x)
+    own = discretisation_shifts(RefinedProblem(fine), coarse, found.x, found.evaluation)
     change = finer.x - found.x
     assert np.abs(change).max() > 1e-5
     np.testing.assert_allclose([own[name] for name in coarse.names], change, rtol=0.1, atol=0.05 * np.abs(change).max())

@@ -11,24 +11,24 @@ import numpy as np
 import pytest
 from made_recordings import GRID, group, holding_pendulum, places, setting
 
-from yid_ocp.analysis import layouts as module
-from yid_ocp.analysis.identifiability import carried, with_grasp_offsets, with_nuisances
-from yid_ocp.analysis.layouts import (
-    ARM,
-    CAMERA,
-    FORWARD,
-    TOGETHER,
-    LayoutBuilder,
-    Setting,
+from yid_ocp.analysis import experiment_design as module
+from yid_ocp.analysis.experiment_design import (
+    _FORWARD_GRIPPER_OFFSET,
+    _INWARD_GRIPPER_OFFSET,
+    ARM_GROUP,
+    CAMERA_GROUP,
+    BaseExperiment,
+    CandidateExperimentBuilder,
     _pushed_together,
     _travel,
 )
+from yid_ocp.analysis.identifiability import transfer_unknowns, with_grasp_offset_effects, with_nuisance_unknowns
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError, SolverError
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Grasp, System
-from yid_ocp.model.drives import Spring
 from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.model.y_object import y_object
 from yid_ocp.problem import EstimationProblem, ProblemOptions
@@ -49,7 +49,9 @@ def mechanics(*, grasps=(), second=None, driven=(), prescribed=(), measured=Fals
     system = SimpleNamespace(
         grasps=[SimpleNamespace(kind=kind) for kind in grasps], driven=driven, prescribed=prescribed, servos=()
     )
-    return LayoutBuilder(Setting(SimpleNamespace(system=system, episodes=(episode,)), np.zeros(1), second_arm=second))
+    return CandidateExperimentBuilder(
+        BaseExperiment(SimpleNamespace(system=system, episodes=(episode,)), np.zeros(1), two_arm_system=second)
+    )
 
 
 @pytest.mark.parametrize(
@@ -69,7 +71,7 @@ def mechanics(*, grasps=(), second=None, driven=(), prescribed=(), measured=Fals
     ],
 )
 def test_changes_of_mechanics_that_make_sense(settings, possible):
-    assert mechanics(**settings).possible() == possible.split()
+    assert mechanics(**settings).applicable_changes() == possible.split()
 
 
 @pytest.mark.parametrize(
@@ -86,13 +88,13 @@ def test_changes_of_mechanics_that_make_sense(settings, possible):
 def test_noise_of_torques_is_what_is_stated_or_typical(joints, std):
     made = None if joints is None else JointGroup(("a", "b"), np.arange(2.0), np.zeros((2, 2)), **joints)
     problem = SimpleNamespace(episodes=(SimpleNamespace(recording=SimpleNamespace(joints=made)),))
-    found = LayoutBuilder(Setting(problem, np.zeros(1), torque_std=0.7))._torque_options()
+    found = CandidateExperimentBuilder(BaseExperiment(problem, np.zeros(1), torque_std=0.7))._torque_options()
     assert found.std == std
 
 
 def test_a_layout_is_built_once_and_says_what_takes_time(monkeypatch):
     told, built = [], []
-    builder = LayoutBuilder(Setting(None, np.zeros(1)), SimpleNamespace(stage=told.append))
+    builder = CandidateExperimentBuilder(BaseExperiment(None, np.zeros(1)), SimpleNamespace(stage=told.append))
 
     def build(mechanics):
         built.append(mechanics)
@@ -103,9 +105,9 @@ def test_a_layout_is_built_once_and_says_what_takes_time(monkeypatch):
     monkeypatch.setattr(builder, "_build", build)
     both, none = frozenset({"weld", "torque"}), frozenset()
     for _ in range(2):
-        assert builder.layout(none) == "a layout"
-        assert builder.layout(both) == "it snaps"
-        assert builder.layout(frozenset({"motion"})) == "a layout"
+        assert builder.build_experiment(none) == "a layout"
+        assert builder.build_experiment(both) == "it snaps"
+        assert builder.build_experiment(frozenset({"motion"})) == "a layout"
     assert built == [none, both, frozenset({"motion"})]
     assert told == [
         "working out joint torques as a measurement, the arms' motion as known and weld grasps in place of points",
@@ -141,7 +143,7 @@ def test_travel_is_the_farthest_of_the_gripper_from_its_start(holding):
 
 def test_travel_without_grippers_is_typical(urdf_folder):
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    system = System.build(robot, driven=["shoulder", "elbow"], points=["tip"])
+    system = System.build(robot, driven=["shoulder", "elbow"], point_frames=["tip"])
     assert travelled(system, [(0.0, 0.0), (1.0, 1.0)]) == 0.11
 
 
@@ -153,15 +155,17 @@ def test_two_arms_hold_the_object_together_and_away(urdf_folder, points):
     place[:2, 3] = 0.5, 0.2
     grasps = [Grasp("left", "tip", "w_T2"), Grasp("right", "lower", "w_T3")]
     objects = [(y_object(), None, place)]
-    system = System.build(robot, objects=objects, grasps=grasps, driven=["shoulder", "elbow"], points=points)
-    ends = dict(zip(points, places(system, points, np.zeros(system.size)), strict=True))
+    system = System.build(robot, objects=objects, grasps=grasps, driven=["shoulder", "elbow"], point_frames=points)
+    ends = dict(zip(points, places(system, points, np.zeros(system.n_coordinates)), strict=True))
     middle = sum(ends.values()) / len(ends)
     away = np.array([*middle[:2], 0.0]) / math.hypot(*middle[:2])
     found = _pushed_together(system, {})
-    assert set(found) == {grasp.name for grasp in grasps if grasp.held in ends}
+    assert set(found) == {grasp.name for grasp in grasps if grasp.held_frame in ends}
     for grasp in grasps[: len(found)]:
-        inward = (middle - ends[grasp.held]) / np.linalg.norm(middle - ends[grasp.held])
-        np.testing.assert_allclose(found[grasp.name], TOGETHER * inward + FORWARD * away, atol=1e-12)
+        inward = (middle - ends[grasp.held_frame]) / np.linalg.norm(middle - ends[grasp.held_frame])
+        np.testing.assert_allclose(
+            found[grasp.name], _INWARD_GRIPPER_OFFSET * inward + _FORWARD_GRIPPER_OFFSET * away, atol=1e-12
+        )
 
 
 def test_an_object_over_the_robot_is_not_pushed_away(holding):
@@ -175,7 +179,7 @@ def moving(holding, monkeypatch):
     kept = SimpleNamespace()
     joints = list(holding.mechanism.joints)
     for i, (lower, upper, effort) in enumerate([(-1.0, 1.0, 5.0), (-0.5, 2.0, 3.0)]):
-        joints[i] = replace(joints[i], lower=lower, upper=upper, effort_limit=effort)
+        joints[i] = replace(joints[i], lower_limit=lower, upper_limit=upper, effort_limit=effort)
     limited = replace(holding, mechanism=replace(holding.mechanism, joints=tuple(joints)))
 
     def engine(system, values, motion, simulation, posture):
@@ -187,20 +191,20 @@ def moving(holding, monkeypatch):
         return "motion"
 
     monkeypatch.setattr(module, "simulate_in_mujoco", engine)
-    monkeypatch.setattr(module, "multisine", draw)
+    monkeypatch.setattr(module, "random_multisine", draw)
 
     def run(q=((0.0, 0.0),) * 3, effort=((0.0, 0.0),) * 3, twice=False, system=None):
         q = np.array(q, float)
-        kept.q = np.hstack([q, np.full((len(q), limited.size - 2), 9.0)])
+        kept.q = np.hstack([q, np.full((len(q), limited.n_coordinates - 2), 9.0)])
         kept.effort = np.array(effort, float)
         angles = np.array([[0.3, 0.1], [0.9, -0.4]])
         episode = SimpleNamespace(measured_arm=angles, grid=GRID, name="run", errors=None)
         problem = SimpleNamespace(
             system=limited, split=lambda x, i: (limited.parameters.vector({"T1.bend": x[0]}), None), episodes=(episode,)
         )
-        made = Setting(problem, np.array([6.5]))
-        recording, notes = LayoutBuilder(made)._moved(system or limited, episode, 5, twice)
-        kept.travel = _travel(limited, made.values, episode)
+        made = BaseExperiment(problem, np.array([6.5]))
+        recording, notes = CandidateExperimentBuilder(made)._moved(system or limited, episode, 5, twice)
+        kept.travel = _travel(limited, made.parameter_values, episode)
         return recording, notes, kept
 
     run.system = limited
@@ -256,7 +260,7 @@ def test_a_second_arm_finds_its_own_posture(moving, monkeypatch):
         asked.append((system, seed, offsets))
         return {"elbow": 0.7, "shoulder": 0.2}
 
-    monkeypatch.setattr(module, "initial_posture", settle)
+    monkeypatch.setattr(module, "grasping_joint_angles", settle)
     other = replace(moving.system, driven=("elbow", "shoulder"))
     _, _, kept = moving(system=other)
     assert kept.drawn[3] == kept.simulated[4] == {"elbow": 0.7, "shoulder": 0.2}
@@ -302,13 +306,15 @@ def engine(monkeypatch):
         kept.welded.append((system, others))
         return SimpleNamespace(driven=system.driven, welded=True)
 
-    monkeypatch.setattr(LayoutBuilder, "_moved", moved)
-    monkeypatch.setattr(LayoutBuilder, "_welded", weld)
+    monkeypatch.setattr(CandidateExperimentBuilder, "_moved", moved)
+    monkeypatch.setattr(CandidateExperimentBuilder, "_welded", weld)
     return kept
 
 
 def experiment(base, *names, second=None):
-    return LayoutBuilder(Setting(base, np.zeros(1), second_arm=second, seed=20))._experiment(frozenset(names))
+    return CandidateExperimentBuilder(
+        BaseExperiment(base, np.zeros(1), two_arm_system=second, motion_seed=20)
+    )._experiment(frozenset(names))
 
 
 @pytest.mark.parametrize("names", [(), ("torque",)])
@@ -321,7 +327,7 @@ def test_without_another_motion_the_recordings_stay(engine, names):
 
 
 def test_recordings_end_where_the_problem_does():
-    made = LayoutBuilder(Setting(Base(duration=2.0), np.zeros(1)))
+    made = CandidateExperimentBuilder(BaseExperiment(Base(duration=2.0), np.zeros(1)))
     cut = made._cut(made.setting.problem.episodes[0])
     np.testing.assert_allclose(cut.joints.t, 10.0 + 0.1 * np.arange(21))
 
@@ -375,7 +381,7 @@ def dense(made, torque=False, seen=(), second=None, joints=None, base_grasps=("w
     chosen, episode = made
     chosen.problem.system.grasps = [SimpleNamespace(held=name) for name in base_grasps]
     chosen.problem.step = SimpleNamespace(time_step=0.1)
-    builder = LayoutBuilder(replace(chosen, second_arm=second))
+    builder = CandidateExperimentBuilder(replace(chosen, two_arm_system=second))
     recording = replace(episode.recording, joints=joints) if joints is not None else episode.recording
     return builder._dense(recording, 3, seen, torque)
 
@@ -404,9 +410,9 @@ def test_sensors_that_were_not_there_are_added():
     joints = JointGroup(("j",), t, np.zeros((len(t), 1)))
     found = dense(setting(), seen=SEEN, joints=joints, second=SimpleNamespace(grasps=[SimpleNamespace(held="w_T3")]))
     looking, feeling = found.points
-    assert (looking.name, looking.names, looking.sensor) == (CAMERA, ("tip", "marker"), "camera")
+    assert (looking.name, looking.names, looking.sensor) == (CAMERA_GROUP, ("tip", "marker"), "camera")
     np.testing.assert_array_equal(looking.pose, np.eye(4))
-    assert (feeling.name, feeling.names, feeling.sensor, feeling.pose) == (ARM, ("marker", "w_T3"), "arm", None)
+    assert (feeling.name, feeling.names, feeling.sensor, feeling.pose) == (ARM_GROUP, ("marker", "w_T3"), "arm", None)
     np.testing.assert_allclose(looking.t, 10.0 + 0.1 * np.arange(21))
     assert found.joints.effort is None
 
@@ -433,12 +439,14 @@ def test_torques_that_were_not_recorded_are_predicted(known):
 def swung(urdf_folder):
     """swung(**options): a pendulum, the shoulder driven, the elbow springy, the tip seen by a camera."""
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    system = System.build(robot, prescribed=["shoulder"], springs={"elbow": Spring(3.0)}, damping=0.1, points=["tip"])
+    system = System.build(
+        robot, prescribed=["shoulder"], springs={"elbow": RobotJointSpring(3.0)}, damping=0.1, point_frames=["tip"]
+    )
     step = compile_step(system, 0.02, use_compiler=False)
     t = 0.02 * np.arange(41)
     path = 0.4 * np.sin(7.0 * t)
     joints = JointGroup(["shoulder"], t, path[:, None], position_std=0.0)
-    camera = PointGroup(CAMERA, ["tip"], t[::4], np.zeros((11, 1, 3)), 2e-3, sensor="camera", pose=np.eye(4))
+    camera = PointGroup(CAMERA_GROUP, ["tip"], t[::4], np.zeros((11, 1, 3)), 2e-3, sensor="camera", pose=np.eye(4))
     recording = Recording(joints, (camera,), name="swing")
 
     def build(**options):
@@ -449,10 +457,10 @@ def swung(urdf_folder):
 
 
 def informed(problem, mechanics=(), **settings):
-    made = Setting(problem, problem.start, "known", None, **settings)
-    built = LayoutBuilder(made).layout(frozenset(mechanics))
+    made = BaseExperiment(problem, problem.start, "known", None, **settings)
+    built = CandidateExperimentBuilder(made).build_experiment(frozenset(mechanics))
     assert not isinstance(built, str), built
-    return built, built.information([made.views(episode) for episode in problem.episodes])
+    return built, built.fisher_information([made.recorded_observations(episode) for episode in problem.episodes])
 
 
 @pytest.mark.parametrize(
@@ -501,30 +509,30 @@ def test_the_same_mechanics_need_no_other_step(swung):
 def test_starts_are_unknown_or_stay_where_the_fit_has_them(swung, initial, start, becomes, given):
     problem = swung(initial_state=initial)
     x = problem.start
-    made = with_nuisances(problem, x, start, None)
+    made = with_nuisance_unknowns(problem, x, start, None)
     assert made.options.initial_state == becomes
     assert (made is problem) == (becomes == initial)
     assert made.free == problem.free
     if made is not problem:
-        assert set(made.options.known_start) == ({"swing"} if given else set())
+        assert set(made.options.known_initial_states) == ({"swing"} if given else set())
     if given and made is not problem:
         episode = problem.episodes[0]
-        before = problem.start_state(episode, *problem.split(x, 0)).state
-        np.testing.assert_allclose(made.options.known_start["swing"], before)
-        after = made.start_state(made.episodes[0], *made.split(carried(x, problem.names, made), 0)).state
+        before = problem.initial_state(episode, *problem.split(x, 0)).state
+        np.testing.assert_allclose(made.options.known_initial_states["swing"], before)
+        after = made.initial_state(made.episodes[0], *made.split(transfer_unknowns(x, problem.names, made), 0)).state
         np.testing.assert_allclose(after, before)
 
 
 @pytest.mark.parametrize("std", [None, 2e-3])
 def test_where_grasps_sit_is_unknown_only_where_that_is_asked(held_tube, std):
-    step = compile_step(with_grasp_offsets(held_tube.system), 0.02, use_compiler=False)
+    step = compile_step(with_grasp_offset_effects(held_tube.system), 0.02, use_compiler=False)
     recordings = [episode.recording for episode in held_tube.episodes]
     free = (*held_tube.free, "grasp_offset@hand.dy")
     problem = EstimationProblem(step, recordings, free, held_tube.options)
-    made = with_nuisances(problem, problem.start, "known", std)
+    made = with_nuisance_unknowns(problem, problem.initial_unknowns, "known", std)
     added = () if std is None else ("grasp_offset@hand.dx", "grasp_offset@hand.dz")
     assert made.free == (*free, *added)
-    assert made.options.priors == dict.fromkeys(added, std)
+    assert made.options.prior_stds == dict.fromkeys(added, std)
 
 
 def test_shorter_recordings_tell_less(swung):
@@ -549,35 +557,35 @@ def test_what_cannot_be_rolled_out_is_no_layout(swung, monkeypatch):
     monkeypatch.setattr(
         EstimationProblem, "evaluate", lambda self, x: SimpleNamespace(ok=False, jacobian=None, message="it snaps")
     )
-    made = LayoutBuilder(Setting(problem, problem.start, "known", None))
-    assert made.layout(frozenset()) == "the model cannot be rolled out: it snaps"
+    made = CandidateExperimentBuilder(BaseExperiment(problem, problem.start, "known", None))
+    assert made.build_experiment(frozenset()) == "the model cannot be rolled out: it snaps"
 
 
 def test_welds_keep_the_orientation_at_the_start(held_tube):
-    builder = LayoutBuilder(Setting(held_tube, held_tube.start, "known", None))
+    builder = CandidateExperimentBuilder(BaseExperiment(held_tube, held_tube.start, "known", None))
     system = builder._welded(held_tube.system, frozenset())
-    layout = builder.layout(frozenset())
+    layout = builder.build_experiment(frozenset())
     (grasp,) = system.grasps
     assert grasp.kind == "weld"
-    start = layout.problem.start_state(layout.problem.episodes[0], *layout.problem.split(layout.x, 0))
-    symbol = ca.SX.sym("q", system.size)
-    tree = replace(layout.problem.system.mechanism, parameters=system.parameters).numeric(None)
+    start = layout.problem.initial_state(layout.problem.episodes[0], *layout.problem.split(layout.x, 0))
+    symbol = ca.SX.sym("q", system.n_coordinates)
+    tree = replace(layout.problem.system.mechanism, parameters=system.parameters).with_numeric_values(None)
     kinematics = forward_kinematics(tree, symbol)
-    turn = kinematics.pose(grasp.holder).rotation.T @ kinematics.pose(grasp.held).rotation
-    wanted = np.array(ca.Function("turn", [symbol], [turn])(start.state[: system.size]))
-    np.testing.assert_allclose(np.array(ca.DM(grasp.rotation)), wanted, atol=1e-9)
+    turn = kinematics.frame_pose(grasp.holder_frame).rotation.T @ kinematics.frame_pose(grasp.held_frame).rotation
+    wanted = np.array(ca.Function("turn", [symbol], [turn])(start.state[: system.n_coordinates]))
+    np.testing.assert_allclose(np.array(ca.DM(grasp.held_orientation)), wanted, atol=1e-9)
     assert np.linalg.norm(wanted - np.eye(3)) > 0.01
 
 
 @pytest.mark.parametrize("how", ["layout", "start"])
 def test_welds_need_a_start(held_tube, monkeypatch, how):
-    builder = LayoutBuilder(Setting(held_tube, held_tube.start, "known", None))
+    builder = CandidateExperimentBuilder(BaseExperiment(held_tube, held_tube.start, "known", None))
     if how == "layout":
         monkeypatch.setattr(builder, "layout", lambda others: "it snaps")
     else:
-        builder.layout(frozenset())
+        builder.build_experiment(frozenset())
         monkeypatch.setattr(
-            EstimationProblem, "start_state", lambda self, *rest: SimpleNamespace(message="it snaps", state=None)
+            EstimationProblem, "initial_state", lambda self, *rest: SimpleNamespace(message="it snaps", state=None)
         )
     with pytest.raises(SolverError, match="it snaps"):
         builder._welded(held_tube.system, frozenset())

@@ -12,12 +12,18 @@ from made_models import Formula, estimate, solution
 from made_recordings import holding_pendulum
 
 from yid_ocp.analysis import identifiability as module
-from yid_ocp.analysis.combinations import Component, combination_words, listed_names, sparse_basis
-from yid_ocp.analysis.identifiability import carried, identifiability, unknown_vector, with_grasp_offsets, without
+from yid_ocp.analysis.identifiability import (
+    _orthogonal_part,
+    identifiability,
+    transfer_unknowns,
+    unknowns_from_solution,
+    with_grasp_offset_effects,
+)
+from yid_ocp.analysis.parameter_combinations import DirectionComponent, describe_combination, join_names, sparse_basis
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError, SolverError
 from yid_ocp.model import Grasp
-from yid_ocp.solvers.words import percent_words
+from yid_ocp.solvers.fit_messages import percent_text
 
 
 def judged(problem, at=None, **more):
@@ -46,7 +52,7 @@ def test_a_parameter_is_as_sure_as_its_rows_say():
     assert info.identifiable == ("a",)
     np.testing.assert_allclose(info.information, np.diag([900.0, 9.0]))
     np.testing.assert_allclose(info.correlations, np.eye(2), atol=1e-12)
-    assert (info.names, info.nuisances, info.profiles) == (("a", "b"), (), {})
+    assert (info.names, info.nuisance_names, info.profiles) == (("a", "b"), (), {})
 
 
 def test_parameters_that_are_seen_together_are_less_sure_than_each_alone():
@@ -97,7 +103,7 @@ def test_a_fit_is_judged_by_the_noise_that_drives_the_motion_too(monkeypatch):
     problem = Weighed(lambda x: [300 * (x["a"] / 2 - 1) + 20.0 * (-1) ** k for k in range(60)], {"a": 2.0})
     assert judged(problem, [2.0]).parameters["a"].verdict == "identifiable"
     # of a problem with more unknowns the fit is still that of the problem as it was solved
-    monkeypatch.setattr(module, "with_nuisances", lambda *given: Weighed.weighted_at(problem, None))
+    monkeypatch.setattr(module, "with_nuisance_unknowns", lambda *given: Weighed.weighted_at(problem, None))
     assert judged(problem, [2.0]).parameters["a"].verdict == "identifiable"
 
 
@@ -131,7 +137,7 @@ def test_a_nuisance_takes_what_it_explains():
 
     info = judged(with_start(rows, stated=1))
     assert info.names == ("a", "b")
-    assert info.nuisances == ("start.q.x[run]",)
+    assert info.nuisance_names == ("start.q.x[run]",)
     expected = np.linalg.inv(np.array([[900.0, 150.0], [150.0, 29.0]]))[0, 0]
     assert info.parameters["a"].std_relative == pytest.approx(math.sqrt(expected))
     assert info.parameters["a"].std_alone == pytest.approx(1 / 30)
@@ -157,7 +163,7 @@ def test_other_nuisances_are_named_as_well(monkeypatch):
     free = {"a": (0.0, math.inf), GRASP: (-1.0, 1.0), "start.q": (-1.0, 1.0)}
     wide = Formula(rows, {"a": 2.0, GRASP: 0.0}, bounds=free)
     narrow = Formula(lambda x: [30 * (x["a"] / 2 - 1)], {"a": 2.0})
-    monkeypatch.setattr(module, "with_nuisances", lambda *_: wide)
+    monkeypatch.setattr(module, "with_nuisance_unknowns", lambda *_: wide)
     [hidden] = judged(narrow).directions
     assert hidden.words == "a cannot be told apart from where the grasp sits"
 
@@ -166,7 +172,7 @@ def test_other_nuisances_are_named_as_well(monkeypatch):
         return [30 * a + 5 * x[GRASP], 30 * a + 5 * x["start.q"]]
 
     wider = Formula(both, {"a": 2.0, GRASP: 0.0, "start.q": 0.0}, bounds=free)
-    monkeypatch.setattr(module, "with_nuisances", lambda *_: wider)
+    monkeypatch.setattr(module, "with_nuisance_unknowns", lambda *_: wider)
     [hidden] = judged(narrow).directions
     assert hidden.words == "a cannot be told apart from the unknown start and where the grasp sits"
 
@@ -186,10 +192,10 @@ def test_a_combination_that_a_nuisance_hides_is_said_so():
 @pytest.mark.parametrize("tolerance", [1e-9, 1e-11])
 def test_a_column_far_smaller_than_the_largest_counts_as_none(tolerance):
     explained = np.array([[1.0, 0.0], [0.0, tolerance], [0.0, 0.0]])
-    left = without(np.eye(3)[:, 1:2], explained)
+    left = _orthogonal_part(np.eye(3)[:, 1:2], explained)
     np.testing.assert_allclose(left.ravel(), [0, 0.0 if tolerance > 1e-10 else 1.0, 0], atol=1e-9)
-    np.testing.assert_array_equal(without(np.eye(3), np.zeros((3, 0))), np.eye(3))
-    np.testing.assert_array_equal(without(np.eye(3), np.zeros((3, 2))), np.eye(3))
+    np.testing.assert_array_equal(_orthogonal_part(np.eye(3), np.zeros((3, 0))), np.eye(3))
+    np.testing.assert_array_equal(_orthogonal_part(np.eye(3), np.zeros((3, 2))), np.eye(3))
 
 
 # -- directions -------------------------------------------------------------------------------------------------------
@@ -219,7 +225,7 @@ def test_what_is_said_of_one_parameter_is_what_stands_beside_it():
     assert len(info.directions) == 2
     for direction in info.directions:
         [name] = [name for name, part in direction.components.items() if abs(part) > 0.5]
-        assert f"(± {percent_words(info.parameters[name].std_relative)} %)" in direction.words
+        assert f"(± {percent_text(info.parameters[name].std_relative)} %)" in direction.words
 
 
 def test_a_joint_change_names_the_largest_part_first_and_leaves_small_ones_out():
@@ -328,14 +334,14 @@ def test_a_point_that_cannot_be_rolled_out_is_refused():
 
 def test_a_point_is_a_solution_an_array_or_the_start():
     problem = Formula(two(), START)
-    np.testing.assert_array_equal(unknown_vector(problem, None), [2.0, 50.0])
-    np.testing.assert_array_equal(unknown_vector(problem, [3, 4]), [3.0, 4.0])
+    np.testing.assert_array_equal(unknowns_from_solution(problem, None), [2.0, 50.0])
+    np.testing.assert_array_equal(unknowns_from_solution(problem, [3, 4]), [3.0, 4.0])
     found = solution(b=estimate(70.0), other=estimate(9.0))
-    np.testing.assert_array_equal(unknown_vector(problem, found), [2.0, 70.0])
+    np.testing.assert_array_equal(unknowns_from_solution(problem, found), [2.0, 70.0])
     with pytest.raises(SolverError, match="shape"):
-        unknown_vector(problem, [1.0])
+        unknowns_from_solution(problem, [1.0])
     with pytest.raises(SolverError, match="b is not finite"):
-        unknown_vector(problem, [1.0, math.nan])
+        unknowns_from_solution(problem, [1.0, math.nan])
 
 
 @pytest.mark.parametrize("size", [1e-12, 1.0, 1e12])
@@ -343,7 +349,7 @@ def test_what_is_explained_does_not_depend_on_the_size_of_the_explanation(size):
     rng = np.random.default_rng(4)
     columns, explained = rng.standard_normal((6, 2)), rng.standard_normal((6, 3))
     explained = np.column_stack([explained, explained @ [1.0, 2.0, 3.0]])
-    left = without(columns, size * explained)
+    left = _orthogonal_part(columns, size * explained)
     np.testing.assert_allclose(explained.T @ left, 0.0, atol=1e-12)
     projected = explained @ np.linalg.lstsq(explained, columns, rcond=1e-9)[0]
     np.testing.assert_allclose(left, columns - projected, atol=1e-12)
@@ -356,7 +362,7 @@ def test_every_grasp_without_an_offset_gets_one(urdf_folder):
     system = replace(system, grasps=(*system.grasps, other))
     for there in ((), (("grasp_compliance", "hand"),), (("grasp_offset", "other"), ("grasp_compliance", "other"))):
         made = system.with_effects([make_effect(kind, place, system) for kind, place in there])
-        found = [(e.kind, e.location) for e in with_grasp_offsets(made).effects]
+        found = [(e.kind, e.location) for e in with_grasp_offset_effects(made).effects]
         assert found[: len(there)] == list(there)
         missing = [place for place in ("hand", "other") if ("grasp_offset", place) not in there]
         assert found[len(there) :] == [("grasp_offset", place) for place in missing]
@@ -364,7 +370,7 @@ def test_every_grasp_without_an_offset_gets_one(urdf_folder):
 
 def test_unknowns_are_carried_over_by_name():
     other = Formula(lambda x: [x["c"]], {"b": 1.0, "c": 7.0, "a": 1.0})
-    np.testing.assert_array_equal(carried(np.array([2.0, 50.0]), ("a", "b"), other), [50.0, 7.0, 2.0])
+    np.testing.assert_array_equal(transfer_unknowns(np.array([2.0, 50.0]), ("a", "b"), other), [50.0, 7.0, 2.0])
 
 
 # -- combinations -----------------------------------------------------------------------------------------------------
@@ -372,7 +378,7 @@ def test_unknowns_are_carried_over_by_name():
 
 def parts(*values, units=("N/m", "N/m")):
     return [
-        Component(f"k{i}", part, value, unit)
+        DirectionComponent(f"k{i}", part, value, unit)
         for i, ((part, value), unit) in enumerate(zip(values, units, strict=False))
     ]
 
@@ -402,7 +408,7 @@ def moves(function):
 )
 def test_a_plain_combination_has_its_direction_and_holds_at_a_finite_change(direction, function, units, words):
     a, b = np.array(direction) / np.linalg.norm(direction)
-    said = combination_words(parts((a, 2.0), (b, 5.0), units=units), moves(function))
+    said = describe_combination(parts((a, 2.0), (b, 5.0), units=units), moves(function))
     assert (words is not None and said.startswith(f"k0 and k1 are seen only as {words}")) is (words is not None)
 
 
@@ -415,9 +421,9 @@ def test_a_combination_may_move_the_data_a_little():
             alone = len(changes) == 1
             return 100.0 if alone else 100.0 * size
 
-        assert ("the product" in combination_words(made, moved)) is named
-    assert "the product" in combination_words(made, lambda changes: 5.0 if len(changes) == 1 else 0.99)
-    assert "the product" not in combination_words(made, lambda changes: 5.0 if len(changes) == 1 else 1.01)
+        assert ("the product" in describe_combination(made, moved)) is named
+    assert "the product" in describe_combination(made, lambda changes: 5.0 if len(changes) == 1 else 0.99)
+    assert "the product" not in describe_combination(made, lambda changes: 5.0 if len(changes) == 1 else 1.01)
 
 
 def test_the_combination_that_moves_the_data_least_is_named():
@@ -428,32 +434,35 @@ def test_the_combination_that_moves_the_data_least_is_named():
         return 1e3 * abs(a + b - 6.0)
 
     # equal values: sum, product and series look alike at first
-    assert "k0 + k1" in combination_words(made, moved)
+    assert "k0 + k1" in describe_combination(made, moved)
 
 
 def test_a_partner_that_would_have_to_be_negative_is_none():
     made = parts((1.0, 9.0), (-9.0, 1.0))
-    said = combination_words(made, lambda changes: 0.0 if len(changes) == 2 else 100.0)
+    said = describe_combination(made, lambda changes: 0.0 if len(changes) == 2 else 100.0)
     assert "k0 + k1" not in said
 
 
 def test_one_parameter_alone_and_names_in_a_row():
-    assert combination_words(parts((1.0, 2.0)), None) == "k0 is not seen"
-    assert listed_names(["a"]) == "a"
-    assert listed_names(["a", "b"]) == "a and b"
-    assert listed_names(list("abcd")) == "a, b, c and d"
-    assert listed_names(list("abcde")) == "a, b, c, d and 1 more"
+    assert describe_combination(parts((1.0, 2.0)), None) == "k0 is not seen"
+    assert join_names(["a"]) == "a"
+    assert join_names(["a", "b"]) == "a and b"
+    assert join_names(list("abcd")) == "a, b, c and d"
+    assert join_names(list("abcde")) == "a, b, c, d and 1 more"
 
 
 def test_a_trade_is_in_percent_of_the_largest_change():
-    made = [Component(name, part, 1.0, "N/m") for name, part in (("a", 0.1), ("b", -0.4), ("c", 0.3))]
-    said = combination_words(made, None)
+    made = [DirectionComponent(name, part, 1.0, "N/m") for name, part in (("a", 0.1), ("b", -0.4), ("c", 0.3))]
+    said = describe_combination(made, None)
     assert (
         said
         == "a, b and c are seen only together: a +2.5 % with b -10 % with c +7.5 % changes nothing that is measured"
     )
-    five = [Component(name, part, 1.0, "N/m") for name, part in zip("abcde", (0.1, -0.5, 0.2, 0.3, 0.4), strict=True)]
-    assert "b -10 % with e +8 % with d +6 % with c +4 % and the others to match" in combination_words(five, None)
+    five = [
+        DirectionComponent(name, part, 1.0, "N/m")
+        for name, part in zip("abcde", (0.1, -0.5, 0.2, 0.3, 0.4), strict=True)
+    ]
+    assert "b -10 % with e +8 % with d +6 % with c +4 % and the others to match" in describe_combination(five, None)
 
 
 @pytest.mark.parametrize("seed", range(4))

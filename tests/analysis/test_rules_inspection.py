@@ -12,18 +12,18 @@ import pytest
 from made_recordings import places
 
 from yid_ocp.analysis import convergence
-from yid_ocp.analysis.convergence import grasp_gaps, held_still, natural_frequencies
-from yid_ocp.analysis.inspection import (
-    DIFFERENCE,
+from yid_ocp.analysis.convergence import _with_prescribed_joints, min_grasp_gaps, natural_frequencies
+from yid_ocp.analysis.step_diagnostics import (
+    _DIFFERENCE_STEP,
     _differences,
     _error,
-    inspect_step,
-    jacobian_sparsity,
-    linearise,
+    _jacobian_sparsity,
+    linearise_and_check,
+    step_structure,
 )
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Grasp, Segment, System, flexible_object
-from yid_ocp.model.drives import Spring
+from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 
 
@@ -31,8 +31,8 @@ from yid_ocp.model.urdf import read_urdf
 def swing(urdf_folder):
     """A double pendulum whose shoulder is driven, its elbow springy."""
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    springs = {"elbow": Spring(3.0)}
-    system = System.build(robot, driven=["shoulder"], springs=springs, damping=0.2, points=["tip"])
+    springs = {"elbow": RobotJointSpring(3.0)}
+    system = System.build(robot, driven=["shoulder"], springs=springs, damping=0.2, point_frames=["tip"])
     return compile_step(system, 0.01, use_compiler=False)
 
 
@@ -51,23 +51,23 @@ def held(urdf_folder):
 
 
 def test_a_step_is_counted(swing):
-    found = inspect_step(swing)
-    assert found.sizes == swing.sizes
-    assert found.sizes | {"n": 2, "nu": 1, "nz": 0, "m": 0, "nc": 0, "nx": 4} == found.sizes
-    assert found.unknowns == 2
+    found = step_structure(swing)
+    assert found.dimensions == swing.sizes
+    assert found.dimensions | {"n": 2, "nu": 1, "nz": 0, "m": 0, "nc": 0, "nx": 4} == found.dimensions
+    assert found.n_unknowns == 2
     assert found.jacobian_nonzeros == 4
-    assert [entry.name for entry in found.functions] == [f.name() for f in swing.functions.all]
-    for entry, f in zip(found.functions, swing.functions.all, strict=True):
-        assert entry.operations == f.n_instructions()
-        assert entry.nonzeros == sum(f.sparsity_out(i).nnz() for i in range(f.n_out()))
-    assert max(entry.operations for entry in found.functions) > 100
+    assert [entry.name for entry in found.function_sizes] == [f.name() for f in swing.functions.all]
+    for entry, f in zip(found.function_sizes, swing.functions.all, strict=True):
+        assert entry.n_operations == f.n_instructions()
+        assert entry.n_nonzeros == sum(f.sparsity_out(i).nnz() for i in range(f.n_out()))
+    assert max(entry.n_operations for entry in found.function_sizes) > 100
 
 
 def test_the_pattern_is_of_the_residual_by_its_unknowns(held):
-    pattern = jacobian_sparsity(held)
+    pattern = _jacobian_sparsity(held)
     count = held.sizes["n"] - 2 + held.sizes["nz"] + held.sizes["m"]
     assert pattern.shape == (count, count)
-    assert inspect_step(held).unknowns == count
+    assert step_structure(held).n_unknowns == count
     # a multiplier does not enter the constraint that it keeps
     corner = np.array(ca.DM(pattern, 1.0))[-held.sizes["m"] :, -held.sizes["m"] :]
     assert not np.any(corner)
@@ -108,23 +108,23 @@ STATE, TORQUE, THETA = np.array([0.5, -3.0, 20.0, 0.0, -0.5]), np.array([1.0, 4.
 
 def test_a_linear_step_is_linearised():
     step = Linear()
-    found = linearise(step, STATE, TORQUE, THETA, (1.0, 2.0))
+    found = linearise_and_check(step, STATE, TORQUE, THETA, (1.0, 2.0))
     np.testing.assert_array_equal(found.state, STATE)
     np.testing.assert_array_equal(found.b_input, step.b)
     np.testing.assert_array_equal(found.b_theta, step.c)
     assert found.spectral_radius == pytest.approx(np.max(np.abs(np.linalg.eigvals(found.a))))
-    assert set(found.errors) == {"A", "B_u", "B_theta"}
-    assert max(found.errors.values()) < 1e-8
+    assert set(found.finite_difference_errors) == {"A", "B_u", "B_theta"}
+    assert max(found.finite_difference_errors.values()) < 1e-8
 
 
 @pytest.mark.parametrize("name", ["A", "B_u", "B_theta"])
 @pytest.mark.parametrize("by", [0.5, -0.25])
 def test_a_wrong_entry_is_a_fraction_of_the_largest(name, by):
     step = Linear(**{name: by})
-    found = linearise(step, STATE, TORQUE, THETA, (1.0, 2.0))
+    found = linearise_and_check(step, STATE, TORQUE, THETA, (1.0, 2.0))
     matrix = {"A": np.delete(found.a, 1, axis=1), "B_u": found.b_input, "B_theta": found.b_theta}[name]
-    assert found.errors[name] == pytest.approx(abs(by) / np.max(np.abs(matrix)), rel=1e-6)
-    assert all(error < 1e-8 for other, error in found.errors.items() if other != name)
+    assert found.finite_difference_errors[name] == pytest.approx(abs(by) / np.max(np.abs(matrix)), rel=1e-6)
+    assert all(error < 1e-8 for other, error in found.finite_difference_errors.items() if other != name)
 
 
 def test_differences_are_taken_relative_to_the_size_of_what_is_varied():
@@ -139,7 +139,7 @@ def test_differences_are_taken_relative_to_the_size_of_what_is_varied():
     np.testing.assert_allclose(slopes, [[0.03, 0.0], [-50.0, 0.1]], atol=1e-8)
     moved = np.array(asked) - at
     np.testing.assert_allclose(
-        moved, np.array([[1, 0], [-1, 0], [0, 50], [0, -50]]) * DIFFERENCE, rtol=1e-6, atol=1e-18
+        moved, np.array([[1, 0], [-1, 0], [0, 50], [0, -50]]) * _DIFFERENCE_STEP, rtol=1e-6, atol=1e-18
     )
     assert _differences(lambda x: np.ones(3), np.zeros(0)).shape == (3, 0)
 
@@ -164,9 +164,9 @@ def test_a_real_step_agrees_with_its_differences(held):
     posture = np.array([0.3, -0.6])
     state[list(held.system.prescribed_indices)] = posture
     state[0 : held.sizes["n"]] += 0.01
-    found = linearise(held, state, np.zeros(0), values, (posture, posture + 0.01))
+    found = linearise_and_check(held, state, np.zeros(0), values, (posture, posture + 0.01))
     assert found.a.shape == (held.sizes["nx"],) * 2
-    assert max(found.errors.values()) < 1e-5
+    assert max(found.finite_difference_errors.values()) < 1e-5
 
 
 # -- frequencies ------------------------------------------------------------------------------------------------------
@@ -183,7 +183,7 @@ def hanging(urdf_folder):
 
     def find(stiffness=3.0, damping=0.0, mode="driven", gravity=-9.81):
         more = {"gravity": (0, 0, gravity), "damping": damping, mode: ["shoulder"]}
-        system = System.build(robot, springs={"elbow": Spring(stiffness)}, points=["tip"], **more)
+        system = System.build(robot, springs={"elbow": RobotJointSpring(stiffness)}, point_frames=["tip"], **more)
         return natural_frequencies(system, {"shoulder": 0.0}, system.parameters.vector(), H)
 
     return find
@@ -195,50 +195,50 @@ def test_a_rod_swings_at_the_frequency_of_its_spring_and_weight(hanging, mode, s
     found = hanging(stiffness, damping, mode)
     exact = math.sqrt((stiffness + WEIGHT) / INERTIA) / (2 * math.pi)
     lowered = math.atan(math.pi * exact * H) / (math.pi * H)
-    assert found.hertz == pytest.approx([lowered], rel=1e-6)
+    assert found.frequencies_hz == pytest.approx([lowered], rel=1e-6)
     assert lowered < 0.999 * exact
-    assert (found.growing, found.message) == (0, "")
+    assert (found.n_unstable_modes, found.message) == (0, "")
 
 
 def test_frequencies_of_several_joints_ascend(urdf_folder):
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    springs = {"shoulder": Spring(30.0), "elbow": Spring(3.0)}
-    system = System.build(robot, springs=springs, damping=0.3, points=["tip"])
+    springs = {"shoulder": RobotJointSpring(30.0), "elbow": RobotJointSpring(3.0)}
+    system = System.build(robot, springs=springs, damping=0.3, point_frames=["tip"])
     found = natural_frequencies(system, {}, system.parameters.vector(), H)
     m1, m2, l1, c1, c2 = 1.0, 0.6, 0.5, 0.25, 0.2
     a = 0.0208 + m1 * c1**2 + m2 * (l1**2 + c2**2 + 2 * l1 * c2) + 0.008
     b, c = 0.008 + m2 * (c2**2 + l1 * c2), INERTIA
     stiff = np.array([[30.0 + 9.81 * (m1 * c1 + m2 * (l1 + c2)), WEIGHT], [WEIGHT, 3.0 + WEIGHT]])
     exact = np.sort(np.sqrt(np.linalg.eigvals(np.linalg.solve([[a, b], [b, c]], stiff)))) / (2 * math.pi)
-    assert found.hertz == pytest.approx(np.arctan(math.pi * exact * H) / (math.pi * H), rel=1e-6)
+    assert found.frequencies_hz == pytest.approx(np.arctan(math.pi * exact * H) / (math.pi * H), rel=1e-6)
 
 
 def test_what_leaves_its_posture_grows(hanging):
     """A rod that stands on a spring too soft for its weight: no frequency, one way to fall."""
     found = hanging(0.5, 0.05, gravity=9.81)
-    assert found.growing == 1
-    assert not len(found.hertz)
-    assert hanging(3.0, 0.05, gravity=9.81).growing == 0
+    assert found.n_unstable_modes == 1
+    assert not len(found.frequencies_hz)
+    assert hanging(3.0, 0.05, gravity=9.81).n_unstable_modes == 0
 
 
 def test_what_cannot_swing_says_so(urdf_folder, hanging, monkeypatch):
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    system = System.build(robot, driven=["shoulder"], prescribed=["elbow"], points=["tip"])
+    system = System.build(robot, driven=["shoulder"], prescribed=["elbow"], point_frames=["tip"])
     found = natural_frequencies(system, {}, system.parameters.vector(), H)
-    assert (len(found.hertz), found.growing) == (0, 0)
+    assert (len(found.frequencies_hz), found.n_unstable_modes) == (0, 0)
     assert found.message == "every coordinate is prescribed, nothing can swing"
     rest = SimpleNamespace(converged=False, message="it does not come to rest")
     monkeypatch.setattr(
-        "yid_ocp.analysis.convergence.Statics", lambda step: SimpleNamespace(solve=lambda *a, **k: rest)
+        "yid_ocp.analysis.convergence.EquilibriumSolver", lambda step: SimpleNamespace(solve=lambda *a, **k: rest)
     )
     found = hanging()
-    assert (len(found.hertz), found.message) == (0, "it does not come to rest")
+    assert (len(found.frequencies_hz), found.message) == (0, "it does not come to rest")
 
 
 def test_a_robot_held_still_keeps_its_order(urdf_folder):
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    system = System.build(robot, driven=["elbow"], prescribed=["shoulder"], points=["tip"])
-    still = held_still(system)
+    system = System.build(robot, driven=["elbow"], prescribed=["shoulder"], point_frames=["tip"])
+    still = _with_prescribed_joints(system)
     assert (still.driven, still.prescribed) == ((), ("elbow", "shoulder"))
 
 
@@ -271,20 +271,20 @@ def reaching(urdf_folder):
 )
 def test_gaps_of_grasps_are_what_bending_cannot_close(reaching, x, angle, gap):
     system = reaching(x)
-    found = grasp_gaps(system, {"shoulder": angle, "elbow": 0.0}, system.parameters.vector())
+    found = min_grasp_gaps(system, {"shoulder": angle, "elbow": 0.0}, system.parameters.vector())
     assert set(found) == {"hand"}
     assert found["hand"] == pytest.approx(gap, abs=2e-3)
 
 
 def test_systems_without_grasps_have_no_gaps(reaching):
     system = reaching(grasps=0)
-    assert grasp_gaps(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector()) == {}
+    assert min_grasp_gaps(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector()) == {}
 
 
 def test_each_grasp_has_its_gap(reaching):
     """Tip at 0.3 m and elbow at 0.7 m above the ground, of a rod of 0.6 m whose middle link ends at 0.4 m."""
     system = reaching(grasps=2)
-    found = grasp_gaps(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector())
+    found = min_grasp_gaps(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector())
     assert list(found) == ["hand", "other"]
     assert min(found.values()) > 0.05
 
@@ -307,9 +307,9 @@ def test_a_gap_is_sought_from_four_starts_until_it_closes(reaching, monkeypatch,
 
     done: list[int] = []
     monkeypatch.setattr(convergence.scipy.optimize, "least_squares", found)
-    gaps = grasp_gaps(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector())
+    gaps = min_grasp_gaps(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector())
     assert len(done) == searches
-    q = np.zeros(system.size)
+    q = np.zeros(system.n_coordinates)
     ends = [starts[i] * whole["x"] for i in range(searches)]
     distances = []
     for end in ends:

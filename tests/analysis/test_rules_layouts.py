@@ -9,30 +9,42 @@ import numpy as np
 import pytest
 from made_recordings import GRID, group, holding_pendulum, places, setting
 
-from yid_ocp.analysis.layouts import (
-    ARM_STD,
-    CAMERA_STD,
-    MARKER_DISTANCE,
-    Layout,
-    View,
-    regular_times,
-    seeing,
-    sights,
+from yid_ocp.analysis.experiment_design import (
+    _DEFAULT_ARM_POINT_STD,
+    _DEFAULT_CAMERA_STD,
+    _MARKER_AXIS_DISTANCE,
+    CandidateExperiment,
+    FrameObservation,
+    observable_frames,
+    uniform_sample_times,
+    with_added_frames,
 )
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Segment, System, flexible_object
-from yid_ocp.model.drives import Spring
+from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import SensorOptions
-from yid_ocp.problem.grid import Grid
+from yid_ocp.problem.time_grid import TimeGrid
 
 # -- what a recording saw ---------------------------------------------------------------------------------------------
 
 
 def test_settings_ask_for_the_start_that_is_assumed_and_known_grasps_unless_told():
     made, _ = setting(group())
-    assert (made.start, made.grasp_std, made.second_arm, made.torque_std, made.seed) == ("assumed", None, None, 0.1, 11)
+    assert (
+        made.initial_state_knowledge,
+        made.grasp_offset_prior_std,
+        made.two_arm_system,
+        made.torque_std,
+        made.motion_seed,
+    ) == (
+        "assumed",
+        None,
+        None,
+        0.1,
+        11,
+    )
 
 
 @pytest.mark.parametrize(
@@ -49,7 +61,7 @@ def test_settings_ask_for_the_start_that_is_assumed_and_known_grasps_unless_told
 )
 def test_cameras_and_arms_are_told_apart(groups, camera, arm):
     made, episode = setting(*groups)
-    seen, felt = made.camera(episode), made.arm(episode)
+    seen, felt = made.camera_sampling(episode), made.arm_sampling(episode)
     assert (None if seen[0] is None else seen[0].name) == camera
     assert (None if felt[0] is None else felt[0].name) == arm
 
@@ -58,37 +70,37 @@ def test_times_count_from_the_start_and_the_typical_noise_is_the_median():
     std = np.full((3, 2, 3), 2e-3)
     std[0] = [9e-3, np.nan, 9e-3]
     made, episode = setting(group(std=std), group("points_arm", t=(10.2, 10.3), std=7e-4))
-    _, times, noise = made.camera(episode)
+    _, times, noise = made.camera_sampling(episode)
     np.testing.assert_allclose(times, [0.0, 0.5, 1.0])
     assert noise == 2e-3
-    _, times, noise = made.arm(episode)
+    _, times, noise = made.arm_sampling(episode)
     np.testing.assert_allclose(times, [0.2, 0.3])
     assert noise == 7e-4
 
 
 def test_sensors_that_were_not_there_are_typical():
     made, episode = setting()
-    found, times, noise = made.camera(episode)
-    assert (found, noise) == (None, CAMERA_STD)
+    found, times, noise = made.camera_sampling(episode)
+    assert (found, noise) == (None, _DEFAULT_CAMERA_STD)
     np.testing.assert_allclose(times, np.arange(7) / 3.0)
-    found, times, noise = made.arm(episode)
-    assert (found, noise) == (None, ARM_STD)
+    found, times, noise = made.arm_sampling(episode)
+    assert (found, noise) == (None, _DEFAULT_ARM_POINT_STD)
     np.testing.assert_allclose(times, 0.1 * np.arange(21), atol=1e-12)
 
 
 def test_groups_that_are_not_used_see_nothing():
     made, episode = setting(group(), group("points_arm"), sensors={"points_camera": SensorOptions(use=False)})
-    assert made.camera(episode)[0] is None
-    assert {view.group for view in made.views(episode)} == {"points_arm"}
+    assert made.camera_sampling(episode)[0] is None
+    assert {view.point_group for view in made.recorded_observations(episode)} == {"points_arm"}
 
 
 def test_views_are_of_the_frames_of_points_that_the_model_has():
     sensors = {"points_camera": SensorOptions(frames={"led": "tip"}), "points_arm": SensorOptions(points=("b",))}
     groups = (group(names=("a", "led", "nothing")), group("points_arm"))
     made, episode = setting(*groups, sensors=sensors)
-    assert made.frames(groups[0]) == {"a": "a", "led": "tip"}
-    assert made.frames(groups[1]) == {"b": "b"}
-    assert [(view.group, view.frame) for view in made.views(episode)] == [
+    assert made.point_frames(groups[0]) == {"a": "a", "led": "tip"}
+    assert made.point_frames(groups[1]) == {"b": "b"}
+    assert [(view.point_group, view.frame) for view in made.recorded_observations(episode)] == [
         ("points_camera", "a"),
         ("points_camera", "tip"),
         ("points_arm", "b"),
@@ -100,7 +112,7 @@ def test_views_are_where_points_were_seen():
     position, std = made.position.copy(), np.arange(18.0).reshape(3, 2, 3) + 1
     position[1, 1] = np.nan
     chosen, episode = setting(replace(made, position=position, std=std))
-    first, second = chosen.views(episode)
+    first, second = chosen.recorded_observations(episode)
     np.testing.assert_allclose(first.times, [0.0, 0.5, 1.0])
     np.testing.assert_array_equal(first.std, std[:, 0])
     np.testing.assert_allclose(second.times, [0.0, 1.0])
@@ -109,11 +121,11 @@ def test_views_are_where_points_were_seen():
 
 def test_a_stated_noise_level_replaces_the_recorded_one():
     made, episode = setting(group(std=None), sensors={"points_camera": SensorOptions(std=3e-3)})
-    assert made.camera(episode)[2] == 3e-3
-    assert made.views(episode)[1].std.shape == (3, 3)
+    assert made.camera_sampling(episode)[2] == 3e-3
+    assert made.recorded_observations(episode)[1].std.shape == (3, 3)
     unknown, episode = setting(group(std=None))
     with pytest.raises(DataError, match="the noise level of group 'points_camera' is not known"):
-        unknown.views(episode)
+        unknown.recorded_observations(episode)
 
 
 @pytest.mark.parametrize(
@@ -121,7 +133,7 @@ def test_a_stated_noise_level_replaces_the_recorded_one():
     [(1.0, [0.0, 1.0, 2.0]), (0.4, [0.0]), (1.5, [0.0, 2 / 3, 4 / 3, 2.0]), (10.0, 0.1 * np.arange(21))],
 )
 def test_an_even_clock_covers_the_recording(rate, times):
-    np.testing.assert_allclose(regular_times(GRID, rate), times, atol=1e-12)
+    np.testing.assert_allclose(uniform_sample_times(GRID, rate), times, atol=1e-12)
 
 
 # -- information ------------------------------------------------------------------------------------------------------
@@ -130,26 +142,26 @@ def test_an_even_clock_covers_the_recording(rate, times):
 def sloped(seed=3, episodes=1, unknowns=2):
     """A layout whose frames move by random slopes; information that is fixed is 7 of the first unknown."""
     rng = np.random.default_rng(seed)
-    grid = Grid(10.0, 0.5, 4)
+    grid = TimeGrid(10.0, 0.5, 4)
     slopes = {
         (i, "camera", frame): rng.standard_normal((5, 3, unknowns)) for i in range(episodes) for frame in ("a", "b")
     }
     fixed = np.zeros((unknowns, unknowns))
     fixed[0, 0] = 7.0
     problem = SimpleNamespace(episodes=[SimpleNamespace(grid=grid)] * episodes)
-    return Layout(problem, np.zeros(unknowns), ("p", "q"), slopes, fixed)
+    return CandidateExperiment(problem, np.zeros(unknowns), ("p", "q"), slopes, fixed)
 
 
 def view(times, std, frame="a"):
-    return View("camera", frame, np.array(times), np.array(std, float) * np.ones((len(times), 3)))
+    return FrameObservation("camera", frame, np.array(times), np.array(std, float) * np.ones((len(times), 3)))
 
 
 def test_no_views_tell_what_is_fixed():
     made = sloped()
-    found = made.information([[]])
-    np.testing.assert_array_equal(found, made.fixed)
+    found = made.fisher_information([[]])
+    np.testing.assert_array_equal(found, made.prior_information)
     found += 1.0
-    assert made.fixed[1, 1] == 0.0
+    assert made.prior_information[1, 1] == 0.0
 
 
 @pytest.mark.parametrize(
@@ -168,9 +180,12 @@ def test_no_views_tell_what_is_fixed():
 def test_a_view_is_interpolated_between_nodes(time, weights):
     made = sloped()
     std = np.array([[0.1, 0.2, 0.5]])
-    rows = sum((w * made.slopes[0, "camera", "a"][k] for k, w in weights.items()), np.zeros((3, 2))) / std.T
-    found = made.information([[view([time], std)]])
-    np.testing.assert_allclose(found - made.fixed, rows.T @ rows, atol=1e-9)
+    rows = (
+        sum((w * made.position_sensitivities[0, "camera", "a"][k] for k, w in weights.items()), np.zeros((3, 2)))
+        / std.T
+    )
+    found = made.fisher_information([[view([time], std)]])
+    np.testing.assert_allclose(found - made.prior_information, rows.T @ rows, atol=1e-9)
 
 
 def test_views_add_up_over_frames_times_and_recordings():
@@ -178,7 +193,7 @@ def test_views_add_up_over_frames_times_and_recordings():
     first, second = [view([0.0, 1.0], 0.1)], [view([0.5], 0.2), view([0.5], 0.2, "b")]
 
     def of(i, frame, node, std):
-        rows = made.slopes[i, "camera", frame][node] / std
+        rows = made.position_sensitivities[i, "camera", frame][node] / std
         return rows.T @ rows
 
     def lists(i, chosen):
@@ -186,12 +201,12 @@ def test_views_add_up_over_frames_times_and_recordings():
             return of(i, "a", 0, 0.1) + of(i, "a", 2, 0.1)
         return of(i, "a", 1, 0.2) + of(i, "b", 1, 0.2)
 
-    wanted = made.fixed + lists(0, first) + lists(1, second) + lists(2, first)
-    np.testing.assert_allclose(made.information([first, second]), wanted)
+    wanted = made.prior_information + lists(0, first) + lists(1, second) + lists(2, first)
+    np.testing.assert_allclose(made.fisher_information([first, second]), wanted)
     # each once: the same views again come from memory, others do not
     assert len(made._known) == 4 + 0 * 3
-    np.testing.assert_allclose(made.information([first, second]), wanted)
-    finer = made.information([[view([0.0, 1.0], 0.05)], second])
+    np.testing.assert_allclose(made.fisher_information([first, second]), wanted)
+    finer = made.fisher_information([[view([0.0, 1.0], 0.05)], second])
     np.testing.assert_allclose(finer - wanted, 3 * (lists(0, first) + lists(2, first)), atol=1e-9)
 
 
@@ -214,15 +229,15 @@ def holding(urdf_folder):
 )
 def test_a_segment_has_a_tip_a_middle_and_a_marker(links, names):
     tube = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=links, bend=4.0, twist=3.0)])
-    found = sights(System.build(None, objects=[(tube, None, None)]))
+    found = observable_frames(System.build(None, objects=[(tube, None, None)]))
     assert [sight.name for sight in found] == names
-    assert [sight.arm for sight in found] == [False] * len(names)
-    assert found[-1].words == "a marker 3 cm off the axis at the end of T1"
-    assert [sight.frame is None for sight in found] == [True] * (len(names) - 1) + [False]
+    assert [sight.is_arm_measurable for sight in found] == [False] * len(names)
+    assert found[-1].description == "a marker 3 cm off the axis at the end of T1"
+    assert [sight.added_frame is None for sight in found] == [True] * (len(names) - 1) + [False]
 
 
 def test_markers_at_held_ends_can_be_felt(holding):
-    assert {sight.name: sight.arm for sight in sights(holding)} == {
+    assert {sight.name: sight.is_arm_measurable for sight in observable_frames(holding)} == {
         "w_T1": False,
         "T1_1_tip": False,
         "T1_marker": True,
@@ -230,9 +245,9 @@ def test_markers_at_held_ends_can_be_felt(holding):
 
 
 def test_a_marker_is_off_the_axis(holding):
-    marker = sights(holding)[-1].frame
-    tip, beside = places(holding, ["w_T1", marker], np.zeros(holding.size))
-    np.testing.assert_allclose(beside - tip, [MARKER_DISTANCE, 0.0, 0.0], atol=1e-12)
+    marker = observable_frames(holding)[-1].added_frame
+    tip, beside = places(holding, ["w_T1", marker], np.zeros(holding.n_coordinates))
+    np.testing.assert_allclose(beside - tip, [_MARKER_AXIS_DISTANCE, 0.0, 0.0], atol=1e-12)
 
 
 URDF = """<robot name="r"><link name="wall"/>
@@ -257,24 +272,26 @@ URDF = """<robot name="r"><link name="wall"/>
 def test_a_springy_joint_has_a_marker_across_its_axis(tmp_path, axis, beside):
     file = tmp_path / "r.urdf"
     file.write_text(URDF.format(axis=" ".join(map(str, axis))))
-    springs = {"turn": Spring(1.0), "slide": Spring(1.0)}
-    system = System.build(read_urdf(file), springs=springs, points=["b"])
-    found = {sight.name: sight for sight in sights(system)}
-    moving = {name for name, frame in system.mechanism.frames.items() if frame.joint >= 0}
+    springs = {"turn": RobotJointSpring(1.0), "slide": RobotJointSpring(1.0)}
+    system = System.build(read_urdf(file), springs=springs, point_frames=["b"])
+    found = {sight.name: sight for sight in observable_frames(system)}
+    moving = {name for name, frame in system.mechanism.frames.items() if frame.joint_index >= 0}
     assert set(found) == moving | {"turn_marker"}
     assert "wall" in system.mechanism.frames
-    assert all(sight.frame is None and sight.words == name for name, sight in found.items() if name in moving)
+    assert all(
+        sight.added_frame is None and sight.description == name for name, sight in found.items() if name in moving
+    )
     marker = found["turn_marker"]
-    assert marker.words == "a marker 3 cm off the axis of turn"
-    wanted = MARKER_DISTANCE * np.array(beside) / np.linalg.norm(beside)
-    np.testing.assert_allclose(places(system, [marker.frame], np.zeros(2))[0], wanted, atol=1e-12)
+    assert marker.description == "a marker 3 cm off the axis of turn"
+    wanted = _MARKER_AXIS_DISTANCE * np.array(beside) / np.linalg.norm(beside)
+    np.testing.assert_allclose(places(system, [marker.added_frame], np.zeros(2))[0], wanted, atol=1e-12)
 
 
 def test_more_frames_need_no_new_equations(urdf_folder):
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    step = compile_step(System.build(robot, points=["tip"]), 0.01, use_compiler=False)
+    step = compile_step(System.build(robot, point_frames=["tip"]), 0.01, use_compiler=False)
     frame = step.system.mechanism.frame("tip")
-    more = seeing(step, {"other": frame})
+    more = with_added_frames(step, {"other": frame})
     assert set(more.system.mechanism.frames) == {*step.system.mechanism.frames, "other"}
     assert "other" not in step.system.mechanism.frames
     assert more.kernel is step.kernel

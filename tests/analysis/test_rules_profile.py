@@ -11,10 +11,17 @@ import numpy as np
 import pytest
 from made_models import Formula, estimate, solution
 
-from yid_ocp.analysis.profile import LEVEL, best_fit, profile_likelihood, small, sure_of_small, with_intervals
+from yid_ocp.analysis.profile import (
+    CHI2_QUANTILE_95,
+    check_small_estimate,
+    is_small_problem,
+    nearby_optimum,
+    profile_likelihood,
+    with_profile_intervals,
+)
 
 OPEN = {"a": (-math.inf, math.inf), "b": (-math.inf, math.inf)}
-HALF = math.sqrt(LEVEL)
+HALF = math.sqrt(CHI2_QUANTILE_95)
 
 
 def profiled(problem, name="a", std=None, at=None, **more):
@@ -26,7 +33,7 @@ def profiled(problem, name="a", std=None, at=None, **more):
 
 
 def test_the_level_is_that_of_95_percent():
-    assert pytest.approx(1.959963984540054**2, rel=1e-12) == LEVEL
+    assert pytest.approx(1.959963984540054**2, rel=1e-12) == CHI2_QUANTILE_95
 
 
 # -- linear models ----------------------------------------------------------------------------------------------------
@@ -300,8 +307,8 @@ def test_others_stop_at_their_bounds():
         bounds={"b": (0.5, 1.25), "a": OPEN["a"]},
     )
     found = profiled(problem)
-    assert found.upper == pytest.approx(3.5 + math.sqrt(LEVEL - 0.05**2), rel=0.01)
-    assert found.lower == pytest.approx(2.75 - math.sqrt(LEVEL - 0.025**2), rel=0.01)
+    assert found.upper == pytest.approx(3.5 + math.sqrt(CHI2_QUANTILE_95 - 0.05**2), rel=0.01)
+    assert found.lower == pytest.approx(2.75 - math.sqrt(CHI2_QUANTILE_95 - 0.025**2), rel=0.01)
 
 
 def test_only_a_product_is_seen_and_either_factor_is_open():
@@ -399,7 +406,7 @@ def test_a_point_that_is_evaluated_already_is_not_evaluated_again():
 
 def test_the_best_fit_is_the_optimum_nearby():
     problem = Formula(lambda x: [2 * (x["a"] - 3.0), x["a"] * x["b"] - 6.0], {"a": 2.0, "b": 1.0})
-    x, evaluation = best_fit(problem, problem.start)
+    x, evaluation = nearby_optimum(problem, problem.start)
     np.testing.assert_allclose(x, [3.0, 2.0], rtol=1e-4)
     assert evaluation.cost == pytest.approx(0.0, abs=1e-6)
     assert evaluation.jacobian is not None
@@ -412,7 +419,7 @@ def test_the_best_fit_is_the_optimum_nearby():
 def test_intervals_are_worked_out_unasked_where_they_take_no_time(parameters, unknowns, expected):
     names = tuple(f"k{i}" for i in range(parameters))
     starts = tuple(f"start.q.joint[{i}]" for i in range(unknowns - parameters))
-    assert small(SimpleNamespace(names=names + starts, shared=names, local=())) is expected
+    assert is_small_problem(SimpleNamespace(names=names + starts, shared=names, local=())) is expected
 
 
 # -- verdicts ---------------------------------------------------------------------------------------------------------
@@ -427,7 +434,7 @@ def test_a_stiffness_that_comes_out_small_by_chance_is_not_called_found():
     problem = Formula(rows, {"a.bend": 20.0, "b.bend": 0.2})
     there = problem.evaluate(problem.start)
     fitted = solution(a_bend=estimate(20.0, 0.01), b_bend=estimate(0.2, 0.25))
-    judged = with_intervals(problem, replace(fitted, x=problem.start, evaluation=there)).parameters
+    judged = with_profile_intervals(problem, replace(fitted, x=problem.start, evaluation=there)).parameters
     assert judged["a.bend"] == fitted.parameters["a.bend"]
     assert judged["b.bend"] == replace(fitted.parameters["b.bend"], verdict="not_identifiable", std=math.inf)
 
@@ -442,9 +449,9 @@ def test_a_small_stiffness_counts_where_its_typical_size_is_ruled_out(asymptote,
         {"a.bend": 20.0, "b.bend": 0.2},
     )
     there = problem.evaluate(problem.start)
-    entry = sure_of_small(problem, problem.start, 1, estimate(0.2, 0.01), 20.0, there)
+    entry = check_small_estimate(problem, problem.start, 1, estimate(0.2, 0.01), 20.0, there)
     assert entry.verdict == said
-    assert sure_of_small(problem, problem.start, 1, estimate(7.0, 0.01), 20.0, there).verdict == "identifiable"
+    assert check_small_estimate(problem, problem.start, 1, estimate(7.0, 0.01), 20.0, there).verdict == "identifiable"
 
 
 def test_an_interval_may_be_open_where_a_typical_size_is_not_asked():
@@ -453,7 +460,7 @@ def test_an_interval_may_be_open_where_a_typical_size_is_not_asked():
     )
     there = problem.evaluate(problem.start)
     fitted = solution(a_bend=estimate(20.0, 0.01), b_bend=estimate(12.0, 7.0, "weak"))
-    found = with_intervals(problem, replace(fitted, x=problem.start, evaluation=there)).parameters["b.bend"]
+    found = with_profile_intervals(problem, replace(fitted, x=problem.start, evaluation=there)).parameters["b.bend"]
     assert (found.verdict, found.std) == ("weak", math.inf)
     assert found.interval == (pytest.approx(12.0 / (1 + HALF / 1.7), rel=0.02), None)
 
@@ -462,6 +469,6 @@ def test_a_stiffness_that_is_known_to_be_small_is_found():
     problem = Formula(lambda x: [x["a.bend"] - 20.0, 10.0 * (x["b.bend"] - 0.05)], {"a.bend": 20.0, "b.bend": 0.05})
     there = problem.evaluate(problem.start)
     fitted = solution(a_bend=estimate(20.0, 1.0), b_bend=estimate(0.05, 0.1))
-    found = with_intervals(problem, replace(fitted, x=problem.start, evaluation=there)).parameters["b.bend"]
+    found = with_profile_intervals(problem, replace(fitted, x=problem.start, evaluation=there)).parameters["b.bend"]
     assert (found.verdict, found.std) == ("identifiable", 0.1)
     assert found.interval == (None, pytest.approx(0.05 + HALF / 10, rel=0.01))

@@ -11,19 +11,25 @@ from made_models import estimate as estimated
 from made_models import solution
 from made_recordings import places
 
-from yid_ocp.analysis import stability as module
-from yid_ocp.analysis.stability import LOOKS, TOLERATED, Growth, growth_along, growth_of_fit
+from yid_ocp.analysis import time_step_stability as module
+from yid_ocp.analysis.time_step_stability import (
+    _MAX_GROWTH_DECADES,
+    _N_CHECKED_NODES,
+    StepErrorGrowth,
+    _error_growth_along,
+    largest_error_growth,
+)
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.integrator.rollout import simulate
-from yid_ocp.integrator.statics import Statics
+from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.integrator.step_model import Feedback
+from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, Status, solve
-from yid_ocp.workflow import refine
-from yid_ocp.workflow.refine import steadied
+from yid_ocp.workflow import discretisation_check
+from yid_ocp.workflow.discretisation_check import with_stability_check
 
 H = 0.01
 
@@ -77,38 +83,38 @@ def turned(size, degrees):
     ids=["alternates", "falls over", "dies out", "nearly alternates", "turns back", "swings"],
 )
 def test_only_what_turns_back_at_every_step_is_the_methods_own(matrix, factor):
-    found = growth_along(*swap(made([matrix] * 10)))
-    assert found.factor == pytest.approx(factor)
-    assert found.decades == pytest.approx(10 * np.log10(factor) if factor > 1 else 0.0)
+    found = _error_growth_along(*swap(made([matrix] * 10)))
+    assert found.max_step_factor == pytest.approx(factor)
+    assert found.growth_decades == pytest.approx(10 * np.log10(factor) if factor > 1 else 0.0)
     assert found.time_step == H
 
 
 def test_prescribed_coordinates_do_not_count():
     step, rollout = made([diagonal(-3.0, -1.1, -5.0, 0.3)] * 4, fixed=(0,))
-    assert growth_along(step, np.zeros(0), rollout).factor == pytest.approx(1.1)
+    assert _error_growth_along(step, np.zeros(0), rollout).max_step_factor == pytest.approx(1.1)
 
 
 def test_the_tracking_filter_is_part_of_the_loop():
     """Gains too high for the time step alternate by themselves, others calm what would."""
     matrix = diagonal(0.9, 0.5, -1.2, 0.0)
     step, rollout = made([matrix] * 4, by_torque=[1.0, 0.0, 0.0, 0.0])
-    feedback = Feedback(np.array([0], np.int32), np.full((4, 1, 1), 2.4), np.zeros((4, 1)))
-    assert growth_along(step, np.zeros(0), rollout).factor == pytest.approx(1.2)
-    assert growth_along(step, np.zeros(0), rollout, feedback).factor == pytest.approx(1.5)
-    calm = replace(feedback, index=np.array([2], np.int32), gain=np.full((4, 1, 1), -0.4))
+    feedback = TrackingFeedback(np.array([0], np.int32), np.full((4, 1, 1), 2.4), np.zeros((4, 1)))
+    assert _error_growth_along(step, np.zeros(0), rollout).max_step_factor == pytest.approx(1.2)
+    assert _error_growth_along(step, np.zeros(0), rollout, feedback).max_step_factor == pytest.approx(1.5)
+    calm = replace(feedback, state_indices=np.array([2], np.int32), gain=np.full((4, 1, 1), -0.4))
     step, rollout = made([matrix] * 4, by_torque=[0.0, 0.0, 1.0, 0.0])
-    assert growth_along(step, np.zeros(0), rollout, calm).factor == pytest.approx(0.8)
+    assert _error_growth_along(step, np.zeros(0), rollout, calm).max_step_factor == pytest.approx(0.8)
 
 
 def test_growth_is_that_of_the_worst_stretch():
     """Ten steps of ten percent, five that calm it down, three of fifty percent."""
     sizes = [1.1] * 10 + [0.1] * 5 + [1.5] * 3
-    found = growth_along(*swap(made([diagonal(-size, 0, 0, 0) for size in sizes])))
-    assert found.decades == pytest.approx(max(10 * np.log10(1.1), 3 * np.log10(1.5)))
-    assert found.factor == pytest.approx(1.5)
-    assert found.time == pytest.approx(15 * H)
-    joined = growth_along(*swap(made([diagonal(-size, 0, 0, 0) for size in [1.1] * 10 + [0.9] + [1.5] * 3])))
-    assert joined.decades == pytest.approx(10 * np.log10(1.1) + np.log10(0.9) + 3 * np.log10(1.5))
+    found = _error_growth_along(*swap(made([diagonal(-size, 0, 0, 0) for size in sizes])))
+    assert found.growth_decades == pytest.approx(max(10 * np.log10(1.1), 3 * np.log10(1.5)))
+    assert found.max_step_factor == pytest.approx(1.5)
+    assert found.max_growth_time == pytest.approx(15 * H)
+    joined = _error_growth_along(*swap(made([diagonal(-size, 0, 0, 0) for size in [1.1] * 10 + [0.9] + [1.5] * 3])))
+    assert joined.growth_decades == pytest.approx(10 * np.log10(1.1) + np.log10(0.9) + 3 * np.log10(1.5))
 
 
 def test_long_motions_are_looked_at_here_and_there():
@@ -116,28 +122,30 @@ def test_long_motions_are_looked_at_here_and_there():
     step, rollout = made([diagonal(-1.01, 0, 0, 0)] * 1000)
     inner = step.jacobians
     step.jacobians = lambda *arguments, **more: asked.append(1) or inner(*arguments, **more)
-    found = growth_along(step, np.zeros(0), rollout)
-    assert len(asked) == LOOKS
-    assert found.decades == pytest.approx(1000 * np.log10(1.01))
+    found = _error_growth_along(step, np.zeros(0), rollout)
+    assert len(asked) == _N_CHECKED_NODES
+    assert found.growth_decades == pytest.approx(1000 * np.log10(1.01))
 
 
 def test_a_rollout_that_failed_counts_as_far_as_it_got():
     step, rollout = made([diagonal(-1.2, 0, 0, 0)] * 20, finite=8)
-    assert growth_along(step, np.zeros(0), rollout).decades == pytest.approx(7 * np.log10(1.2))
+    assert _error_growth_along(step, np.zeros(0), rollout).growth_decades == pytest.approx(7 * np.log10(1.2))
     step, rollout = made([diagonal(-1.2, 0, 0, 0)] * 20, finite=1)
-    assert growth_along(step, np.zeros(0), rollout) == Growth("motion", 0.0, 0.0, 0.0, H)
+    assert _error_growth_along(step, np.zeros(0), rollout) == StepErrorGrowth("motion", 0.0, 0.0, 0.0, H)
     broken = [diagonal(-1.2, 0, 0, 0)] * 5 + [np.full((4, 4), np.nan)] * 5
-    assert growth_along(*swap(made(broken))).decades == pytest.approx(5 * np.log10(1.2))
+    assert _error_growth_along(*swap(made(broken))).growth_decades == pytest.approx(5 * np.log10(1.2))
 
 
-@pytest.mark.parametrize(("decades", "stable"), [(0.0, True), (TOLERATED, True), (TOLERATED + 0.1, False)])
+@pytest.mark.parametrize(
+    ("decades", "stable"), [(0.0, True), (_MAX_GROWTH_DECADES, True), (_MAX_GROWTH_DECADES + 0.1, False)]
+)
 def test_what_is_said(decades, stable):
-    growth = Growth("run", decades, 1.29, 0.35, 0.005)
-    assert growth.stable is stable
+    growth = StepErrorGrowth("run", decades, 1.29, 0.35, 0.005)
+    assert growth.is_stable is stable
     if stable:
-        assert growth.words == "run: the step of 0.005 s is stable along the motion"
+        assert growth.description == "run: the step of 0.005 s is stable along the motion"
     else:
-        assert growth.words == (
+        assert growth.description == (
             "run: the step of 0.005 s is not stable: an error that alternates from step to step grows by 29 % in a "
             "step at 0.35 s; take a shorter problem.time_step (0.0025 s, say)"
         )
@@ -145,14 +153,14 @@ def test_what_is_said(decades, stable):
 
 def test_the_worst_recording_counts(monkeypatch, pendulum):
     problem = pendulum()
-    assert growth_of_fit(problem, problem.start).stable
-    assert growth_of_fit(problem, problem.start).recording == "twin"
+    assert largest_error_growth(problem, problem.start).is_stable
+    assert largest_error_growth(problem, problem.start).recording_name == "twin"
     twice = problem.on((problem.episodes[0],) * 2, ())
-    found = iter([Growth("a", 7.0, 1.1, 0.0, H), Growth("b", 2.0, 1.9, 0.0, H)])
+    found = iter([StepErrorGrowth("a", 7.0, 1.1, 0.0, H), StepErrorGrowth("b", 2.0, 1.9, 0.0, H)])
     looks = []
-    monkeypatch.setattr(module, "growth_along", lambda *arguments: looks.append(arguments[-1]) or next(found))
-    assert growth_of_fit(twice, problem.start).recording == "a"
-    assert looks == [LOOKS // 2] * 2
+    monkeypatch.setattr(module, "_error_growth_along", lambda *arguments: looks.append(arguments[-1]) or next(found))
+    assert largest_error_growth(twice, problem.start).recording_name == "a"
+    assert looks == [_N_CHECKED_NODES // 2] * 2
 
 
 # -- a light cable between two hands ----------------------------------------------------------------------------------
@@ -186,7 +194,7 @@ def light(tmp_path_factory):
         grasps = [Grasp("hand", "hand", "w_cable")]
         objects = [(flexible_object([segment]), None, None)]
         system = System.build(
-            robot, objects=objects, grasps=grasps, prescribed=["x", "z"], points=["cable:30%", "cable:60%"]
+            robot, objects=objects, grasps=grasps, prescribed=["x", "z"], point_frames=["cable:30%", "cable:60%"]
         )
         return compile_step(system, time_step, *NODE, use_compiler=False)
 
@@ -199,7 +207,7 @@ def moved(step, duration):
     ramp = np.minimum(t / 0.3, 1.0) ** 2
     path = np.stack([0.35 + 0.1 * ramp * np.sin(6 * t), 0.75 + 0.08 * ramp * np.sin(9 * t)], axis=1)
     theta = step.system.parameters.vector()
-    rest = Statics(step).solve(path[0], theta)
+    rest = EquilibriumSolver(step).solve(path[0], theta)
     return t, path, simulate(step, theta, rest.state, len(t) - 1, path=path)
 
 
@@ -209,9 +217,9 @@ def test_a_light_cable_between_two_hands(light, stiffness, time_step, stable):
     step = light(stiffness, time_step)
     _, _, rollout = moved(step, 0.4)
     assert rollout.status.ok
-    growth = growth_along(step, step.system.parameters.vector(), rollout)
-    assert growth.stable is stable
-    assert (growth.factor > 1.1) is not stable
+    growth = _error_growth_along(step, step.system.parameters.vector(), rollout)
+    assert growth.is_stable is stable
+    assert (growth.max_step_factor > 1.1) is not stable
 
 
 @pytest.fixture(scope="module")
@@ -219,7 +227,7 @@ def light_recording(light):
     """The cable as a step of a millisecond moves it, its points seen to a millimetre at 100 Hz."""
     fine = light(0.5, 0.001)
     t, path, rollout = moved(fine, 0.8)
-    assert growth_along(fine, fine.system.parameters.vector(), rollout).stable
+    assert _error_growth_along(fine, fine.system.parameters.vector(), rollout).is_stable
     seen = np.array([places(fine.system, fine.system.points, q) for q in rollout.state[::10, : fine.system.size]])
     seen += 1e-3 * np.random.default_rng(0).standard_normal(seen.shape)
     points = PointGroup("points", fine.system.points, t[::10], seen, 1e-3)
@@ -236,7 +244,7 @@ def test_a_fit_that_walked_away_from_an_unstable_truth_has_not_converged(light, 
     assert found.status == Status.CONVERGED
     entry = found.parameters["cable.bend"]
     assert (abs(entry.value - 0.5) > 100 * entry.std) == (status == Status.STALLED)
-    judged, said = steadied(problem, found)
+    judged, said = with_stability_check(problem, found)
     assert judged.status == status
     assert set(said) == {"start", "estimate"}
     if status == Status.STALLED:
@@ -259,14 +267,14 @@ def test_a_fit_that_walked_away_from_an_unstable_truth_has_not_converged(light, 
     ],
 )
 def test_a_search_may_begin_but_not_end_where_the_step_is_not_stable(monkeypatch, before, start, estimate, after):
-    grown = {0.0: Growth("run", start, 1.3, 0.1, H), 1.0: Growth("run", estimate, 1.3, 0.1, H)}
-    monkeypatch.setattr(refine, "growth_of_fit", lambda problem, x: grown[float(x[0])])
+    grown = {0.0: StepErrorGrowth("run", start, 1.3, 0.1, H), 1.0: StepErrorGrowth("run", estimate, 1.3, 0.1, H)}
+    monkeypatch.setattr(discretisation_check, "largest_error_growth", lambda problem, x: grown[float(x[0])])
     found = replace(solution(status=before, a=estimated(1.0)), message="done")
-    judged, said = steadied(SimpleNamespace(start=np.zeros(1)), found)
+    judged, said = with_stability_check(SimpleNamespace(start=np.zeros(1)), found)
     assert judged.status == after
     assert (said["start"]["decades"], said["estimate"]["decades"]) == (start, estimate)
     named = "at the estimate run" if estimate else "at the start run" if start and before == Status.FAILED else "done"
     assert judged.message.startswith(named)
     assert "done" in judged.message
-    monkeypatch.setattr(refine, "growth_of_fit", lambda problem, x: None)
-    assert steadied(SimpleNamespace(start=np.zeros(1)), found) == (found, {"start": None, "estimate": None})
+    monkeypatch.setattr(discretisation_check, "largest_error_growth", lambda problem, x: None)
+    assert with_stability_check(SimpleNamespace(start=np.zeros(1)), found) == (found, {"start": None, "estimate": None})

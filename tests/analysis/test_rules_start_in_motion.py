@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from yid_ocp.analysis import start_in_motion as module
-from yid_ocp.analysis.start_in_motion import safe_start
-from yid_ocp.model.cable import START_SPEED
+from yid_ocp.analysis import cable_memory_check as module
+from yid_ocp.analysis.cable_memory_check import decide_cable_memory
+from yid_ocp.model.cable import START_SPEED_PARAMETER
 
 
 class Means:
@@ -28,7 +28,7 @@ class Means:
     @staticmethod
     def _episode(value, speed):
         samples = SimpleNamespace(whitened=lambda predicted: predicted - value, count=1)
-        start = None if speed is None else SimpleNamespace(values={START_SPEED: speed})
+        start = None if speed is None else SimpleNamespace(values={START_SPEED_PARAMETER: speed})
         return SimpleNamespace(samples=(samples,), start=start)
 
     @staticmethod
@@ -82,13 +82,13 @@ def asked(monkeypatch):
 )
 def test_nothing_is_asked_where_nothing_is_in_question(asked, names, speeds):
     problem, found = Means((1.0, 2.0, 3.0), speeds, names), solution((2.0, 0.5), names)
-    safe = safe_start(problem, None, found)
+    safe = decide_cable_memory(problem, None, found)
     assert (safe.problem, safe.solution, safe.message, asked.problems) == (problem, found, "", [])
 
 
 def test_a_single_recording_in_motion_bears_nothing_out(asked):
     problem = Means((1.0, 2.0, 3.0), (0.5, 0.0, None))
-    safe = safe_start(problem, None, solution((2.0, 0.5)))
+    safe = decide_cable_memory(problem, None, solution((2.0, 0.5)))
     assert safe.problem is asked.problems[0]
     assert (safe.problem.names, safe.problem.fixed, asked.starts) == (("k",), {"a.memory": 0.0}, [[2.0]])
     assert "too few recordings start in motion" in safe.message
@@ -99,7 +99,7 @@ def test_memory_is_kept_where_recordings_left_out_are_predicted_better_with_it(a
     problem, found = Means((1.0, 2.0, 3.0), (0.5, 0.2, 0.0)), solution((2.0, 0.5))
     errors = {id(problem): with_memory}
     monkeypatch.setattr(module, "_left_out", lambda p, s, moving: errors.get(id(p), 3.0))
-    safe = safe_start(problem, None, found)
+    safe = decide_cable_memory(problem, None, found)
     assert (safe.problem is problem) is kept
     assert f"memory is {'' if kept else 'not '}kept" in safe.message
     assert f"{with_memory:.3g} with it and 3 without" in safe.message
@@ -108,7 +108,7 @@ def test_memory_is_kept_where_recordings_left_out_are_predicted_better_with_it(a
 def test_what_cannot_be_solved_without_memory_keeps_it(asked):
     asked.ok = False
     problem, found = Means((1.0, 2.0, 3.0), (0.5, 0.2, 0.0)), solution((2.0, 0.5))
-    assert safe_start(problem, None, found).solution is found
+    assert decide_cable_memory(problem, None, found).solution is found
 
 
 def test_a_recording_is_predicted_from_the_others_alone():

@@ -10,37 +10,46 @@ import numpy as np
 import pytest
 
 from yid_ocp.analysis import what_if as module
-from yid_ocp.analysis.layouts import ARM, ARM_STD, CAMERA, CAMERA_RATE, CAMERA_STD, MECHANICS, View, regular_times
+from yid_ocp.analysis.experiment_design import (
+    _DEFAULT_ARM_POINT_STD,
+    _DEFAULT_CAMERA_RATE,
+    _DEFAULT_CAMERA_STD,
+    ARM_GROUP,
+    CAMERA_GROUP,
+    MECHANICAL_CHANGES,
+    FrameObservation,
+    uniform_sample_times,
+)
 from yid_ocp.analysis.what_if import (
-    FLOOR,
-    Change,
-    Outcome,
+    _MIN_INFORMATION_EIGENVALUE,
+    ChangedExperimentResult,
+    ExperimentChange,
     WhatIfOptions,
+    _are_compatible,
     _greedy,
     _Outcomes,
+    _possible_changes,
+    _rank_results,
+    _relative_stds_and_gain,
     _smallest,
-    compatible,
-    possible_changes,
-    precision,
-    ranked,
     what_if,
 )
 from yid_ocp.errors import SolverError
-from yid_ocp.problem.grid import Grid
-from yid_ocp.progress import SILENT
+from yid_ocp.problem.time_grid import TimeGrid
+from yid_ocp.progress import NULL_PROGRESS
 
 
 def change(name, **more):
     """A change by its name alone, its mechanics or rate read from it."""
-    mechanics = name if name in MECHANICS else ""
+    mechanics = name if name in MECHANICAL_CHANGES else ""
     rate = float(name.removeprefix("rate:")) if name.startswith("rate:") else None
-    return Change(name, f"words of {name}", mechanics, rate=rate, **more)
+    return ExperimentChange(name, f"words of {name}", mechanics, camera_rate=rate, **more)
 
 
 def outcome(*names, found=0, gain=0.0, of=3, failed=False):
     """What some changes would tell: `found` of `of` parameters identifiable."""
     verdicts = {f"k{i}": "identifiable" if i < found else "weak" for i in range(of)}
-    return Outcome(names, "", {}, {} if failed else verdicts, found, -math.inf if failed else gain)
+    return ChangedExperimentResult(names, "", {}, {} if failed else verdicts, found, -math.inf if failed else gain)
 
 
 # -- ranks ------------------------------------------------------------------------------------------------------------
@@ -51,7 +60,7 @@ def outcome(*names, found=0, gain=0.0, of=3, failed=False):
     [(outcome(found=3), True), (outcome(found=2), False), (outcome(failed=True), False), (outcome(of=0), False)],
 )
 def test_complete_is_every_parameter(made, complete):
-    assert made.complete is complete
+    assert made.is_fully_identifiable is complete
 
 
 def test_most_identifiable_first_then_gain_and_what_failed_last():
@@ -63,7 +72,7 @@ def test_most_identifiable_first_then_gain_and_what_failed_last():
         outcome("e", found=0, failed=True),
     ]
     for shuffled in itertools.permutations(order):
-        assert [entry.changes for entry in ranked(shuffled)] == [("d",), ("a",), ("c",), ("b",), ("e",)]
+        assert [entry.changes for entry in _rank_results(shuffled)] == [("d",), ("a",), ("c",), ("b",), ("e",)]
 
 
 @pytest.mark.parametrize(
@@ -77,7 +86,7 @@ def test_most_identifiable_first_then_gain_and_what_failed_last():
     ],
 )
 def test_one_rate_and_one_motion_go_together(names, together):
-    assert compatible([change(name) for name in names]) is together
+    assert _are_compatible([change(name) for name in names]) is together
 
 
 # -- sets -------------------------------------------------------------------------------------------------------------
@@ -190,18 +199,18 @@ def gained(*values):
 
 
 def test_the_limit_of_identifiability_is_four_hundred_percent():
-    assert module.WEAK == 4
+    assert module.MAX_WEAK_RELATIVE_STD == 4
 
 
 def test_relative_precision_of_known_parameters():
     made = layout("ab", [2.0, -5.0])
-    std, gain = precision(made, np.diag([100.0, 4.0]))
+    std, gain = _relative_stds_and_gain(made, np.diag([100.0, 4.0]))
     assert std == pytest.approx({"a": 0.1 / 2.0, "b": 0.5 / 5.0})
     assert gain == pytest.approx(gained(400.0, 100.0))
 
 
 def test_a_parameter_at_zero_has_its_scale():
-    std, gain = precision(layout("ab", [0.0, 5.0], [3.0, 7.0]), np.diag([1.0, 1.0]))
+    std, gain = _relative_stds_and_gain(layout("ab", [0.0, 5.0], [3.0, 7.0]), np.diag([1.0, 1.0]))
     assert std == pytest.approx({"a": 1 / 3, "b": 1 / 5})
     assert gain == pytest.approx(gained(9.0, 25.0))
 
@@ -211,27 +220,27 @@ def test_nuisances_take_their_part():
     rng = np.random.default_rng(4)
     root = rng.standard_normal((6, 3))
     information = root.T @ root
-    std, _ = precision(layout(("a", "n", "b"), [2.0, 9.0, 4.0], [1.0, 0.1, 1.0], ("a", "b")), information)
+    std, _ = _relative_stds_and_gain(layout(("a", "n", "b"), [2.0, 9.0, 4.0], [1.0, 0.1, 1.0], ("a", "b")), information)
     covariance = np.linalg.inv(information)
     assert std == pytest.approx({"a": math.sqrt(covariance[0, 0]) / 2, "b": math.sqrt(covariance[2, 2]) / 4})
 
 
 def test_correlated_parameters_are_judged_together():
     information = np.array([[2.0, 1.0], [1.0, 1.0]])
-    std, gain = precision(layout("ab", [1.0, 1.0]), information)
+    std, gain = _relative_stds_and_gain(layout("ab", [1.0, 1.0]), information)
     assert std == pytest.approx({"a": 1.0, "b": math.sqrt(2.0)})
     assert gain == pytest.approx(gained(*np.linalg.eigvalsh(information)))
 
 
 def test_what_is_not_seen_is_unknown_up_to_a_floor():
-    std, gain = precision(layout("ab", [1.0, 1.0]), np.diag([4.0, 0.0]))
-    assert std == pytest.approx({"a": 0.5, "b": 1 / math.sqrt(FLOOR)})
+    std, gain = _relative_stds_and_gain(layout("ab", [1.0, 1.0]), np.diag([4.0, 0.0]))
+    assert std == pytest.approx({"a": 0.5, "b": 1 / math.sqrt(_MIN_INFORMATION_EIGENVALUE)})
     assert gain == pytest.approx(gained(4.0, 0.0))
 
 
 # -- views ------------------------------------------------------------------------------------------------------------
 
-GRID = Grid(10.0, 0.1, 20)
+GRID = TimeGrid(10.0, 0.1, 20)
 
 
 class Recorded:
@@ -246,17 +255,22 @@ class Recorded:
         self.problem = SimpleNamespace(episodes=made, system=SimpleNamespace(grasps=self.grasps))
 
     def camera(self, episode):
-        return (self._camera, self.t_camera, 5e-3) if self._camera else (None, np.array([0.0, 1.0]), CAMERA_STD)
+        return (
+            (self._camera, self.t_camera, 5e-3) if self._camera else (None, np.array([0.0, 1.0]), _DEFAULT_CAMERA_STD)
+        )
 
     def arm(self, episode):
-        return (self._arm, self.t_arm, 2e-3) if self._arm else (None, np.array([0.0, 0.1]), ARM_STD)
+        return (self._arm, self.t_arm, 2e-3) if self._arm else (None, np.array([0.0, 0.1]), _DEFAULT_ARM_POINT_STD)
 
     def views(self, episode):
         found = []
         if self._camera:
-            found += [View("points_camera_1", name, self.t_camera[1:], np.ones((3, 3))) for name in ("tip", "elbow")]
+            found += [
+                FrameObservation("points_camera_1", name, self.t_camera[1:], np.ones((3, 3)))
+                for name in ("tip", "elbow")
+            ]
         if self._arm:
-            found.append(View("points_arm_1", "hand", self.t_arm, np.ones((3, 3))))
+            found.append(FrameObservation("points_arm_1", "hand", self.t_arm, np.ones((3, 3))))
         return found
 
 
@@ -277,7 +291,7 @@ def test_without_changes_everything_is_seen_as_it_was():
 
 @pytest.mark.parametrize(
     ("has", "group", "times", "std"),
-    [(True, "points_camera_1", [0.0, 0.5, 1.0, 1.5], 5e-3), (False, CAMERA, [0.0, 1.0], CAMERA_STD)],
+    [(True, "points_camera_1", [0.0, 0.5, 1.0, 1.5], 5e-3), (False, CAMERA_GROUP, [0.0, 1.0], _DEFAULT_CAMERA_STD)],
     ids=["a camera", "none so far"],
 )
 def test_a_camera_sees_more(has, group, times, std):
@@ -292,7 +306,7 @@ def test_a_camera_sees_more(has, group, times, std):
 
 @pytest.mark.parametrize(
     ("has", "group", "times", "std"),
-    [(True, "points_arm_1", [0.0, 0.1, 0.2], 2e-3), (False, ARM, [0.0, 0.1], ARM_STD)],
+    [(True, "points_arm_1", [0.0, 0.1, 0.2], 2e-3), (False, ARM_GROUP, [0.0, 0.1], _DEFAULT_ARM_POINT_STD)],
     ids=["an arm", "none so far"],
 )
 def test_an_arm_feels_more(has, group, times, std):
@@ -305,7 +319,7 @@ def test_an_arm_feels_more(has, group, times, std):
 
 def test_another_rate_is_the_cameras_alone():
     found = views(Recorded(), [change("rate:4"), change("x", camera=("w_T3",), arm=("w_T1",))])
-    even = regular_times(GRID, 4.0)
+    even = uniform_sample_times(GRID, 4.0)
     assert [view.frame for view in found] == ["tip", "elbow", "hand", "w_T3", "w_T1"]
     for view in found:
         if view.group == "points_camera_1":
@@ -390,7 +404,7 @@ def sight(name, arm=False):
 @pytest.fixture
 def seen(monkeypatch):
     made = [sight("tip"), sight("middle"), sight("hand", arm=True), sight("marker", arm=True)]
-    monkeypatch.setattr(module, "sights", lambda system: made)
+    monkeypatch.setattr(module, "observable_frames", lambda system: made)
 
 
 @pytest.mark.usefixtures("seen")
@@ -408,16 +422,16 @@ def seen(monkeypatch):
     ids=["both", "no camera", "no arm", "neither"],
 )
 def test_what_is_not_seen_could_be_seen(setting, names):
-    found = possible_changes(setting, Builder())
+    found = _possible_changes(setting, Builder())
     assert [entry.name for entry in found] == ["weld", "motion", *names.split()]
-    assert [entry.mechanics for entry in found] == ["weld", "motion", *[""] * len(names.split())]
-    assert found[0].words == MECHANICS["weld"]
+    assert [entry.mechanical_change for entry in found] == ["weld", "motion", *[""] * len(names.split())]
+    assert found[0].description == MECHANICAL_CHANGES["weld"]
     for entry in found[2:]:
         kind, what = entry.name.split(":")
-        assert entry.camera == ((what,) if kind == "camera" else ())
-        assert entry.arm == ((what,) if kind == "arm" else ())
-        assert entry.rate == (float(what) if kind == "rate" else None)
-    words = {entry.name: entry.words for entry in found}
+        assert entry.added_camera_frames == ((what,) if kind == "camera" else ())
+        assert entry.added_arm_frames == ((what,) if kind == "arm" else ())
+        assert entry.camera_rate == (float(what) if kind == "rate" else None)
+    words = {entry.name: entry.description for entry in found}
     assert words["camera:middle"] == "the middle, seen by the camera"
     assert words["arm:marker"] == "the marker, seen by the arm"
 
@@ -437,10 +451,10 @@ def test_what_is_not_seen_could_be_seen(setting, names):
 def test_faster_cameras_than_there_was(times, rates):
     setting = Recorded()
     setting._camera.t = np.array(times) + 1e-12
-    found = [entry for entry in possible_changes(setting, Builder()) if entry.rate is not None]
+    found = [entry for entry in _possible_changes(setting, Builder()) if entry.camera_rate is not None]
     assert [entry.name for entry in found] == rates
     if found:
-        assert found[-1].words == "the camera at 30 Hz without gaps"
+        assert found[-1].description == "the camera at 30 Hz without gaps"
 
 
 # -- all of it --------------------------------------------------------------------------------------------------------
@@ -468,42 +482,42 @@ def pieces(monkeypatch, seen):
         kept.judged.append((problem, x, start, grasp_std))
         return SimpleNamespace(chi2_per_dof=kept.chi2)
 
-    monkeypatch.setattr(module, "Setting", Setting)
-    monkeypatch.setattr(module, "LayoutBuilder", build)
+    monkeypatch.setattr(module, "BaseExperiment", Setting)
+    monkeypatch.setattr(module, "CandidateExperimentBuilder", build)
     monkeypatch.setattr(module, "identifiability", judge)
-    monkeypatch.setattr(module, "unknown_vector", lambda problem, solution: (problem, solution))
+    monkeypatch.setattr(module, "unknowns_from_solution", lambda problem, solution: (problem, solution))
     return kept
 
 
 def test_all_single_changes_the_smallest_sets_and_the_greedy_ones(pieces):
-    found = what_if("problem", progress=SILENT)
+    found = what_if("problem", progress=NULL_PROGRESS)
     assert pieces.settings == [("problem", ("problem", None), "assumed", None, None, 0.1, 11)]
-    assert pieces.progress is SILENT
+    assert pieces.progress is NULL_PROGRESS
     assert pieces.judged == []
-    assert found.base.std_relative == pytest.approx({"a": 0.1, "b": 1.0})
-    assert [entry.changes for entry in found.smallest] == [("weld",)]
-    assert [entry.changes for entry in found.greedy] == [("weld",)]
-    assert found.singles[0].changes == ("weld",)
-    assert found.singles[-1].changes == ("motion",)
-    assert len(found.singles) == 7
-    assert found.searched == 8
+    assert found.unchanged_experiment.std_relative == pytest.approx({"a": 0.1, "b": 1.0})
+    assert [entry.changes for entry in found.smallest_sufficient_sets] == [("weld",)]
+    assert [entry.changes for entry in found.greedy_sequence] == [("weld",)]
+    assert found.single_changes[0].changes == ("weld",)
+    assert found.single_changes[-1].changes == ("motion",)
+    assert len(found.single_changes) == 7
+    assert found.n_evaluated_sets == 8
 
 
 def test_the_smallest_sets_are_ranked(pieces):
-    found = what_if("problem", options=WhatIfOptions(only=("motion", "weld"), largest=1))
-    assert [entry.changes for entry in found.singles] == [("weld",), ("motion",)]
-    assert found.searched == 3
+    found = what_if("problem", options=WhatIfOptions(considered_changes=("motion", "weld"), max_set_size=1))
+    assert [entry.changes for entry in found.single_changes] == [("weld",), ("motion",)]
+    assert found.n_evaluated_sets == 3
 
 
 @pytest.mark.parametrize(("chi2", "std"), [(2.25, 0.15), (0.5, 0.1)])
 def test_at_a_solution_its_fit_counts_unless_better_than_the_noise(pieces, chi2, std):
     pieces.chi2 = chi2
-    options = WhatIfOptions(torque_std=0.7, seed=5, only=())
-    found = what_if("problem", "fit", start="known", grasp_std=None, second_arm="arm", options=options)
+    options = WhatIfOptions(torque_std=0.7, motion_seed=5, considered_changes=())
+    found = what_if("problem", "fit", start="known", grasp_std=None, two_arm_system="arm", options=options)
     assert pieces.settings == [("problem", ("problem", "fit"), "known", None, "arm", 0.7, 5)]
     assert pieces.judged == [("problem", ("problem", "fit"), "known", None)]
-    assert found.base.std_relative["a"] == pytest.approx(std)
-    assert (found.singles, found.smallest, found.greedy) == ((), (), ())
+    assert found.unchanged_experiment.std_relative["a"] == pytest.approx(std)
+    assert (found.single_changes, found.smallest_sufficient_sets, found.greedy_sequence) == ((), (), ())
 
 
 def test_an_experiment_that_cannot_be_worked_out_is_an_error(pieces):
@@ -513,4 +527,4 @@ def test_an_experiment_that_cannot_be_worked_out_is_an_error(pieces):
 
 
 def test_a_camera_that_nobody_had(pieces):
-    assert (CAMERA_RATE, CAMERA_STD, ARM_STD) == (3.0, 5e-3, 1e-3)
+    assert (_DEFAULT_CAMERA_RATE, _DEFAULT_CAMERA_STD, _DEFAULT_ARM_POINT_STD) == (3.0, 5e-3, 1e-3)

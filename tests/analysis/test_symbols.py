@@ -8,18 +8,18 @@ import pytest
 from formula_reader import FUNCTIONS, read
 from held_rod import held_rod
 
-from yid_ocp.analysis.symbols import StepSymbols, latex_text
+from yid_ocp.analysis.step_symbols import StepSymbols, escape_latex
 from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.discrete import discrete_equations
 from yid_ocp.model import Grasp
-from yid_ocp.model.drives import Spring
+from yid_ocp.model.servos_and_springs import RobotJointSpring
 
 
 @pytest.fixture(scope="module")
 def symbols(urdf_folder):
     """A driven shoulder, a springy elbow whose tip is tied to a rod; a relaxing branch on the rod."""
-    system = held_rod(urdf_folder, kind="axis", driven=["shoulder"], springs={"elbow": Spring(3.0)})
-    return StepSymbols.of(discrete_equations(system))
+    system = held_rod(urdf_folder, kind="axis", driven=["shoulder"], springs={"elbow": RobotJointSpring(3.0)})
+    return StepSymbols.from_equations(discrete_equations(system))
 
 
 def point(symbols):
@@ -32,7 +32,7 @@ def point(symbols):
 
 
 def value(symbols, expression, at):
-    return np.array(ca.densify(ca.Function("f", [symbols.all_columns], [expression])(at))).ravel()
+    return np.array(ca.densify(ca.Function("f", [symbols.column_symbols], [expression])(at))).ravel()
 
 
 def test_blocks_have_the_names_of_the_project(symbols):
@@ -52,7 +52,7 @@ def test_rows_and_columns_stand_where_the_equations_have_them(symbols):
     e = symbols.equations
     at = point(symbols)
     expected = value(symbols, ca.vertcat(e.momentum_balance, e.internal, e.constraint, e.p1), at)
-    np.testing.assert_array_equal(value(symbols, symbols.all_rows, at), expected)
+    np.testing.assert_array_equal(value(symbols, symbols.row_expressions, at), expected)
     for block in (*symbols.rows, *symbols.columns):
         span = symbols.span(block.name)
         assert span.stop - span.start == len(block.labels) == block.values.numel()
@@ -66,7 +66,7 @@ def test_rows_and_columns_stand_where_the_equations_have_them(symbols):
 def test_every_equation_of_a_grasp_has_a_name(kind):
     grasp = Grasp("left", "a", "b", kind)
     names = grasp.equation_names
-    assert len(set(names)) == len(names) == grasp.equations
+    assert len(set(names)) == len(names) == grasp.n_equations
     assert names[:3] == ("left.x", "left.y", "left.z")
 
 
@@ -74,9 +74,9 @@ def test_every_equation_of_a_grasp_has_a_name(kind):
 def test_an_entry_is_the_row_as_text(symbols, row):
     """The printed lines are all that is needed to work the row out."""
     at, entry = point(symbols), symbols.entry(row)
-    expected = value(symbols, symbols.all_rows, at)[symbols.row(row)]
+    expected = value(symbols, symbols.row_expressions, at)[symbols.row(row)]
     assert worked_out(symbols, entry, at) == pytest.approx(expected, rel=1e-9)
-    assert entry.value(symbols.all_columns, at) == pytest.approx(expected, rel=1e-12)
+    assert entry.value(symbols.column_symbols, at) == pytest.approx(expected, rel=1e-12)
     assert entry.title == row
     assert entry.lines[0].startswith(f"{row}: {entry.formula.operations} operations, depends on ")
     assert entry.lines[-1] == f"  {row} = {entry.formula.values[0]}"
@@ -118,16 +118,16 @@ def test_an_entry_with_a_column_is_the_slope(symbols, row, column):
     for sign in (1, -1):
         moved = at.copy()
         moved[j] += sign * width
-        ends.append(value(symbols, symbols.all_rows, moved)[i])
+        ends.append(value(symbols, symbols.row_expressions, moved)[i])
     entry = symbols.entry(f" {row},{column} ")
     assert entry.title == f"d {row} / d {column}"
-    assert not entry.zero
+    assert not entry.is_zero
     assert worked_out(symbols, entry, at) == pytest.approx((ends[0] - ends[1]) / (2 * width), rel=1e-6, abs=1e-9)
 
 
 def test_an_entry_that_vanishes_says_so(symbols):
     entry = symbols.entry("constraint[hand.x], T1.bend")
-    assert entry.zero
+    assert entry.is_zero
     assert entry.lines == ["d constraint[hand.x] / d T1.bend = 0 whatever the state"]
 
 
@@ -177,5 +177,5 @@ def test_all_rows_are_listed_the_short_ones_whole(symbols):
 
 
 def test_latex_gets_no_letter_that_it_would_read_as_its_own():
-    assert latex_text("kelvin_voigt@T1.tau") == r"kelvin\_voigt@T1.tau"
-    assert latex_text("T1:40%") == r"T1:40\%"
+    assert escape_latex("kelvin_voigt@T1.tau") == r"kelvin\_voigt@T1.tau"
+    assert escape_latex("T1:40%") == r"T1:40\%"

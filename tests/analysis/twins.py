@@ -17,7 +17,7 @@ def twin_recording(problem: EstimationProblem, x: np.ndarray, seed: int) -> Reco
     assert evaluation.ok, evaluation.message
     recording = problem.episodes[0].recording
     groups = []
-    for group, predicted in zip(recording.points, evaluation.episodes[0].predicted, strict=True):
+    for group, predicted in zip(recording.points, evaluation.episode_predictions[0].predicted_outputs, strict=True):
         count = len(predicted)
         position, std = group.position[:count], group.std[:count]
         seen = predicted.reshape(position.shape) + std * rng.standard_normal(position.shape)

@@ -40,7 +40,7 @@ def edited(file, old, new):
         ("path_cutoff: .inf", "time_step: 10", ("time_step = 10", "up to 0.1 [s]")),
         ("path_cutoff: .inf", "time_step: -0.01", ("above 0",)),
         ("path_cutoff: .inf", "time_step: .nan", ("time_step",)),
-        ("name: gauss_newton", "iterations: many", ("solver.iterations", "a whole number")),
+        ("name: gauss_newton", "iterations: many", ("solver.max_iterations", "a whole number")),
         ("name: gauss_newton", "name: gaus_newton", ("there is no solver", "gauss_newton")),
         ("path_cutoff: .inf", "feedback: lqg", ("none, proportional, lqr",)),
         ("mode: prescribed", "mode: perscribed", ("driven, prescribed, servo, passive",)),
@@ -184,8 +184,8 @@ def test_a_grasp_out_of_reach(cli, tmp_path, monkeypatch, repository, left_nothi
     monkeypatch.chdir(tmp_path)
     done = cli(
         "solve", repository / "configs" / "single_arm_no_vision.yaml",
-        "--set", "model.object={kind: y, links: 1, mount: {xyz: [2.5, 0, -0.93]}}",
-        "--set", "problem.compiler=false",
+        "--set", "model.object={kind: foam_y, links: 1, mount: {xyz: [2.5, 0, -0.93]}}",
+        "--set", "problem.use_compiler=false",
     )  # fmt: skip
     assert_refused(done, "grasp 'left' cannot be closed", "mm are missing", "model.grasp.left")
     left_nothing()
@@ -194,7 +194,7 @@ def test_a_grasp_out_of_reach(cli, tmp_path, monkeypatch, repository, left_nothi
 def test_a_grasp_of_an_unknown_frame(cli, tmp_path, monkeypatch, repository):
     monkeypatch.chdir(tmp_path)
     config = repository / "configs" / "single_arm_no_vision.yaml"
-    done = cli("solve", config, "--set", "model.grasp.left.holder=left_griper")
+    done = cli("solve", config, "--set", "model.grasp.left.holder_frame=left_griper")
     assert_refused(done, "there is no frame 'left_griper'", "did you mean 'left_gripper'?")
     done = cli("solve", config, "--set", "model.object={kind: z}")
     assert_refused(done, "there is no kind 'z'", "y, segments")

@@ -13,10 +13,10 @@ import sys
 import h5py
 import pytest
 
-from yid_ocp.analysis.cross_check import CrossCheck
+from yid_ocp.analysis.pinocchio_comparison import PinocchioComparison
 from yid_ocp.cli import COMMANDS
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.schema import schema
+from yid_ocp.config.schema import config_json_schema
 from yid_ocp.data import read_recording
 
 SOLVE_KEYS = {
@@ -49,9 +49,9 @@ def test_as_a_module():
 
 def test_every_command_is_a_file_of_workflow(repository):
     for row in COMMANDS:
-        source = (repository / "yid_ocp" / "workflow" / f"{row.module}.py").read_text()
+        source = (repository / "yid_ocp" / "workflow" / f"{row.workflow_module}.py").read_text()
         assert "\ndef run(arguments: argparse.Namespace) -> int:\n" in source
-    assert len({row.name for row in COMMANDS}) == len({row.module for row in COMMANDS}) == len(COMMANDS)
+    assert len({row.name for row in COMMANDS}) == len({row.workflow_module for row in COMMANDS}) == len(COMMANDS)
 
 
 def test_no_command_and_unknown_command(cli):
@@ -122,7 +122,7 @@ def test_solve_finds_what_the_efforts_say(cli, pendulum, pendulum_data, tmp_path
 
 
 def test_a_resolved_configuration_runs_again(cli, pendulum, tmp_path):
-    assert cli("solve", pendulum, "--out", "first", "--set", "output.report=false").code == 0
+    assert cli("solve", pendulum, "--out", "first", "--set", "output.write_report=false").code == 0
     assert not (tmp_path / "first" / "report.html").exists()
     assert cli("solve", "first/config.yaml", "--out", "second").code == 0
     first, second = (json.loads((tmp_path / name / "result.json").read_text()) for name in ("first", "second"))
@@ -238,7 +238,7 @@ def test_every_command_that_works_prints_json():
     for row in COMMANDS:
         if row.name not in ("schema", "completion"):
             made = argparse.ArgumentParser()
-            row.arguments(made)
+            row.add_arguments(made)
             assert {"--json", "--quiet"} <= set(made._option_string_actions), row.name
 
 
@@ -276,7 +276,7 @@ def test_check_refines_links_and_time_step(cli, tmp_path, monkeypatch):
         "    kind: segments\n"
         "    segments:\n"
         "      beam:\n"
-        "        {length: 0.5, mass: 0.3, radius: 0.01, rigidity: true, clamped: true}\n"
+        "        {length: 0.5, mass: 0.3, radius: 0.01, stiffness_per_curvature: true, clamped_at_base: true}\n"
         "  damping: 0.001\n"
         "  gravity: [0, 0, 0]\n"
         "parameters: {beam.bend: {initial: 0.5}, beam.twist: {initial: 0.5}}\n"
@@ -403,8 +403,8 @@ def test_check_compares_with_another_library(cli, pendulum, tmp_path):
 
 
 def test_check_warns_of_a_file_that_another_library_reads_otherwise(cli, pendulum, monkeypatch):
-    otherwise = CrossCheck("double_pendulum.urdf as read", 0.03, 0.0, 0.0)
-    monkeypatch.setattr("yid_ocp.workflow.check.check_file", lambda *arguments, **more: otherwise)
+    otherwise = PinocchioComparison("double_pendulum.urdf as read", 0.03, 0.0, 0.0)
+    monkeypatch.setattr("yid_ocp.workflow.check.compare_urdf_with_pinocchio", lambda *arguments, **more: otherwise)
     done = cli("check", pendulum, "--out", "c")
     assert done.code == 0, done.err
     assert "warning: double_pendulum.urdf as read differs from Pinocchio's: mass matrix by 3 %" in done.out
@@ -412,7 +412,7 @@ def test_check_warns_of_a_file_that_another_library_reads_otherwise(cli, pendulu
     def unread(*arguments, **more):
         raise ValueError("no such joint type")
 
-    monkeypatch.setattr("yid_ocp.workflow.check.check_file", unread)
+    monkeypatch.setattr("yid_ocp.workflow.check.compare_urdf_with_pinocchio", unread)
     done = cli("check", pendulum, "--out", "d")
     assert "warning: double_pendulum.urdf cannot be compared, Pinocchio does not read it: no such joint" in done.out
 
@@ -423,7 +423,7 @@ def test_simulate_is_a_recording_that_solve_reads(pendulum_data):
     assert abs(recording.joints.effort).max() > 0.5
     # of prescribed joints: what they need at the nodes
     assert recording.joints.effort_kind == "sample"
-    assert recording.truth["shoulder.stiffness"] == pendulum_data.truth["shoulder.stiffness"]
+    assert recording.true_parameters["shoulder.stiffness"] == pendulum_data.truth["shoulder.stiffness"]
 
 
 def test_import_and_export(cli, pendulum_data, tmp_path):
@@ -442,4 +442,4 @@ def test_schema_is_the_one_beside_the_configurations(cli, repository, tmp_path):
     assert cli("schema", "--out", tmp_path / "schema.json").code == 0
     made, kept = (path.read_text() for path in (tmp_path / "schema.json", repository / "configs" / "schema.json"))
     assert made == kept, "regenerate it with  yid-ocp schema --out configs/schema.json"
-    assert json.loads(kept) == schema()
+    assert json.loads(kept) == config_json_schema()

@@ -9,10 +9,10 @@ import sys
 
 import pytest
 
-from yid_ocp.config.reader import settable
+from yid_ocp.config.reader import settable_keys
 
 pytest.importorskip("argcomplete")
-FILE = "model: {object: {kind: y}}\nparameters:\n  T1.bend: {free: true}\n  T1.twist: {}\n"
+FILE = "model: {object: {kind: foam_y}}\nparameters:\n  T1.bend: {free: true}\n  T1.twist: {}\n"
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
@@ -52,14 +52,14 @@ def test_commands_options_files_and_settings_are_completed(tmp_path):
 def test_keys_that_may_be_set(tmp_path):
     file = tmp_path / "run.yaml"
     file.write_text(FILE)
-    assert settable("problem.ti") == ["problem.time_step="]
-    assert settable("mod") == ["model."]
-    assert settable("parameters.", file) == ["parameters.T1.bend.", "parameters.T1.twist."]
-    assert "parameters.T1.bend.free=" in settable("parameters.T1.bend.", file)
-    assert settable("parameters.") == settable("nothing.") == []
-    assert settable("compare.methods.lif") == ["compare.methods.lifted."]
-    assert "model.object.links=" in settable("model.object.l", file)
-    assert "compare.methods.lifted.iterations=" in settable("compare.methods.lifted.")
+    assert settable_keys("problem.ti") == ["problem.time_step="]
+    assert settable_keys("mod") == ["model."]
+    assert settable_keys("parameters.", file) == ["parameters.T1.bend.", "parameters.T1.twist."]
+    assert "parameters.T1.bend.free=" in settable_keys("parameters.T1.bend.", file)
+    assert settable_keys("parameters.") == settable_keys("nothing.") == []
+    assert settable_keys("compare.methods.lif") == ["compare.methods.lifted."]
+    assert "model.object.links=" in settable_keys("model.object.l", file)
+    assert "compare.methods.lifted.max_iterations=" in settable_keys("compare.methods.lifted.")
 
 
 def test_without_the_package_the_command_says_so_and_the_shell_gets_nothing(cli, monkeypatch):

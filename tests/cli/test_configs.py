@@ -7,21 +7,21 @@ import json
 import pytest
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.workflow.build import recording_file
+from yid_ocp.workflow.build import recording_path
 
 PAPER = ("single_arm_no_vision", "single_arm_vision", "dual_arm_no_vision", "dual_arm_vision")
 # settings that make each run quick: fewer links, a short horizon, interpreted where that is faster than compiling
 COARSE = (
     "model.object.links=2",
     "problem.duration=0.3",
-    "solver.iterations=2",
-    "problem.compiler=false",
+    "solver.max_iterations=2",
+    "problem.use_compiler=false",
     # one stiffness: the others are hardly seen in so short a time, and their profile likelihoods take many refits
     "parameters={}",
     "parameters={T*.bend: {initial: 15}, T1.bend: {free: true, initial: 15}, T*.twist: {initial: 10}}",
 )
 # one of the paper's experiments is run with half the time step as well
-UNREFINED = ("output.discretisation=none",)
+UNREFINED = ("output.discretisation_check=none",)
 DEFT = "../../shared/recordings/deft/bdlo1_train_{}.h5"
 QUICK = {
     **dict.fromkeys(PAPER, (*COARSE, *UNREFINED)),
@@ -31,17 +31,17 @@ QUICK = {
     "servo_arm": (
         "problem.duration=0.5",
         "model.object.segments.rod.links=2",
-        "solver.iterations=3",
-        "problem.compiler=false",
+        "solver.max_iterations=3",
+        "problem.use_compiler=false",
         *UNREFINED,
     ),
-    "panda_beam": ("problem.duration=1.5", "model.object.segments.beam.links=2", "solver.iterations=3"),
+    "panda_beam": ("problem.duration=1.5", "model.object.segments.beam.links=2", "solver.max_iterations=3"),
     **dict.fromkeys(("springs_series_ends", "springs_series_joint", "springs_torsion"), ()),
     "soft_beam": (
         "problem.duration=0.3",
         "model.object.segments.beam.links=2",
-        "solver.iterations=2",
-        "problem.compiler=false",
+        "solver.max_iterations=2",
+        "problem.use_compiler=false",
         "model.effects=[]",
         "parameters={}",
         "parameters={beam.bend: {free: true, initial: 0.018}, beam.damping: {free: true, initial: 4.0e-5}}",
@@ -49,9 +49,9 @@ QUICK = {
     ),
     "deft_bdlo1": (
         "problem.duration=0.1",
-        "solver.iterations=2",
-        "problem.compiler=false",
-        "problem.start_parameters=[]",
+        "solver.max_iterations=2",
+        "problem.use_compiler=false",
+        "problem.start_fit_parameters=[]",
         *UNREFINED,
         f"recordings.estimate=[{DEFT.format('007')}]",
         f"recordings.held_out=[{DEFT.format('014')}]",
@@ -74,12 +74,12 @@ def test_configuration_runs(cli, repository, tmp_path, name):
     file = configurations(repository)[name]
     run = load_config(file)
     missing = [
-        path for path in (*run.recordings.estimate, *run.recordings.held_out) if not recording_file(path).is_file()
+        path for path in (*run.recordings.estimate, *run.recordings.held_out) if not recording_path(path).is_file()
     ]
     if missing:
         pytest.skip(f"its recordings are not here: {missing[0]}")
     settings = [part for setting in QUICK[name] for part in ("--set", setting)]
-    done = cli("solve", file, "--out", tmp_path / "run", *settings, "--set", "output.report=false")
+    done = cli("solve", file, "--out", tmp_path / "run", *settings, "--set", "output.write_report=false")
     assert done.code in (0, 1), done.err
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     assert result["status"] in ("converged", "iteration_limit"), result["message"]
@@ -109,12 +109,12 @@ WITHHELD = {
 @pytest.mark.parametrize("what", sorted(WITHHELD))
 def test_what_is_withheld_from_the_beams_model_is_named(cli, repository, tmp_path, what):
     file = configurations(repository)["panda_beam"]
-    missing = [path for path in load_config(file).recordings.estimate if not recording_file(path).is_file()]
+    missing = [path for path in load_config(file).recordings.estimate if not recording_path(path).is_file()]
     if missing:
         pytest.skip(f"its recordings are not here: {missing[0]}")
     settings, truth = WITHHELD[what]
-    chosen = [part for setting in (*settings, "diagnosis.effects=1") for part in ("--set", setting)]
-    done = cli("diagnose", file, "--out", tmp_path / "run", *chosen, "--set", "output.report=false")
+    chosen = [part for setting in (*settings, "diagnosis.max_effects=1") for part in ("--set", setting)]
+    done = cli("diagnose", file, "--out", tmp_path / "run", *chosen, "--set", "output.write_report=false")
     assert done.code == 0, done.err
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     assert result["verdict"] == "effect"

@@ -9,7 +9,7 @@ import pytest
 
 
 def test_a_diagnosis_leaves_a_run_folder(cli, pendulum, tmp_path):
-    chosen = ("--set", "diagnosis.candidates=[joint_coulomb, link_mass@elbow]", "--set", "output.report=false")
+    chosen = ("--set", "diagnosis.candidates=[joint_coulomb, link_mass@elbow]", "--set", "output.write_report=false")
     done = cli("diagnose", pendulum, "--out", tmp_path / "run", *chosen)
     assert done.code == 0, done.err
     result = json.loads((tmp_path / "run" / "result.json").read_text())
@@ -31,7 +31,7 @@ def test_candidates_that_do_not_fit_are_said(cli, pendulum, tmp_path):
 
 def test_a_deviation_that_is_mostly_the_models_error(cli, pendulum, tmp_path):
     """Deviations ten times the noise, of which a tenth is noise, are the noise again."""
-    chosen = ("--set", "diagnosis.candidates=[joint_coulomb]", "--set", "output.report=false")
+    chosen = ("--set", "diagnosis.candidates=[joint_coulomb]", "--set", "output.write_report=false")
     found = []
     for std, share in ((0.01, 1.0), (0.1, 0.1)):
         out = tmp_path / f"run_{std}_{share}"

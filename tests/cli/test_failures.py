@@ -14,13 +14,13 @@ from pathlib import Path
 import pytest
 
 from yid_ocp.errors import DataError
-from yid_ocp.problem.prediction import Predictor
+from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.workflow import solve as solve_module
 
 
 def test_a_solve_that_does_not_converge(cli, pendulum, tmp_path):
     done = cli(
-        "solve", pendulum, "--out", "limit", "--set", "solver.iterations=1", "--set", "solver.name=steepest_descent"
+        "solve", pendulum, "--out", "limit", "--set", "solver.max_iterations=1", "--set", "solver.name=steepest_descent"
     )
     assert done.code == 1
     result = json.loads((tmp_path / "limit" / "result.json").read_text())
@@ -33,7 +33,7 @@ def test_a_solve_that_does_not_converge(cli, pendulum, tmp_path):
 
 def test_a_rollout_that_fails_leaves_reason_and_best_point(cli, pendulum, tmp_path, monkeypatch):
     told = "estimate: step 3: Newton did not converge"
-    monkeypatch.setattr(Predictor, "run_all", lambda predictor, asked, derivatives: [told] * len(asked))
+    monkeypatch.setattr(EpisodePredictor, "predict_episodes", lambda predictor, asked, derivatives: [told] * len(asked))
     done = cli("solve", pendulum, "--out", "failed")
     assert done.code == 1
     result = json.loads((tmp_path / "failed" / "result.json").read_text(), parse_constant=pytest.fail)
@@ -142,7 +142,7 @@ def test_a_full_disk_is_the_users_business(cli, pendulum, left_nothing, monkeypa
     def full(*arguments):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("yid_ocp.workflow.folder.os.replace", full)
+    monkeypatch.setattr("yid_ocp.workflow.run_folder.os.replace", full)
     done = cli("solve", pendulum)
     assert done.code == 2
     assert "No space left on device" in done.err

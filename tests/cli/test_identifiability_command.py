@@ -63,7 +63,7 @@ def test_springs_that_cannot_be_told_apart(cli, repository, tmp_path):
 
 def test_springs_that_can(cli, repository, tmp_path):
     file = repository / "configs" / "springs_series_joint.yaml"
-    options = ("--intervals", "spring_1.stiffness", "--set", "output.report=false")
+    options = ("--intervals", "spring_1.stiffness", "--set", "output.write_report=false")
     done = cli("identifiability", file, "--out", tmp_path / "run", *options)
     assert done.code == 0, done.err
     assert "2 of 2 parameters can be found" in done.out
@@ -78,7 +78,7 @@ def test_springs_that_can(cli, repository, tmp_path):
 
 def test_judged_at_the_initial_values_without_solving(cli, repository, tmp_path):
     file = repository / "configs" / "springs_series_ends.yaml"
-    options = ("--initial", "--intervals", "none", "--set", "output.report=false")
+    options = ("--initial", "--intervals", "none", "--set", "output.write_report=false")
     done = cli("identifiability", file, "--out", tmp_path / "run", *options)
     assert done.code == 0, done.err
     result = read(tmp_path / "run")
@@ -87,7 +87,7 @@ def test_judged_at_the_initial_values_without_solving(cli, repository, tmp_path)
 
 
 def test_a_pendulum_moved_as_measured(cli, pendulum, tmp_path):
-    done = cli("identifiability", pendulum, "--out", tmp_path / "run", "--set", "output.report=false")
+    done = cli("identifiability", pendulum, "--out", tmp_path / "run", "--set", "output.write_report=false")
     assert done.code == 0, done.err
     result = read(tmp_path / "run")
     assert {entry["verdict"] for entry in result["parameters"].values()} == {"identifiable"}
@@ -103,7 +103,7 @@ def test_an_interval_of_an_unknown_parameter(cli, repository, tmp_path, left_not
 
 def test_a_passive_joint_that_is_none(cli, repository, tmp_path, left_nothing):
     file = repository / "configs" / "springs_series_ends.yaml"
-    settings = ("--set", "model.arms.passive=[spring_1, spring_9]")
+    settings = ("--set", "model.arms.passive_joints=[spring_1, spring_9]")
     done = cli("identifiability", file, "--out", tmp_path / "run", *settings)
     assert done.code == 2
     assert "there is no joint 'spring_9'" in done.err
@@ -115,7 +115,7 @@ def test_a_failed_solve_leaves_no_point_to_judge_at(cli, repository, tmp_path, m
     from yid_ocp.workflow import identifiability
 
     def failing(problem, solver, callback=None, limits=None):
-        done = solve(problem, GaussNewton(iterations=1))
+        done = solve(problem, GaussNewton(max_iterations=1))
         return replace(done, status=Status.FAILED, message="the rollout failed", evaluation=None)
 
     monkeypatch.setattr(identifiability, "solve", failing)
@@ -129,7 +129,7 @@ def test_a_failed_solve_leaves_no_point_to_judge_at(cli, repository, tmp_path, m
 @pytest.mark.parametrize("named", ["pendulum", "springs_torsion", "springs_series_joint"])
 def test_no_two_commands_give_two_verdicts_for_one_parameter(cli, repository, pendulum, tmp_path, named):
     file = pendulum if named == "pendulum" else repository / "configs" / f"{named}.yaml"
-    quick = ("--set", "output.report=false")
+    quick = ("--set", "output.write_report=false")
     methods = ("--set", "compare.methods={gauss_newton: {}, single_shooting: {}}")
     for command, more in (("solve", ()), ("identifiability", ()), ("compare", methods)):
         done = cli(command, file, "--out", tmp_path / command, *quick, *more)
@@ -149,7 +149,7 @@ def test_no_two_commands_give_two_verdicts_for_one_parameter(cli, repository, pe
 
 def test_a_model_that_does_not_explain_its_recordings_is_said_first_by_all(cli, pendulum, tmp_path):
     """The same pendulum with its noise stated ten times too small."""
-    quick = ("--set", "output.report=false", "--set", "sensors={joints.effort: {std: 0.001}}")
+    quick = ("--set", "output.write_report=false", "--set", "sensors={joints.effort: {std: 0.001}}")
     methods = ("--set", "compare.methods={gauss_newton: {}}")
     for command, more in (("solve", ()), ("identifiability", ()), ("compare", methods)):
         done = cli(command, pendulum, "--out", tmp_path / command, *quick, *more)

@@ -10,39 +10,47 @@ from dataclasses import MISSING
 import pytest
 from ruamel.yaml import YAML
 
-from yid_ocp.config.keys import sections_of
-from yid_ocp.config.reader import DEFAULT, load_config
-from yid_ocp.config.settings import Run
+from yid_ocp.config.reader import DEFAULT_CONFIG, load_config
+from yid_ocp.config.setting_keys import section_variants
+from yid_ocp.config.settings import RunSettings
 from yid_ocp.errors import ConfigError
-from yid_ocp.options import BOUNDS, entries_of, members, options_of, stripped, values_of, words
+from yid_ocp.options import (
+    _BOUND_MARKERS,
+    dataclass_options,
+    describe_type,
+    mapping_value_type,
+    sequence_entry_type,
+    split_annotated,
+    union_members,
+)
 from yid_ocp.solvers import GaussNewton, SteepestDescent
 
 
 def test_the_embedded_default_is_the_one_in_configs(repository):
-    embedded = repository / "yid_ocp" / "data" / "defaults" / DEFAULT
-    assert embedded.read_bytes() == (repository / "configs" / DEFAULT).read_bytes()
-    assert load_config() == dataclasses.replace(load_config(repository / "configs" / DEFAULT))
+    embedded = repository / "yid_ocp" / "data" / "defaults" / DEFAULT_CONFIG
+    assert embedded.read_bytes() == (repository / "configs" / DEFAULT_CONFIG).read_bytes()
+    assert load_config() == dataclasses.replace(load_config(repository / "configs" / DEFAULT_CONFIG))
 
 
 def test_numbers_as_in_yaml_1_2(written):
     run = load_config(
         written(
             "problem: {time_step: 1e-3, huber_threshold: .inf, path_cutoff: 5}\n"
-            "solver: {iterations: 010}\ndescription: 'yes'\n"
+            "solver: {max_iterations: 010}\ndescription: 'yes'\n"
         )
     )
     assert run.problem.time_step == 1e-3
     assert math.isinf(run.problem.huber_threshold)
-    assert run.solver == GaussNewton(iterations=10)
+    assert run.solver == GaussNewton(max_iterations=10)
     assert run.problem.path_cutoff == 5.0
     assert run.description == "yes"
 
 
 def test_a_solver_has_the_settings_of_its_method(written):
-    run = load_config(written("solver: {name: steepest_descent, iterations: 7, shrink: 0.3}\n"))
-    assert run.solver == SteepestDescent(iterations=7, shrink=0.3)
+    run = load_config(written("solver: {name: steepest_descent, max_iterations: 7, backtracking_factor: 0.3}\n"))
+    assert run.solver == SteepestDescent(max_iterations=7, backtracking_factor=0.3)
     with pytest.raises(ConfigError, match="there is no key 'shrink'"):
-        load_config(written("solver: {name: gauss_newton, shrink: 0.3}\n"))
+        load_config(written("solver: {name: gauss_newton, backtracking_factor: 0.3}\n"))
 
 
 def test_paths_are_relative_to_the_file(written, tmp_path):
@@ -50,13 +58,13 @@ def test_paths_are_relative_to_the_file(written, tmp_path):
         written(
             "model: {robot: ../arm.urdf}\n"
             "recordings: {estimate: [a/b.h5, default:x.h5], held_out: [/elsewhere/c.h5]}\n"
-            "output: {folder: results}\n"
+            "output: {runs_folder: results}\n"
         )
     )
     assert run.model.robot == str((tmp_path.parent / "arm.urdf").resolve())
     assert run.recordings.estimate == (str(tmp_path.resolve() / "a" / "b.h5"), "default:x.h5")
     assert run.recordings.held_out == ("/elsewhere/c.h5",)
-    assert run.output.folder == str(tmp_path.resolve() / "results")
+    assert run.output.runs_folder == str(tmp_path.resolve() / "results")
     assert load_config(written("model: {robot: package:panda}\n")).model.robot == "package:panda"
 
 
@@ -69,8 +77,8 @@ def test_paths_are_relative_to_the_file(written, tmp_path):
         ("sensors.joints.effort.std=0.1", ("sensors", "joints.effort", "std", 0.1)),
         ("sensors.joints.effort.std={a: 0.1}", ("sensors", "joints.effort", "std", {"a": 0.1})),
         ("model.grasp.left.kind=weld", ("model", "grasp", "left", "kind", "weld")),
-        ("solver.iterations=3", ("solver", "iterations", 3)),
-        ("model.object={kind: y, links: 2}", ("model", "object", "links", 2)),
+        ("solver.max_iterations=3", ("solver", "iterations", 3)),
+        ("model.object={kind: foam_y, links: 2}", ("model", "object", "links", 2)),
         ("model.object.links=6", ("model", "object", "links", 6)),
         ("model.damping=0.1", ("model", "damping", 0.1)),
         ("model.springs.left_s1={stiffness: 20}", ("model", "springs", "left_s1", "stiffness", 20.0)),
@@ -92,8 +100,8 @@ def test_settings_over_the_file_keep_what_they_do_not_touch():
     run = load_config(None, ["parameters.T1.bend.initial=5"])
     assert run.parameters["T1.bend"].free
     assert len(run.parameters) == 6
-    assert run.where("parameters", "T1.bend", "initial").startswith("--set parameters.T1.bend.initial")
-    assert "line" in run.where("parameters", "T2.bend", "free")
+    assert run.describe_location("parameters", "T1.bend", "initial").startswith("--set parameters.T1.bend.initial")
+    assert "line" in run.describe_location("parameters", "T2.bend", "free")
 
 
 @pytest.mark.parametrize(
@@ -103,13 +111,13 @@ def test_settings_over_the_file_keep_what_they_do_not_touch():
         ("model:\n  object: {kind: cube}\n", "there is no kind 'cube'"),
         ("model:\n  object: 3\n", "model.object = 3 is not a section"),
         ("model:\n  object:\n    kind: segments\n    segments: {a: {length: 1, radius: 0.1}}\n", "'mass' is missing"),
-        ("model:\n  grasp: {left: {holder: x}}\n", "'held' is missing"),
+        ("model:\n  grasp: {left: {holder_frame: x}}\n", "'held' is missing"),
         ("model:\n  grasp: [left]\n", "model.grasp"),
         ("model:\n  gravity: [0, 0]\n", "a list of 3"),
         ("model:\n  arms: {joints: left_s0}\n", "a list"),
         ("problem:\n  duration: true\n", "a number"),
         ("problem:\n  time_step: '0.01'\n", "a number"),
-        ("problem:\n  gains: []\n", "problem.gains"),
+        ("problem:\n  proportional_gains: []\n", "problem.proportional_gains"),
         ("description: 2024-01-01\n", "description"),
         ("sensors:\n  points: {std: 0}\n", "above 0"),
     ],
@@ -135,7 +143,7 @@ def test_old_or_misplaced_keys_are_told_their_section(written):
     assert caught.value.hint == "did you mean 'duration'?"
     with pytest.raises(ConfigError) as caught:
         load_config(written("problem: {iterations: 3}\n"))
-    assert "'iterations' is a key of `solver`, `compare.methods.NAME`, `track.options.fit`" in caught.value.hint
+    assert "'iterations' is a key of `solver`, `compare.methods.NAME`, `track.options.shape_fit`" in caught.value.hint
     with pytest.raises(ConfigError) as caught:
         load_config(written("solver: {name: steepest_descent, step_tolerance: 1}\n"))
     assert "'step_tolerance' is a key of `solver` with name: gauss_newton, lifted" in caught.value.hint
@@ -162,8 +170,8 @@ METHODS = "compare:\n  methods:\n    gauss_newton: {}\n    lifted:\n      VALUE\
 @pytest.mark.parametrize(
     ("value", "words"),
     [
-        ("iterations: abc", ("compare.methods.lifted.iterations", "a whole number from 1", "line 5")),
-        ("iterations: -3", ("compare.methods.lifted.iterations = -3", "a whole number from 1", "line 5")),
+        ("iterations: abc", ("compare.methods.lifted.max_iterations", "a whole number from 1", "line 5")),
+        ("iterations: -3", ("compare.methods.lifted.max_iterations = -3", "a whole number from 1", "line 5")),
         ("iterations: 3.0", ("a whole number from 1",)),
         ("defect_tolerance: 0", ("a number above 0 [rad, m or N m s]",)),
         ("iteration: 3", ("there is no key 'iteration' in compare.methods.lifted", "did you mean 'iterations'?")),
@@ -191,11 +199,11 @@ def test_compared_methods(written):
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("compare.methods.gauss_newton.iterations=abc", "a whole number from 1"),
-        ("compare.methods.gauss_newton.iterations=0", "a whole number from 1"),
+        ("compare.methods.gauss_newton.max_iterations=abc", "a whole number from 1"),
+        ("compare.methods.gauss_newton.max_iterations=0", "a whole number from 1"),
         ("compare.methods.gauss_newton.iteration=3", "did you mean 'iterations'?"),
         ("compare.methods.newton.iterations=3", "did you mean 'gauss_newton'?"),
-        ("solver.iterations=-3", "a whole number from 1"),
+        ("solver.max_iterations=-3", "a whole number from 1"),
         ("solver.time_step=0.01", "'time_step' is a key of `problem`"),
     ],
 )
@@ -212,8 +220,8 @@ sensors:
   joints.effort: {std: 0.1}
 parameters:
   T1.bend: {free: true, initial: 5.0}
-solver: {name: gauss_newton, iterations: 7}
-model: {object: {kind: y, links: 3}}
+solver: {name: gauss_newton, max_iterations: 7}
+model: {object: {kind: foam_y, links: 3}}
 """
 
 
@@ -228,16 +236,16 @@ def test_set_merges_sections(written):
     bend = run.parameters["T1.bend"]
     assert (bend.free, bend.initial, bend.bounds) == (True, 4.0, (1.0, 9.0))
     assert run.parameters["T2.*"].free
-    assert load_config(file, ["solver={step_tolerance: 1e-3}"]).solver.iterations == 7
+    assert load_config(file, ["solver={step_tolerance: 1e-3}"]).solver.max_iterations == 7
     assert load_config(file, ["model={gravity: [0, 0, -1]}"]).model.object.links == 3
 
 
 def test_set_replaces_lists_other_kinds_and_what_is_emptied_first(written):
     file = written(SET)
     lifted = load_config(file, ["solver={name: lifted}"]).solver
-    assert (lifted.name, lifted.iterations) == ("lifted", type(lifted)().iterations)
+    assert (lifted.name, lifted.max_iterations) == ("lifted", type(lifted)().max_iterations)
     assert load_config(file, ["model.object={kind: segments, segments: {}}"]).model.object.kind == "segments"
-    assert load_config(file, ["model.object={kind: y}"]).model.object.links == 3
+    assert load_config(file, ["model.object={kind: foam_y}"]).model.object.links == 3
     assert load_config(file, ["sensors={}"]).sensors == {}
     assert list(load_config(file, ["sensors=null", "sensors={camera: {use: false}}"]).sensors) == ["camera"]
     assert load_config(file, ["recordings.estimate=[a.h5]", "recordings.estimate=[b.h5]"]).recordings.estimate[1:] == ()
@@ -263,51 +271,53 @@ def test_what_is_set_wrong_is_told_with_the_nearest_key(written, setting, words)
 
 def test_a_section_that_set_makes_says_where_it_comes_from(written):
     run = load_config(written(SET), ["parameters.T9.bend.free=true"])
-    assert run.where("parameters", "T9.bend") == "--set parameters.T9.bend.free: parameters.T9.bend"
+    assert run.describe_location("parameters", "T9.bend") == "--set parameters.T9.bend.free: parameters.T9.bend"
 
 
 # Numbers that may have any value: places, angles, offsets.
 ANY_NUMBER = {
-    "plan.posture.NAME",
+    "plan.start_joint_positions.NAME",
     "import.torque_constants.NAME",
     "import.gears.NAME",
-    "model.arms.locked.NAME",
-    "model.springs.NAME.rest",
+    "model.arms.locked_joints.NAME",
+    "model.springs.NAME.rest_position",
     "model.effects.values.NAME",
     "parameters.NAME.initial",
-    "track.virtual.latency",
-    "track.options.filters.floor",
+    "track.virtual_frames.latency",
+    "track.options.filters.floor_height",
     "track.options.filters.floor_margin",
-    "track.options.filters.behind",
-    "track.options.clock.offset",
+    "track.options.filters.max_depth_behind_base",
+    "track.options.clock.initial_offset",
 }
 
 
 def numbers(hint, wrap=lambda value: value, path=(), option=None):
     """Every number that a file may hold: its key, what the file around it looks like, its option's type, its bounds."""
-    sections = sections_of(hint)
+    sections = section_variants(hint)
     for word, kind in (sections.classes if sections is not None else {}).items():
-        options = options_of(kind)
-        needed = {name: needed_value(entry.hint) for name, entry in options.items() if entry.default is MISSING}
-        needed |= {sections.key: word} if sections.key else {}
+        options = dataclass_options(kind)
+        needed = {
+            name: needed_value(entry.type_hint) for name, entry in options.items() if entry.default_value is MISSING
+        }
+        needed |= {sections.selector_key: word} if sections.selector_key else {}
         for name, entry in options.items():
-            yield from numbers(entry.hint, within(wrap, name, needed), (*path, name), entry.hint)
+            yield from numbers(entry.type_hint, within(wrap, name, needed), (*path, name), entry.type_hint)
     if sections is not None:
         return
-    values = values_of(hint)
-    named = sections_of(values)
-    if named is not None and named.key == "name":
+    values = mapping_value_type(hint)
+    named = section_variants(values)
+    if named is not None and named.selector_key == "name":
         for name in named.classes:
-            yield from numbers(named.of(name, "").classes[""], within(wrap, name), (*path, name))
+            yield from numbers(named.for_name(name, "").classes[""], within(wrap, name), (*path, name))
     elif values is not None:
         yield from numbers(values, within(wrap, "NAME"), (*path, "NAME"), option)
-    for member in members(hint):
-        entries, (bare, markers) = entries_of(member), stripped(member)
+    for member in union_members(hint):
+        entries, (bare, markers) = sequence_entry_type(member), split_annotated(member)
         if entries is not None:
             yield from numbers(entries, lambda value: wrap([value]), path, option)
         if bare in (int, float):
-            kinds = tuple(kind for kind, *_ in BOUNDS)
-            bounds = [marker for marker in (*stripped(hint)[1], *markers) if isinstance(marker, kinds)]
+            kinds = tuple(kind for kind, *_ in _BOUND_MARKERS)
+            bounds = [marker for marker in (*split_annotated(hint)[1], *markers) if isinstance(marker, kinds)]
             yield ".".join(path), wrap, option, bounds
 
 
@@ -316,18 +326,18 @@ def within(wrap, name, beside=None):
 
 
 def needed_value(hint):
-    bare, _ = stripped(hint)
-    return 1.0 if bare is float else [*"abcde"] if entries_of(hint) is not None else "a"
+    bare, _ = split_annotated(hint)
+    return 1.0 if bare is float else [*"abcde"] if sequence_entry_type(hint) is not None else "a"
 
 
-NUMBERS = list(numbers(Run))
+NUMBERS = list(numbers(RunSettings))
 
 
 def outside():
     """A wrong value for every bound."""
     for key, wrap, option, bounds in NUMBERS:
         for bound in bounds:
-            [value] = [getattr(bound, name) for kind, name, *_ in BOUNDS if isinstance(bound, kind)]
+            [value] = [getattr(bound, name) for kind, name, *_ in _BOUND_MARKERS if isinstance(bound, kind)]
             wrong = {"Gt": value, "Lt": value, "Ge": value - 1, "Le": value + 1}[type(bound).__name__]
             yield pytest.param(key, wrap(wrong), option, id=f"{key}={wrong}")
 
@@ -343,7 +353,7 @@ def test_a_number_outside_its_bounds_is_refused(written, key, data, option):
     YAML(typ="safe").dump(data, stream)
     with pytest.raises(ConfigError) as caught:
         load_config(written(stream.getvalue()))
-    assert caught.value.allowed == words(option)
+    assert caught.value.allowed == describe_type(option)
     assert "line" in caught.value.where
     last = [part for part in key.split(".") if part != "NAME"][-1]
     assert last in caught.value.where
@@ -379,6 +389,6 @@ def test_odd_yaml_is_refused_at_once(tmp_path, text, said):
 
 def test_merged_sections_have_their_lines(tmp_path):
     file = tmp_path / "merged.yaml"
-    file.write_text("problem:\n  <<: {time_step: 0.02}\n  compiler: 3\n", encoding="utf-8")
+    file.write_text("problem:\n  <<: {time_step: 0.02}\n  use_compiler: 3\n", encoding="utf-8")
     with pytest.raises(ConfigError, match=r"line 3: problem\.compiler"):
         load_config(file)

@@ -8,19 +8,19 @@ import jsonschema
 import pytest
 from ruamel.yaml import YAML
 
-from yid_ocp.config.examples import EXAMPLES
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.schema import schema, settings_page
+from yid_ocp.config.schema import config_json_schema, settings_markdown
+from yid_ocp.config.settings_examples import SETTINGS_EXAMPLES
 from yid_ocp.errors import ConfigError
 
 
 def test_the_one_beside_the_configurations_is_current(repository):
     kept = json.loads((repository / "configs" / "schema.json").read_text(encoding="utf-8"))
-    assert kept == schema(), "regenerate it with  yid-ocp schema --out configs/schema.json"
+    assert kept == config_json_schema(), "regenerate it with  yid-ocp schema --out configs/schema.json"
 
 
 def test_the_page_in_the_docs_is_current(repository):
-    page = settings_page()
+    page = settings_markdown()
     assert (repository / "docs" / "settings.md").read_text(encoding="utf-8") == page, (
         "CONTRIBUTING.md says how to make it"
     )
@@ -37,9 +37,11 @@ def test_the_page_in_the_docs_is_current(repository):
 def test_every_section_of_the_page_has_an_example_that_can_be_read(repository, tmp_path):
     page = (repository / "docs" / "settings.md").read_text(encoding="utf-8")
     titles = [line.removeprefix("## ") for line in page.splitlines() if line.startswith("## ")]
-    assert set(titles) == set(EXAMPLES), "every section of docs/settings.md needs an example in config/examples.py"
-    rules = schema()
-    for title, text in EXAMPLES.items():
+    assert set(titles) == set(SETTINGS_EXAMPLES), (
+        "every section of docs/settings.md needs an example in config/settings_examples.py"
+    )
+    rules = config_json_schema()
+    for title, text in SETTINGS_EXAMPLES.items():
         (tmp_path / "run.yaml").write_text(text)
         try:
             load_config(tmp_path / "run.yaml")
@@ -51,7 +53,7 @@ def test_every_section_of_the_page_has_an_example_that_can_be_read(repository, t
 
 
 def test_the_schema_accepts_every_configuration_and_refuses_typos(repository):
-    rules = schema()
+    rules = config_json_schema()
     jsonschema.Draft202012Validator.check_schema(rules)
     files = sorted((repository / "configs").glob("*.yaml"))
     assert len(files) >= 5

@@ -8,7 +8,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import CableObject, DiagnosisSettings, ProblemSettings, dump_config
+from yid_ocp.config.settings import CableSettings, DiagnosisSettings, ProblemSettings, dump_config
 from yid_ocp.diagnosis import Thresholds
 from yid_ocp.model.cable import CableOptions
 from yid_ocp.problem import ProblemOptions, SensorOptions
@@ -24,8 +24,8 @@ def test_written_back_it_is_the_same_run(repository, tmp_path, name):
 
 def test_written_back_every_setting_is_there(written):
     text = (
-        "solver: {name: lifted, node_interval: 3}\ncompare: {methods: {lifted: {iterations: 2}}}\n"
-        "track: {options: {filters: {behind: null}}}\n"
+        "solver: {name: lifted, node_interval: 3}\ncompare: {methods: {lifted: {max_iterations: 2}}}\n"
+        "track: {options: {filters: {max_depth_behind_base: null}}}\n"
     )
     run = load_config(written(text))
     told = YAML(typ="safe", pure=True).load(dump_config(run))
@@ -50,11 +50,13 @@ def test_written_back_every_setting_is_there(written):
 
 
 def test_sections_are_what_their_users_take(written):
-    run = load_config(written("problem: {path_cutoff: 3}\ndiagnosis: {effects: 1}\nsensors: {points: {std: 0.1}}\n"))
+    run = load_config(
+        written("problem: {path_cutoff: 3}\ndiagnosis: {max_effects: 1}\nsensors: {points: {std: 0.1}}\n")
+    )
     assert isinstance(run.problem, ProblemOptions)
     assert run.problem.path_cutoff == 3.0
     assert isinstance(run.diagnosis, Thresholds)
-    assert (run.diagnosis.effects, run.diagnosis.level) == (1, Thresholds().level)
+    assert (run.diagnosis.max_effects, run.diagnosis.significance_level) == (1, Thresholds().significance_level)
     assert run.sensors["points"] == SensorOptions(std=0.1)
 
 
@@ -62,7 +64,7 @@ def test_no_section_repeats_the_options_of_another_package():
     for section, options in (
         (ProblemSettings, ProblemOptions),
         (DiagnosisSettings, Thresholds),
-        (CableObject, CableOptions),
+        (CableSettings, CableOptions),
     ):
         own = section.__annotations__
         assert not set(own) & {field.name for field in dataclasses.fields(options)}

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from yid_ocp.data.recording import JOINT_CHANNELS, JointGroup, PointGroup, Recording
+from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording
 
 
 def turned(angle: float) -> np.ndarray:
@@ -25,7 +25,7 @@ def example() -> Recording:
     joints = JointGroup(
         names=("left_s0", "left_s1"),
         t=t,
-        **{channel: generator.normal(size=(50, 2)) for channel in JOINT_CHANNELS},  # type: ignore[arg-type]
+        **{channel: generator.normal(size=(50, 2)) for channel in JOINT_CHANNEL_UNITS},  # type: ignore[arg-type]
         position_std=1e-3,
         velocity_std=np.array([0.01, 0.02]),
         effort_bias_std=np.array([0.2, 0.3]),
@@ -45,7 +45,9 @@ def example() -> Recording:
         turned(0.3),
     )
     arm = PointGroup("points_arm", ("w_T2",), t, generator.normal(size=(50, 1, 3)), sensor="arm", clock="nominal")
-    return Recording(joints, (arm, camera), "a test", "nowhere", "example", truth={"T1.bend": 22.0, "T1.twist": 3})
+    return Recording(
+        joints, (arm, camera), "a test", "nowhere", "example", true_parameters={"T1.bend": 22.0, "T1.twist": 3}
+    )
 
 
 def with_joints(**changes: Any) -> Recording:
@@ -68,10 +70,14 @@ def changed(array: np.ndarray, index: Any, value: float) -> np.ndarray:
 
 
 def assert_same(left: Recording, right: Recording) -> None:
-    assert (left.description, left.source, left.truth) == (right.description, right.source, right.truth)
-    assert (left.straight is None) == (right.straight is None)
-    if left.straight is not None and right.straight is not None:
-        assert np.array_equal(left.straight, right.straight)
+    assert (left.description, left.source, left.true_parameters) == (
+        right.description,
+        right.source,
+        right.true_parameters,
+    )
+    assert (left.marker_reference_pose is None) == (right.marker_reference_pose is None)
+    if left.marker_reference_pose is not None and right.marker_reference_pose is not None:
+        assert np.array_equal(left.marker_reference_pose, right.marker_reference_pose)
     assert [type(group) for group in left.groups] == [type(group) for group in right.groups]
     for one, other in zip(left.groups, right.groups, strict=True):
         for field in dataclasses.fields(one):

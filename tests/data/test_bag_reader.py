@@ -13,9 +13,9 @@ import pytest
 from heard import Heard
 from recording_examples import joints_of
 
-from yid_ocp.data.hdf5 import write_recording
-from yid_ocp.data.readers import preview, read_any
+from yid_ocp.data.readers import preview_file, read_any
 from yid_ocp.data.readers.bags import read_bag
+from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.errors import DataError
 
 SECOND = 10**9
@@ -118,7 +118,7 @@ def arm_and_camera() -> Messages:
 @pytest.mark.parametrize("kind", FORMATS)
 def test_bag_round_trip(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, heard = write_bag(tmp_path, kind, arm_and_camera()), Heard()
-    monkeypatch.setattr("yid_ocp.data.readers.bags.TOLD", 3)
+    monkeypatch.setattr("yid_ocp.data.readers.bags._PROGRESS_INTERVAL", 3)
     recording = read_any(path, sensor="camera", progress=heard)
     assert heard.parts == [(done, 8, "messages") for done in (0, 3, 6)]
     joints = joints_of(recording)
@@ -262,24 +262,24 @@ def test_a_bag_of_twelve_topics(tmp_path: Path) -> None:
 
 def test_the_preview_of_a_bag_proposes_what_imports_it(tmp_path: Path) -> None:
     path = write_bag(tmp_path, "mcap", twelve_topics())
-    contents = preview(path)
+    contents = preview_file(path)
     by_name = {source.name: source for source in contents.sources}
     assert len(by_name) == 12
-    assert by_name["/left"].becomes == "joints a"
-    assert by_name["/left"].rate == pytest.approx(100.0)
-    assert by_name["/vrpn/hand/pose"].becomes == "point hand"
+    assert by_name["/left"].imported_as == "joints a"
+    assert by_name["/left"].mean_rate == pytest.approx(100.0)
+    assert by_name["/vrpn/hand/pose"].imported_as == "point hand"
     assert "middle: --points /tf:FRAME" in by_name["/tf"].note
-    assert sum(not source.becomes for source in contents.sources) == 8
-    assert contents.options["points"] == {"/mocap/tip": "tip", "/vrpn/hand/pose": "hand"}
-    assert read_any(path, **contents.options).joint_names == ("a", "b")
+    assert sum(not source.imported_as for source in contents.sources) == 8
+    assert contents.reader_options["points"] == {"/mocap/tip": "tip", "/vrpn/hand/pose": "hand"}
+    assert read_any(path, **contents.reader_options).joint_names == ("a", "b")
 
 
 def test_a_preview_says_what_looks_like_degrees_and_millimetres(tmp_path: Path) -> None:
     messages = [("/j", START, joint_state(("a",), START, position=[170.0])), ("/p", START, point(START, (900.0, 0, 0)))]
     path = write_bag(tmp_path, "mcap", messages)
-    contents = preview(path)
-    assert contents.options["units"] == {"position": "deg", "points": "mm"}
-    recording = read_any(path, **contents.options)
+    contents = preview_file(path)
+    assert contents.reader_options["units"] == {"position": "deg", "points": "mm"}
+    recording = read_any(path, **contents.reader_options)
     assert joints_of(recording).position[0, 0] == pytest.approx(math.radians(170))
     assert recording.points[0].position[0, 0, 0] == pytest.approx(0.9)
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from yid_ocp.data.readers import preview, read_any
+from yid_ocp.data.readers import preview_file, read_any
 from yid_ocp.data.readers.c3d import read_c3d
 from yid_ocp.errors import DataError
 
@@ -68,11 +68,11 @@ def test_subjects_stay_where_names_would_be_the_same(tmp_path: Path) -> None:
 
 def test_the_preview_lists_markers_and_the_rest(tmp_path: Path) -> None:
     write_c3d(tmp_path / "run.c3d")
-    contents = preview(tmp_path / "run.c3d")
-    assert [source.becomes for source in contents.sources[:2]] == ["point base", "point tip"]
+    contents = preview_file(tmp_path / "run.c3d")
+    assert [source.imported_as for source in contents.sources[:2]] == ["point base", "point tip"]
     assert contents.sources[1].note == "seen in 83% of the frames"
-    assert contents.sources[0].rate == pytest.approx(200.0)
-    assert read_any(tmp_path / "run.c3d", **contents.options).point_names == ("base", "tip")
+    assert contents.sources[0].mean_rate == pytest.approx(200.0)
+    assert read_any(tmp_path / "run.c3d", **contents.reader_options).point_names == ("base", "tip")
 
 
 def test_files_that_are_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.data.channels import quantum
-from yid_ocp.data.checks import check_recording, same_data, shared_samples
-from yid_ocp.data.doubt import CAUSES, Doubt
-from yid_ocp.data.gaps import cut_at_gaps
+from yid_ocp.data.channel_checks import quantization_step
+from yid_ocp.data.checks import _shared_sample_count, check_recording, duplicate_data_issue
+from yid_ocp.data.issues import ISSUE_CAUSES, Issue
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.data.recording_gaps import split_at_gaps
 from yid_ocp.problem.options import SensorOptions
 
 NAMES = ("a", "b", "c")
@@ -140,9 +140,9 @@ def test_a_fault_is_told_by_its_cause(fault):
 def test_commands_may_end_at_a_bound():
     recording, _ = FAULTS["clipped efforts"]
     assert causes(changed(recording, effort_kind="command")) == set()
-    assert causes(recording, joints_effort=SensorOptions(kind="command")) == set()
+    assert causes(recording, joints_effort=SensorOptions(effort_kind="command")) == set()
     commands = changed(recording, effort_kind="command")
-    assert causes(commands, joints_effort=SensorOptions(kind="sample")) == {"saturated"}
+    assert causes(commands, joints_effort=SensorOptions(effort_kind="sample")) == {"saturated"}
 
 
 def test_noise_that_settings_state_counts_instead_of_the_recorded():
@@ -214,26 +214,28 @@ def test_nothing_moves():
 
 def test_steps_of_a_channel():
     rng = np.random.default_rng(0)
-    assert quantum(0.25 * rng.integers(-50, 50, 2000)) == pytest.approx(0.25)
-    assert quantum(rng.standard_normal(2000)) == 0.0
-    assert quantum(np.ones(100)) == 0.0
+    assert quantization_step(0.25 * rng.integers(-50, 50, 2000)) == pytest.approx(0.25)
+    assert quantization_step(rng.standard_normal(2000)) == 0.0
+    assert quantization_step(np.ones(100)) == 0.0
 
 
 def test_one_measurement_listed_twice_is_told_also_in_part():
     recording = made()
-    assert same_data(recording, replace(recording, name="again")).cause == "same_data"
-    assert same_data(recording, replace(recording.slice(2.0, 6.0), name="part")).what.startswith("401 samples of part")
-    assert same_data(recording, made(2)) is None
-    assert shared_samples(recording, made(2)) == 0
+    assert duplicate_data_issue(recording, replace(recording, name="again")).cause == "same_data"
+    assert duplicate_data_issue(recording, replace(recording.time_slice(2.0, 6.0), name="part")).what.startswith(
+        "401 samples of part"
+    )
+    assert duplicate_data_issue(recording, made(2)) is None
+    assert _shared_sample_count(recording, made(2)) == 0
 
 
 def test_doubts_have_a_cause_that_is_listed_and_say_how_sure_they_are():
     with pytest.raises(ValueError, match="no cause 'bad'"):
-        Doubt("bad", "", "warning", 1.0, "", "r")
-    words = [Doubt("gap", "", "warning", evidence, "", "r").sure for evidence in (0.5, 1.6, 4.0)]
+        Issue("bad", "", "warning", 1.0, "", "r")
+    words = [Issue("gap", "", "warning", evidence, "", "r").certainty_word for evidence in (0.5, 1.6, 4.0)]
     assert words == ["perhaps", "likely", "certain"]
-    assert Doubt("gap", "", "warning", np.inf, "", "r", "joints", "t", 1.0, 2.0).where == "r/joints/t, 1 to 2 s"
-    assert len(set(CAUSES.values())) == len(CAUSES)
+    assert Issue("gap", "", "warning", np.inf, "", "r", "joints", "t", 1.0, 2.0).where == "r/joints/t, 1 to 2 s"
+    assert len(set(ISSUE_CAUSES.values())) == len(ISSUE_CAUSES)
 
 
 # -- gaps -------------------------------------------------------------------------------------------------------------
@@ -246,34 +248,34 @@ def without(recording, begin, end):
 
 
 def test_a_recording_is_cut_at_a_gap_and_every_part_is_kept_where_it_may_start_in_motion():
-    parts = cut_at_gaps(without(made(), 3.0, 5.0), (), True)
+    parts = split_at_gaps(without(made(), 3.0, 5.0), (), True)
     assert [(p.joints.t[0], p.joints.t[-1]) for p in parts.recordings] == [(0.0, 2.99), (5.01, 8.0)]
     assert [p.name for p in parts.recordings] == ["made_part1", "made_part2"]
-    (doubt,) = parts.doubts
+    (doubt,) = parts.issues
     assert (doubt.cause, doubt.weight, doubt.begin, doubt.end) == ("gap", "warning", 2.99, 5.01)
     assert "2 parts of it, 5.98 s, are used" in doubt.what
 
 
 def test_where_a_model_starts_from_rest_only_parts_that_do_are_kept():
     recording = without(made(), 3.0, 5.0)
-    parts = cut_at_gaps(recording, (), False)
+    parts = split_at_gaps(recording, (), False)
     assert [(p.name, p.joints.t[-1]) for p in parts.recordings] == [("made", 2.99)]
-    assert "a part counts only where it starts at rest" in parts.doubts[0].what
+    assert "a part counts only where it starts at rest" in parts.issues[0].what
     resting = np.where(np.abs(recording.joints.t - 5.2) < 0.3, 0.0, 1.0)[:, None] * recording.joints.position
-    assert len(cut_at_gaps(changed(recording, position=resting), (), False).recordings) == 2
+    assert len(split_at_gaps(changed(recording, position=resting), (), False).recordings) == 2
 
 
 def test_a_few_samples_missing_are_no_gap_and_short_parts_are_left_out():
-    assert cut_at_gaps(without(made(), 3.0, 3.05), (), True).doubts == ()
-    parts = cut_at_gaps(without(made(), 0.3, 1.0), (), True)
+    assert split_at_gaps(without(made(), 3.0, 3.05), (), True).issues == ()
+    parts = split_at_gaps(without(made(), 0.3, 1.0), (), True)
     assert [p.joints.t[0] for p in parts.recordings] == [1.01]
 
 
 def test_a_clock_that_jumps_is_told_from_joints_that_went_on_unseen():
     recording = made()
     late = np.where(recording.joints.t > 4.0, 2.0, 0.0)
-    parts = cut_at_gaps(changed(recording, t=recording.joints.t + late), (), True)
-    assert [doubt.cause for doubt in parts.doubts] == ["clock_jump"]
+    parts = split_at_gaps(changed(recording, t=recording.joints.t + late), (), True)
+    assert [doubt.cause for doubt in parts.issues] == ["clock_jump"]
     assert len(parts.recordings) == 2
 
 
@@ -282,5 +284,5 @@ def test_points_that_drive_a_model_may_be_hidden_for_a_while():
     seen = np.zeros((500, 2, 3)) + np.sin(t)[:, None, None]
     seen[200:300, 0] = np.nan
     recording = Recording(None, (PointGroup("points", ("p0", "p5"), t, seen),), name="cable")
-    assert [len(p.points[0].t) for p in cut_at_gaps(recording, ("p0",), True).recordings] == [200, 200]
-    assert cut_at_gaps(recording, ("p5",), True).doubts == ()
+    assert [len(p.points[0].t) for p in split_at_gaps(recording, ("p0",), True).recordings] == [200, 200]
+    assert split_at_gaps(recording, ("p5",), True).issues == ()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from recording_examples import joints_of, table
 
-from yid_ocp.data.readers import preview
+from yid_ocp.data.readers import preview_file
 from yid_ocp.data.readers.csv import read_csv
 from yid_ocp.errors import DataError
 
@@ -194,20 +194,20 @@ def test_joints_and_points_are_chosen_and_renamed(tmp_path: Path) -> None:
     ids=["text among it", "unknown name", "no header"],
 )
 def test_the_preview_of_a_table(text: str, columns: dict[str, str], delimiter: str, tmp_path: Path) -> None:
-    contents = preview(table(tmp_path, text))
-    assert contents.options["columns"] == columns
-    assert contents.options.get("delimiter", ",") == delimiter
-    assert ("header" in contents.options) == text.startswith("0")
+    contents = preview_file(table(tmp_path, text))
+    assert contents.reader_options["columns"] == columns
+    assert contents.reader_options.get("delimiter", ",") == delimiter
+    assert ("header" in contents.reader_options) == text.startswith("0")
 
 
 def test_the_preview_counts_bad_lines_and_guesses_units(tmp_path: Path) -> None:
     rows = "".join(f"{10 * k},{90 + k},500,500,500\n" for k in range(8))
     path = table(tmp_path, "t,q_a,tip_x,tip_y,tip_z\n" + rows + "80,broken,1,1,1\n")
-    contents = preview(path)
-    assert contents.options["units"] == {"position": "deg", "points": "mm", "t": "ms"}
-    assert contents.options["skip_bad_lines"] is True
+    contents = preview_file(path)
+    assert contents.reader_options["units"] == {"position": "deg", "points": "mm", "t": "ms"}
+    assert contents.reader_options["skip_bad_lines"] is True
     assert contents.notes[0] == "1 of 9 lines are no rows of numbers"
-    joints = joints_of(read_csv(path, **contents.options))
+    joints = joints_of(read_csv(path, **contents.reader_options))
     assert joints.t[1] == pytest.approx(0.01)
     assert joints.position[0, 0] == pytest.approx(math.pi / 2)
 
@@ -227,9 +227,9 @@ def test_telemetry_of_isaac_sims_identification(tmp_path: Path) -> None:
     np.testing.assert_array_equal(joints.position, [[0.1, 0.2], [0.5, 0.6]])
     np.testing.assert_array_equal(joints.velocity, [[1, 2], [3, 4]])
     np.testing.assert_array_equal(joints.position_command, [[0.3, 0.4], [0.7, 0.8]])
-    contents = preview(path)
-    assert "columns" not in contents.options
-    assert [source.becomes for source in contents.sources][:4] == ["t", "position:1", "position:2", "velocity:1"]
+    contents = preview_file(path)
+    assert "columns" not in contents.reader_options
+    assert [source.imported_as for source in contents.sources][:4] == ["t", "position:1", "position:2", "velocity:1"]
     # q0 is none of them, and q_1 is what it was
     path.write_text("t,q0\n0,1\n1,2\n", encoding="utf-8")
     with pytest.raises(DataError, match="meaning of column 'q0' is not known"):

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from recording_examples import assert_same, changed, example, finite, turned, with_joints
 
-from yid_ocp.data.hdf5 import read_recording, write_recording
-from yid_ocp.data.recording import JOINT_CHANNELS, JointGroup, PointGroup, Recording, validate
+from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, validate_recording
+from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.errors import DataError, OutputError
 
 ROOT = Path(__file__).parents[2]
@@ -44,7 +44,7 @@ def test_round_trip(file: Path) -> None:
 
 
 def test_positions_of_the_straight_object_survive_the_file(tmp_path: Path) -> None:
-    recording = dataclasses.replace(example(), straight=np.array([[0.1, 0.2, 0.3]]))
+    recording = dataclasses.replace(example(), marker_reference_pose=np.array([[0.1, 0.2, 0.3]]))
     write_recording(recording, tmp_path / "run.h5")
     assert_same(read_recording(tmp_path / "run.h5"), recording)
     with h5py.File(tmp_path / "run.h5") as handle:
@@ -73,8 +73,8 @@ def recordings(draw: st.DrawFn) -> Recording:
         t, joint_names = clock(), names()
         shape = (len(t), len(joint_names))
         channels: dict[str, Any] = {"position": draw(hnp.arrays(float, shape, elements=finite(50.0)))}
-        for channel in draw(st.sets(st.sampled_from(sorted(set(JOINT_CHANNELS) - {"position"})))):
-            bound = {"rad": 50.0, "rad/s": 1e6, "N m": 1e9}[JOINT_CHANNELS[channel]]
+        for channel in draw(st.sets(st.sampled_from(sorted(set(JOINT_CHANNEL_UNITS) - {"position"})))):
+            bound = {"rad": 50.0, "rad/s": 1e6, "N m": 1e9}[JOINT_CHANNEL_UNITS[channel]]
             channels[channel] = draw(hnp.arrays(float, shape, elements=finite(bound)))
         std = st.none() | st.floats(0, 1e9) | hnp.arrays(float, shape[1], elements=st.floats(0, 1e9))
         kinds = st.sampled_from([None, "sample", "mean", "command"])
@@ -97,12 +97,12 @@ def recordings(draw: st.DrawFn) -> Recording:
         pose = draw(st.none() | finite(10.0).map(turned))
         points.append(PointGroup(f"points{suffix}", point_names, t, position, std, draw(TEXT), draw(TEXT), pose))
     truth = draw(st.dictionaries(st.text(), finite(1e300), max_size=3))
-    return Recording(joints, tuple(points), draw(TEXT), draw(TEXT), truth=truth)
+    return Recording(joints, tuple(points), draw(TEXT), draw(TEXT), true_parameters=truth)
 
 
 @given(recordings())
 def test_any_valid_recording_survives_the_file(recording: Recording) -> None:
-    validate(recording)
+    validate_recording(recording)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "run.h5"
         write_recording(recording, path)
@@ -283,7 +283,7 @@ def test_a_failure_leaves_the_old_file_alone(file: Path, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(os, "replace", refuse)
     with pytest.raises(OutputError, match="Permission denied"):
-        write_recording(example().slice(0.0, 0.1), file)
+        write_recording(example().time_slice(0.0, 0.1), file)
     assert [entry.name for entry in file.parent.iterdir()] == ["run.h5"]
     assert file.read_bytes() == before
 
@@ -313,7 +313,7 @@ def test_the_real_recordings_are_all_there() -> None:
 def test_real_recordings_read(path: Path, tmp_path: Path) -> None:
     recording = read_recording(path)
     assert (len(recording.joint_names), len(recording.point_names)) == REAL_SIZES[path.parent.name]
-    assert (recording.straight is not None) == (path.parent.name == "soft_beam")
+    assert (recording.marker_reference_pose is not None) == (path.parent.name == "soft_beam")
     assert 4.0 < recording.duration < 60.0
     assert recording.source
     write_recording(recording, tmp_path / "copy.h5")

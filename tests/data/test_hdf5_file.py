@@ -9,8 +9,8 @@ import h5py
 import numpy as np
 import pytest
 
-from yid_ocp.data import hdf5_file, trial
-from yid_ocp.data.hdf5_file import new_hdf5, open_hdf5
+from yid_ocp.data import hdf5_io, readability_check
+from yid_ocp.data.hdf5_io import create_hdf5_atomically, open_checked_hdf5
 from yid_ocp.errors import DataError, OutputError
 
 needs_fork = pytest.mark.skipif(not hasattr(os, "fork"), reason="files are tried in forks")
@@ -19,14 +19,14 @@ needs_fork = pytest.mark.skipif(not hasattr(os, "fork"), reason="files are tried
 @pytest.fixture
 def file(tmp_path):
     path = tmp_path / "file.h5"
-    with new_hdf5(path) as new:
+    with create_hdf5_atomically(path) as new:
         new.attrs["format"] = "test"
         new.create_dataset("a/values", data=np.arange(3.0))
     return path
 
 
 def test_what_was_written_is_read(file):
-    with open_hdf5(file) as data:
+    with open_checked_hdf5(file) as data:
         assert data.attrs["format"] == "test"
         np.testing.assert_array_equal(data["a/values"], [0.0, 1.0, 2.0])
     assert [path.name for path in file.parent.iterdir()] == ["file.h5"]
@@ -34,7 +34,7 @@ def test_what_was_written_is_read(file):
 
 def test_a_block_that_fails_leaves_the_old_file(file):
     before = file.read_bytes()
-    with pytest.raises(TypeError), new_hdf5(file) as new:
+    with pytest.raises(TypeError), create_hdf5_atomically(file) as new:
         new.create_dataset("b", data=object())
     assert file.read_bytes() == before
 
@@ -44,7 +44,7 @@ def test_a_full_disk_is_an_error_and_not_the_end(tmp_path, monkeypatch):
     """The library would write when it closes the file, and end the process when it cannot."""
     monkeypatch.setattr("yid_ocp.files.secrets.token_hex", lambda _: "x")
     (tmp_path / ".full.h5.x.tmp").symlink_to("/dev/full")
-    with pytest.raises(OutputError, match="No space left"), new_hdf5(tmp_path / "full.h5") as new:
+    with pytest.raises(OutputError, match="No space left"), create_hdf5_atomically(tmp_path / "full.h5") as new:
         new.create_dataset("a", data=np.zeros(1000))
     assert not (tmp_path / "full.h5").exists()
 
@@ -63,7 +63,7 @@ def test_other_files_are_not_read(file, tmp_path, kind):
             layout = h5py.VirtualLayout((1,), "f8")
             layout[:] = h5py.VirtualSource(other, "secret", (1,))
             data["a"].create_virtual_dataset("more", layout)
-    with pytest.raises(DataError, match=r"'more'.*another file"), open_hdf5(file):
+    with pytest.raises(DataError, match=r"'more'.*another file"), open_checked_hdf5(file):
         pass
 
 
@@ -71,7 +71,7 @@ def test_other_files_are_not_read(file, tmp_path, kind):
 def test_groups_without_end_are_refused(file):
     with h5py.File(file, "a") as data:
         data["a/self"] = data["a"]
-    with pytest.raises(DataError, match="stand in one another"), open_hdf5(file):
+    with pytest.raises(DataError, match="stand in one another"), open_checked_hdf5(file):
         pass
 
 
@@ -79,20 +79,20 @@ def test_groups_without_end_are_refused(file):
 def test_what_is_declared_but_not_there_is_refused(file):
     with h5py.File(file, "a") as data:
         data.create_dataset("huge", (10**9,), "f8", chunks=(1000,))
-    with pytest.raises(DataError, match=r"declares 7\.5 GiB"), open_hdf5(file):
+    with pytest.raises(DataError, match=r"declares 7\.5 GiB"), open_checked_hdf5(file):
         pass
 
 
 @needs_fork
 def test_a_file_that_ends_the_library_does_not_end_us(file, monkeypatch):
-    monkeypatch.setattr(hdf5_file, "_foreign", lambda group: os.kill(os.getpid(), signal.SIGSEGV))
-    with pytest.raises(DataError, match="SIGSEGV"), open_hdf5(file):
+    monkeypatch.setattr(hdf5_io, "_foreign", lambda group: os.kill(os.getpid(), signal.SIGSEGV))
+    with pytest.raises(DataError, match="SIGSEGV"), open_checked_hdf5(file):
         pass
 
 
 @needs_fork
 def test_a_file_that_never_ends_is_given_up(file, monkeypatch):
-    monkeypatch.setattr(trial, "TRIAL_TIME", 0.3)
-    monkeypatch.setattr(hdf5_file, "_foreign", lambda group: signal.pause())
-    with pytest.raises(DataError, match=r"within 0\.3 s"), open_hdf5(file):
+    monkeypatch.setattr(readability_check, "_READ_TIMEOUT", 0.3)
+    monkeypatch.setattr(hdf5_io, "_foreign", lambda group: signal.pause())
+    with pytest.raises(DataError, match=r"within 0\.3 s"), open_checked_hdf5(file):
         pass

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from recording_examples import joints_of
 
-from yid_ocp.data.readers import preview, read_any
+from yid_ocp.data.readers import preview_file, read_any
 from yid_ocp.data.readers.lerobot import read_lerobot
 from yid_ocp.errors import DataError
 
@@ -90,13 +90,13 @@ def test_velocities_and_currents_among_the_state(tmp_path: Path) -> None:
 
 def test_the_preview_proposes_degrees(tmp_path: Path) -> None:
     path = write_dataset(tmp_path / "arm", "v3.0")
-    contents = preview(path)
-    assert contents.options["units"]["position"] == "deg"
+    contents = preview_file(path)
+    assert contents.reader_options["units"]["position"] == "deg"
     assert "2 episodes at 30 Hz, v3.0, recorded on so101" in contents.notes[0]
     by_name = {source.name: source for source in contents.sources}
-    assert by_name["action"].becomes == "position_command"
-    assert not by_name["observation.images.top"].becomes
-    assert read_any(path, **contents.options).joint_names == ("shoulder_pan", "elbow_flex", "gripper")
+    assert by_name["action"].imported_as == "position_command"
+    assert not by_name["observation.images.top"].imported_as
+    assert read_any(path, **contents.reader_options).joint_names == ("shoulder_pan", "elbow_flex", "gripper")
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,9 @@ import pytest
 from recording_examples import joints_of, table
 
 from yid_ocp.data import readers
-from yid_ocp.data.hdf5 import write_recording
 from yid_ocp.data.readers import READERS, read_any
-from yid_ocp.data.recording import JointGroup, Recording, validate
+from yid_ocp.data.recording import JointGroup, Recording, validate_recording
+from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.errors import DataError
 
 SHARED = Path(__file__).parents[2].parent / "shared" / "recordings"
@@ -48,7 +48,7 @@ def test_a_new_reader_is_one_registration(tmp_path: Path, monkeypatch: pytest.Mo
 
     @READERS.register(".one")
     def read_one(path: Path, *, value: float = 1.0) -> Recording:
-        return validate(Recording(JointGroup(("a",), np.zeros(1), np.full((1, 1), value)), name=path.stem))
+        return validate_recording(Recording(JointGroup(("a",), np.zeros(1), np.full((1, 1), value)), name=path.stem))
 
     assert joints_of(read_any(tmp_path / "run.one", value=2.0)).position[0, 0] == 2.0
 

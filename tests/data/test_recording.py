@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from recording_examples import assert_same, changed, example, finite, with_camera, with_joints
 
-from yid_ocp.data.hdf5 import write_recording
-from yid_ocp.data.recording import JointGroup, PointGroup, Recording, check_names, validate
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording, check_recorded_names, validate_recording
+from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.errors import DataError
 
 # ------------------------------------------------------------------------------------------------------ in memory
@@ -53,7 +53,7 @@ def test_channels_are_those_recorded() -> None:
 
 
 def test_slice_keeps_each_clock_and_both_ends() -> None:
-    part = example().slice(0.1, 0.4)
+    part = example().time_slice(0.1, 0.4)
     assert part.joints is not None
     assert part.joints.t[[0, -1]] == pytest.approx([0.1, 0.4])
     assert part.joints.effort is not None
@@ -61,11 +61,11 @@ def test_slice_keeps_each_clock_and_both_ends() -> None:
     assert list(part.points[1].t) == [0.1, 0.35]
     assert part.points[1].std is not None
     assert part.points[1].std.shape == (2, 3, 3)
-    assert_same(part, validate(part))
+    assert_same(part, validate_recording(part))
 
 
 def test_slice_drops_groups_without_samples() -> None:
-    part = example().slice(0.6, 1.0)
+    part = example().time_slice(0.6, 1.0)
     assert part.joints is None
     assert [group.name for group in part.points] == ["points_camera"]
 
@@ -73,7 +73,7 @@ def test_slice_drops_groups_without_samples() -> None:
 @pytest.mark.parametrize("bounds", [(5.0, 6.0), (0.4, 0.1), (0.1, 0.1), (float("nan"), 1.0)])
 def test_an_empty_slice_is_refused(bounds: tuple[float, float]) -> None:
     with pytest.raises(DataError, match="nothing was recorded") as caught:
-        example().slice(*bounds)
+        example().time_slice(*bounds)
     assert "0 s to 0.9 s" in caught.value.allowed
 
 
@@ -96,27 +96,29 @@ def test_select_points_refuses_what_is_not_there() -> None:
 
 
 def test_check_names_names_the_nearest() -> None:
-    check_names(example(), ["left_s1"], ["w_T1", "w_T2"])
+    check_recorded_names(example(), ["left_s1"], ["w_T1", "w_T2"])
     with pytest.raises(DataError, match="no joints 'left_s2', 'elbow'") as caught:
-        check_names(example(), ["left_s2", "left_s0", "elbow"], [])
+        check_recorded_names(example(), ["left_s2", "left_s0", "elbow"], [])
     assert "did you mean 'left_s" in caught.value.hint
     assert caught.value.allowed == "left_s0, left_s1"
     with pytest.raises(DataError, match="no point 'tip'") as caught:
-        check_names(Recording(example().joints), [], ["tip"])
+        check_recorded_names(Recording(example().joints), [], ["tip"])
     assert caught.value.allowed == "no points were recorded"
 
 
 def test_positions_of_the_straight_object_follow_their_points() -> None:
     straight = np.arange(9.0).reshape(3, 3)
-    recording = validate(dataclasses.replace(example(), points=example().points[1:], straight=straight))
-    assert recording.straight is not None
+    recording = validate_recording(
+        dataclasses.replace(example(), points=example().points[1:], marker_reference_pose=straight)
+    )
+    assert recording.marker_reference_pose is not None
     with pytest.raises(ValueError, match="read-only"):
-        recording.straight[0, 0] = 5.0
+        recording.marker_reference_pose[0, 0] = 5.0
     kept = recording.select_points(["w_T3", "w_T1"])
-    assert np.array_equal(validate(kept).straight, straight[[2, 0]])
-    assert recording.select_points([]).straight is None
-    assert np.array_equal(validate(recording.slice(0.0, 0.2)).straight, straight)
-    assert recording.slice(0.4, 0.45).straight is None, "no frame of the points lies in between"
+    assert np.array_equal(validate_recording(kept).marker_reference_pose, straight[[2, 0]])
+    assert recording.select_points([]).marker_reference_pose is None
+    assert np.array_equal(validate_recording(recording.time_slice(0.0, 0.2)).marker_reference_pose, straight)
+    assert recording.time_slice(0.4, 0.45).marker_reference_pose is None, "no frame of the points lies in between"
     both = dataclasses.replace(example(), straight=np.zeros((1, 3)))
     assert both.select_points(["w_T1"]).straight is None, "the group that it belongs to is gone"
 
@@ -128,9 +130,9 @@ def test_a_slice_holds_just_the_times_in_between(times: list[float], one: float,
     expected = t[(t >= start - 1e-9) & (t <= stop + 1e-9)]
     if start == stop or not len(expected):
         with pytest.raises(DataError):
-            recording.slice(start, stop)
+            recording.time_slice(start, stop)
     else:
-        part = recording.slice(start, stop)
+        part = recording.time_slice(start, stop)
         assert part.joints is not None
         assert np.array_equal(part.joints.t, expected)
 
@@ -143,7 +145,7 @@ T, Q, CAMERA = BASE.joints.t, BASE.joints.position, BASE.points[1]
 
 
 def with_straight(straight: np.ndarray, **changes: Any) -> Recording:
-    return dataclasses.replace(BASE, straight=straight, **changes)
+    return dataclasses.replace(BASE, marker_reference_pose=straight, **changes)
 
 
 INVALID: dict[str, tuple[Callable[[], Recording], str]] = {
@@ -209,8 +211,8 @@ INVALID: dict[str, tuple[Callable[[], Recording], str]] = {
         lambda: with_straight(np.zeros((3, 3)), points=BASE.points[::-1]),
         "belong to 'points_camera', but a file would list 'points_arm' first",
     ),
-    "truth not finite": (lambda: dataclasses.replace(BASE, truth={"T1.bend": np.inf}), "'T1.bend' is inf"),
-    "truth not a number": (lambda: dataclasses.replace(BASE, truth={"T1.bend": "3"}), "'T1.bend' is '3'"),  # type: ignore[dict-item]
+    "truth not finite": (lambda: dataclasses.replace(BASE, true_parameters={"T1.bend": np.inf}), "'T1.bend' is inf"),
+    "truth not a number": (lambda: dataclasses.replace(BASE, true_parameters={"T1.bend": "3"}), "'T1.bend' is '3'"),  # type: ignore[dict-item]
 }
 
 
@@ -218,7 +220,7 @@ INVALID: dict[str, tuple[Callable[[], Recording], str]] = {
 def test_invalid_recordings_are_refused(case: str, tmp_path: Path) -> None:
     make, message = INVALID[case]
     with pytest.raises(DataError, match=message) as caught:
-        validate(make())
+        validate_recording(make())
     assert "recording '" in caught.value.where
     if case != "NaN effort":
         with pytest.raises(DataError, match=message):
@@ -229,22 +231,22 @@ def test_invalid_recordings_are_refused(case: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(("case", "word"), [("degrees", "degrees"), ("millimetres", "millimetres")])
 def test_wrong_units_are_guessed(case: str, word: str) -> None:
     with pytest.raises(DataError) as caught:
-        validate(INVALID[case][0]())
+        validate_recording(INVALID[case][0]())
     assert word in caught.value.hint
 
 
 def test_nan_effort_on_request() -> None:
     recording = with_joints(effort=changed(Q, (2, 0), np.nan))
-    assert validate(recording, allow_nan_effort=True) is recording
+    assert validate_recording(recording, allow_nan_effort=True) is recording
     with pytest.raises(DataError, match="velocity"):
-        validate(with_joints(velocity=changed(Q, (2, 0), np.nan)), allow_nan_effort=True)
+        validate_recording(with_joints(velocity=changed(Q, (2, 0), np.nan)), allow_nan_effort=True)
 
 
 def test_std_of_a_point_not_seen_may_be_nan() -> None:
     recording = with_camera(std=np.where(np.isnan(CAMERA.position), np.nan, 0.01))
-    assert validate(recording) is recording
+    assert validate_recording(recording) is recording
 
 
 def test_a_point_never_seen_is_allowed() -> None:
     recording = with_camera(position=np.full((4, 3, 3), np.nan))
-    assert validate(recording) is recording
+    assert validate_recording(recording) is recording

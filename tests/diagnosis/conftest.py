@@ -46,7 +46,7 @@ class Bench:
         start = np.zeros(step.sizes["nx"])
         start[:2] = path[0]
         swept = simulate(step, system.parameters.vector(), start, steps, None, path)
-        assert swept.status.ok
+        assert swept.status.is_converged
         effort = np.vstack([swept.effort, swept.effort[-1:]])
         if torque is not None:
             effort = effort + torque(t)

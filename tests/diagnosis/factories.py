@@ -14,20 +14,26 @@ from types import SimpleNamespace
 import numpy as np
 from made_series import seeing
 
-from yid_ocp.diagnosis.carry_over import Carried
-from yid_ocp.diagnosis.finding import Absorbed, Finding
-from yid_ocp.diagnosis.localise import Place
-from yid_ocp.diagnosis.refit import Fit, Loss
-from yid_ocp.diagnosis.screening import Confusability, Linearisation, Score, Signature, Visibility
-from yid_ocp.diagnosis.select import Added, Closure
-from yid_ocp.diagnosis.smoother import Smoothed, Trace
-from yid_ocp.diagnosis.smoother_model import Source
+from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult, NominalParameterChange
+from yid_ocp.diagnosis.localise import GapLocation
+from yid_ocp.diagnosis.refit import HeldOutLoss, RefitModel
+from yid_ocp.diagnosis.screening import (
+    CandidateDetectability,
+    CandidateLinearization,
+    CandidateScore,
+    ConfusabilityMatrix,
+    EffectSignature,
+)
+from yid_ocp.diagnosis.select import GapClosure, SelectedEffect
+from yid_ocp.diagnosis.smoother import SmoothedUnknowns, SmootherResult
+from yid_ocp.diagnosis.smoother_model import UnknownGroup
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.effects.base import EffectBase, Quantity
+from yid_ocp.diagnosis.transfer_check import TransferCheck
+from yid_ocp.effects.base import EffectBase, ParameterDefinition
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem.evaluation import Evaluation, ResidualRows
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.null_test import Floor, NullTest, Window
+from yid_ocp.problem.null_test import ChannelNoiseLevel, NullTestResult, _ResidualWindow
 
 # -- effects ----------------------------------------------------------------------------------------------------------
 
@@ -36,85 +42,89 @@ class MadeUp(EffectBase):
     """An effect that is nothing but its quantities."""
 
     @classmethod
-    def locations(cls, system):
+    def possible_locations(cls, system):
         return ()
 
     @classmethod
-    def quantities_at(cls, location, system):
+    def parameter_definitions(cls, location, system):
         return ()
 
 
 class MadeUpThing(MadeUp):
     """One that says nothing of other places."""
 
-    alone = True
+    is_local = True
 
 
 def amplitude(name="a", neutral=0.0, lower=0.0, upper=math.inf, expected=(0.0, 1.0), unit="N m"):
     """A quantity whose neutral value alone makes the effect vanish."""
-    return Quantity(name, unit, neutral, lower, upper, expected, "made up")
+    return ParameterDefinition(name, unit, neutral, lower, upper, expected, "made up")
 
 
 def shape(name="s", neutral=0.5, expected=(0.1, 1.0), lower=0.0, upper=math.inf):
     """A quantity that says nothing while the amplitudes are neutral."""
-    return Quantity(name, "s", neutral, lower, upper, expected, "made up", shape=True)
+    return ParameterDefinition(name, "s", neutral, lower, upper, expected, "made up", is_shape_parameter=True)
 
 
-def effect(label="friction@elbow", *quantities: Quantity, alone=False) -> EffectBase:
+def effect(label="friction@elbow", *quantities: ParameterDefinition, alone=False) -> EffectBase:
     """An effect `kind@location` with some quantities, one amplitude where none are given."""
     kind, _, location = label.partition("@")
     chosen = quantities or (amplitude(),)
-    entries = (Parameter(f"{label}.{q.name}", q.neutral, q.unit, q.lower, q.upper, q.description) for q in chosen)
+    entries = (Parameter(f"{label}.{q.name}", q.neutral_value, q.unit, q.lower, q.upper, q.description) for q in chosen)
     return (MadeUpThing if alone else MadeUp)(kind, location, tuple(chosen), Parameters(entries))
 
 
 # -- null test --------------------------------------------------------------------------------------------------------
 
 
-def outcome(p=0.5, chi2=1.0, degrees=100.0, channels=None, windows=()) -> NullTest:
+def outcome(p=0.5, chi2=1.0, degrees=100.0, channels=None, windows=()) -> NullTestResult:
     """The outcome of a null test."""
     channels = {"points.tip": chi2} if channels is None else channels
-    return NullTest(chi2, degrees, p, dict(channels), dict.fromkeys(channels, 0.5), tuple(windows))
+    return NullTestResult(chi2, degrees, p, dict(channels), dict.fromkeys(channels, 0.5), tuple(windows))
 
 
-def window(begin, end, flagged=True, z=5.0) -> Window:
-    return Window("run", "points.tip", begin, end, z, flagged)
+def window(begin, end, flagged=True, z=5.0) -> _ResidualWindow:
+    return _ResidualWindow("run", "points.tip", begin, end, z, flagged)
 
 
 # -- screening --------------------------------------------------------------------------------------------------------
 
 
-def signature(of: EffectBase, columns, noise=None, **shapes: float) -> Signature:
+def signature(of: EffectBase, columns, noise=None, **shapes: float) -> EffectSignature:
     """A signature; its noise is white unless given."""
     columns = np.asarray(columns, float)
     columns = columns[:, None] if columns.ndim == 1 else columns
     noise = columns.T @ columns if noise is None else np.atleast_2d(np.asarray(noise, float))
-    return Signature(of, {f"{of.label}.{name}": value for name, value in shapes.items()}, columns, noise)
+    return EffectSignature(of, {f"{of.label}.{name}": value for name, value in shapes.items()}, columns, noise)
 
 
-def point(residual, *signatures: Signature) -> Linearisation:
-    return Linearisation(np.asarray(residual, float), signatures, {})
+def point(residual, *signatures: EffectSignature) -> CandidateLinearization:
+    return CandidateLinearization(np.asarray(residual, float), signatures, {})
 
 
-def score(of: EffectBase, p=0.5, decrease=1.0, statistic=1.0, step: Mapping[str, float] | None = None) -> Score:
-    return Score(of, dict.fromkeys(of.amplitudes, 0.1) if step is None else dict(step), decrease, statistic, p)
+def score(
+    of: EffectBase, p=0.5, decrease=1.0, statistic=1.0, step: Mapping[str, float] | None = None
+) -> CandidateScore:
+    return CandidateScore(
+        of, dict.fromkeys(of.amplitude_names, 0.1) if step is None else dict(step), decrease, statistic, p
+    )
 
 
-def visible(of: EffectBase, seen=True, detectable=0.1) -> Visibility:
-    return Visibility(of, dict.fromkeys(of.amplitudes, detectable), seen)
+def visible(of: EffectBase, seen=True, detectable=0.1) -> CandidateDetectability:
+    return CandidateDetectability(of, dict.fromkeys(of.amplitude_names, detectable), seen)
 
 
-def alike(labels: Sequence[str], matrix) -> Confusability:
-    return Confusability(tuple(labels), np.asarray(matrix, float))
+def alike(labels: Sequence[str], matrix) -> ConfusabilityMatrix:
+    return ConfusabilityMatrix(tuple(labels), np.asarray(matrix, float))
 
 
 # -- refits -----------------------------------------------------------------------------------------------------------
 
 
-def loss(*means: float, count=100.0, channels=None) -> Loss:
+def loss(*means: float, count=100.0, channels=None) -> HeldOutLoss:
     """A held-out loss with these chi2/n in its blocks, all with as many samples."""
     counts = np.full(len(means), float(count))
-    return Loss(counts * np.asarray(means, float), counts, channels or {"points.tip": (0.01, "m")})
+    return HeldOutLoss(counts * np.asarray(means, float), counts, channels or {"points.tip": (0.01, "m")})
 
 
 def evaluation(residual, jacobian=None, ok=True, message="") -> Evaluation:
@@ -130,72 +140,78 @@ def costing(cost: float, rows: int) -> Evaluation:
 
 def fit(
     effects: Sequence[EffectBase] = (),
-    lost: Loss | None = None,
+    lost: HeldOutLoss | None = None,
     cost=1.0,
     values=None,
     std=None,
     problem=None,
     held=None,
-) -> Fit:
+) -> RefitModel:
     """A refitted model; values are neutral unless given. `held`: std of amplitudes with shapes held, if others."""
-    neutral = {name: value for entry in effects for name, value in entry.neutral.items()}
+    neutral = {name: value for entry in effects for name, value in entry.neutral_values.items()}
     values = neutral | dict(values or {})
     std = dict.fromkeys(values, 0.01) | dict(std or {})
     lost = loss(1.0, 1.0) if lost is None else lost
-    held = {name: std[name] for entry in effects for name in entry.amplitudes} | dict(held or {})
-    return Fit(tuple(effects), problem, values, std, held, cost, evaluation([1.0]), lost, "made up")
+    held = {name: std[name] for entry in effects for name in entry.amplitude_names} | dict(held or {})
+    return RefitModel(tuple(effects), problem, values, std, held, cost, evaluation([1.0]), lost, "made up")
 
 
-def closed(value=0.9, low=0.8, high=0.95) -> Closure:
-    return Closure(value, low, high)
+def closed(value=0.9, low=0.8, high=0.95) -> GapClosure:
+    return GapClosure(value, low, high)
 
 
-def added(of: EffectBase, rivals: Sequence[EffectBase] = (), fitted: Fit | None = None, part: Closure | None = None):
+def added(
+    of: EffectBase, rivals: Sequence[EffectBase] = (), fitted: RefitModel | None = None, part: GapClosure | None = None
+):
     """An effect that was added; it is the first of its rivals."""
-    return Added(of, fitted or fit([of]), part or closed(), (of, *rivals))
+    return SelectedEffect(of, fitted or fit([of]), part or closed(), (of, *rivals))
 
 
-def carried(label="friction@elbow", name="a", values=(0.5, 0.9), stds=(0.01, 0.02), agrees=False) -> Carried:
+def carried(label="friction@elbow", name="a", values=(0.5, 0.9), stds=(0.01, 0.02), agrees=False) -> TransferCheck:
     """An amplitude on the recordings to estimate on and on the held-out ones."""
-    return Carried(label, name, "N m", values[0], stds[0], values[1], stds[1], agrees)
+    return TransferCheck(label, name, "N m", values[0], stds[0], values[1], stds[1], agrees)
 
 
 # -- smoother ---------------------------------------------------------------------------------------------------------
 
-FORCE, OTHER_FORCE = Source("T1", "force"), Source("T2", "force")
-READ_FORCE, BIAS, OFFSET = Source("elbow", "force", True), Source("camera", "bias"), Source("left", "offset")
+FORCE, OTHER_FORCE = UnknownGroup("T1", "force"), UnknownGroup("T2", "force")
+READ_FORCE, BIAS, OFFSET = (
+    UnknownGroup("elbow", "force", True),
+    UnknownGroup("camera", "bias"),
+    UnknownGroup("left", "offset"),
+)
 
 
-def trace(sources: Sequence[Source], mean, std, recording="run", interval=0.5) -> Trace:
+def trace(sources: Sequence[UnknownGroup], mean, std, recording="run", interval=0.5) -> SmoothedUnknowns:
     """Unknowns of a recording, one column each, over even intervals."""
     mean, std = np.asarray(mean, float), np.asarray(std, float)
     edges = interval * np.arange(len(mean) + 1)
     names = tuple(f"{source.location}.{i}" for i, source in enumerate(sources))
-    return Trace(recording, edges, names, tuple(sources), np.ones(len(sources)), mean, std)
+    return SmoothedUnknowns(recording, edges, names, tuple(sources), np.ones(len(sources)), mean, std)
 
 
 def smoothed(
-    weight: Mapping[Source, float],
+    weight: Mapping[UnknownGroup, float],
     *,
     evidence: Mapping[str, float] | None = None,
-    variance: Mapping[Source, float] | None = None,
-    detectable: Mapping[Source, float] | None = None,
-    traces: Sequence[Trace] = (),
+    variance: Mapping[UnknownGroup, float] | None = None,
+    detectable: Mapping[UnknownGroup, float] | None = None,
+    traces: Sequence[SmoothedUnknowns] = (),
     chi2=(200.0, 100.0),
     degrees=(100.0, 90.0),
     **more: float,
-) -> Smoothed:
+) -> SmootherResult:
     """What the smoother says."""
-    return Smoothed(
-        traces=tuple(traces),
-        variance={s: float(w > 0) for s, w in weight.items()} if variance is None else dict(variance),
-        weight=dict(weight),
-        detectable=dict.fromkeys(weight, 0.5) if detectable is None else dict(detectable),
-        before=chi2[0],
-        after=chi2[1],
-        degrees_before=degrees[0],
-        degrees_after=degrees[1],
-        evidence={"none": 0.0, "both": 0.0, "plant": 0.0, "sensor": 0.0} | dict(evidence or {}),
+    return SmootherResult(
+        smoothed_unknowns=tuple(traces),
+        group_variance={s: float(w > 0) for s, w in weight.items()} if variance is None else dict(variance),
+        log_evidence_drop=dict(weight),
+        detectable_std=dict.fromkeys(weight, 0.5) if detectable is None else dict(detectable),
+        chi2_before=chi2[0],
+        chi2_after=chi2[1],
+        dof_before=degrees[0],
+        dof_after=degrees[1],
+        log_evidence={"none": 0.0, "both": 0.0, "plant": 0.0, "sensor": 0.0} | dict(evidence or {}),
         **more,
     )
 
@@ -203,20 +219,20 @@ def smoothed(
 # -- the whole finding ------------------------------------------------------------------------------------------------
 
 
-def place(location="T1", share=1.0, observable=True, windows=()) -> Place:
-    return Place(location, share, observable, tuple(windows))
+def place(location="T1", share=1.0, observable=True, windows=()) -> GapLocation:
+    return GapLocation(location, share, observable, tuple(windows))
 
 
-def absorbed(name, before, after, std=0.1, unit="N m/rad") -> Absorbed:
-    return Absorbed(name, unit, before, after, std)
+def absorbed(name, before, after, std=0.1, unit="N m/rad") -> NominalParameterChange:
+    return NominalParameterChange(name, unit, before, after, std)
 
 
-def finding(verdict="effect", **changed) -> Finding:
+def finding(verdict="effect", **changed) -> DiagnosisResult:
     """A finding; everything that is not named is unremarkable."""
     of = effect()
     usual = {
         "verdict": verdict,
-        "floor": (Floor("points.tip", "m", 0.001, 100),),
+        "floor": (ChannelNoiseLevel("points.tip", "m", 0.001, 100),),
         "before": outcome(p=1e-9, chi2=2.0),
         "held_out_before": outcome(p=1e-8, chi2=2.1),
         "visibility": (visible(of),),
@@ -239,7 +255,7 @@ def finding(verdict="effect", **changed) -> Finding:
         "seconds": {"nominal": 1.0},
         "reason": "none" if verdict == "unknown" else "",
     }
-    return Finding(**(usual | changed))
+    return DiagnosisResult(**(usual | changed))
 
 
 # -- problems ---------------------------------------------------------------------------------------------------------
@@ -261,7 +277,7 @@ class Candidates:
     def __init__(self, effects, y, column, nominal):
         self.effects, self.y, self.column = tuple(effects), y, column
         self.nominal = tuple(nominal)
-        self.theta = dict(nominal) | {n: v for of in effects for n, v in of.neutral.items()}
+        self.theta = dict(nominal) | {n: v for of in effects for n, v in of.neutral_values.items()}
         self.names: tuple[str, ...] = self.nominal
         self.weak, self.fault, self.asked, self.parts, self.warmed = 0, "", [], [], []
 
@@ -270,7 +286,7 @@ class Candidates:
         return self
 
     def told(self, parts, problem):
-        """Keep what `residual_series` was asked of."""
+        """Keep what `residual_channels` was asked of."""
         self.asked, self.parts = list(problem.names), parts
         return parts
 
@@ -338,12 +354,12 @@ class Recorded:
             vector=lambda values: asked.append(dict(values)),
             shared=("k",),
             validate=lambda x, derivatives=False: [(held, result)],
-            held_out_rows=lambda i, episode, found: self._samples.rows(found.predicted[0], by),
+            held_out_rows=lambda i, episode, found: self._samples.residual_block(found.predicted[0], by),
             on=lambda episodes, held_out: SimpleNamespace(
                 episodes=episodes,
                 held_out=held_out,
                 options=SimpleNamespace(path_cutoff=math.inf),
-                rows=ResidualRows.of(episodes, 0, 0),
+                rows=ResidualRows.from_episodes(episodes, 0, 0),
             ),
         )
 

@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.analysis.history import Estimates
+from yid_ocp.analysis.estimate_history import RunEstimates
 from yid_ocp.config.reader import load_config
-from yid_ocp.data.hdf5 import write_recording
 from yid_ocp.data.recording import PointGroup, Recording
-from yid_ocp.diagnosis.baseline import since, with_baseline
-from yid_ocp.diagnosis.hypotheses import CandidateProblem
-from yid_ocp.diagnosis.refit import refit
+from yid_ocp.data.recording_hdf5 import write_recording
+from yid_ocp.diagnosis.baseline_comparison import compare_with_baseline, with_baseline_prior
+from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
+from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.errors import ConfigError
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.simulated import recorded
+from yid_ocp.problem.synthetic_recording import recording_from_prediction
 from yid_ocp.workflow.build import build_problem
 from yid_ocp.workflow.diagnose import run_diagnose
 from yid_ocp.workflow.solve import run_solve
@@ -27,14 +27,14 @@ model:
     kind: segments
     mount: {rpy: [0.0, 1.5707963267948966, 0.0]}
     segments:
-      beam: {length: 0.1, mass: 0.1, section: [0.03, 0.03], links: 2, rigidity: true, clamped: true, joint_order: y}
+      beam: {length: 0.1, mass: 0.1, cross_section: [0.03, 0.03], links: 2, stiffness_per_curvature: true, clamped_at_base: true, joint_axes: y}
 recordings: {estimate: [bare.h5]}
 parameters:
   beam.bend: {free: true, initial: 0.015}
   beam.damping: {free: true, initial: 8.0e-5}
-problem: {time_step: 0.01, compiler: false, initial_state: estimated, configuration_std: 0.2, velocity_std: 3.0}
+problem: {time_step: 0.01, use_compiler: false, initial_state: estimated, start_configuration_std: 0.2, start_velocity_std: 3.0}
 diagnosis: {candidates: [point_mass@w_beam, kelvin_voigt@beam]}
-output: {report: false, discretisation: none}
+output: {write_report: false, discretisation_check: none}
 """
 NOISE, LOAD = 1e-4, 0.05
 TRUTH = {"beam.bend": 0.02, "beam.damping": 5e-5}
@@ -49,12 +49,12 @@ def swing(folder, name, seed, effects="[]"):
     run = load_config(folder / "beam.yaml", (f"model.effects={effects}",))
     problem = build_problem(run)
     start = {f"start.q.{joint}[bare]": 0.1 for joint in problem.system.mechanism.joint_names}
-    values = problem.named(problem.vector({**TRUTH, **start}))
+    values = problem.named_values(problem.vector({**TRUTH, **start}))
     theta, offset = problem.split(problem.vector(values), 0)
-    outcome = problem.predictor.run(problem.episodes[0], theta, offset, False)
+    outcome = problem.predictor.predict_episode(problem.episodes[0], theta, offset, False)
     assert not isinstance(outcome, str)
-    made = recorded(problem.predictor, problem.episodes[0], outcome, problem.theta, seed)
-    write_recording(replace(made, truth={}), folder / f"{name}.h5")
+    made = recording_from_prediction(problem.predictor, problem.episodes[0], outcome, problem.theta, seed)
+    write_recording(replace(made, true_parameters={}), folder / f"{name}.h5")
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +75,7 @@ def diagnosed(beam, recording, out):
 
 def test_a_load_is_what_differs_and_taking_it_away_predicts_the_first_day(beam, tmp_path):
     outcome = diagnosed(beam, "loaded", tmp_path / "new")
-    finding, result = outcome.finding, outcome.result
+    finding, result = outcome.diagnosis, outcome.result
     assert [effect.label for effect in finding.effects] == ["point_mass@w_beam"]
     mass = finding.last.values["point_mass@w_beam.mass"]
     assert abs(mass - LOAD) < 4 * finding.last.std["point_mass@w_beam.mass"]
@@ -109,17 +109,19 @@ def test_a_move_counts_as_the_difference_of_two_independent_estimates(beam, time
         ("recordings.estimate=[again.h5]", "recordings.held_out=[bare.h5]", "parameters.beam.damping.free=false"),
     )
     problem = build_problem(run)
-    alone = refit(CandidateProblem(problem.at(TRUTH), (), False), (), {})
+    alone = refit_with_effects(AllCandidatesProblem(problem.with_parameter_values(TRUTH), (), False), (), {})
     assert alone is not None
     std = alone.std["beam.bend"] * times
     before = alone.values["beam.bend"] + 3 * std
-    known = Estimates("old", ("beam.bend",), np.array([before]), np.array([[std**2]]))
-    both = refit(CandidateProblem(with_baseline(problem.at(TRUTH), known), (), False), (), {})
+    known = RunEstimates("old", ("beam.bend",), np.array([before]), np.array([[std**2]]))
+    both = refit_with_effects(
+        AllCandidatesProblem(with_baseline_prior(problem.with_parameter_values(TRUTH), known), (), False), (), {}
+    )
     assert both is not None
-    [shift] = since(both, known, 0.01).parameters
+    [shift] = compare_with_baseline(both, known, 0.01).parameter_shifts
     apart = (alone.values["beam.bend"] - before) / np.hypot(std, alone.std["beam.bend"])
     if times < 0.2:
-        assert shift.score is None  # the recording says nothing beside such a baseline
+        assert shift.z_score is None  # the recording says nothing beside such a baseline
     else:
-        assert shift.score == pytest.approx(apart, rel=0.1)
+        assert shift.z_score == pytest.approx(apart, rel=0.1)
         assert isinstance(both.problem, EstimationProblem)

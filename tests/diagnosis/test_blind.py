@@ -7,7 +7,14 @@ import json
 import pytest
 
 from yid_ocp.cli import main
-from yid_ocp.diagnosis.blind import Ensemble, Label, mark, opened, score, seal
+from yid_ocp.diagnosis.blind import (
+    CaseGenerator,
+    CaseLabel,
+    open_sealed_labels,
+    score_case,
+    score_ensemble,
+    seal_labels,
+)
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.virtual.injected import InjectedEffect
 
@@ -16,7 +23,7 @@ GUST = InjectedEffect("gusts", "T3", {"size": 0.1})
 
 
 def label(category, *injected, multiple=None, case="case_000"):
-    return Label(case, category, injected, multiple, {"T1.bend": 12.0})
+    return CaseLabel(case, category, injected, multiple, {"T1.bend": 12.0})
 
 
 def result(verdict, which=(), effects=(), where=(), confusable=(), closure=None, values=None):
@@ -36,18 +43,18 @@ def result(verdict, which=(), effects=(), where=(), confusable=(), closure=None,
 
 def test_sealed_labels_open_only_as_they_were():
     labels = [label("single", KV, multiple=3.0), label("null", case="case_001")]
-    text, digest = seal(labels)
-    again = opened(text, digest)
+    text, digest = seal_labels(labels)
+    again = open_sealed_labels(text, digest)
     assert again[0].injected == (KV,)
     assert [entry.category for entry in again] == ["single", "null"]
     with pytest.raises(DataError, match="committed"):
-        opened(text.replace("0.05", "0.06"), digest)
+        open_sealed_labels(text.replace("0.05", "0.06"), digest)
 
 
 def test_an_effect_named_first_is_right_and_its_parameters_are_compared():
     values = {"kelvin_voigt@T1": {"tau": {"value": 0.052, "std": 0.002, "unit": "s"}}}
     said = result("effect", ["kelvin_voigt@T1"], ["kelvin_voigt@T1"], ["T1"], closure=0.9, values=values)
-    found = mark(label("single", KV, multiple=10.0), said, best=1.0, seconds=5.0)
+    found = score_case(label("single", KV, multiple=10.0), said, best=1.0, seconds=5.0)
     assert found.right
     assert found.kind_first
     assert found.location_first
@@ -70,28 +77,28 @@ def test_an_effect_named_first_is_right_and_its_parameters_are_compared():
     ],
 )
 def test_a_set_of_three_with_the_truth_is_right_and_nothing_else(said, right):
-    assert mark(label("single", KV, multiple=10.0), said).right is right
+    assert score_case(label("single", KV, multiple=10.0), said).right is right
 
 
 def test_outside_the_library_only_unknown_at_the_right_place_is_right():
-    assert mark(label("outside", GUST), result("unknown", where=["T3", "T1"])).right
-    assert not mark(label("outside", GUST), result("unknown", where=["T1", "T3"])).right
-    assert not mark(label("outside", GUST), result("effect", ["density@T3"], ["density@T3"], ["T3"])).right
+    assert score_case(label("outside", GUST), result("unknown", where=["T3", "T1"])).right
+    assert not score_case(label("outside", GUST), result("unknown", where=["T1", "T3"])).right
+    assert not score_case(label("outside", GUST), result("effect", ["density@T3"], ["density@T3"], ["T3"])).right
 
 
 def test_rates_count_what_they_say():
     marks = [
-        mark(label("null"), result("no_gap")),
-        mark(label("null"), result("unknown")),
-        mark(
+        score_case(label("null"), result("no_gap")),
+        score_case(label("null"), result("unknown")),
+        score_case(
             label("single", KV, multiple=10.0),
             result("effect", ["kelvin_voigt@T1"], ["kelvin_voigt@T1"], ["T1"], closure=0.8),
             1.0,
         ),
-        mark(label("single", KV, multiple=1.0), result("no_gap")),
-        mark(label("outside", GUST), result("unknown", where=["T1"])),
+        score_case(label("single", KV, multiple=1.0), result("no_gap")),
+        score_case(label("outside", GUST), result("unknown", where=["T1"])),
     ]
-    found = score(marks)
+    found = score_ensemble(marks)
     assert found["false_alarms"] == 0.5
     assert found["detection"]["10"] == {"cases": 1, "gap": 1.0, "first": 1.0, "right": 1.0}
     assert found["detection"]["1"] == {"cases": 1, "gap": 0.0, "first": 0.0, "right": 0.0}
@@ -105,7 +112,7 @@ def test_rates_count_what_they_say():
 def test_a_system_that_nothing_drives_is_refused(bench):
     problem = bench.problem([bench.recording({}, 1, duration=0.5)])
     with pytest.raises(ConfigError, match="driven"):
-        Ensemble(problem, 1)
+        CaseGenerator(problem, 1)
 
 
 def test_the_command_says_which_systems_it_needs(capsys, tmp_path, urdf_folder):

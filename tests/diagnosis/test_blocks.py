@@ -31,14 +31,14 @@ def swinging(urdf_folder):
     start[:2], start[2:4] = 0.4 * rng.standard_normal(2), 0.02 * rng.standard_normal(2)
     swept = simulate(step, real.parameters.vector(), start, 600)
     frames = list(nominal.mechanism.frames)[-2:]
-    q = ca.SX.sym("q", nominal.size)
+    q = ca.SX.sym("q", nominal.n_coordinates)
     kinematics = forward_kinematics(nominal.mechanism, q)
-    place = ca.Function("place", [q], [ca.horzcat(*(kinematics.position(frame) for frame in frames))])
+    place = ca.Function("place", [q], [ca.horzcat(*(kinematics.frame_position(frame) for frame in frames))])
     clean = np.stack([np.array(place(x[:2])).T for x in swept.state])
     t = TIME_STEP * np.arange(601)
     seen = clean + NOISE * rng.standard_normal(clean.shape)
     points = PointGroup("points", tuple(frames), t, seen, std=np.full(clean.shape, NOISE))
-    options = ProblemOptions(initial_state="estimated", configuration_std=0.5, velocity_std=2.0)
+    options = ProblemOptions(initial_state="estimated", start_configuration_std=0.5, start_velocity_std=2.0)
     return EstimationProblem(
         compile_step(nominal, TIME_STEP),
         [Recording(None, (points,), name="one")],
@@ -49,8 +49,8 @@ def swinging(urdf_folder):
 
 def test_the_held_out_blocks_begin_where_the_others_do(swinging):
     finding = diagnose(swinging, ["joint_coulomb", "joint_viscous"])
-    assert finding.in_blocks
-    assert finding.held_out_before.chi2_per_dof == pytest.approx(finding.before.chi2_per_dof, rel=0.3)
+    assert finding.is_split_in_blocks
+    assert finding.nominal_held_out_test.chi2_per_dof == pytest.approx(finding.nominal_test.chi2_per_dof, rel=0.3)
     assert finding.verdict == "effect"
-    assert finding.effects[0].label == "joint_coulomb@elbow"
-    assert finding.where[0].location == "elbow"
+    assert finding.accepted_effects[0].label == "joint_coulomb@elbow"
+    assert finding.gap_locations[0].location == "elbow"

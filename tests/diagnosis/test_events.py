@@ -10,26 +10,26 @@ import pytest
 
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis import diagnose
-from yid_ocp.diagnosis.events import Event, Events, Fall, find_events, without_events
-from yid_ocp.diagnosis.pulses import Pulse
+from yid_ocp.diagnosis.diagnosis_messages import _event_sentences
+from yid_ocp.diagnosis.events import DisturbanceEvent, EventSet, Overspeed, find_events, problem_without_events
+from yid_ocp.diagnosis.pulse_detection import DetectedPulse
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.diagnosis.words import event_sentences
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.null_test import sample_times
 from yid_ocp.solvers import GaussNewton, solve
-from yid_ocp.virtual.engine import Simulation
-from yid_ocp.virtual.experiment import ArmNoise, VirtualExperiment, virtual_experiment
-from yid_ocp.virtual.interruptions import Interruptions, Push, Snag
-from yid_ocp.virtual.motion import Motion
+from yid_ocp.virtual.disturbances import DisturbanceTerms, ForcePulse, SnagSpring
+from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperiment, run_virtual_experiment
+from yid_ocp.virtual.mujoco_simulation import SimulationOptions
+from yid_ocp.virtual.multisine_motion import MultisineMotion
 
 pytest.importorskip("mujoco", reason="twins are made in MuJoCo: pip install 'yid-ocp[blind]'")
 
 JOINTS = ("shoulder", "elbow")
 DAMPING = {"shoulder": 0.1, "elbow": 0.05}
-PUSHES = (Push("shoulder", 1.5, 2.0, 1.5), Push("elbow", 3.0, 3.4, -0.8))
+PUSHES = (ForcePulse("shoulder", 1.5, 2.0, 1.5), ForcePulse("elbow", 3.0, 3.4, -0.8))
 
 
 @dataclass(frozen=True)
@@ -39,22 +39,22 @@ class Twin:
     driven: System
     prescribed: System
 
-    def recording(self, interruptions: Interruptions | None = None, seed: int = 0) -> Recording:
+    def recording(self, interruptions: DisturbanceTerms | None = None, seed: int = 0) -> Recording:
         frequency = np.array([[0.5, 0.9, 1.3], [0.6, 1.0, 1.5]])
         phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, (2, 3))
-        motion = Motion(JOINTS, 0.25 / frequency, frequency, phase)
-        noise = ArmNoise(position=5e-5, effort=0.02)
+        motion = MultisineMotion(JOINTS, 0.25 / frequency, frequency, phase)
+        noise = ArmSensorNoise(position_std=5e-5, effort_std=0.02)
         how = VirtualExperiment(
             motion,
             dict.fromkeys(JOINTS, 0.3),
-            Simulation(5.0, 200.0, 1e-3, effort_kind="mean"),
+            SimulationOptions(5.0, 200.0, 1e-3, effort_kind="mean"),
             noise,
             None,
             interruptions,
             seed,
             f"run_{seed}",
         )
-        return virtual_experiment(self.driven, None, how)
+        return run_virtual_experiment(self.driven, None, how)
 
     def problem(self, *recordings: Recording) -> EstimationProblem:
         sensors = {"joints.effort": SensorOptions(std=0.02), "joints.position": SensorOptions(std=5e-5)}
@@ -62,7 +62,7 @@ class Twin:
         free = [f"{joint}.damping" for joint in JOINTS]
         return EstimationProblem(step, recordings, free, ProblemOptions(sensors=sensors, path_cutoff=8.0))
 
-    def events(self, *recordings: Recording) -> Events:
+    def events(self, *recordings: Recording) -> EventSet:
         problem = self.problem(*recordings)
         x = solve(problem, GaussNewton()).x
         return find_events(problem, x, problem.evaluate(x), None)
@@ -78,7 +78,7 @@ def twin(urdf_folder) -> Twin:
 
 @pytest.fixture(scope="module")
 def pushed(twin) -> Recording:
-    return twin.recording(Interruptions(PUSHES))
+    return twin.recording(DisturbanceTerms(PUSHES))
 
 
 def test_pushes_are_found_at_their_joints_in_their_windows_with_their_impulses(twin, pushed):
@@ -88,8 +88,8 @@ def test_pushes_are_found_at_their_joints_in_their_windows_with_their_impulses(t
         ("force", "elbow", "N m"),
     ]
     for event, push in zip(found, PUSHES, strict=True):
-        assert event.begin == pytest.approx(push.begin, abs=0.1)
-        assert event.end == pytest.approx(push.end, abs=0.1)
+        assert event.begin == pytest.approx(push.start_time, abs=0.1)
+        assert event.end == pytest.approx(push.end_time, abs=0.1)
         assert event.impulse == pytest.approx(push.impulse, rel=0.15)
         assert abs(event.impulse - push.impulse) < 3 * event.std
 
@@ -100,7 +100,7 @@ def test_nothing_happens_in_a_clean_run(twin, seed):
 
 
 def test_a_snag_is_an_event_of_its_joint(twin):
-    found = twin.events(twin.recording(Interruptions((), (Snag("elbow", 2.0, 2.3, 30.0),)))).found
+    found = twin.events(twin.recording(DisturbanceTerms((), (SnagSpring("elbow", 2.0, 2.3, 30.0),)))).found
     assert found
     assert {event.location for event in found} == {"elbow"}
     assert all(event.begin > 1.8 and event.end < 2.5 for event in found)
@@ -108,8 +108,8 @@ def test_a_snag_is_an_event_of_its_joint(twin):
 
 def test_forces_that_mostly_recur_are_the_motions_own(twin, pushed):
     """What is there at the same times of another recording comes with the motion; one that does is still an event."""
-    other = (replace(PUSHES[0], begin=3.2, end=3.7), *PUSHES[1:])
-    again, partly = (twin.recording(Interruptions(pushes), seed=1) for pushes in (PUSHES, other))
+    other = (replace(PUSHES[0], start_time=3.2, end_time=3.7), *PUSHES[1:])
+    again, partly = (twin.recording(DisturbanceTerms(pushes), seed=1) for pushes in (PUSHES, other))
     assert not twin.events(pushed, again).found
     assert [event.location for event in twin.events(pushed, partly).found] == ["shoulder", "elbow", "elbow", "shoulder"]
 
@@ -143,7 +143,7 @@ def test_a_gap_that_lives_in_events_alone_is_none_and_the_words_tell_of_them(ben
 
 
 def test_pushes_that_take_little_of_the_gap_with_them_are_a_model_that_errs_everywhere(bench, monkeypatch):
-    claimed = Event(
+    claimed = DisturbanceEvent(
         "run_1",
         "elbow",
         "elbow",
@@ -154,43 +154,50 @@ def test_pushes_that_take_little_of_the_gap_with_them_are_a_model_that_errs_ever
         -0.01,
         0.001,
         "N m",
-        Pulse(1.0, 1.2, -0.1, False, 0.01, 1e-9),
+        DetectedPulse(1.0, 1.2, -0.1, False, 0.01, 1e-9),
     )
-    odd = replace(claimed, kind="sample", channel="points_arm.tip.x", begin=2.0, end=2.01, unit="m", pulse=None)
-    monkeypatch.setattr(sys.modules["yid_ocp.diagnosis.diagnose"], "find_events", lambda *_: Events((claimed, odd)))
+    odd = replace(
+        claimed, kind="sample", channel="points_arm.tip.x", start_time=2.0, end_time=2.01, unit="m", detected_pulse=None
+    )
+    monkeypatch.setattr(sys.modules["yid_ocp.diagnosis.diagnose"], "find_events", lambda *_: EventSet((claimed, odd)))
     rubbing = [bench.recording({"joint_coulomb@elbow": {"tau_c": 0.3}}, seed) for seed in (1, 2)]
     for share, expected in ((0.1, (odd,)), (0.0, (claimed, odd))):
-        limits = Thresholds(event_share=share)
+        limits = Thresholds(min_event_chi2_fraction=share)
         finding = diagnose(bench.problem(rubbing[:1]), ["effort_offset@elbow"], rubbing[1:], thresholds=limits)
         assert finding.verdict == "unknown"
-        assert finding.events.found == expected
+        assert finding.events.disturbances == expected
 
 
 def test_samples_of_an_events_joint_in_its_window_do_not_count(twin, pushed):
     problem = twin.problem(pushed)
-    event = Event("run_0", "elbow", "elbow", "force", 3.0, 3.4, -0.8, -0.16, 0.01, "N m")
-    cleaned = without_events(problem, Events((event,)))
-    (before,), (after,) = problem.episodes[0].samples, cleaned.episodes[0].samples
+    event = DisturbanceEvent("run_0", "elbow", "elbow", "force", 3.0, 3.4, -0.8, -0.16, 0.01, "N m")
+    cleaned = problem_without_events(problem, EventSet((event,)))
+    (before,), (after,) = problem.episodes[0].samples, cleaned.episodes[0].measurements
     t = sample_times(problem.episodes[0], before)
-    hidden = before.seen & ~after.seen
+    hidden = before.seen & ~after.is_used
     smear = 1 / problem.options.path_cutoff
     assert not hidden[:, 0].any()
     assert np.array_equal(hidden[:, 1], before.seen[:, 1] & (t > 3.0 - smear) & (t < 3.4 + smear))
-    assert without_events(problem, Events((replace(event, recording="another"),))).episodes[0].samples[0] is before
+    assert (
+        problem_without_events(problem, EventSet((replace(event, recording="another"),))).episodes[0].measurements[0]
+        is before
+    )
 
 
 def test_after_a_fall_nothing_counts(twin, pushed):
-    events = find_events(*fitted(twin.problem(pushed)), None, Thresholds(fall=1.0))
-    (fall,) = events.falls
+    events = find_events(*fitted(twin.problem(pushed)), None, Thresholds(max_joint_speed=1.0))
+    (fall,) = events.overspeeds
     assert fall.recording == "run_0"
     assert fall.joint in JOINTS
-    assert all(event.end < fall.time for event in events.found)
-    cleaned = without_events(twin.problem(pushed), Events((), (Fall("run_0", "elbow", 3.0),)))
-    (samples,) = cleaned.episodes[0].samples
+    assert all(event.end_time < fall.start_time for event in events.disturbances)
+    cleaned = problem_without_events(twin.problem(pushed), EventSet((), (Overspeed("run_0", "elbow", 3.0),)))
+    (samples,) = cleaned.episodes[0].measurements
     t = sample_times(cleaned.episodes[0], samples)
-    assert not samples.seen[t > 3.0].any()
-    assert samples.seen[(t > 1.0) & (t < 2.0)].all()
-    assert "From 3 s on nothing is judged in run_0" in event_sentences(Events((), (Fall("run_0", "elbow", 3.0),)))
+    assert not samples.is_used[t > 3.0].any()
+    assert samples.is_used[(t > 1.0) & (t < 2.0)].all()
+    assert "From 3 s on nothing is judged in run_0" in _event_sentences(
+        EventSet((), (Overspeed("run_0", "elbow", 3.0),))
+    )
 
 
 def fitted(problem: EstimationProblem):
@@ -199,12 +206,12 @@ def fitted(problem: EstimationProblem):
 
 
 def test_what_happened_is_told_one_by_one_up_to_eight():
-    event = Event("run", "elbow", "elbow", "force", 1.0, 1.5, 0.5, 0.12, 0.01, "N m")
-    odd = Event("run", "camera", "points.w_T1.x", "sample", 2.0, 2.01, 0.05, 5e-4, 1e-5, "m")
-    assert event_sentences(Events()) == ""
-    assert event_sentences(Events((event,))) == (
+    event = DisturbanceEvent("run", "elbow", "elbow", "force", 1.0, 1.5, 0.5, 0.12, 0.01, "N m")
+    odd = DisturbanceEvent("run", "camera", "points.w_T1.x", "sample", 2.0, 2.01, 0.05, 5e-4, 1e-5, "m")
+    assert _event_sentences(EventSet()) == ""
+    assert _event_sentences(EventSet((event,))) == (
         "One event stands beside all this, short and in one place: elbow is pushed by up to +0.5 N m from 1.00 to 1.50 "
         "s in run (+0.12 ± 0.01 N m s)."
     )
-    assert "points.w_T1.x is off by +0.05 m at 2.005 s in run" in event_sentences(Events((event, odd)))
-    assert event_sentences(Events((event,) * 10)).endswith("; and 2 more.")
+    assert "points.w_T1.x is off by +0.05 m at 2.005 s in run" in _event_sentences(EventSet((event, odd)))
+    assert _event_sentences(EventSet((event,) * 10)).endswith("; and 2 more.")

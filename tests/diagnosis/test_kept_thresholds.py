@@ -7,8 +7,13 @@ from importlib.resources import files
 
 import pytest
 
-from yid_ocp.diagnosis.blind.calibrate import FORMAT, RULES, advised, conformal
-from yid_ocp.diagnosis.thresholds import DEFAULTS
+from yid_ocp.diagnosis.blind.threshold_calibration import (
+    _CALIBRATION_RULES,
+    _FORMAT,
+    _conformal_quantile,
+    _recommended_settings,
+)
+from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS
 
 
 @pytest.fixture(scope="module")
@@ -17,21 +22,23 @@ def kept():
 
 
 def test_defaults_are_those_that_it_advises(kept):
-    assert kept["format"] == FORMAT
-    assert kept["settings"] == {rule.setting: getattr(DEFAULTS, rule.setting) for rule in RULES.values()}
+    assert kept["format"] == _FORMAT
+    assert kept["settings"] == {
+        rule.setting: getattr(DEFAULT_THRESHOLDS, rule.setting) for rule in _CALIBRATION_RULES.values()
+    }
 
 
 def test_its_advice_follows_from_its_samples_by_the_rules_as_they_are(kept):
     rules = kept["rules"]
-    assert set(rules) == set(RULES)
-    for name, rule in RULES.items():
+    assert set(rules) == set(_CALIBRATION_RULES)
+    for name, rule in _CALIBRATION_RULES.items():
         own = rules[name]
         assert (own["setting"], own["of"], own["side"], own["limit"]) == (rule.setting, rule.of, rule.side, rule.limit)
         sample = [float("-inf") if value is None else value for value in own["sample"]]
-        value, coverage = conformal(sample, rule.side, kept["asked"])
+        value, coverage = _conformal_quantile(sample, rule.side, kept["asked"])
         assert own["coverage"] == coverage
         assert own["quantile"] == (None if value == float("-inf") else value)
-    assert advised(rules) == kept["settings"]
+    assert _recommended_settings(rules) == kept["settings"]
 
 
 def test_it_says_what_it_was_made_of(kept):

@@ -11,7 +11,7 @@ from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.diagnosis import Thresholds, diagnose
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
-from yid_ocp.model.urdf import read_urdf, robot_description_file
+from yid_ocp.model.urdf import example_robot_urdf, read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 
 pin = pytest.importorskip("pinocchio", reason="the other engine is Pinocchio: pip install pin")
@@ -34,7 +34,7 @@ CANDIDATES = (
 def robot(side: str):
     names = tuple(f"{side}_{joint}" for joint in JOINTS)
     system = System.build(read_urdf("package:baxter", joints=names), prescribed=names, damping=0.05)
-    model = pin.buildModelFromUrdf(str(robot_description_file("baxter")))
+    model = pin.buildModelFromUrdf(str(example_robot_urdf("baxter")))
     locked = [j for j in range(1, model.njoints) if model.names[j] not in names]
     return names, compile_step(system, TIME_STEP), pin.buildReducedModel(model, locked, pin.neutral(model))
 
@@ -94,7 +94,7 @@ def diagnosed(side: str, extra):
         ProblemOptions(path_cutoff=float("inf")),
         held_out=[recording(side, 2, extra)],
     )
-    return diagnose(problem, CANDIDATES, thresholds=Thresholds(effects=2))
+    return diagnose(problem, CANDIDATES, thresholds=Thresholds(max_effects=2))
 
 
 @pytest.mark.parametrize(

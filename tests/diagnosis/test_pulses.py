@@ -8,19 +8,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.diagnosis.pulses import History, Pulse, pulses
+from yid_ocp.diagnosis.pulse_detection import DetectedPulse, ForceEstimate, detect_pulses
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.problem.low_pass import LowPass
-from yid_ocp.problem.null_test import discoveries
+from yid_ocp.problem.low_pass_filter import LowPassFilter
+from yid_ocp.problem.null_test import benjamini_hochberg_mask
 
 T = 0.1 * np.arange(80)
 NOISE = 0.02
 
 
-def history(values: np.ndarray, seed: int = 0, noise: float = NOISE, **changed) -> History:
+def history(values: np.ndarray, seed: int = 0, noise: float = NOISE, **changed) -> ForceEstimate:
     """What sensors of this noise say of a force, where the model may be wrong by 0.03."""
     measured = values + noise * np.random.default_rng(seed).standard_normal(len(values))
-    made = History(
+    made = ForceEstimate(
         "run", "elbow", "elbow", "N m", T, measured / noise**2, np.eye(len(T)) / noise**2, 0.03 + 0 * T, 0 * T
     )
     return replace(made, **changed)
@@ -31,10 +31,10 @@ def bell(begin: float, end: float, size: float) -> np.ndarray:
     return size * np.sin(np.pi * part) ** 2
 
 
-def sure(of: History, limits: Thresholds | None = None) -> list[Pulse]:
-    found, tries = pulses(of, limits or Thresholds())
-    real = discoveries([pulse.p_value for pulse in found], tries, 0.01)
-    return sorted((p for p, r in zip(found, real, strict=True) if r), key=lambda p: p.begin)
+def sure(of: ForceEstimate, limits: Thresholds | None = None) -> list[DetectedPulse]:
+    found, tries = detect_pulses(of, limits or Thresholds())
+    real = benjamini_hochberg_mask([pulse.p_value for pulse in found], tries, 0.01)
+    return sorted((p for p, r in zip(found, real, strict=True) if r), key=lambda p: p.start_time)
 
 
 def wobble() -> np.ndarray:
@@ -48,18 +48,18 @@ def test_pulses_are_found_with_their_windows_and_impulses_beside_a_slow_rest(see
     found = sure(history(wobble() + sum(bell(*entry) for entry in truth), seed))
     assert len(found) == 2
     for pulse, (begin, end, size) in zip(found, truth, strict=True):
-        assert pulse.begin == pytest.approx(begin, abs=0.1)
-        assert pulse.end == pytest.approx(end, abs=0.1)
+        assert pulse.start_time == pytest.approx(begin, abs=0.1)
+        assert pulse.end_time == pytest.approx(end, abs=0.1)
         impulse = size * (end - begin) / 2
         assert pulse.impulse == pytest.approx(impulse, rel=0.25)
-        assert abs(pulse.impulse - impulse) < 3 * pulse.std * pulse.area
+        assert abs(pulse.impulse - impulse) < 3 * pulse.peak_std * pulse.unit_impulse
 
 
 def test_a_pulse_that_stays_at_its_size_is_flat():
     part = np.clip((T - 3.0) / 0.8, 0, 1)
     plateau = 0.5 * np.sin(np.pi / 2 * np.minimum(np.minimum(part, 1 - part) / 0.25, 1)) ** 2
     (pulse,) = sure(history(plateau))
-    assert pulse.flat
+    assert pulse.is_flat_topped
     assert pulse.impulse == pytest.approx(0.5 * 0.8 * 0.75, rel=0.15)
 
 
@@ -95,37 +95,39 @@ def test_friction_that_holds_may_change_by_twice_itself_wherever_a_joint_stands_
 def test_what_lasts_longer_than_the_longest_event_is_the_models():
     slow = bell(2.0, 5.0, 0.5)
     assert sure(history(slow)) == []
-    assert len(sure(history(slow), Thresholds(pulse=4.0))) in (0, 1)
+    assert len(sure(history(slow), Thresholds(max_event_duration=4.0))) in (0, 1)
 
 
 def test_a_filter_widens_what_is_seen_and_not_what_is_told():
     fine = np.arange(0, 8, 0.005)
     cutoff = 3.0
     narrow = 0.8 * np.where((fine > 4) & (fine < 4.3), np.sin(np.pi * (fine - 4) / 0.3) ** 2, 0)
-    seen = np.interp(T, fine, LowPass(cutoff)(fine, narrow[:, None])[:, 0])
+    seen = np.interp(T, fine, LowPassFilter(cutoff)(fine, narrow[:, None])[:, 0])
     (pulse,) = sure(history(seen, noise=0.005, cutoff=cutoff, error=0.01 + 0 * T))
-    assert pulse.end - pulse.begin < 0.5
+    assert pulse.end_time - pulse.start_time < 0.5
     assert pulse.impulse == pytest.approx(0.8 * 0.15, rel=0.15)
-    assert pulse.values(T, cutoff) == pytest.approx(seen, abs=0.06)
+    assert pulse.evaluate_at(T, cutoff) == pytest.approx(seen, abs=0.06)
 
 
 def test_a_few_windows_among_many_are_chance():
-    assert discoveries([1e-3], 1000, 0.01) == [False]
-    assert discoveries([1e-5, 1.9e-5, 1e-2], 1000, 0.01) == [True, True, False]
+    assert benjamini_hochberg_mask([1e-3], 1000, 0.01) == [False]
+    assert benjamini_hochberg_mask([1e-5, 1.9e-5, 1e-2], 1000, 0.01) == [True, True, False]
     # the second carries a first that would not pass alone
-    assert discoveries([1.5e-5, 1.9e-5], 1000, 0.01) == [True, True]
-    assert discoveries([], 1000, 0.01) == []
+    assert benjamini_hochberg_mask([1.5e-5, 1.9e-5], 1000, 0.01) == [True, True]
+    assert benjamini_hochberg_mask([], 1000, 0.01) == []
 
 
 def test_the_evidence_is_a_gaussians():
     """Sigma^-1 y and the evidence against dense algebra."""
-    from yid_ocp.diagnosis.pulses import QUICK, SLOW, _Rest
+    from yid_ocp.diagnosis.pulse_detection import _MODEL_ERROR_TIME, _SLOW_FORCE_TIME, _Rest
 
     made = history(bell(3.0, 3.5, 0.3), held=0.1 + 0 * T)
     rest = _Rest.of(made, 2.0, 0.05, 0.2)
     apart = np.abs(T[:, None] - T)
     quick = np.full(len(T), math.sqrt(0.06**2 + 0.05**2 + 0.1**2 / 3))
-    covariance = np.outer(quick, quick) * (np.eye(len(T)) + np.exp(-apart / QUICK)) / 2 + 0.04 * np.exp(-apart / SLOW)
+    covariance = np.outer(quick, quick) * (np.eye(len(T)) + np.exp(-apart / _MODEL_ERROR_TIME)) / 2 + 0.04 * np.exp(
+        -apart / _SLOW_FORCE_TIME
+    )
     total = covariance + NOISE**2 * np.eye(len(T))
     value = NOISE**2 * made.score
     assert rest.precision == pytest.approx(np.linalg.inv(total), rel=1e-5, abs=1e-4)
@@ -133,10 +135,10 @@ def test_the_evidence_is_a_gaussians():
     less = _Rest.of(made, 1.0, 0.0, 0.05)
     other = (
         np.outer(q := np.full(len(T), math.sqrt(0.03**2 + 0.1**2 / 3)), q)
-        * (np.eye(len(T)) + np.exp(-apart / QUICK))
+        * (np.eye(len(T)) + np.exp(-apart / _MODEL_ERROR_TIME))
         / 2
     )
-    other += 0.05**2 * np.exp(-apart / SLOW) + NOISE**2 * np.eye(len(T))
+    other += 0.05**2 * np.exp(-apart / _SLOW_FORCE_TIME) + NOISE**2 * np.eye(len(T))
 
     def log_density(matrix: np.ndarray) -> float:
         return -0.5 * float(value @ np.linalg.solve(matrix, value)) - 0.5 * float(np.linalg.slogdet(matrix)[1])

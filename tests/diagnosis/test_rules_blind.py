@@ -12,17 +12,24 @@ import pytest
 from factories import amplitude, effect, shape, signature
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
-from yid_ocp.diagnosis.blind import Conditions, Ensemble, Label, Planned, finer_values, planned
+from yid_ocp.diagnosis.blind import (
+    CaseGenerator,
+    CaseLabel,
+    PlannedCase,
+    RecordingConditions,
+    finer_chain_parameters,
+    plan_cases,
+)
 from yid_ocp.diagnosis.blind import ensemble as module
-from yid_ocp.diagnosis.blind.ensemble import DRAWS, OUTSIDE_SIZES, Detectable
-from yid_ocp.diagnosis.hypotheses import CandidateProblem
+from yid_ocp.diagnosis.blind.ensemble import _OUT_OF_LIBRARY_SIZES, MAX_CASE_DRAWS, DetectableEffect
+from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import ConfigError, ModelError
-from yid_ocp.virtual.engine import Simulation
-from yid_ocp.virtual.experiment import ArmNoise, PointCamera
+from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera
 from yid_ocp.virtual.injected import InjectedEffect
-from yid_ocp.virtual.motion import Excitation
-from yid_ocp.virtual.outside import OUTSIDE
+from yid_ocp.virtual.mujoco_simulation import SimulationOptions
+from yid_ocp.virtual.multisine_motion import MultisineOptions
+from yid_ocp.virtual.out_of_library_effects import OUT_OF_LIBRARY_EFFECTS
 
 KV = InjectedEffect("kelvin_voigt", "T1", {"tau": 0.05})
 
@@ -81,26 +88,27 @@ def drawn(monkeypatch):
 
     def build(seed=3, candidates=(DAMPER, FRICTION, TILT, SOLID), finer=None, failures=0, conditions=None, **given):
         build.failures = failures
-        monkeypatch.setattr(module, "chosen_effects", lambda *_: list(candidates))
-        ensemble = Ensemble(problem(**given), seed, finer, conditions=conditions)
+        monkeypatch.setattr(module, "make_candidate_effects", lambda *_: list(candidates))
+        ensemble = CaseGenerator(problem(**given), seed, finer, conditions=conditions)
         columns = {"kelvin_voigt": [[100.0]], "joint_coulomb": [[0.5]], "gravity_tilt": [[30.0, 40.0]]}
         signatures = [
-            signature(of, columns.get(of.kind, [[50.0]]), **({"s": 0.25} if of.shapes else {})) for of in candidates
+            signature(of, columns.get(of.kind, [[50.0]]), **({"s": 0.25} if of.shape_names else {}))
+            for of in candidates
         ]
-        ensemble._detectable = tuple(Detectable.of(entry) for entry in signatures)
+        ensemble._detectable = tuple(DetectableEffect.from_signature(entry) for entry in signatures)
         return ensemble
 
-    monkeypatch.setattr(module, "injected_experiment", experiment)
-    monkeypatch.setattr(module, "multisine", multisine)
+    monkeypatch.setattr(module, "run_injected_experiment", experiment)
+    monkeypatch.setattr(module, "random_multisine", multisine)
     build.made = made
     return build
 
 
 def test_an_ensemble_starts_where_the_recording_does(drawn):
     ensemble = drawn()
-    assert ensemble.posture == {"s0": 0.1, "s1": 0.2, "w0": 0.3}
-    assert not ensemble.conditions.vision
-    assert drawn(pose=np.eye(4)).conditions.vision
+    assert ensemble.initial_configuration == {"s0": 0.1, "s1": 0.2, "w0": 0.3}
+    assert not ensemble.conditions.has_camera
+    assert drawn(pose=np.eye(4)).conditions.has_camera
 
 
 @pytest.mark.parametrize(
@@ -121,18 +129,18 @@ def test_what_cannot_be_simulated_is_refused(drawn, given, words):
 
 def test_what_is_detectable_counts_the_noise_of_torques(drawn, monkeypatch):
     ensemble = drawn()
-    composed = CandidateProblem("by the sensors", (DAMPER,), False)
+    composed = AllCandidatesProblem("by the sensors", (DAMPER,), False)
     monkeypatch.setattr(ensemble, "of", lambda recordings: SimpleNamespace(system="system"))
-    monkeypatch.setattr(module, "CandidateProblem", SimpleNamespace(of=lambda *_: composed))
+    monkeypatch.setattr(module, "AllCandidatesProblem", SimpleNamespace(of=lambda *_: composed))
     weighted = SimpleNamespace(problem="by all noise", values={"k": 1.0})
-    monkeypatch.setattr(module, "nominal_fit", lambda *_, limits: weighted)
-    monkeypatch.setattr(module, "linearise", lambda of, base, values, grid: of)
-    assert ensemble.point() == replace(composed, problem="by all noise")
+    monkeypatch.setattr(module, "fit_nominal_model", lambda *_, limits: weighted)
+    monkeypatch.setattr(module, "linearize_candidates", lambda of, base, values, grid: of)
+    assert ensemble.linearize_clean_recordings() == replace(composed, problem="by all noise")
 
 
 def test_the_truth_is_spread_about_the_start(drawn):
     ensemble = drawn()
-    found = [ensemble.truth(np.random.default_rng(seed)) for seed in range(200)]
+    found = [ensemble.draw_true_parameters(np.random.default_rng(seed)) for seed in range(200)]
     for name, start in (("T1.bend", 20.0), ("T2.bend", 5.0)):
         ratio = np.log([truth[name] / start for truth in found]) / math.log(1.5)
         assert -1 <= ratio.min() < -0.9
@@ -143,7 +151,7 @@ def test_the_truth_is_spread_about_the_start(drawn):
 
 def test_a_recording_says_nothing_of_what_is_in_it(drawn):
     ensemble = drawn()
-    found = ensemble.record({"T1.bend": 7.0}, (KV,), np.random.default_rng(1), "case_001")
+    found = ensemble.simulate_recording({"T1.bend": 7.0}, (KV,), np.random.default_rng(1), "case_001")
     assert (found.name, found.description, found.source, found.truth) == ("case_001", "", "", {})
     [made] = drawn.made
     assert made["system"] is ensemble.problem.system
@@ -151,7 +159,7 @@ def test_a_recording_says_nothing_of_what_is_in_it(drawn):
     assert (made["posture"], made["camera"]) == (ensemble.posture, None)
     motion = made["motion"]
     assert (motion["of"], motion["truth"]) == (ensemble.problem.system, {"T1.bend": 7.0})
-    assert (motion["posture"], motion["excitation"]) == (ensemble.posture, Excitation(travel=0.15))
+    assert (motion["posture"], motion["excitation"]) == (ensemble.posture, MultisineOptions(gripper_travel=0.15))
     rng = np.random.default_rng(1)
     assert [motion["seed"], made["seed"]] == [int(rng.integers(2**31)) for _ in range(2)]
 
@@ -159,20 +167,22 @@ def test_a_recording_says_nothing_of_what_is_in_it(drawn):
 def test_several_arms_on_one_object_go_less_far(drawn):
     together = system()
     together.grasps = ("left", "right")
-    drawn(of=together).record({}, (), np.random.default_rng(1), "case")
-    assert drawn.made[0]["motion"]["excitation"] == Excitation(travel=0.08)
+    drawn(of=together).simulate_recording({}, (), np.random.default_rng(1), "case")
+    assert drawn.made[0]["motion"]["excitation"] == MultisineOptions(gripper_travel=0.08)
 
 
 def test_a_camera_looks_on_where_one_did(drawn):
-    drawn(pose=np.eye(4)).record({}, (), np.random.default_rng(1), "case")
+    drawn(pose=np.eye(4)).simulate_recording({}, (), np.random.default_rng(1), "case")
     assert drawn.made[0]["camera"] == PointCamera()
 
 
 def test_a_finer_chain_moves_as_the_nominal_one_and_has_its_own_values(drawn, monkeypatch):
     asked = []
-    monkeypatch.setattr(module, "finer_values", lambda nominal, finer, truth: {"finer": (nominal, finer, dict(truth))})
+    monkeypatch.setattr(
+        module, "finer_chain_parameters", lambda nominal, finer, truth: {"finer": (nominal, finer, dict(truth))}
+    )
     ensemble = drawn(finer=lambda times: asked.append(times) or "fine")
-    ensemble.record({"T1.bend": 7.0}, (), np.random.default_rng(1), "case", links=2)
+    ensemble.simulate_recording({"T1.bend": 7.0}, (), np.random.default_rng(1), "case", links=2)
     nominal = ensemble.problem.system
     assert asked == [2]
     assert drawn.made[0]["system"] == "fine"
@@ -181,24 +191,27 @@ def test_a_finer_chain_moves_as_the_nominal_one_and_has_its_own_values(drawn, mo
 
 
 def of_category(ensemble, category, multiple=None):
-    return ensemble.draw(Planned(7, "one", category, multiple))
+    return ensemble.draw_case(PlannedCase(7, "one", category, multiple))
 
 
 @pytest.mark.parametrize("category", ["null", "finer_chain"])
 def test_clean_cases_have_nothing_injected(drawn, monkeypatch, category):
     ensemble = drawn(finer=lambda times: SimpleNamespace(fine=times))
-    monkeypatch.setattr(module, "finer_values", lambda *_: {})
+    monkeypatch.setattr(module, "finer_chain_parameters", lambda *_: {})
     case, told = of_category(ensemble, category)
     assert (told.injected, told.multiple, told.category) == ((), None, category)
     assert (case.name, told.case) == ("case_007", "case_007")
-    assert (case.estimate[0].name, case.held_out.name) == ("case_007_estimate_0", "case_007_held_out")
+    assert (case.estimation_recordings[0].name, case.held_out_recording.name) == (
+        "case_007_estimate_0",
+        "case_007_held_out",
+    )
     assert len(drawn.made) == 2
     assert drawn.made[0]["injected"] == drawn.made[1]["injected"] == ()
     assert drawn.made[0]["seed"] != drawn.made[1]["seed"]
     assert drawn.made[0]["motion"]["seed"] != drawn.made[1]["motion"]["seed"]
     fine = category == "finer_chain"
     assert (drawn.made[0]["system"] is not ensemble.problem.system) is fine
-    assert len(case.without) == 1
+    assert len(case.excluded_kinds) == 1
 
 
 def test_a_single_effect_is_in_both_recordings_and_some_other_kind_is_left_out(drawn, monkeypatch):
@@ -206,19 +219,19 @@ def test_a_single_effect_is_in_both_recordings_and_some_other_kind_is_left_out(d
     [injected] = told.injected
     assert [made["injected"] for made in drawn.made] == [(injected,)] * 2
     assert [made["truth"] for made in drawn.made] == [told.truth] * 2
-    assert case.without[0] not in (injected.kind, "")
+    assert case.excluded_kinds[0] not in (injected.kind, "")
     assert told.multiple is not None
 
 
 def test_a_left_out_effect_is_the_one_at_work(drawn, monkeypatch):
     case, told = of_category(drawn(), "left_out")
-    assert case.without == (told.injected[0].kind,)
+    assert case.excluded_kinds == (told.injected[0].kind,)
 
 
 def test_with_one_other_kind_none_is_left_out(drawn, monkeypatch):
     ensemble = drawn(candidates=(DAMPER, FRICTION))
-    assert of_category(ensemble, "single")[0].without == ()
-    assert of_category(ensemble, "null")[0].without[0] in ("kelvin_voigt", "joint_coulomb")
+    assert of_category(ensemble, "single")[0].excluded_kinds == ()
+    assert of_category(ensemble, "null")[0].excluded_kinds[0] in ("kelvin_voigt", "joint_coulomb")
 
 
 def test_a_pair_is_two_effects_of_the_largest_size(drawn, monkeypatch):
@@ -227,13 +240,13 @@ def test_a_pair_is_two_effects_of_the_largest_size(drawn, monkeypatch):
         _, told = of_category(ensemble, "pair")
         labels = [e.label for e in told.injected]
         assert len(set(labels)) == len(labels) <= 2
-    same, size = drawn(candidates=(DAMPER,))._injected(Planned(0, "one", "pair", 10.0), np.random.default_rng(1))
+    same, size = drawn(candidates=(DAMPER,))._injected(PlannedCase(0, "one", "pair", 10.0), np.random.default_rng(1))
     assert (len(same), size) == (1, pytest.approx(0.2 * 100 / 3.858))
 
 
 def test_outside_effects_are_in_no_library(drawn, monkeypatch):
     _, told = of_category(drawn(), "outside")
-    assert told.injected[0].kind in OUTSIDE
+    assert told.injected[0].kind in OUT_OF_LIBRARY_EFFECTS
     assert told.multiple is None
 
 
@@ -244,29 +257,29 @@ def test_a_motion_that_cannot_be_simulated_is_drawn_anew(drawn, monkeypatch):
     assert other.truth != told.truth
     assert case.name == again.name
     drawn.made.clear()
-    of_category(drawn(failures=DRAWS - 1), "null")
+    of_category(drawn(failures=MAX_CASE_DRAWS - 1), "null")
     drawn.made.clear()
     with pytest.raises(ModelError, match=r"none of 64 motions(.|\n)*case_\d+ of one(.|\n)*another --seed"):
-        of_category(drawn(failures=DRAWS), "null")
+        of_category(drawn(failures=MAX_CASE_DRAWS), "null")
 
 
 def test_a_case_is_the_same_whatever_was_drawn_before(drawn):
     ensemble = drawn()
-    wanted = [Planned(i, "one", "single", 3.0) for i in range(4)]
-    first = [ensemble.draw(entry)[1] for entry in wanted]
-    assert drawn().draw(wanted[3])[1] == first[3]
-    assert Label.from_dict(json.loads(json.dumps(first[3].to_dict()))) == first[3]
+    wanted = [PlannedCase(i, "one", "single", 3.0) for i in range(4)]
+    first = [ensemble.draw_case(entry)[1] for entry in wanted]
+    assert drawn().draw_case(wanted[3])[1] == first[3]
+    assert CaseLabel.from_dict(json.loads(json.dumps(first[3].to_dict()))) == first[3]
     assert first[3].experiment == "one"
     assert len({json.dumps(entry.truth) for entry in first}) == 4
-    assert drawn(seed=9).draw(wanted[3])[1].truth != first[3].truth
+    assert drawn(seed=9).draw_case(wanted[3])[1].truth != first[3].truth
     # an ensemble to calibrate by shares no case with the one that is reported
-    assert drawn(conditions=Conditions(purpose="calibration")).draw(wanted[3])[1].truth != first[3].truth
+    assert drawn(conditions=RecordingConditions(purpose="calibration")).draw_case(wanted[3])[1].truth != first[3].truth
 
 
 def test_an_experiment_has_its_recordings_noise_and_step(drawn):
-    noise, simulation = ArmNoise(effort=0.1), Simulation(time_step=5e-5)
-    case, _ = of_category(drawn(conditions=Conditions(3, noise, simulation)), "null")
-    assert [entry.name for entry in case.estimate] == [f"case_007_estimate_{i}" for i in range(3)]
+    noise, simulation = ArmSensorNoise(effort_std=0.1), SimulationOptions(time_step=5e-5)
+    case, _ = of_category(drawn(conditions=RecordingConditions(3, noise, simulation)), "null")
+    assert [entry.name for entry in case.estimation_recordings] == [f"case_007_estimate_{i}" for i in range(3)]
     assert len(drawn.made) == 4
     assert all((made["noise"], made["simulation"]) == (noise, simulation) for made in drawn.made)
     assert len({made["seed"] for made in drawn.made}) == 4
@@ -274,16 +287,18 @@ def test_an_experiment_has_its_recordings_noise_and_step(drawn):
 
 def test_what_is_detectable_survives_as_plain_data(drawn):
     ensemble = drawn()
-    told = json.loads(json.dumps([entry.to_dict() for entry in ensemble.detectable]))
+    told = json.loads(json.dumps([entry.to_dict() for entry in ensemble.detectable_effects]))
     other = drawn(seed=5)
-    other.knowing(told)
-    for one, two in zip(ensemble.detectable, other.detectable, strict=True):
-        assert (one.effect, one.shape) == (two.effect, two.shape)
-        np.testing.assert_array_equal(one.columns, two.columns)
+    other.load_detectable_effects(told)
+    for one, two in zip(ensemble.detectable_effects, other.detectable_effects, strict=True):
+        assert (one.effect, one.shape_values) == (two.effect, two.shape_values)
+        np.testing.assert_array_equal(one.sensitivity_factor, two.sensitivity_factor)
     # the size is that of the whole signature
     tall = signature(TILT, np.random.default_rng(0).normal(size=(50, 2)))
     way = np.array([0.3, -0.7])
-    assert np.linalg.norm(Detectable.of(tall).columns @ way) == pytest.approx(np.linalg.norm(tall.columns @ way))
+    assert np.linalg.norm(DetectableEffect.from_signature(tall).sensitivity_factor @ way) == pytest.approx(
+        np.linalg.norm(tall.projected_sensitivity @ way)
+    )
 
 
 # -- the plan ---------------------------------------------------------------------------------------------------------
@@ -300,7 +315,7 @@ def counted(plan, key):
 
 
 def test_every_sort_and_size_is_planned_and_spread_over_the_experiments():
-    plan = planned(300, 3, WEIGHTS, WHOLE)
+    plan = plan_cases(300, 3, WEIGHTS, WHOLE)
     assert [entry.number for entry in plan] == list(range(300))
     assert counted(plan, lambda e: e.category) == {
         "null": 60, "single": 144, "pair": 30, "outside": 30, "left_out": 18, "finer_chain": 18
@@ -315,25 +330,25 @@ def test_every_sort_and_size_is_planned_and_spread_over_the_experiments():
         assert all(abs(own[name] / total - part / 0.7) < 0.1 for name, part in WEIGHTS.items())
     assert {entry.experiment for entry in plan if entry.category == "finer_chain"} == WHOLE
     assert [entry.category for entry in plan] != sorted(entry.category for entry in plan)
-    assert plan == planned(300, 3, WEIGHTS, WHOLE)
-    assert plan != planned(300, 4, WEIGHTS, WHOLE)
-    assert plan != planned(300, 3, WEIGHTS, WHOLE, "calibration")
+    assert plan == plan_cases(300, 3, WEIGHTS, WHOLE)
+    assert plan != plan_cases(300, 4, WEIGHTS, WHOLE)
+    assert plan != plan_cases(300, 3, WEIGHTS, WHOLE, "calibration")
 
 
 def test_few_cases_have_few_experiments():
-    assert counted(planned(20, 1, WEIGHTS, WHOLE), lambda e: e.experiment).keys() == {"a", "b"}
-    assert counted(planned(2, 1, WEIGHTS, WHOLE), lambda e: e.experiment) == {"a": 2}
-    assert len(planned(1, 1, WEIGHTS)) == 1
+    assert counted(plan_cases(20, 1, WEIGHTS, WHOLE), lambda e: e.experiment).keys() == {"a", "b"}
+    assert counted(plan_cases(2, 1, WEIGHTS, WHOLE), lambda e: e.experiment) == {"a": 2}
+    assert len(plan_cases(1, 1, WEIGHTS)) == 1
 
 
 def test_an_object_without_links_has_single_effects_instead_of_finer_chains():
-    found = counted(planned(100, 1, {"bare": 1.0}), lambda e: e.category)
+    found = counted(plan_cases(100, 1, {"bare": 1.0}), lambda e: e.category)
     assert found == {"null": 20, "single": 54, "pair": 10, "outside": 10, "left_out": 6}
 
 
 def test_no_case_is_no_ensemble():
     with pytest.raises(ConfigError, match="0 cases"):
-        planned(0, 1, WEIGHTS)
+        plan_cases(0, 1, WEIGHTS)
 
 
 # -- sizes ------------------------------------------------------------------------------------------------------------
@@ -346,7 +361,7 @@ def test_no_case_is_no_ensemble():
 )
 def test_an_effect_is_so_many_times_its_detectable_size_or_as_large_as_expected(drawn, of, column, wanted, largest):
     ensemble = drawn()
-    columns = [[column]] if len(of.amplitudes) == 1 else [[0.6 * column, 0.8 * column]]
+    columns = [[column]] if len(of.amplitude_names) == 1 else [[0.6 * column, 0.8 * column]]
     for seed in range(5):
         found, multiple = ensemble._sized(signature(of, columns), np.random.default_rng(seed), wanted)
         values = np.array(list(found.values.values()))
@@ -380,8 +395,8 @@ def test_an_effect_that_nothing_sees_has_no_size(drawn):
 
 
 def test_what_is_detectable_is_a_threshold(monkeypatch, drawn):
-    monkeypatch.setattr(module, "chosen_effects", lambda *_: [DAMPER])
-    ensemble = Ensemble(problem(), 1, limits=Thresholds(detection=2.0))
+    monkeypatch.setattr(module, "make_candidate_effects", lambda *_: [DAMPER])
+    ensemble = CaseGenerator(problem(), 1, limits=Thresholds(detection_z=2.0))
     found, multiple = ensemble._sized(signature(DAMPER, [[100.0]]), np.random.default_rng(1), 3.0)
     assert found.values["tau"] == pytest.approx(0.06)
     assert multiple == pytest.approx(3.0)
@@ -427,11 +442,11 @@ def test_kinds_come_before_places(drawn):
 def test_single_effects_have_the_size_that_is_planned(drawn):
     ensemble = drawn(candidates=(SOLID, TILT))
     for size in (1.0, 3.0, 10.0):
-        wanted = Planned(0, "one", "single", size)
+        wanted = PlannedCase(0, "one", "single", size)
         sizes = [ensemble._injected(wanted, np.random.default_rng(seed))[1] for seed in range(30)]
         assert size in sizes
         assert max(sizes) <= size * (1 + 1e-12)
-    assert ensemble._injected(Planned(0, "one", "left_out", 10.0), np.random.default_rng(1))[1] >= 3.0
+    assert ensemble._injected(PlannedCase(0, "one", "left_out", 10.0), np.random.default_rng(1))[1] >= 3.0
 
 
 # -- outside the library ----------------------------------------------------------------------------------------------
@@ -440,7 +455,9 @@ def test_single_effects_have_the_size_that_is_planned(drawn):
 def test_effects_outside_the_library_have_the_size_of_what_they_act_on(drawn):
     ensemble = drawn()
     found = [ensemble._outside(np.random.default_rng(seed)) for seed in range(600)]
-    by_kind = {kind: [f for f in found if f.kind == kind] for kind in OUTSIDE if kind != "slipping_grasp"}
+    by_kind = {
+        kind: [f for f in found if f.kind == kind] for kind in OUT_OF_LIBRARY_EFFECTS if kind != "slipping_grasp"
+    }
     assert all(len(group) > 10 for group in by_kind.values())
     ripples = by_kind["torque_ripple"]
     assert {f.location for f in ripples} == {"s0"}, "the first half of the joints, rounded down"
@@ -467,13 +484,13 @@ def test_a_drive_saturates_at_a_part_of_the_torque_that_was_recorded(drawn):
 
 
 def test_every_effect_outside_the_library_has_a_size():
-    assert set(OUTSIDE_SIZES) == set(OUTSIDE)
+    assert set(_OUT_OF_LIBRARY_SIZES) == set(OUT_OF_LIBRARY_EFFECTS)
 
 
 def test_without_an_object_only_joints_misbehave(drawn):
     ensemble = drawn(of=system(segments=(), driven=("s0",)))
     found = {ensemble._outside(np.random.default_rng(seed)).label for seed in range(60)}
-    assert found == {f"{kind}@s0" for kind, (place, *_) in OUTSIDE_SIZES.items() if place == "joint"}
+    assert found == {f"{kind}@s0" for kind, (place, *_) in _OUT_OF_LIBRARY_SIZES.items() if place == "joint"}
 
 
 # -- finer chains -----------------------------------------------------------------------------------------------------
@@ -497,7 +514,9 @@ def test_a_finer_chain_has_springs_and_dampers_as_many_times_as_strong():
         T2_damping=1.0,
     )
     finer = chain({"T1": 8, "T2": 3}, T1_bend=20.0, T1_twist=5.0, T2_bend=6.0)
-    found = finer_values(nominal, finer, {"T1.bend": 12.0, "T1.twist": 3.0, "T2.bend": 7.0, "T2.damping": 2.0})
+    found = finer_chain_parameters(
+        nominal, finer, {"T1.bend": 12.0, "T1.twist": 3.0, "T2.bend": 7.0, "T2.damping": 2.0}
+    )
     assert found == {
         "T1.bend": 24.0,
         "T1.twist": 3.0,

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from yid_ocp.diagnosis import Thresholds
-from yid_ocp.diagnosis.blind import Label, calibrate, mark, opened_wide
-from yid_ocp.diagnosis.blind.calibrate import RULES, conformal
+from yid_ocp.diagnosis.blind import CaseLabel, calibrate_thresholds, permissive_thresholds, score_case
+from yid_ocp.diagnosis.blind.threshold_calibration import _CALIBRATION_RULES, _conformal_quantile
 from yid_ocp.virtual.injected import InjectedEffect
 
 DAMPER = InjectedEffect("kelvin_voigt", "T1", {"tau": 0.05})
@@ -23,20 +23,20 @@ def test_a_further_case_stays_below_the_quantile_as_often_as_is_said(n: int, cov
     kept = said = 0.0
     for _ in range(3000):
         *sample, another = rng.standard_exponential(n + 1)
-        value, said = conformal(sample, "most", coverage)
+        value, said = _conformal_quantile(sample, "most", coverage)
         kept += another <= value
     assert said >= coverage
     assert kept / 3000 == pytest.approx(said, abs=0.015)
 
 
 def test_too_few_cases_promise_less() -> None:
-    assert conformal([3.0, 1.0, 2.0], "most") == (3.0, 0.75)
-    assert conformal([3.0, 1.0, 2.0], "least") == (1.0, 0.75)
-    value, coverage = conformal([], "most")
+    assert _conformal_quantile([3.0, 1.0, 2.0], "most") == (3.0, 0.75)
+    assert _conformal_quantile([3.0, 1.0, 2.0], "least") == (1.0, 0.75)
+    value, coverage = _conformal_quantile([], "most")
     assert (math.isnan(value), coverage) == (True, 0.0)
     # of forty the second largest is enough, of nineteen the largest
-    assert conformal(list(range(40)), "most") == (38, 39 / 41)
-    assert conformal(list(range(40)), "least") == (1, 39 / 41)
+    assert _conformal_quantile(list(range(40)), "most") == (38, 39 / 41)
+    assert _conformal_quantile(list(range(40)), "least") == (1, 39 / 41)
 
 
 STATISTICS = {
@@ -54,7 +54,7 @@ STATISTICS = {
 
 
 def case(category: str, verdict: str, *effects: InjectedEffect, multiple: float | None = None, **said: Any) -> Any:
-    label = Label("case_000", category, effects, multiple, {})
+    label = CaseLabel("case_000", category, effects, multiple, {})
     named = [{"kind": effect.kind, "location": effect.location} for effect in effects] if verdict == "effect" else []
     result = {
         "verdict": verdict,
@@ -65,12 +65,12 @@ def case(category: str, verdict: str, *effects: InjectedEffect, multiple: float 
         "gap": {"closure": None},
         "statistics": STATISTICS | said.pop("statistics", {}),
     }
-    return label, mark(label, result), {"result": result, **said}
+    return label, score_case(label, result), {"result": result, **said}
 
 
 def calibrated(*cases: Any) -> dict[str, Any]:
     labels, marks, answers = zip(*cases, strict=True)
-    return json.loads(json.dumps(calibrate(labels, marks, answers)))["rules"]
+    return json.loads(json.dumps(calibrate_thresholds(labels, marks, answers)))["rules"]
 
 
 def test_clean_recordings_set_what_chance_may_reach() -> None:
@@ -94,7 +94,7 @@ def test_clean_recordings_set_what_chance_may_reach() -> None:
     assert evidence["sample"] == [None, None, 2.0, 7.0]
     assert {size: entry["count"] for size, entry in evidence["effects_beyond"].items()} == {"0.1": 0, "1": 1}
     assert (evidence["strange_beyond"]["count"], evidence["strange_beyond"]["of"]) == (0, 1)
-    assert evidence["is"] == Thresholds().worth
+    assert evidence["is"] == Thresholds().min_log_bayes_factor
     # a residual that is not significant is none, however large
     assert found["gap"]["sample"][-2:] == [pytest.approx(0.04), pytest.approx(0.2)]
     assert found["channel"]["sample"] == [None, None, None, pytest.approx(0.15)]
@@ -106,11 +106,11 @@ def test_a_candidate_is_surer_than_any_of_clean_recordings() -> None:
     clean = [case("null", "no_gap", open=STATISTICS | {"candidate": p}) for p in (0.4, 2.345e-5, 3e-3)]
     effects = [case("single", "effect", DAMPER, multiple=3.0, statistics={"candidate": p}) for p in (1e-9, 1e-3)]
     labels, marks, answers = zip(*clean, *effects, strict=True)
-    found = calibrate(labels, marks, answers)
+    found = calibrate_thresholds(labels, marks, answers)
     assert found["rules"]["candidate"]["quantile"] == 2.345e-5
     assert found["rules"]["candidate"]["effects_beyond"]["3"]["count"] == 1
     assert found["settings"]["candidate_level"] == 2.3e-5
-    few = calibrate(labels[:1], marks[:1], answers[:1])
+    few = calibrate_thresholds(labels[:1], marks[:1], answers[:1])
     assert few["settings"]["candidate_level"] == 1e-4, "no less sure than odds that convince"
 
 
@@ -167,7 +167,7 @@ def test_settings_are_quantiles_within_what_is_of_use(
     clean = case("null", "no_gap", open=STATISTICS | {"evidence": evidence})
     named = case("single", "effect", DAMPER, multiple=3.0, statistics={"explained": explained})
     labels, marks, answers = zip(clean, named, strict=True)
-    settings = calibrate(labels, marks, answers)["settings"]
+    settings = calibrate_thresholds(labels, marks, answers)["settings"]
     assert (settings["worth"], settings["explained"]) == (worth, asked)
 
 
@@ -177,7 +177,7 @@ def test_of_two_rules_for_one_setting_the_wider_counts() -> None:
     behind = {"a@b": same | {"squares": -4.0}, "kelvin_voigt@T1": same | {"squares": 14.0}}
     true = case("single", "effect", DAMPER, multiple=3.0, statistics={"behind": behind})
     labels, marks, answers = zip(clean, true, strict=True)
-    assert calibrate(labels, marks, answers)["settings"]["worth"] == 9.0
+    assert calibrate_thresholds(labels, marks, answers)["settings"]["worth"] == 9.0
 
 
 def test_cases_that_could_not_be_fitted_do_not_count() -> None:
@@ -189,8 +189,8 @@ def test_cases_that_could_not_be_fitted_do_not_count() -> None:
 
 
 def test_every_rule_is_of_a_threshold() -> None:
-    for rule in RULES.values():
+    for rule in _CALIBRATION_RULES.values():
         assert hasattr(Thresholds(), rule.setting)
-    wide = opened_wide(Thresholds(refits=3))
-    assert wide.refits == 3
-    assert wide.level > 1 > Thresholds().level
+    wide = permissive_thresholds(Thresholds(n_refit_per_round=3))
+    assert wide.n_refit_per_round == 3
+    assert wide.significance_level > 1 > Thresholds().significance_level

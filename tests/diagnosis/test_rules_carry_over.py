@@ -7,12 +7,17 @@ import math
 import pytest
 from factories import amplitude, carried, effect, fit, shape
 
-from yid_ocp.diagnosis import carry_over
-from yid_ocp.diagnosis.carry_over import carried_over, compared, counting_both, disagreeing
-from yid_ocp.diagnosis.hypotheses import CandidateProblem
-from yid_ocp.diagnosis.refit import Search
+from yid_ocp.diagnosis import transfer_check
+from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
+from yid_ocp.diagnosis.refit import RefitContext
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.progress import SILENT
+from yid_ocp.diagnosis.transfer_check import (
+    _compare_amplitudes,
+    check_transfer,
+    failed_transfer_checks,
+    inflate_std_by_disagreement,
+)
+from yid_ocp.progress import NULL_PROGRESS
 
 SPRING = effect("spring@elbow", amplitude("k", lower=-9.0, expected=(0.0, 10.0)), shape("s"))
 SHIFT = effect(
@@ -47,25 +52,25 @@ def of(label, values, stds, effects=(SPRING,)):
 )
 def test_values_agree_within_their_errors_or_a_part_of_their_size(first, second, agrees):
     one, other = (of("spring@elbow", {"k": value}, {"k": std}) for value, std in (first, second))
-    [entry] = compared(SPRING, one, other, Thresholds(carried_stds=3.3))
-    assert entry.agrees is agrees
-    assert (entry.effect, entry.name, entry.unit) == ("spring@elbow", "k", "N m")
-    assert (entry.value, entry.again) == (first[0], second[0])
-    assert (entry.std, entry.again_std) == pytest.approx((first[1], second[1]), nan_ok=True)
+    [entry] = _compare_amplitudes(SPRING, one, other, Thresholds(transfer_z_max=3.3))
+    assert entry.is_consistent is agrees
+    assert (entry.effect_label, entry.parameter, entry.unit) == ("spring@elbow", "k", "N m")
+    assert (entry.estimation_value, entry.held_out_value) == (first[0], second[0])
+    assert (entry.estimation_std, entry.held_out_std) == pytest.approx((first[1], second[1]), nan_ok=True)
 
 
 def test_how_far_they_may_differ_is_two_thresholds():
     one, other = (of("spring@elbow", {"k": v}, {"k": 0.01}) for v in (10.0, 6.9))
-    assert compared(SPRING, one, other, Thresholds(carried=0.32))[0].agrees
-    assert compared(SPRING, one, other, Thresholds(carried_stds=250.0))[0].agrees
+    assert _compare_amplitudes(SPRING, one, other, Thresholds(transfer_rtol=0.32))[0].is_consistent
+    assert _compare_amplitudes(SPRING, one, other, Thresholds(transfer_z_max=250.0))[0].is_consistent
 
 
 def test_a_small_part_of_a_vector_may_differ_by_a_part_of_the_whole():
     stds = {"x": 1e-3, "y": 1e-3}
     one, other = (of("shift@grasp", values, stds, (SHIFT,)) for values in ({"x": 1.0, "y": 0.1}, {"x": 1.0, "y": -0.1}))
-    assert [entry.agrees for entry in compared(SHIFT, one, other)] == [True, True]
+    assert [entry.is_consistent for entry in _compare_amplitudes(SHIFT, one, other)] == [True, True]
     far = of("shift@grasp", {"x": 1.0, "y": -0.3}, stds, (SHIFT,))
-    assert [entry.agrees for entry in compared(SHIFT, one, far)] == [True, False]
+    assert [entry.is_consistent for entry in _compare_amplitudes(SHIFT, one, far)] == [True, False]
 
 
 @pytest.mark.parametrize(
@@ -82,17 +87,17 @@ def test_a_small_part_of_a_vector_may_differ_by_a_part_of_the_whole():
 )
 def test_standard_deviations_count_how_far_two_sets_of_recordings_are_apart(first, second, std):
     one, other = (of("spring@elbow", {"k": value, "s": 3.0}, {"k": size}) for value, size in (first, second))
-    counted = counting_both(one, compared(SPRING, one, other))
+    counted = inflate_std_by_disagreement(one, _compare_amplitudes(SPRING, one, other))
     assert counted.std == one.std | {"spring@elbow.k": pytest.approx(std)}
     assert counted.values == one.values
-    again = counting_both(other, compared(SPRING, other, one))
+    again = inflate_std_by_disagreement(other, _compare_amplitudes(SPRING, other, one))
     reach = 2 * (counted.std["spring@elbow.k"] + again.std["spring@elbow.k"])
     assert not abs(first[0] - second[0]) > reach  # their intervals overlap
 
 
 def test_those_that_do_not_carry_over_are_told():
     entries = (carried(agrees=True), carried(name="b"))
-    assert disagreeing(entries) == entries[1:]
+    assert failed_transfer_checks(entries) == entries[1:]
 
 
 class Problem:
@@ -116,10 +121,10 @@ def test_the_held_out_recordings_are_fitted_with_the_same_effects(monkeypatch):
         asked.append((problem.problem.episodes, problem.problem.held_out, effects, dict(start), store, name, limits))
         return again
 
-    monkeypatch.setattr(carry_over, "refit", refitted)
-    search = Search(CandidateProblem(Problem(), (SPRING,), False), Thresholds(), SILENT, "store")
-    [entry] = carried_over(search, first)
-    assert (entry.value, entry.again, entry.agrees) == (2.0, 7.0, False)
+    monkeypatch.setattr(transfer_check, "refit_with_effects", refitted)
+    search = RefitContext(AllCandidatesProblem(Problem(), (SPRING,), False), Thresholds(), NULL_PROGRESS, "store")
+    [entry] = check_transfer(search, first)
+    assert (entry.estimation_value, entry.held_out_value, entry.is_consistent) == (2.0, 7.0, False)
     [(episodes, held_out, effects, start, store, name, limits)] = asked
     assert (episodes, held_out, effects, store, limits) == (("other",), ("own",), (SPRING,), "store", Thresholds())
     assert start == {"k": 3.0, "spring@elbow.k": 2.0, "spring@elbow.s": 0.5}, "no start of a single recording"
@@ -128,26 +133,28 @@ def test_the_held_out_recordings_are_fitted_with_the_same_effects(monkeypatch):
 
 @pytest.mark.parametrize(("blocks", "effects"), [(True, (SPRING,)), (False, ())], ids=["in blocks", "no effect"])
 def test_nothing_is_compared_where_there_is_nothing_to_compare(monkeypatch, blocks, effects):
-    monkeypatch.setattr(carry_over, "refit", lambda *_: pytest.fail("not asked for"))
-    search = Search(CandidateProblem(Problem(), (SPRING,), blocks), Thresholds(), SILENT)
-    assert carried_over(search, fit(effects)) == ()
+    monkeypatch.setattr(transfer_check, "refit_with_effects", lambda *_: pytest.fail("not asked for"))
+    search = RefitContext(AllCandidatesProblem(Problem(), (SPRING,), blocks), Thresholds(), NULL_PROGRESS)
+    assert check_transfer(search, fit(effects)) == ()
 
 
 def test_a_model_that_cannot_be_fitted_there_is_no_evidence(monkeypatch):
-    monkeypatch.setattr(carry_over, "refit", lambda *_: None)
-    search = Search(CandidateProblem(Problem(), (SPRING,), False), Thresholds(), SILENT)
-    assert carried_over(search, fit([SPRING])) == ()
+    monkeypatch.setattr(transfer_check, "refit_with_effects", lambda *_: None)
+    search = RefitContext(AllCandidatesProblem(Problem(), (SPRING,), False), Thresholds(), NULL_PROGRESS)
+    assert check_transfer(search, fit([SPRING])) == ()
 
 
 def test_noise_that_drives_the_motion_weighs_there_too(monkeypatch):
     problem = Problem(disturbed=True)
     seen = []
-    composed = CandidateProblem(problem, (SPRING,), False)
-    monkeypatch.setattr(CandidateProblem, "weighted_at", lambda self, values: seen.append(dict(values)) or "weighted")
-    monkeypatch.setattr(CandidateProblem, "nominal", ("k",), raising=False)
-    monkeypatch.setattr(carry_over, "_shared", lambda turned, fitted: {})
+    composed = AllCandidatesProblem(problem, (SPRING,), False)
+    monkeypatch.setattr(
+        AllCandidatesProblem, "whitened_at", lambda self, values: seen.append(dict(values)) or "weighted"
+    )
+    monkeypatch.setattr(AllCandidatesProblem, "nominal_parameters", ("k",), raising=False)
+    monkeypatch.setattr(transfer_check, "_shared", lambda turned, fitted: {})
     asked = []
-    monkeypatch.setattr(carry_over, "refit", lambda problem, *_: asked.append(problem))
-    carried_over(Search(composed, Thresholds(), SILENT), fit([SPRING], values={"k": 4.0}))
+    monkeypatch.setattr(transfer_check, "refit_with_effects", lambda problem, *_: asked.append(problem))
+    check_transfer(RefitContext(composed, Thresholds(), NULL_PROGRESS), fit([SPRING], values={"k": 4.0}))
     assert asked == ["weighted"]
     assert seen[0]["k"] == 4.0

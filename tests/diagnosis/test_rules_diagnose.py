@@ -29,11 +29,11 @@ from factories import (
 from heard import Heard
 from made_series import series
 
-from yid_ocp.diagnosis.earlier import Earlier
-from yid_ocp.diagnosis.events import NOTHING, Event, Events
-from yid_ocp.diagnosis.hypotheses import CandidateProblem
-from yid_ocp.diagnosis.refit import Search
-from yid_ocp.diagnosis.screening import Screened, together
+from yid_ocp.diagnosis.baseline_data import BaselineData
+from yid_ocp.diagnosis.events import NO_EVENTS, DisturbanceEvent, EventSet
+from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
+from yid_ocp.diagnosis.refit import RefitContext
+from yid_ocp.diagnosis.screening import ScreeningResult, score_jointly
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import DataError, SolverError
 from yid_ocp.solvers import GaussNewton
@@ -90,10 +90,10 @@ def solution(value=2.0, evaluated=True):
 )
 def test_the_nominal_fit_begins_at_the_solution_of_all_data(nominal, blocks, given, solved, start):
     nominal.found = solution(3.0)
-    composed, limits = SimpleNamespace(blocks=blocks, problem=CALM), Thresholds(poor=2.0)
+    composed, limits = SimpleNamespace(blocks=blocks, problem=CALM), Thresholds(restart_chi2=2.0)
     assert module.nominal_fit("problem", composed, given, "store", limits) is nominal.outcome
     assert nominal.starts == [(composed, (), start, "store", limits)]
-    assert nominal.solved == [("problem", GaussNewton(iterations=30))][:solved]
+    assert nominal.solved == [("problem", GaussNewton(max_iterations=30))][:solved]
 
 
 def test_where_the_solution_cannot_be_rolled_out_again_the_fit_begins_at_the_start(nominal):
@@ -134,9 +134,9 @@ def test_the_largest_angles_are_those_of_a_segments_joints_in_all_recordings():
 def test_the_test_on_the_fits_data_leaves_out_what_parameters_took(monkeypatch):
     monkeypatch.setattr(module, "residual_series", lambda problem: [series(range(5))] if problem == "problem" else [])
     fitted = SimpleNamespace(problem="problem", evaluation=evaluation([2.0] * 5), values={"k": 1.0, "l": 1.0})
-    found = module.fitted_test(fitted, Thresholds(window=0.02))
+    found = module.fitted_test(fitted, Thresholds(residual_window=0.02))
     assert found.chi2_per_dof == pytest.approx(20 / 3)
-    assert found.degrees == 3.0
+    assert found.degrees_of_freedom == 3.0
     assert len(found.windows) == 3
 
 
@@ -146,7 +146,7 @@ def test_held_out_data_are_tested_without_any_fit(monkeypatch):
     problem = measured.predicted([[2.0], [4.0], [9.0]])
     found = module.held_out_test(SimpleNamespace(problem=problem, values={"k": 5.0}, evaluation=None), Thresholds())
     assert found.chi2_per_dof == pytest.approx((4.0 + 36.0) / 2)
-    assert found.degrees == 2.0
+    assert found.degrees_of_freedom == 2.0
     assert problem.asked == [{"k": 5.0}]
 
 
@@ -238,7 +238,7 @@ def test_a_gap_that_is_left_is_located_again(left):
 
 
 def test_channels_above_noise_are_no_gap_without_a_candidate_or_a_sure_excess(left):
-    left.fitted = left.held = outcome(p=0.3, chi2=1.02, channels={"a": 1.3, "b": 0.9})
+    left.with_fitted_initial_state = left.held = outcome(p=0.3, chi2=1.02, channels={"a": 1.3, "b": 0.9})
     assert after((added(FRICTION),))[1][2] == ()
     assert left.smoothed == []
 
@@ -253,7 +253,7 @@ class Steps:
         self.given = {
             "before": outcome(p=1e-9, chi2=2.0, degrees=100.0),
             "held": outcome(p=1e-9, chi2=2.0),
-            "screened": Screened(
+            "screened": ScreeningResult(
                 (visible(FRICTION), visible(OFFSET, seen=False)), (score(FRICTION, p=1e-9),), TABLE, ALONE
             ),
             "smoothed": SEEN,
@@ -262,7 +262,7 @@ class Steps:
             "disturbed": False,
             "elsewhere": None,
             "carried": (),
-            "events": [NOTHING],
+            "events": [NO_EVENTS],
             "smoothed_for_events": None,
         } | given
         self.taken, self.heard = [], Heard()
@@ -308,9 +308,9 @@ class Steps:
         held = (SimpleNamespace(name="other"),)
         self.effects = [Remembering("friction@elbow"), Remembering("offset@wrist")]
         self.nominal.problem.held_out = held
-        self.composed = CandidateProblem("problem", tuple(self.effects), self.given["blocks"])
-        search = Search(self.composed, Thresholds(**limits), self.heard, "store")
-        return module._diagnosed("problem", search, "solution", module._Clock(), Earlier.of((), ()))
+        self.composed = AllCandidatesProblem("problem", tuple(self.effects), self.given["blocks"])
+        search = RefitContext(self.composed, Thresholds(**limits), self.heard, "store")
+        return module._diagnosed("problem", search, "solution", module._Clock(), BaselineData.from_runs((), ()))
 
 
 class Remembering:
@@ -326,7 +326,7 @@ class Remembering:
 
 
 TABLE = alike([FRICTION.label], [[1.0]])
-ALONE = together(point([0.0]))
+ALONE = score_jointly(point([0.0]))
 VALUES = {"k": 1.0, "l": 1.0}
 UNIT = SimpleNamespace(unit="N m/rad")
 SYSTEM = SimpleNamespace(parameters={"k": UNIT, "l": UNIT})
@@ -347,7 +347,7 @@ def test_a_gap_is_screened_located_and_closed(monkeypatch):
     assert found.closure.value == pytest.approx(1 - 0.05 / 1.05)
     assert (found.added, found.fits[0]) == (steps.given["added"], steps.given["added"][0].fit)
     assert found.held_out == ("other",)
-    assert found.absorbed[0].before == 1.0
+    assert found.nominal_changes[0].before == 1.0
     assert found.summary.startswith("The gap is real")
     stages = ["nominal", "events", "screening", "other_starts", "localisation", "refits", "carry_over", "remaining"]
     assert list(found.seconds) == stages
@@ -360,7 +360,7 @@ NOISE = {"before": outcome(p=0.4, degrees=100.0), "held": outcome(p=0.5)}
 FAINT = {"before": outcome(p=0.003, chi2=1.2, degrees=100.0), "held": outcome(p=0.5)}
 SLIGHT = {"before": outcome(p=1e-9, chi2=1.09, degrees=100.0)}
 LARGE = smoothed({FORCE: 9.0}, chi2=(500.0, 100.0))
-HARMLESS = Screened((visible(FRICTION),), (score(FRICTION, p=0.6),), TABLE, ALONE)
+HARMLESS = ScreeningResult((visible(FRICTION),), (score(FRICTION, p=0.6),), TABLE, ALONE)
 
 
 @pytest.mark.parametrize(
@@ -372,7 +372,7 @@ HARMLESS = Screened((visible(FRICTION),), (score(FRICTION, p=0.6),), TABLE, ALON
         (FAINT | {"screened": HARMLESS}, ["nominal", "screen", "smooth", "compose"], "effect"),
         ({"before": outcome(p=1e-9, chi2=2.0, degrees=5.9)}, ["nominal", "screen"], "insufficient_data"),
         ({"before": outcome(p=1e-9, chi2=2.0, degrees=6.0)}, ["nominal", "screen", "smooth", "compose"], "effect"),
-        ({"screened": Screened((), (), TABLE, ALONE)}, ["nominal", "screen", "smooth"], "insufficient_data"),
+        ({"screened": ScreeningResult((), (), TABLE, ALONE)}, ["nominal", "screen", "smooth"], "insufficient_data"),
         ({"added": ()}, ["nominal", "screen", "smooth", "compose"], "unknown"),
         # where noise drives the motion the smoother's word does not count
         (FAINT | {"screened": HARMLESS, "disturbed": True}, ["nominal", "screen", "smooth"], "no_gap"),
@@ -408,7 +408,7 @@ def test_what_leads_to_which_step(monkeypatch, given, taken, verdict):
     assert (steps.names, found.verdict) == (taken, verdict)
     if verdict not in ("effect", "confusable"):
         assert found.remaining is steps.given["held"]
-        assert found.absorbed[0].after == found.absorbed[0].before == 1.0
+        assert found.nominal_changes[0].after == found.nominal_changes[0].before == 1.0
         assert found.effects == ()
     if not found.added:
         assert math.isnan(found.closure.value)
@@ -446,7 +446,7 @@ class Valleys:
         return None if cost is None else fit(cost=cost, values=start)
 
     def other(self):
-        search = Search(SimpleNamespace(problem=self.problem), Thresholds(), Heard(), "store")
+        search = RefitContext(SimpleNamespace(problem=self.problem), Thresholds(), Heard(), "store")
         return module.elsewhere(search, fit(cost=100.0, values={"k": 2.0, "l": -1.0}))
 
 
@@ -475,17 +475,17 @@ def test_an_effect_that_is_accepted_is_where_the_gap_was(monkeypatch):
     steps.given["added"][0].fit.std.update({"k": 0.5})
     found = steps.run()
     assert found.where[0] == place("elbow", found.where[0].share)
-    assert (found.absorbed[0].after, found.absorbed[0].std) == (2.0, 0.5)
-    assert found.in_blocks
+    assert (found.nominal_changes[0].after, found.nominal_changes[0].std) == (2.0, 0.5)
+    assert found.is_split_in_blocks
     assert found.next_experiment.startswith("Repeat")
 
 
 def happening(begin, channel="elbow"):
-    return Event("run", channel, channel, "force", begin, begin + 0.4, 0.5, 0.1, 0.01, "N m")
+    return DisturbanceEvent("run", channel, channel, "force", begin, begin + 0.4, 0.5, 0.1, 0.01, "N m")
 
 
 def test_what_events_explain_is_taken_out_before_the_rest_is_judged(monkeypatch):
-    events = Events((happening(1.0),))
+    events = EventSet((happening(1.0),))
     steps = Steps(monkeypatch, events=[events, events])
     found = steps.run()
     name, (composed, start, store, label, _) = steps.taken[1]
@@ -501,10 +501,10 @@ def test_where_nothing_happened_the_smoother_is_not_run_twice(monkeypatch):
     assert steps.run().smoothed is SEEN
     assert "smooth" not in steps.names
     # a recording in blocks was smoothed whole, one with events before they were taken out, another fit not at all
-    events = Events((happening(1.0),))
+    events = EventSet((happening(1.0),))
     other = fit(lost=loss(2.0, 2.1), cost=90.0, values=VALUES)
     before = outcome(p=1e-9, chi2=1.05, degrees=100.0)
-    for given in ({"blocks": True}, {"events": [events, NOTHING]}, {"elsewhere": other, "before": before}):
+    for given in ({"blocks": True}, {"events": [events, NO_EVENTS]}, {"elsewhere": other, "before": before}):
         steps = Steps(monkeypatch, smoothed_for_events=SEEN, **given)
         if "elsewhere" in given:
             object.__setattr__(other, "problem", steps.nominal.problem)
@@ -514,7 +514,7 @@ def test_where_nothing_happened_the_smoother_is_not_run_twice(monkeypatch):
 
 
 def test_events_are_sought_again_about_the_fit_without_them_until_they_stay(monkeypatch):
-    first, more = Events((happening(1.0),)), Events((happening(1.0), happening(3.0, "shoulder")))
+    first, more = EventSet((happening(1.0),)), EventSet((happening(1.0), happening(3.0, "shoulder")))
     steps = Steps(monkeypatch, events=[first, more, more])
     assert steps.run().events is more
     cleaned = [given[0].problem for name, given in steps.taken if name == "settled"]
@@ -522,8 +522,8 @@ def test_events_are_sought_again_about_the_fit_without_them_until_they_stay(monk
 
 
 def test_what_the_accepted_effects_explain_was_no_event(monkeypatch):
-    events = Events((happening(1.0),))
-    steps = Steps(monkeypatch, events=[events, events, NOTHING])
+    events = EventSet((happening(1.0),))
+    steps = Steps(monkeypatch, events=[events, events, NO_EVENTS])
     found = steps.run()
     assert found.verdict == "effect"
-    assert found.events is NOTHING
+    assert found.events is NO_EVENTS

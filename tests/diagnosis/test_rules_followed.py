@@ -12,8 +12,8 @@ from factories import fit, loss
 from heard import Heard
 
 from yid_ocp.diagnosis import hypotheses
-from yid_ocp.diagnosis.hypotheses import CandidateProblem, Cut
-from yid_ocp.diagnosis.refit import Search
+from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, TruncatedRecording
+from yid_ocp.diagnosis.refit import RefitContext
 from yid_ocp.diagnosis.thresholds import Thresholds
 
 module = importlib.import_module("yid_ocp.diagnosis.diagnose")
@@ -52,12 +52,12 @@ class Problem:
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
-    monkeypatch.setattr(hypotheses, "beginning", lambda episode, steps: replace(episode, steps=steps))
+    monkeypatch.setattr(hypotheses, "truncate_episode", lambda episode, steps: replace(episode, steps=steps))
     monkeypatch.setattr(hypotheses, "_in_blocks", lambda problem: replace(problem, held_out=("blocks",)))
 
 
 def followed(*held, margin=0.9):
-    return CandidateProblem(Problem(held_out=held), (), False).followed({}, margin)
+    return AllCandidatesProblem(Problem(held_out=held), (), False).truncate_held_out({}, margin)
 
 
 def test_what_is_followed_to_its_end_stays():
@@ -73,14 +73,14 @@ def test_what_is_lost_on_the_way_is_compared_until_shortly_before():
     assert kept == whole
     # found to a sixty-fourth of 500 steps, less a tenth
     assert 0.9 * (300 - 8) - 1 <= cut_short.steps <= 0.9 * 300
-    assert cut == Cut("b", cut_short.steps * 0.01, 5.0)
+    assert cut == TruncatedRecording("b", cut_short.steps * 0.01, 5.0)
     assert not composed.blocks
 
 
 def test_too_short_a_beginning_is_left_out():
     composed, cuts = followed(Held("a", 500), Held("b", 500, until=100))
     assert composed.problem.held_out == (Held("a", 500),)
-    assert cuts == (Cut("b", 0.0, 5.0),)
+    assert cuts == (TruncatedRecording("b", 0.0, 5.0),)
     barely, _ = followed(Held("a", 500), Held("b", 500, until=130))
     assert len(barely.problem.held_out) == 2
 
@@ -89,7 +89,7 @@ def test_where_nothing_is_left_the_other_recordings_are_split():
     composed, cuts = followed(Held("b", 500, until=50))
     assert composed.blocks
     assert composed.problem.held_out == ("blocks",)
-    assert cuts == (Cut("b", 0.0, 5.0),)
+    assert cuts == (TruncatedRecording("b", 0.0, 5.0),)
 
 
 def test_with_no_margin_nothing_of_it_is_kept():
@@ -106,13 +106,13 @@ def run(monkeypatch, *losses, before=()):
 
     def cut(self, values, margin):
         margins.append(margin)
-        return replace(self, problem=f"cut {margin}"), (Cut("b", 5 * margin, 5.0),)
+        return replace(self, problem=f"cut {margin}"), (TruncatedRecording("b", 5 * margin, 5.0),)
 
-    monkeypatch.setattr(CandidateProblem, "followed", cut)
+    monkeypatch.setattr(AllCandidatesProblem, "truncate_held_out", cut)
     monkeypatch.setattr(
         module, "_settled", lambda composed, *_: todo and fit(lost=loss(todo.pop(0)), problem=composed.problem)
     )
-    search = Search(CandidateProblem("whole", (), False), Thresholds(), heard)
+    search = RefitContext(AllCandidatesProblem("whole", (), False), Thresholds(), heard)
     first = fit(lost=loss(todo.pop(0)), problem="whole")
     return (*module._followed(search, first, before), margins, heard.stages)
 
@@ -125,11 +125,11 @@ def test_a_model_that_follows_everything_is_left_alone(monkeypatch):
 def test_recordings_are_cut_until_the_model_follows(monkeypatch):
     search, nominal, cuts, margins, said = run(monkeypatch, math.inf, math.inf, 7.0)
     assert (search.problem.problem, nominal.loss.mean, margins) == ("cut 0.5", 7.0, [0.9, 0.5])
-    assert cuts == (Cut("b", 2.5, 5.0),), "the last cut of a recording counts"
+    assert cuts == (TruncatedRecording("b", 2.5, 5.0),), "the last cut of a recording counts"
     assert said[0] == "The nominal model follows b for 4.5 of 5 s only; the rest is left out."
 
 
 def test_cuts_of_an_earlier_round_stay(monkeypatch):
-    known = (Cut("a", 1.0, 5.0), Cut("b", 4.0, 5.0))
+    known = (TruncatedRecording("a", 1.0, 5.0), TruncatedRecording("b", 4.0, 5.0))
     *_, cuts, _, _ = run(monkeypatch, math.inf, 7.0, before=known)
-    assert cuts == (Cut("a", 1.0, 5.0), Cut("b", 4.5, 5.0))
+    assert cuts == (TruncatedRecording("a", 1.0, 5.0), TruncatedRecording("b", 4.5, 5.0))

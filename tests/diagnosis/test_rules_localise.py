@@ -9,14 +9,20 @@ import numpy as np
 import pytest
 from factories import BIAS, FORCE, OFFSET, OTHER_FORCE, place, smoothed, trace
 
-from yid_ocp.diagnosis.localise import attributed, informed_map, localise, merged, units
-from yid_ocp.diagnosis.smoother_model import Source
+from yid_ocp.diagnosis.localise import (
+    attribute_gap_to_effects,
+    informed_z_scores,
+    localise_gap,
+    merge_intervals,
+    unknown_units,
+)
+from yid_ocp.diagnosis.smoother_model import UnknownGroup
 
-TWIST = Source("T1", "bias")
+TWIST = UnknownGroup("T1", "bias")
 
 
 def described(places):
-    return [(p.location, pytest.approx(p.share), p.observable) for p in places]
+    return [(p.location, pytest.approx(p.gap_share), p.is_observable) for p in places]
 
 
 @pytest.mark.parametrize(
@@ -44,7 +50,7 @@ def described(places):
 )
 def test_places_share_the_gap_by_their_evidence(weight, detectable, expected):
     found = smoothed(weight, detectable=dict.fromkeys(weight, 0.5) | detectable)
-    assert described(localise(found)) == expected
+    assert described(localise_gap(found)) == expected
 
 
 def test_a_gap_is_there_when_an_unknown_is_surely_not_zero():
@@ -52,18 +58,20 @@ def test_a_gap_is_there_when_an_unknown_is_surely_not_zero():
         trace([FORCE, OTHER_FORCE], [[3.1, 0.0], [-3.1, 0.0], [2.9, 9.0], [3.1, 0.0]], np.ones((4, 2))),
         trace([OTHER_FORCE], [[0.0], [9.0]], np.ones((2, 1)), recording="second"),
     ]
-    found = {p.location: p.windows for p in localise(smoothed({FORCE: 3.0, OTHER_FORCE: 1.0}, traces=traces))}
+    found = {p.location: p.time_windows for p in localise_gap(smoothed({FORCE: 3.0, OTHER_FORCE: 1.0}, traces=traces))}
     assert found == {"T1": ((0.0, 1.0), (1.5, 2.0)), "T2": ((0.5, 1.5),)}
-    strict = {p.location: p.windows for p in localise(smoothed({FORCE: 3.0, OTHER_FORCE: 1.0}, traces=traces), 5.0)}
+    strict = {
+        p.location: p.time_windows for p in localise_gap(smoothed({FORCE: 3.0, OTHER_FORCE: 1.0}, traces=traces), 5.0)
+    }
     assert strict == {"T1": (), "T2": ((0.5, 1.5),)}
 
 
 def test_any_unknown_of_a_place_tells_when_but_only_groups_at_work():
     traces = [trace([FORCE, FORCE, TWIST], [[9.0, 0.0, 0.0], [0.0, 9.0, 0.0], [0.0, 0.0, 9.0]], np.ones((3, 3)))]
     found = smoothed({FORCE: 3.0, TWIST: 1.0}, variance={FORCE: 1.0, TWIST: 0.0}, traces=traces)
-    assert localise(found)[0].windows == ((0.0, 1.0),)
+    assert localise_gap(found)[0].time_windows == ((0.0, 1.0),)
     tiny = [trace([FORCE], [[1e-13], [1e-11]], np.zeros((2, 1)))]
-    assert localise(smoothed({FORCE: 1.0}, traces=tiny))[0].windows == ((0.5, 1.0),)
+    assert localise_gap(smoothed({FORCE: 1.0}, traces=tiny))[0].time_windows == ((0.5, 1.0),)
 
 
 @pytest.mark.parametrize(
@@ -79,7 +87,7 @@ def test_any_unknown_of_a_place_tells_when_but_only_groups_at_work():
     ids=["none", "touching", "one in the other", "touching up to rounding", "apart", "overlapping"],
 )
 def test_touching_spans_are_one_stretch(spans, expected):
-    assert merged(spans) == expected
+    assert merge_intervals(spans) == expected
 
 
 # -- what effects close -----------------------------------------------------------------------------------------------
@@ -114,7 +122,7 @@ def test_touching_spans_are_one_stretch(spans, expected):
     ],
 )
 def test_places_of_effects_share_by_what_they_close(before, closed, rest, expected):
-    found = described(attributed(before, closed, rest, ()))
+    found = described(attribute_gap_to_effects(before, closed, rest, ()))
     assert sorted(found, key=lambda p: p[0]) == sorted(expected, key=lambda p: p[0])
     shares = [share.expected for _, share, _ in found]
     assert shares == sorted(shares, reverse=True)
@@ -123,10 +131,13 @@ def test_places_of_effects_share_by_what_they_close(before, closed, rest, expect
 def test_places_keep_their_windows_and_those_without_unknowns_take_the_residuals():
     seen, residual = ((0.0, 1.0),), ((2.0, 3.0),)
     before = [place("T1", windows=seen), place("T2")]
-    found = {p.location: p.windows for p in attributed(before, {"T1": 0.5, "world": 0.2}, [place("T3")], residual)}
+    found = {
+        p.location: p.time_windows
+        for p in attribute_gap_to_effects(before, {"T1": 0.5, "world": 0.2}, [place("T3")], residual)
+    }
     assert found == {"T1": seen, "world": residual, "T2": (), "T3": ()}
-    [whole] = attributed([place("T2")], {"T2": 1.0}, [], residual)
-    assert whole.windows == residual
+    [whole] = attribute_gap_to_effects([place("T2")], {"T2": 1.0}, [], residual)
+    assert whole.time_windows == residual
 
 
 # -- the map ----------------------------------------------------------------------------------------------------------
@@ -146,7 +157,7 @@ def test_places_keep_their_windows_and_those_without_unknowns_take_the_residuals
 )
 def test_only_informed_values_are_on_the_map(variance, std, mean, mapped, expected):
     found = smoothed({FORCE: 1.0}, variance={FORCE: variance}, traces=[trace([FORCE], [[mean]], [[std]])])
-    edges, names, values = informed_map(found, mapped=mapped)
+    edges, names, values = informed_z_scores(found, informed_fraction=mapped)
     np.testing.assert_allclose(values, [[expected]])
     assert (list(edges), names) == ([0.0, 0.5], ("T1.0",))
 
@@ -154,12 +165,12 @@ def test_only_informed_values_are_on_the_map(variance, std, mean, mapped, expect
 def test_the_map_is_of_one_recording():
     traces = [trace([FORCE], [[1.0]], [[0.1]]), trace([FORCE], [[2.0]], [[0.1]])]
     found = smoothed({FORCE: 1.0}, variance={FORCE: 1.0}, traces=traces)
-    assert informed_map(found)[2] == pytest.approx(10.0)
-    assert informed_map(found, 1)[2] == pytest.approx(20.0)
+    assert informed_z_scores(found)[2] == pytest.approx(10.0)
+    assert informed_z_scores(found, 1)[2] == pytest.approx(20.0)
 
 
 def test_units_of_unknowns_are_those_of_their_joints_or_metres():
     joints = (SimpleNamespace(name="slide", kind="prismatic"), SimpleNamespace(name="hinge", kind="revolute"))
     system = SimpleNamespace(mechanism=SimpleNamespace(joints=joints, joint_names=("slide", "hinge")))
     made = SimpleNamespace(unknowns=("hinge", "slide", "left.x", "tip.z"), sources=(FORCE, FORCE, OFFSET, BIAS))
-    assert units(system, made) == ("N m", "N", "m", "m")
+    assert unknown_units(system, made) == ("N m", "N", "m", "m")

@@ -11,11 +11,11 @@ from types import SimpleNamespace
 import pytest
 from factories import amplitude, effect, fit, loss
 
-from yid_ocp.diagnosis.blind import Case, Label, answers, mark, score, seal
+from yid_ocp.diagnosis.blind import BlindCase, CaseLabel, answers, score_case, score_ensemble, seal_labels
 from yid_ocp.virtual.injected import InjectedEffect
 
-# the package's own name `score` is the function
-scoring = importlib.import_module("yid_ocp.diagnosis.blind.score")
+# the package's own name `score_ensemble` is the function
+scoring = importlib.import_module("yid_ocp.diagnosis.blind.score_ensemble")
 KV, DRY = InjectedEffect("kelvin_voigt", "T1", {"tau": 0.05}), InjectedEffect("joint_coulomb", "elbow", {"tau_c": 2.0})
 DAMPER = effect("kelvin_voigt@T1", amplitude("tau", expected=(0.0, 0.2), unit="s"))
 FRICTION = effect("joint_coulomb@elbow", amplitude("tau_c", expected=(0.0, 3.0)))
@@ -23,7 +23,7 @@ GUST = InjectedEffect("gusts", "T3", {"size": 0.1})
 
 
 def label(category, *injected, multiple=None):
-    return Label("case_000", category, injected, multiple, {"T1.bend": 12.0})
+    return CaseLabel("case_000", category, injected, multiple, {"T1.bend": 12.0})
 
 
 def pair(text):
@@ -94,7 +94,7 @@ RIGHT, WRONG = "kelvin_voigt@T1", "density@T2"
     ],
 )
 def test_what_is_right_depends_on_the_case(case, answer, right):
-    assert mark(case, answer).right is right
+    assert score_case(case, answer).right is right
 
 
 @pytest.mark.parametrize(
@@ -107,7 +107,7 @@ def test_what_is_right_depends_on_the_case(case, answer, right):
     ],
 )
 def test_a_mark_says_what_comes_first(listed, where, first, second, located):
-    found = mark(label("single", KV), said("unknown", [], which=listed, where=where))
+    found = score_case(label("single", KV), said("unknown", [], which=listed, where=where))
     assert (found.kind_first, found.kind_second, found.location_first) == (first, second, located)
 
 
@@ -116,20 +116,20 @@ def test_a_mark_says_what_comes_first(listed, where, first, second, located):
     [("no_gap", False), ("insufficient_data", False), ("unknown", True), ("effect", True), ("confusable", True)],
 )
 def test_a_gap_is_reported_by_the_verdict(verdict, gap):
-    assert mark(label("null"), said(verdict)).gap is gap
+    assert score_case(label("null"), said(verdict)).gap is gap
 
 
 def test_a_clean_case_has_no_truth_to_be_first():
-    found = mark(label("null"), said("effect", [WRONG], where=["T2"]))
+    found = score_case(label("null"), said("effect", [WRONG], where=["T2"]))
     assert (found.kind_first, found.kind_second, found.location_first) == (False, False, False)
     assert (found.truth, found.answer, found.confusable) == ("-", WRONG, ())
-    assert mark(label("null"), said("no_gap")).answer == "-"
+    assert score_case(label("null"), said("no_gap")).answer == "-"
     assert math.isnan(found.multiple)
 
 
 def test_a_mark_keeps_case_answer_and_figures():
     group = [WRONG, RIGHT]
-    found = mark(
+    found = score_case(
         label("pair", KV, DRY, multiple=3.0),
         said("confusable", [WRONG, "a@b"], confusable=[["a@b", "c@d"], group], closure=0.5),
         best=0.8,
@@ -139,7 +139,7 @@ def test_a_mark_keeps_case_answer_and_figures():
     assert (found.truth, found.answer) == ("kelvin_voigt@T1 + joint_coulomb@elbow", f"{WRONG} + a@b")
     assert (found.multiple, found.closure, found.best, found.seconds) == (3.0, 0.5, 0.8, 7.0)
     assert found.confusable == tuple(group)
-    assert math.isnan(mark(label("null"), said("no_gap")).closure)
+    assert math.isnan(score_case(label("null"), said("no_gap")).closure)
 
 
 @pytest.mark.parametrize(
@@ -154,7 +154,7 @@ def test_a_mark_keeps_case_answer_and_figures():
 )
 def test_a_parameter_is_within_95_percent_or_not(value, std, error, inside):
     values = {RIGHT: {"tau": {"value": value, "std": std, "unit": "s"}}}
-    found = mark(label("single", KV), said("effect", [WRONG, RIGHT], which=[WRONG, RIGHT], values=values))
+    found = score_case(label("single", KV), said("effect", [WRONG, RIGHT], which=[WRONG, RIGHT], values=values))
     assert found.errors == {f"{RIGHT}.tau": (pytest.approx(error), inside)}
 
 
@@ -171,14 +171,14 @@ def test_a_parameter_is_within_95_percent_or_not(value, std, error, inside):
     ids=["not named", "no value", "infinite", "unknown deviation", "truth is infinite", "in no library"],
 )
 def test_parameters_that_cannot_be_compared_are_left_out(injected, effects, values):
-    found = mark(label("single", injected), said("effect", effects, values=dict.fromkeys(effects, values)))
+    found = score_case(label("single", injected), said("effect", effects, values=dict.fromkeys(effects, values)))
     assert found.errors == {}
 
 
 def test_an_error_relative_to_nothing_is_large():
     zero = InjectedEffect("kelvin_voigt", "T1", {"tau": 0.0})
     values = {RIGHT: {"tau": {"value": 1e-3, "std": 1.0}}}
-    assert mark(label("single", zero), said("effect", [RIGHT], values=values)).errors[f"{RIGHT}.tau"][0] == 1e6
+    assert score_case(label("single", zero), said("effect", [RIGHT], values=values)).errors[f"{RIGHT}.tau"][0] == 1e6
 
 
 # -- rates ------------------------------------------------------------------------------------------------------------
@@ -205,7 +205,7 @@ def marked(category, **changed):
 
 
 def test_rates_are_over_the_cases_that_they_speak_of():
-    found = score(
+    found = score_ensemble(
         [
             marked("null", gap=True),
             marked("null", gap=False),
@@ -250,7 +250,7 @@ def test_rates_are_over_the_cases_that_they_speak_of():
 
 
 def test_no_cases_of_a_sort_have_no_rate():
-    found = score([])
+    found = score_ensemble([])
     assert found["cases"] == 0
     whole = ("format", "cases", "detection", "detection_intervals", "marks", "intervals", "experiments")
     assert {found[key] for key in found if key not in (*whole, "confusion", "calibration")} == {None}
@@ -271,12 +271,12 @@ def test_rates_have_binomial_intervals(count, total, low, high):
 
 def test_what_was_said_of_what_is_counted():
     marks = [
-        mark(label("single", KV), said("effect", [RIGHT])),
-        mark(label("single", KV), said("effect", ["density@T1"])),
-        mark(label("single", KV), said("no_gap")),
-        mark(label("null"), said("no_gap")),
-        mark(label("null"), said("unknown")),
-        mark(label("null"), said("no_gap")),
+        score_case(label("single", KV), said("effect", [RIGHT])),
+        score_case(label("single", KV), said("effect", ["density@T1"])),
+        score_case(label("single", KV), said("no_gap")),
+        score_case(label("null"), said("no_gap")),
+        score_case(label("null"), said("unknown")),
+        score_case(label("null"), said("no_gap")),
     ]
     found = scoring.confusion(marks)
     assert (found["true"], found["said"]) == (
@@ -289,11 +289,11 @@ def test_what_was_said_of_what_is_counted():
 def test_intervals_and_p_values_are_held_against_what_they_promise():
     def single(miss):
         values = {"kelvin_voigt@T1": {"tau": {"value": 0.05 + 0.01 * miss, "std": 0.01, "unit": "s"}}}
-        return mark(label("single", KV), said("effect", [RIGHT], values=values))
+        return score_case(label("single", KV), said("effect", [RIGHT], values=values))
 
     def null(p):
         told = said("no_gap")
-        return mark(label("null"), {**told, "gap": {**told["gap"], "before": {"p_value": p}}})
+        return score_case(label("null"), {**told, "gap": {**told["gap"], "before": {"p_value": p}}})
 
     found = scoring.calibration([single(0.5), single(-1.5), single(2.1), null(0.03), null(0.4), null(0.9)])
     held = {entry["level"]: entry["count"] for entry in found["intervals"]}
@@ -306,7 +306,7 @@ def test_intervals_and_p_values_are_held_against_what_they_promise():
 
 
 def test_a_sealed_text_is_sorted_and_holds_all():
-    text, digest = seal([label("single", KV, multiple=3.0)])
+    text, digest = seal_labels([label("single", KV, multiple=3.0)])
     assert json.loads(text) == [
         {
             "case": "case_000",
@@ -320,14 +320,14 @@ def test_a_sealed_text_is_sorted_and_holds_all():
     assert text.index('"case"') < text.index('"injected"') < text.index('"truth"')
     assert len(digest) == 64
     with pytest.raises(ValueError, match="not JSON compliant"):
-        seal([label("single", multiple=math.nan)])
+        seal_labels([label("single", multiple=math.nan)])
 
 
 # -- answers ----------------------------------------------------------------------------------------------------------
 
 
 def case(without=("density",)):
-    return Case("case_000", "estimate", "held out", without)
+    return BlindCase("case_000", "estimate", "held out", without)
 
 
 def test_an_answer_is_given_from_the_recordings_without_what_was_left_out(monkeypatch):
@@ -339,7 +339,7 @@ def test_an_answer_is_given_from_the_recordings_without_what_was_left_out(monkey
 
     monkeypatch.setattr(answers, "diagnose", diagnose)
     ensemble = SimpleNamespace(of=lambda recording: SimpleNamespace(system="system", recording=recording))
-    assert answers.answer(ensemble, case(), "all", "thresholds", "progress") == "finding"
+    assert answers.diagnose_case(ensemble, case(), "all", "thresholds", "progress") == "finding"
     assert asked["problem"].recording == "estimate"
     assert (asked["choice"], asked["leave_out"]) == ("all", ("density",))
     assert (asked["held_out"], asked["thresholds"], asked["progress"]) == (["held out"], "thresholds", "progress")
@@ -366,19 +366,19 @@ def test_the_best_that_could_be_closed_is_that_of_the_true_effects(monkeypatch, 
         problem: str
 
     made = SimpleNamespace(of=lambda problem, effects, held_out: Composed(tuple(effects), held_out, "from the start"))
-    monkeypatch.setattr(answers, "chosen_effects", lambda *_: [stiff, FRICTION])
-    monkeypatch.setattr(answers, "CandidateProblem", made)
+    monkeypatch.setattr(answers, "make_candidate_effects", lambda *_: [stiff, FRICTION])
+    monkeypatch.setattr(answers, "AllCandidatesProblem", made)
     monkeypatch.setattr(
-        answers, "nominal_fit", lambda *_: fit(lost=loss(2.0, 2.0), values={"k": 3.0}, problem="settled")
+        answers, "fit_nominal_model", lambda *_: fit(lost=loss(2.0, 2.0), values={"k": 3.0}, problem="settled")
     )
 
     def refit(composed, chosen, start):
         asked.append((composed.held, composed.problem, [e.kind for e in chosen], dict(start)))
         return fit(chosen, loss(1.25, 1.25)) if refitted else None
 
-    monkeypatch.setattr(answers, "refit", refit)
+    monkeypatch.setattr(answers, "refit_with_effects", refit)
     ensemble = SimpleNamespace(of=lambda recording: SimpleNamespace(system="system"))
-    found = answers.best_closure(ensemble, case(), Label("c", "single", injected, 1.0, {}))
+    found = answers.best_possible_closure(ensemble, case(), CaseLabel("c", "single", injected, 1.0, {}))
     assert found == pytest.approx(expected, nan_ok=True)
     at_truth = {"kelvin_voigt@T1.tau": 0.05} if injected else {}
     assert asked == [(["held out"], "settled", ["kelvin_voigt"] if injected else [], {"k": 3.0} | at_truth)]

@@ -12,23 +12,23 @@ from factories import amplitude, costing, effect, evaluation, fit, loss, measure
 from heard import Heard
 
 from yid_ocp.diagnosis.refit import (
-    Refitted,
-    Search,
+    RefitContext,
+    StoredFit,
+    _block_duration,
+    _conditional_amplitude_std,
     _half_done,
-    amplitude_std,
-    block_length,
-    held_out_loss,
-    recalled,
-    refit,
-    refit_all,
-    told,
+    _held_out_loss,
+    _mark_uninformative_std,
+    load_stored_refit,
+    refit_each_candidate,
+    refit_with_effects,
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.solvers import Status
 
-# the package's own name `refit` is the function
-module = importlib.import_module("yid_ocp.diagnosis.refit")
+# the package's own name `refit_with_effects` is the function
+module = importlib.import_module("yid_ocp.diagnosis.refit_with_effects")
 LIMITS = Thresholds()
 FRICTION = effect("friction@elbow", amplitude(neutral=0.25), shape("s", neutral=0.5))
 A, S = "friction@elbow.a", "friction@elbow.s"
@@ -108,17 +108,17 @@ def solved(monkeypatch):
 
 def test_filters_are_about_the_torques_that_are_seen_at_the_start(solved):
     problem = Problem(lambda values: 1.0)
-    refit(problem, [FRICTION], {"k": 2.0, A: 3.0, S: 0.9})
+    refit_with_effects(problem, [FRICTION], {"k": 2.0, A: 3.0, S: 0.9})
     # and once more where it ended, which is the same
     assert problem.at == 2 * [{**problem.named(np.ones(5)), "k": 2.0, A: 3.0, S: 0.9}]
 
 
 def test_held_out_recordings_are_seen_about_the_torques_where_the_best_of_all_runs_ended(solved):
     problem, memory = fitting(good=7.0), Memory()
-    found = refit(problem, [FRICTION], START, memory)
+    found = refit_with_effects(problem, [FRICTION], START, memory)
     assert len(solved.runs) == 2
     assert problem.foreseen == solved.losses == [found.values]
-    recalled(problem, [FRICTION], memory)
+    load_stored_refit(problem, [FRICTION], memory)
     assert problem.foreseen == solved.losses == 2 * [found.values]
 
 
@@ -126,14 +126,14 @@ def test_held_out_recordings_are_seen_about_the_torques_where_the_best_of_all_ru
 def test_an_effect_that_takes_much_of_an_offset_is_fitted_once_more(solved, monkeypatch, apart, runs):
     monkeypatch.setattr(module, "torques_apart", lambda before, after: apart)
     monkeypatch.setattr(module, "_Following", lambda problem: problem)
-    refit(Problem(lambda values: 1.0), [FRICTION], {"k": 2.0, A: 3.0})
+    refit_with_effects(Problem(lambda values: 1.0), [FRICTION], {"k": 2.0, A: 3.0})
     assert len(solved.runs) == runs
 
 
 def test_a_spread_far_beyond_what_one_would_expect_is_no_knowledge():
     low, high = FRICTION.prior_range[A]
     std = {"k": 1e9, A: 101 * (high - low), S: 99 * (FRICTION.prior_range[S][1] - FRICTION.prior_range[S][0])}
-    assert told([FRICTION], std) == {**std, A: math.inf}
+    assert _mark_uninformative_std([FRICTION], std) == {**std, A: math.inf}
 
 
 # -- is a refit half done ---------------------------------------------------------------------------------------------
@@ -176,8 +176,8 @@ def test_a_refit_that_explains_much_but_not_all_is_half_done(before, after, half
 def test_what_is_much_and_what_is_all_are_thresholds():
     problem, finish = Problem(lambda values: 100.0), costing(60.0, 10)
     assert _half_done(problem, [FRICTION], {}, finish, LIMITS)
-    assert not _half_done(problem, [FRICTION], {}, finish, Thresholds(promising=0.5))
-    assert not _half_done(problem, [FRICTION], {}, finish, Thresholds(poor=13.0))
+    assert not _half_done(problem, [FRICTION], {}, finish, Thresholds(restart_gain=0.5))
+    assert not _half_done(problem, [FRICTION], {}, finish, Thresholds(restart_chi2=13.0))
 
 
 # -- refits -----------------------------------------------------------------------------------------------------------
@@ -196,7 +196,7 @@ def fitting(good, bad=60.0, plain=100.0):
 
 def test_a_half_done_refit_is_tried_again_from_the_nominal_initial_values(solved):
     problem = fitting(good=7.0)
-    found = refit(problem, [FRICTION], START)
+    found = refit_with_effects(problem, [FRICTION], START)
     assert [run["k"] for run in solved.runs] == [5.0, 1.0]
     again = {"k": 1.0, "k[run]": 1.0, "start.q.k[run]": 1.0, A: 0.75, S: 0.9}
     assert solved.runs[1] == again
@@ -204,7 +204,7 @@ def test_a_half_done_refit_is_tried_again_from_the_nominal_initial_values(solved
     assert found.cost == pytest.approx(7.0)
     assert solved.losses == [again]
     assert found.std == dict.fromkeys(problem.names, 0.1)
-    assert (found.effects, found.message, found.resumed) == ((FRICTION,), "done", False)
+    assert (found.effects, found.solver_message, found.is_from_store) == ((FRICTION,), "done", False)
     assert problem.warmed == ["there", (), "there"], "the shape at rest is looked for where it was"
 
 
@@ -214,18 +214,18 @@ def test_a_half_done_refit_is_tried_again_from_the_nominal_initial_values(solved
     ids=["worse from there", "no better from there", "impossible from there", "not half done"],
 )
 def test_the_first_of_two_refits_stands_unless_the_second_is_better(solved, good, bad, runs):
-    found = refit(fitting(good, bad), [FRICTION], START)
+    found = refit_with_effects(fitting(good, bad), [FRICTION], START)
     assert [run["k"] for run in solved.runs] == runs
     assert (found.values["k"], found.cost) == (5.0, pytest.approx(bad))
 
 
 def test_a_refit_from_the_initial_values_is_not_repeated(solved):
-    refit(fitting(good=60.0), [FRICTION], {A: 0.75, S: 0.9})
+    refit_with_effects(fitting(good=60.0), [FRICTION], {A: 0.75, S: 0.9})
     assert len(solved.runs) == 1
 
 
 def test_when_to_try_again_is_a_threshold(solved):
-    refit(fitting(good=7.0), [FRICTION], START, limits=Thresholds(promising=0.9))
+    refit_with_effects(fitting(good=7.0), [FRICTION], START, limits=Thresholds(restart_gain=0.9))
     assert len(solved.runs) == 1
 
 
@@ -233,13 +233,13 @@ def test_when_to_try_again_is_a_threshold(solved):
 def test_a_start_that_cannot_be_rolled_out_is_drawn_back_towards_the_neutral_effect(solved, largest, drawn):
     limit = 9.0 if largest == 2.0 else largest
     problem = Problem(lambda values: 5.0 if values[A] <= limit else None)
-    found = refit(problem, [FRICTION], {"k": 5.0, A: 2.25, S: 0.5})
+    found = refit_with_effects(problem, [FRICTION], {"k": 5.0, A: 2.25, S: 0.5})
     assert found.values[A] == pytest.approx(drawn)
     assert found.values["k"] == 5.0
 
 
 def test_a_model_that_cannot_be_rolled_out_at_all_has_no_refit(solved):
-    assert refit(Problem(lambda values: None), [FRICTION], START) is None
+    assert refit_with_effects(Problem(lambda values: None), [FRICTION], START) is None
     assert solved.runs == []
     assert [run[A] for run in solved.failed] == pytest.approx([0.75, 0.5, 0.35, 0.275, 0.25])
 
@@ -248,7 +248,7 @@ def test_a_refit_that_ends_where_nothing_can_be_rolled_out_is_none(solved, monke
     away = SimpleNamespace(message="", status=Status.CONVERGED, warm=None)
     moving = SimpleNamespace(run=lambda p, x, _: SimpleNamespace(**vars(away), x=x + 9))
     monkeypatch.setattr(module, "SOLVER", moving)
-    assert refit(Problem(lambda values: 5.0 if values["k"] < 9 else None), [FRICTION], START) is None
+    assert refit_with_effects(Problem(lambda values: 5.0 if values["k"] < 9 else None), [FRICTION], START) is None
 
 
 def test_an_amplitude_is_judged_with_its_shape_held():
@@ -256,16 +256,16 @@ def test_an_amplitude_is_judged_with_its_shape_held():
     names = ["k", A, S]
     jacobian = np.array([[1.0, 0.3, 0.2], [0.0, 8.0, 0.1], [0.0, 0.4, 0.01], [0.1, 0.0, 0.0]])
     covariance = np.linalg.inv(jacobian.T @ jacobian)
-    found = amplitude_std(names, [FRICTION], covariance)
+    found = _conditional_amplitude_std(names, [FRICTION], covariance)
     held = np.linalg.inv(jacobian[:, :2].T @ jacobian[:, :2])
     assert found == {A: pytest.approx(np.sqrt(held[1, 1]))}
     assert found[A] < 0.7 * np.sqrt(covariance[1, 1])
     # what says nothing of the shape, or of the amplitude
     covariance[2, 2] = np.nan
-    assert amplitude_std(names, [FRICTION], covariance) == {A: pytest.approx(np.sqrt(covariance[1, 1]))}
+    assert _conditional_amplitude_std(names, [FRICTION], covariance) == {A: pytest.approx(np.sqrt(covariance[1, 1]))}
     covariance[1, 1] = np.nan
-    assert amplitude_std(names, [FRICTION], covariance) == {A: np.inf}
-    assert amplitude_std(names, [FRICTION], np.zeros((0, 0))) == {}
+    assert _conditional_amplitude_std(names, [FRICTION], covariance) == {A: np.inf}
+    assert _conditional_amplitude_std(names, [FRICTION], np.zeros((0, 0))) == {}
 
 
 def test_another_place_is_tried_where_more_than_noise_is_left(solved, monkeypatch):
@@ -274,11 +274,13 @@ def test_another_place_is_tried_where_more_than_noise_is_left(solved, monkeypatc
     cases = {11.5: (11.5, 0.75), 11.7: (5.0, -0.75), None: (5.0, -0.75)}
     for first, (cost, value) in cases.items():
         there = {0.75: first, -0.75: 5.0}
-        found = refit(Problem(lambda values, there=there: there.get(values[A])), [FRICTION], {"k": 2.0, A: 0.75})
+        found = refit_with_effects(
+            Problem(lambda values, there=there: there.get(values[A])), [FRICTION], {"k": 2.0, A: 0.75}
+        )
         assert (found.cost, found.values[A]) == (pytest.approx(cost), value)
     # a worse one is not taken
     there = {0.75: 20.0, -0.75: 21.0}
-    found = refit(Problem(lambda values: there.get(values[A], 30.0)), [FRICTION], {"k": 2.0, A: 0.75})
+    found = refit_with_effects(Problem(lambda values: there.get(values[A], 30.0)), [FRICTION], {"k": 2.0, A: 0.75})
     assert found.values[A] == pytest.approx(0.75)
 
 
@@ -287,9 +289,9 @@ def test_another_place_is_tried_where_more_than_noise_is_left(solved, monkeypatc
 
 def test_a_refit_is_stored_under_its_effects_or_its_name(solved):
     store = Memory()
-    refit(Problem(lambda values: 5.0), [FRICTION], START, store)
+    refit_with_effects(Problem(lambda values: 5.0), [FRICTION], START, store)
     assert set(store) == {"friction@elbow"}
-    refit(Problem(lambda values: 5.0), [FRICTION], START, store, "another")
+    refit_with_effects(Problem(lambda values: 5.0), [FRICTION], START, store, "another")
     assert set(store) == {"friction@elbow", "another"}
     kept = store["another"]
     assert (kept.values, kept.message) == (START, "done")
@@ -299,18 +301,18 @@ def test_a_refit_is_stored_under_its_effects_or_its_name(solved):
 
 def test_a_stored_refit_is_evaluated_and_not_solved(solved):
     values, std = {**START, "k": 2.0}, dict.fromkeys(START, 0.3)
-    store = Memory({"friction@elbow": Refitted(values, std, {A: 0.2}, "long ago")})
+    store = Memory({"friction@elbow": StoredFit(values, std, {A: 0.2}, "long ago")})
     problem = Problem(lambda values: 5.0)
-    found = refit(problem, [FRICTION], START, store)
+    found = refit_with_effects(problem, [FRICTION], START, store)
     assert solved.runs == []
-    assert (found.values, found.std, found.message, found.resumed) == (values, std, "long ago", True)
+    assert (found.values, found.std, found.solver_message, found.is_from_store) == (values, std, "long ago", True)
     assert found.amplitude_std == {A: 0.2}
     assert found.cost == pytest.approx(5.0)
     assert solved.losses == [values]
     assert problem.freed == (FRICTION,)
-    assert recalled(problem, [FRICTION], store).values == values
-    assert recalled(problem, [FRICTION], store, "another") is None
-    assert recalled(problem, [FRICTION], None) is None
+    assert load_stored_refit(problem, [FRICTION], store).values == values
+    assert load_stored_refit(problem, [FRICTION], store, "another") is None
+    assert load_stored_refit(problem, [FRICTION], None) is None
 
 
 @pytest.mark.parametrize(
@@ -325,8 +327,8 @@ def test_a_stored_refit_is_evaluated_and_not_solved(solved):
     ids=["other unknowns", "deviations of others", "one unknown more", "other amplitudes", "cannot be rolled out"],
 )
 def test_a_stored_refit_of_another_problem_is_no_use(solved, values, std, held, cost):
-    store = Memory({"friction@elbow": Refitted(values, std, held, "")})
-    assert recalled(Problem(lambda _: cost), [FRICTION], store) is None
+    store = Memory({"friction@elbow": StoredFit(values, std, held, "")})
+    assert load_stored_refit(Problem(lambda _: cost), [FRICTION], store) is None
 
 
 def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
@@ -339,9 +341,9 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
         return None if effects[-1] is third else SimpleNamespace(**vars(made) | {"resumed": effects[-1] is other})
 
     monkeypatch.setattr(module, "refit", one)
-    search = Search("problem", LIMITS, heard, "store")
+    search = RefitContext("problem", LIMITS, heard, "store")
     tried = [(FRICTION, {A: 0.7}), (other, {"k": 3.0}), (third, {})]
-    found = refit_all(search, (effect("base@x"),), tried, {"k": 2.0})
+    found = refit_each_candidate(search, (effect("base@x"),), tried, {"k": 2.0})
     assert [f.effects[-1].kind for f in found] == ["friction", "offset"]
     by_kind = {kinds[-1]: (problem, kinds, *rest) for problem, kinds, *rest in asked}
     assert by_kind["friction"] == ("problem", ["base", "friction"], {"k": 2.0, A: 0.7}, "store", "", LIMITS)
@@ -354,7 +356,7 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
         "resumed the refit with offset@elbow: held-out chi2/n 1.234",
     ]
     # from elsewhere they have names of their own in the store
-    refit_all(search, (effect("base@x"),), tried, {}, "from there")
+    refit_each_candidate(search, (effect("base@x"),), tried, {}, "from there")
     assert sorted(name for *_, name, _ in asked[3:]) == [
         f"base@x and {label} from there" for label in ("friction@elbow", "offset@elbow", "third@x")
     ]
@@ -374,7 +376,7 @@ def episode(name="other", steps=100, time_step=0.01, of=()):
     ids=["short", "forty seconds", "two recordings", "long", "a minute"],
 )
 def test_held_out_time_is_cut_in_some_forty_blocks(seconds, length):
-    assert block_length([episode(steps=round(s / 0.01)) for s in seconds]) == pytest.approx(length)
+    assert _block_duration([episode(steps=round(s / 0.01)) for s in seconds]) == pytest.approx(length)
 
 
 def measured(times, value, weight, time_step=0.01):
@@ -425,11 +427,11 @@ def test_a_held_out_loss_sums_whitened_squares_block_by_block(predicting):
     problem, told = predicting(
         (episode(of=[group, more]), SimpleNamespace(predicted=(predicted, np.array([[1.0, 2.0]]))))
     )
-    found = held_out_loss(problem, np.zeros(1))
+    found = _held_out_loss(problem, np.zeros(1))
     # blocks of half a second: [0, 0.5), [0.5, 1.0) and the last sample
-    np.testing.assert_allclose(found.squares, [1 + 4 + 9 + 36, 4 + 1, 1 + 4])
-    np.testing.assert_allclose(found.counts, [2 + 1 + 2, 4, 2])
-    assert found.channels == {"a": (0.25, "m")}
+    np.testing.assert_allclose(found.block_chi2, [1 + 4 + 9 + 36, 4 + 1, 1 + 4])
+    np.testing.assert_allclose(found.block_sample_counts, [2 + 1 + 2, 4, 2])
+    assert found.channel_rmse == {"a": (0.25, "m")}
     assert told["episodes"] == ["other"]
 
 
@@ -441,9 +443,9 @@ def test_blocks_without_samples_do_not_count_and_recordings_follow_each_other(pr
         (episode("two", 100, of=[second]), SimpleNamespace(predicted=(np.array([[1.0, 1.0]]),))),
     ]
     problem, told = predicting(*pairs)
-    found = held_out_loss(problem, np.zeros(1))
-    np.testing.assert_allclose(found.squares, [1.0, 9.0, 2.0])
-    np.testing.assert_allclose(found.counts, [2.0, 2.0, 2.0])
+    found = _held_out_loss(problem, np.zeros(1))
+    np.testing.assert_allclose(found.block_chi2, [1.0, 9.0, 2.0])
+    np.testing.assert_allclose(found.block_sample_counts, [2.0, 2.0, 2.0])
     assert told["episodes"] == ["one", "two"]
 
 
@@ -451,9 +453,9 @@ def test_a_failed_prediction_is_infinitely_bad_where_it_was_measured(predicting)
     group = measured([0.1, 0.6], [[1, 1], [1, 1]], [[1, 1], [1, 0]])
     good = SimpleNamespace(predicted=(np.ones((2, 2)),))
     problem, told = predicting((episode("one", of=[group]), "it snaps"), (episode("two", of=[group]), good))
-    found = held_out_loss(problem, np.zeros(1))
-    np.testing.assert_array_equal(found.squares, [math.inf, math.inf, 0.0, 0.0])
-    np.testing.assert_array_equal(found.counts, [2.0, 1.0, 2.0, 1.0])
+    found = _held_out_loss(problem, np.zeros(1))
+    np.testing.assert_array_equal(found.block_chi2, [math.inf, math.inf, 0.0, 0.0])
+    np.testing.assert_array_equal(found.block_sample_counts, [2.0, 1.0, 2.0, 1.0])
     assert told["episodes"] == ["two"]
     none, _ = predicting((episode("one", of=[group]), "it snaps"))
-    assert held_out_loss(none, np.zeros(1)).channels == {}
+    assert _held_out_loss(none, np.zeros(1)).channel_rmse == {}

@@ -12,17 +12,17 @@ from made_series import series
 
 from yid_ocp.diagnosis import screening
 from yid_ocp.diagnosis.screening import (
-    Screened,
+    ScreeningResult,
     _basis,
     _coloured,
-    confusability,
-    linearise,
-    robust,
-    scores,
-    screen,
-    shape_grid,
-    together,
-    visibility,
+    _newey_west_covariance,
+    _shape_grid,
+    candidate_detectability,
+    confusability_matrix,
+    linearize_candidates,
+    score_candidates,
+    score_jointly,
+    screen_candidates,
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import SolverError
@@ -37,7 +37,7 @@ SHAPED = effect("branch@T1", amplitude(), shape())
 def only(of, columns, residual, noise=None, **shapes):
     """The score of one candidate that is visible."""
     at = point(residual, signature(of, columns, noise, **shapes))
-    [found] = scores(at, [series(range(len(residual)))], [visible(of)])
+    [found] = score_candidates(at, [series(range(len(residual)))], [visible(of)])
     return found
 
 
@@ -57,17 +57,17 @@ def only(of, columns, residual, noise=None, **shapes):
 )
 def test_shapes_are_tried_evenly_over_their_range(expected, count, values):
     of = effect("branch@T1", amplitude(), shape("s", expected=expected))
-    found = shape_grid(of, count)
+    found = _shape_grid(of, count)
     assert [entry["branch@T1.s"] for entry in found] == pytest.approx(values)
     assert all(len(entry) == 1 for entry in found)
 
 
 def test_two_shapes_go_together_and_no_shape_is_one_try():
     both = effect("branch@T1", amplitude(), shape("s", expected=(1.0, 4.0)), shape("r", expected=(0.0, 2.0)))
-    found = [tuple(entry.values()) for entry in shape_grid(both, 3)]
+    found = [tuple(entry.values()) for entry in _shape_grid(both, 3)]
     assert found == [pytest.approx(pair) for pair in ((1.0, 0.0), (2.0, 1.0), (4.0, 2.0))]
-    assert shape_grid(ONE_SIDED, 5) == [{}]
-    assert len(shape_grid(SHAPED)) == 4
+    assert _shape_grid(ONE_SIDED, 5) == [{}]
+    assert len(_shape_grid(SHAPED)) == 4
 
 
 # -- projection and noise ---------------------------------------------------------------------------------------------
@@ -130,15 +130,17 @@ def test_the_robust_covariance_is_that_of_bartlett(count):
     for i in range(count):
         for j in range(count):
             expected += max(0.0, 1 - abs(i - j) / length) * np.outer(u[i], u[j])
-    np.testing.assert_allclose(robust(columns, residual, [series(rows)]), expected, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(
+        _newey_west_covariance(columns, residual, [series(rows)]), expected, rtol=1e-10, atol=1e-12
+    )
 
 
 def test_the_robust_covariance_adds_over_series():
     rng = np.random.default_rng(2)
     columns, residual = rng.standard_normal((20, 1)), rng.standard_normal(20)
     first, second = series(range(12)), series(range(12, 20))
-    parts = robust(columns, residual, [first]) + robust(columns, residual, [second])
-    np.testing.assert_allclose(robust(columns, residual, [first, second]), parts, rtol=1e-12)
+    parts = _newey_west_covariance(columns, residual, [first]) + _newey_west_covariance(columns, residual, [second])
+    np.testing.assert_allclose(_newey_west_covariance(columns, residual, [first, second]), parts, rtol=1e-12)
     assert parts > 0
 
 
@@ -161,56 +163,67 @@ def test_the_robust_covariance_adds_over_series():
 )
 def test_an_amplitude_is_detectable_by_its_noise(columns, noise, expected, size, seen):
     of = effect("friction@elbow", amplitude(lower=-math.inf, expected=expected))
-    [found] = visibility(point([0.0, 0.0], signature(of, columns, noise)), detection=2.0)
-    assert found.detectable == {"friction@elbow.a": pytest.approx(size)}
-    assert found.visible is seen
+    [found] = candidate_detectability(point([0.0, 0.0], signature(of, columns, noise)), detection_z=2.0)
+    assert found.detectable_amplitudes == {"friction@elbow.a": pytest.approx(size)}
+    assert found.is_detectable is seen
 
 
 def test_the_usual_detection_is_one_percent_found_nine_times_in_ten():
-    [found] = visibility(point([0.0], signature(ONE_SIDED, [1.0])))
+    [found] = candidate_detectability(point([0.0], signature(ONE_SIDED, [1.0])))
     normal = scipy.stats.norm
-    assert found.detectable["friction@elbow.a"] == pytest.approx(normal.isf(0.005) + normal.isf(0.1), abs=2e-3)
+    assert found.detectable_amplitudes["friction@elbow.a"] == pytest.approx(
+        normal.isf(0.005) + normal.isf(0.1), abs=2e-3
+    )
 
 
 def test_the_range_counts_from_the_neutral_value():
     of = effect("factor@T1", amplitude(neutral=1.0, lower=0.0, expected=(0.7, 1.2)))
-    assert [visibility(point([0.0], signature(of, [c])), 2.0)[0].visible for c in (6.0, 8.0)] == [False, True]
+    assert [candidate_detectability(point([0.0], signature(of, [c])), 2.0)[0].is_detectable for c in (6.0, 8.0)] == [
+        False,
+        True,
+    ]
 
 
 def test_amplitudes_that_do_the_same_hide_each_other_less_than_they_add():
-    [found] = visibility(point([0.0] * 2, signature(PAIR, [[1.0, 1.0], [0.0, 1.0]])), detection=2.0)
-    assert found.detectable == {"tilt@world.x": pytest.approx(2 * math.sqrt(2)), "tilt@world.y": pytest.approx(2.0)}
-    [one] = visibility(point([0.0], signature(PAIR, [[3.0, 0.0]])), detection=2.0)
-    assert one.detectable["tilt@world.y"] == math.inf
-    assert one.visible
+    [found] = candidate_detectability(point([0.0] * 2, signature(PAIR, [[1.0, 1.0], [0.0, 1.0]])), detection_z=2.0)
+    assert found.detectable_amplitudes == {
+        "tilt@world.x": pytest.approx(2 * math.sqrt(2)),
+        "tilt@world.y": pytest.approx(2.0),
+    }
+    [one] = candidate_detectability(point([0.0], signature(PAIR, [[3.0, 0.0]])), detection_z=2.0)
+    assert one.detectable_amplitudes["tilt@world.y"] == math.inf
+    assert one.is_detectable
 
 
 @pytest.mark.parametrize("order", [(0.5, 4.0, 1.0), (4.0, 0.5, 1.0), (1.0, 0.5, 4.0)])
 def test_the_best_shape_tells_what_is_detectable(order):
     at = point([0.0], *(signature(SHAPED, [size], s=size) for size in order))
-    [found] = visibility(at, detection=2.0)
-    assert found.detectable["branch@T1.a"] == pytest.approx(0.5)
-    assert found.visible
+    [found] = candidate_detectability(at, detection_z=2.0)
+    assert found.detectable_amplitudes["branch@T1.a"] == pytest.approx(0.5)
+    assert found.is_detectable
 
 
 def test_a_shape_that_is_seen_comes_before_one_that_is_detectable_but_never_so_small():
     of = effect("pair@x", amplitude("x", expected=(0.0, 0.05)), amplitude("y", expected=(0.0, 1.0)), shape())
     hidden, seen = signature(of, [[20.0, 0.0]], s=0.1), signature(of, [[0.0, 4.0]], s=0.2)
-    [found] = visibility(point([0.0], hidden, seen), detection=2.0)
-    assert (found.detectable["pair@x.y"], found.visible) == (pytest.approx(0.5), True)
-    [other] = visibility(point([0.0], seen, hidden), detection=2.0)
-    assert (other.detectable["pair@x.x"], other.visible) == (pytest.approx(0.1), True)
+    [found] = candidate_detectability(point([0.0], hidden, seen), detection_z=2.0)
+    assert (found.detectable_amplitudes["pair@x.y"], found.is_detectable) == (pytest.approx(0.5), True)
+    [other] = candidate_detectability(point([0.0], seen, hidden), detection_z=2.0)
+    assert (other.detectable_amplitudes["pair@x.x"], other.is_detectable) == (pytest.approx(0.1), True)
     weaker = signature(of, [[0.0, 3.0]], s=0.3)
-    [best] = visibility(point([0.0], seen, weaker), detection=2.0)
-    assert best.detectable["pair@x.y"] == pytest.approx(0.5)
+    [best] = candidate_detectability(point([0.0], seen, weaker), detection_z=2.0)
+    assert best.detectable_amplitudes["pair@x.y"] == pytest.approx(0.5)
     larger = signature(of, [[10.0, 0.0]], s=0.4)
-    [first] = visibility(point([0.0], hidden, larger), detection=2.0)
-    assert (first.detectable["pair@x.x"], first.visible) == (pytest.approx(0.1), False)
+    [first] = candidate_detectability(point([0.0], hidden, larger), detection_z=2.0)
+    assert (first.detectable_amplitudes["pair@x.x"], first.is_detectable) == (pytest.approx(0.1), False)
 
 
 def test_candidates_are_judged_one_by_one():
     at = point([0.0], signature(ONE_SIDED, [9.0]), signature(TWO_SIDED, [1.0]))
-    assert [(v.effect.label, v.visible) for v in visibility(at)] == [("friction@elbow", True), ("offset@elbow", False)]
+    assert [(v.effect.label, v.is_detectable) for v in candidate_detectability(at)] == [
+        ("friction@elbow", True),
+        ("offset@elbow", False),
+    ]
 
 
 # -- scores -----------------------------------------------------------------------------------------------------------
@@ -221,43 +234,43 @@ def test_a_score_is_that_of_the_lagrange_multiplier_test():
     found = only(TWO_SIDED, x, r, noise=1e-9)
     step = -float(x @ r) / float(x @ x)
     left = r + x * step
-    assert found.step == {"offset@elbow.a": pytest.approx(step)}
-    assert found.decrease == pytest.approx(float(r @ r - left @ left))
+    assert found.predicted_values == {"offset@elbow.a": pytest.approx(step)}
+    assert found.predicted_chi2_decrease == pytest.approx(float(r @ r - left @ left))
     # scattering as what would be left with the step done
-    covariance = float(robust(x[:, None], left, [series(range(4))])[0, 0])
-    assert found.statistic == pytest.approx(float(x @ r) ** 2 / covariance)
-    assert found.p_value == pytest.approx(float(CHI2.sf(found.statistic, 1)))
+    covariance = float(_newey_west_covariance(x[:, None], left, [series(range(4))])[0, 0])
+    assert found.lm_statistic == pytest.approx(float(x @ r) ** 2 / covariance)
+    assert found.p_value == pytest.approx(float(CHI2.sf(found.lm_statistic, 1)))
 
 
 def test_a_residual_below_the_noise_does_not_make_a_score_sure():
     """What would be left scatters less than noise does, so the noise decides."""
     x, r = np.ones(4), -1.5 * np.ones(4)
     found = only(TWO_SIDED, x, r)
-    assert found.statistic == pytest.approx(36.0 / 4.0)
+    assert found.lm_statistic == pytest.approx(36.0 / 4.0)
     assert found.p_value == pytest.approx(float(CHI2.sf(9.0, 1)))
-    assert only(TWO_SIDED, x, r, noise=16.0).statistic == pytest.approx(36.0 / 16.0)
+    assert only(TWO_SIDED, x, r, noise=16.0).lm_statistic == pytest.approx(36.0 / 16.0)
 
 
 def test_an_amplitude_of_one_sign_is_tested_on_one_side():
     x, r = np.ones(4), -1.5 * np.ones(4)
     two, one = only(TWO_SIDED, x, r), only(ONE_SIDED, x, r)
-    assert one.statistic == two.statistic > 0
+    assert one.lm_statistic == two.lm_statistic > 0
     assert one.p_value == pytest.approx(two.p_value / 2)
 
 
 @pytest.mark.parametrize("size", [1.5, 0.5])
 def test_an_amplitude_of_the_wrong_sign_explains_nothing(size):
     found = only(ONE_SIDED, np.ones(4), size * np.ones(4))
-    assert found.step == {"friction@elbow.a": 0.0}
-    assert (found.decrease, found.statistic, found.p_value) == (0.0, 0.0, 1.0)
+    assert found.predicted_values == {"friction@elbow.a": 0.0}
+    assert (found.predicted_chi2_decrease, found.lm_statistic, found.p_value) == (0.0, 0.0, 1.0)
     other = only(TWO_SIDED, np.ones(4), size * np.ones(4))
-    assert other.step == {"offset@elbow.a": pytest.approx(-size)}
+    assert other.predicted_values == {"offset@elbow.a": pytest.approx(-size)}
     assert other.p_value == pytest.approx(float(CHI2.sf(4 * size**2, 1)))
 
 
 def test_an_orthogonal_residual_scores_nothing():
     found = only(ONE_SIDED, [1.0, 1.0], [1.0, -1.0])
-    assert (found.decrease, found.statistic, found.p_value) == (0.0, 0.0, 1.0)
+    assert (found.predicted_chi2_decrease, found.lm_statistic, found.p_value) == (0.0, 0.0, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -268,8 +281,8 @@ def test_an_orthogonal_residual_scores_nothing():
 def test_a_step_stops_at_its_bounds_and_promises_less(wanted, step, decrease):
     of = effect("offset@elbow", amplitude(neutral=1.0, lower=0.5, upper=2.5))
     found = only(of, np.ones(4), -wanted * np.ones(4))
-    assert found.step == {"offset@elbow.a": pytest.approx(1.0 + step)}
-    assert found.decrease == pytest.approx(decrease)
+    assert found.predicted_values == {"offset@elbow.a": pytest.approx(1.0 + step)}
+    assert found.predicted_chi2_decrease == pytest.approx(decrease)
 
 
 def test_two_amplitudes_have_two_degrees_of_freedom():
@@ -277,17 +290,17 @@ def test_two_amplitudes_have_two_degrees_of_freedom():
     r = np.array([-1.0, -2.0, -3.0])
     found = only(PAIR, x, r)
     step = np.linalg.lstsq(x, -r, rcond=None)[0]
-    assert list(found.step.values()) == pytest.approx(step)
+    assert list(found.predicted_values.values()) == pytest.approx(step)
     statistic = float(x.T @ r @ np.linalg.solve(x.T @ x, x.T @ r))
-    assert found.statistic == pytest.approx(statistic)
+    assert found.lm_statistic == pytest.approx(statistic)
     assert found.p_value == pytest.approx(float(CHI2.sf(statistic, 2)))
 
 
 def test_amplitudes_that_do_the_same_share_the_step():
     found = only(PAIR, [[1.0, 1.0], [1.0, 1.0]], [-1.0, -1.0])
-    assert list(found.step.values()) == pytest.approx([0.5, 0.5])
-    assert found.decrease == pytest.approx(2.0)
-    assert found.statistic == pytest.approx(2.0)
+    assert list(found.predicted_values.values()) == pytest.approx([0.5, 0.5])
+    assert found.predicted_chi2_decrease == pytest.approx(2.0)
+    assert found.lm_statistic == pytest.approx(2.0)
 
 
 def test_two_amplitudes_that_start_at_zero_are_not_halved():
@@ -300,22 +313,22 @@ def test_the_best_of_many_shapes_counts_as_the_best_of_that_many_tries():
     r = np.array([-1.5, -1.5, 0.0, 0.0])
     columns = [np.array(c) for c in ([1.0, 0.0, 1.0, 0.0], [1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0])]
     at = point(r, *(signature(SHAPED, c, s=0.1 * (i + 1)) for i, c in enumerate(columns)))
-    [found] = scores(at, [series(range(4))], [visible(SHAPED)])
+    [found] = score_candidates(at, [series(range(4))], [visible(SHAPED)])
     alone = only(SHAPED, columns[1], r, s=0.2)
-    assert found.step == {"branch@T1.a": pytest.approx(1.5), "branch@T1.s": 0.2}
-    assert found.decrease == pytest.approx(4.5)
+    assert found.predicted_values == {"branch@T1.a": pytest.approx(1.5), "branch@T1.s": 0.2}
+    assert found.predicted_chi2_decrease == pytest.approx(4.5)
     assert found.p_value == pytest.approx(3 * alone.p_value)
     none = point(0 * r, *(signature(SHAPED, c, s=1.0) for c in columns))
-    assert scores(none, [series(range(4))], [visible(SHAPED)])[0].p_value == 1.0
+    assert score_candidates(none, [series(range(4))], [visible(SHAPED)])[0].p_value == 1.0
 
 
 def test_scores_are_of_visible_candidates_and_the_most_promising_first():
     others = [effect(f"offset@{name}", amplitude(lower=-math.inf)) for name in ("a", "b", "c")]
     at = point([3.0, 2.0, 1.0], *(signature(of, np.eye(3)[i]) for i, of in zip((1, 0, 2), others, strict=True)))
     seen = [visible(others[0]), visible(others[1]), visible(others[2], seen=False)]
-    found = scores(at, [series(range(3))], seen)
+    found = score_candidates(at, [series(range(3))], seen)
     assert [s.effect.label for s in found] == ["offset@b", "offset@a"]
-    assert [s.decrease for s in found] == pytest.approx([9.0, 4.0])
+    assert [s.predicted_chi2_decrease for s in found] == pytest.approx([9.0, 4.0])
 
 
 # -- what stands in for what ------------------------------------------------------------------------------------------
@@ -326,47 +339,51 @@ def test_a_signature_explained_by_another():
     b = effect("b@x", amplitude(lower=-1.0, expected=(-1.0, 1.0)))
     angle = math.radians(30)
     at = point([0.0] * 2, signature(a, [2.0, 0.0]), signature(b, [math.cos(angle), math.sin(angle)]))
-    found = confusability(together(at))
+    found = confusability_matrix(score_jointly(at))
     assert found.labels == ("a@x", "b@x")
-    np.testing.assert_allclose(found.matrix, [[1.0, 0.75], [0.75, 1.0]], atol=1e-12)
+    np.testing.assert_allclose(found.overlap_fractions, [[1.0, 0.75], [0.75, 1.0]], atol=1e-12)
 
 
 def test_two_amplitudes_explain_more_than_one():
     one, two = effect("one@x", amplitude(expected=(0.0, 2.0))), PAIR
     at = point([0.0] * 2, signature(one, [1.0, 1.0]), signature(two, np.eye(2)))
-    np.testing.assert_allclose(confusability(together(at)).matrix, [[1.0, 1.0], [0.5, 1.0]], atol=1e-12)
+    np.testing.assert_allclose(
+        confusability_matrix(score_jointly(at)).overlap_fractions, [[1.0, 1.0], [0.5, 1.0]], atol=1e-12
+    )
 
 
 def test_amplitudes_count_by_half_the_range_that_is_expected():
     wide = effect("pair@x", amplitude("x", expected=(0.0, 4.0)), amplitude("y", expected=(-1.0, 1.0)))
     one = effect("one@x", amplitude())
     at = point([0.0] * 2, signature(wide, np.eye(2)), signature(one, [1.0, 0.0]))
-    np.testing.assert_allclose(confusability(together(at)).matrix, [[1.0, 4.0 / 5.0], [1.0, 1.0]], atol=1e-12)
+    np.testing.assert_allclose(
+        confusability_matrix(score_jointly(at)).overlap_fractions, [[1.0, 4.0 / 5.0], [1.0, 1.0]], atol=1e-12
+    )
 
 
 def test_nothing_is_like_what_moves_nothing():
     a, b = effect("a@x", amplitude()), effect("b@x", amplitude())
     at = point([0.0] * 2, signature(a, [0.0, 0.0]), signature(b, [1.0, 0.0]))
-    np.testing.assert_array_equal(confusability(together(at)).matrix, [[0.0, 0.0], [0.0, 1.0]])
-    assert confusability(together(point([0.0]))).labels == ()
+    np.testing.assert_array_equal(confusability_matrix(score_jointly(at)).overlap_fractions, [[0.0, 0.0], [0.0, 1.0]])
+    assert confusability_matrix(score_jointly(point([0.0]))).labels == ()
 
 
 def test_shapes_are_those_of_the_scores_or_the_middle_of_the_grid():
     one = effect("one@x", amplitude())
     axes = [signature(SHAPED, np.eye(4)[i], s=0.1 * (i + 1)) for i in range(4)]
     at = point([0.0] * 4, *axes, signature(one, [0.0, 1.0, 0.0, 0.0]))
-    assert confusability(together(at)).matrix[1, 0] == 0.0
+    assert confusability_matrix(score_jointly(at)).overlap_fractions[1, 0] == 0.0
     chosen = score(SHAPED, step={"branch@T1.a": 1.0, "branch@T1.s": 0.2})
-    assert confusability(together(at, [chosen])).matrix[1, 0] == pytest.approx(1.0)
+    assert confusability_matrix(score_jointly(at, [chosen])).overlap_fractions[1, 0] == pytest.approx(1.0)
     middle = point([0.0] * 4, *axes, signature(one, [0.0, 0.0, 1.0, 0.0]))
-    assert confusability(together(middle)).matrix[1, 0] == pytest.approx(1.0)
+    assert confusability_matrix(score_jointly(middle)).overlap_fractions[1, 0] == pytest.approx(1.0)
 
 
 def test_candidates_alike_explain_the_signature_from_the_limit_on():
     table = alike(["a", "b", "c", "d"], [[1.0, 0.9, 0.89, 0.95], [0.2, 1.0, 0.3, 0.1], [0, 0, 1, 0], [0, 0, 0, 1]])
-    assert table.like("a", 0.9) == ("b", "d")
-    assert table.like("a", 0.5) == ("b", "c", "d")
-    assert table.like("b", 0.9) == ()
+    assert table.confusable_with("a", 0.9) == ("b", "d")
+    assert table.confusable_with("a", 0.5) == ("b", "c", "d")
+    assert table.confusable_with("b", 0.9) == ()
 
 
 # -- two at once -------------------------------------------------------------------------------------------------------
@@ -378,36 +395,38 @@ def test_two_that_hide_in_each_other_show_as_a_pair():
     at = point(
         [0.0, -1.0, 0.0], *(signature(of, x) for of, x in ((a, [1, 0.5, 0]), (b, [1, -0.5, 0]), (c, [0, 0.5, 2])))
     )
-    pairs = list(together(at).pairs([a.label, b.label, c.label]))
+    pairs = list(score_jointly(at).ranked_pairs([a.label, b.label, c.label]))
     assert [tuple(of.kind for of in pair.effects) for pair in pairs] == [("a", "b"), ("a", "c"), ("b", "c")]
     best = pairs[0]
-    assert best.decrease == pytest.approx(1.0)
-    assert best.worth == pytest.approx(-1.0)
-    assert best.step == pytest.approx({"a@x.a": 1.0, "b@x.a": -1.0})
-    assert [tuple(of.kind for of in p.effects) for p in together(at).pairs(["c@x", "b@x"])] == [("b", "c")]
+    assert best.predicted_chi2_decrease == pytest.approx(1.0)
+    assert best.penalized_chi2_decrease == pytest.approx(-1.0)
+    assert best.predicted_values == pytest.approx({"a@x.a": 1.0, "b@x.a": -1.0})
+    assert [tuple(of.kind for of in p.effects) for p in score_jointly(at).ranked_pairs(["c@x", "b@x"])] == [("b", "c")]
 
 
 def test_pairs_promise_what_the_linear_model_of_both_does():
     rng = np.random.default_rng(3)
     effects = (PAIR, TWO_SIDED, SHAPED)
-    columns = [rng.standard_normal((9, len(of.amplitudes))) for of in effects]
+    columns = [rng.standard_normal((9, len(of.amplitude_names))) for of in effects]
     residual = rng.standard_normal(9)
     made = [signature(of, x, **({"s": 0.2} if of is SHAPED else {})) for of, x in zip(effects, columns, strict=True)]
-    for pair in together(point(residual, *made)).pairs([of.label for of in effects]):
+    for pair in score_jointly(point(residual, *made)).ranked_pairs([of.label for of in effects]):
         x = np.hstack([columns[effects.index(of)] for of in pair.effects])
-        names = [name for of in pair.effects for name in of.amplitudes]
+        names = [name for of in pair.effects for name in of.amplitude_names]
         lower, upper = (np.concatenate([screening._room(of)[k] for of in pair.effects]) for k in (0, 1))
         step = np.clip(-np.linalg.lstsq(x, residual)[0], lower, upper)
-        assert [pair.step[name] for name in names] == pytest.approx(step)
-        assert pair.decrease == pytest.approx(residual @ residual - np.sum((residual + x @ step) ** 2))
-        assert pair.worth == pytest.approx(pair.decrease - len(names))
-        assert pair.step.get("branch@T1.s", 0.2) == 0.2
+        assert [pair.predicted_values[name] for name in names] == pytest.approx(step)
+        assert pair.predicted_chi2_decrease == pytest.approx(residual @ residual - np.sum((residual + x @ step) ** 2))
+        assert pair.penalized_chi2_decrease == pytest.approx(pair.predicted_chi2_decrease - len(names))
+        assert pair.predicted_values.get("branch@T1.s", 0.2) == 0.2
 
 
 def test_what_was_not_seen_is_listed():
     table = alike([], np.zeros((0, 0)))
-    screened = Screened((visible(ONE_SIDED), visible(TWO_SIDED, seen=False)), (), table, together(point([0.0])))
-    assert screened.unseen == ["offset@elbow"]
+    screened = ScreeningResult(
+        (visible(ONE_SIDED), visible(TWO_SIDED, seen=False)), (), table, score_jointly(point([0.0]))
+    )
+    assert screened.undetectable_labels == ["offset@elbow"]
 
 
 # -- one sweep for all ------------------------------------------------------------------------------------------------
@@ -428,7 +447,7 @@ def swept(monkeypatch):
 
     made = Candidates((ONE_SIDED, TWO_SIDED, PAIR, SHAPED), rng.standard_normal(ROWS), column, {"k": 0.3})
     parts = [series(range(8)), series(range(8, ROWS), colour=(1.0, 0.5))]
-    monkeypatch.setattr(screening, "residual_series", lambda problem: made.told(parts, problem))
+    monkeypatch.setattr(screening, "residual_channels", lambda problem: made.told(parts, problem))
     return made
 
 
@@ -438,61 +457,68 @@ def projected(basis, columns):
 
 
 def test_every_candidate_is_linearised_beside_what_the_fit_frees(swept):
-    found = linearise(swept, (), {"k": 0.3}, grid=3)
+    found = linearize_candidates(swept, (), {"k": 0.3}, grid=3)
     labels = [s.effect.label for s in found.signatures]
     assert labels == ["friction@elbow", "offset@elbow", "tilt@world", *["branch@T1"] * 3]
-    assert found.values == {"k": 0.3}
+    assert found.parameter_values == {"k": 0.3}
     fitted = swept.column("k", swept.theta)[:, None]
-    np.testing.assert_allclose(found.residual, projected(fitted, swept.residual_at({"k": 0.3})), atol=1e-12)
+    np.testing.assert_allclose(found.projected_residual, projected(fitted, swept.residual_at({"k": 0.3})), atol=1e-12)
     for entry in found.signatures:
-        theta = swept.theta | entry.shape
-        plain = np.stack([swept.column(name, theta) for name in entry.effect.amplitudes], axis=1)
-        np.testing.assert_allclose(entry.columns, projected(fitted, plain), atol=1e-12)
-        np.testing.assert_allclose(entry.noise, _coloured(entry.columns, swept.parts), atol=1e-12)
-    tried = [s.shape for s in found.signatures if s.effect is SHAPED]
-    assert tried == shape_grid(SHAPED, 3)
-    assert all(s.shape == {} for s in found.signatures if s.effect is not SHAPED)
+        theta = swept.theta | entry.shape_values
+        plain = np.stack([swept.column(name, theta) for name in entry.effect.amplitude_names], axis=1)
+        np.testing.assert_allclose(entry.projected_sensitivity, projected(fitted, plain), atol=1e-12)
+        np.testing.assert_allclose(
+            entry.score_noise_covariance, _coloured(entry.projected_sensitivity, swept.parts), atol=1e-12
+        )
+    tried = [s.shape_values for s in found.signatures if s.effect is SHAPED]
+    assert tried == _shape_grid(SHAPED, 3)
+    assert all(s.shape_values == {} for s in found.signatures if s.effect is not SHAPED)
     assert swept.asked == ["k"]
 
 
 def test_effects_in_the_model_are_free_and_no_candidates(swept):
     values = {"k": 0.1, "tilt@world.x": 0.5, "tilt@world.y": -0.5}
-    found = linearise(swept, (PAIR,), values, grid=1)
+    found = linearize_candidates(swept, (PAIR,), values, grid=1)
     assert [s.effect.label for s in found.signatures] == ["friction@elbow", "offset@elbow", "branch@T1"]
     names = ("k", "tilt@world.x", "tilt@world.y")
     fitted = np.stack([swept.column(name, swept.theta) for name in names], axis=1)
-    np.testing.assert_allclose(found.residual, projected(fitted, swept.residual_at(values)), atol=1e-12)
+    np.testing.assert_allclose(found.projected_residual, projected(fitted, swept.residual_at(values)), atol=1e-12)
     plain = swept.column("friction@elbow.a", swept.theta)[:, None]
-    np.testing.assert_allclose(found.signatures[0].columns, projected(fitted, plain), atol=1e-12)
+    np.testing.assert_allclose(found.signatures[0].projected_sensitivity, projected(fitted, plain), atol=1e-12)
     assert swept.asked == ["k"]
 
 
 def test_weak_priors_are_no_data(swept):
-    before = linearise(swept, (), {"k": 0.3})
+    before = linearize_candidates(swept, (), {"k": 0.3})
     swept.weak = 2
-    after = linearise(swept, (), {"k": 0.3})
-    assert len(after.residual) == ROWS
-    np.testing.assert_allclose(after.residual, before.residual)
-    np.testing.assert_allclose(after.signatures[0].columns, before.signatures[0].columns)
+    after = linearize_candidates(swept, (), {"k": 0.3})
+    assert len(after.projected_residual) == ROWS
+    np.testing.assert_allclose(after.projected_residual, before.projected_residual)
+    np.testing.assert_allclose(after.signatures[0].projected_sensitivity, before.signatures[0].projected_sensitivity)
 
 
 def test_without_other_candidates_nothing_is_swept(swept):
-    found = linearise(swept, (ONE_SIDED, TWO_SIDED, PAIR, SHAPED), {"k": 0.3})
+    found = linearize_candidates(swept, (ONE_SIDED, TWO_SIDED, PAIR, SHAPED), {"k": 0.3})
     assert found.signatures == ()
-    assert found.residual.shape == (0,)
+    assert found.projected_residual.shape == (0,)
 
 
 @pytest.mark.parametrize("fault", ["fails", "has no Jacobian"])
 def test_a_model_that_cannot_be_rolled_out_cannot_be_linearised(swept, fault):
     swept.fault = fault
     with pytest.raises(SolverError, match="cannot be linearised"):
-        linearise(swept, (), {"k": 0.3})
+        linearize_candidates(swept, (), {"k": 0.3})
 
 
 def test_screening_goes_by_its_thresholds(swept):
-    found = screen(swept, (), {"k": 0.3}, Thresholds(shape_values=2, detection=1.5))
-    at = linearise(swept, (), {"k": 0.3}, 2)
-    assert [v.detectable for v in found.visible] == [v.detectable for v in visibility(at, 1.5)]
-    assert found.scores == scores(at, swept.parts, visibility(at, 1.5))
+    found = screen_candidates(swept, (), {"k": 0.3}, Thresholds(shape_grid_size=2, detection_z=1.5))
+    at = linearize_candidates(swept, (), {"k": 0.3}, 2)
+    assert [v.detectable_amplitudes for v in found.detectability] == [
+        v.detectable_amplitudes for v in candidate_detectability(at, 1.5)
+    ]
+    assert found.candidate_scores == score_candidates(at, swept.parts, candidate_detectability(at, 1.5))
     assert swept.warmed[:2] == [None, ()]
-    np.testing.assert_array_equal(found.alike.matrix, confusability(together(at, found.scores)).matrix)
+    np.testing.assert_array_equal(
+        found.confusability.overlap_fractions,
+        confusability_matrix(score_jointly(at, found.candidate_scores)).overlap_fractions,
+    )

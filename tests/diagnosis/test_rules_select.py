@@ -12,21 +12,21 @@ from factories import alike, amplitude, effect, fit, loss, point, score, shape
 from heard import Heard
 
 from yid_ocp.diagnosis import select
-from yid_ocp.diagnosis.refit import Loss, Search
-from yid_ocp.diagnosis.screening import Pair, Screened, together
+from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext
+from yid_ocp.diagnosis.screening import CandidatePair, ScreeningResult, score_jointly
 from yid_ocp.diagnosis.select import (
-    behind,
-    closure,
-    compose,
-    far_likelier,
-    gain,
-    likely_pairs,
-    out_of_shape,
-    oversized,
-    relevant,
-    shortlist,
-    stands_out,
-    within_reach,
+    _is_amplitude_outside_prior,
+    _is_rmse_reduced,
+    _is_shape_outside_prior,
+    _is_significant,
+    _lr_decisive,
+    _near_best_models,
+    _pairs_to_refit,
+    _refit_shortlist,
+    gap_closure,
+    held_out_improvement,
+    penalized_chi2_difference,
+    select_effects,
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import SolverError
@@ -49,9 +49,9 @@ LIMITS = Thresholds()
     ids=["above", "weighed by samples", "below noise", "failed", "empty"],
 )
 def test_a_loss_is_a_mean_over_samples_and_a_gap_what_exceeds_one(squares, counts, mean, gap):
-    found = Loss(np.array(squares), np.array(counts), {})
-    assert found.mean == pytest.approx(mean)
-    assert found.gap == pytest.approx(gap)
+    found = HeldOutLoss(np.array(squares), np.array(counts), {})
+    assert found.chi2_per_sample == pytest.approx(mean)
+    assert found.excess_chi2 == pytest.approx(gap)
 
 
 @pytest.mark.parametrize(
@@ -66,28 +66,28 @@ def test_a_loss_is_a_mean_over_samples_and_a_gap_what_exceeds_one(squares, count
     ids=["all", "half", "nothing", "worse", "below noise"],
 )
 def test_a_closure_is_the_part_of_the_gap_that_went(before, after, closed):
-    found = closure(loss(*before), loss(*after))
-    assert (found.value, found.low, found.high) == pytest.approx((closed, closed, closed))
+    found = gap_closure(loss(*before), loss(*after))
+    assert (found.fraction, found.ci_low, found.ci_high) == pytest.approx((closed, closed, closed))
 
 
 @pytest.mark.parametrize(
     ("before", "after"), [((0.9, 1.0), (0.5, 0.5)), ((1.0, 1.0), (1.0, 1.0)), ((2.0, 3.0), (math.inf, 1.0))]
 )
 def test_there_is_no_closure_without_a_gap_or_a_prediction(before, after):
-    found = closure(loss(*before), loss(*after))
-    assert all(math.isnan(value) for value in (found.value, found.low, found.high))
+    found = gap_closure(loss(*before), loss(*after))
+    assert all(math.isnan(value) for value in (found.fraction, found.ci_low, found.ci_high))
 
 
-def bootstrapped(before: Loss, after: Loss, tails=(0.025, 0.975), paired=True, seed=0):
+def bootstrapped(before: HeldOutLoss, after: HeldOutLoss, tails=(0.025, 0.975), paired=True, seed=0):
     """Quantiles of the closure over resampled blocks, the same blocks for both losses unless `paired` is false."""
     rng = np.random.default_rng(seed)
-    count = len(before.counts)
+    count = len(before.block_sample_counts)
     draws = rng.integers(0, count, (1000, count))
     other = draws if paired else rng.integers(0, count, (1000, count))
     ratios = []
     for here, there in zip(draws, other, strict=True):
-        g0 = max(before.squares[here].sum() / before.counts[here].sum() - 1, 0.0)
-        g1 = max(after.squares[there].sum() / after.counts[there].sum() - 1, 0.0)
+        g0 = max(before.block_chi2[here].sum() / before.block_sample_counts[here].sum() - 1, 0.0)
+        g1 = max(after.block_chi2[there].sum() / after.block_sample_counts[there].sum() - 1, 0.0)
         if g0 > 0:
             ratios.append(1 - g1 / g0)
     return np.quantile(ratios, tails)
@@ -100,30 +100,30 @@ def noisy():
     size = rng.uniform(0.5, 6.0, 20)
     left = 1 + 0.4 * (size - 1) + 0.1 * rng.standard_normal(20)
     counts = rng.integers(50, 150, 20).astype(float)
-    return Loss(size * counts, counts, {}), Loss(left * counts, counts, {})
+    return HeldOutLoss(size * counts, counts, {}), HeldOutLoss(left * counts, counts, {})
 
 
 def test_the_interval_of_a_closure_is_that_of_95_percent_over_paired_blocks(noisy):
-    found = closure(*noisy)
-    np.testing.assert_allclose([found.low, found.high], bootstrapped(*noisy), rtol=1e-12)
+    found = gap_closure(*noisy)
+    np.testing.assert_allclose([found.ci_low, found.ci_high], bootstrapped(*noisy), rtol=1e-12)
     half = bootstrapped(*noisy, tails=(0.25, 0.75))
-    assert found.low < half[0] < half[1] < found.high
+    assert found.ci_low < half[0] < half[1] < found.ci_high
     apart = bootstrapped(*noisy, paired=False)
-    assert apart[0] < found.low - 0.1, "blocks drawn apart would widen it"
-    assert found.low < found.value < found.high
+    assert apart[0] < found.ci_low - 0.1, "blocks drawn apart would widen it"
+    assert found.ci_low < found.fraction < found.ci_high
 
 
 def test_resampled_blocks_without_a_gap_do_not_count():
     before, after = loss(0.1, 4.0, 0.2), loss(0.1, 1.5, 0.2)
-    found = closure(before, after)
-    np.testing.assert_allclose([found.low, found.high], bootstrapped(before, after), rtol=1e-12)
-    assert found.high <= 1.0
+    found = gap_closure(before, after)
+    np.testing.assert_allclose([found.ci_low, found.ci_high], bootstrapped(before, after), rtol=1e-12)
+    assert found.ci_high <= 1.0
 
 
 def test_blocks_are_drawn_by_the_seed(noisy):
-    found, again = closure(*noisy, seed=1), closure(*noisy)
-    np.testing.assert_allclose([found.low, found.high], bootstrapped(*noisy, seed=1), rtol=1e-12)
-    assert found.value == again.value
+    found, again = gap_closure(*noisy, seed=1), gap_closure(*noisy)
+    np.testing.assert_allclose([found.ci_low, found.ci_high], bootstrapped(*noisy, seed=1), rtol=1e-12)
+    assert found.fraction == again.fraction
     assert found != again
 
 
@@ -132,11 +132,11 @@ def test_blocks_are_drawn_by_the_seed(noisy):
 
 def test_a_gain_has_the_standard_error_of_its_sum_over_blocks():
     before, after = loss(3.0, 4.0, 2.0, count=10.0), loss(2.0, 2.0, 2.0, count=10.0)
-    gained, error = gain(before, after)
+    gained, error = held_out_improvement(before, after)
     assert gained == pytest.approx(1.0)
     # blocks differ by 10, 20 and 0: their standard deviation is 10, and there are three of them
     assert error == pytest.approx(math.sqrt(3) * 10.0 / 30.0)
-    assert gain(after, before) == pytest.approx((-gained, error))
+    assert held_out_improvement(after, before) == pytest.approx((-gained, error))
 
 
 @pytest.mark.parametrize(
@@ -150,7 +150,7 @@ def test_a_gain_has_the_standard_error_of_its_sum_over_blocks():
     ids=["one block tells nothing", "even", "cannot be predicted", "could not be predicted"],
 )
 def test_a_gain_at_its_ends(before, after, expected):
-    assert gain(loss(*before), loss(*after)) == pytest.approx(expected)
+    assert held_out_improvement(loss(*before), loss(*after)) == pytest.approx(expected)
 
 
 # -- the choice -------------------------------------------------------------------------------------------------------
@@ -162,7 +162,7 @@ WIDE = effect("wide@x", amplitude("a"), shape("s", expected=(0.1, 1.0)))
 
 def there(of, *means, **values):
     """A fit whose effect is surely there."""
-    sizes = {f"{of.label}.{q.name}": 1.0 for q in of.quantities if not q.shape}
+    sizes = {f"{of.label}.{q.name}": 1.0 for q in of.definitions if not q.is_shape_parameter}
     return fit([of], loss(*means), values=sizes | {f"{of.label}.{name}": value for name, value in values.items()})
 
 
@@ -185,15 +185,15 @@ def labels(fits):
 )
 def test_the_simplest_within_reach_of_the_best_comes_first(small, large, expected):
     fits = [fit([LARGE], loss(*large)), fit([SMALL], loss(*small))]
-    hundredth = Thresholds(tie=0.01)
-    assert labels(within_reach(fits, hundredth)) == expected
-    assert labels(within_reach(fits[::-1], hundredth)) == expected
+    hundredth = Thresholds(chi2_equivalence=0.01)
+    assert labels(_near_best_models(fits, hundredth)) == expected
+    assert labels(_near_best_models(fits[::-1], hundredth)) == expected
 
 
 def test_a_tie_is_a_part_of_the_best_loss():
     fits = [fit([LARGE], loss(50.0, 50.0)), fit([SMALL], loss(50.4, 50.4))]
-    assert labels(within_reach(fits, Thresholds(tie=0.01))) == ["small@x", "large@x"]
-    assert labels(within_reach(fits, Thresholds(tie=0.005))) == ["large@x"]
+    assert labels(_near_best_models(fits, Thresholds(chi2_equivalence=0.01))) == ["small@x", "large@x"]
+    assert labels(_near_best_models(fits, Thresholds(chi2_equivalence=0.005))) == ["large@x"]
 
 
 @pytest.mark.parametrize(
@@ -211,22 +211,22 @@ def test_a_tie_is_a_part_of_the_best_loss():
 )
 def test_where_a_model_errs_everywhere_fewer_parameters_outweigh_a_larger_loss(level, ratio, blocks, expected):
     fits = [fit([LARGE], loss(*[level] * blocks)), fit([SMALL], loss(*[ratio * level] * blocks))]
-    assert labels(within_reach(fits)) == expected
+    assert labels(_near_best_models(fits)) == expected
     # never the other way round
     better = [fit([SMALL], loss(*[level] * blocks)), fit([LARGE], loss(*[ratio * level] * blocks))]
-    assert labels(within_reach(better)) == ["small@x"]
+    assert labels(_near_best_models(better)) == ["small@x"]
 
 
 def test_of_equally_simple_ones_the_better_comes_first():
     other = effect("other@x", amplitude())
     fits = [fit([SMALL], loss(1.004, 1.004)), fit([other], loss(1.0, 1.0)), fit([LARGE], loss(0.999, 0.999))]
-    assert labels(within_reach(fits, Thresholds(tie=0.01))) == ["other@x", "small@x", "large@x"]
+    assert labels(_near_best_models(fits, Thresholds(chi2_equivalence=0.01))) == ["other@x", "small@x", "large@x"]
 
 
 def test_an_amplitude_far_out_of_its_range_comes_last():
     fits = [there(SMALL, 1.0, 1.0, a=2.5), there(LARGE, 1.0, 1.0)]
-    assert labels(within_reach(fits)) == ["large@x", "small@x"]
-    assert labels(within_reach(fits, Thresholds(range_widths=2.0))) == ["small@x", "large@x"]
+    assert labels(_near_best_models(fits)) == ["large@x", "small@x"]
+    assert labels(_near_best_models(fits, Thresholds(prior_range_margin=2.0))) == ["small@x", "large@x"]
 
 
 @pytest.mark.parametrize(
@@ -241,7 +241,7 @@ def test_an_amplitude_far_out_of_its_range_comes_last():
 )
 def test_an_unlikely_shape_counts_only_where_no_other_comes_near(odd, plain, expected):
     fits = [there(WIDE, *odd, s=9.0), there(SMALL, *plain)]
-    assert labels(within_reach(fits)) == expected
+    assert labels(_near_best_models(fits)) == expected
 
 
 @pytest.mark.parametrize(
@@ -255,20 +255,20 @@ def test_an_unlikely_shape_counts_only_where_no_other_comes_near(odd, plain, exp
 )
 def test_one_that_is_not_sure_to_be_there_counts_only_where_no_other_comes_near(unsure, sure, expected):
     fits = [there(LARGE, *unsure, a=0.019, b=0.0), there(SMALL, *sure)]
-    assert labels(within_reach(fits)) == expected
-    assert labels(within_reach([there(LARGE, *unsure, a=0.021, b=0.0), there(SMALL, *sure)])) == ["large@x"]
+    assert labels(_near_best_models(fits)) == expected
+    assert labels(_near_best_models([there(LARGE, *unsure, a=0.021, b=0.0), there(SMALL, *sure)])) == ["large@x"]
 
 
 def test_how_near_another_must_come_is_a_threshold():
     fits = [there(WIDE, 1.0, 1.0, s=9.0), there(SMALL, 1.08, 1.08)]
-    assert labels(within_reach(fits)) == ["wide@x"]
-    assert labels(within_reach(fits, Thresholds(stand_in=0.1))) == ["small@x"]
+    assert labels(_near_best_models(fits)) == ["wide@x"]
+    assert labels(_near_best_models(fits, Thresholds(implausible_shape_margin=0.1))) == ["small@x"]
 
 
 def test_a_model_without_effects_is_the_simplest():
     fits = [there(SMALL, 1.0, 1.0), fit((), loss(1.0, 1.0))]
-    assert [len(entry.effects) for entry in within_reach(fits)] == [0, 1]
-    assert [entry.size for entry in (fit(), fit([SMALL]), fit([SMALL, LARGE]))] == [0, 1, 3]
+    assert [len(entry.effects) for entry in _near_best_models(fits)] == [0, 1]
+    assert [entry.effect_parameter_count for entry in (fit(), fit([SMALL]), fit([SMALL, LARGE]))] == [0, 1, 3]
 
 
 @pytest.mark.parametrize(
@@ -290,7 +290,7 @@ def test_a_model_without_effects_is_the_simplest():
 )
 def test_a_shape_may_leave_its_range_by_a_factor_or_a_width(expected, value, odd):
     of = effect("wide@x", amplitude(), shape("s", expected=expected, lower=-math.inf))
-    assert out_of_shape(of, {"wide@x.a": 99.0, "wide@x.s": value}) is odd
+    assert _is_shape_outside_prior(of, {"wide@x.a": 99.0, "wide@x.s": value}) is odd
 
 
 def test_a_shape_that_may_as_well_lie_within_is_not_out_of_it():
@@ -298,7 +298,9 @@ def test_a_shape_that_may_as_well_lie_within_is_not_out_of_it():
     of = effect("wide@x", amplitude(), shape("s", expected=(0.1, 1.0), lower=-math.inf))
 
     def odd(value, std, **limits):
-        return out_of_shape(of, {"wide@x.a": 99.0, "wide@x.s": value}, Thresholds(**limits), {"wide@x.s": std})
+        return _is_shape_outside_prior(
+            of, {"wide@x.a": 99.0, "wide@x.s": value}, Thresholds(**limits), {"wide@x.s": std}
+        )
 
     assert [odd(3.0, std) for std in (0.49, 0.51, math.inf)] == [True, False, False]
     assert [odd(0.02, std) for std in (0.014, 0.016)] == [True, False]
@@ -309,8 +311,8 @@ def test_a_shape_that_may_as_well_lie_within_is_not_out_of_it():
         fit([effect("other@x", amplitude())], loss(1.04, 1.04), values={"other@x.a": 1.0}),
     )
     sure, unsure = (fit([of], loss(1.0, 1.0), values=values, std={"wide@x.s": std}) for std in (0.1, 2.0))
-    assert within_reach([sure, near])[0] is near
-    assert within_reach([unsure, near])[0] is unsure
+    assert _near_best_models([sure, near])[0] is near
+    assert _near_best_models([unsure, near])[0] is unsure
 
 
 @pytest.mark.parametrize(
@@ -318,8 +320,8 @@ def test_a_shape_that_may_as_well_lie_within_is_not_out_of_it():
 )
 def test_an_amplitude_may_leave_its_range_by_its_width(value, odd):
     of = effect("wide@x", amplitude("b"), amplitude(lower=-9.0, expected=(1.0, 3.0)), shape("s"))
-    assert oversized(of, {"wide@x.a": value, "wide@x.b": 0.0, "wide@x.s": 99.0}) is odd
-    assert out_of_shape(of, {"wide@x.a": 99.0, "wide@x.b": 0.0, "wide@x.s": 0.5}) is False
+    assert _is_amplitude_outside_prior(of, {"wide@x.a": value, "wide@x.b": 0.0, "wide@x.s": 99.0}) is odd
+    assert _is_shape_outside_prior(of, {"wide@x.a": 99.0, "wide@x.b": 0.0, "wide@x.s": 0.5}) is False
 
 
 # -- the shortlist ----------------------------------------------------------------------------------------------------
@@ -333,7 +335,7 @@ def ranked(**decreases):
 
 
 def shortlisted(scores, table, places=(), **limits):
-    return [of.kind for of, _ in shortlist(scores, table, Thresholds(**{"surest": 0} | limits), places)]
+    return [of.kind for of, _ in _refit_shortlist(scores, table, Thresholds(**{"surest": 0} | limits), places)]
 
 
 def test_the_best_are_refitted_and_those_that_can_stand_in_for_them():
@@ -355,7 +357,7 @@ def test_as_many_more_as_are_refitted_and_each_once():
     matrix[0, 2:] = matrix[1, 2:] = 0.95
     table = alike([s.effect.label for s in scores], matrix)
     assert shortlisted(scores, table, refits=2) == ["a", "b", "c", "d"]
-    [(of, step), *_] = shortlist(scores, table, LIMITS)
+    [(of, step), *_] = _refit_shortlist(scores, table, LIMITS)
     assert (of.kind, step) == ("a", {"a@x.a": 9.0})
 
 
@@ -379,7 +381,7 @@ def test_the_best_of_every_place_of_the_gap_is_refitted():
 # -- one effect after the other ---------------------------------------------------------------------------------------
 
 A, B, C = (effect(f"{name}@x", amplitude()) for name in "abc")
-FEW = together(point([0.0]))
+FEW = score_jointly(point([0.0]))
 
 
 class Rounds:
@@ -392,10 +394,10 @@ class Rounds:
         self.absent, self.before, self.pairs, self.left = absent, before, pairs, left
         kinds = [score(of, p=p, decrease=9.0 - i) for i, (of, p) in enumerate(zip((A, B, C), p_values, strict=True))]
         self.scores = tuple(kinds)
-        monkeypatch.setattr(select, "refit_all", self.refit_all)
-        monkeypatch.setattr(select, "refit", self.refit)
-        monkeypatch.setattr(select, "refit_pairs", self.refit_pairs)
-        monkeypatch.setattr(select, "screen", self.screen)
+        monkeypatch.setattr(select, "refit_each_candidate", self.refit_all)
+        monkeypatch.setattr(select, "refit_with_effects", self.refit)
+        monkeypatch.setattr(select, "refit_each_pair", self.refit_pairs)
+        monkeypatch.setattr(select, "screen_candidates", self.screen)
 
     def fit(self, effects):
         known = "".join(sorted(of.kind for of in effects))
@@ -408,12 +410,14 @@ class Rounds:
         if base and self.left is not None:
             left = tuple(replace(s, p_value=self.left) for s in left)
         table = alike([s.effect.label for s in left], np.eye(len(left)))
-        return Screened((), left, table, SimpleNamespace(pairs=self.promised))
+        return ScreeningResult((), left, table, SimpleNamespace(pairs=self.promised))
 
     def promised(self, among):
         kinds = {of.kind: of for of in (A, B, C) if of.label in among}
         return [
-            Pair((kinds[one], kinds[other]), {}, 9.0, 7.0) for one, other in self.pairs if {one, other} <= set(kinds)
+            CandidatePair((kinds[one], kinds[other]), {}, 9.0, 7.0)
+            for one, other in self.pairs
+            if {one, other} <= set(kinds)
         ]
 
     def refit_pairs(self, search, tried, values):
@@ -443,9 +447,9 @@ class Rounds:
         return None if kinds in self.fails else self.fit(effects)
 
     def compose(self, moved=False, **limits):
-        search = Search(SimpleNamespace(), Thresholds(**limits), self.heard, None)
+        search = RefitContext(SimpleNamespace(), Thresholds(**limits), self.heard, None)
         nominal = fit((), loss(*self.losses[""]), values={"k": 0.0})
-        first, added = compose(search, nominal, self.screened(), moved=moved)
+        first, added = select_effects(search, nominal, self.screened(), moved=moved)
         return [f.effects[0].kind for f in first], [entry.effect.kind for entry in added], added
 
 
@@ -456,7 +460,7 @@ def test_one_effect_that_leaves_no_gap_is_enough(monkeypatch):
     assert rounds.refits == [([], ["a", "b", "c"], 0.0)]
     assert [kinds for kinds, *_ in rounds.screens] == [["a"]]
     assert added[0].closure.value == pytest.approx(1 - 0.05 / 2.1)
-    assert [of.kind for of in added[0].rivals] == ["a"]
+    assert [of.kind for of in added[0].equivalent_effects] == ["a"]
     assert rounds.heard.stages == [
         "added a@x: 97.6 % of the held-out gap closed",
         "scoring what is left beside a@x",
@@ -479,7 +483,7 @@ def test_rivals_are_those_within_reach(monkeypatch):
     rounds = Rounds(monkeypatch, {"": (3.0, 3.2), "a": (1.0, 1.1), "b": (1.001, 1.101), "c": (1.5, 1.7)})
     first, _, added = rounds.compose()
     assert first == ["a", "b", "c"]
-    assert [of.kind for of in added[0].rivals] == ["a", "b"]
+    assert [of.kind for of in added[0].equivalent_effects] == ["a", "b"]
 
 
 GROWING = {
@@ -517,7 +521,7 @@ def test_no_more_effects_than_allowed_nor_than_are_significant(monkeypatch):
 
 def test_what_is_added_to_others_is_of_a_size_to_be_expected(monkeypatch):
     rounds = Rounds(monkeypatch, GROWING)
-    monkeypatch.setattr(select, "oversized", lambda of, values, limits: of.kind == "b")
+    monkeypatch.setattr(select, "_is_amplitude_outside_prior", lambda of, values, limits: of.kind == "b")
     assert rounds.compose()[1] == ["a", "c"]
     # the first one may be larger, and what is in the place of one that is may be too
     alone = Rounds(monkeypatch, {**GROWING, "b": (1.0, 1.1)})
@@ -586,50 +590,52 @@ def test_an_effect_must_close_a_sure_part_of_the_gap(monkeypatch, nominal, best,
     ],
 )
 def test_held_out_recordings_are_far_likelier_with_an_effect_that_leaves_noise(before, after, sure):
-    assert far_likelier(loss(*before), loss(*after)) is sure
-    assert closure(loss(*before), loss(*after)).sure is sure
-    assert not far_likelier(loss(*before), loss(*after), Thresholds(worth=20.0))
+    assert _lr_decisive(loss(*before), loss(*after)) is sure
+    assert gap_closure(loss(*before), loss(*after)).is_decisive is sure
+    assert not _lr_decisive(loss(*before), loss(*after), Thresholds(min_log_bayes_factor=20.0))
 
 
 def test_an_effect_far_less_likely_than_the_best_is_not_within_reach():
     one, other = fit([effect("one@elbow")], loss(0.9, 1.0)), fit([effect("other@elbow")], loss(1.01, 1.0))
-    assert within_reach([one, other]) == [one]
+    assert _near_best_models([one, other]) == [one]
     near = fit([effect("other@elbow")], loss(0.98, 1.0))
-    assert within_reach([one, near]) == [one, near]
+    assert _near_best_models([one, near]) == [one, near]
 
 
 def test_all_recordings_tell_which_effects_are_within_reach():
     one = fit([effect("one@elbow")], loss(0.99, 1.0), cost=100.0)
     # 2 more in held-out squares, and twice the cost: 12 in all, where 10 are worth a word
-    assert within_reach([one, fit([effect("other@elbow")], loss(1.01, 1.0), cost=105.0)]) == [one]
-    assert len(within_reach([one, fit([effect("other@elbow")], loss(1.01, 1.0), cost=103.9)])) == 2
+    assert _near_best_models([one, fit([effect("other@elbow")], loss(1.01, 1.0), cost=105.0)]) == [one]
+    assert len(_near_best_models([one, fit([effect("other@elbow")], loss(1.01, 1.0), cost=103.9)])) == 2
     # a parameter more is worth one by chance
     two = fit([effect("two@elbow", amplitude("a"), amplitude("b"))], loss(0.99, 1.0), cost=100.0)
-    assert len(within_reach([two, fit([effect("other@elbow")], loss(1.01, 1.0), cost=104.4)])) == 2
-    assert behind(fit([effect("other@elbow")], loss(1.01, 1.0), cost=104.4), two) == pytest.approx(9.8)
+    assert len(_near_best_models([two, fit([effect("other@elbow")], loss(1.01, 1.0), cost=104.4)])) == 2
+    assert penalized_chi2_difference(fit([effect("other@elbow")], loss(1.01, 1.0), cost=104.4), two) == pytest.approx(
+        9.8
+    )
     # chance lets another be the best on what is held out, by less than a standard error
     ahead, true = fit([effect("ahead@elbow")], loss(0.9, 1.0), cost=130.0), fit([effect("true@elbow")], loss(1.0, 0.95))
-    assert within_reach([ahead, replace(true, cost=100.0)]) == [replace(true, cost=100.0)]
-    both = within_reach([ahead, replace(true, cost=127.0)])
+    assert _near_best_models([ahead, replace(true, cost=100.0)]) == [replace(true, cost=100.0)]
+    both = _near_best_models([ahead, replace(true, cost=127.0)])
     assert [entry.effects[0].kind for entry in both] == ["true", "ahead"], "the likelier first"
     # where more than noise is left, squares are errors of the model
     rough = fit([effect("one@elbow")], loss(1.19, 1.2), cost=100.0)
-    assert len(within_reach([rough, fit([effect("other@elbow")], loss(1.2, 1.2), cost=130.0)])) == 2
+    assert len(_near_best_models([rough, fit([effect("other@elbow")], loss(1.2, 1.2), cost=130.0)])) == 2
 
 
 def test_what_all_recordings_say_is_within_reach_beyond_a_standard_error_on_those_held_out():
     """A spring that bends far away is an offset; chance alone may predict one motion better with it, by 2 here."""
     spring = fit([effect("spring@elbow", amplitude("a"), amplitude("b"))], loss(1.0, 1.0), cost=103.0)
     offset = fit([effect("offset@elbow")], loss(1.01, 1.01), cost=102.0)
-    assert gain(offset.loss, spring.loss) == pytest.approx((0.01, 0.0))
-    assert behind(offset, spring) == pytest.approx(-1.0)
-    assert [entry.effects[0].kind for entry in within_reach([spring, offset])] == ["offset", "spring"]
+    assert held_out_improvement(offset.held_out_loss, spring.held_out_loss) == pytest.approx((0.01, 0.0))
+    assert penalized_chi2_difference(offset, spring) == pytest.approx(-1.0)
+    assert [entry.effects[0].kind for entry in _near_best_models([spring, offset])] == ["offset", "spring"]
     # 3.84 is what a 95 % interval is worth
-    assert len(within_reach([spring, replace(offset, cost=104.4)])) == 2
-    assert within_reach([spring, replace(offset, cost=104.5)]) == [spring]
+    assert len(_near_best_models([spring, replace(offset, cost=104.4)])) == 2
+    assert _near_best_models([spring, replace(offset, cost=104.5)]) == [spring]
     # where more than noise is left, squares are errors of the model
-    rough = [replace(spring, loss=loss(1.2, 1.2)), replace(offset, loss=loss(1.21, 1.21))]
-    assert within_reach(rough) == [rough[0]]
+    rough = [replace(spring, held_out_loss=loss(1.2, 1.2)), replace(offset, held_out_loss=loss(1.21, 1.21))]
+    assert _near_best_models(rough) == [rough[0]]
 
 
 def test_nothing_is_added_where_no_refit_succeeds(monkeypatch):
@@ -671,7 +677,7 @@ def screened_with(usual, base):
     found = usual(base)
     if len(base) < 2:
         return found
-    return Screened((), (score(C, p=1e-9),), alike([C.label], [[1.0]]), FEW)
+    return ScreeningResult((), (score(C, p=1e-9),), alike([C.label], [[1.0]]), FEW)
 
 
 def test_an_effect_stays_where_the_others_do_worse_or_cannot_be_fitted(monkeypatch):
@@ -701,7 +707,7 @@ def test_a_later_effect_shows_what_an_earlier_one_stood_in_for(monkeypatch):
     assert [e.label for e in added[-1].fit.effects] == ["c@x", "b@x"], "in the order in which they stand"
     assert [len(entry.fit.effects) for entry in added] == [1, 2]
     assert "put c@x in the place of a@x" in rounds.heard.stages
-    assert [of.kind for of in added[0].rivals] == ["c"]
+    assert [of.kind for of in added[0].equivalent_effects] == ["c"]
 
 
 HIDDEN = GROWING | {"b": (9.0, 9.2), "c": (9.1, 9.3), "ab": (1.0, 5.0), "ac": (3.1, 3.3), "bc": (1.2, 1.3)}
@@ -752,18 +758,20 @@ def test_both_of_a_pair_have_to_be_there(monkeypatch, absent):
 
 def test_pairs_that_others_can_stand_in_for_are_not_refitted():
     kinds = {name: effect(f"{name}@x", amplitude()) for name in "abcdef"}
-    promised = [Pair((kinds[one], kinds[other]), {}, 9.0 - i, 7.0 - i) for i, (one, other) in enumerate(PROMISED)]
+    promised = [
+        CandidatePair((kinds[one], kinds[other]), {}, 9.0 - i, 7.0 - i) for i, (one, other) in enumerate(PROMISED)
+    ]
     table = np.eye(6)
     table[3, 1] = 0.9  # d's signature is b's, not the other way round
-    found = Screened(
+    found = ScreeningResult(
         (), tuple(score(of) for of in kinds.values()), alike([k.label for k in kinds.values()], table), FEW
     )
     asked = []
-    found = replace(found, together=SimpleNamespace(pairs=lambda among: asked.append(among) or promised))
-    chosen = likely_pairs(found, Thresholds(pairs=3), kinds["a"])
+    found = replace(found, joint_scores=SimpleNamespace(pairs=lambda among: asked.append(among) or promised))
+    chosen = _pairs_to_refit(found, Thresholds(n_refit_pairs=3), kinds["a"])
     assert asked == [["b@x", "c@x", "d@x", "e@x", "f@x"]]
     assert ["".join(of.kind for of in pair) for pair, _ in chosen] == ["bc", "ef", "bd"]
-    assert likely_pairs(found, Thresholds(pairs=0), kinds["a"]) == []
+    assert _pairs_to_refit(found, Thresholds(n_refit_pairs=0), kinds["a"]) == []
 
 
 PROMISED = ("bc", "cd", "dc", "ef", "bd", "be")
@@ -774,18 +782,18 @@ def test_what_does_as_well_beside_the_others_is_a_rival(monkeypatch):
     losses = GROWING | {"ab": (2.0, 2.2), "b": (3.4, 3.5), "bc": (2.001, 2.201)}
     _, chosen, added = Rounds(monkeypatch, losses).compose(effects=2)
     assert chosen == ["a", "b"]
-    assert [of.kind for of in added[0].rivals] == ["a", "c"]
+    assert [of.kind for of in added[0].equivalent_effects] == ["a", "c"]
 
 
 @pytest.mark.parametrize(("std", "there"), [(0.5, True), (0.51, False)])
 def test_an_effect_within_two_standard_deviations_of_neutral_is_not_there(std, there):
     of = effect("wide@x", amplitude("a", neutral=1.0), amplitude("b"), shape("s"))
     found = fit([of], values={"wide@x.a": 2.0, "wide@x.b": 0.01}, std={"wide@x.a": std, "wide@x.b": 1.0})
-    assert stands_out(of, found) is there
-    assert stands_out(of, found, Thresholds(away=1.9)) or std > 0.52
+    assert _is_significant(of, found) is there
+    assert _is_significant(of, found, Thresholds(min_z=1.9)) or std > 0.52
     # a shape that is not known next to nothing makes the amplitude no less sure
     unsure = fit([of], values=found.values, std={"wide@x.a": 9.0}, held={"wide@x.a": std, "wide@x.b": 1.0})
-    assert stands_out(of, unsure) is there
+    assert _is_significant(of, unsure) is there
 
 
 def test_an_effect_that_is_not_there_is_not_added(monkeypatch):
@@ -808,16 +816,16 @@ def test_an_effect_that_is_not_there_is_not_added(monkeypatch):
     ids=["all channels", "too little", "one channel", "too little of one", "far likelier", "not predicted before"],
 )
 def test_an_effect_counts_by_what_it_takes_away_of_an_error(before, after, counts):
-    assert relevant(before, after) is counts
+    assert _is_rmse_reduced(before, after) is counts
 
 
 def test_what_contradicts_a_baseline_counts_whatever_blocks_are_drawn():
     counts = np.full(8, 10.0)
-    before, after = Loss(2 * counts, counts, {}, 800.0), Loss(3 * counts, counts, {}, 0.0)
-    assert (before.mean, after.mean) == (12.0, 3.0)
-    assert gain(before, after) == (pytest.approx(9.0), 0.0)
-    found = closure(before, after)
-    assert (found.value, found.low, found.high) == pytest.approx((9 / 11, 9 / 11, 9 / 11))
+    before, after = HeldOutLoss(2 * counts, counts, {}, 800.0), HeldOutLoss(3 * counts, counts, {}, 0.0)
+    assert (before.chi2_per_sample, after.chi2_per_sample) == (12.0, 3.0)
+    assert held_out_improvement(before, after) == (pytest.approx(9.0), 0.0)
+    found = gap_closure(before, after)
+    assert (found.fraction, found.ci_low, found.ci_high) == pytest.approx((9 / 11, 9 / 11, 9 / 11))
 
 
 def test_the_best_of_a_place_is_refitted_even_if_it_promises_nothing_where_anything_is_significant():

@@ -12,7 +12,7 @@ import threadpoolctl
 from factories import BIAS, FORCE, OTHER_FORCE
 
 from yid_ocp.diagnosis import smoother, smoother_model
-from yid_ocp.diagnosis.smoother_model import Interval, Linear
+from yid_ocp.diagnosis.smoother_model import IntervalModel, LinearResidualModel
 from yid_ocp.diagnosis.thresholds import Thresholds
 
 SOURCES = (FORCE, OTHER_FORCE, BIAS)
@@ -26,7 +26,7 @@ def one_thread():
         yield
 
 
-def made(seed: int, parameters=2, recording="run", size=None, loose=0.3) -> Linear:
+def made(seed: int, parameters=2, recording="run", size=None, loose=0.3) -> LinearResidualModel:
     """A linear model of three unknowns; with `size` its residual holds disturbances of these standard deviations."""
     rng = np.random.default_rng(seed)
     intervals = []
@@ -35,7 +35,7 @@ def made(seed: int, parameters=2, recording="run", size=None, loose=0.3) -> Line
         outside[:, 0] *= 0.0 if size is None else 1.0
         by_unknown = rng.standard_normal((ROWS, len(SOURCES)))
         intervals.append(
-            Interval(
+            IntervalModel(
                 rng.standard_normal((ROWS, 1 + parameters)),
                 rng.standard_normal((ROWS, STATES)),
                 by_unknown,
@@ -48,7 +48,7 @@ def made(seed: int, parameters=2, recording="run", size=None, loose=0.3) -> Line
     at_rest = rng.standard_normal((STATES, len(SOURCES)))
     edges = 0.1 * np.arange(COUNT + 1)
     names = tuple(f"u{i}" for i in range(len(SOURCES)))
-    model = Linear(
+    model = LinearResidualModel(
         recording,
         tuple(intervals),
         edges,
@@ -62,27 +62,27 @@ def made(seed: int, parameters=2, recording="run", size=None, loose=0.3) -> Line
     )
     if size is not None:
         design, _ = dense(model)
-        scale = np.concatenate([model.loose, np.tile(size, COUNT)])
+        scale = np.concatenate([model.initial_state_std, np.tile(size, COUNT)])
         signal = (design @ (scale * rng.standard_normal(len(scale)))).reshape(COUNT, ROWS)
         for interval, part in zip(intervals, signal, strict=True):
-            interval.observed[:, 0] += part
+            interval.negative_residual_jacobian[:, 0] += part
     return model
 
 
-def dense(model: Linear) -> tuple[np.ndarray, np.ndarray]:
+def dense(model: LinearResidualModel) -> tuple[np.ndarray, np.ndarray]:
     """Residual rows, and unknowns (COUNT, nd, ...), by the first state and all disturbances of unit variance."""
-    nd, width = len(model.sources), STATES + len(model.sources) * COUNT
+    nd, width = len(model.unknown_groups), STATES + len(model.unknown_groups) * COUNT
     unknown = np.zeros((COUNT, nd, width))
     for j in range(COUNT):
         if j:
-            unknown[j] = model.decay * unknown[j - 1]
+            unknown[j] = model.interval_correlation * unknown[j - 1]
         own = slice(STATES + nd * j, STATES + nd * (j + 1))
-        unknown[j][:, own] += np.eye(nd) * (math.sqrt(1 - model.decay**2) if j else 1.0)
-    state = np.eye(STATES, width) + model.at_rest @ unknown[0]
+        unknown[j][:, own] += np.eye(nd) * (math.sqrt(1 - model.interval_correlation**2) if j else 1.0)
+    state = np.eye(STATES, width) + model.initial_state_jacobian @ unknown[0]
     rows = []
     for j, interval in enumerate(model.intervals):
-        rows.append(interval.by_state @ state + interval.by_unknown @ unknown[j])
-        state = interval.transition @ state + interval.drive @ unknown[j]
+        rows.append(interval.state_jacobian @ state + interval.unknown_jacobian @ unknown[j])
+        state = interval.state_transition @ state + interval.unknown_input_matrix @ unknown[j]
     return np.vstack(rows), unknown
 
 
@@ -94,11 +94,11 @@ class Dense:
         for model in models:
             design, _ = dense(model)
             blocks.append(design)
-            observed.append(np.vstack([i.observed for i in model.intervals]))
-            by_source = np.array([variance[s] for s in model.sources])
-            prior.append(np.concatenate([model.loose**2, np.tile(by_source, COUNT)]))
+            observed.append(np.vstack([i.negative_residual_jacobian for i in model.intervals]))
+            by_source = np.array([variance[s] for s in model.unknown_groups])
+            prior.append(np.concatenate([model.initial_state_std**2, np.tile(by_source, COUNT)]))
             for interval in model.intervals:
-                values, vectors = np.linalg.eigh(interval.rest)
+                values, vectors = np.linalg.eigh(interval.unreachable_products)
                 outside.append((vectors * np.sqrt(np.maximum(values, 0.0))).T)
         rows = sum(len(b) for b in blocks)
         self.design = np.zeros((rows + sum(map(len, outside)), sum(b.shape[1] for b in blocks)))
@@ -143,9 +143,9 @@ def smoothed(monkeypatch, models, **limits):
         told["limits"] = given
         return tuple(models)
 
-    monkeypatch.setattr(smoother, "linear_model", linear_model)
+    monkeypatch.setattr(smoother, "linear_residual_models", linear_model)
     chosen = Thresholds(**limits)
-    found = smoother.smooth(SimpleNamespace(), np.zeros(0), None, chosen)
+    found = smoother.run_smoother(SimpleNamespace(), np.zeros(0), None, chosen)
     assert told["limits"] == chosen
     return found
 
@@ -212,7 +212,10 @@ def test_the_best_variance_of_a_group_is_searched_over_all_sizes():
     more, at = smoother._largest_evidence(smoother._bases(models, base), FORCE)
     assert more == pytest.approx(Dense(models, base | {FORCE: at}).evidence, rel=1e-9)
     # a group may hold several unknowns, and some of them errors that are known
-    both = [replace(model, sources=(FORCE, FORCE, BIAS), known=np.array([0.0, 0.4, 0.0])) for model in models]
+    both = [
+        replace(model, unknown_groups=(FORCE, FORCE, BIAS), torque_noise_variance=np.array([0.0, 0.4, 0.0]))
+        for model in models
+    ]
     some = {FORCE: 0.0, BIAS: 0.3}
     most, here = smoother._largest_evidence(smoother._bases(both, some), FORCE)
     assert most == pytest.approx(smoother._run(both, some | {FORCE: here}, smooth=False).evidence, rel=1e-9)
@@ -226,27 +229,31 @@ def test_the_group_that_explains_the_residual_is_taken_in(monkeypatch, column):
     models = [made(5, size=size), made(6, size=size, recording="second")]
     found = smoothed(monkeypatch, models)
     source = SOURCES[column]
-    at_work = {s: v for s, v in found.variance.items() if v}
+    at_work = {s: v for s, v in found.group_variance.items() if v}
     assert set(at_work) == {source}
-    reference, nothing = Dense(models, found.variance), Dense(models, NOTHING)
+    reference, nothing = Dense(models, found.group_variance), Dense(models, NOTHING)
     own, other = ("sensor", "plant") if source is BIAS else ("plant", "sensor")
-    assert found.evidence[own] == found.evidence["both"] == pytest.approx(reference.evidence - nothing.evidence)
-    assert found.evidence[own] > found.evidence[other] + 5
-    assert found.evidence["none"] == 0.0
-    assert found.weight == NOTHING | {source: pytest.approx(reference.evidence - nothing.evidence)}
-    assert found.side == own
-    assert found.worth == 5.0
+    assert (
+        found.log_evidence[own]
+        == found.log_evidence["both"]
+        == pytest.approx(reference.log_evidence - nothing.log_evidence)
+    )
+    assert found.log_evidence[own] > found.log_evidence[other] + 5
+    assert found.log_evidence["none"] == 0.0
+    assert found.log_evidence_drop == NOTHING | {source: pytest.approx(reference.evidence - nothing.evidence)}
+    assert found.gap_origin == own
+    assert found.min_log_bayes_factor == 5.0
 
 
 def test_several_groups_are_taken_in_while_the_evidence_rises_enough(monkeypatch):
     models = [made(7, size=np.array([3.0, 3.0, 3.0])), made(8, size=np.array([3.0, 3.0, 3.0]))]
     found = smoothed(monkeypatch, models)
-    assert all(v > 0 for v in found.variance.values())
-    full = Dense(models, found.variance).evidence
+    assert all(v > 0 for v in found.group_variance.values())
+    full = Dense(models, found.group_variance).evidence
     for source in SOURCES:
-        less = Dense(models, found.variance | {source: 0.0}).evidence
-        assert found.weight[source] == pytest.approx(full - less, rel=1e-6)
-    assert found.side == "both"
+        less = Dense(models, found.group_variance | {source: 0.0}).evidence
+        assert found.log_evidence_drop[source] == pytest.approx(full - less, rel=1e-6)
+    assert found.gap_origin == "both"
     assert sum(v > 0 for v in smoothed(monkeypatch, models, places=2).variance.values()) == 2
     assert not any(smoothed(monkeypatch, models, worth=1e6).variance.values())
 
@@ -254,49 +261,52 @@ def test_several_groups_are_taken_in_while_the_evidence_rises_enough(monkeypatch
 def test_noise_alone_takes_nothing_in(monkeypatch):
     models = [made(9, size=np.zeros(3), loose=0.0)]
     found = smoothed(monkeypatch, models)
-    assert found.side == "none"
-    assert not any(found.variance.values())
-    assert found.weight == NOTHING
-    assert found.before == pytest.approx(found.after)
-    assert found.degrees_before == found.degrees_after == COUNT * (ROWS + 2) - 2
+    assert found.gap_origin == "none"
+    assert not any(found.group_variance.values())
+    assert found.log_evidence_drop == NOTHING
+    assert found.chi2_before == pytest.approx(found.chi2_after)
+    assert found.dof_before == found.dof_after == COUNT * (ROWS + 2) - 2
 
 
 def test_what_is_explained_is_the_fall_of_the_residual_and_the_degrees_that_it_takes(monkeypatch):
     models = [made(5, size=np.array([3.0, 0.0, 0.0])), made(6, size=np.array([3.0, 0.0, 0.0]))]
     found = smoothed(monkeypatch, models)
-    plain, full = Dense(models, NOTHING), Dense(models, found.variance)
+    plain, full = Dense(models, NOTHING), Dense(models, found.group_variance)
     bare = plain.y - plain.by_theta @ plain.theta
     # the first state is loose in any case, but it is no unknown: only the residual after it counts
-    assert found.before == pytest.approx(float(bare @ bare), rel=1e-8)
+    assert found.chi2_before == pytest.approx(float(bare @ bare), rel=1e-8)
     left = np.linalg.solve(full.conditional, full.y - full.by_theta @ full.theta)
-    assert found.after == pytest.approx(float(left @ left), rel=1e-8)
-    assert found.degrees_before == 2 * COUNT * (ROWS + 2) - 2
+    assert found.chi2_after == pytest.approx(float(left @ left), rel=1e-8)
+    assert found.dof_before == 2 * COUNT * (ROWS + 2) - 2
     start = [STATES + 3 * j for j in range(COUNT)]
     own = [model * (STATES + 3 * COUNT) + i for model in range(2) for i in start]
     design = full.design[:, own]
-    taken = found.variance[FORCE] * np.trace(design.T @ np.linalg.solve(full.conditional, design))
-    assert found.degrees_after == pytest.approx(found.degrees_before - taken, rel=1e-8)
+    taken = found.group_variance[FORCE] * np.trace(design.T @ np.linalg.solve(full.conditional, design))
+    assert found.dof_after == pytest.approx(found.dof_before - taken, rel=1e-8)
 
 
 def test_degrees_never_fall_below_one(monkeypatch):
     model = made(5, parameters=COUNT * (ROWS + 2) + 5)
     found = smoothed(monkeypatch, [model])
-    assert found.degrees_before == found.degrees_after == 1.0
+    assert found.dof_before == found.dof_after == 1.0
 
 
 def test_traces_hold_the_posterior_with_the_uncertainty_of_parameters(monkeypatch):
     models = [made(5, size=np.array([3.0, 0.0, 0.0])), made(6, size=np.array([3.0, 0.0, 0.0]), recording="second")]
     found = smoothed(monkeypatch, models)
-    mean, covariance = Dense(models, found.variance).disturbances()
-    assert [trace.recording for trace in found.traces] == ["run", "second"]
+    mean, covariance = Dense(models, found.group_variance).disturbances()
+    assert [trace.recording for trace in found.smoothed_unknowns] == ["run", "second"]
     width = STATES + 3 * COUNT
-    for i, trace in enumerate(found.traces):
+    for i, trace in enumerate(found.smoothed_unknowns):
         _, unknown = dense(models[i])
         own = slice(i * width, (i + 1) * width)
-        np.testing.assert_allclose(trace.mean, unknown @ mean[own], rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(trace.posterior_mean, unknown @ mean[own], rtol=1e-6, atol=1e-9)
         variance = np.einsum("jdw,wv,jdv->jd", unknown, covariance[own, own], unknown)
-        np.testing.assert_allclose(trace.std, np.sqrt(np.maximum(variance, 0.0)), rtol=1e-5, atol=1e-7)
-        assert (trace.edges.tolist(), trace.unknowns) == (models[i].edges.tolist(), ("u0", "u1", "u2"))
+        np.testing.assert_allclose(trace.posterior_std, np.sqrt(np.maximum(variance, 0.0)), rtol=1e-5, atol=1e-7)
+        assert (trace.interval_edges.tolist(), trace.unknown_names) == (
+            models[i].interval_edges.tolist(),
+            ("u0", "u1", "u2"),
+        )
 
 
 def test_what_would_be_noticed_comes_from_the_model_alone(monkeypatch):
@@ -305,7 +315,7 @@ def test_what_would_be_noticed_comes_from_the_model_alone(monkeypatch):
     reference = Dense(models, NOTHING)
     for column, source in enumerate(SOURCES):
         expected = math.sqrt(10.0 / reference.scores(0, column)[1])
-        assert found.detectable[source] == pytest.approx(expected, rel=1e-8)
+        assert found.detectable_std[source] == pytest.approx(expected, rel=1e-8)
     more = smoothed(monkeypatch, models, noticed=40.0)
     assert more.detectable == {s: pytest.approx(2 * v) for s, v in found.detectable.items()}
 

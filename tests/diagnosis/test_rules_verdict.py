@@ -9,9 +9,15 @@ import pytest
 from factories import BIAS, FORCE, READ_FORCE, added, closed, effect, fit, outcome, score, smoothed, visible
 
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.diagnosis.verdict import decide, explained_part, has_gap, shapeless, why_unknown
+from yid_ocp.diagnosis.verdict import (
+    compute_explained_fraction,
+    decide_verdict,
+    find_unknown_reason,
+    has_gap,
+    is_chance_excess,
+)
 
-LIMITS = Thresholds(explained=0.5)
+LIMITS = Thresholds(min_explained_fraction=0.5)
 ONE, OTHER = effect("friction@elbow"), effect("offset@elbow")
 ELSEWHERE, THIRD = effect("friction@wrist"), effect("spring@elbow")
 LOADS = effect("load@elbow", alone=True), effect("load@wrist", alone=True)
@@ -85,7 +91,10 @@ def test_a_gap_is_sure_and_worth_a_name(before, held_out, gap):
 )
 def test_a_gap_along_a_candidate_needs_a_channel_above_noise(p_values, before, held_out, gap):
     tests = [outcome(channels=channels) for channels in (before, held_out)]
-    assert has_gap(*tests, Thresholds(smallest_channel=0.03, candidate_level=0.01), scored(*p_values)) is gap
+    assert (
+        has_gap(*tests, Thresholds(min_channel_excess_chi2=0.03, candidate_significance_level=0.01), scored(*p_values))
+        is gap
+    )
 
 
 @pytest.mark.parametrize(
@@ -105,12 +114,12 @@ def test_an_offset_beyond_what_was_stated_needs_no_channel_above_noise(label, p,
 
 def test_the_level_and_the_smallest_gap_are_thresholds():
     tests = (outcome(p=0.02, chi2=1.2), outcome())
-    assert has_gap(*tests, Thresholds(level=0.05))
-    assert not has_gap(*tests, Thresholds(level=0.05, smallest_gap=0.3))
-    by_one = Thresholds(candidate_level=0.05)
+    assert has_gap(*tests, Thresholds(significance_level=0.05))
+    assert not has_gap(*tests, Thresholds(significance_level=0.05, min_excess_chi2=0.3))
+    by_one = Thresholds(candidate_significance_level=0.05)
     assert has_gap(outcome(), outcome(chi2=1.2), by_one, scored(0.03))
-    assert not has_gap(outcome(), outcome(chi2=1.2), replace(by_one, smallest_channel=0.3), scored(0.03))
-    assert not has_gap(outcome(), outcome(chi2=1.2), Thresholds(level=0.05), scored(0.03))
+    assert not has_gap(outcome(), outcome(chi2=1.2), replace(by_one, min_channel_excess_chi2=0.3), scored(0.03))
+    assert not has_gap(outcome(), outcome(chi2=1.2), Thresholds(significance_level=0.05), scored(0.03))
 
 
 # -- is it chance -----------------------------------------------------------------------------------------------------
@@ -149,13 +158,13 @@ SPEAKING = smoothed({FORCE: 9.0, BIAS: 0.0}, evidence={"plant": 9.0, "both": 9.0
     ],
 )
 def test_a_barely_significant_excess_without_shape_is_chance(found, p_values, before, held_out, chance):
-    assert shapeless(found, scored(*p_values), outcome(p=before), outcome(p=held_out), LIMITS) is chance
+    assert is_chance_excess(found, scored(*p_values), outcome(p=before), outcome(p=held_out), LIMITS) is chance
 
 
 def test_how_sure_an_excess_without_shape_must_be_is_a_threshold():
     tests = outcome(p=0.003), outcome()
-    assert not shapeless(SILENT, (), *tests, Thresholds(shapeless=0.5))
-    assert shapeless(SILENT, (), *tests, Thresholds(shapeless=0.5, level=0.001))
+    assert not is_chance_excess(SILENT, (), *tests, Thresholds(unexplained_p_factor=0.5))
+    assert is_chance_excess(SILENT, (), *tests, Thresholds(unexplained_p_factor=0.5, significance_level=0.001))
 
 
 # -- the verdict ------------------------------------------------------------------------------------------------------
@@ -184,7 +193,7 @@ CERTAIN = closed(0.45, 0.4, 0.49)
         ({"explained": 0.5}, "effect"),
         ({"explained": 0.1, "total": closed(0.9, 0.5, 0.95)}, "effect"),
         ({"explained": 0.1, "total": closed(0.9, 0.49, 0.95)}, "unknown"),
-        ({"explained": 0.1, "total": replace(closed(0.9, math.nan, math.nan), sure=True)}, "unknown"),
+        ({"explained": 0.1, "total": replace(closed(0.9, math.nan, math.nan), is_decisive=True)}, "unknown"),
         ({"explained": 7.0}, "effect"),
         ({"added": (added(ONE, [OTHER]),)}, "confusable"),
         ({"added": (added(ONE, [OTHER]), added(OTHER))}, "confusable"),
@@ -244,7 +253,7 @@ CERTAIN = closed(0.45, 0.4, 0.49)
 def test_the_verdict(changed, verdict):
     usual = {"gap": True, "visible": SEEN, "added": (added(ONE),), "total": CERTAIN, "enough": True, "explained": 1.0}
     said = usual | {"carried": True} | changed
-    found = decide(
+    found = decide_verdict(
         said["gap"],
         said["visible"],
         said["added"],
@@ -269,13 +278,13 @@ def test_the_verdict(changed, verdict):
 )
 def test_the_first_reason_that_holds_is_why_a_gap_has_no_name(changed, reason):
     said = {"added": (added(ONE),), "total": CERTAIN, "explained": 1.0, "carried": True} | changed
-    assert why_unknown(said["added"], said["total"], LIMITS, said["explained"], said["carried"]) == reason
+    assert find_unknown_reason(said["added"], said["total"], LIMITS, said["explained"], said["carried"]) == reason
 
 
 def test_without_a_smoother_the_explained_part_is_whole():
-    assert decide(True, SEEN, (added(ONE),), CERTAIN, LIMITS, True) == "effect"
-    assert explained_part(fit(), (added(ONE),), None) == 1.0
-    assert explained_part(fit(), (), SPEAKING) == 1.0
+    assert decide_verdict(True, SEEN, (added(ONE),), CERTAIN, LIMITS, True) == "effect"
+    assert compute_explained_fraction(fit(), (added(ONE),), None) == 1.0
+    assert compute_explained_fraction(fit(), (), SPEAKING) == 1.0
 
 
 @pytest.mark.parametrize(
@@ -302,13 +311,13 @@ def test_what_effects_explain_of_what_can_be_explained(costs, chi2, degrees, par
     nominal, last = fit(cost=costs[0]), added(ONE, fitted=fit([ONE], cost=costs[1]))
     first = added(OTHER, fitted=fit([OTHER], cost=1e3))
     found = smoothed({FORCE: 1.0}, chi2=chi2, degrees=degrees)
-    assert explained_part(nominal, (first, last), found) == pytest.approx(part)
+    assert compute_explained_fraction(nominal, (first, last), found) == pytest.approx(part)
 
 
 def test_two_effects_take_of_the_noise_what_all_their_parameters_take():
     last = added(ONE, fitted=fit([ONE, OTHER], cost=60.0))
     found = smoothed({FORCE: 1.0}, chi2=(200.0, 110.0), degrees=(90.0, 78.0))
-    assert explained_part(fit(cost=100.0), (last,), found) == pytest.approx(78.0 / 78.0)
+    assert compute_explained_fraction(fit(cost=100.0), (last,), found) == pytest.approx(78.0 / 78.0)
 
 
 # -- on which side ----------------------------------------------------------------------------------------------------
@@ -344,7 +353,7 @@ def test_two_effects_take_of_the_noise_what_all_their_parameters_take():
     ],
 )
 def test_the_side_of_a_gap_by_evidence(weight, evidence, side):
-    assert smoothed(weight, evidence=evidence).side == side
+    assert smoothed(weight, evidence=evidence).gap_origin == side
 
 
 def test_how_much_more_both_must_explain_is_a_threshold():
@@ -366,4 +375,4 @@ def test_how_much_more_both_must_explain_is_a_threshold():
     ids=["all", "half", "nothing", "worse", "more than all", "no gap", "below noise"],
 )
 def test_the_part_of_a_gap_that_can_be_explained_at_all(chi2, degrees, part):
-    assert smoothed({FORCE: 1.0}, chi2=chi2, degrees=degrees).explainable == pytest.approx(part)
+    assert smoothed({FORCE: 1.0}, chi2=chi2, degrees=degrees).explainable_fraction == pytest.approx(part)

@@ -27,11 +27,11 @@ from factories import (
     visible,
 )
 
-from yid_ocp.diagnosis.finding import which
-from yid_ocp.diagnosis.hypotheses import Cut
+from yid_ocp.diagnosis.diagnosis_messages import _UNKNOWN_REASON_TEXTS, diagnosis_summary_text, next_experiment_text
+from yid_ocp.diagnosis.diagnosis_result import _ranked_candidates
+from yid_ocp.diagnosis.hypotheses import TruncatedRecording
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.diagnosis.verdict import Reason
-from yid_ocp.diagnosis.words import NAMELESS, next_experiment, sentences
+from yid_ocp.diagnosis.verdict import UnknownReason
 
 FRICTION, OFFSET = effect("friction@elbow"), effect("offset@wrist", amplitude(lower=-9.0))
 NO_EFFECT = {"added": (), "fits": ()}
@@ -62,13 +62,15 @@ NO_EFFECT = {"added": (), "fits": ()}
 def test_whether_there_is_a_gap_comes_first(verdict, p_values, said):
     before, held = outcome(p=p_values[0], chi2=1.123), outcome(p=p_values[1], chi2=2.345)
     made = finding(verdict, before=before, held_out_before=held, **NO_EFFECT)
-    assert sentences(made).startswith(said)
+    assert diagnosis_summary_text(made).startswith(said)
 
 
 def test_insufficient_data_say_why_and_nothing_of_places():
-    said = sentences(finding("insufficient_data", message="4 samples.", next_experiment="Longer.", **NO_EFFECT))
+    said = diagnosis_summary_text(
+        finding("insufficient_data", message="4 samples.", next_experiment="Longer.", **NO_EFFECT)
+    )
     assert said == "The data do not suffice: 4 samples. Next experiment: Longer."
-    none = sentences(finding("no_gap", next_experiment="None is needed.", **NO_EFFECT))
+    none = diagnosis_summary_text(finding("no_gap", next_experiment="None is needed.", **NO_EFFECT))
     assert none.endswith("p = 1e-09). Next experiment: None is needed.")
 
 
@@ -88,11 +90,11 @@ def test_insufficient_data_say_why_and_nothing_of_places():
 )
 def test_places_with_much_of_the_gap_are_named(shares, said):
     made = finding("unknown", where=tuple(place(name, share) for name, share in shares.items()), **NO_EFFECT)
-    assert f"{said} No known effect explains it." in sentences(made)
+    assert f"{said} No known effect explains it." in diagnosis_summary_text(made)
 
 
 def test_without_places_nothing_is_said_of_them():
-    assert "It lies" not in sentences(finding("unknown", where=(), **NO_EFFECT))
+    assert "It lies" not in diagnosis_summary_text(finding("unknown", where=(), **NO_EFFECT))
 
 
 @pytest.mark.parametrize(
@@ -110,7 +112,7 @@ def test_without_places_nothing_is_said_of_them():
 )
 def test_the_side_is_said_where_the_evidence_tells(weight, evidence, said):
     made = finding("unknown", smoothed=smoothed(weight, evidence=evidence), **NO_EFFECT)
-    assert said in sentences(made)
+    assert said in diagnosis_summary_text(made)
 
 
 # -- which ------------------------------------------------------------------------------------------------------------
@@ -119,7 +121,10 @@ def test_the_side_is_said_where_the_evidence_tells(weight, evidence, said):
 def with_effect(of, value, std=0.02, **changed):
     """A finding in which this effect was added."""
     fitted = fit(
-        [of], loss(1.0, 1.1), values=dict.fromkeys(of.amplitudes, value), std=dict.fromkeys(of.amplitudes, std)
+        [of],
+        loss(1.0, 1.1),
+        values=dict.fromkeys(of.amplitude_names, value),
+        std=dict.fromkeys(of.amplitude_names, std),
     )
     return finding(**({"added": (added(of, fitted=fitted),), "fits": (fitted,)} | changed))
 
@@ -135,25 +140,25 @@ def with_effect(of, value, std=0.02, **changed):
 )
 def test_an_effect_is_said_with_its_numbers(unit, std, said):
     of = effect("friction@elbow", amplitude(unit=unit))
-    assert said in sentences(with_effect(of, 0.4567, std))
+    assert said in diagnosis_summary_text(with_effect(of, 0.4567, std))
 
 
 def test_a_closure_is_said_with_its_interval():
-    said = sentences(with_effect(FRICTION, 0.5, closure=closed(0.9123, 0.8012, 0.9534)))
+    said = diagnosis_summary_text(with_effect(FRICTION, 0.5, closure=closed(0.9123, 0.8012, 0.9534)))
     assert "closes 91.2 % of it on held-out motions (95 % interval 80.1 to 95.3 %)." in said
 
 
 def test_two_effects_close_together():
     both = fit([FRICTION, OFFSET], values={"friction@elbow.a": 0.5, "offset@wrist.a": 0.25})
-    said = sentences(finding(added=(added(FRICTION), added(OFFSET, fitted=both))))
+    said = diagnosis_summary_text(finding(added=(added(FRICTION), added(OFFSET, fitted=both))))
     assert "friction@elbow with a = 0.5 ± 0.01 N m; offset@wrist with a = 0.25 ± 0.01 N m together close 90 %" in said
 
 
 def test_rivals_are_said_to_be_not_separable():
     third = effect("third@x")
-    said = sentences(with_effect(FRICTION, 0.5, added=(added(FRICTION, [OFFSET, third]),)))
+    said = diagnosis_summary_text(with_effect(FRICTION, 0.5, added=(added(FRICTION, [OFFSET, third]),)))
     assert "Not separable from friction@elbow: offset@wrist, third@x." in said
-    assert "Not separable" not in sentences(with_effect(FRICTION, 0.5))
+    assert "Not separable" not in diagnosis_summary_text(with_effect(FRICTION, 0.5))
 
 
 @pytest.mark.parametrize(("value", "odd"), [(2.0, False), (2.5, False), (2.51, True), (-0.5, False), (-0.51, True)])
@@ -162,13 +167,13 @@ def test_an_amplitude_beyond_its_range_may_stand_in_for_something_else(value, od
     of = effect("offset@wrist", amplitude(neutral=9.0, lower=-99.0, upper=99.0, expected=(0.0, 2.0)))
     sentence = "Beyond what one would expect, and so perhaps standing in for something else: "
     expected = f"{sentence}offset@wrist.a = {value:.3g} (range 0 to 2)."
-    assert (expected in sentences(with_effect(of, value))) is odd
+    assert (expected in diagnosis_summary_text(with_effect(of, value))) is odd
 
 
 def test_an_amplitude_at_its_neutral_value_is_never_odd():
     of = effect("factor@T1", amplitude(neutral=9.0, expected=(0.0, 1.0)))
-    assert "Beyond" not in sentences(with_effect(of, 9.0))
-    assert "Beyond" in sentences(with_effect(of, 8.0))
+    assert "Beyond" not in diagnosis_summary_text(with_effect(of, 9.0))
+    assert "Beyond" in diagnosis_summary_text(with_effect(of, 8.0))
 
 
 @pytest.mark.parametrize(
@@ -184,7 +189,7 @@ def test_an_amplitude_at_its_neutral_value_is_never_odd():
 )
 def test_what_remains(chi2, p, places, said):
     made = with_effect(FRICTION, 0.5, remaining=outcome(p=p, chi2=chi2), remaining_where=places)
-    assert f" {said} " in sentences(made)
+    assert f" {said} " in diagnosis_summary_text(made)
 
 
 @pytest.mark.parametrize(
@@ -200,25 +205,25 @@ def test_what_remains(chi2, p, places, said):
 )
 def test_a_parameter_that_moves_much_is_said_to(before, after, said):
     made = with_effect(FRICTION, 0.5, absorbed=(absorbed("T1.bend", before, after),))
-    assert (f"With it T1.bend goes from {before:.3g} to {after:.3g}." in sentences(made)) is said
+    assert (f"With it T1.bend goes from {before:.3g} to {after:.3g}." in diagnosis_summary_text(made)) is said
 
 
 def test_six_parameters_at_most_are_said_to_move():
     made = with_effect(FRICTION, 0.5, absorbed=tuple(absorbed(f"p{i}", 1.0, 2.0) for i in range(8)))
-    said = sentences(made)
+    said = diagnosis_summary_text(made)
     assert "p5 goes from 1 to 2. Next" in said
     assert "p6" not in said
 
 
 def test_an_unknown_gap_names_the_best_attempt():
-    said = sentences(finding("unknown", fits=(fit([OFFSET]), fit([FRICTION])), added=()))
+    said = diagnosis_summary_text(finding("unknown", fits=(fit([OFFSET]), fit([FRICTION])), added=()))
     assert "No known effect explains it (the best, offset@wrist, is not sure to be there and to close a part)." in said
 
 
 def test_blocks_and_the_next_experiment_come_last():
-    said = sentences(with_effect(FRICTION, 0.5, in_blocks=True, next_experiment="Repeat."))
+    said = diagnosis_summary_text(with_effect(FRICTION, 0.5, in_blocks=True, next_experiment="Repeat."))
     assert said.endswith("alternate blocks of what is estimated on were held out. Next experiment: Repeat.")
-    assert "blocks" not in sentences(with_effect(FRICTION, 0.5))
+    assert "blocks" not in diagnosis_summary_text(with_effect(FRICTION, 0.5))
 
 
 # -- yid-diagnosis/1 --------------------------------------------------------------------------------------------------
@@ -265,7 +270,7 @@ def test_the_result_holds_what_was_found():
     )
     result = made.to_dict()
     assert result["format"] == "yid-diagnosis/1"
-    assert result["gap"]["before"]["chi2_per_dof"] == made.held_out_before.chi2_per_dof
+    assert result["gap"]["before"]["chi2_per_dof"] == made.nominal_held_out_test.chi2_per_dof
     assert result["gap"]["after"] | {"unit": None} == {
         "rmse": {"points.tip": 0.01},
         "unit": None,
@@ -285,7 +290,11 @@ def test_the_result_holds_what_was_found():
     assert [step["added"] for step in result["steps"]] == ["friction@elbow", "offset@wrist"]
     assert result["steps"][0]["chi2_per_dof"] == 1.0
     assert result["steps"][0]["rmse"] == {"points.tip": 0.01}
-    assert (result["side"], result["explainable"], result["evidence"]["plant"]) == ("plant", spoken.explainable, 9.0)
+    assert (result["side"], result["explainable"], result["evidence"]["plant"]) == (
+        "plant",
+        spoken.explainable_fraction,
+        9.0,
+    )
     assert result["unseen"] == ["offset@wrist"]
     assert result["noise"] == {"points.tip": {"std": 0.001, "unit": "m", "samples": 100}}
     assert result["held_out_in_blocks"] is True
@@ -305,7 +314,7 @@ def test_candidates_are_listed_with_what_was_added_first():
             score(FRICTION, p=0.05, statistic=9.0),
         ),
     )
-    listed = which(made)
+    listed = _ranked_candidates(made)
     assert [f"{e['kind']}@{e['location']}" for e in listed] == ["friction@elbow", "offset@wrist", "third@x"]
     assert [entry["score"] for entry in listed] == [9.0, 8.0, 7.0]
     assert [entry["p_value"] for entry in listed] == [0.05, 0.1, 0.2]
@@ -319,20 +328,22 @@ def test_candidates_are_listed_with_what_was_added_first():
 
 def test_a_refit_without_a_score_is_listed_as_insignificant():
     made = finding(scores=(), fits=(fit([OFFSET]),), added=())
-    [entry] = which(made)
+    [entry] = _ranked_candidates(made)
     assert (entry["kind"], entry["score"], entry["p_value"]) == ("offset", 0.0, 1.0)
 
 
 def test_an_unknown_gap_lists_refits_before_scores():
     made = finding("unknown", fits=(fit([OFFSET]),), scores=(score(FRICTION), score(OFFSET)))
-    assert [entry["kind"] for entry in which(made)] == ["offset", "friction"]
+    assert [entry["kind"] for entry in _ranked_candidates(made)] == ["offset", "friction"]
 
 
 # -- why a gap has no name --------------------------------------------------------------------------------------------
 
 
 def nameless(reason, **changed):
-    return sentences(finding("unknown", reason=reason, limits=Thresholds(explained=0.5), **changed))
+    return diagnosis_summary_text(
+        finding("unknown", reason=reason, limits=Thresholds(min_explained_fraction=0.5), **changed)
+    )
 
 
 @pytest.mark.parametrize(
@@ -379,9 +390,9 @@ def test_what_does_not_carry_over_is_named_with_both_values():
     assert "friction@elbow.b" not in text
 
 
-@pytest.mark.parametrize("reason", get_args(Reason))
+@pytest.mark.parametrize("reason", get_args(UnknownReason))
 def test_every_reason_has_a_sentence(reason):
-    assert reason == "" or reason in NAMELESS
+    assert reason == "" or reason in _UNKNOWN_REASON_TEXTS
 
 
 def test_stand_ins_are_shown_as_such_in_the_result():
@@ -397,8 +408,8 @@ def test_stand_ins_are_shown_as_such_in_the_result():
 
 
 def test_places_that_cannot_be_told_apart_are_named_together():
-    at = replace(place("T3"), also=("T1", "T2"))
-    text = sentences(finding(where=(at,)))
+    at = replace(place("T3"), indistinguishable_from=("T1", "T2"))
+    text = diagnosis_summary_text(finding(where=(at,)))
     assert "It lies in T3 or T1 or T2 (100 %)" in text
     assert finding(where=(at,)).to_dict()["where"][0]["also"] == ["T1", "T2"]
 
@@ -411,13 +422,13 @@ def test_places_that_cannot_be_told_apart_are_named_together():
     ],
 )
 def test_a_recording_that_cannot_be_followed_is_named(kept, said):
-    made = finding(cuts=(Cut("other", kept, 5.0),))
-    assert said in sentences(made)
+    made = finding(cuts=(TruncatedRecording("other", kept, 5.0),))
+    assert said in diagnosis_summary_text(made)
     assert made.to_dict()["gap"]["cut"] == [{"recording": "other", "kept": kept, "whole": 5.0}]
 
 
 def test_blocks_for_want_of_a_recording_that_can_be_followed_are_said():
-    text = sentences(finding(cuts=(Cut("other", 0.0, 5.0),), in_blocks=True))
+    text = diagnosis_summary_text(finding(cuts=(TruncatedRecording("other", 0.0, 5.0),), in_blocks=True))
     assert "No held-out recording is left: alternate blocks" in text
 
 
@@ -426,7 +437,7 @@ def test_blocks_for_want_of_a_recording_that_can_be_followed_are_said():
 
 @pytest.mark.parametrize("share", [0.0, 0.004])
 def test_a_place_without_a_share_is_no_place(share):
-    text = sentences(finding("unknown", where=(place("spring_1", share),)))
+    text = diagnosis_summary_text(finding("unknown", where=(place("spring_1", share),)))
     assert "spring_1" not in text.replace("Move spring_1", "")
     assert "These data do not tell where it lies." in text
 
@@ -441,4 +452,4 @@ def test_a_place_without_a_share_is_no_place(share):
     ],
 )
 def test_nobody_is_asked_to_move_what_does_not_move(at, share, said):
-    assert next_experiment("unknown", (), (place(at, share),), ()) == said
+    assert next_experiment_text("unknown", (), (place(at, share),), ()) == said

@@ -11,9 +11,15 @@ import pytest
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.diagnosis import smoother_model
-from yid_ocp.diagnosis.localise import Place, attributed, informed_map, localise, merged
-from yid_ocp.diagnosis.smoother import _filter, _run, _scores, history_of_force, smooth
-from yid_ocp.diagnosis.smoother_model import Interval, Linear, Source, linear_model
+from yid_ocp.diagnosis.localise import (
+    GapLocation,
+    attribute_gap_to_effects,
+    informed_z_scores,
+    localise_gap,
+    merge_intervals,
+)
+from yid_ocp.diagnosis.smoother import _filter, _run, _scores, force_likelihood_terms, run_smoother
+from yid_ocp.diagnosis.smoother_model import IntervalModel, LinearResidualModel, UnknownGroup, linear_residual_models
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
@@ -22,13 +28,13 @@ from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.solvers import GaussNewton, solve
 
-FORCE, BIAS = Source("here", "force"), Source("camera", "bias")
+FORCE, BIAS = UnknownGroup("here", "force"), UnknownGroup("camera", "bias")
 
 
-def random_model(seed: int, states=3, unknowns=2, parameters=2, count=4, rows=5) -> Linear:
+def random_model(seed: int, states=3, unknowns=2, parameters=2, count=4, rows=5) -> LinearResidualModel:
     rng = np.random.default_rng(seed)
     intervals = tuple(
-        Interval(
+        IntervalModel(
             rng.standard_normal((rows, 1 + parameters)),
             rng.standard_normal((rows, states)),
             rng.standard_normal((rows, unknowns)),
@@ -40,7 +46,7 @@ def random_model(seed: int, states=3, unknowns=2, parameters=2, count=4, rows=5)
         for _ in range(count)
     )
     sources = (FORCE,) * (unknowns - 1) + (BIAS,)
-    return Linear(
+    return LinearResidualModel(
         "run",
         intervals,
         0.1 * np.arange(count + 1),
@@ -54,24 +60,24 @@ def random_model(seed: int, states=3, unknowns=2, parameters=2, count=4, rows=5)
     )
 
 
-def dense(model: Linear, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def dense(model: LinearResidualModel, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Design (rows, all disturbances), their covariance, and the unknowns by them."""
-    ns, nd, count = len(model.loose), len(variance), len(model.intervals)
+    ns, nd, count = len(model.initial_state_std), len(variance), len(model.intervals)
     width = ns + nd * count
-    gain = np.sqrt(1 - model.decay**2)
+    gain = np.sqrt(1 - model.interval_correlation**2)
     unknown = np.zeros((count, nd, width))
     for j in range(count):
         if j:
-            unknown[j] = model.decay * unknown[j - 1]
+            unknown[j] = model.interval_correlation * unknown[j - 1]
         unknown[j][:, ns + nd * j : ns + nd * (j + 1)] += np.eye(nd) * (gain if j else 1.0)
     state = np.zeros((ns, width))
     state[:, :ns] = np.eye(ns)
-    state += model.at_rest @ unknown[0]
+    state += model.initial_state_jacobian @ unknown[0]
     rows = []
     for j, interval in enumerate(model.intervals):
-        rows.append(interval.by_state @ state + interval.by_unknown @ unknown[j])
-        state = interval.transition @ state + interval.drive @ unknown[j]
-    return np.vstack(rows), np.concatenate([model.loose**2, np.tile(variance, count)]), unknown
+        rows.append(interval.state_jacobian @ state + interval.unknown_jacobian @ unknown[j])
+        state = interval.state_transition @ state + interval.unknown_input_matrix @ unknown[j]
+    return np.vstack(rows), np.concatenate([model.initial_state_std**2, np.tile(variance, count)]), unknown
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -79,7 +85,7 @@ def test_the_filter_gives_the_evidence_and_the_posterior_of_dense_algebra(seed):
     model = random_model(seed)
     variance = np.array([0.8, 2.5])
     design, prior, unknown = dense(model, variance)
-    observed = np.vstack([i.observed for i in model.intervals])
+    observed = np.vstack([i.negative_residual_jacobian for i in model.intervals])
     total = design @ np.diag(prior) @ design.T + np.eye(len(design))
     done = _filter(model, variance, True)
     assert done.products == pytest.approx(observed.T @ np.linalg.solve(total, observed), rel=1e-9)
@@ -98,20 +104,20 @@ def test_the_filter_gives_the_evidence_and_the_posterior_of_dense_algebra(seed):
 def test_what_is_said_of_one_unknowns_history_is_that_of_dense_algebra(unknown):
     model = random_model(5)
     variance = {FORCE: 0.8, BIAS: 2.5}
-    design, prior, _ = dense(model, np.array([variance[source] for source in model.sources]))
-    observed = np.vstack([i.observed for i in model.intervals])
+    design, prior, _ = dense(model, np.array([variance[source] for source in model.unknown_groups]))
+    observed = np.vstack([i.negative_residual_jacobian for i in model.intervals])
     # parameters have a prior of three of their sizes
     total = design @ np.diag(prior) @ design.T + np.eye(len(design)) + 9 * observed[:, 1:] @ observed[:, 1:].T
     columns = []
     for at in range(len(model.intervals)):
-        state, rows = np.zeros(len(model.loose)), []
+        state, rows = np.zeros(len(model.initial_state_std)), []
         for j, interval in enumerate(model.intervals):
             value = float(j == at)
-            rows.append(interval.by_state @ state + interval.by_unknown[:, unknown] * value)
-            state = interval.transition @ state + interval.drive[:, unknown] * value
+            rows.append(interval.state_jacobian @ state + interval.unknown_jacobian[:, unknown] * value)
+            state = interval.state_transition @ state + interval.unknown_input_matrix[:, unknown] * value
         columns.append(np.concatenate(rows))
     response = np.stack(columns, axis=1)
-    score, information = history_of_force(model, variance, unknown)
+    score, information = force_likelihood_terms(model, variance, unknown)
     assert score == pytest.approx(response.T @ np.linalg.solve(total, observed[:, 0]), rel=1e-7, abs=1e-9)
     assert information == pytest.approx(response.T @ np.linalg.solve(total, response), rel=1e-7, abs=1e-9)
 
@@ -152,11 +158,11 @@ def recorded(system: System, pushed: dict[int, tuple[float, float, float]], seed
     for joint, (size, begin, end) in pushed.items():
         extra[(t[:-1] >= begin) & (t[:-1] < end), joint] += size
     swept = simulate(step, system.parameters.vector(), np.zeros(step.sizes["nx"]), steps, extra)
-    assert swept.status.ok
+    assert swept.status.is_converged
     known = list(system.mechanism.frames)[-2:]
-    q = ca.SX.sym("q", system.size)
+    q = ca.SX.sym("q", system.n_coordinates)
     kinematics = forward_kinematics(system.mechanism, q)
-    place = ca.Function("p", [q], [ca.horzcat(*(kinematics.position(f) for f in known))])
+    place = ca.Function("p", [q], [ca.horzcat(*(kinematics.frame_position(f) for f in known))])
     position = np.stack([np.array(place(x[:2])).T for x in swept.state])
     noise = np.random.default_rng(seed).standard_normal(position.shape)
     points = PointGroup("points", tuple(known), t, position + 1e-3 * noise, std=np.full(position.shape, 1e-3))
@@ -188,22 +194,22 @@ def test_the_linear_model_predicts_what_a_small_push_does(driven, monkeypatch, f
 
     def as_they_are(observed, by_state, by_unknown, transition, drive):
         none = np.zeros((observed.shape[1], observed.shape[1]))
-        return Interval(observed, by_state, by_unknown, transition, drive, none, len(observed))
+        return IntervalModel(observed, by_state, by_unknown, transition, drive, none, len(observed))
 
     monkeypatch.setattr(smoother_model, "_compressed", as_they_are)
     recording = recorded(driven, {}, 1)
     problem = problem_of(driven, recording, feedback)
-    x = problem.start
+    x = problem.initial_unknowns
     evaluation = problem.evaluate(x)
-    model = linear_model(problem, x, evaluation)[0]
-    column = model.unknowns.index("elbow")
-    size = 1e-4 / model.reference[column]
-    state, moved = np.zeros(len(model.loose)), []
+    model = linear_residual_models(problem, x, evaluation)[0]
+    column = model.unknown_names.index("elbow")
+    size = 1e-4 / model.reference_std[column]
+    state, moved = np.zeros(len(model.initial_state_std)), []
     for j, interval in enumerate(model.intervals):
-        unknown = np.zeros(len(model.unknowns))
+        unknown = np.zeros(len(model.unknown_names))
         unknown[column] = size if 5 <= j < 9 else 0.0
-        moved.append(interval.by_state @ state + interval.by_unknown @ unknown)
-        state = interval.transition @ state + interval.drive @ unknown
+        moved.append(interval.state_jacobian @ state + interval.unknown_jacobian @ unknown)
+        state = interval.state_transition @ state + interval.unknown_input_matrix @ unknown
     joints = recording.joints
     assert joints is not None
     assert joints.effort is not None
@@ -213,7 +219,7 @@ def test_the_linear_model_predicts_what_a_small_push_does(driven, monkeypatch, f
     difference = changed.evaluate(x, False).residual - evaluation.residual
     rows = np.concatenate(moved)
     # with one sensor the residual's order is that of time, interval after interval
-    assert len(rows) == problem.rows.data.stop
+    assert len(rows) == problem.residual_rows.data.stop
     difference = difference[: len(rows)]
     if feedback == "none":
         assert rows == pytest.approx(difference, rel=1e-3, abs=1e-4 * np.abs(difference).max())
@@ -225,29 +231,29 @@ def test_the_linear_model_predicts_what_a_small_push_does(driven, monkeypatch, f
 def test_clean_data_have_no_place(driven):
     problem = problem_of(driven, recorded(driven, {}, 2))
     solution = solve(problem, GaussNewton())
-    found = smooth(problem, np.array(solution.x), solution.evaluation)
-    assert found.evidence["both"] == 0
-    assert found.side == "none"
-    assert all(place.share == 0 for place in localise(found))
-    assert any(place.observable for place in localise(found))
+    found = run_smoother(problem, np.array(solution.x), solution.evaluation)
+    assert found.log_evidence["both"] == 0
+    assert found.gap_origin == "none"
+    assert all(place.gap_share == 0 for place in localise_gap(found))
+    assert any(place.is_observable for place in localise_gap(found))
 
 
 @pytest.mark.parametrize(("joint", "name", "push"), [(0, "shoulder", 0.3), (1, "elbow", 0.03)])
 def test_a_push_is_found_where_and_when_it_was(driven, joint, name, push):
     problem = problem_of(driven, recorded(driven, {joint: (push, 0.8, 1.3)}, 3))
     solution = solve(problem, GaussNewton())
-    found = smooth(problem, np.array(solution.x), solution.evaluation)
-    places = localise(found)
+    found = run_smoother(problem, np.array(solution.x), solution.evaluation)
+    places = localise_gap(found)
     assert places[0].location == name
-    assert places[0].share > 0.5
-    assert found.evidence["plant"] > found.evidence["sensor"] + 10
-    assert any(begin < 1.2 and end > 0.9 for begin, end in places[0].windows)
-    trace = found.traces[0]
-    column = trace.unknowns.index(name)
-    middle = (trace.edges[:-1] >= 0.9) & (trace.edges[1:] <= 1.25)
-    size = trace.reference[column] * trace.mean[middle, column]
+    assert places[0].gap_share > 0.5
+    assert found.log_evidence["plant"] > found.log_evidence["sensor"] + 10
+    assert any(begin < 1.2 and end > 0.9 for begin, end in places[0].time_windows)
+    trace = found.smoothed_unknowns[0]
+    column = trace.unknown_names.index(name)
+    middle = (trace.interval_edges[:-1] >= 0.9) & (trace.interval_edges[1:] <= 1.25)
+    size = trace.reference_std[column] * trace.posterior_mean[middle, column]
     assert np.abs(size).mean() == pytest.approx(push, rel=0.35)
-    edges, names, values = informed_map(found)
+    edges, names, values = informed_z_scores(found)
     assert values.shape == (len(edges) - 1, len(names))
     assert np.isfinite(values[:, names.index(name)]).any()
 
@@ -260,29 +266,29 @@ def test_a_sensor_that_reads_wrong_is_told_from_a_push(driven):
     wrong = replace(recording, points=(replace(group, position=moved),))
     problem = problem_of(driven, wrong)
     solution = solve(problem, GaussNewton())
-    found = smooth(problem, np.array(solution.x), solution.evaluation)
-    assert found.side == "sensor"
-    assert localise(found)[0].location == "points"
+    found = run_smoother(problem, np.array(solution.x), solution.evaluation)
+    assert found.gap_origin == "sensor"
+    assert localise_gap(found)[0].location == "points"
 
 
 def test_efforts_of_prescribed_joints_say_which(bench):
     recording = bench.recording({"joint_coulomb@elbow": {"tau_c": 0.3}}, 1, duration=2.0)
     problem = bench.problem([recording])
     solution = solve(problem, GaussNewton())
-    found = smooth(problem, np.array(solution.x), solution.evaluation)
-    places = localise(found)
+    found = run_smoother(problem, np.array(solution.x), solution.evaluation)
+    places = localise_gap(found)
     assert places[0].location == "elbow"
-    assert places[0].share > 0.8
-    assert found.explainable > 0.5
-    assert found.side == "either", "a force at a measured joint and its sensor's bias are the same"
+    assert places[0].gap_share > 0.8
+    assert found.explainable_fraction > 0.5
+    assert found.gap_origin == "either", "a force at a measured joint and its sensor's bias are the same"
 
 
 def test_effects_take_the_share_that_they_close():
-    before = (Place("T1", 0.9, True, ((0.0, 1.0),)), Place("T2", 0.1, True, ()))
-    found = attributed(before, {"world": 0.8}, (Place("T2", 1.0, True, ()),), ((0.5, 1.0),))
-    assert [(p.location, round(p.share, 3)) for p in found] == [("world", 0.8), ("T2", 0.2), ("T1", 0.0)]
-    assert found[0].windows == ((0.5, 1.0),)
+    before = (GapLocation("T1", 0.9, True, ((0.0, 1.0),)), GapLocation("T2", 0.1, True, ()))
+    found = attribute_gap_to_effects(before, {"world": 0.8}, (GapLocation("T2", 1.0, True, ()),), ((0.5, 1.0),))
+    assert [(p.location, round(p.gap_share, 3)) for p in found] == [("world", 0.8), ("T2", 0.2), ("T1", 0.0)]
+    assert found[0].time_windows == ((0.5, 1.0),)
 
 
 def test_touching_spans_are_one():
-    assert merged([(1.0, 1.5), (0.0, 0.5), (0.5, 1.0), (3.0, 4.0)]) == ((0.0, 1.5), (3.0, 4.0))
+    assert merge_intervals([(1.0, 1.5), (0.0, 0.5), (0.5, 1.0), (3.0, 4.0)]) == ((0.0, 1.5), (3.0, 4.0))

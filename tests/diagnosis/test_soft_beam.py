@@ -16,7 +16,7 @@ from yid_ocp.workflow.solve import run_solve
 
 pytestmark = pytest.mark.slow
 SECOND_MOMENT = 0.03**4 / 12  # of the section [m^4]
-QUIET = ("output.report=false",)
+QUIET = ("output.write_report=false",)
 
 
 @pytest.fixture(scope="module")
@@ -49,13 +49,13 @@ def test_the_load_is_named_and_taking_it_away_predicts_the_bare_run(repository, 
     for i, (recording, mass) in enumerate(loads(folder)):
         said = (f"recordings.estimate=[{recording}]", f"diagnosis.baseline=[{bare.folder}]")
         run = load_config(repository / "configs" / "soft_beam.yaml", (*QUIET, *said))
-        finding = run_diagnose(run, tmp_path / f"load{i}").finding
-        assert finding.effects[0].label == "point_mass@w_beam"
-        found = finding.last.values["point_mass@w_beam.mass"]
+        finding = run_diagnose(run, tmp_path / f"load{i}").diagnosis
+        assert finding.accepted_effects[0].label == "point_mass@w_beam"
+        found = finding.final_model.values["point_mass@w_beam.mass"]
         assert found == pytest.approx(mass, rel=0.1)
         assert finding.counterfactual is not None
         # of a swing of 9 mm; without a diagnosis it is as little or 11 mm, by where the nominal fit ends
-        [(_, without)] = finding.counterfactual.removed.means.values()
+        [(_, without)] = finding.counterfactual.effects_removed.rmse_by_unit.values()
         assert without < 2e-3
-        assert finding.counterfactual.removed.better
-        assert finding.counterfactual.added.better
+        assert finding.counterfactual.effects_removed.is_improved
+        assert finding.counterfactual.effects_added.is_improved

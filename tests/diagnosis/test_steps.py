@@ -8,20 +8,33 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from yid_ocp.diagnosis import closure, confusability, linearise, refit, scores, together, visibility
-from yid_ocp.diagnosis.hypotheses import CandidateProblem, chosen_effects
-from yid_ocp.diagnosis.refit import Loss
-from yid_ocp.diagnosis.screening import Linearisation, Signature, robust, shape_grid
-from yid_ocp.diagnosis.select import gain, out_of_shape, oversized, within_reach
+from yid_ocp.diagnosis import (
+    candidate_detectability,
+    confusability_matrix,
+    gap_closure,
+    linearize_candidates,
+    refit_with_effects,
+    score_candidates,
+    score_jointly,
+)
+from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
+from yid_ocp.diagnosis.refit import HeldOutLoss
+from yid_ocp.diagnosis.screening import CandidateLinearization, EffectSignature, _newey_west_covariance, _shape_grid
+from yid_ocp.diagnosis.select import (
+    _is_amplitude_outside_prior,
+    _is_shape_outside_prior,
+    _near_best_models,
+    held_out_improvement,
+)
 from yid_ocp.effects import make_effect
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.low_pass import LowPass
-from yid_ocp.problem.null_test import Series, null_test, residual_series, smoothed_colour
+from yid_ocp.problem.low_pass_filter import LowPassFilter
+from yid_ocp.problem.null_test import ResidualChannel, _filtered_noise_autocorrelation, residual_channels, run_null_test
 
 
 def white(rows, colour=None):
     t = 0.01 * np.arange(len(rows))
-    return Series("run", "points.tip", "points", "m", t, rows, np.ones(1) if colour is None else colour)
+    return ResidualChannel("run", "points.tip", "points", "m", t, rows, np.ones(1) if colour is None else colour)
 
 
 @pytest.fixture(scope="module")
@@ -29,10 +42,10 @@ def screened(bench):
     recordings = [bench.recording({"joint_coulomb@elbow": {"tau_c": 0.1}}, seed, duration=2.0) for seed in (1, 2)]
     problem = bench.problem(recordings[:1])
     choice = ("effort_offset", "joint_coulomb", "joint_stribeck@elbow", "rotor_inertia@elbow", "link_mass@elbow")
-    effects = chosen_effects(bench.system, recordings, choice)
-    composed = CandidateProblem.of(problem, effects, recordings[1:])
-    nominal = refit(composed, (), {})
-    return composed, nominal, linearise(composed, (), nominal.values)
+    effects = make_candidate_effects(bench.system, recordings, choice)
+    composed = AllCandidatesProblem.from_problem(problem, effects, recordings[1:])
+    nominal = refit_with_effects(composed, (), {})
+    return composed, nominal, linearize_candidates(composed, (), nominal.values)
 
 
 def test_all_candidates_together_are_the_nominal_model_until_they_are_freed(bench, screened):
@@ -51,7 +64,7 @@ def test_part_of_the_parameters_is_freed_by_columns_of_the_whole(screened):
     some = composed.freeing(chosen)
     alone = EstimationProblem(composed.problem.step, [e.recording for e in some.episodes], some.free, some.options)
     x = some.vector(nominal.values) + 0.01
-    assert some.names == alone.names
+    assert some.names == alone.unknown_names
     assert some.evaluate(x).jacobian == pytest.approx(alone.evaluate(x).jacobian, rel=1e-9, abs=1e-9)
     assert composed.problem.free == composed.nominal == ("shoulder.damping", "elbow.damping")
 
@@ -59,21 +72,21 @@ def test_part_of_the_parameters_is_freed_by_columns_of_the_whole(screened):
 def test_p_values_of_matching_noise_are_uniform():
     rng = np.random.default_rng(5)
     rows = np.arange(400)
-    p = [null_test([white(rows)], rng.standard_normal(400), 0).p_value for _ in range(300)]
+    p = [run_null_test([white(rows)], rng.standard_normal(400), 0).p_value for _ in range(300)]
     assert scipy.stats.kstest(p, "uniform").pvalue > 0.01
 
 
 def test_p_values_of_coloured_noise_are_uniform_when_its_colour_is_known():
     rng = np.random.default_rng(6)
-    colour = smoothed_colour(LowPass(5.0), 0.01)
+    colour = _filtered_noise_autocorrelation(LowPassFilter(5.0), 0.01)
     lags = np.abs(np.subtract.outer(np.arange(400), np.arange(400)))
     covariance = np.where(lags < len(colour), colour[np.minimum(lags, len(colour) - 1)], 0.0)
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0))
     rows = np.arange(400)
-    p = np.array([null_test([white(rows, colour)], root @ rng.standard_normal(400), 0).p_value for _ in range(300)])
+    p = np.array([run_null_test([white(rows, colour)], root @ rng.standard_normal(400), 0).p_value for _ in range(300)])
     assert scipy.stats.kstest(p, "uniform").pvalue > 1e-3
-    blind = np.array([null_test([white(rows)], root @ rng.standard_normal(400), 0).p_value for _ in range(300)])
+    blind = np.array([run_null_test([white(rows)], root @ rng.standard_normal(400), 0).p_value for _ in range(300)])
     assert np.mean(blind < 0.01) > np.mean(p < 0.01), "taking coloured noise for white raises false alarms"
 
 
@@ -81,31 +94,31 @@ def test_a_burst_is_flagged_where_it_is():
     rng = np.random.default_rng(7)
     r = rng.standard_normal(1000)
     r[310:340] += 4
-    test = null_test([white(np.arange(1000))], r, 0)
-    assert [(w.begin, w.end) for w in test.windows if w.flagged] == [(3.0, 3.5)]
-    assert test.whiteness["points.tip"] < 1e-3
+    test = run_null_test([white(np.arange(1000))], r, 0)
+    assert [(w.start_time, w.end_time) for w in test.windows if w.is_flagged] == [(3.0, 3.5)]
+    assert test.whiteness_p_values["points.tip"] < 1e-3
 
 
 def test_screening_finds_the_withheld_effect_first(screened):
     _, nominal, point = screened
-    series = residual_series(nominal.problem)
-    ranked = scores(point, series, visibility(point))
+    series = residual_channels(nominal.problem)
+    ranked = score_candidates(point, series, candidate_detectability(point))
     assert ranked[0].effect.label == "joint_coulomb@elbow"
-    assert ranked[0].step["joint_coulomb@elbow.tau_c"] == pytest.approx(0.1, rel=0.1)
+    assert ranked[0].predicted_values["joint_coulomb@elbow.tau_c"] == pytest.approx(0.1, rel=0.1)
     assert ranked[0].p_value < 1e-6
-    assert all(a.decrease >= b.decrease for a, b in itertools.pairwise(ranked))
+    assert all(a.predicted_chi2_decrease >= b.predicted_chi2_decrease for a, b in itertools.pairwise(ranked))
 
 
 def test_the_promised_decrease_is_that_of_a_refit_where_the_model_is_linear(screened):
     composed, nominal, point = screened
-    series = residual_series(nominal.problem)
-    ranked = {s.effect.label: s for s in scores(point, series, visibility(point))}
+    series = residual_channels(nominal.problem)
+    ranked = {s.effect.label: s for s in score_candidates(point, series, candidate_detectability(point))}
     for label in ("joint_coulomb@elbow", "rotor_inertia@elbow", "effort_offset@shoulder"):
         if label not in ranked:
             continue
         effect = next(e for e in composed.effects if e.label == label)
-        fit = refit(composed, (effect,), nominal.values)
-        assert 2 * (nominal.cost - fit.cost) == pytest.approx(ranked[label].decrease, rel=1e-3, abs=1e-3)
+        fit = refit_with_effects(composed, (effect,), nominal.values)
+        assert 2 * (nominal.cost - fit.cost) == pytest.approx(ranked[label].predicted_chi2_decrease, rel=1e-3, abs=1e-3)
 
 
 def test_what_the_fit_has_explained_is_projected_off(screened):
@@ -120,18 +133,18 @@ def test_what_the_fit_has_explained_is_projected_off(screened):
 
 def test_a_candidate_explains_itself_and_nothing_explains_more(screened):
     _, _, point = screened
-    table = confusability(together(point))
-    assert np.diag(table.matrix) == pytest.approx(1.0)
-    assert np.all((table.matrix >= 0) & (table.matrix <= 1))
+    table = confusability_matrix(score_jointly(point))
+    assert np.diag(table.overlap_fractions) == pytest.approx(1.0)
+    assert np.all((table.overlap_fractions >= 0) & (table.overlap_fractions <= 1))
     assert "joint_stribeck@elbow" in table.labels
 
 
 def test_detectable_amplitudes_do_not_depend_on_the_residual_and_fall_with_the_noise(screened):
     _, nominal, point = screened
-    table = {v.effect.label: v for v in visibility(point)}
-    silent = {v.effect.label: v for v in visibility(type(point)(0 * point.residual, point.signatures, {}))}
-    assert all(table[label].detectable == silent[label].detectable for label in table)
-    coulomb = table["joint_coulomb@elbow"].detectable["joint_coulomb@elbow.tau_c"]
+    table = {v.effect.label: v for v in candidate_detectability(point)}
+    silent = {v.effect.label: v for v in candidate_detectability(type(point)(0 * point.residual, point.signatures, {}))}
+    assert all(table[label].detectable_amplitudes == silent[label].detectable_amplitudes for label in table)
+    coulomb = table["joint_coulomb@elbow"].detectable_amplitudes["joint_coulomb@elbow.tau_c"]
     assert 0 < coulomb < 0.1
     del nominal
 
@@ -139,16 +152,18 @@ def test_detectable_amplitudes_do_not_depend_on_the_residual_and_fall_with_the_n
 def test_robust_covariance_of_white_scores_is_the_plain_one():
     rng = np.random.default_rng(8)
     x = rng.standard_normal((4000, 2))
-    total = np.mean([robust(x, rng.standard_normal(4000), [white(np.arange(4000))]) for _ in range(40)], axis=0)
+    total = np.mean(
+        [_newey_west_covariance(x, rng.standard_normal(4000), [white(np.arange(4000))]) for _ in range(40)], axis=0
+    )
     assert total == pytest.approx(x.T @ x, rel=0.1, abs=300)
 
 
 def test_shapes_are_tried_over_their_range(bench):
     effect = make_effect("joint_stribeck", "elbow", bench.system)
-    grid = shape_grid(effect, 4)
+    grid = _shape_grid(effect, 4)
     values = [entry["joint_stribeck@elbow.v_stribeck"] for entry in grid]
-    assert (values[0], values[-1]) == pytest.approx(effect.prior_range["joint_stribeck@elbow.v_stribeck"])
-    assert shape_grid(make_effect("joint_coulomb", "elbow", bench.system)) == [{}]
+    assert (values[0], values[-1]) == pytest.approx(effect.prior_ranges["joint_stribeck@elbow.v_stribeck"])
+    assert _shape_grid(make_effect("joint_coulomb", "elbow", bench.system)) == [{}]
 
 
 @pytest.mark.parametrize(("lean", "chosen"), [(0.0, 0), (1e-10, 0), (0.01, 1)])
@@ -160,14 +175,14 @@ def test_of_shape_values_that_make_no_difference_the_first_counts(bench, lean, c
     # the more it leans towards the residual, the more of it the second one explains
     columns = (column, column - lean * residual)
     grid = [{"joint_stribeck@elbow.v_stribeck": value} for value in (0.02, 0.05)]
-    signatures = tuple(Signature(effect, values, x, x.T @ x) for values, x in zip(grid, columns, strict=True))
-    point = Linearisation(residual[:, 0], signatures, {})
-    best = scores(point, [white(np.arange(200))], visibility(point))[0]
-    assert best.step["joint_stribeck@elbow.v_stribeck"] == grid[chosen]["joint_stribeck@elbow.v_stribeck"]
+    signatures = tuple(EffectSignature(effect, values, x, x.T @ x) for values, x in zip(grid, columns, strict=True))
+    point = CandidateLinearization(residual[:, 0], signatures, {})
+    best = score_candidates(point, [white(np.arange(200))], candidate_detectability(point))[0]
+    assert best.predicted_values["joint_stribeck@elbow.v_stribeck"] == grid[chosen]["joint_stribeck@elbow.v_stribeck"]
 
 
 def loss(squares, counts):
-    return Loss(np.asarray(squares, float), np.asarray(counts, float), {})
+    return HeldOutLoss(np.asarray(squares, float), np.asarray(counts, float), {})
 
 
 def test_closure_is_the_part_of_the_gap_that_is_gone():
@@ -175,40 +190,42 @@ def test_closure_is_the_part_of_the_gap_that_is_gone():
     counts = np.full(40, 50.0)
     noise = 50 * (1 + 0.1 * rng.standard_normal(40))
     before, after = loss(noise + 100, counts), loss(noise + 25, counts)
-    found = closure(before, after)
-    assert found.value == pytest.approx(1 - after.gap / before.gap)
-    assert found.low < found.value < found.high
-    assert found.low > 0.6
-    assert found.high < 0.9
-    assert closure(before, before).value == 0
-    assert np.isnan(closure(loss(0.9 * counts, counts), after).value)
+    found = gap_closure(before, after)
+    assert found.fraction == pytest.approx(1 - after.excess_chi2 / before.excess_chi2)
+    assert found.ci_low < found.fraction < found.ci_high
+    assert found.ci_low > 0.6
+    assert found.ci_high < 0.9
+    assert gap_closure(before, before).fraction == 0
+    assert np.isnan(gap_closure(loss(0.9 * counts, counts), after).fraction)
 
 
 def test_a_rollout_that_failed_never_wins():
     counts = np.full(10, 50.0)
     good, failed = loss(counts, counts), loss(np.full(10, np.inf), counts)
-    assert gain(failed, good)[0] == np.inf
-    assert gain(good, failed)[0] == -np.inf
+    assert held_out_improvement(failed, good)[0] == np.inf
+    assert held_out_improvement(good, failed)[0] == -np.inf
 
 
 def test_the_simplest_within_one_standard_error_wins(screened):
     composed, nominal, _ = screened
     effects = {e.label: e for e in composed.effects}
-    one = refit(composed, (effects["joint_coulomb@elbow"],), nominal.values)
-    two = refit(composed, (effects["joint_coulomb@elbow"], effects["effort_offset@shoulder"]), nominal.values)
-    assert within_reach([two, one])[0] is one
-    assert nominal not in within_reach([nominal, one])
+    one = refit_with_effects(composed, (effects["joint_coulomb@elbow"],), nominal.values)
+    two = refit_with_effects(
+        composed, (effects["joint_coulomb@elbow"], effects["effort_offset@shoulder"]), nominal.values
+    )
+    assert _near_best_models([two, one])[0] is one
+    assert nominal not in _near_best_models([nominal, one])
 
 
 def test_values_far_from_what_one_would_expect_are_noticed(bench):
     stribeck = make_effect("joint_stribeck", "elbow", bench.system)
-    low, high = stribeck.prior_range["joint_stribeck@elbow.v_stribeck"]
+    low, high = stribeck.prior_ranges["joint_stribeck@elbow.v_stribeck"]
 
     def values(size, speed):
         return {"joint_stribeck@elbow.tau_s": size, "joint_stribeck@elbow.v_stribeck": speed}
 
     middle = (low * high) ** 0.5
-    assert not oversized(stribeck, values(3.9, middle))
-    assert oversized(stribeck, values(4.1, middle))
-    assert not out_of_shape(stribeck, values(4.1, 1.9 * high))
-    assert out_of_shape(stribeck, values(1.0, low / 3))
+    assert not _is_amplitude_outside_prior(stribeck, values(3.9, middle))
+    assert _is_amplitude_outside_prior(stribeck, values(4.1, middle))
+    assert not _is_shape_outside_prior(stribeck, values(4.1, 1.9 * high))
+    assert _is_shape_outside_prior(stribeck, values(1.0, low / 3))

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from yid_ocp.diagnosis import Thresholds, diagnose
-from yid_ocp.diagnosis.localise import informed_map, localise
-from yid_ocp.diagnosis.select import out_of_shape, oversized
+from yid_ocp.diagnosis.localise import informed_z_scores, localise_gap
+from yid_ocp.diagnosis.select import _is_amplitude_outside_prior, _is_shape_outside_prior
 from yid_ocp.effects import make_effect
-from yid_ocp.options import About
+from yid_ocp.options import OptionInfo
 
 KIND = "joint_coulomb@elbow"
 
@@ -31,7 +31,7 @@ def usual(bench):
 def test_every_threshold_says_what_it_is():
     for name, hint in get_type_hints(Thresholds, include_extras=True).items():
         assert get_origin(hint) is Annotated, name
-        assert any(isinstance(entry, About) and entry.text for entry in get_args(hint)), name
+        assert any(isinstance(entry, OptionInfo) and entry.description for entry in get_args(hint)), name
         assert name in (Thresholds.__doc__ or "")
 
 
@@ -52,7 +52,7 @@ def test_the_whole_diagnosis_goes_by_what_it_is_given(bench, usual):
     assert max(round(w.end - w.begin, 6) for w in usual.before.windows) == 0.5
     assert max(round(w.end - w.begin, 6) for w in other.before.windows) == 1.0
     sizes = [
-        {v.effect.label: v.detectable[f"{KIND}.tau_c"] for v in f.visibility if v.effect.label == KIND}
+        {v.effect.label: v.detectable[f"{KIND}.tau_c"] for v in f.detectability if v.effect.label == KIND}
         for f in (usual, other)
     ]
     assert sizes[1][KIND] == pytest.approx(2 * sizes[0][KIND])
@@ -80,17 +80,17 @@ def test_a_verdict_goes_by_its_thresholds(bench, limits, verdict):
 
 
 def test_a_gap_is_there_by_so_many_standard_deviations(usual):
-    loose, strict = (localise(usual.smoothed, sure)[0].windows for sure in (0.5, 20.0))
+    loose, strict = (localise_gap(usual.smoothed, sure)[0].time_windows for sure in (0.5, 20.0))
     assert sum(b - a for a, b in loose) > sum(b - a for a, b in strict)
-    informed = [np.isfinite(informed_map(usual.smoothed, 0, mapped)[2]).sum() for mapped in (0.1, 0.999)]
+    informed = [np.isfinite(informed_z_scores(usual.smoothed, 0, mapped)[2]).sum() for mapped in (0.1, 0.999)]
     assert informed[0] > informed[1]
 
 
 def test_how_far_a_value_may_leave_its_range(bench):
     effect = make_effect("joint_stribeck", "elbow", bench.system)
-    _, high = effect.prior_range["joint_stribeck@elbow.v_stribeck"]
+    _, high = effect.prior_ranges["joint_stribeck@elbow.v_stribeck"]
     values = {"joint_stribeck@elbow.tau_s": 4.1, "joint_stribeck@elbow.v_stribeck": 2.5 * high}
-    assert out_of_shape(effect, values)
-    assert not out_of_shape(effect, values, Thresholds(shape_factor=3.0))
-    assert oversized(effect, values)
-    assert not oversized(effect, values, Thresholds(range_widths=1.5))
+    assert _is_shape_outside_prior(effect, values)
+    assert not _is_shape_outside_prior(effect, values, Thresholds(shape_range_factor=3.0))
+    assert _is_amplitude_outside_prior(effect, values)
+    assert not _is_amplitude_outside_prior(effect, values, Thresholds(prior_range_margin=1.5))

@@ -11,20 +11,20 @@ import pytest
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.diagnosis import diagnose
-from yid_ocp.diagnosis.diagnose import held_out_test, nominal_fit
-from yid_ocp.diagnosis.hypotheses import CandidateProblem, chosen_effects
-from yid_ocp.diagnosis.refit import refit
-from yid_ocp.diagnosis.screening import linearise
-from yid_ocp.diagnosis.smoother_model import INTERVAL, MEMORY, linear_model
+from yid_ocp.diagnosis.diagnose import _held_out_null_test, fit_nominal_model
+from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
+from yid_ocp.diagnosis.refit import refit_with_effects
+from yid_ocp.diagnosis.screening import linearize_candidates
+from yid_ocp.diagnosis.smoother_model import _CORRELATION_TIME, _MIN_INTERVAL, linear_residual_models
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model import System
-from yid_ocp.model.drives import Spring
 from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, solve
-from yid_ocp.solvers.judgement import spread_by_noise
+from yid_ocp.solvers.uncertainty import noise_covariance_factor
 
 TIME_STEP, STEPS = 0.01, 300
 WHITE, OFFSET, ANGLE, POINT = 0.05, 0.1, 2e-4, 1e-3
@@ -34,7 +34,7 @@ FREE = ("elbow.stiffness", "elbow.damping")
 @pytest.fixture(scope="module")
 def step(urdf_folder) -> Step:
     tree = read_urdf(urdf_folder / "double_pendulum.urdf")
-    springs = {"elbow": Spring(3.0)}
+    springs = {"elbow": RobotJointSpring(3.0)}
     system = System.build(tree, driven=("shoulder",), springs=springs, damping={"shoulder": 0.3, "elbow": 0.05})
     return compile_step(system, TIME_STEP)
 
@@ -46,7 +46,7 @@ def recorded(step: Step, seed: int, offset: float | None = None, friction: float
     torque = sum(rng.uniform(0.3, 0.8) * np.sin(2 * np.pi * f * t) for f in rng.uniform([0.3, 0.7, 1.5], [0.5, 1, 2]))
     theta = system.parameters.vector({"shoulder.damping": 0.3 + friction})
     swept = simulate(step, theta, np.zeros(step.sizes["nx"]), STEPS, torque[:-1, None])
-    assert swept.status.ok
+    assert swept.status.is_converged
     off = OFFSET * rng.standard_normal() if offset is None else offset
     noise = rng.standard_normal
     joints = JointGroup(
@@ -59,74 +59,83 @@ def recorded(step: Step, seed: int, offset: float | None = None, friction: float
         effort_bias_std=OFFSET,
         effort_kind="command",
     )
-    q = ca.SX.sym("q", system.size)
-    place = ca.Function("p", [q], [forward_kinematics(system.mechanism, q).position("tip")])
-    tip = np.array([np.array(place(x[: system.size])).T for x in swept.state]) + POINT * noise((STEPS + 1, 1, 3))
+    q = ca.SX.sym("q", system.n_coordinates)
+    place = ca.Function("p", [q], [forward_kinematics(system.mechanism, q).frame_position("tip")])
+    tip = np.array([np.array(place(x[: system.n_coordinates])).T for x in swept.state]) + POINT * noise(
+        (STEPS + 1, 1, 3)
+    )
     points = PointGroup("points_camera", ("tip",), t, tip, std=np.full(tip.shape, POINT))
     return Recording(joints, (points,), name=f"run_{seed}")
 
 
 def problem_of(step: Step, recordings: list[Recording], held_out: list[Recording] | None = None) -> EstimationProblem:
-    options = ProblemOptions(initial_state="equilibrium", feedback="proportional", gains=(9.0,))
+    options = ProblemOptions(initial_state="equilibrium", feedback="proportional", proportional_gains=(9.0,))
     return EstimationProblem(step, recordings, FREE, options, None, held_out or [])
 
 
-def composed(step: Step, held_out: bool, *candidates: str) -> CandidateProblem:
+def composed(step: Step, held_out: bool, *candidates: str) -> AllCandidatesProblem:
     problem = problem_of(step, [recorded(step, 1)])
-    effects = chosen_effects(step.system, [problem.episodes[0].recording], list(candidates) or ["joint_viscous"])
-    return CandidateProblem.of(problem, effects, [recorded(step, 2)] if held_out else [])
+    effects = make_candidate_effects(
+        step.system, [problem.episodes[0].recording], list(candidates) or ["joint_viscous"]
+    )
+    return AllCandidatesProblem.from_problem(problem, effects, [recorded(step, 2)] if held_out else [])
 
 
 @pytest.mark.parametrize("held_out", [True, False], ids=["held_out", "in_blocks"])
 def test_all_hypotheses_share_weights_frozen_at_one_point(step, held_out):
     made = composed(step, held_out)
-    weighted = made.weighted_at({"elbow.stiffness": 2.5})
-    assert (weighted.effects, weighted.blocks) == (made.effects, made.blocks)
+    weighted = made.whitened_at({"elbow.stiffness": 2.5})
+    assert (weighted.candidate_effects, weighted.is_split_in_blocks) == (
+        made.candidate_effects,
+        made.is_split_in_blocks,
+    )
     own = weighted.problem
-    extended = weighted.freeing(weighted.effects)
-    assert all(x is y is not None for x, y in zip(own.innovations, extended.innovations, strict=True))
-    held = zip(own.held_out_innovations, extended.held_out_innovations, strict=True)
+    extended = weighted.with_free_effects(weighted.candidate_effects)
+    assert all(x is y is not None for x, y in zip(own.whitening_filters, extended.whitening_filters, strict=True))
+    held = zip(own.held_out_whitening_filters, extended.held_out_whitening_filters, strict=True)
     assert all(x is y is not None for x, y in held)
-    assert made.problem.innovations == made.problem.held_out_innovations == (None,)
+    assert made.problem.whitening_filters == made.problem.held_out_whitening_filters == (None,)
     there = own.evaluate(own.vector({"elbow.stiffness": 2.5}), False)
-    again = own.weighted_at(own.vector({"elbow.stiffness": 2.5})).evaluate(own.vector({"elbow.stiffness": 2.5}), False)
+    again = own.whitened_at(own.vector({"elbow.stiffness": 2.5})).evaluate(own.vector({"elbow.stiffness": 2.5}), False)
     assert there.cost == pytest.approx(again.cost, rel=0.02)
 
 
 @pytest.mark.parametrize("held_out", [True, False], ids=["held_out", "in_blocks"])
 def test_what_an_effect_takes_from_a_torque_its_offset_gives_back(step, held_out):
     """Weights are frozen once, about torques that an offset among the effects must not move."""
-    made = composed(step, held_out, "effort_offset", "joint_viscous").weighted_at({"elbow.stiffness": 2.5})
-    wide = made.freeing(made.effects)
+    made = composed(step, held_out, "effort_offset", "joint_viscous").whitened_at({"elbow.stiffness": 2.5})
+    wide = made.with_free_effects(made.candidate_effects)
     at = {"elbow.stiffness": 2.5}
     x, frozen = (wide.vector({**at, "effort_offset@shoulder.offset": value}) for value in (0.3, 0.0))
-    moved = wide.about_torques_at(x, frozen).held_out_about_torques_at(x, frozen)
+    moved = wide.relinearized_at_torque_bias(x, frozen).held_out_relinearized_at_torque_bias(x, frozen)
     for before, after in (
-        (wide.innovations, moved.innovations),
-        (wide.held_out_innovations, moved.held_out_innovations),
+        (wide.whitening_filters, moved.whitening_filters),
+        (wide.held_out_whitening_filters, moved.held_out_whitening_filters),
     ):
-        assert after[0].steps is before[0].steps
-        np.testing.assert_allclose(after[0].errors.offset, before[0].errors.offset - 0.3, atol=1e-12)
-    there, then = moved.weighted_by_sensors().evaluate(x), wide.weighted_by_sensors().evaluate(frozen)
+        assert after[0].filter_steps is before[0].filter_steps
+        np.testing.assert_allclose(
+            after[0].input_errors.torque_bias, before[0].input_errors.torque_bias - 0.3, atol=1e-12
+        )
+    there, then = moved.whitened_by_sensor_noise().evaluate(x), wide.whitened_by_sensor_noise().evaluate(frozen)
     np.testing.assert_allclose(there.residual[: len(then.residual)], then.residual, atol=1e-7)
     own, nominal = (
-        problem.held_out_rows(0, *problem.validate(point)[0]).residual
+        problem.held_out_residual(0, *problem.predict_held_out(point)[0]).residual
         for problem, point in ((moved, x), (wide, frozen))
     )
     assert np.max(np.abs(own - nominal)) > 1e-3  # its prior is no longer about zero
     # and to first order the rows are those of a filter that is worked out there
-    again = moved.weighted_at(x)
+    again = moved.whitened_at(x)
     np.testing.assert_allclose(again.evaluate(x).residual, moved.evaluate(x).residual, atol=0.1)
 
 
 def test_noise_that_drives_the_motion_is_no_gap(step):
     """With weights by the sensors' noise alone the same fit leaves several times what noise would."""
     made = composed(step, True)
-    fit = nominal_fit(problem_of(step, [recorded(step, 1)]), made)
+    fit = fit_nominal_model(problem_of(step, [recorded(step, 1)]), made)
     bare = made.problem.without_input_errors()
     plain = bare.evaluate(bare.vector(fit.values), False)
     assert 2 * plain.cost > 2 * len(plain.residual)
-    test = held_out_test(fit)
+    test = _held_out_null_test(fit)
     assert 0.8 < test.chi2_per_dof < 1.2
     assert test.p_value > 1e-3
 
@@ -134,13 +143,13 @@ def test_noise_that_drives_the_motion_is_no_gap(step):
 def test_what_parameters_are_unsure_of_is_no_gap(step):
     """A fit to recordings that tell a fiftieth as much may be fifty times as far off."""
     made = composed(step, True)
-    fit = nominal_fit(problem_of(step, [recorded(step, 1)]), made)
-    spread = spread_by_noise(fit.problem, fit.evaluation)
+    fit = fit_nominal_model(problem_of(step, [recorded(step, 1)]), made)
+    spread = noise_covariance_factor(fit.problem, fit.evaluation)
     off = fit.problem.vector(fit.values) + 50 * spread @ np.ones(spread.shape[1]) / math.sqrt(spread.shape[1])
-    moved = replace(fit, values=fit.problem.named(off))
-    assert held_out_test(moved).p_value < 1e-12
+    moved = replace(fit, values=fit.problem.named_values(off))
+    assert _held_out_null_test(moved).p_value < 1e-12
     less = replace(fit.evaluation, jacobian=fit.evaluation.jacobian / 50)
-    test = held_out_test(replace(moved, evaluation=less))
+    test = _held_out_null_test(replace(moved, evaluation=less))
     assert 0.8 < test.chi2_per_dof < 1.2
     assert test.p_value > 1e-3
 
@@ -157,34 +166,34 @@ def sprung(step, urdf_folder):
     The spring's torque at rest is twelve times the offset that is stated.
     """
     tree = read_urdf(urdf_folder / "double_pendulum.urdf")
-    springs = {"elbow": Spring(3.0), "shoulder": Spring(STRONG)}
+    springs = {"elbow": RobotJointSpring(3.0), "shoulder": RobotJointSpring(STRONG)}
     system = System.build(tree, driven=("shoulder",), springs=springs, damping={"shoulder": 0.3, "elbow": 0.05})
     moves = compile_step(system, TIME_STEP)
     # a spring about another angle is one about zero and a constant torque
     files = [recorded(moves, seed, -STRONG * REST) for seed in (1, 2)]
     problem = problem_of(step, files[:1])
-    effects = chosen_effects(step.system, files[:1], ["joint_spring@shoulder", "effort_offset@shoulder"])
-    return problem, CandidateProblem.of(problem, effects, files[1:])
+    effects = make_candidate_effects(step.system, files[:1], ["joint_spring@shoulder", "effort_offset@shoulder"])
+    return problem, AllCandidatesProblem.from_problem(problem, effects, files[1:])
 
 
 def test_a_filter_is_about_the_torque_that_is_left_beside_an_effect(sprung):
     """Its offset as the nominal model has it, some newton metres, is no error beside the spring."""
     problem, made = sprung
-    nominal = nominal_fit(problem, made)
+    nominal = fit_nominal_model(problem, made)
     made = replace(made, problem=nominal.problem)
     spring, offset = (next(e for e in made.effects if e.kind == kind) for kind in ("joint_spring", "effort_offset"))
     k, rest = "joint_spring@shoulder.stiffness", "joint_spring@shoulder.rest_angle"
-    found = refit(made, [spring], {**nominal.values, k: 0.3, rest: 1.0})
-    other = refit(made, [offset], nominal.values)
+    found = refit_with_effects(made, [spring], {**nominal.values, k: 0.3, rest: 1.0})
+    other = refit_with_effects(made, [offset], nominal.values)
     assert found.values[k] == pytest.approx(STRONG, abs=4 * found.std[k])
     assert found.values[rest] == pytest.approx(REST, abs=4 * found.std[rest])
     assert found.std[k] < 0.1 * STRONG
-    assert found.loss.mean < 1.1 < other.loss.mean
-    for whitening in (*found.problem.innovations, *found.problem.held_out_innovations):
+    assert found.held_out_loss.chi2_per_sample < 1.1 < other.held_out_loss.chi2_per_sample
+    for whitening in (*found.problem.whitening_filters, *found.problem.held_out_whitening_filters):
         assert abs(whitening.errors.offset[0]) < OFFSET
     # and what is looked for beside it stands on the same ground
-    beside = linearise(made, [spring], found.values)
-    assert 0.95 < float(beside.residual @ beside.residual) / (2 * found.cost) < 1.001
+    beside = linearize_candidates(made, [spring], found.values)
+    assert 0.95 < float(beside.projected_residual @ beside.projected_residual) / (2 * found.cost) < 1.001
 
 
 # -- torques are regressors with errors -------------------------------------------------------------------------------
@@ -192,7 +201,7 @@ def test_a_filter_is_about_the_torque_that_is_left_beside_an_effect(sprung):
 
 def with_absent(step: Step, effect: str) -> Step:
     """The pendulum with an effect that it has not."""
-    effects = chosen_effects(step.system, [recorded(step, 1)], [effect])
+    effects = make_candidate_effects(step.system, [recorded(step, 1)], [effect])
     return compile_step(step.system.with_effects(effects), TIME_STEP)
 
 
@@ -204,9 +213,9 @@ def geared(step) -> Step:
 
 def weighted_at_truth(geared: Step, recording: Recording, feedback: str) -> EstimationProblem:
     free = (*FREE, *(name for effect in geared.system.effects for name in effect.parameters.names))
-    options = ProblemOptions(initial_state="equilibrium", feedback=feedback, gains=(9.0,))
+    options = ProblemOptions(initial_state="equilibrium", feedback=feedback, proportional_gains=(9.0,))
     problem = EstimationProblem(geared, [recording], free, options, {"elbow.stiffness": 3.0, "elbow.damping": 0.05})
-    return problem.weighted_at(problem.start, rounds=3)
+    return problem.whitened_at(problem.initial_unknowns, rounds=3)
 
 
 @pytest.mark.parametrize("effect", ["rotor_inertia@shoulder", "effort_gain@shoulder", "effort_lag@shoulder"])
@@ -216,7 +225,7 @@ def test_noise_of_torques_is_not_mistaken_for_what_they_multiply(step, monkeypat
     absent, z = with_absent(step, effect), []
     for seed in range(20, 32):
         problem = weighted_at_truth(absent, recorded(step, seed), "proportional")
-        residual, jacobian = problem.informing(problem.evaluate(problem.start))
+        residual, jacobian = problem.residual_without_weak_priors(problem.evaluate(problem.initial_unknowns))
         covariance = np.linalg.inv(jacobian.T @ jacobian)
         z.append(-covariance @ jacobian.T @ residual / np.sqrt(np.diag(covariance)))
     assert np.all(np.abs(np.mean(z, axis=0)) < 3 / np.sqrt(len(z)))
@@ -229,19 +238,19 @@ def test_taking_noise_off_a_reading_leaves_the_torque_that_acts(step, inverse):
     gained = with_absent(step, "effort_gain@shoulder")
     problem = EstimationProblem(gained, [recorded(step, 7)], ("effort_gain@shoulder.inverse",))
     at, near = (np.array([value]) for value in (inverse, inverse + 0.01))
-    episode = problem.weighted_at(at, rounds=3).episodes[0]
-    errors, [theta, later] = episode.errors, [problem.split(x, 0)[0] for x in (at, near)]
-    assert np.max(np.abs(errors.white)) > WHITE
-    acting, more = (problem.predictor.inputs(episode, own, ()).torque for own in (theta, later))
-    np.testing.assert_allclose(acting, inverse * episode.torque - errors.taken_off, atol=1e-12)
-    noise = errors.white / inverse if inverse else 0.0
+    episode = problem.whitened_at(at, rounds=3).episodes[0]
+    errors, [theta, later] = episode.input_errors, [problem.split(x, 0)[0] for x in (at, near)]
+    assert np.max(np.abs(errors.torque_noise)) > WHITE
+    acting, more = (problem.predictor.corrected_inputs(episode, own, ()).torque for own in (theta, later))
+    np.testing.assert_allclose(acting, inverse * episode.torque - errors.total_torque_error, atol=1e-12)
+    noise = errors.torque_noise / inverse if inverse else 0.0
     np.testing.assert_allclose(more - acting, 0.01 * (episode.torque - noise), atol=1e-12)
 
 
 def test_what_is_found_does_not_depend_on_the_tracking_filter(geared, step):
     recording = recorded(step, 7)
     one, other = (weighted_at_truth(geared, recording, name) for name in ("proportional", "lqr"))
-    first, second = (problem.evaluate(problem.start) for problem in (one, other))
+    first, second = (problem.evaluate(problem.initial_unknowns) for problem in (one, other))
     np.testing.assert_allclose(first.residual, second.residual, atol=0.02)
     size = np.linalg.norm(first.jacobian, axis=0)
     np.testing.assert_allclose(np.linalg.norm(first.jacobian - second.jacobian, axis=0) / size, 0.0, atol=0.01)
@@ -251,14 +260,20 @@ def test_what_is_found_does_not_depend_on_the_tracking_filter(geared, step):
 def test_squares_of_innovations_are_the_least_over_all_errors(geared, step, feedback):
     """What sensors and torques must have been wrong by along the smoothed motion, in units of their noise."""
     problem = weighted_at_truth(geared, recorded(step, 8), feedback)
-    innovations = problem.evaluate(problem.start).residual[problem.rows.data]
-    errors = problem.episodes[0].errors
-    along = problem.on(problem.episodes, ()).evaluate(problem.start).residual[problem.rows.data]
-    apart = [errors.white[:-1] / errors.torque_std, errors.offset / errors.bias_std]
+    innovations = problem.evaluate(problem.initial_unknowns).residual[problem.residual_rows.data]
+    errors = problem.episodes[0].input_errors
+    along = (
+        problem.with_episodes(problem.episodes, ())
+        .evaluate(problem.initial_unknowns)
+        .residual[problem.residual_rows.data]
+    )
+    apart = [errors.torque_noise[:-1] / errors.torque_std, errors.torque_bias / errors.torque_bias_std]
     least = along @ along + sum(float(np.sum(part**2)) for part in apart)
     assert least == pytest.approx(innovations @ innovations, rel=5e-3)
     # and nobody mistakes it for a prediction
-    recorded_torque = problem.weighted_by_sensors().evaluate(problem.start).residual[problem.rows.data]
+    recorded_torque = (
+        problem.whitened_by_sensor_noise().evaluate(problem.initial_unknowns).residual[problem.residual_rows.data]
+    )
     assert recorded_torque @ recorded_torque > 2 * along @ along
 
 
@@ -267,11 +282,11 @@ def test_a_refit_is_as_sure_as_a_solution(step, friction):
     """One deviation for one parameter, whichever command says it; a misfit counts in it."""
     problem = problem_of(step, [recorded(step, 1, friction=friction)])
     found = solve(problem, GaussNewton())
-    effects = chosen_effects(step.system, [problem.episodes[0].recording], ["joint_viscous"])
-    fit = nominal_fit(problem, CandidateProblem.of(problem, effects, [recorded(step, 2)]), found)
+    effects = make_candidate_effects(step.system, [problem.episodes[0].recording], ["joint_viscous"])
+    fit = fit_nominal_model(problem, AllCandidatesProblem.from_problem(problem, effects, [recorded(step, 2)]), found)
     std = found.parameters["elbow.stiffness"].std
     assert fit.std["elbow.stiffness"] == pytest.approx(std, rel=0.1)
-    _, jacobian = fit.problem.informing(fit.evaluation)
+    _, jacobian = fit.problem.residual_without_weak_priors(fit.evaluation)
     noise = np.sqrt(np.linalg.inv(jacobian.T @ jacobian)[0, 0])
     assert (std > 1.5 * noise) == (friction > 0)
 
@@ -283,8 +298,8 @@ def test_offsets_are_named_where_they_leave_what_was_expected(step):
     assert within.verdict == "no_gap"
     far = [recorded(step, seed, 6 * OFFSET) for seed in (3, 4)]
     beyond = diagnose(problem_of(step, far[:1], far[1:]), library)
-    assert [effect.label for effect in beyond.effects] == ["effort_offset@shoulder"]
-    found = beyond.last.values["effort_offset@shoulder.offset"]
+    assert [effect.label for effect in beyond.accepted_effects] == ["effort_offset@shoulder"]
+    found = beyond.final_model.values["effort_offset@shoulder.offset"]
     assert found == pytest.approx(6 * OFFSET, abs=4 * OFFSET)
 
 
@@ -292,13 +307,13 @@ def test_an_effect_is_found_beside_the_noise_of_torques(step):
     """A gear whose friction is ten times what could be noticed."""
     library = ["joint_viscous", "effort_offset@shoulder"]
     clean = problem_of(step, [recorded(step, 5)], [recorded(step, 6)])
-    seen = diagnose(clean, library).visibility
-    detectable = next(e.detectable for e in seen if e.effect.label == "joint_viscous@shoulder")
+    seen = diagnose(clean, library).detectability
+    detectable = next(e.detectable_amplitudes for e in seen if e.effect.label == "joint_viscous@shoulder")
     more = 10 * detectable["joint_viscous@shoulder.b"]
     rubbing = [recorded(step, seed, friction=more) for seed in (5, 6)]
     finding = diagnose(problem_of(step, rubbing[:1], rubbing[1:]), library)
-    assert [effect.label for effect in finding.effects] == ["joint_viscous@shoulder"]
-    found = finding.last
+    assert [effect.label for effect in finding.accepted_effects] == ["joint_viscous@shoulder"]
+    found = finding.final_model
     assert found.values["joint_viscous@shoulder.b"] == pytest.approx(
         more, abs=4 * found.std["joint_viscous@shoulder.b"]
     )
@@ -306,14 +321,19 @@ def test_an_effect_is_found_beside_the_noise_of_torques(step):
 
 def test_the_smoother_expects_forces_as_large_as_the_torques_noise(step):
     problem = problem_of(step, [recorded(step, 1)])
-    weighted = problem.weighted_by_sensors()
-    x = problem.start
-    model = linear_model(weighted, x, weighted.evaluate(x))[0]
-    decay = math.exp(-INTERVAL / MEMORY)
-    column = model.unknowns.index("shoulder")
+    weighted = problem.whitened_by_sensor_noise()
+    x = problem.initial_unknowns
+    model = linear_residual_models(weighted, x, weighted.evaluate(x))[0]
+    decay = math.exp(-_MIN_INTERVAL / _CORRELATION_TIME)
+    column = model.unknown_names.index("shoulder")
     # the integral over a long time has the variance of white noise that is held over each sample
-    lasting = (model.known[column] * model.reference[column] ** 2 - OFFSET**2) * INTERVAL * (1 + decay) / (1 - decay)
+    lasting = (
+        (model.torque_noise_variance[column] * model.reference_std[column] ** 2 - OFFSET**2)
+        * _MIN_INTERVAL
+        * (1 + decay)
+        / (1 - decay)
+    )
     assert lasting == pytest.approx(WHITE**2 * TIME_STEP, rel=0.02)
-    assert np.count_nonzero(model.known) == 1
+    assert np.count_nonzero(model.torque_noise_variance) == 1
     calm = problem.without_input_errors()
-    assert not linear_model(calm, x, calm.evaluate(x))[0].known.any()
+    assert not linear_residual_models(calm, x, calm.evaluate(x))[0].torque_noise_variance.any()

@@ -10,9 +10,9 @@ import pytest
 from jsonschema import validate
 
 from yid_ocp.diagnosis import Thresholds, diagnose
-from yid_ocp.diagnosis.hypotheses import CandidateProblem
-from yid_ocp.diagnosis.smoother import smooth
-from yid_ocp.diagnosis.verdict import shapeless
+from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
+from yid_ocp.diagnosis.smoother import run_smoother
+from yid_ocp.diagnosis.verdict import is_chance_excess
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import YidError
 from yid_ocp.problem import ProblemOptions, SensorOptions
@@ -98,7 +98,7 @@ FRICTION = ("joint_coulomb", "link_mass@elbow", "effort_offset@elbow")
 def found(bench, effects, candidates, *, held_out=True, **how):
     recordings = [bench.recording(effects, seed, **how) for seed in (1, 2)]
     problem = bench.problem(recordings[:1])
-    finding = diagnose(problem, candidates, recordings[1:] if held_out else (), thresholds=Thresholds(effects=2))
+    finding = diagnose(problem, candidates, recordings[1:] if held_out else (), thresholds=Thresholds(max_effects=2))
     result = json.loads(json.dumps(finding.to_dict()))
     validate(result, SCHEMA)
     located = result["verdict"] in ("effect", "confusable", "unknown")
@@ -125,8 +125,8 @@ def test_a_withheld_effect_is_named_placed_and_measured(bench):
     assert told["behind"]["joint_coulomb@elbow"] == {"left": left, "chi2_per_dof": 0.0, "error": 0.0, "squares": 0.0}
     assert min(entry["squares"] for entry in told["behind"].values()) == 0.0, "no other is as likely"
     [apart] = finding.carried
-    assert told["carried"] == pytest.approx(abs(apart.value - apart.again) / np.hypot(apart.std, apart.again_std))
-    damping = next(entry for entry in finding.absorbed if entry.name == "elbow.damping")
+    assert told["carried"] == pytest.approx(abs(apart.value - apart.again) / np.hypot(apart.std, apart.held_out_std))
+    damping = next(entry for entry in finding.nominal_changes if entry.name == "elbow.damping")
     assert damping.before > damping.after, "friction hides in the damping until it is named"
     assert "joint_coulomb@elbow with tau_c" in result["summary"]
 
@@ -153,32 +153,32 @@ def test_one_recording_is_split_in_blocks_and_the_report_says_so(bench):
 def test_a_candidate_that_is_left_out_is_composed_and_not_tried(bench):
     recordings = [bench.recording({"joint_coulomb@elbow": {"tau_c": 0.1}}, seed) for seed in (1, 2)]
     problem = bench.problem(recordings[:1])
-    finding = diagnose(problem, FRICTION, recordings[1:], leave_out=["joint_coulomb@elbow", "effort_offset"])
-    tried = {score.effect.label for score in finding.scores}
+    finding = diagnose(problem, FRICTION, recordings[1:], exclude=["joint_coulomb@elbow", "effort_offset"])
+    tried = {score.effect.label for score in finding.candidate_scores}
     assert tried == {"joint_coulomb@shoulder", "link_mass@elbow"}
-    assert "joint_coulomb@elbow.tau_c" in finding.nominal.problem.system.parameters.names
-    assert "joint_coulomb@elbow" not in {effect.label for effect in finding.effects}
+    assert "joint_coulomb@elbow.tau_c" in finding.nominal_model.problem.system.parameters.names
+    assert "joint_coulomb@elbow" not in {effect.label for effect in finding.accepted_effects}
     for name, said in (("joint_viscous", "no candidate here"), ("joint_coulomb@tail", "no candidate here")):
         with pytest.raises(YidError, match=said):
-            diagnose(problem, FRICTION, recordings[1:], leave_out=[name])
+            diagnose(problem, FRICTION, recordings[1:], exclude=[name])
     with pytest.raises(YidError, match="no candidate is left"):
-        diagnose(problem, FRICTION, recordings[1:], leave_out=["joint_coulomb", "link_mass", "effort_offset"])
+        diagnose(problem, FRICTION, recordings[1:], exclude=["joint_coulomb", "link_mass", "effort_offset"])
 
 
 def test_candidates_are_composed_once_for_a_step(bench):
     recordings = [bench.recording({}, seed) for seed in (1, 2)]
     system = bench.system
 
-    def composed(*labels: str, **values: float) -> CandidateProblem:
+    def composed(*labels: str, **values: float) -> AllCandidatesProblem:
         effects = [make_effect(*label.split("@"), system, values or None) for label in labels]
-        return CandidateProblem.of(bench.problem(recordings[:1]), effects, recordings[1:])
+        return AllCandidatesProblem.from_problem(bench.problem(recordings[:1]), effects, recordings[1:])
 
     first, again = (
         composed("joint_coulomb@elbow", "link_mass@elbow"),
         composed("joint_coulomb@elbow", "link_mass@elbow"),
     )
     assert again.problem.step is first.problem.step
-    assert again.effects == first.effects, "those whose symbols the step has"
+    assert again.candidate_effects == first.candidate_effects, "those whose symbols the step has"
     assert composed("link_mass@elbow", "joint_coulomb@elbow").problem.step is not first.problem.step
     at_work = composed("joint_coulomb@elbow", tau_c=0.1)
     assert at_work.problem.step is not composed("joint_coulomb@elbow").problem.step
@@ -258,15 +258,15 @@ def test_the_papers_weighting_cannot_be_diagnosed(bench):
 
 def test_a_barely_significant_excess_without_shape_is_chance(bench):
     finding = diagnose(bench.problem([bench.recording({}, 1)]), FRICTION, [bench.recording({}, 2)])
-    nominal = finding.nominal
-    smoothed = smooth(nominal.problem, nominal.problem.vector(nominal.values), nominal.evaluation)
+    nominal = finding.nominal_model
+    smoothed = run_smoother(nominal.problem, nominal.problem.vector(nominal.values), nominal.evaluation)
     limits = Thresholds()
 
     def tested(p):
-        return replace(finding.before, p_value=p)
+        return replace(finding.nominal_test, p_value=p)
 
-    assert smoothed.side == "none"
-    assert shapeless(smoothed, finding.scores, tested(3e-3), tested(0.5), limits)
-    assert not shapeless(smoothed, finding.scores, tested(3e-6), tested(0.5), limits)
-    sure = [replace(score, p_value=1e-9) for score in finding.scores]
-    assert not shapeless(smoothed, sure, tested(3e-3), tested(0.5), limits)
+    assert smoothed.gap_origin == "none"
+    assert is_chance_excess(smoothed, finding.candidate_scores, tested(3e-3), tested(0.5), limits)
+    assert not is_chance_excess(smoothed, finding.candidate_scores, tested(3e-6), tested(0.5), limits)
+    sure = [replace(score, p_value=1e-9) for score in finding.candidate_scores]
+    assert not is_chance_excess(smoothed, sure, tested(3e-3), tested(0.5), limits)

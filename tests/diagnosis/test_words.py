@@ -7,8 +7,13 @@ from types import SimpleNamespace
 
 import pytest
 
-from yid_ocp.diagnosis import Place, Thresholds, diagnose
-from yid_ocp.diagnosis.words import next_experiment, sentences, separating, shortage
+from yid_ocp.diagnosis import GapLocation, Thresholds, diagnose
+from yid_ocp.diagnosis.diagnosis_messages import (
+    _separating_experiment,
+    diagnosis_summary_text,
+    insufficient_data_message,
+    next_experiment_text,
+)
 from yid_ocp.effects import make_effect
 
 
@@ -30,8 +35,10 @@ def finding(bench):
 )
 def test_what_remains_is_noise_by_the_level_of_the_diagnosis(finding, level, p_value, chi2, noise):
     rest = replace(finding.remaining, p_value=p_value, chi2_per_dof=chi2)
-    place = Place("elbow", 1.0, True, ())
-    said = sentences(replace(finding, remaining=rest, remaining_where=(place,), limits=Thresholds(level=level)))
+    place = GapLocation("elbow", 1.0, True, ())
+    said = diagnosis_summary_text(
+        replace(finding, remaining=rest, remaining_where=(place,), limits=Thresholds(significance_level=level))
+    )
     assert ("What remains is noise." in said) is noise
     expected = f"What remains: held-out chi2 per degree of freedom {chi2:.3g}, most of it in elbow."
     assert (expected in said) is not noise
@@ -39,7 +46,7 @@ def test_what_remains_is_noise_by_the_level_of_the_diagnosis(finding, level, p_v
 
 def test_a_finding_keeps_its_words_and_what_decided_them(finding):
     assert finding.limits == Thresholds()
-    assert finding.summary == sentences(finding) == finding.to_dict()["summary"]
+    assert finding.summary == diagnosis_summary_text(finding) == finding.to_dict()["summary"]
 
 
 def kind(label: str, depends_on: str):
@@ -63,13 +70,13 @@ def kind(label: str, depends_on: str):
 )
 def test_rivals_are_separated_by_what_they_depend_on(bench, labels, said):
     effects = [make_effect(*label.split("@"), bench.system) for label in labels]
-    assert separating(effects) == said
+    assert _separating_experiment(effects) == said
 
 
 def test_an_aspect_that_the_library_does_not_know_comes_last():
     rivals = [kind("melting@T1", "how hot it is"), kind("density@T1", "how hard it accelerates")]
-    assert separating(rivals).startswith("Vary how hard it accelerates and how hot it is independently")
-    assert separating([kind("odd@T1", "")]) == "Record other motions, faster and larger."
+    assert _separating_experiment(rivals).startswith("Vary how hard it accelerates and how hot it is independently")
+    assert _separating_experiment([kind("odd@T1", "")]) == "Record other motions, faster and larger."
 
 
 @pytest.mark.parametrize(
@@ -78,7 +85,7 @@ def test_an_aspect_that_the_library_does_not_know_comes_last():
         ("insufficient_data", (), (), "Record longer and larger motions; more of the object has to be seen."),
         (
             "unknown",
-            (Place("T2", 1.0, True, ()),),
+            (GapLocation("T2", 1.0, True, ()),),
             (),
             "Move T2 alone, slowly and fast, and hold it still in several postures.",
         ),
@@ -89,20 +96,20 @@ def test_an_aspect_that_the_library_does_not_know_comes_last():
     ],
 )
 def test_the_next_experiment_follows_the_verdict(verdict, where, unseen, said):
-    assert next_experiment(verdict, (), where, unseen) == said
+    assert next_experiment_text(verdict, (), where, unseen) == said
 
 
 def test_rivals_come_before_all_else():
     rivals = (kind("a@T1", "when it is read"), kind("b@T1", "when it is read"))
     added = [SimpleNamespace(rivals=rivals[:1]), SimpleNamespace(rivals=rivals)]
-    assert next_experiment("confusable", added, (), ()) == "Vary when it is read over a wider range."
+    assert next_experiment_text("confusable", added, (), ()) == "Vary when it is read over a wider range."
 
 
 def test_a_shortage_says_what_is_needed():
-    before, limits = SimpleNamespace(degrees=11.6), Thresholds(samples_per_unknown=4.0)
+    before, limits = SimpleNamespace(degrees=11.6), Thresholds(min_samples_per_unknown=4.0)
     seen = [SimpleNamespace(visible=True)]
-    assert shortage("effect", before, 5, seen, limits) == ""
-    said = shortage("insufficient_data", before, 5, seen, limits)
+    assert insufficient_data_message("effect", before, 5, seen, limits) == ""
+    said = insufficient_data_message("insufficient_data", before, 5, seen, limits)
     assert said.startswith("12 effective samples for 5 unknowns, at least 20 are needed")
-    hidden = shortage("insufficient_data", before, 5, [SimpleNamespace(visible=False)], limits)
+    hidden = insufficient_data_message("insufficient_data", before, 5, [SimpleNamespace(visible=False)], limits)
     assert hidden == "no candidate of the size that one would expect would show in these recordings."

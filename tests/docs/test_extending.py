@@ -55,7 +55,17 @@ def test_the_plugins_run_from_a_configuration(text, repository, pendulum_data, t
     config.write_text(given.replace("  springs:", f"  effects: {effects}\n  springs:"), encoding="utf-8")
     # a process of its own, whose kinds are no other test's
     script = f"import sys; sys.path[:0] = [{str(repository)!r}]; from yid_ocp.cli import main; sys.exit(main())"
-    command = [sys.executable, "-c", script, "solve", "drawn.yaml", "--out", "run", "--set", "output.report=false"]
+    command = [
+        sys.executable,
+        "-c",
+        script,
+        "solve",
+        "drawn.yaml",
+        "--out",
+        "run",
+        "--set",
+        "output.write_report=false",
+    ]
     run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
     result = json.loads((tmp_path / "run" / "result.json").read_text(encoding="utf-8"))
@@ -67,14 +77,14 @@ def test_the_plugins_run_from_a_configuration(text, repository, pendulum_data, t
 def test_what_it_names_exists(text) -> None:
     from yid_ocp.effects import EFFECTS
     from yid_ocp.effects.base import EffectBase
-    from yid_ocp.model.system import RecordedEffect
+    from yid_ocp.model.system import RecordingErrorEffect
 
     rows = re.findall(r"^\| `(\w+)\((.*?)\)` \|.*\| (.*?) \|$", text, re.MULTILINE)
     assert {name for name, _, _ in rows} >= {"modify", "terms", "measure", "correct", "delay"}
     for name, arguments, examples in rows:
         code = getattr(EffectBase, name).__code__
         assert list(code.co_varnames[1 : code.co_argcount]) == arguments.split(", ")
-        assert hasattr(RecordedEffect, name)
+        assert hasattr(RecordingErrorEffect, name)
         for kind in re.findall(r"`(\w+)`", examples):
             assert kind in EFFECTS
             assert getattr(EFFECTS[kind], name) is not getattr(EffectBase, name)

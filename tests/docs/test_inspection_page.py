@@ -7,9 +7,9 @@ import shlex
 
 import pytest
 
-from yid_ocp.analysis.symbols import StepSymbols
+from yid_ocp.analysis.step_symbols import StepSymbols
 from yid_ocp.config.reader import load_config
-from yid_ocp.export.functions import LARGEST_JACOBIAN
+from yid_ocp.export.casadi_functions import _MAX_JACOBIAN_OPERATIONS
 from yid_ocp.integrator.discrete import discrete_equations
 from yid_ocp.workflow.build import build_system
 
@@ -21,17 +21,19 @@ def page(repository) -> str:
 
 @pytest.fixture(scope="module")
 def symbols(repository) -> StepSymbols:
-    return StepSymbols.of(discrete_equations(build_system(load_config(repository / "configs/dual_arm_vision.yaml"))))
+    return StepSymbols.from_equations(
+        discrete_equations(build_system(load_config(repository / "configs/dual_arm_vision.yaml")))
+    )
 
 
 def test_its_commands_exist_and_its_entries_are_there(page, symbols, repository) -> None:
-    from yid_ocp.cli import parser
+    from yid_ocp.cli import build_argument_parser
 
     [block] = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
     for line in block.strip().splitlines():
         name, *arguments = shlex.split(line)
         assert name == "yid-ocp"
-        said = parser().parse_args(arguments)
+        said = build_argument_parser().parse_args(arguments)
         assert (repository / said.config).is_file()
         for entry in said.entries:
             assert symbols.entry(entry).title.split(" / ")[0].removeprefix("d ") == entry.split(",")[0]
@@ -54,4 +56,4 @@ def test_the_names_that_it_lists_are_names(page, symbols) -> None:
     assert len(listed) > 6
     for name in listed:
         assert name in (*symbols.row_names, *symbols.column_names), name
-    assert f"{LARGEST_JACOBIAN:_}".replace("_", " ") in page
+    assert f"{_MAX_JACOBIAN_OPERATIONS:_}".replace("_", " ") in page

@@ -34,7 +34,7 @@ def test_the_blocks_run(repository, tmp_path) -> None:
 
 
 def test_what_it_names_exists(repository) -> None:
-    from yid_ocp.solvers.program import NonlinearProgram
+    from yid_ocp.solvers.nonlinear_program import NonlinearProgram
 
     text = (repository / "docs" / "program.md").read_text(encoding="utf-8")
     named = set(re.findall(r"`nlp\.(\w+)", text))

@@ -16,11 +16,11 @@ def test_the_tutorial_runs(repository) -> None:
 
 
 def test_its_commands_exist(repository) -> None:
-    from yid_ocp.cli import parser
+    from yid_ocp.cli import build_argument_parser
 
     text = (repository / "docs" / "tutorial.md").read_text(encoding="utf-8")
     [block] = re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
     for line in block.strip().splitlines():
         name, *arguments = line.split()
         assert name == "yid-ocp"
-        parser().parse_args(arguments)
+        build_argument_parser().parse_args(arguments)

@@ -10,16 +10,16 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from yid_ocp.data.edges import edge_lengths
+from yid_ocp.data.edge_lengths import median_edge_lengths
 from yid_ocp.data.recording import PointGroup, Recording
-from yid_ocp.effects import SENSORS, EffectBase, candidates, make_effect
+from yid_ocp.effects import SENSOR_KINDS, EffectBase, candidate_effects, make_effect
 from yid_ocp.integrator.rollout import simulate
-from yid_ocp.integrator.statics import Statics
-from yid_ocp.integrator.step import Directions, Rollout, Step, compile_step
+from yid_ocp.integrator.statics import EquilibriumSolver
+from yid_ocp.integrator.step import Rollout, SensitivityDirections, Step, compile_step
 from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object, forward_kinematics
-from yid_ocp.model.cable import Cable, CableOptions, cable_system
+from yid_ocp.model.cable import CableOptions, CableTopology, cable_system
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement
-from yid_ocp.model.rotations import roll_pitch_yaw, transform
+from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.sensors import EffortSensor, PointSensor, Sensor, sensor_function
 
 POSTURE = np.array([0.3, 0.8, 0.9])
@@ -29,7 +29,7 @@ POSE = ((0.0, 0.0, -1.0, 2.0), (1.0, 0.0, 0.0, 0.3), (0.0, -1.0, 0.0, 0.5), (0.0
 
 def arm() -> Mechanism:
     """Three joints, 0.3 m links of 1 kg, each turned from the one before."""
-    along = Placement.of(transform(np.eye(3), [0.0, 0.0, 0.3]))
+    along = Placement.from_matrix(homogeneous_transform(np.eye(3), [0.0, 0.0, 0.3]))
     axes = ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0))
     joints = tuple(
         Joint(
@@ -38,7 +38,7 @@ def arm() -> Mechanism:
             i - 1,
             along if i else Placement.identity(),
             axes[i],
-            (Inertia.of(1.0, [0.01, 0.02, 0.15], np.diag([8e-3, 7e-3, 2e-3])),),
+            (Inertia.from_values(1.0, [0.01, 0.02, 0.15], np.diag([8e-3, 7e-3, 2e-3])),),
         )
         for i, name in enumerate("abc")
     )
@@ -47,25 +47,27 @@ def arm() -> Mechanism:
 
 def small_y(foot: np.ndarray):
     """T1 of two links, T2 and T3 of one."""
-    turn = [roll_pitch_yaw(lean, 0.2, 0.0) for lean in (-0.8, 0.8)]
+    turn = [rotation_from_rpy(lean, 0.2, 0.0) for lean in (-0.8, 0.8)]
     segments = (
         Segment("T1", 0.4, 0.08, 0.03, 2, damping=0.02),
-        Segment("T2", 0.25, 0.04, 0.02, 1, parent="T1", rotation=turn[0], damping=0.02),
-        Segment("T3", 0.3, 0.05, 0.02, 1, parent="T1", rotation=turn[1], damping=0.02),
+        Segment("T2", 0.25, 0.04, 0.02, 1, parent="T1", rest_rotation=turn[0], damping=0.02),
+        Segment("T3", 0.3, 0.05, 0.02, 1, parent="T1", rest_rotation=turn[1], damping=0.02),
     )
     return flexible_object(segments, foot)
 
 
 def position(mechanism: Mechanism, frame: str, q: np.ndarray) -> np.ndarray:
     """Origin of a frame at nominal parameters."""
-    return np.array(ca.DM(forward_kinematics(mechanism.numeric(), ca.SX(ca.DM(q))).position(frame))).ravel()
+    return np.array(
+        ca.DM(forward_kinematics(mechanism.with_numeric_values(), ca.SX(ca.DM(q))).frame_position(frame))
+    ).ravel()
 
 
 def build(prescribed: bool = False, grasped: bool = True) -> System:
     """The arm at `POSTURE` holding the tip of T2 of the undeformed object, 2 cm beside it."""
     robot, item = arm(), small_y(np.eye(4))
     gap = position(robot, "left_gripper", POSTURE) - position(item.mechanism, "w_T2", np.zeros(12))
-    foot = transform(np.eye(3), gap + np.array([0.01, -0.02, -0.015]))
+    foot = homogeneous_transform(np.eye(3), gap + np.array([0.01, -0.02, -0.015]))
     names = robot.joint_names
     return System.build(
         robot,
@@ -96,14 +98,16 @@ class Bench:
         self.system = system
         self.steps = steps
         self.plain = compile_step(system, H, use_compiler=False)
-        self.rest = Statics(self.plain).solve(POSTURE, system.parameters.vector())
-        assert self.rest.converged, self.rest.message
+        self.rest = EquilibriumSolver(self.plain).solve(POSTURE, system.parameters.vector())
+        assert self.rest.is_converged, self.rest.message
         t = H * np.arange(steps + 1)[:, None]
-        self.torque = self.rest.torque + np.array([1.0, -2.0, 0.7][: len(system.driven)]) * np.sin(30 * t[:-1] + 1)
+        self.torque = self.rest.holding_torque + np.array([1.0, -2.0, 0.7][: len(system.driven)]) * np.sin(
+            30 * t[:-1] + 1
+        )
         self.path = POSTURE + 0.03 * np.sin(25 * t + np.arange(3)) - 0.03 * np.sin(np.arange(3))
         self.path = self.path[:, : len(system.prescribed)]
         rng = np.random.default_rng(3)
-        self.kick = 1e-3 * rng.normal(size=system.size)
+        self.kick = 1e-3 * rng.normal(size=system.n_coordinates)
 
     def effect(self, kind: str, location: str, **values: float) -> EffectBase:
         return make_effect(kind, location, self.system, values)
@@ -116,9 +120,11 @@ class Bench:
         names, sizes = step.system.mechanism.joint_names, step.sizes
         at = [names.index(name) for name in self.system.mechanism.joint_names]
         state, n = np.zeros(sizes["nx"]), sizes["n"]
-        state[at] = self.rest.state[: self.system.size]
-        state[[n + i for i in at]] = self.rest.state[self.system.size : 2 * self.system.size] + self.kick
-        for row, name in enumerate(step.system.internal):
+        state[at] = self.rest.state[: self.system.n_coordinates]
+        state[[n + i for i in at]] = (
+            self.rest.state[self.system.n_coordinates : 2 * self.system.n_coordinates] + self.kick
+        )
+        for row, name in enumerate(step.system.internal_coordinates):
             joint = name.rpartition(".")[2]
             if joint in names and not name.startswith("hysteresis"):
                 state[2 * n + row] = state[names.index(joint)]
@@ -127,7 +133,7 @@ class Bench:
     def run(self, step: Step, values: Mapping[str, float] | None = None, names=(), start=None, steps=None) -> Run:
         theta = step.system.parameters.vector(values)
         begin = self.start(step) if start is None else start
-        directions = Directions(tuple(names), np.zeros((len(begin), len(names)))) if names else None
+        directions = SensitivityDirections(tuple(names), np.zeros((len(begin), len(names)))) if names else None
         count = steps or self.steps
         rollout = simulate(
             step, theta, begin, count, self.torque[:count], self.path[: count + 1], directions=directions
@@ -154,11 +160,11 @@ class Bench:
 PARENT = tuple(f"p{i}" for i in range(7))
 
 
-def made_cable() -> tuple[Cable, Recording]:
+def made_cable() -> tuple[CableTopology, Recording]:
     """A cable of six edges with a branch of two, and a recording in which its clamps sway."""
     where = {name: [0.1 * i, 0.0, 1.0] for i, name in enumerate(PARENT)}
     where |= {"c1": [0.3, 0.1, 1.0], "c2": [0.3, 0.2, 1.0]}
-    layout = Cable(PARENT, {"a": ("p3", "c1", "c2")}, where)
+    layout = CableTopology(PARENT, {"a": ("p3", "c1", "c2")}, where)
     t = H * np.arange(21)
     points = np.tile(np.array([where[name] for name in layout.vertices]), (len(t), 1, 1))
     points[:, :, 2] -= 0.02 * np.sin(np.pi * points[0, :, 0] / 0.6)
@@ -186,15 +192,15 @@ def benches(driven, prescribed) -> dict[str, Bench]:
 
 
 @pytest.fixture(scope="session")
-def cable() -> tuple[Cable, Recording, System]:
+def cable() -> tuple[CableTopology, Recording, System]:
     layout, recording = made_cable()
-    return layout, recording, cable_system(edge_lengths(layout.edges, [recording]), layout, CableOptions())
+    return layout, recording, cable_system(median_edge_lengths(layout.edges, [recording]), layout, CableOptions())
 
 
 @pytest.fixture(scope="session")
 def all_effects() -> Callable[[System], list[EffectBase]]:
     def every(system: System) -> list[EffectBase]:
-        return [make_effect(kind, place, system) for kind, place in candidates(system, SENSORS)]
+        return [make_effect(kind, place, system) for kind, place in candidate_effects(system, SENSOR_KINDS)]
 
     return every
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.effects import EFFECTS
-from yid_ocp.integrator.compiler import compiler
+from yid_ocp.integrator.compiler import _compiler_path
 from yid_ocp.integrator.rollout import adjoint_gradient
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.sensors import sensor_function
@@ -97,12 +97,12 @@ def test_readings_have_exact_slopes(which, prescribed, all_effects, sensors) -> 
         assert np.allclose(exact[:, column], (above - below).ravel() / 2e-6, rtol=1e-6, atol=1e-8), name
 
 
-@pytest.mark.skipif(compiler() is None, reason="no C compiler")
+@pytest.mark.skipif(_compiler_path() is None, reason="no C compiler")
 def test_compiled_and_interpreted_agree_with_every_effect(cases) -> None:
     case = cases("driven", "away")
     bench = case.bench
     step = compile_step(case.step.system, case.step.time_step)
-    assert step.compiled
+    assert step.is_compiled
     fast, slow = bench.run(step, case.values, case.names, case.start, STEPS).rollout, case.run.rollout
     for field in ("state", "multipliers", "by_state", "by_multipliers"):
         one, other = getattr(fast, field), getattr(slow, field)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from yid_ocp.effects import EFFECTS, SENSORS, candidates, make_effect
+from yid_ocp.effects import EFFECTS, SENSOR_KINDS, candidate_effects, make_effect
 from yid_ocp.integrator.rollout import simulate
-from yid_ocp.integrator.statics import Statics
+from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.virtual.experiment import paper_system
+from yid_ocp.virtual.experiment import baxter_foam_y_system
 
 POSTURE = (-0.55, -1.0, -0.2, 1.3, -0.1, 1.1, 0.0)
 
@@ -36,10 +36,10 @@ def test_all_together_change_nothing(mode, benches, all_effects, sensors) -> Non
 @pytest.mark.parametrize("kind", [kind for kind in EFFECTS if not kind.startswith("servo_")])
 def test_alone_it_changes_nothing_and_has_a_slope(kind, benches) -> None:
     bench = benches["driven"]
-    places = [place for k, place in candidates(bench.system, SENSORS) if k == kind]
+    places = [place for k, place in candidate_effects(bench.system, SENSOR_KINDS) if k == kind]
     assert places, f"{kind} fits nowhere"
     effect = make_effect(kind, places[-1], bench.system)
-    assert effect.neutral == {entry.name: entry.value for entry in effect.parameters}
+    assert effect.neutral_values == {entry.name: entry.value for entry in effect.parameters}
     step = bench.step(effect)
     plain, run = bench.run(bench.plain, steps=3), bench.run(step, names=effect.parameters.names, steps=3)
     assert run.rollout.status.ok
@@ -51,18 +51,18 @@ def test_alone_it_changes_nothing_and_has_a_slope(kind, benches) -> None:
 
 
 def test_the_papers_system_with_all_candidates(all_effects) -> None:
-    system = paper_system(1)
+    system = baxter_foam_y_system(1)
     everything = system.with_effects(all_effects(system))
     assert everything.mechanism.joint_names[:7] == system.driven
     results = []
     for one in (system, everything):
         step = compile_step(one, 0.01, use_compiler=False)
         theta = one.parameters.vector()
-        rest = Statics(step).solve(POSTURE, theta)
-        assert rest.converged
-        torque = np.tile(rest.torque, (5, 1)) + np.linspace(0, 1, 5)[:, None]
+        rest = EquilibriumSolver(step).solve(POSTURE, theta)
+        assert rest.is_converged
+        torque = np.tile(rest.holding_torque, (5, 1)) + np.linspace(0, 1, 5)[:, None]
         rollout = simulate(step, theta, rest.state, 5, torque)
-        assert rollout.status.ok
+        assert rollout.status.is_converged
         names = one.mechanism.joint_names
         results.append(rollout.state[:, [names.index(name) for name in system.mechanism.joint_names]])
     assert largest(results[1] - results[0], results[0]) < 1e-10

@@ -9,35 +9,39 @@ import numpy as np
 import pytest
 
 from yid_ocp.effects import EFFECTS, make_effect
-from yid_ocp.effects.base import link_ends, link_frames, strength
-from yid_ocp.effects.inertia import REACH, SHIFT
+from yid_ocp.effects.base import link_end_frames, link_frames, relative_effort_limit
+from yid_ocp.effects.inertia import _MAX_COM_SHIFT, _MAX_PAYLOAD_DISTANCE
 from yid_ocp.model import Mechanism, System
-from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body
-from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, merged
-from yid_ocp.model.rotations import roll_pitch_yaw, transform
+from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_derivatives
+from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, merge_bodies
+from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.virtual.experiment import paper_system
+from yid_ocp.virtual.experiment import baxter_foam_y_system
 
-TURNED = transform(roll_pitch_yaw(0.3, -0.5, 1.1), [0.02, 0.1, 0.25])
+TURNED = homogeneous_transform(rotation_from_rpy(0.3, -0.5, 1.1), [0.02, 0.1, 0.25])
 
 
 def arm() -> System:
     """Three joints, of which the last carries a hand in a frame that is turned and beside it."""
-    along = Placement.of(transform(np.eye(3), [0.0, 0.05, 0.3]))
-    body = Inertia.of(1.2, [0.01, -0.02, 0.15], np.array([[9e-3, 3e-4, 0], [3e-4, 8e-3, 2e-4], [0, 2e-4, 2e-3]]))
+    along = Placement.from_matrix(homogeneous_transform(np.eye(3), [0.0, 0.05, 0.3]))
+    body = Inertia.from_values(
+        1.2, [0.01, -0.02, 0.15], np.array([[9e-3, 3e-4, 0], [3e-4, 8e-3, 2e-4], [0, 2e-4, 2e-3]])
+    )
     axes = ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0))
     joints = tuple(
         Joint(f"j{i}", "revolute", i - 1, along if i else Placement.identity(), axes[i], (body,)) for i in range(3)
     )
-    frames = {f"link{i}": Frame(i, Placement.identity()) for i in range(3)} | {"hand": Frame(2, Placement.of(TURNED))}
+    frames = {f"link{i}": Frame(i, Placement.identity()) for i in range(3)} | {
+        "hand": Frame(2, Placement.from_matrix(TURNED))
+    }
     return System.build(Mechanism("arm", joints, frames), prescribed=["j0", "j1", "j2"], damping=0.0)
 
 
 def mechanics(system: System):
     """Mass matrix, dL/dq and dL/dv of a system at (q, v) as functions of its parameters."""
-    q, v = ca.SX.sym("q", system.size), ca.SX.sym("v", system.size)
-    rigid = rigid_body(forward_kinematics(system.mechanism, q), v, system.gravity)
-    outputs = [mass_matrix(rigid, system.mechanism), rigid.by_q, rigid.by_v]
+    q, v = ca.SX.sym("q", system.n_coordinates), ca.SX.sym("v", system.n_coordinates)
+    rigid = rigid_body_derivatives(forward_kinematics(system.mechanism, q), v, system.gravity)
+    outputs = [mass_matrix(rigid, system.mechanism), rigid.lagrangian_by_q, rigid.lagrangian_by_v]
     return ca.Function("mechanics", [q, v, system.parameters.symbols], [ca.densify(x) for x in outputs])
 
 
@@ -46,10 +50,10 @@ def in_pinocchio(system: System, mass: float, point, pin):
     model, parent = pin.Model(), 0
     model.gravity.linear[:] = [0.0, 0.0, -9.81]
     for joint in system.mechanism.joints:
-        at = np.array(ca.DM(joint.placement.matrix()))
+        at = np.array(ca.DM(joint.placement.homogeneous_matrix()))
         parent = model.addJoint(parent, pin.JointModelRevoluteUnaligned(*joint.axis), pin.SE3(at), joint.name)
-        body = merged(joint.bodies)
-        com, tensor = (np.array(ca.DM(x)) for x in (body.com, body.about_com))
+        body = merge_bodies(joint.bodies)
+        com, tensor = (np.array(ca.DM(x)) for x in (body.center_of_mass, body.inertia_about_com))
         model.appendBodyToJoint(parent, pin.Inertia(float(body.mass), com.ravel(), tensor), pin.SE3.Identity())
     own = model.inertias[parent]
     whole, centre = own.mass + mass, (own.mass * own.lever + mass * np.array(point)) / (own.mass + mass)
@@ -100,10 +104,12 @@ def test_the_link_keeps_mass_and_inertia_wherever_a_search_goes() -> None:
     nominal = arm()
     effect = make_effect("payload", "hand", nominal)
     system = nominal.with_effects([effect])
-    last = merged(system.mechanism.joints[2].bodies)
-    function = ca.Function("link", [system.parameters.symbols], [last.mass, last.com, last.about_com])
+    last = merge_bodies(system.mechanism.joints[2].bodies)
+    function = ca.Function(
+        "link", [system.parameters.symbols], [last.mass, last.center_of_mass, last.inertia_about_com]
+    )
     rng = np.random.default_rng(0)
-    bounds = [(q.lower, q.upper) for q in effect.quantities]
+    bounds = [(q.lower, q.upper) for q in effect.definitions]
     centre = nominal.mechanism.joints[2].bodies[0]
     for k in range(400):
         scale = 10.0 ** -rng.uniform(0, 5)
@@ -123,19 +129,21 @@ def test_moments_beyond_reach_do_not_act_and_what_acts_is_reported() -> None:
     nominal = arm()
     effect = make_effect("payload", "hand", nominal)
     names = effect.parameters.names
-    near = effect.reported(dict(zip(names, (1.0, 0.0, 0.2, 0.0), strict=True)), dict.fromkeys(names, 0.01))
+    near = effect.reported_parameters(dict(zip(names, (1.0, 0.0, 0.2, 0.0), strict=True)), dict.fromkeys(names, 0.01))
     assert near["my"].value == pytest.approx(0.2, rel=1e-3)
     assert near["my"].std == 0.01
-    far = effect.reported(dict(zip(names, (1.0, 0.0, 3.0, 4.0), strict=True)), dict.fromkeys(names, 0.01))
-    most = np.hypot(REACH * 1.0, SHIFT * 1.2)
+    far = effect.reported_parameters(dict(zip(names, (1.0, 0.0, 3.0, 4.0), strict=True)), dict.fromkeys(names, 0.01))
+    most = np.hypot(_MAX_PAYLOAD_DISTANCE * 1.0, _MAX_COM_SHIFT * 1.2)
     assert np.hypot(far["my"].value, far["mz"].value) == pytest.approx(most, rel=1e-6)
     assert np.isnan(far["my"].std)
     assert far["mass"].std == 0.01
     given = nominal.with_effects([make_effect("payload", "hand", nominal, {"mass": 1.0, "my": 3.0, "mz": 4.0})])
-    body = merged(given.mechanism.joints[2].bodies)
-    first = np.array(ca.evalf(ca.substitute(body.mass * body.com, given.parameters.symbols, given.parameters.vector())))
-    own = merged(nominal.mechanism.joints[2].bodies)
-    added = first.ravel() - np.array(ca.DM(own.mass * own.com)).ravel()
+    body = merge_bodies(given.mechanism.joints[2].bodies)
+    first = np.array(
+        ca.evalf(ca.substitute(body.mass * body.center_of_mass, given.parameters.symbols, given.parameters.vector()))
+    )
+    own = merge_bodies(nominal.mechanism.joints[2].bodies)
+    added = first.ravel() - np.array(ca.DM(own.mass * own.center_of_mass)).ravel()
     acting = np.array([far[name].value for name in ("mx", "my", "mz")])
     assert added == pytest.approx(TURNED[:3, :3] @ acting + 1.0 * TURNED[:3, 3])
 
@@ -143,8 +151,8 @@ def test_moments_beyond_reach_do_not_act_and_what_acts_is_reported() -> None:
 @pytest.mark.parametrize(
     ("mass", "moments", "other"),
     [
-        (0.2, (0.0, 0.03, -0.04), -0.05 / REACH),
-        (-0.2, (0.0, 0.03, -0.04), 0.05 / REACH),
+        (0.2, (0.0, 0.03, -0.04), -0.05 / _MAX_PAYLOAD_DISTANCE),
+        (-0.2, (0.0, 0.03, -0.04), 0.05 / _MAX_PAYLOAD_DISTANCE),
         (0.2, (3.0, 0.0, 0.0), -0.9 * 1.2),
         (0.2, (0.0, 0.0, 0.0), None),
         (0.0, (0.1, 0.0, 0.0), None),
@@ -154,7 +162,7 @@ def test_moments_beyond_reach_do_not_act_and_what_acts_is_reported() -> None:
 def test_a_search_begins_with_the_other_sign_too(mass, moments, other) -> None:
     effect = make_effect("payload", "hand", arm())
     start = dict(zip(effect.parameters.names, (mass, *moments), strict=True))
-    found = effect.elsewhere(start)
+    found = effect.alternative_start(start)
     assert found == (None if other is None else {"payload@hand.mass": pytest.approx(other)})
 
 
@@ -175,27 +183,29 @@ def test_two_frames_of_one_link_say_the_same() -> None:
 
 
 def test_places_for_a_mass() -> None:
-    one = paper_system(1)
+    one = baxter_foam_y_system(1)
     frames = link_frames(one)
     assert len(frames) == 7
     assert frames[-1] == "left_gripper"
-    ends = link_ends(one)
+    ends = link_end_frames(one)
     # what the hand holds is where the branch ends, and the first link's frame turns about its own origin
     assert "left_gripper" not in ends
     assert "left_upper_shoulder" not in ends
     assert {"left_lower_shoulder", "left_wrist"} <= set(ends)
-    assert set(ends) <= set(EFFECTS["point_mass"].likely(one))
+    assert set(ends) <= set(EFFECTS["point_mass"].candidate_locations(one))
     names = [f"panda_joint{i}" for i in range(1, 8)]
     robot = read_urdf("package:panda", joints=names, exclude_links=["panda_hand"])
     bare = System.build(robot, prescribed=names)
     assert link_frames(bare)[-1] == "panda_link8"
     # joints 1 and 2 meet where nothing moves, 5 and 6 in one place
-    assert sorted(link_ends(bare)) == [f"panda_link{i}" for i in (3, 4, 5, 7, 8)]
+    assert sorted(link_end_frames(bare)) == [f"panda_link{i}" for i in (3, 4, 5, 7, 8)]
     whole = read_urdf("package:panda")
     fingers = [j.name for j in whole.joints if j.kind == "prismatic"]
     held = System.build(whole, prescribed=whole.joint_names)
     assert fingers
-    assert not any(held.mechanism.frame(f).joint == held.mechanism.joint_index(fingers[0]) for f in link_frames(held))
+    assert not any(
+        held.mechanism.frame(f).joint_index == held.mechanism.joint_index(fingers[0]) for f in link_frames(held)
+    )
 
 
 def test_ranges_of_strong_joints_follow_their_limits() -> None:
@@ -205,22 +215,22 @@ def test_ranges_of_strong_joints_follow_their_limits() -> None:
         for joint, limit in zip(system.mechanism.joints, (300.0, 20.0, 1e9), strict=True)
     )
     strong = replace(system, mechanism=replace(system.mechanism, joints=joints))
-    assert [strength(strong, name) for name in ("j0", "j1", "j2")] == [6.0, 1.0, 1.0]
+    assert [relative_effort_limit(strong, name) for name in ("j0", "j1", "j2")] == [6.0, 1.0, 1.0]
     for kind in ("joint_coulomb", "joint_presliding"):
-        tau_c = make_effect(kind, "j0", strong).quantities[0]
+        tau_c = make_effect(kind, "j0", strong).definitions[0]
         assert tau_c.upper == pytest.approx(0.2 * 300.0)
-        assert make_effect(kind, "j1", strong).quantities[0] == make_effect(kind, "j1", system).quantities[0]
+        assert make_effect(kind, "j1", strong).definitions[0] == make_effect(kind, "j1", system).definitions[0]
     for kind in ("joint_viscous", "joint_stribeck", "joint_spring", "rotor_inertia", "effort_offset"):
-        first, plain = (make_effect(kind, "j0", s).quantities[0] for s in (strong, system))
+        first, plain = (make_effect(kind, "j0", s).definitions[0] for s in (strong, system))
         assert first.upper == pytest.approx(6 * plain.upper)
         assert first.prior_range[1] == pytest.approx(6 * plain.prior_range[1])
     # what the first joint bears, the hand may hold
-    assert make_effect("point_mass", "hand", strong).quantities[0].upper == pytest.approx(60.0)
+    assert make_effect("point_mass", "hand", strong).definitions[0].upper == pytest.approx(60.0)
 
 
 def test_a_mass_on_the_object_may_weigh_as_much_as_the_object() -> None:
-    system = paper_system(1)
+    system = baxter_foam_y_system(1)
     whole = 0.064 + 0.015 + 0.016
-    mass = make_effect("point_mass", "w_T1", system).quantities[0]
+    mass = make_effect("point_mass", "w_T1", system).definitions[0]
     assert mass.prior_range[1] == pytest.approx(whole, rel=0.05)
     assert mass.upper >= whole

@@ -11,11 +11,11 @@ import pytest
 
 from yid_ocp.effects import EFFECTS, make_effect
 from yid_ocp.integrator.rollout import simulate
-from yid_ocp.integrator.statics import Statics
+from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object, forward_kinematics
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement
-from yid_ocp.model.rotations import roll_pitch_yaw, transform
+from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.system import NodeState
 from yid_ocp.sensors import EffortSensor, PointSensor, sensor_function
 
@@ -36,9 +36,9 @@ def link(gravity=(0.0, 0.0, 0.0), prescribed=JOINTS, links=1) -> System:
 
 def hinge(mode: str = "prescribed", gravity=(0.0, 0.0, 0.0)) -> System:
     """One arm joint about y that carries a link along z."""
-    body = Inertia.of(MASS, [0.0, 0.0, LENGTH / 2], np.diag([1e-3, 1e-3, 1e-4]))
+    body = Inertia.from_values(MASS, [0.0, 0.0, LENGTH / 2], np.diag([1e-3, 1e-3, 1e-4]))
     joint = Joint("left_a", "revolute", -1, Placement.identity(), (0.0, 1.0, 0.0), (body,))
-    tip = Frame(0, Placement.of(transform(np.eye(3), [0, 0, LENGTH])))
+    tip = Frame(0, Placement.from_matrix(homogeneous_transform(np.eye(3), [0, 0, LENGTH])))
     return System.build(Mechanism("arm", (joint,), {"left_gripper": tip}), gravity=gravity, **{mode: ["left_a"]})
 
 
@@ -53,7 +53,7 @@ def follow(system, effects, path, values=None, z0=None):
     if z0 is not None:
         start[2 * sizes["n"] :] = z0
     rollout = simulate(step, theta, start, len(lead) - 1, path=lead)
-    assert rollout.status.ok
+    assert rollout.status.is_converged
     return rollout.effort[1:, 0], rollout
 
 
@@ -73,7 +73,7 @@ def swing(system, effects, angle: float, steps: int):
     index = step.system.mechanism.joint_index("T1_0_y")
     start[index] = angle
     rollout = simulate(step, step.system.parameters.vector(), start, steps)
-    assert rollout.status.ok
+    assert rollout.status.is_converged
     return rollout.state[:, index]
 
 
@@ -128,7 +128,7 @@ def test_cubic_stiffness_stiffens() -> None:
 def test_rest_curvature_is_where_the_object_comes_to_rest() -> None:
     system = link(prescribed=(), links=2)
     bent = system.with_effects([make_effect("rest_curvature", "T1", system, {"qx": 0.1, "qy": -0.2})])
-    rest = Statics(compile_step(bent, H, use_compiler=False)).solve([], bent.parameters.vector())
+    rest = EquilibriumSolver(compile_step(bent, H, use_compiler=False)).solve([], bent.parameters.vector())
     assert rest.state[:6] == pytest.approx([0.1, -0.2, 0.0] * 2)
 
 
@@ -192,8 +192,8 @@ def test_drag_of_a_turning_link() -> None:
 
 def rest_of(system: System, *effects):
     step = compile_step(system.with_effects(effects), H, use_compiler=False)
-    rest = Statics(step).solve([], step.system.parameters.vector(), tolerance=1e-9)
-    assert rest.converged
+    rest = EquilibriumSolver(step).solve([], step.system.parameters.vector(), tolerance=1e-9)
+    assert rest.is_converged
     return step, rest
 
 
@@ -218,7 +218,7 @@ def test_a_mount_forgets_a_start_that_does_not_fit_its_load() -> None:
         use_compiler=False,
     )
     rollout = simulate(step, step.system.parameters.vector(), np.zeros(step.sizes["nx"]), 12)
-    assert rollout.status.ok
+    assert rollout.status.is_converged
     mount = rollout.state[:, 1]
     # it follows its load from the second step on, without ringing from step to step
     assert np.all(np.diff(mount[2:]) > 0)
@@ -227,7 +227,7 @@ def test_a_mount_forgets_a_start_that_does_not_fit_its_load() -> None:
 def test_a_junction_turns_all_branches() -> None:
     segments = [Segment("T1", LENGTH, MASS, RADIUS, 2, damping=0.0)]
     segments += [
-        Segment(n, 0.2, 0.05, RADIUS, 1, parent="T1", rotation=roll_pitch_yaw(lean, 0, 0), damping=0.0)
+        Segment(n, 0.2, 0.05, RADIUS, 1, parent="T1", rest_rotation=rotation_from_rpy(lean, 0, 0), damping=0.0)
         for n, lean in (("T2", -0.5), ("T3", 0.5))
     ]
     system = System.build(objects=[(flexible_object(segments), None, None)], gravity=(0.4, 0.0, 0.0))
@@ -237,10 +237,10 @@ def test_a_junction_turns_all_branches() -> None:
     theta = step.system.parameters.vector()
     kinematics = forward_kinematics(step.system.mechanism, ca.SX(ca.DM(rest.state[: step.sizes["n"]])))
     where = ca.Function(
-        "p", [step.system.parameters.symbols], [kinematics.position(f"w_{n}") for n in ("T1", "T2", "T3")]
+        "p", [step.system.parameters.symbols], [kinematics.frame_position(f"w_{n}") for n in ("T1", "T2", "T3")]
     )
     junction, *tips = (np.array(p).ravel() for p in where(theta))
-    axis_function = ca.Function("a", [step.system.parameters.symbols], [kinematics.screws[at("T2_0_x") - 1][:3]])
+    axis_function = ca.Function("a", [step.system.parameters.symbols], [kinematics.joint_screws[at("T2_0_x") - 1][:3]])
     axis = np.array(axis_function(theta)).ravel()
     torque = sum(np.cross((tip - junction) / 2, [0.05 * 0.4, 0, 0]) @ axis for tip in tips)
     assert 8.0 * rest.state[at("junction_compliance@w_T1_y")] == pytest.approx(torque, rel=1e-6)
@@ -248,12 +248,12 @@ def test_a_junction_turns_all_branches() -> None:
 
 def hanging(*effects_of, gravity=(0.0, 0.0, -G)):
     """The one-link tube with its tip held from above by an arm joint that is prescribed at zero."""
-    up = Placement.of(transform(np.eye(3), [0, 0, LENGTH]))
+    up = Placement.from_matrix(homogeneous_transform(np.eye(3), [0, 0, LENGTH]))
     joint = Joint("left_a", "revolute", -1, up, (0.0, 0.0, 1.0))
     robot = Mechanism("arm", (joint,), {"left_gripper": Frame(0, Placement.identity())})
     item = flexible_object([Segment("T1", LENGTH, MASS, RADIUS, 1, bend=KAPPA, damping=0.5)])
     slide = Joint("foot", "prismatic", -1, Placement.identity(), (0.0, 0.0, 1.0))
-    tree = robot.joined(Mechanism("rail", (slide,), {"rail": Frame(0, Placement.identity())}))
+    tree = robot.with_mechanism(Mechanism("rail", (slide,), {"rail": Frame(0, Placement.identity())}))
     grasp = Grasp("left", "left_gripper", "w_T1")
     system = System.build(
         tree, objects=[(item, "rail", None)], grasps=[grasp], prescribed=["left_a"], gravity=gravity, damping=0.0
@@ -264,8 +264,8 @@ def hanging(*effects_of, gravity=(0.0, 0.0, -G)):
 def test_a_compliant_grasp_stretches_by_force_over_stiffness() -> None:
     system, effects = hanging(("grasp_compliance", {"stiffness": 400.0, "damping": 3.0}))
     step = compile_step(system.with_effects(effects), H, use_compiler=False)
-    rest = Statics(step).solve([0.0], step.system.parameters.vector())
-    assert rest.converged
+    rest = EquilibriumSolver(step).solve([0.0], step.system.parameters.vector())
+    assert rest.is_converged
     # the tube hangs on the grasp alone: its foot slides
     assert rest.state[step.system.mechanism.joint_index("foot")] == pytest.approx(-MASS * G / 400.0)
 
@@ -277,7 +277,7 @@ def test_damping_calms_a_bouncing_grasp() -> None:
         step = compile_step(system.with_effects(effects), 0.001, use_compiler=False)
         at = step.system.mechanism.joint_index("foot")
         rollout = simulate(step, step.system.parameters.vector(), np.zeros(step.sizes["nx"]), 400)
-        assert rollout.status.ok
+        assert rollout.status.is_converged
         sway.append(np.std(rollout.state[300:, at]))
     assert sway[1] < 0.1 * sway[0]
 
@@ -286,9 +286,9 @@ def test_a_slipping_grasp_creeps_at_its_rate() -> None:
     system, effects = hanging(("grasp_slip", {"slip_per_load": 0.005}))
     step = compile_step(system.with_effects(effects), H, use_compiler=False)
     theta = step.system.parameters.vector()
-    rest = Statics(step).solve([0.0], theta)
+    rest = EquilibriumSolver(step).solve([0.0], theta)
     rollout = simulate(step, theta, rest.state, 40)
-    assert rollout.status.ok
+    assert rollout.status.is_converged
     foot, offset = rollout.state[:, step.system.mechanism.joint_index("foot")], rollout.state[:, -1]
     # the gripper pulls the tube up, so it creeps towards the tip and the tube sinks
     assert offset[-1] == pytest.approx(0.005 * MASS * G * 40 * H, rel=0.02)
@@ -298,7 +298,7 @@ def test_a_slipping_grasp_creeps_at_its_rate() -> None:
 def test_a_grasp_offset_moves_the_held_point() -> None:
     system, effects = hanging(("grasp_offset", {"dz": 0.013}))
     step = compile_step(system.with_effects(effects), H, use_compiler=False)
-    rest = Statics(step).solve([0.0], step.system.parameters.vector())
+    rest = EquilibriumSolver(step).solve([0.0], step.system.parameters.vector())
     assert rest.state[step.system.mechanism.joint_index("foot")] == pytest.approx(0.013)
 
 
@@ -335,7 +335,7 @@ def test_spring_rotor_and_link_mass_at_an_arm_joint() -> None:
 
 def test_gripper_mass_is_felt_by_a_bare_arm() -> None:
     system = hinge(gravity=(0, 0, -G))
-    assert "left_gripper" in EFFECTS["point_mass"].likely(system)
+    assert "left_gripper" in EFFECTS["point_mass"].candidate_locations(system)
     load, _ = follow(system, [], still(math.pi / 2))
     mass = make_effect("point_mass", "left_gripper", system, {"mass": 0.33})
     assert follow(system, [mass], still(math.pi / 2))[0] == pytest.approx(load - 0.33 * G * LENGTH)
@@ -347,8 +347,12 @@ def test_gripper_mass_is_felt_by_a_bare_arm() -> None:
 def read(system: System, effects, sensor, q=None, effort=None) -> np.ndarray:
     whole = system.with_effects(effects)
     function = sensor_function(whole, sensor, ())
-    n = whole.size
-    at = (np.zeros(n) if q is None else q, np.zeros(len(whole.internal)), np.zeros(n) if effort is None else effort)
+    n = whole.n_coordinates
+    at = (
+        np.zeros(n) if q is None else q,
+        np.zeros(len(whole.internal_coordinates)),
+        np.zeros(n) if effort is None else effort,
+    )
     return np.array(function(*at, whole.parameters.vector())[0]).ravel()
 
 
@@ -383,12 +387,12 @@ def test_joint_readings_and_the_way_back(kind, values, angle, torque) -> None:
     seen = [read(system, [effect], sensor, [0.5], [3.0])[0] for sensor in (Encoder(), EffortSensor(("left_a",)))]
     assert seen == pytest.approx([angle, torque])
     back = [
-        effect.correct(f"joints.{quantity}.left_a", ca.SX(reading), ca.SX(3.0))
+        effect.corrected_reading(f"joints.{quantity}.left_a", ca.SX(reading), ca.SX(3.0))
         for quantity, reading in zip(("position", "effort"), seen, strict=True)
     ]
     value = ca.Function("back", [effect.parameters.symbols], back)(ca.DM([p.value for p in effect.parameters]))
     assert [float(x) for x in value] == pytest.approx([0.5, 3.0])
-    assert effect.correct("joints.position.other", ca.SX(1), ca.SX(1)).is_one()
+    assert effect.corrected_reading("joints.position.other", ca.SX(1), ca.SX(1)).is_one()
 
 
 POSE = np.eye(4)
@@ -422,7 +426,7 @@ def test_latency_belongs_to_cameras_and_late_torque_to_arms() -> None:
 
     def seconds(effect, channel: str, camera: bool = False) -> float:
         values = ca.DM([p.value for p in effect.parameters])
-        return float(ca.Function("d", [effect.parameters.symbols], [effect.delay(channel, camera)])(values))
+        return float(ca.Function("d", [effect.parameters.symbols], [effect.added_delay(channel, camera)])(values))
 
     assert seconds(late, "torque.left_a") == 0.03
     assert seconds(late, "joints.effort.left_a") == -0.03

@@ -10,9 +10,9 @@ from yid_ocp.effects import make_effect
 from yid_ocp.errors import DataError, SolverError
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.inputs import sensors_present
-from yid_ocp.sensors import camera_pose, sensor_function
-from yid_ocp.solvers.transcription import Transcription
+from yid_ocp.problem.recorded_inputs import recorded_sensors
+from yid_ocp.sensors import recorded_camera_pose, sensor_function
+from yid_ocp.solvers.compiled_transcription import CompiledTranscription
 
 H, STEPS = 0.01, 24
 NAMES = ("left_a", "left_b", "left_c")
@@ -63,7 +63,11 @@ def problem(bench, kinds, *, neutral=False, feedback="none", free=(), **options)
     step = compile_step(bench.system.with_effects(effects), H, use_compiler=False)
     names = tuple(name for effect in effects for name in effect.parameters.names)
     settings = ProblemOptions(
-        path_cutoff=float("inf"), feedback=feedback, gains=(20.0, 20.0, 10.0), weak_prior_factor=0.0, **options
+        path_cutoff=float("inf"),
+        feedback=feedback,
+        proportional_gains=(20.0, 20.0, 10.0),
+        weak_prior_factor=0.0,
+        **options,
     )
     return EstimationProblem(step, [recording(bench)], ("T1.bend", *names, *free), settings)
 
@@ -73,7 +77,7 @@ CASES = [("prescribed", "none"), ("driven", "none"), ("driven", "proportional"),
 
 def active(task: EstimationProblem) -> bool:
     """Whether true inputs may differ from recorded ones."""
-    corrections = task.functions.corrections
+    corrections = task.model_functions.input_corrections
     torque = corrections.corrects_efforts and bool(task.system.driven)
     return corrections.corrects_angles or corrections.delays_torque or torque
 
@@ -83,29 +87,31 @@ def test_neutral_readings_change_nothing(mode, feedback, benches) -> None:
     bench = benches[mode]
     plain = problem(bench, (), feedback=feedback)
     full = problem(bench, KINDS, neutral=True, feedback=feedback)
-    one, other = (p.evaluate(p.start, derivatives=False) for p in (plain, full))
+    one, other = (p.evaluate(p.initial_unknowns, derivatives=False) for p in (plain, full))
     assert one.ok, one.message
     assert other.residual == pytest.approx(one.residual, rel=1e-9, abs=1e-9)
     assert not active(plain)
     assert active(full)
-    assert plain.as_recorded
-    assert full.with_free(["T1.bend", "kelvin_voigt@T3.tau"]).as_recorded
+    assert plain.has_uncorrected_inputs
+    assert full.with_free_parameters(["T1.bend", "kelvin_voigt@T3.tau"]).has_uncorrected_inputs
     # the momentum that an LQR filter follows depends on how fast the clock runs
-    assert full.with_free(["T1.bend", "clock_scale@clock.scale"]).as_recorded is (feedback != "lqr")
-    assert not full.with_free(["effort_delay@left.delay"]).as_recorded
-    assert not full.with_free(["effort_lag@left_c.time_constant"]).as_recorded
-    assert not full.with_free(["camera_latency@camera.delay"]).as_recorded
+    assert full.with_free_parameters(["T1.bend", "clock_scale@clock.scale"]).has_uncorrected_inputs is (
+        feedback != "lqr"
+    )
+    assert not full.with_free_parameters(["effort_delay@left.delay"]).has_uncorrected_inputs
+    assert not full.with_free_parameters(["effort_lag@left_c.time_constant"]).has_uncorrected_inputs
+    assert not full.with_free_parameters(["camera_latency@camera.delay"]).has_uncorrected_inputs
     with pytest.raises(SolverError, match="gauss_newton"):
-        Transcription(full, 1)
+        CompiledTranscription(full, 1)
 
 
 @pytest.mark.parametrize(("mode", "feedback"), CASES)
 def test_derivatives_agree_with_differences_and_with_the_adjoint(mode, feedback, benches) -> None:
     task = problem(benches[mode], KINDS, feedback=feedback)
-    x = task.start
+    x = task.initial_unknowns
     result = task.evaluate(x)
     assert result.ok, result.message
-    for column, name in enumerate(task.names):
+    for column, name in enumerate(task.unknown_names):
         width = 1e-5 if name.endswith(("delay", "offset", "width", "compliance", "time_constant")) else 1e-4
         shift = np.zeros(len(x))
         shift[column] = width
@@ -113,14 +119,17 @@ def test_derivatives_agree_with_differences_and_with_the_adjoint(mode, feedback,
         numeric = (above - below) / (2 * width)
         exact = result.jacobian[:, column]
         assert np.max(np.abs(exact - numeric)) <= 1e-4 * np.max(np.abs(exact)) + 1e-5, name
-    _, gradient, _ = task.gradient(x)
+    _, gradient, _ = task.cost_and_gradient(x)
     assert gradient == pytest.approx(result.jacobian.T @ result.residual, rel=1e-6, abs=1e-6)
 
 
 def test_a_delay_at_a_sample_has_the_mean_slope_of_both_sides(driven, prescribed) -> None:
     for bench, kind in ((driven, "effort_delay"), (prescribed, "effort_delay"), (driven, "camera_latency")):
         task = problem(bench, (kind,), neutral=True)
-        x, column = task.start, task.names.index(next(n for n in task.names if n.startswith(kind)))
+        x, column = (
+            task.initial_unknowns,
+            task.unknown_names.index(next(n for n in task.unknown_names if n.startswith(kind))),
+        )
         exact = task.evaluate(x).jacobian[:, column]
         shift = np.zeros(len(x))
         shift[column] = 1e-5
@@ -134,49 +143,51 @@ def test_a_delay_at_a_sample_has_the_mean_slope_of_both_sides(driven, prescribed
 def test_what_acts_follows_the_recorded_effort_of_a_prescribed_joint(time_constant, prescribed) -> None:
     """T dz/dt = c - z; with a negative T the recorded effort follows what acts."""
     task = problem(prescribed, ("effort_lag",), neutral=True)
-    x = task.start.copy()
-    column = task.names.index("effort_lag@left_a.time_constant")
-    acting = task.evaluate(x, derivatives=False).episodes[0]
+    x = task.initial_unknowns.copy()
+    column = task.unknown_names.index("effort_lag@left_a.time_constant")
+    acting = task.evaluate(x, derivatives=False).episode_predictions[0]
     x[column] = time_constant
-    recorded = task.evaluate(x, derivatives=False).episodes[0]
-    at = next(i for i, samples in enumerate(task.episodes[0].samples) if samples.sensor.efforts)
-    joint = task.episodes[0].samples[at].sensor.efforts.index("left_a")
-    z, c = (found.predicted[at][:, joint] for found in (acting, recorded))
+    recorded = task.evaluate(x, derivatives=False).episode_predictions[0]
+    at = next(i for i, samples in enumerate(task.episodes[0].measurements) if samples.sensor.effort_joints)
+    joint = task.episodes[0].measurements[at].sensor.effort_joints.index("left_a")
+    z, c = (found.predicted_outputs[at][:, joint] for found in (acting, recorded))
     follower, other = (z, c) if time_constant > 0 else (c, z)
     rate = np.gradient(follower, H)
     error = 0.02 * rate - (other - follower)
     # the ramp of the motion ends in a step of its acceleration, which no difference of rates resolves
     assert np.median(np.abs(error)) < 0.05 * np.median(np.abs(other - follower))
-    others = [k for k in range(recorded.predicted[at].shape[1]) if k != joint]
-    np.testing.assert_array_equal(recorded.predicted[at][:, others], acting.predicted[at][:, others])
+    others = [k for k in range(recorded.predicted_outputs[at].shape[1]) if k != joint]
+    np.testing.assert_array_equal(recorded.predicted_outputs[at][:, others], acting.predicted_outputs[at][:, others])
 
 
 def test_a_late_camera_sees_the_past(driven, sensors) -> None:
     task = problem(driven, ("camera_latency",), neutral=True)
     delay = 3 * H
-    index = task.names.index("camera_latency@camera.delay")
-    x = task.start.copy()
-    now = task.evaluate(x, derivatives=False).episodes[0]
+    index = task.unknown_names.index("camera_latency@camera.delay")
+    x = task.initial_unknowns.copy()
+    now = task.evaluate(x, derivatives=False).episode_predictions[0]
     x[index] = delay
-    late = task.evaluate(x, derivatives=False).episodes[0]
+    late = task.evaluate(x, derivatives=False).episode_predictions[0]
     episode = task.episodes[0]
-    at = next(i for i, s in enumerate(episode.samples) if s.sensor.group == "points_camera")
-    moved = episode.samples[at]
-    assert late.predicted[1 - at] == pytest.approx(now.predicted[1 - at], abs=1e-9)
+    at = next(i for i, s in enumerate(episode.measurements) if s.sensor.group_name == "points_camera")
+    moved = episode.measurements[at]
+    assert late.predicted_outputs[1 - at] == pytest.approx(now.predicted_outputs[1 - at], abs=1e-9)
     position = np.maximum(moved.node + moved.fraction - 3.0, 0.0)
     n = driven.system.size
     function = sensor_function(task.system, sensors.camera, ())
     nodes = np.array([np.array(function(s[:n], [], np.zeros(n), task.theta)[0]).ravel() for s in now.rollout.state])
     for k in range(6):
         expected = np.interp(position, np.arange(len(nodes)), nodes[:, k])
-        assert late.predicted[at][:, k] == pytest.approx(expected, abs=1e-9)
+        assert late.predicted_outputs[at][:, k] == pytest.approx(expected, abs=1e-9)
 
 
 def test_an_offset_is_taken_out_of_the_prescribed_path(prescribed) -> None:
     task = problem(prescribed, ("encoder_offset",))
-    inputs = task.predictor.inputs(task.episodes[0], task.theta, ("encoder_offset@left_b.offset",))
-    assert inputs.path - task.episodes[0].path == pytest.approx(np.tile([0.0, -0.01, 0.0], (STEPS + 1, 1)))
-    assert np.all(inputs.by_path[:, 1] == -1)
+    inputs = task.predictor.corrected_inputs(task.episodes[0], task.theta, ("encoder_offset@left_b.offset",))
+    assert inputs.prescribed_path - task.episodes[0].prescribed_path == pytest.approx(
+        np.tile([0.0, -0.01, 0.0], (STEPS + 1, 1))
+    )
+    assert np.all(inputs.prescribed_path_sensitivity[:, 1] == -1)
 
 
 def test_a_gear_needs_recorded_effort(prescribed) -> None:
@@ -188,26 +199,29 @@ def test_a_gear_needs_recorded_effort(prescribed) -> None:
 
 def test_what_a_recording_holds(driven) -> None:
     full = recording(driven)
-    assert sensors_present([full]) == {"joints.position", "joints.effort", "camera"}
-    assert sensors_present([recording(driven, effort=False, camera=False)]) == {"joints.position"}
+    assert recorded_sensors([full]) == {"joints.position", "joints.effort", "camera"}
+    assert recorded_sensors([recording(driven, effort=False, camera=False)]) == {"joints.position"}
     arm, camera = full.points
-    assert camera_pose(arm) is None
-    assert camera_pose(camera) is not None
+    assert recorded_camera_pose(arm) is None
+    assert recorded_camera_pose(camera) is not None
     unposed = PointGroup("points_camera", ("p",), [0.0], np.zeros((1, 1, 3)), clock="nominal")
-    assert camera_pose(unposed) == tuple(map(tuple, np.eye(4)))
-    assert "nominal_clock" in sensors_present([Recording(points=(unposed,))])
+    assert recorded_camera_pose(unposed) == tuple(map(tuple, np.eye(4)))
+    assert "nominal_clock" in recorded_sensors([Recording(points=(unposed,))])
 
 
 def test_a_cable_from_a_fitted_start(cable, all_effects) -> None:
     layout, made, system = cable
     options = ProblemOptions(
-        initial_state="fitted_to_points", clamps=layout.clamps, path_cutoff=float("inf"), weak_prior_factor=0.0
+        initial_state="fitted_to_points",
+        clamp_paths=layout.clamp_paths,
+        path_cutoff=float("inf"),
+        weak_prior_factor=0.0,
     )
     residuals = []
     for one in (system, system.with_effects(all_effects(system))):
         step = compile_step(one, H, use_compiler=False)
         found = EstimationProblem(step, [made], ("parent.bend",), options)
-        result = found.evaluate(found.start)
+        result = found.evaluate(found.initial_unknowns)
         assert result.ok, result.message
         residuals.append(np.column_stack([result.residual, result.jacobian]))
     assert residuals[1] == pytest.approx(residuals[0], rel=1e-6, abs=1e-7)
@@ -215,22 +229,22 @@ def test_a_cable_from_a_fitted_start(cable, all_effects) -> None:
 
 def test_options_can_switch_the_camera_off(driven) -> None:
     task = problem(driven, ("camera_latency",), sensors={"points_camera": SensorOptions(use=False)})
-    assert np.all(task.evaluate(task.start).jacobian[:, -1] == 0)
+    assert np.all(task.evaluate(task.initial_unknowns).jacobian[:, -1] == 0)
 
 
 @pytest.mark.parametrize("kind", sorted(HEAVIER))
 def test_the_filter_follows_the_momentum_of_the_effects(driven, kind) -> None:
     """The cost is one number, whether derivatives are asked for or not, and however the effect's value is given."""
     task = problem(driven, (kind,), feedback="lqr")
-    with_slopes, without = (task.evaluate(task.start, derivatives=flag).cost for flag in (True, False))
-    fixed = task.with_free(["T1.bend"])
+    with_slopes, without = (task.evaluate(task.initial_unknowns, derivatives=flag).cost for flag in (True, False))
+    fixed = task.with_free_parameters(["T1.bend"])
     told = problem(driven, (kind,), neutral=True, feedback="lqr")
-    values = dict(zip(task.names, task.start, strict=True))
-    other = told.evaluate([values[name] for name in told.names], derivatives=False).cost
+    values = dict(zip(task.unknown_names, task.initial_unknowns, strict=True))
+    other = told.evaluate([values[name] for name in told.unknown_names], derivatives=False).cost
     assert without == pytest.approx(with_slopes, rel=1e-12)
-    assert fixed.evaluate(fixed.start, derivatives=False).cost == pytest.approx(without, rel=1e-12)
+    assert fixed.evaluate(fixed.initial_unknowns, derivatives=False).cost == pytest.approx(without, rel=1e-12)
     assert other == pytest.approx(without, rel=1e-9)
 
 
 def test_an_arms_own_damping_leaves_the_recording_as_it_is(driven) -> None:
-    assert problem(driven, (), feedback="lqr", free=("left_a.damping",)).as_recorded
+    assert problem(driven, (), feedback="lqr", free=("left_a.damping",)).has_uncorrected_inputs

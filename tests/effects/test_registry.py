@@ -7,20 +7,20 @@ import re
 
 import pytest
 
-from yid_ocp.effects import EFFECTS, SENSORS, candidates, make_effect, vocabulary
+from yid_ocp.effects import EFFECTS, SENSOR_KINDS, candidate_effects, effect_overview, make_effect
 from yid_ocp.effects import base as places
-from yid_ocp.effects.base import ASPECTS
+from yid_ocp.effects.base import EXCITATIONS
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model import Effect, Segment, System, flexible_object
-from yid_ocp.model.drives import PositionServos
-from yid_ocp.model.system import RecordedEffect
+from yid_ocp.model.servos_and_springs import PositionServoOptions
+from yid_ocp.model.system import RecordingErrorEffect
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.virtual.experiment import paper_system
+from yid_ocp.virtual.experiment import baxter_foam_y_system
 
 
 @pytest.fixture(scope="module")
 def one_arm() -> System:
-    return paper_system(1)
+    return baxter_foam_y_system(1)
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,9 @@ def beam() -> System:
     """Panda with a beam on its hand, its joints prescribed."""
     names = [f"panda_joint{i}" for i in range(1, 8)]
     robot = read_urdf("package:panda", joints=names)
-    item = flexible_object([Segment("beam", 0.52, 0.33, 0.01, 3, clamped=True, rigidity=True)], name="beam")
+    item = flexible_object(
+        [Segment("beam", 0.52, 0.33, 0.01, 3, clamped_at_base=True, stiffness_per_curvature=True)], name="beam"
+    )
     return System.build(robot, objects=[(item, "panda_hand", None)], prescribed=names)
 
 
@@ -38,8 +40,8 @@ OF_SERVOS = {"servo_gain", "servo_delay", "servo_saturation"}
 
 def with_servos() -> System:
     """The papers' arm with a position servo on every joint."""
-    system = paper_system(1)
-    return System.build(system.mechanism, driven=system.driven, servos=PositionServos(), grasps=system.grasps)
+    system = baxter_foam_y_system(1)
+    return System.build(system.mechanism, driven=system.driven, servos=PositionServoOptions(), grasps=system.grasps)
 
 
 def test_the_vocabulary_is_the_shared_one(shared) -> None:
@@ -48,82 +50,86 @@ def test_the_vocabulary_is_the_shared_one(shared) -> None:
     table = {row[0]: row for row in rows[2:]}
     described = {kind.strip() for name in table for kind in name.split(",")}
     assert set(EFFECTS) == described
-    servos, system = with_servos(), paper_system(1)
-    places = {kind: (servos, place) for kind, place in candidates(servos, SENSORS)}
-    places |= {kind: (system, place) for kind, place in candidates(system, SENSORS)}
+    servos, system = with_servos(), baxter_foam_y_system(1)
+    places = {kind: (servos, place) for kind, place in candidate_effects(servos, SENSOR_KINDS)}
+    places |= {kind: (system, place) for kind, place in candidate_effects(system, SENSOR_KINDS)}
     for kind in EFFECTS:
         row = next(cells for name, cells in table.items() if kind in map(str.strip, name.split(",")))
         system, place = places[kind]
         effect = make_effect(kind, place, system)
-        for quantity in effect.quantities:
-            assert re.search(rf"\b{quantity.reported[0]}\b", row[2]), f"{kind}: {quantity.reported[0]} not in {row[2]}"
+        for quantity in effect.definitions:
+            assert re.search(rf"\b{quantity.reported_name_and_unit[0]}\b", row[2]), (
+                f"{kind}: {quantity.reported_name_and_unit[0]} not in {row[2]}"
+            )
 
 
 def test_every_kind_describes_itself(one_arm) -> None:
-    assert [kind for kind, _, _ in vocabulary()] == list(EFFECTS)
-    for kind, equation, _ in vocabulary():
+    assert [kind for kind, _, _ in effect_overview()] == list(EFFECTS)
+    for kind, equation, _ in effect_overview():
         assert equation
         assert EFFECTS[kind].__doc__
-        assert EFFECTS[kind].depends_on in ASPECTS
-    for kind, place in candidates(one_arm, SENSORS):
+        assert EFFECTS[kind].required_excitation in EXCITATIONS
+    for kind, place in candidate_effects(one_arm, SENSOR_KINDS):
         effect = make_effect(kind, place, one_arm)
         assert isinstance(effect, Effect)
-        assert isinstance(effect, RecordedEffect)
-        assert effect.amplitudes
-        for quantity, entry in zip(effect.quantities, effect.parameters, strict=True):
+        assert isinstance(effect, RecordingErrorEffect)
+        assert effect.amplitude_names
+        for quantity, entry in zip(effect.definitions, effect.parameters, strict=True):
             assert entry.name == f"{kind}@{place}.{quantity.name}"
-            assert entry.value == quantity.neutral
-            low, high = effect.prior_range[entry.name]
+            assert entry.value == quantity.neutral_value
+            low, high = effect.prior_ranges[entry.name]
             assert entry.lower <= low < high <= entry.upper
             assert entry.unit == quantity.unit
             assert quantity.description
 
 
 def test_candidates_of_the_papers_system(one_arm) -> None:
-    found = candidates(one_arm, SENSORS)
+    found = candidate_effects(one_arm, SENSOR_KINDS)
     assert {kind for kind, _ in found} == set(EFFECTS) - OF_SERVOS
     assert len(found) == len(set(found))
-    blind = candidates(one_arm, ["joints.position"])
+    blind = candidate_effects(one_arm, ["joints.position"])
     assert not {kind for kind, _ in blind} & {"camera_scale", "effort_gain", "clock_scale"}
     assert ("kelvin_voigt", "T3") in blind
     assert ("junction_compliance", "w_T1") in blind
     assert ("grasp_slip", "left") in blind
     with pytest.raises(ModelError, match="camera"):
-        candidates(one_arm, ["kamera"])
+        candidate_effects(one_arm, ["kamera"])
 
 
 def test_places_of_two_arms() -> None:
-    two = paper_system(2)
-    assert set(places.arms(two)) == {"left", "right"}
-    assert all(len(joints) == 7 for joints in places.arms(two).values())
-    found = candidates(two, SENSORS)
+    two = baxter_foam_y_system(2)
+    assert set(places.joints_by_arm(two)) == {"left", "right"}
+    assert all(len(joints) == 7 for joints in places.joints_by_arm(two).values())
+    found = candidate_effects(two, SENSOR_KINDS)
     assert {("effort_delay", "left"), ("effort_delay", "right"), ("grasp_offset", "right")} <= set(found)
 
 
 def test_places_of_a_beam_on_a_gripper(beam) -> None:
-    found = candidates(beam, ["joints.position", "joints.effort"])
+    found = candidate_effects(beam, ["joints.position", "joints.effort"])
     assert ("mount_compliance", "base") in found
     assert ("effort_delay", "gripper") in found
     assert ("gravity_scale", "object") in found
     assert not [place for kind, place in found if kind.startswith(("grasp", "junction", "camera"))]
     # without efforts nothing shows what is wrong with a prescribed joint
-    assert not [place for _, place in candidates(beam, ["joints.position"]) if place.startswith("panda_joint4")][1:]
+    assert not [place for _, place in candidate_effects(beam, ["joints.position"]) if place.startswith("panda_joint4")][
+        1:
+    ]
     bare = System.build(beam.mechanism, prescribed=beam.prescribed)
-    assert [p for k, p in candidates(bare, SENSORS) if k == "point_mass"]
+    assert [p for k, p in candidate_effects(bare, SENSOR_KINDS) if k == "point_mass"]
 
 
 def test_places_of_a_branched_cable(cable) -> None:
     _, _, cable = cable
-    found = candidates(cable, ["nominal_clock"])
+    found = candidate_effects(cable, ["nominal_clock"])
     assert {("mount_compliance", "clamp_start"), ("junction_compliance", "junction_a")} <= set(found)
     assert {("grasp_compliance", "clamp_end"), ("grasp_slip", "clamp_end")} <= set(found)
     assert {("kelvin_voigt", "parent"), ("kelvin_voigt", "a"), ("point_mass", "junction_a")} <= set(found)
     assert not places.robot_joints(cable)
     changed = cable.with_effects([make_effect(kind, place, cable) for kind, place in found])
-    assert changed.size == cable.size + 4
+    assert changed.n_coordinates == cable.n_coordinates + 4
     assert changed.prescribed == cable.prescribed
     branch = changed.mechanism.joints[changed.mechanism.joint_index("a_0_x")]
-    assert changed.mechanism.joints[branch.parent].name == "junction_compliance@junction_a_y"
+    assert changed.mechanism.joints[branch.parent_index].name == "junction_compliance@junction_a_y"
 
 
 @pytest.mark.parametrize(
@@ -163,17 +169,17 @@ def test_a_compliance_is_given_and_reported_as_stiffness(one_arm) -> None:
     effect = make_effect("grasp_compliance", "left", one_arm, {"stiffness": 500.0})
     name = "grasp_compliance@left.compliance"
     assert effect.parameters[name].value == pytest.approx(2e-3)
-    found = effect.reported({name: 4e-3}, {name: 4e-4})
+    found = effect.reported_parameters({name: 4e-3}, {name: 4e-4})
     assert found["stiffness"].value == pytest.approx(250.0)
     assert found["stiffness"].std == pytest.approx(25.0)
     assert found["stiffness"].unit == "N/m"
     assert found["damping"].unit == "N s/m"
-    rigid = effect.reported({name: 0.0}, {name: 1e-4})["stiffness"]
+    rigid = effect.reported_parameters({name: 0.0}, {name: 1e-4})["stiffness"]
     assert math.isinf(rigid.value)
     assert math.isnan(rigid.std)
     with pytest.raises(ConfigError, match="positive"):
         make_effect("grasp_compliance", "left", one_arm, {"stiffness": 0.0})
-    assert effect.shapes == ("grasp_compliance@left.damping",)
+    assert effect.shape_names == ("grasp_compliance@left.damping",)
 
 
 def test_names_and_places_survive_added_joints(one_arm) -> None:
@@ -183,17 +189,17 @@ def test_names_and_places_survive_added_joints(one_arm) -> None:
     assert names[:7] == one_arm.driven
     assert [n for n in names if "@" not in n] == list(one_arm.mechanism.joint_names)
     for j, joint in enumerate(changed.mechanism.joints):
-        assert joint.parent < j
-    parent = changed.mechanism.joints[names.index("T3_0_x")].parent
+        assert joint.parent_index < j
+    parent = changed.mechanism.joints[names.index("T3_0_x")].parent_index
     assert names[parent] == "junction_compliance@w_T1_y"
-    assert names[changed.mechanism.joints[names.index("T2_0_x")].parent] == names[parent]
+    assert names[changed.mechanism.joints[names.index("T2_0_x")].parent_index] == names[parent]
     assert places.robot_joints(changed) == places.robot_joints(one_arm)
-    assert changed.mechanism.frame("w_T1").joint == names.index("T1_3_z")
+    assert changed.mechanism.frame("w_T1").joint_index == names.index("T1_3_z")
 
 
 def test_how_much_stiffening_to_expect_depends_on_how_far_joints_turn() -> None:
-    effect = make_effect("cubic_stiffness", "T1", paper_system(1))
-    low, high = effect.prior_range["cubic_stiffness@T1.k3"]
-    told = effect.expected({"T1": 0.25, "T2": 1.0})
-    assert told.prior_range["cubic_stiffness@T1.k3"] == pytest.approx((4 * low, 4 * high))
-    assert effect.expected({"T2": 0.1}) is effect
+    effect = make_effect("cubic_stiffness", "T1", baxter_foam_y_system(1))
+    low, high = effect.prior_ranges["cubic_stiffness@T1.k3"]
+    told = effect.with_expected_ranges({"T1": 0.25, "T2": 1.0})
+    assert told.prior_ranges["cubic_stiffness@T1.k3"] == pytest.approx((4 * low, 4 * high))
+    assert effect.with_expected_ranges({"T2": 0.1}) is effect

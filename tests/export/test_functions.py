@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from held_rod import held_rod
 
-from yid_ocp.analysis.symbols import StepSymbols
+from yid_ocp.analysis.step_symbols import StepSymbols
 from yid_ocp.errors import OutputError
-from yid_ocp.export import functions as exported
-from yid_ocp.export.functions import export_functions, step_exports
-from yid_ocp.integrator.statics import Statics
+from yid_ocp.export import casadi_functions as exported
+from yid_ocp.export.casadi_functions import _exported_step_functions, export_step_functions
+from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model.kinematics import forward_kinematics
 
@@ -32,7 +32,9 @@ def step(urdf_folder):
 @pytest.fixture(scope="module")
 def folder(step, tmp_path_factory):
     folder = tmp_path_factory.mktemp("export") / "deep" / "folder"
-    written = export_functions(StepSymbols.of(step.equations), folder, step.system.parameters.vector(), step.time_step)
+    written = export_step_functions(
+        StepSymbols.from_equations(step.equations), folder, step.system.parameters.vector(), step.time_step
+    )
     assert [path.name for path in written] == [*(f"{name}.casadi" for name in FUNCTIONS), "equations.c", "names.json"]
     assert sorted(path.name for path in folder.iterdir()) == sorted(path.name for path in written)
     return folder
@@ -54,7 +56,7 @@ def compared(function, reference, values):
 
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_what_is_loaded_back_has_the_same_values(step, folder, name):
-    reference = {f.name(): f for f in step_exports(StepSymbols.of(step.equations))}[name]
+    reference = {f.name(): f for f in _exported_step_functions(StepSymbols.from_equations(step.equations))}[name]
     loaded = ca.Function.load(str(folder / f"{name}.casadi"))
     assert loaded.name_in() == reference.name_in()
     assert loaded.name_out() == reference.name_out()
@@ -68,10 +70,10 @@ def test_the_loaded_rows_vanish_along_a_step(step, folder):
     """What the kernel solves is what was written: DEL, inner equations and constraints are met, p1 is the momentum."""
     rows = ca.Function.load(str(folder / "rows.casadi"))
     theta = step.system.parameters.vector()
-    rest = Statics(step).solve(np.array([0.3, -0.6]), theta, None)
+    rest = EquilibriumSolver(step).solve(np.array([0.3, -0.6]), theta, None)
     n = step.sizes["n"]
     q0, p0, z0 = rest.state[:n], rest.state[n : 2 * n], rest.state[2 * n :]
-    torque = rest.torque + 0.5
+    torque = rest.holding_torque + 0.5
     q1, p1, lam, status = step(q0, p0, torque, theta, None, z0)
     assert status.ok
     found = rows(
@@ -117,7 +119,7 @@ def test_points_and_mechanics_are_the_models(step, folder):
     q = np.random.default_rng(1).uniform(-0.5, 0.5, step.sizes["n"])
     symbol = ca.SX.sym("q", len(q))
     kinematics = forward_kinematics(step.system.mechanism, symbol)
-    place = ca.Function("at", [symbol, step.system.parameters.symbols], [kinematics.position("T1:50%")])
+    place = ca.Function("at", [symbol, step.system.parameters.symbols], [kinematics.frame_position("T1:50%")])
     np.testing.assert_allclose(points.call([q, theta])[1].full(), place(q, theta).full(), atol=1e-14)
     v = np.random.default_rng(2).normal(size=len(q))
     mass, _, momentum = (x.full() for x in ca.Function.load(str(folder / "mechanics.casadi")).call([q, v, theta]))
@@ -138,7 +140,7 @@ def test_the_c_file_compiles_to_the_same_values(step, folder, tmp_path):
 
 
 def test_names_say_what_stands_where(step, folder):
-    symbols = StepSymbols.of(step.equations)
+    symbols = StepSymbols.from_equations(step.equations)
     names = json.loads((folder / "names.json").read_text())
     assert names["format"] == "yid-equations/1"
     assert list(names["functions"]) == list(FUNCTIONS)
@@ -150,11 +152,15 @@ def test_names_say_what_stands_where(step, folder):
 
 
 def test_a_large_jacobian_is_left_to_the_reader(step, monkeypatch):
-    monkeypatch.setattr(exported, "LARGEST_JACOBIAN", 10)
-    assert "rows_by_unknowns" not in [f.name() for f in step_exports(StepSymbols.of(step.equations))]
+    monkeypatch.setattr(exported, "_MAX_JACOBIAN_OPERATIONS", 10)
+    assert "rows_by_unknowns" not in [
+        f.name() for f in _exported_step_functions(StepSymbols.from_equations(step.equations))
+    ]
 
 
 def test_a_folder_that_cannot_be_made_is_said(step, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot be made"):
-        export_functions(StepSymbols.of(step.equations), tmp_path / "file" / "x", step.system.parameters.vector(), 0.01)
+        export_step_functions(
+            StepSymbols.from_equations(step.equations), tmp_path / "file" / "x", step.system.parameters.vector(), 0.01
+        )

@@ -9,25 +9,25 @@ import subprocess
 import pytest
 from held_rod import held_rod
 
-from yid_ocp.analysis.symbols import StepSymbols
+from yid_ocp.analysis.step_symbols import StepSymbols
 from yid_ocp.effects import make_effect
-from yid_ocp.export.latex import write_sheet
+from yid_ocp.export.latex_sheet import write_equation_sheet
 from yid_ocp.integrator.discrete import discrete_equations
 from yid_ocp.model import System
-from yid_ocp.model.drives import Spring
+from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 
 
 @pytest.fixture(scope="module")
 def symbols(urdf_folder):
     """A driven shoulder, an elbow with a spring and an effect with inner coordinates on a rod that is held."""
-    system = held_rod(urdf_folder, links=1, ratio=0.4, driven=["shoulder"], springs={"elbow": Spring(3.25)})
-    return StepSymbols.of(discrete_equations(system))
+    system = held_rod(urdf_folder, links=1, ratio=0.4, driven=["shoulder"], springs={"elbow": RobotJointSpring(3.25)})
+    return StepSymbols.from_equations(discrete_equations(system))
 
 
 def sheet(symbols, tmp_path, free=("T1.bend",), time_step=0.01):
     path = tmp_path / "equations.tex"
-    write_sheet(path, symbols, symbols.equations.system.parameters.vector(), free, time_step)
+    write_equation_sheet(path, symbols, symbols.equations.system.parameters.vector(), free, time_step)
     return path.read_text()
 
 
@@ -85,7 +85,7 @@ def test_numbers_stand_for_all_but_what_is_free(symbols, tmp_path):
 def test_rules_say_what_the_step_does(symbols, tmp_path):
     assert r"\tfrac{h}{2} F - \tfrac12" in sheet(symbols, tmp_path)
     system = symbols.equations.system
-    left = StepSymbols.of(discrete_equations(system, "left", "node"))
+    left = StepSymbols.from_equations(discrete_equations(system, "left", "node"))
     text = sheet(left, tmp_path)
     assert r"- L_v(q_m, v_m) + h F - D\varphi(q_k)^{T} \lambda_k" in text
     assert "p_{k+1} &= \\tfrac{h}{2} L_q(q_m, v_m) + L_v(q_m, v_m) \\\\\n" in text
@@ -94,9 +94,9 @@ def test_rules_say_what_the_step_does(symbols, tmp_path):
         make_effect("grasp_compliance", "hand", system, {}),
         make_effect("mount_compliance", "base", system, {}),
     ]
-    soft = StepSymbols.of(discrete_equations(system.with_effects(added)))
-    assert soft.equations.constraint_gain is not None
-    assert soft.equations.system.compliant
+    soft = StepSymbols.from_equations(discrete_equations(system.with_effects(added)))
+    assert soft.equations.constraint_relaxation_gain is not None
+    assert soft.equations.system.joint_compliances
     text = sheet(soft, tmp_path, free=())
     check(text)
     assert r"+ T \left(" in text
@@ -105,7 +105,7 @@ def test_rules_say_what_the_step_does(symbols, tmp_path):
 
 def test_without_grasps_there_is_no_word_of_them(urdf_folder, tmp_path):
     system = System.build(read_urdf(urdf_folder / "mixed_joints.urdf"))
-    text = sheet(StepSymbols.of(discrete_equations(system)), tmp_path, free=())
+    text = sheet(StepSymbols.from_equations(discrete_equations(system)), tmp_path, free=())
     check(text)
     assert "varphi" not in text
     assert "lambda" not in text
@@ -119,7 +119,7 @@ def test_short_rows_are_written_out(tmp_path, urdf_folder):
       <mass value="2"/><inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial></link></robot>"""
     (tmp_path / "one.urdf").write_text(urdf)
     system = System.build(read_urdf(tmp_path / "one.urdf"), damping=0.125)
-    text = sheet(StepSymbols.of(discrete_equations(system)), tmp_path, free=())
+    text = sheet(StepSymbols.from_equations(discrete_equations(system)), tmp_path, free=())
     check(text)
     row = next(line for line in text.splitlines() if line.startswith(r"$\displaystyle R_{k"))
     assert "B_{" not in row

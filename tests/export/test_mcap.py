@@ -12,7 +12,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from yid_ocp.data import JointGroup, PointGroup, Recording, read_any
 from yid_ocp.errors import OutputError
-from yid_ocp.export.mcap import Signal, export_mcap, recorded_signals
+from yid_ocp.export.mcap import TopicSignal, export_mcap, signals_from_recording
 from yid_ocp.workflow.export_signals import export_run_signals
 
 
@@ -56,7 +56,7 @@ def recording() -> Recording:
 
 def test_a_recording_comes_back_number_by_number(recording, tmp_path):
     file = tmp_path / "one.mcap"
-    assert export_mcap(recorded_signals(recording), file) == 0
+    assert export_mcap(signals_from_recording(recording), file) == 0
     found = read(file)
     assert set(found) == {"/joint_states", "/joint_commands", "/points/camera/tip", "/points/camera/mid"}
     states = found["/joint_states"]
@@ -78,7 +78,7 @@ def test_a_recording_comes_back_number_by_number(recording, tmp_path):
 
 def test_it_can_be_imported_again(recording, tmp_path):
     file = tmp_path / "one.mcap"
-    export_mcap(recorded_signals(recording), file)
+    export_mcap(signals_from_recording(recording), file)
     topics = {"/points/camera/tip": "tip", "/points/camera/mid": "mid"}
     again = read_any(file, joint_topics=("/joint_states",), points=topics)
     np.testing.assert_array_equal(again.joints.position, recording.joints.position)
@@ -87,7 +87,7 @@ def test_it_can_be_imported_again(recording, tmp_path):
 
 def test_times_before_zero_are_moved_by_whole_seconds(tmp_path):
     t = np.array([-1.25, 0.0, 0.5])
-    signals = [Signal("/f", "wrench", t, {"xyz": np.arange(9.0).reshape(3, 3)})]
+    signals = [TopicSignal("/f", "wrench", t, {"xyz": np.arange(9.0).reshape(3, 3)})]
     assert export_mcap(signals, tmp_path / "f.mcap") == 2.0
     found = read(tmp_path / "f.mcap")["/f"]
     assert [stamp for stamp, *_ in found] == [0.75, 2.0, 2.5]
@@ -99,12 +99,12 @@ def test_nothing_is_refused_and_nothing_is_left_behind(tmp_path):
         export_mcap([], tmp_path / "none.mcap")
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot be written"):
-        export_mcap([Signal("/f", "vector", np.zeros(1), {"xyz": np.zeros((1, 3))})], tmp_path / "file" / "a.mcap")
+        export_mcap([TopicSignal("/f", "vector", np.zeros(1), {"xyz": np.zeros((1, 3))})], tmp_path / "file" / "a.mcap")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_a_solve_says_what_it_measured_and_predicted(pendulum, cli, tmp_path):
-    assert cli("solve", pendulum, "--out", "run", "--set", "output.report=false").code == 0
+    assert cli("solve", pendulum, "--out", "run", "--set", "output.write_report=false").code == 0
     done = cli("export", "run", "--format", "mcap", "--out", "signals")
     assert done.code == 0, done.err
     assert done.out.split() == ["signals/estimate.mcap", "signals/held_out.mcap"]

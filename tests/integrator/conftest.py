@@ -12,7 +12,7 @@ import pytest
 
 from yid_ocp.errors import ResourceError
 from yid_ocp.integrator.step import Step, compile_step
-from yid_ocp.integrator.step_model import Feedback
+from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.model import (
     Grasp,
     Kinematics,
@@ -20,14 +20,14 @@ from yid_ocp.model import (
     Parameter,
     Parameters,
     Segment,
+    StepTerms,
     System,
-    Terms,
     flexible_object,
     forward_kinematics,
 )
-from yid_ocp.model.kinematics import force_cross, motion_cross
+from yid_ocp.model.kinematics import motion_cross_force_product, motion_cross_motion_product
 from yid_ocp.model.mechanism import Placement
-from yid_ocp.model.system import ClosedForce, floating_clamp
+from yid_ocp.model.system import ForceWithDerivatives, floating_clamp
 from yid_ocp.model.urdf import read_urdf
 
 
@@ -40,7 +40,7 @@ class Added:
     parameters: Parameters
     internal: Mapping[str, ca.SX] = field(default_factory=dict)
     change: Callable = lambda effect, system: system
-    add: Callable = lambda effect, state: Terms()
+    add: Callable = lambda effect, state: StepTerms()
 
     def modify(self, system):
         return self.change(self, system)
@@ -65,7 +65,9 @@ def maxwell_branch(joint: str, stiffness: float, relaxation_time: float) -> Adde
         k1, tau = effect.parameters.symbols[0], effect.parameters.symbols[1]
         row = state.internal[name]
         stretch = state.q[state.system.mechanism.joint_index(joint)] - state.z[row]
-        return Terms(lagrangian=-0.5 * k1 * stretch**2, internal={name: stretch - tau * state.z_rate[row]})
+        return StepTerms(
+            lagrangian=-0.5 * k1 * stretch**2, internal_equations={name: stretch - tau * state.z_rate[row]}
+        )
 
     return Added("maxwell", joint, parameters, {name: ca.SX.sym(name)}, add=add)
 
@@ -76,7 +78,7 @@ def soft_joint(joint: str, compliance: float) -> Added:
 
     def change(effect, system):
         elastic = tuple(spring for spring in system.elastic if spring.joint != joint)
-        compliant = {**system.compliant, joint: effect.parameters.symbols[0]}
+        compliant = {**system.joint_compliances, joint: effect.parameters.symbols[0]}
         return replace(system, elastic=elastic, compliant=compliant)
 
     return Added("soft", joint, parameters, change=change)
@@ -111,7 +113,7 @@ def creeping_grasp(grasp: str, rate: float) -> Added:
         row, rate = state.internal[name], effect.parameters.symbols[0]
         # where it has long stood, as far as the load would have it creep in a second
         at_rest = {name: state.z[row] - rate * load}
-        return Terms(internal={name: state.z_rate[row] - rate * load}, at_rest=at_rest)
+        return StepTerms(internal_equations={name: state.z_rate[row] - rate * load}, static_equations=at_rest)
 
     return Added("creep", grasp, parameters, internal, change, add)
 
@@ -132,7 +134,7 @@ def growing_link(joint: str, length: float, time: float) -> Added:
     def add(effect, state):
         target, tau = effect.parameters.symbols[0], effect.parameters.symbols[1]
         row = state.internal[name]
-        return Terms(internal={name: target - state.z[row] - tau * state.z_rate[row]})
+        return StepTerms(internal_equations={name: target - state.z[row] - tau * state.z_rate[row]})
 
     return Added("growth", joint, parameters, internal, change, add)
 
@@ -165,12 +167,12 @@ def thick_air(joint: str, coefficient: float, viscosity: float, buoyancy: float)
         slope = reach.T @ (-c * (ca.sumsqr(speed) * ca.SX.eye(3) + 2 * speed @ speed.T)) @ reach
         force, by_rate, by_turn = ca.SX(len(screws), 1), ca.SX(6, len(screws)), ca.SX(6, len(screws))
         for j in chain:
-            added = motion_cross(along[tree.joints[j].parent], screws[j])
+            added = motion_cross_motion_product(along[tree.joints[j].parent], screws[j])
             force[j] = ca.dot(screws[j], wrench)
             by_rate[:, j] = slope @ screws[j]
-            by_turn[:, j] = slope @ added + force_cross(screws[j], wrench)
-        closed = ClosedForce(force, by_rate, by_turn)
-        return Terms(viscous=-b * v, closed=closed)
+            by_turn[:, j] = slope @ added + motion_cross_force_product(screws[j], wrench)
+        closed = ForceWithDerivatives(force, by_rate, by_turn)
+        return StepTerms(dissipative_force=-b * v, force_with_derivatives=closed)
 
     return Added("air", joint, parameters, change=change, add=add)
 
@@ -184,8 +186,8 @@ def cable(**changes) -> System:
 
 def tip(mechanism: Mechanism, frame: str, q: np.ndarray) -> np.ndarray:
     """4x4 pose of a frame at nominal parameters."""
-    kinematics: Kinematics = forward_kinematics(mechanism.numeric(), ca.SX(ca.DM(q)))
-    return np.array(ca.DM(kinematics.pose(frame).matrix()))
+    kinematics: Kinematics = forward_kinematics(mechanism.with_numeric_values(), ca.SX(ca.DM(q)))
+    return np.array(ca.DM(kinematics.frame_pose(frame).homogeneous_matrix()))
 
 
 def clamped_cable(kind: str, effects=()) -> tuple[System, np.ndarray]:
@@ -193,7 +195,7 @@ def clamped_cable(kind: str, effects=()) -> tuple[System, np.ndarray]:
     bent = np.array([0.3, -0.2, 0.1, 0.4, 0.2, -0.1, 0.2, 0.3, 0.15])
     pose = tip(cable().mechanism, "w_C", bent)
     clamp = floating_clamp("clamp")
-    grasp = Grasp("clamp", "clamp", "w_C", kind, rotation=ca.SX(ca.DM(pose[:3, :3])))
+    grasp = Grasp("clamp", "clamp", "w_C", kind, held_orientation=ca.SX(ca.DM(pose[:3, :3])))
     segment = Segment("C", 0.6, 0.3, 0.05, links=3, bend=2.0, twist=1.0, damping=0.01)
     objects = [(flexible_object([segment], name="cable"), None, None)]
     system = System.build(
@@ -216,7 +218,7 @@ class Case:
     start: np.ndarray
     torque: np.ndarray
     path: np.ndarray
-    feedback: Feedback
+    feedback: TrackingFeedback
 
     def rollout(self, theta=None, start=None, torque=None, path=None, feedback=None, directions=None, step=None):
         chosen = [self.theta, self.start, self.torque, self.path]
@@ -240,7 +242,7 @@ def make_case(
     path = q[list(system.prescribed_indices)] + speed * time + 4.0 * rng.normal(size=sizes["nc"]) * time**2
     index = rng.choice(sizes["nx"], size=5, replace=False).astype(np.int32)
     gain = strength * rng.normal(size=(steps, sizes["nu"], 5))
-    feedback = Feedback(index, gain, start[index] + 0.01 * rng.normal(size=(steps, 5)))
+    feedback = TrackingFeedback(index, gain, start[index] + 0.01 * rng.normal(size=(steps, 5)))
     return Case(step, theta, start, torque, path, feedback)
 
 
@@ -252,7 +254,7 @@ def closed_loop(urdf_folder, effects=()) -> tuple[System, np.ndarray]:
         q[robot.joint_index(name)] = value
     holder, held = tip(robot, "tool", q), tip(robot, "nose", q)
     offset = np.linalg.solve(holder, held)[:3, 3]
-    grasp = Grasp("loop", "tool", "nose", offset=ca.SX(ca.DM(offset)))
+    grasp = Grasp("loop", "tool", "nose", holder_offset=ca.SX(ca.DM(offset)))
     driven, prescribed = ["spin", "extend"], ["swing"]
     system = System.build(robot, grasps=[grasp], driven=driven, prescribed=prescribed, damping=0.3, effects=effects)
     return system, q

@@ -7,8 +7,8 @@ def test_elimination_fills_no_more_than_the_tree(single_step):
     """Tips before roots and multipliers last: a pivot touches its ancestors, and the multipliers of grasps below it."""
     tables, system = single_step.model.structure, single_step.system
     size = len(tables.order)
-    names = [*system.mechanism.joint_names, *[f"lam{i}" for i in range(system.constraint_count)]]
-    ordered = [names[i] for i in tables.unknown_row[tables.order]]
+    names = [*system.mechanism.joint_names, *[f"lam{i}" for i in range(system.n_constraints)]]
+    ordered = [names[i] for i in tables.unknown_rows[tables.order]]
     assert ordered[0] == "T3_3_z"
     assert ordered[-3:] == ["lam0", "lam1", "lam2"]
     tip = [ordered[i] for i in tables.fill[0]]

@@ -13,11 +13,11 @@ from yid_ocp.integrator import codegen, compiled, compiler
 from yid_ocp.integrator.compiled import CompiledKernel
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.integrator.step_model import Directions
+from yid_ocp.integrator.step_model import SensitivityDirections
 from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf
 
-needs_compiler = pytest.mark.skipif(compiler.compiler() is None, reason="this machine has no C compiler")
+needs_compiler = pytest.mark.skipif(compiler._compiler_path() is None, reason="this machine has no C compiler")
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def test_no_memory_is_said_by_every_entry_point(poor, step, parts, urdf_folder):
     poor.watch(library)
     kernel = CompiledKernel(model, library)
     names = ("spin.mass", "hinge.damping")
-    directions = Directions(names, np.zeros((step.sizes["nx"], 2)))
+    directions = SensitivityDirections(names, np.zeros((step.sizes["nx"], 2)))
     arguments = (case.theta, case.start, case.torque, case.path, case.feedback)
     plain = case.rollout(feedback=case.feedback, directions=directions)
     assert plain.status.ok
@@ -43,20 +43,25 @@ def test_no_memory_is_said_by_every_entry_point(poor, step, parts, urdf_folder):
     assert poor.grants_needed(lambda: kernel.rollout(*arguments, directions)) == 1
     by_state = np.ones_like(plain.state)
     assert (
-        poor.grants_needed(lambda: kernel.adjoint(case.theta, plain, case.feedback, names, by_state, None, None)) == 1
+        poor.grants_needed(
+            lambda: kernel.adjoint_gradient(case.theta, plain, case.feedback, names, by_state, None, None)
+        )
+        == 1
     )
     trajectory = (case.theta, plain.state, plain.multipliers, plain.torque, names, True)
     assert poor.grants_needed(lambda: kernel.linearize(*trajectory)) == 1
     given = np.concatenate([case.start[list(case.step.system.driven_indices)], case.path[0]])
     loads = np.ones((sum(model.sizes[key] for key in ("n", "nz", "m")), 1)), np.ones((model.sizes["n"], 1))
-    assert poor.grants_needed(lambda: kernel.slopes(*trajectory[:4], *loads)) == 1
+    assert poor.grants_needed(lambda: kernel.step_jacobians(*trajectory[:4], *loads)) == 1
     unknowns = np.zeros(sum(model.sizes[key] for key in ("n", "nz", "m")) - model.sizes["nc"])
-    assert poor.grants_needed(lambda: kernel.rest(case.theta, unknowns, given, case.torque[0], 1e3, 1e-9)) == 1
+    assert (
+        poor.grants_needed(lambda: kernel.find_equilibrium(case.theta, unknowns, given, case.torque[0], 1e3, 1e-9)) == 1
+    )
 
     poor.grants.value = 100
     again = kernel.rollout(*arguments, directions)
     np.testing.assert_array_equal(again.state, plain.state)
-    np.testing.assert_array_equal(again.by_state, plain.by_state)
+    np.testing.assert_array_equal(again.state_sensitivity, plain.by_state)
 
 
 @needs_compiler
@@ -84,7 +89,7 @@ def test_a_rollout_beyond_all_memory(urdf_folder, use_compiler):
         simulate(step, theta, start, 10**14)
     for word in ("a rollout of 100000000000000 steps with 0 derivatives", "3.2e+06 GB", "fewer parameters"):
         assert word in str(caught.value)
-    wide = Directions((), np.broadcast_to(0.0, (4, 10**15)))
+    wide = SensitivityDirections((), np.broadcast_to(0.0, (4, 10**15)))
     with pytest.raises(ResourceError, match=r"3 steps with 1000000000000000 derivatives: it takes 1\.28e\+08 GB"):
         step.kernel.rollout(theta, start, nothing, np.zeros((4, 0)), None, wide)
 
@@ -94,7 +99,7 @@ def test_a_rollout_beyond_all_memory(urdf_folder, use_compiler):
 def test_derivatives_of_other_equations_are_refused(step, monkeypatch, tmp_path, rows):
     """The kernel adds them row by row without looking; a number of rows that does not fit is found before."""
     monkeypatch.setenv("YID_OCP_CACHE", str(tmp_path))
-    original = codegen.theta_function
+    original = codegen.parameter_jacobian_function
 
     def cut(equations, names):
         function = original(equations, names)
@@ -102,7 +107,7 @@ def test_derivatives_of_other_equations_are_refused(step, monkeypatch, tmp_path,
         outputs[rows] = ca.vertcat(outputs[rows], ca.SX(1, len(names)))
         return ca.Function("by_theta", equations.arguments, outputs)
 
-    monkeypatch.setattr(codegen, "theta_function", cut)
+    monkeypatch.setattr(codegen, "parameter_jacobian_function", cut)
     q, theta = np.zeros(6), step.system.parameters.vector()
     with pytest.raises(ValueError, match="derivatives by 1 parameters have the shapes"):
         step.jacobians(q, q, np.zeros(2), theta, ([0.0], [0.0]), names=["spin.mass"])
@@ -110,7 +115,7 @@ def test_derivatives_of_other_equations_are_refused(step, monkeypatch, tmp_path,
 
 def test_fewer_directions_than_parameters_are_refused():
     with pytest.raises(ModelError, match="1 directions for 2 parameters"):
-        Directions(("a", "b"), np.zeros((4, 1)))
+        SensitivityDirections(("a", "b"), np.zeros((4, 1)))
 
 
 @needs_compiler
@@ -120,7 +125,7 @@ def test_derivatives_that_the_cache_has_are_not_derived_again(parts, urdf_folder
 
     def swept(wanted):
         case = parts.make_case(*parts.closed_loop(urdf_folder))
-        directions = Directions(wanted, np.zeros((case.step.sizes["nx"], len(wanted))))
+        directions = SensitivityDirections(wanted, np.zeros((case.step.sizes["nx"], len(wanted))))
         return case.rollout(directions=directions).by_state
 
     first, turned = swept(names), swept(names[::-1])
@@ -129,7 +134,7 @@ def test_derivatives_that_the_cache_has_are_not_derived_again(parts, urdf_folder
     def derive(*_):
         raise AssertionError("derived again")
 
-    monkeypatch.setattr(codegen, "theta_function", derive)
+    monkeypatch.setattr(codegen, "parameter_jacobian_function", derive)
     np.testing.assert_array_equal(swept(names), first)
     with pytest.raises(AssertionError, match="derived again"):
         swept(("spin.mass",))
@@ -144,10 +149,10 @@ def test_derivatives_are_those_of_their_own_equations(parts, urdf_folder, monkey
         monkeypatch.setenv("YID_OCP_CACHE", str(tmp_path / cache))
         system = System.build(tree, driven=("shoulder",), damping={"shoulder": 0.3, "elbow": 0.1})
         made = compile_step(system, 1e-2, force_split=split)
-        directions = Directions(("elbow.damping",), np.zeros((made.sizes["nx"], 1)))
+        directions = SensitivityDirections(("elbow.damping",), np.zeros((made.sizes["nx"], 1)))
         start = np.concatenate([[0.4, -0.3], np.zeros(made.sizes["nx"] - 2)])
         given = system.parameters.vector(), start, np.full((20, 1), 0.7), np.zeros((21, 0))
-        return made.kernel.rollout(*given, None, directions).by_state
+        return made.kernel.rollout(*given, None, directions).state_sensitivity
 
     together = [swept(split, "one") for split in ("left", "symmetric")]
     for split, found in zip(("left", "symmetric"), together, strict=True):

@@ -19,7 +19,7 @@ from yid_ocp.model.urdf import read_urdf
 
 SOURCE = "int yid_answer(void) { return %d; }\n"
 
-needs_compiler = pytest.mark.skipif(compiler.compiler() is None, reason="this machine has no C compiler")
+needs_compiler = pytest.mark.skipif(compiler._compiler_path() is None, reason="this machine has no C compiler")
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def cache(tmp_path, monkeypatch):
     folder = tmp_path / "cache"
     monkeypatch.setenv("YID_OCP_CACHE", str(folder))
     yield folder
-    compiler.compiler.cache_clear()
+    compiler._compiler_path.cache_clear()
     compiler._machine.cache_clear()
 
 
@@ -55,11 +55,11 @@ def runs(monkeypatch):
 def test_the_cache_folder_is_private(cache):
     old = os.umask(0)
     try:
-        assert compiler.cache_folder() == cache
+        assert compiler._cache_folder() == cache
     finally:
         os.umask(old)
     assert stat.S_IMODE(cache.stat().st_mode) == 0o700
-    assert compiler.cache_folder() == cache
+    assert compiler._cache_folder() == cache
 
 
 @needs_compiler
@@ -83,17 +83,19 @@ def test_what_a_library_was_made_with_is_part_of_its_key(cache, tmp_path, monkey
     compiler.compile_library(SOURCE % 42)
     if change == "compiler":
         other = tmp_path / "other_cc"
-        other.write_text(f'#!/bin/sh\n[ "$1" = --version ] && echo other && exit\nexec {compiler.compiler()} "$@"\n')
+        other.write_text(
+            f'#!/bin/sh\n[ "$1" = --version ] && echo other && exit\nexec {compiler._compiler_path()} "$@"\n'
+        )
         other.chmod(0o755)
         monkeypatch.setenv("CC", str(other))
-        compiler.compiler.cache_clear()
+        compiler._compiler_path.cache_clear()
     elif change == "processor":
         monkeypatch.setattr(compiler.platform, "machine", lambda: "another")
         monkeypatch.setattr(compiler.platform, "processor", lambda: "another")
     elif change == "flags":
-        monkeypatch.setattr(compiler, "FLAGS", (*compiler.FLAGS, "-g"))
+        monkeypatch.setattr(compiler, "_COMMON_FLAGS", (*compiler._COMMON_FLAGS, "-g"))
     elif change == "level":
-        monkeypatch.setattr(compiler, "LEVEL", "-O0")
+        monkeypatch.setattr(compiler, "_OPTIMIZATION_FLAG", "-O0")
     elif change == "casadi":
         monkeypatch.setattr(compiler.ca.CasadiMeta, "version", lambda: "another")
     compiler._machine.cache_clear()
@@ -101,16 +103,16 @@ def test_what_a_library_was_made_with_is_part_of_its_key(cache, tmp_path, monkey
     assert len(list(cache.iterdir())) == 2
 
 
-@pytest.mark.parametrize(("program", "words"), [("gcc", compiler.GCC), ("clang", ())])
+@pytest.mark.parametrize(("program", "words"), [("gcc", compiler._GCC_FLAGS), ("clang", ())])
 def test_a_compiler_is_told_what_it_knows(cache, runs, monkeypatch, program, words):
     if shutil.which(program) is None:
         pytest.skip(f"{program} is not here")
     monkeypatch.setenv("CC", program)
-    compiler.compiler.cache_clear()
+    compiler._compiler_path.cache_clear()
     compiler._machine.cache_clear()
     assert compiler.compile_library(SOURCE % 42).yid_answer() == 42
     [told] = [command for command in runs if "-shared" in command]
-    assert tuple(word for word in told if word in compiler.GCC) == words
+    assert tuple(word for word in told if word in compiler._GCC_FLAGS) == words
 
 
 @needs_compiler
@@ -127,7 +129,7 @@ def test_a_step_compiled_again_runs_no_compiler(cache, runs, pendulum):
         np.testing.assert_array_equal(actual, one)
     assert [command for command in runs if "-shared" in command] == []
     other = compile_step(pendulum, 0.02)
-    assert other.compiled
+    assert other.is_compiled
     assert [command for command in runs if "-shared" in command] == []
 
 
@@ -137,7 +139,7 @@ def test_a_cache_that_others_may_write_is_refused(cache, mode):
     cache.mkdir()
     cache.chmod(mode)
     with pytest.raises(OutputError) as caught:
-        compiler.cache_folder()
+        compiler._cache_folder()
     for word in (str(cache), "chmod 700", "YID_OCP_CACHE"):
         assert word in str(caught.value)
 
@@ -147,18 +149,18 @@ def test_a_cache_that_cannot_be_made_is_an_output_error(tmp_path, monkeypatch):
     blocked.write_text("not a folder", encoding="utf-8")
     monkeypatch.setenv("YID_OCP_CACHE", str(blocked / "cache"))
     with pytest.raises(OutputError, match="CC=none"):
-        compiler.cache_folder()
+        compiler._cache_folder()
 
 
 def test_without_a_compiler_everything_works_after_one_notice(cache, monkeypatch, caplog, pendulum):
     monkeypatch.setenv("CC", "none")
-    compiler.compiler.cache_clear()
+    compiler._compiler_path.cache_clear()
     with caplog.at_level(logging.INFO, logger="yid_ocp"):
         step = compile_step(pendulum, 0.01)
         q, _, _, status = step([0.3, 0.1], [0.0, 0.0], [], pendulum.parameters.vector())
-        assert not compile_step(pendulum, 0.02).compiled
-    assert status.ok
-    assert not step.compiled
+        assert not compile_step(pendulum, 0.02).is_compiled
+    assert status.is_converged
+    assert not step.is_compiled
     assert np.all(np.isfinite(q))
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
     assert "no C compiler" in caplog.text
@@ -167,7 +169,7 @@ def test_without_a_compiler_everything_works_after_one_notice(cache, monkeypatch
 
 def test_an_interpreted_step_that_was_asked_for_is_not_remarked_upon(caplog, pendulum):
     with caplog.at_level(logging.INFO, logger="yid_ocp"):
-        assert not compile_step(pendulum, 0.01, use_compiler=False).compiled
+        assert not compile_step(pendulum, 0.01, use_compiler=False).is_compiled
     assert caplog.records == []
 
 
@@ -176,11 +178,11 @@ def test_a_compiler_that_fails_leaves_the_interpreter(cache, tmp_path, monkeypat
     broken.write_text("#!/bin/sh\necho no space left >&2\nexit 1\n", encoding="utf-8")
     broken.chmod(0o755)
     monkeypatch.setenv("CC", str(broken))
-    compiler.compiler.cache_clear()
+    compiler._compiler_path.cache_clear()
     compiler._machine.cache_clear()
     with caplog.at_level(logging.INFO, logger="yid_ocp"):
         step = compile_step(pendulum, 0.01)
-    assert not step.compiled
+    assert not step.is_compiled
     assert "no space left" in caplog.text
     assert list(cache.iterdir()) == []
 
@@ -208,19 +210,19 @@ def test_a_compiler_that_makes_no_library_leaves_the_interpreter(cache, tmp_path
     odd.write_text(f'#!/bin/sh\n[ "$1" = --version ] && exit\n{text}\n', encoding="utf-8")
     odd.chmod(0o755)
     monkeypatch.setenv("CC", str(odd))
-    monkeypatch.setattr(compiler, "PATIENCE", 0.5)
-    compiler.compiler.cache_clear()
+    monkeypatch.setattr(compiler, "_COMPILE_TIMEOUT", 0.5)
+    compiler._compiler_path.cache_clear()
     compiler._machine.cache_clear()
-    assert not compile_step(pendulum, 0.01).compiled
+    assert not compile_step(pendulum, 0.01).is_compiled
     assert "going on without compiled code" in caplog.text
     assert list(cache.iterdir()) == []
 
 
 def test_a_compiler_that_is_not_there_is_said(cache, monkeypatch):
     monkeypatch.setenv("CC", "no_such_cc")
-    compiler.compiler.cache_clear()
+    compiler._compiler_path.cache_clear()
     with pytest.raises(ConfigError, match="no_such_cc"):
-        compiler.compiler()
+        compiler._compiler_path()
 
 
 @needs_compiler
@@ -229,7 +231,7 @@ def test_a_cache_without_room_leaves_the_interpreter(cache, monkeypatch, caplog,
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(compiler.os, "replace", full)
-    assert not compile_step(pendulum, 0.01).compiled
+    assert not compile_step(pendulum, 0.01).is_compiled
     assert str(cache) in caplog.text
     assert "No space left" in caplog.text
 
@@ -239,7 +241,7 @@ def test_a_library_that_cannot_be_loaded_leaves_the_interpreter(cache, monkeypat
     monkeypatch.setattr(compiler.os, "replace", lambda source, target: target.write_bytes(b"not a library"))
     with caplog.at_level(logging.INFO, logger="yid_ocp"):
         step = compile_step(pendulum, 0.01)
-    assert not step.compiled
+    assert not step.is_compiled
     assert "cannot be loaded" in caplog.text
 
 
@@ -271,5 +273,5 @@ def test_a_function_that_cannot_be_compiled_is_as_it_was(cache, monkeypatch, cap
         assert compiler.compiled_function(plain).is_a("SXFunction")
     assert "cannot be loaded" in caplog.text
     monkeypatch.setenv("CC", "none")
-    compiler.compiler.cache_clear()
+    compiler._compiler_path.cache_clear()
     assert compiler.compiled_function(polynomial(3.0)).is_a("SXFunction")

@@ -8,7 +8,7 @@ import pytest
 
 from yid_ocp.integrator.discrete import discrete_equations
 from yid_ocp.model import System, forward_kinematics
-from yid_ocp.model.kinematics import rigid_body
+from yid_ocp.model.kinematics import rigid_body_derivatives
 from yid_ocp.model.urdf import read_urdf
 
 FORCE_LEFT = {"symmetric": 0.5, "left": 1.0}
@@ -18,8 +18,8 @@ PULL_MIDDLE = {"node": 0.0, "midpoint": 0.5}
 def discrete_lagrangian(system: System, q0: ca.SX, q1: ca.SX, h: ca.SX) -> ca.SX:
     """L_d = h L((q0 + q1)/2, (q1 - q0)/h) without effects [J s] (Marsden and West 2001, section 1.3)."""
     q, v = (q0 + q1) / 2, (q1 - q0) / h
-    rigid = rigid_body(forward_kinematics(system.mechanism, q), v, system.gravity)
-    return h * (rigid.kinetic - rigid.potential - system.elastic_energy(q))
+    rigid = rigid_body_derivatives(forward_kinematics(system.mechanism, q), v, system.gravity)
+    return h * (rigid.kinetic_energy - rigid.potential_energy - system.elastic_energy(q))
 
 
 SYSTEMS = {
@@ -58,8 +58,8 @@ def test_equations_are_slot_derivatives_of_the_discrete_lagrangian(
         "constraint": closed(e.q1),
     }
     pairs = [ca.densify(x) for key, value in expected.items() for x in (getattr(e, key), value)]
-    pairs += [ca.densify(x) for x in (e.pulls.after, matrix)]
-    pairs += [ca.densify(x) for x in (e.pulls.after_by_q, ca.jacobian(matrix.T @ e.lam, e.q1))]
+    pairs += [ca.densify(x) for x in (e.constraint_impulses.after_jacobian, matrix)]
+    pairs += [ca.densify(x) for x in (e.constraint_impulses.after_force_by_q, ca.jacobian(matrix.T @ e.lam, e.q1))]
     function = ca.Function("pairs", e.arguments, pairs)
     rng = np.random.default_rng(4)
     theta = system.parameters.vector()

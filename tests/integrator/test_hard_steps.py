@@ -10,9 +10,9 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from yid_ocp.integrator.discrete import ConstraintForce, ForceSplit
+from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.integrator.step_model import LIMIT, Directions, StepCode, StepStatus
+from yid_ocp.integrator.step_model import _INSTABILITY_HINT, NewtonStatus, SensitivityDirections, StepStatus
 from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.model.system import floating_clamp
 from yid_ocp.model.urdf import read_urdf
@@ -37,8 +37,8 @@ class Hard:
     moved: np.ndarray | float = 0.0
     steps: int = 1
     split: ForceSplit = "symmetric"
-    pull: ConstraintForce = "midpoint"
-    code: StepCode = StepCode.OK
+    pull: ConstraintForcePlacement = "midpoint"
+    code: NewtonStatus = NewtonStatus.OK
     damped: bool = False
     conditioning: float = 1.0
     tolerance: float | None = None
@@ -49,7 +49,7 @@ class Hard:
         )
 
     def inputs(self):
-        n, nz = self.system.size, len(self.system.internal)
+        n, nz = self.system.n_coordinates, len(self.system.internal_coordinates)
         start = np.concatenate([self.q, np.broadcast_to(self.p, n), np.zeros(nz)])
         torque = np.full((self.steps, len(self.system.driven)), self.torque)
         path = np.tile(self.q[list(self.system.prescribed_indices)], (self.steps + 1, 1))
@@ -61,7 +61,7 @@ def gripped_cable(parts, shape, kind="point", grasps=1, compliance=None):
     """The cable in a shape, its end held by a prescribed clamp, once or several times over."""
     pose = parts.tip(parts.cable().mechanism, "w_C", shape)
     clamp = floating_clamp("clamp")
-    grasp = Grasp("0", "clamp", "w_C", kind, rotation=ca.SX(ca.DM(pose[:3, :3])))
+    grasp = Grasp("0", "clamp", "w_C", kind, held_orientation=ca.SX(ca.DM(pose[:3, :3])))
     if compliance is not None:
         grasp = replace(grasp, compliance=ca.SX(compliance))
     segment = Segment("C", 0.6, 0.3, 0.05, links=3, bend=2.0, twist=1.0, damping=0.01)
@@ -89,8 +89,8 @@ def out_of_reach(folder):
     """The pendulum, free to turn, grasped at a point 3 m away."""
     turn = read_urdf(folder / "turntable.urdf", joints=["turn"])
     carrier = replace(turn, frames={"disc": turn.frames["disc"]})
-    far = Grasp("far", "ceiling", "tip", offset=ca.SX(ca.DM([0.0, 3.0, 0.0])))
-    return System.build(carrier.joined(read_urdf(folder / "double_pendulum.urdf"), "disc"), grasps=[far])
+    far = Grasp("far", "ceiling", "tip", holder_offset=ca.SX(ca.DM([0.0, 3.0, 0.0])))
+    return System.build(carrier.with_mechanism(read_urdf(folder / "double_pendulum.urdf"), "disc"), grasps=[far])
 
 
 def redundant(folder):
@@ -149,19 +149,19 @@ CASES: dict[str, Callable[..., Hard]] = {
         parts.cable(), BENT, 5e-6, p=0.1 * BENT, steps=300, tolerance=1e-17
     ),
     "at_full_stretch": lambda parts, folder: Hard(
-        *gripped_cable(parts, 0 * BENT), 1e-3, moved=PULLED_BACK, code=StepCode.SINGULAR
+        *gripped_cable(parts, 0 * BENT), 1e-3, moved=PULLED_BACK, code=NewtonStatus.SINGULAR
     ),
     "redundant_grasps": lambda parts, folder: Hard(
-        redundant(folder), np.array([0.1, 0.2, 0.3]), 0.01, code=StepCode.SINGULAR
+        redundant(folder), np.array([0.1, 0.2, 0.3]), 0.01, code=NewtonStatus.SINGULAR
     ),
     "out_of_reach": lambda parts, folder: Hard(
-        out_of_reach(folder), np.array([0.1, 0.3, 0.4]), 0.01, code=StepCode.NOT_CONVERGED
+        out_of_reach(folder), np.array([0.1, 0.3, 0.4]), 0.01, code=NewtonStatus.NOT_CONVERGED
     ),
     "much_too_fast": lambda parts, folder: Hard(
-        pendulum(folder), HANGING, 1.0, p=np.array([10.0, -4.0]), torque=5.0, code=StepCode.NOT_CONVERGED
+        pendulum(folder), HANGING, 1.0, p=np.array([10.0, -4.0]), torque=5.0, code=NewtonStatus.NOT_CONVERGED
     ),
     "not_a_number": lambda parts, folder: Hard(
-        pendulum(folder), HANGING, 0.01, torque=np.nan, code=StepCode.NOT_FINITE
+        pendulum(folder), HANGING, 0.01, torque=np.nan, code=NewtonStatus.NOT_FINITE
     ),
 }
 
@@ -176,10 +176,10 @@ def first_correction(hard: Hard) -> float:
     step, (theta, start, torque, path) = hard.step(use_compiler=False), hard.inputs()
     after = start.copy()
     after[list(hard.system.prescribed_indices)] = path[1]
-    sizes, unknown = step.sizes, step.model.structure.unknown_row
+    sizes, unknown = step.sizes, step.model.structure.unknown_rows
     pair = np.stack([start, after])
     found = step.kernel.linearize(theta, pair, np.zeros((1, sizes["m"])), torque[:1], (), True)
-    change = np.linalg.solve(found.rows_new[0][np.ix_(unknown, unknown)], found.rows[0][unknown])
+    change = np.linalg.solve(found.residual_by_new[0][np.ix_(unknown, unknown)], found.rows[0][unknown])
     return float(np.max(np.abs(change[: len(unknown) - sizes["m"]])))
 
 
@@ -190,18 +190,18 @@ def close(actual, expected, tolerance):
 
 
 def test_both_kernels_agree(hard):
-    if not hard.step(use_compiler=True).compiled:
+    if not hard.step(use_compiler=True).is_compiled:
         pytest.skip("this machine has no C compiler to compare with")
     steps = [hard.step(use_compiler) for use_compiler in (True, False)]
     theta, start, torque, path = hard.inputs()
     names = tuple(hard.system.parameters.names)
-    directions = Directions(names, np.random.default_rng(1).normal(size=(len(start), len(names))))
-    directions.start[list(hard.system.prescribed_indices)] = 0.0
+    directions = SensitivityDirections(names, np.random.default_rng(1).normal(size=(len(start), len(names))))
+    directions.initial_state_tangents[list(hard.system.prescribed_indices)] = 0.0
     one, two = (step.kernel.rollout(theta, start, torque, path, None, directions) for step in steps)
     assert (one.status.code, two.status.code) == (hard.code, hard.code)
-    assert one.status.step == two.status.step == (hard.steps if hard.code == StepCode.OK else 0)
+    assert one.status.step == two.status.step == (hard.steps if hard.code == NewtonStatus.OK else 0)
     assert one.status.message.partition("(")[0] == two.status.message.partition("(")[0]
-    if hard.code != StepCode.OK:
+    if hard.code != NewtonStatus.OK:
         assert all(np.all(np.isnan(r.by_state[1:])) and np.all(np.isnan(r.multipliers)) for r in (one, two))
         return
     if hard.damped:
@@ -212,7 +212,7 @@ def test_both_kernels_agree(hard):
     for key in ("by_state", "by_multipliers", "by_effort"):
         close(getattr(one, key), getattr(two, key), 1e-9 * hard.conditioning)
     by_state = np.random.default_rng(2).normal(size=one.state.shape)
-    back = [step.kernel.adjoint(theta, one, None, names, by_state, None, None) for step in steps]
+    back = [step.kernel.adjoint_gradient(theta, one, None, names, by_state, None, None) for step in steps]
     for key in vars(back[0]):
         close(getattr(back[0], key), getattr(back[1], key), 1e-9 * hard.conditioning)
 
@@ -220,12 +220,12 @@ def test_both_kernels_agree(hard):
 @pytest.mark.parametrize(
     ("code", "step", "late"),
     [
-        (StepCode.NOT_CONVERGED, 700, True),
-        (StepCode.NOT_FINITE, 700, True),
-        (StepCode.NOT_CONVERGED, 3, False),
-        (StepCode.SINGULAR, 700, False),
-        (StepCode.OK, 700, False),
+        (NewtonStatus.NOT_CONVERGED, 700, True),
+        (NewtonStatus.NOT_FINITE, 700, True),
+        (NewtonStatus.NOT_CONVERGED, 3, False),
+        (NewtonStatus.SINGULAR, 700, False),
+        (NewtonStatus.OK, 700, False),
     ],
 )
 def test_a_failure_after_hundreds_of_steps_names_the_methods_limit(code, step, late):
-    assert (LIMIT in StepStatus(code, step, 0.1, 5, 5).message) is late
+    assert (_INSTABILITY_HINT in StepStatus(code, step, 0.1, 5, 5).message) is late

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from yid_ocp.integrator.step import compile_alike
-from yid_ocp.integrator.step_model import Directions
+from yid_ocp.integrator.step import compile_step_like
+from yid_ocp.integrator.step_model import SensitivityDirections
 
 EPSILON = 1e-5
 
@@ -108,7 +108,7 @@ def test_forward_equals_adjoint_equals_differences(case, fed_back):
 
     rollout = case.rollout(feedback=feedback)
     assert rollout.status.ok, rollout.status.message
-    gradient = case.step.kernel.adjoint(
+    gradient = case.step.kernel.adjoint_gradient(
         theta, rollout, feedback, names, weights.state, weights.multipliers, weights.effort
     )
 
@@ -120,17 +120,17 @@ def test_forward_equals_adjoint_equals_differences(case, fed_back):
     start[s["n"] : 2 * s["n"]] *= 0.01
     path[..., -1] = rng.normal(size=(steps + 1, s["nc"]))
     start[fixed] = path[0]
-    forward = case.rollout(feedback=feedback, directions=Directions(names, start, torque, path))
+    forward = case.rollout(feedback=feedback, directions=SensitivityDirections(names, start, torque, path))
     slopes = (
         np.tensordot(weights.state, forward.by_state, 2)
-        + np.tensordot(weights.multipliers, forward.by_multipliers, 2)
+        + np.tensordot(weights.multipliers, forward.multipliers_sensitivity, 2)
         + np.tensordot(weights.effort, forward.by_effort, 2)
     )
 
     np.testing.assert_allclose(forward.state, rollout.state, rtol=0, atol=1e-9 * scale_of(rollout.state))
     scale = np.max(np.abs(slopes))
     np.testing.assert_allclose(slopes[:-2], gradient.by_theta, rtol=1e-8, atol=1e-9 * scale)
-    expected = np.sum(gradient.by_start * start[:, -2]) + np.sum(gradient.by_torque * torque[..., -2])
+    expected = np.sum(gradient.by_initial_state * start[:, -2]) + np.sum(gradient.by_torque * torque[..., -2])
     assert slopes[-2] == pytest.approx(expected, rel=1e-8, abs=1e-9 * scale)
 
     def along(direction, epsilon):
@@ -158,23 +158,23 @@ def test_forward_equals_adjoint_equals_differences(case, fed_back):
 
 
 def test_interpreter_equals_compiled(case):
-    plain = compile_alike(case.step, case.step.system, use_compiler=False)
-    if not case.step.compiled:
+    plain = compile_step_like(case.step, case.step.system, use_compiler=False)
+    if not case.step.is_compiled:
         pytest.skip("this machine has no C compiler to compare with")
-    assert not plain.compiled
+    assert not plain.is_compiled
     names = tuple(case.step.system.parameters.names[::2])
     feedback = case.feedback
     nx, d = case.step.sizes["nx"], len(names) + 1
     rng = np.random.default_rng(3)
     torque = rng.normal(size=(*case.torque.shape, d))
     path = rng.normal(size=(*case.path.shape, d))
-    directions = Directions(names, rng.normal(size=(nx, d)), torque, path)
-    directions.start[list(case.step.system.prescribed_indices)] = path[0]
+    directions = SensitivityDirections(names, rng.normal(size=(nx, d)), torque, path)
+    directions.initial_state_tangents[list(case.step.system.prescribed_indices)] = path[0]
     one = case.rollout(feedback=feedback, directions=directions)
     two = case.rollout(feedback=feedback, directions=directions, step=plain)
     weights = random_cost(case)
     partial = (weights.state, weights.multipliers, weights.effort)
-    back = [s.kernel.adjoint(case.theta, one, feedback, names, *partial) for s in (case.step, plain)]
+    back = [s.kernel.adjoint_gradient(case.theta, one, feedback, names, *partial) for s in (case.step, plain)]
     pairs = [(getattr(one, key), getattr(two, key)) for key in ("state", "multipliers", "effort", "torque")]
     pairs += [(getattr(one, key), getattr(two, key)) for key in ("by_state", "by_multipliers", "by_effort")]
     pairs += [(getattr(back[0], key), getattr(back[1], key)) for key in ("by_theta", "by_start", "by_torque")]
@@ -209,7 +209,7 @@ def test_linearized_steps_are_the_equations_along_any_trajectory(case):
     n, h = s["n"], step.time_step
     rollout = case.rollout()
     exact = step.kernel.linearize(case.theta, rollout.state, rollout.multipliers, rollout.torque, (), False)
-    assert np.max(np.abs(exact.rows[:, step.model.structure.unknown_row])) < 1e-9 * scale_of(rollout.multipliers)
+    assert np.max(np.abs(exact.rows[:, step.model.structure.unknown_rows])) < 1e-9 * scale_of(rollout.multipliers)
     np.testing.assert_allclose(exact.p1, rollout.state[1:, n : 2 * n], rtol=0, atol=1e-9)
     fixed = list(step.system.prescribed_indices)
     np.testing.assert_allclose(-exact.rows[:, fixed] / h, rollout.effort, rtol=0, atol=1e-7 * scale_of(rollout.effort))
@@ -217,7 +217,7 @@ def test_linearized_steps_are_the_equations_along_any_trajectory(case):
     rng = np.random.default_rng(8)
     state = rollout.state + 0.01 * rng.normal(size=rollout.state.shape)
     lam = rollout.multipliers + 0.01 * rng.normal(size=rollout.multipliers.shape)
-    plain = compile_alike(step, step.system, use_compiler=False)
+    plain = compile_step_like(step, step.system, use_compiler=False)
     one, two = (k.linearize(case.theta, state, lam, case.torque, names, True) for k in (step.kernel, plain.kernel))
     for key in vars(one):
         actual, expected = getattr(one, key), getattr(two, key)
@@ -250,14 +250,14 @@ def test_linearized_steps_are_the_equations_along_any_trajectory(case):
 
 def test_single_steps_are_differentiated_alike_by_both_kernels(case):
     """By state, torque and loads that act on every step alike."""
-    sizes, slow = case.step.sizes, compile_alike(case.step, case.step.system, use_compiler=False)
+    sizes, slow = case.step.sizes, compile_step_like(case.step, case.step.system, use_compiler=False)
     rollout = case.rollout()
     assert rollout.status.ok, rollout.status.message
     rng = np.random.default_rng(3)
     rows = rng.normal(size=(sizes["n"] + sizes["nz"] + sizes["m"], 2))
     momentum = rng.normal(size=(sizes["n"], 2))
     along = (case.theta, rollout.state, rollout.multipliers, rollout.torque, rows, momentum)
-    made, expected = (step.kernel.slopes(*along) for step in (case.step, slow))
+    made, expected = (step.kernel.step_jacobians(*along) for step in (case.step, slow))
     assert made[0].shape == (len(case.torque), sizes["nx"], sizes["nx"] + sizes["nu"] + 2)
     for one, other in zip(made, expected, strict=True):
         # large terms cancel in efforts

@@ -13,11 +13,11 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from yid_ocp.integrator import codegen, compiled, compiler, lane_functions
-from yid_ocp.integrator.lane_functions import lane_functions_source
-from yid_ocp.integrator.step_model import Directions, Feedback, Member
+from yid_ocp.integrator import codegen, compiled, compiler, simd_codegen
+from yid_ocp.integrator.simd_codegen import simd_c_source
+from yid_ocp.integrator.step_model import RolloutInputs, SensitivityDirections, TrackingFeedback
 
-pytestmark = pytest.mark.skipif(compiler.compiler() is None, reason="this machine has no C compiler")
+pytestmark = pytest.mark.skipif(compiler._compiler_path() is None, reason="this machine has no C compiler")
 
 # Newton stops at 1e-14 in these cases; the rest is rounding of sums in another order
 TOLERANCE = 1e-9
@@ -27,7 +27,7 @@ RESULTS = ("state", "multipliers", "effort", "torque", "by_state", "by_multiplie
 @pytest.fixture(autouse=True)
 def at_once(monkeypatch):
     """Batches from the first question on."""
-    monkeypatch.setattr(compiled, "WORTH", 0)
+    monkeypatch.setattr(compiled, "MIN_STEPS_TO_COMPILE_BATCH", 0)
 
 
 def watched(monkeypatch, kernel):
@@ -55,12 +55,12 @@ def members_of(case, count=8):
         given = [None, None]
         if i % 2:
             given = [rng.normal(size=(steps, sizes["nu"], width)), rng.normal(size=(steps + 1, sizes["nc"], width))]
-        directions = Directions(chosen, 0.1 * rng.normal(size=(sizes["nx"], width)), *given)
+        directions = SensitivityDirections(chosen, 0.1 * rng.normal(size=(sizes["nx"], width)), *given)
         theta = case.theta * np.exp(0.02 * rng.normal(size=len(case.theta)))
         feedback = case.feedback
-        feedback = Feedback(feedback.index, feedback.gain[:steps] * (1 + 0.02 * i), feedback.reference[:steps])
+        feedback = TrackingFeedback(feedback.index, feedback.gain[:steps] * (1 + 0.02 * i), feedback.reference[:steps])
         torque = case.torque[:steps] * (1 + 0.02 * i)
-        made.append(Member(theta, case.start, torque, case.path[: steps + 1], feedback, directions))
+        made.append(RolloutInputs(theta, case.start, torque, case.path[: steps + 1], feedback, directions))
     return made
 
 
@@ -88,7 +88,7 @@ def test_a_batch_is_its_members_one_by_one(parts, urdf_folder, monkeypatch, name
     assert all(rollout.status.ok for rollout in single)
     calls = watched(monkeypatch, case.step.kernel)
     for some in (members, [replace(member, wanted=None) for member in members]):
-        together = case.step.kernel.rollouts(some)
+        together = case.step.kernel.rollout_batch(some)
         for one, member, other in zip(together, some, single, strict=True):
             expected = other if member.wanted is not None else alone(case, member)
             assert_same(one, expected, TOLERANCE)
@@ -102,7 +102,7 @@ def test_companions_do_not_matter(parts, urdf_folder):
     case = parts.builders["closed_loop"](urdf_folder)
     members = [replace(member, wanted=None) for member in members_of(case)]
     others = [members[0], *(replace(m, theta=m.theta * 1.01, start=m.start + 1e-3) for m in members[1:4]), members[7]]
-    first, second = case.step.kernel.rollouts(members), case.step.kernel.rollouts(others)
+    first, second = case.step.kernel.rollout_batch(members), case.step.kernel.rollout_batch(others)
     if case.step.kernel._batched(None)[1] == 8:
         assert_same(first[0], second[0])
         assert_same(first[7], second[4])
@@ -111,13 +111,13 @@ def test_companions_do_not_matter(parts, urdf_folder):
 def test_a_member_that_fails_fails_as_alone_and_leaves_the_others(parts, urdf_folder, monkeypatch):
     case = parts.builders["closed_loop"](urdf_folder)
     good = [replace(member, wanted=None) for member in members_of(case)]
-    expected = case.step.kernel.rollouts(good)
+    expected = case.step.kernel.rollout_batch(good)
     wild = good[2].torque.copy()
     wild[4] = np.inf
     lost = replace(good[5], theta=np.full_like(good[5].theta, np.nan))
     members = [*good[:2], replace(good[2], torque=wild), *good[3:5], lost, *good[6:]]
     calls = watched(monkeypatch, case.step.kernel)
-    found = case.step.kernel.rollouts(members)
+    found = case.step.kernel.rollout_batch(members)
     assert calls.count(1) == 2  # the two that failed were asked again
     for i in (2, 5):
         assert not found[i].status.ok
@@ -134,7 +134,7 @@ def test_without_vectors_members_are_done_one_by_one(parts, urdf_folder, monkeyp
     monkeypatch.setattr(
         compiler, "compile_library", lambda text, *make: None if "define BATCHED" in text else original(text, *make)
     )
-    for one, member in zip(case.step.kernel.rollouts(members), members, strict=True):
+    for one, member in zip(case.step.kernel.rollout_batch(members), members, strict=True):
         assert_same(one, alone(case, member))
 
 
@@ -142,9 +142,9 @@ def test_few_members_do_not_ask_for_a_batch(parts, urdf_folder, monkeypatch):
     case = parts.builders["closed_loop"](urdf_folder)
     monkeypatch.setattr(compiled, "_batched_library", lambda model: pytest.fail("compiled for nothing"))
     plain = [replace(member, wanted=None) for member in members_of(case)]
-    assert len(case.step.kernel.rollouts(plain[:2])) == 2
-    monkeypatch.setattr(compiled, "WORTH", 10**9)
-    assert len(case.step.kernel.rollouts(plain)) == 8
+    assert len(case.step.kernel.rollout_batch(plain[:2])) == 2
+    monkeypatch.setattr(compiled, "MIN_STEPS_TO_COMPILE_BATCH", 10**9)
+    assert len(case.step.kernel.rollout_batch(plain)) == 8
 
 
 # -- arithmetic --------------------------------------------------------------------------------------------------------
@@ -180,7 +180,7 @@ def everything():
 
 
 MACHINES = {
-    "this": compiler.NATIVE,
+    "this": compiler._NATIVE_FLAGS,
     "avx2": ("-mavx2", "-mfma"),
     "any": (),
 }
@@ -188,9 +188,9 @@ MACHINES = {
 
 def arithmetic_source(function, batched=True):
     """C source of a function of two numbers, for members that march together or for one, with what tries it."""
-    body = lane_functions_source([function])
+    body = simd_c_source([function])
     assert body is not None
-    arithmetic = resources.files("yid_ocp.integrator").joinpath("lanes.c").read_text(encoding="utf-8")
+    arithmetic = resources.files("yid_ocp.integrator").joinpath("simd.c").read_text(encoding="utf-8")
     sizes = f"#define OUTPUTS {function.numel_out(0)}\n#define PLACES {function.sz_w()}"
     return f"{'#define BATCHED' if batched else ''}\n{sizes}\n{arithmetic}\n{body}\n{DRIVER}"
 
@@ -211,13 +211,13 @@ def assert_those_of_casadi(found, function, points, tolerance):
 @pytest.mark.parametrize("machine", MACHINES)
 @pytest.mark.parametrize("program", ["cc", "clang"])
 def test_arithmetic_of_lanes_is_that_of_one(monkeypatch, machine, program):
-    path = compiler.compiler() if program == "cc" else shutil.which(program)
+    path = compiler._compiler_path() if program == "cc" else shutil.which(program)
     if path is None:
         pytest.skip(f"there is no {program}")
     if machine == "avx2" and "avx2" not in compiler._machine():
         pytest.skip("this machine has no AVX2")
-    monkeypatch.setattr(compiler, "compiler", lambda: path)
-    monkeypatch.setattr(compiler, "NATIVE", MACHINES[machine])
+    monkeypatch.setattr(compiler, "_compiler_path", lambda: path)
+    monkeypatch.setattr(compiler, "_NATIVE_FLAGS", MACHINES[machine])
     function = everything()
     library = compiler.compile_library(arithmetic_source(function))
     assert library.yid_lanes() == (8 if machine == "this" and "avx512f" in compiler._machine() else 4)
@@ -231,8 +231,8 @@ def test_arithmetic_of_lanes_is_that_of_one(monkeypatch, machine, program):
 @pytest.mark.parametrize("batched", [True, False], ids=["many", "one"])
 def test_a_long_function_in_parts_is_the_same(monkeypatch, batched, size):
     function, points = everything(), tried_points()
-    monkeypatch.setattr(lane_functions, "LONG", 20)
-    monkeypatch.setattr(lane_functions, "PART", size)
+    monkeypatch.setattr(simd_codegen, "_LONG_INSTRUCTION_COUNT", 20)
+    monkeypatch.setattr(simd_codegen, "_PART_INSTRUCTION_COUNT", size)
     source = arithmetic_source(function, batched)
     assert source.count("noinline") == math.ceil(function.n_instructions() / size)
     library = compiler.compile_library(source)
@@ -247,14 +247,14 @@ def test_a_long_function_in_parts_is_the_same(monkeypatch, batched, size):
 def test_a_step_of_long_functions_is_the_same(parts, urdf_folder, monkeypatch, name):
     case = parts.builders[name](urdf_folder)
     members = members_of(case)
-    monkeypatch.setattr(lane_functions, "LONG", 100)
-    monkeypatch.setattr(lane_functions, "PART", 30)
+    monkeypatch.setattr(simd_codegen, "_LONG_INSTRUCTION_COUNT", 100)
+    monkeypatch.setattr(simd_codegen, "_PART_INSTRUCTION_COUNT", 30)
     model = case.step.model
     text = codegen.kernel_source(model.functions, model.structure)
     assert "linear_3(" in text
     assert "casadi_f0" in text, "short ones are as CasADi writes them"
     kernel = compiled.CompiledKernel(model, compiler.compile_library(text))
-    for member, found in zip(members, kernel.rollouts(members), strict=True):
+    for member, found in zip(members, kernel.rollout_batch(members), strict=True):
         assert_same(found, alone(case, member), TOLERANCE)
 
 
@@ -279,9 +279,9 @@ def test_arithmetic_of_lanes_on_another_processor(tmp_path):
     if cross is None or emulator is None:
         pytest.skip("there is no cross compiler for ARM (gcc-aarch64-linux-gnu), or no emulator (qemu-user-static)")
     function, points = everything(), tried_points()
-    text, program = tmp_path / "lanes.c", tmp_path / "lanes"
+    text, program = tmp_path / "simd.c", tmp_path / "lanes"
     text.write_text(arithmetic_source(function) + MAIN)
-    flags = [flag for flag in compiler.FLAGS if flag not in ("-fPIC", "-shared")]
+    flags = [flag for flag in compiler._COMMON_FLAGS if flag not in ("-fPIC", "-shared")]
     subprocess.run([cross, "-O2", *flags, "-static", str(text), "-o", str(program), "-lm"], check=True)
     said = subprocess.run(
         [emulator, program, str(len(points))], input=points.tobytes(), capture_output=True, check=True
@@ -292,4 +292,4 @@ def test_arithmetic_of_lanes_on_another_processor(tmp_path):
 
 def test_an_operation_without_a_form_is_refused():
     x = ca.SX.sym("x")
-    assert lane_functions_source([ca.Function("odd", [x], [ca.erfinv(x)])]) is None
+    assert simd_c_source([ca.Function("odd", [x], [ca.erfinv(x)])]) is None

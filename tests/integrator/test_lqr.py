@@ -8,11 +8,11 @@ import pytest
 import scipy.linalg
 
 from yid_ocp.errors import ModelError
-from yid_ocp.integrator.lqr import lqr_filter, proportional_filter
+from yid_ocp.integrator.lqr import lqr_feedback, proportional_feedback
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Segment, System, flexible_object, forward_kinematics
-from yid_ocp.model.kinematics import mass_matrix, rigid_body
+from yid_ocp.model.kinematics import mass_matrix, rigid_body_derivatives
 from yid_ocp.model.urdf import read_urdf
 
 ANGLE, RATE, TORQUE = 0.02, 0.3, 1.5
@@ -39,7 +39,7 @@ def motion(robot):
     time = np.arange(STEPS) * TIME_STEP
     torque = np.stack([3.0 * np.sin(2 * time), np.cos(3 * time)], axis=1)
     swung = simulate(arm, arm.system.parameters.vector(), np.array([0.3, -0.2, 0.0, 0.0]), STEPS, torque)
-    assert swung.status.ok
+    assert swung.status.is_converged
     return arm, torque, swung
 
 
@@ -48,14 +48,14 @@ def test_gains_far_from_the_end_solve_the_riccati_equation(step, robot):
     posture = np.array([0.3, -0.2])
     q, v = ca.SX.sym("q", 2), ca.SX.sym("v", 2)
     tree = robot.numeric()
-    rigid = rigid_body(forward_kinematics(tree, q), v, ca.SX(ca.DM([0, 0, -9.81])))
-    function = ca.Function("arm", [q, v], [mass_matrix(rigid, tree), rigid.by_q])
+    rigid = rigid_body_derivatives(forward_kinematics(tree, q), v, ca.SX(ca.DM([0, 0, -9.81])))
+    function = ca.Function("arm", [q, v], [mass_matrix(rigid, tree), rigid.lagrangian_by_q])
     inertia, by_q = (np.array(ca.densify(x)) for x in function(posture, [0, 0]))
     torque = np.tile(-by_q.ravel(), (STEPS, 1))
     theta = step.system.parameters.vector()
-    loop = lqr_filter(step, np.tile(posture, (STEPS + 1, 1)), torque, theta, ANGLE, RATE, TORQUE)
+    loop = lqr_feedback(step, np.tile(posture, (STEPS + 1, 1)), torque, theta, ANGLE, RATE, TORQUE)
     n = step.system.size
-    np.testing.assert_array_equal(loop.index, [0, 1, n, n + 1])
+    np.testing.assert_array_equal(loop.state_indices, [0, 1, n, n + 1])
 
     arm = compile_step(System.build(robot, driven=robot.joint_names, damping=0.1), TIME_STEP, use_compiler=False)
     a, b, _ = arm.jacobians(posture, np.zeros(2), torque[0], arm.system.parameters.vector(), names=())
@@ -73,24 +73,24 @@ def test_gains_far_from_the_end_solve_the_riccati_equation(step, robot):
 def test_the_reference_is_a_motion_of_the_arm_alone(step, motion):
     """It holds the angles and, by the arm's own equations, the momenta; the first one from a standing start."""
     _, torque, swung = motion
-    loop = lqr_filter(step, swung.state[:, :2], torque, step.system.parameters.vector(), ANGLE, RATE, TORQUE)
+    loop = lqr_feedback(step, swung.state[:, :2], torque, step.system.parameters.vector(), ANGLE, RATE, TORQUE)
     np.testing.assert_allclose(loop.reference[1:], swung.state[1:-1], rtol=0, atol=1e-9)
 
 
 def test_a_proportional_filter(step):
     measured = np.arange(8.0).reshape(4, 2)
-    loop = proportional_filter(step, measured, [5.0, 7.0])
+    loop = proportional_feedback(step, measured, [5.0, 7.0])
     np.testing.assert_array_equal(loop.gain, [np.diag([5.0, 7.0])] * 3)
     np.testing.assert_array_equal(loop.reference, measured[:-1])
-    np.testing.assert_array_equal(loop.index, [0, 1])
-    np.testing.assert_array_equal(proportional_filter(step, measured, 5.0).gain, [np.diag([5.0, 5.0])] * 3)
+    np.testing.assert_array_equal(loop.state_indices, [0, 1])
+    np.testing.assert_array_equal(proportional_feedback(step, measured, 5.0).gain, [np.diag([5.0, 5.0])] * 3)
     with pytest.raises(ModelError, match=r"negative: -1 N m/rad"):
-        proportional_filter(step, measured, [5.0, -1.0])
+        proportional_feedback(step, measured, [5.0, -1.0])
     with pytest.raises(ModelError, match="3 gains for 2 driven joints"):
-        proportional_filter(step, measured, [1.0, 2.0, 3.0])
+        proportional_feedback(step, measured, [1.0, 2.0, 3.0])
 
 
 def test_driven_joints_must_come_first(parts):
     step = compile_step(parts.cable(driven=["C_2_x"]), 0.01, use_compiler=False)
     with pytest.raises(ModelError, match="come first"):
-        lqr_filter(step, np.zeros((4, 1)), np.zeros((3, 1)), step.system.parameters.vector())
+        lqr_feedback(step, np.zeros((4, 1)), np.zeros((3, 1)), step.system.parameters.vector())

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from yid_ocp.effects import make_effect
-from yid_ocp.integrator.lqr import lqr_filter
-from yid_ocp.integrator.momentum import MomentumShift, Motion
+from yid_ocp.integrator.lqr import lqr_feedback
+from yid_ocp.integrator.momentum_shift import DrivenJointMotion, MomentumShift
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
@@ -50,7 +50,7 @@ def moved(step, theta, remembered=0.6):
     internal = np.full(step.sizes["nz"], remembered)
     start = np.concatenate([[0.3, -0.2, 0.0, 0.0], internal])
     swung = simulate(step, theta, start, STEPS, torque)
-    assert swung.status.ok
+    assert swung.status.is_converged
     return swung.state, torque, internal
 
 
@@ -63,9 +63,9 @@ def test_reference_and_shift_are_the_momentum_of_the_true_motion(plain, names, m
     state, torque, internal = moved(step, theta)
     shift = MomentumShift(step)
     read = torque + misread
-    loop = lqr_filter(step, state[:, ANGLES], read, shift.without(theta))
-    true = Motion(state[:, ANGLES], torque, internal)
-    value, _ = shift.along(Motion(state[:, ANGLES], read, internal), true, theta, ())
+    loop = lqr_feedback(step, state[:, ANGLES], read, shift.theta_without_effects(theta))
+    true = DrivenJointMotion(state[:, ANGLES], torque, internal)
+    value, _ = shift.shift_and_derivatives(DrivenJointMotion(state[:, ANGLES], read, internal), true, theta, ())
     np.testing.assert_allclose(loop.reference[1:, MOMENTA] + value[1:], state[1:-1, MOMENTA], atol=1e-9)
     if names or misread:
         assert np.max(np.abs(value)) > 1e-3
@@ -77,15 +77,15 @@ def test_the_shift_of_a_torque_that_was_misread(plain):
     theta = step.system.parameters.vector()
     state, torque, none = moved(step, theta)
     shift = MomentumShift(step)
-    assert shift.parameters == ()
+    assert shift.parameter_names == ()
     by_torque = np.stack([torque, 0 * torque], axis=2)
-    recorded = Motion(state[:, ANGLES], torque, none)
-    true = Motion(state[:, ANGLES], 1.5 * torque, none, by_torque=by_torque)
-    value, slope = shift.along(recorded, true, theta, ("gain", "other"))
+    recorded = DrivenJointMotion(state[:, ANGLES], torque, none)
+    true = DrivenJointMotion(state[:, ANGLES], 1.5 * torque, none, torque_sensitivity=by_torque)
+    value, slope = shift.shift_and_derivatives(recorded, true, theta, ("gain", "other"))
     np.testing.assert_allclose(value[1:], 0.5 * TIME_STEP / 2 * torque[:-1], atol=1e-12)
     np.testing.assert_allclose(slope[:, :, 0] * 0.5, value, atol=1e-12)
     np.testing.assert_array_equal(slope[:, :, 1], 0.0)
-    np.testing.assert_allclose(shift.by_torque(theta), TIME_STEP / 2 * np.eye(2), atol=1e-15)
+    np.testing.assert_allclose(shift.momentum_by_torque(theta), TIME_STEP / 2 * np.eye(2), atol=1e-15)
 
 
 @pytest.mark.parametrize("names", [EFFECTS["two that hold"], EFFECTS["friction"]], ids=["holds", "slides"])
@@ -95,18 +95,20 @@ def test_derivatives_are_those_of_differences(plain, names):
     theta = step.system.parameters.vector()
     state, torque, internal = moved(step, theta)
     shift = MomentumShift(step)
-    wanted = shift.parameters
+    wanted = shift.parameter_names
     d, rng = len(wanted) + 2, np.random.default_rng(1)
     by_angles, by_torque = (0.01 * rng.normal(size=(*x.shape, d)) for x in (state[:, ANGLES], torque))
     by_internal = 0.1 * rng.normal(size=(len(internal), d))
-    recorded = Motion(state[:, ANGLES], torque, internal)
+    recorded = DrivenJointMotion(state[:, ANGLES], torque, internal)
 
     def at(move):
         """The shift after a move along each of d directions; parameters move by the first ones."""
         own = theta.copy()
         own[[step.system.parameters.index(name) for name in wanted]] += move[: len(wanted)]
         parts = (state[:, ANGLES] + by_angles @ move, torque + by_torque @ move, internal + by_internal @ move)
-        return shift.along(recorded, Motion(*parts, by_angles, by_torque, by_internal), own, wanted)
+        return shift.shift_and_derivatives(
+            recorded, DrivenJointMotion(*parts, by_angles, by_torque, by_internal), own, wanted
+        )
 
     value, slopes = at(np.zeros(d))
     assert slopes.shape == (*value.shape, d)
@@ -119,19 +121,19 @@ def test_an_armature_shifts_the_reference_momentum(plain):
     """What the same angles mean in momentum: armature times the rate at the middle of the step before."""
     step = compiled(plain, EFFECTS["armature"])
     shift = MomentumShift(step)
-    [name] = shift.parameters
+    [name] = shift.parameter_names
     theta = step.system.parameters.vector()
     neutral = theta.copy()
     neutral[step.system.parameters.index(name)] = 0.0
-    assert not shift.active(neutral, ())
-    assert shift.active(theta, ())
-    assert shift.active(neutral, (name,))
+    assert not shift.is_active(neutral, ())
+    assert shift.is_active(theta, ())
+    assert shift.is_active(neutral, (name,))
     state, torque, none = moved(step, theta)
-    recorded = Motion(state[:, ANGLES], torque, none)
-    value, slope = shift.along(recorded, recorded, theta, (name, "elbow.mass"))
+    recorded = DrivenJointMotion(state[:, ANGLES], torque, none)
+    value, slope = shift.shift_and_derivatives(recorded, recorded, theta, (name, "elbow.mass"))
     rate = np.diff(state[:, 0]) / TIME_STEP
     np.testing.assert_allclose(value[1:, 0], 0.3 * rate[:-1], rtol=1e-9)
     np.testing.assert_allclose(value[:, 1], 0.0, atol=1e-12)
     np.testing.assert_allclose(slope[:, :, 0] * 0.3, value, rtol=1e-9, atol=1e-12)
     np.testing.assert_array_equal(slope[:, :, 1], 0.0)
-    np.testing.assert_array_equal(shift.without(theta), neutral)
+    np.testing.assert_array_equal(shift.theta_without_effects(theta), neutral)

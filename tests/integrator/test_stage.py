@@ -6,12 +6,12 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from yid_ocp.integrator.stage import stage
+from yid_ocp.integrator.nlp_stage import nlp_stage
 
 
 @pytest.fixture(scope="module")
 def made(case):
-    return stage(case.step.equations, case.step.time_step)
+    return nlp_stage(case.step.equations, case.step.time_step)
 
 
 def inputs_of(made):
@@ -39,7 +39,7 @@ def test_slopes_in_closed_form_are_those_that_casadi_finds(case, made):
     point = [rng.normal(scale=0.2, size=symbol.numel()) for symbol in inputs_of(made)]
     point[1] = point[0] + 0.01 * point[1]
     point[-1] = case.theta * (1 + 0.1 * rng.random(len(case.theta)))
-    for value, slopes in ((made.rows, made.slopes), (made.effort, made.effort_slopes)):
+    for value, slopes in ((made.rows, made.slopes), (made.effort, made.effort_jacobians)):
         for name, found in slopes.items():
             symbol = getattr(made, name)
             function = ca.Function(

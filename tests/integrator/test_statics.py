@@ -6,21 +6,26 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from yid_ocp.integrator.discrete import rest_equations
+from yid_ocp.integrator.discrete import equilibrium_equations
 from yid_ocp.integrator.rollout import simulate
-from yid_ocp.integrator.statics import HOLD_STIFFNESS, HOLD_STIFFNESS_WITH_TORQUE, Statics, relaxed
-from yid_ocp.integrator.step import compile_alike, compile_step
+from yid_ocp.integrator.statics import (
+    _HOLD_STIFFNESS,
+    _HOLD_STIFFNESS_WITH_TORQUE,
+    EquilibriumSolver,
+    relaxed_internal_coordinates,
+)
+from yid_ocp.integrator.step import compile_step, compile_step_like
 from yid_ocp.model import Grasp, Segment, System, flexible_object, forward_kinematics
-from yid_ocp.model.drives import Spring
-from yid_ocp.model.rotations import roll_pitch_yaw
+from yid_ocp.model.rotations import rotation_from_rpy
+from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.system import floating_clamp
 from yid_ocp.model.urdf import read_urdf
 
 
 def hung_cable(span: float, **options):
     """A cable of 0.6 m that starts level along x, its end held at a fraction of its length; statics and clamp pose."""
-    turn = roll_pitch_yaw(0.0, np.pi / 2, 0.0)
-    segment = Segment("C", 0.6, 0.3, 0.01, links=4, bend=0.05, twist=1.0, damping=0.01, rotation=turn)
+    turn = rotation_from_rpy(0.0, np.pi / 2, 0.0)
+    segment = Segment("C", 0.6, 0.3, 0.01, links=4, bend=0.05, twist=1.0, damping=0.01, rest_rotation=turn)
     clamp = floating_clamp("clamp")
     system = System.build(
         clamp,
@@ -29,12 +34,12 @@ def hung_cable(span: float, **options):
         prescribed=clamp.joint_names,
         **options,
     )
-    return Statics(compile_step(system, 0.01, use_compiler=False)), np.array([0.6 * span, 0, 0, 0, 0, 0])
+    return EquilibriumSolver(compile_step(system, 0.01, use_compiler=False)), np.array([0.6 * span, 0, 0, 0, 0, 0])
 
 
 def height(system, frame, q) -> float:
     kinematics = forward_kinematics(system.mechanism.numeric(), ca.SX(ca.DM(q)))
-    return float(kinematics.position(frame)[2])
+    return float(kinematics.frame_position(frame)[2])
 
 
 def test_of_several_equilibria_the_one_of_least_energy():
@@ -61,8 +66,10 @@ def test_a_cable_held_far_from_its_undeformed_shape_hangs_at_rest():
 def arm(urdf_folder):
     """The double pendulum, its elbow driven, with a spring on each joint."""
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    springs = {name: Spring(4.0, 0.1) for name in robot.joint_names}
-    return Statics(compile_step(System.build(robot, driven=["elbow"], springs=springs), 0.01, use_compiler=False))
+    springs = {name: RobotJointSpring(4.0, 0.1) for name in robot.joint_names}
+    return EquilibriumSolver(
+        compile_step(System.build(robot, driven=["elbow"], springs=springs), 0.01, use_compiler=False)
+    )
 
 
 def test_a_system_at_rest_stays_there(arm):
@@ -95,7 +102,7 @@ def test_derivatives_of_an_equilibrium(arm):
 
 def derivatives(step, rest, given, held, stiffness, theta):
     """Of the state by theta and by the known coordinates, by CasADi from the equations of rest as a whole."""
-    e, n = rest_equations(step.equations), step.system.size
+    e, n = equilibrium_equations(step.equations), step.system.size
     others = ca.vertcat(e.inputs[4], e.inputs[1])
     outputs = [ca.densify(ca.jacobian(f, x)) for f in (e.residual, e.state) for x in (e.inputs[0], others)]
     w = np.concatenate([rest.state[list(step.system.free_indices)], rest.state[2 * n :], rest.constraint_force])
@@ -112,26 +119,30 @@ def test_compiled_and_interpreted_equilibria_are_one(case):
     torque = 0.3 * case.torque[0] if len(system.driven) else None
     guess = case.start[: system.size].copy()
     guess[fixed] = case.path[0]
-    steps = case.step, compile_alike(case.step, system, use_compiler=False)
-    fast, slow = (Statics(step).solve(given, case.theta, torque, guess, names) for step in steps)
-    assert fast.converged == slow.converged == bool(system.elastic), fast.message
+    steps = case.step, compile_step_like(case.step, system, use_compiler=False)
+    fast, slow = (EquilibriumSolver(step).solve(given, case.theta, torque, guess, names) for step in steps)
+    assert fast.is_converged == slow.is_converged == bool(system.elastic), fast.message
     for name in ("state", "torque", "constraint_force"):
         np.testing.assert_allclose(getattr(fast, name), getattr(slow, name), rtol=1e-7, atol=1e-8, err_msg=name)
-    if not fast.converged:
+    if not fast.is_converged:
         return
-    stiffness = HOLD_STIFFNESS if torque is None else HOLD_STIFFNESS_WITH_TORQUE
+    stiffness = _HOLD_STIFFNESS if torque is None else _HOLD_STIFFNESS_WITH_TORQUE
     held = np.zeros(0) if torque is None else torque
     expected = derivatives(steps[1], fast, given, held, stiffness, case.theta)
     for rest in (fast, slow):
-        np.testing.assert_allclose(np.hstack([rest.by_theta, rest.by_posture]), expected, rtol=1e-7, atol=1e-8)
-        np.testing.assert_allclose(rest.by_torque, rest.by_posture[:, : len(held)] / stiffness, rtol=1e-12)
+        np.testing.assert_allclose(
+            np.hstack([rest.state_by_theta, rest.state_by_known_coordinates]), expected, rtol=1e-7, atol=1e-8
+        )
+        np.testing.assert_allclose(
+            rest.state_by_torque, rest.state_by_known_coordinates[:, : len(held)] / stiffness, rtol=1e-12
+        )
 
 
 def test_a_measured_torque_that_fits_takes_the_load_off_the_holding_spring(arm):
     theta = arm.step.system.parameters.vector()
     elbow = arm.step.system.mechanism.joint_index("elbow")
     rest = arm.solve([0.4], theta)
-    given = rest.torque[0] / HOLD_STIFFNESS
+    given = rest.torque[0] / _HOLD_STIFFNESS
     assert abs(given) > 1e-6
     assert rest.state[elbow] == pytest.approx(0.4 - given, abs=1e-12)
     again = arm.solve([0.4], theta, torque=rest.torque)
@@ -156,6 +167,6 @@ def test_internal_coordinates_of_an_object_that_has_long_been_there(parts):
     system = parts.cable(effects=[parts.maxwell_branch("C_0_x", 3.0, 0.02)])
     step = compile_step(system, 1e-3, use_compiler=False)
     q = np.linspace(0.1, 0.5, 9)
-    np.testing.assert_allclose(relaxed(step, q, system.parameters.vector()), [q[0]], rtol=1e-12)
+    np.testing.assert_allclose(relaxed_internal_coordinates(step, q, system.parameters.vector()), [q[0]], rtol=1e-12)
     plain = compile_step(parts.cable(), 1e-3, use_compiler=False)
-    assert relaxed(plain, q, plain.system.parameters.vector()).shape == (0,)
+    assert relaxed_internal_coordinates(plain, q, plain.system.parameters.vector()).shape == (0,)

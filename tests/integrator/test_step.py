@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from yid_ocp.errors import ConfigError, ModelError
-from yid_ocp.integrator.step import at_time_step, compile_step
-from yid_ocp.integrator.step_model import StepCode
-from yid_ocp.model import Grasp, Parameters, Segment, System, Terms, flexible_object, forward_kinematics
-from yid_ocp.model.urdf import read_urdf, robot_description_file
+from yid_ocp.integrator.step import compile_step, with_time_step
+from yid_ocp.integrator.step_model import NewtonStatus
+from yid_ocp.model import Grasp, Parameters, Segment, StepTerms, System, flexible_object, forward_kinematics
+from yid_ocp.model.urdf import example_robot_urdf, read_urdf
 
 ARM = [f"left_{joint}" for joint in ("s0", "s1", "e0", "e1", "w0", "w1", "w2")]
 BENT = np.array([0.3, -0.2, 0.1, 0.4, 0.2, -0.1, 0.2, 0.3, 0.15])
@@ -25,7 +25,7 @@ def numbers(expression) -> np.ndarray:
 
 def pose(system, frame, q) -> np.ndarray:
     mechanism = system.mechanism.numeric()
-    return numbers(forward_kinematics(mechanism, ca.SX(ca.DM(q))).pose(frame).matrix())
+    return numbers(forward_kinematics(mechanism, ca.SX(ca.DM(q))).frame_pose(frame).homogeneous_matrix())
 
 
 # ---------------------------------------------------------------------------------------------- prescribed coordinates
@@ -42,7 +42,7 @@ def test_effort_of_prescribed_joints_is_inverse_dynamics_to_second_order(roll, m
     pin = pytest.importorskip("pinocchio", reason="the reference needs Pinocchio: pip install pin")
     system = System.build(read_urdf("package:baxter", joints=ARM), prescribed=ARM)
     theta = system.parameters.vector()
-    full = pin.buildModelFromUrdf(str(robot_description_file("baxter")))
+    full = pin.buildModelFromUrdf(str(example_robot_urdf("baxter")))
     rest = [i for i in range(1, full.njoints) if full.names[i] not in ARM]
     model = pin.buildReducedModel(full, rest, pin.neutral(full))
     assert list(model.names[1:]) == ARM
@@ -129,7 +129,9 @@ def test_a_neutral_maxwell_branch_changes_nothing(parts, hinge, roll):
 
 
 def test_an_internal_coordinate_needs_an_equation(parts, hinge):
-    orphan = parts.Added("orphan", "R", Parameters(), {"orphan@R.z": ca.SX.sym("z")}, add=lambda effect, state: Terms())
+    orphan = parts.Added(
+        "orphan", "R", Parameters(), {"orphan@R.z": ca.SX.sym("z")}, add=lambda effect, state: StepTerms()
+    )
     with pytest.raises(ModelError, match=r"orphan@R\.z"):
         compile_step(hinge([orphan]), 0.01)
 
@@ -162,7 +164,7 @@ def test_without_compliance_a_coordinate_stays_at_zero(parts, roll):
     rollout = roll(step, theta, q, np.zeros(9), 200)
     assert rollout.status.ok, rollout.status.message
     # exactly in compiled code, whose elimination does not pivot
-    assert np.max(np.abs(rollout.state[:, [index, 9 + index]])) <= (0.0 if step.compiled else 1e-18)
+    assert np.max(np.abs(rollout.state[:, [index, 9 + index]])) <= (0.0 if step.is_compiled else 1e-18)
     assert np.ptp(rollout.state[:, 3]) > 0.01
     # the neighbours move as if there were no joint
     rigid = replace(parts.cable(prescribed=["C_1_y"]))
@@ -265,11 +267,11 @@ class TestFailures:
         step = compile_step(system, 0.01, use_compiler=use_compiler)
         theta = system.parameters.vector()
         _, _, _, status = step([0.1, 0.2], [0.0, 0.0], [math.nan], theta)
-        assert (status.ok, status.code, status.step) == (False, StepCode.NOT_FINITE, 0)
+        assert (status.is_converged, status.code, status.completed_steps) == (False, NewtonStatus.NOT_FINITE, 0)
         torque = np.zeros((12, 1))
         torque[7] = math.nan
         rollout = roll(step, theta, [0.1, 0.2], [0.0, 0.0], 12, torque=torque)
-        assert (rollout.status.code, rollout.status.step) == (StepCode.NOT_FINITE, 7)
+        assert (rollout.status.code, rollout.status.step) == (NewtonStatus.NOT_FINITE, 7)
         assert rollout.status.message.startswith("step 7: the state is no longer finite")
         assert np.all(np.isfinite(rollout.state[:8]))
         assert np.all(np.isnan(rollout.state[9:]))
@@ -277,14 +279,14 @@ class TestFailures:
 
     def test_a_grasp_out_of_reach(self, urdf_folder, use_compiler):
         robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-        far = Grasp("far", "ceiling", "tip", offset=ca.SX(ca.DM([0.0, 3.0, 0.0])))
+        far = Grasp("far", "ceiling", "tip", holder_offset=ca.SX(ca.DM([0.0, 3.0, 0.0])))
         # the pendulum is planar: without the third joint the equations would be redundant
         turn = read_urdf(urdf_folder / "turntable.urdf", joints=["turn"])
         renamed = replace(turn, frames={"disc": turn.frames["disc"]})
-        system = System.build(renamed.joined(robot, "disc"), grasps=[far])
+        system = System.build(renamed.with_mechanism(robot, "disc"), grasps=[far])
         step = compile_step(system, 0.01, use_compiler=use_compiler)
         q, _, _, status = step([0.1, 0.3, 0.4], np.zeros(3), [], system.parameters.vector())
-        assert status.code in (StepCode.NOT_CONVERGED, StepCode.SINGULAR)
+        assert status.code in (NewtonStatus.NOT_CONVERGED, NewtonStatus.SINGULAR)
         assert status.message.startswith("step 0: ")
         assert q.shape == (3,)
 
@@ -293,8 +295,8 @@ class TestFailures:
         system = System.build(robot, grasps=[Grasp("one", "floor", "disc"), Grasp("two", "floor", "disc")])
         step = compile_step(system, 0.01, use_compiler=use_compiler)
         _, _, _, status = step([0.1, 0.2, 0.3], np.zeros(3), [], system.parameters.vector())
-        assert not status.ok
-        assert status.code != StepCode.OK
+        assert not status.is_converged
+        assert status.code != NewtonStatus.OK
 
     def test_derivatives_of_a_step_that_failed_are_not_numbers(self, urdf_folder, use_compiler):
         system = System.build(read_urdf(urdf_folder / "double_pendulum.urdf"), driven=["elbow"])
@@ -309,9 +311,9 @@ class TestFailures:
         step = compile_step(system, 0.01, use_compiler=use_compiler)
         pair = ([0.1, 0.2], [0.11, 0.19])
         q1, p1, lam, status = step(pair[0], [0.0, 0.0], [], system.parameters.vector(), prescribed=pair)
-        assert status.ok
+        assert status.is_converged
         np.testing.assert_array_equal(q1, pair[1])
-        assert np.all(np.isfinite([*p1, *status.effort]))
+        assert np.all(np.isfinite([*p1, *status.prescribed_effort]))
         assert lam.shape == (0,)
 
 
@@ -361,7 +363,7 @@ def test_wrong_shapes_name_the_array(parts, urdf_folder, change, words):
     s = system.mechanism.joint_index("swing")
     arguments = {"q0": q, "p0": np.zeros(6), "u": np.zeros(2), "theta": system.parameters.vector()}
     arguments |= {"prescribed": (q[[s]], q[[s]])}
-    assert step(**arguments)[3].ok
+    assert step(**arguments)[3].is_converged
     with pytest.raises(ModelError) as caught:
         step(**{**arguments, **change})
     for word in words:
@@ -394,7 +396,7 @@ def test_an_unknown_constraint_force(hinge):
 def test_a_step_of_another_length_is_one_compiled_for_it(parts, use_compiler):
     system = parts.cable()
     coarse, expected = (compile_step(system, h, use_compiler=use_compiler) for h in (4e-3, 1e-4))
-    fine = at_time_step(coarse, 1e-4)
+    fine = with_time_step(coarse, 1e-4)
     assert fine.model.tolerance == expected.model.tolerance < coarse.model.tolerance
     state, theta = np.concatenate([BENT, np.zeros(9)]), system.parameters.vector()
     names = ("C.bend", "C.twist")
@@ -409,4 +411,4 @@ def test_a_step_of_another_length_is_one_compiled_for_it(parts, use_compiler):
     assert coarse.time_step == 4e-3
     assert np.max(np.abs(coarse(state[:9], state[9:], [], theta)[0] - made[0])) > 1e-6
     with pytest.raises(ModelError, match="time_step = 0"):
-        at_time_step(coarse, 0.0)
+        with_time_step(coarse, 0.0)

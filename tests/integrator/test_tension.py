@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from yid_ocp.data import read_recording
-from yid_ocp.integrator.lqr import lqr_filter
+from yid_ocp.integrator.lqr import lqr_feedback
 from yid_ocp.integrator.rollout import simulate
-from yid_ocp.integrator.statics import Statics
+from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
 
 TRUTH = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T3.bend": 11.5, "T3.twist": 9.7}
@@ -28,9 +28,9 @@ def two_arms(paper_systems, clean):
         arm = joints.position[::every]
         steps = len(arm) - 1
         torque = joints.effort[: steps * every].reshape(steps, every, -1).mean(axis=1)
-        rest = Statics(step).solve(arm[0], theta, torque[0])
-        assert rest.converged, rest.message
-        feedback = lqr_filter(step, arm, torque, theta)
+        rest = EquilibriumSolver(step).solve(arm[0], theta, torque[0])
+        assert rest.is_converged, rest.message
+        feedback = lqr_feedback(step, arm, torque, theta)
         return simulate(step, theta, rest.state, steps, torque, feedback=feedback), h
 
     return roll
@@ -62,9 +62,12 @@ def test_a_loop_without_damping_keeps_its_energy(parts, urdf_folder):
     start = np.concatenate([q, np.zeros(step.sizes["n"] + step.sizes["nz"])])
     theta = system.parameters.vector(dict.fromkeys(names, 0.0))
     rollout = simulate(step, theta, start, 4000)
-    assert rollout.status.ok, rollout.status.message
+    assert rollout.status.is_converged, rollout.status.message
     e = step.equations
-    parts_of_energy = [e.rigid.kinetic, e.rigid.kinetic + e.rigid.potential]
+    parts_of_energy = [
+        e.rigid_body_terms.kinetic_energy,
+        e.rigid_body_terms.kinetic_energy + e.rigid_body_terms.potential_energy,
+    ]
     function = ca.Function("energy", [e.q0, e.q1, e.theta, e.time_step], parts_of_energy)
     states = rollout.state[:, : system.size]
     kinetic, energy = (np.array(x).ravel() for x in function(states[:-1].T, states[1:].T, theta, 0.01))

@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 
 from yid_ocp.integrator import codegen, compiler
-from yid_ocp.integrator.statics import Statics
+from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.integrator.step_model import Directions
+from yid_ocp.integrator.step_model import SensitivityDirections
 
 THREADS = 4
 
 
 @pytest.fixture(params=[True, False], ids=["compiled", "interpreted"])
 def use_compiler(request):
-    if request.param and compiler.compiler() is None:
+    if request.param and compiler._compiler_path() is None:
         pytest.skip("this machine has no C compiler")
     return request.param
 
@@ -62,16 +62,24 @@ def test_rollouts_adjoints_and_linearizations(parts, urdf_folder, monkeypatch, t
     case = parts.make_case(*parts.closed_loop(urdf_folder), steps=40)
     system = case.step.system
     names = tuple(system.parameters.names[::2])
-    directions = Directions(names, np.random.default_rng(1).normal(size=(len(case.start), len(names))))
+    directions = SensitivityDirections(names, np.random.default_rng(1).normal(size=(len(case.start), len(names))))
     thetas = [case.theta * (1 + 0.02 * i) for i in range(THREADS)]
 
     def everything(step):
         def run(theta):
             rollout = step.kernel.rollout(theta, case.start, case.torque, case.path, case.feedback, directions)
             assert rollout.status.ok, rollout.status.message
-            back = step.kernel.adjoint(theta, rollout, case.feedback, names, np.ones_like(rollout.state), None, None)
+            back = step.kernel.adjoint_gradient(
+                theta, rollout, case.feedback, names, np.ones_like(rollout.state), None, None
+            )
             along = step.kernel.linearize(theta, rollout.state, rollout.multipliers, rollout.torque, names, True)
-            found = (rollout.state, rollout.multipliers, rollout.effort, rollout.by_state, rollout.by_multipliers)
+            found = (
+                rollout.state,
+                rollout.multipliers,
+                rollout.effort,
+                rollout.by_state,
+                rollout.multipliers_sensitivity,
+            )
             return *found, *vars(back).values(), *vars(along).values()
 
         return run
@@ -98,7 +106,7 @@ def test_parameter_sets_that_are_compiled_while_others_run(parts, urdf_folder, u
 
 def test_equilibria(parts, monkeypatch):
     system = parts.cable()
-    shared, plain = (Statics(compile_step(system, 1e-3, use_compiler=False)) for _ in range(2))
+    shared, plain = (EquilibriumSolver(compile_step(system, 1e-3, use_compiler=False)) for _ in range(2))
     thetas = [system.parameters.vector({"C.bend": 2.0 + i}) for i in range(THREADS)]
 
     def rest(statics):

@@ -18,7 +18,7 @@ def numbers(expression, parameters=None) -> np.ndarray:
 
 def positions(item, frames, q=None):
     """Where frames stand at nominal parameters, shape (len(frames), 3)."""
-    mechanism = item.mechanism.numeric()
+    mechanism = item.mechanism.with_numeric_values()
     q = np.zeros(len(mechanism.joints)) if q is None else q
     kinematics = forward_kinematics(mechanism, ca.SX(ca.DM(q)))
-    return np.array([numbers(kinematics.position(frame)).ravel() for frame in frames])
+    return np.array([numbers(kinematics.frame_position(frame)).ravel() for frame in frames])

@@ -14,7 +14,7 @@ from placed_frames import numbers, positions
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model import Segment, flexible_object
 from yid_ocp.model.flexible import polyline_rotations
-from yid_ocp.model.rotations import roll_pitch_yaw, transform
+from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.y_object import y_object
 
 
@@ -22,10 +22,10 @@ def stiffness(item, values=None):
     """Stiffness and damping of every coordinate by joint name."""
     p = item.mechanism.parameters
     function = ca.Function(
-        "springs", [p.symbols], [ca.vertcat(*(ca.horzcat(s.stiffness, s.damping) for s in item.elastic))]
+        "springs", [p.symbols], [ca.vertcat(*(ca.horzcat(s.stiffness, s.damping) for s in item.elastic_joints))]
     )
     rows = np.array(function(p.vector(values)))
-    return {spring.joint: tuple(row) for spring, row in zip(item.elastic, rows, strict=True)}
+    return {spring.joint_name: tuple(row) for spring, row in zip(item.elastic_joints, rows, strict=True)}
 
 
 def test_unequal_links():
@@ -34,25 +34,25 @@ def test_unequal_links():
     tips = positions(item, ["C_0_tip", "C_1_tip", "C_2_tip", "w_C"])
     np.testing.assert_allclose(tips[:, 2], [0.1, 0.4, 0.6, 0.6])
     assert item.mechanism.parameters["C.length"].value == pytest.approx(0.6)
-    carried = [joint.bodies[0] for joint in item.mechanism.numeric().joints if joint.bodies]
+    carried = [joint.bodies[0] for joint in item.mechanism.with_numeric_values().joints if joint.bodies]
     np.testing.assert_allclose([float(b.mass) for b in carried], [0.1, 0.3, 0.2])
     for body, length in zip(carried, lengths, strict=True):
         mass = float(body.mass)
         side = mass * (length**2 / 12 + 0.01**2 / 4)
-        np.testing.assert_allclose(numbers(body.com).ravel(), [0, 0, length / 2])
-        np.testing.assert_allclose(numbers(body.about_com), np.diag([side, side, mass * 0.01**2 / 2]))
-    layout = item.segment("C")
+        np.testing.assert_allclose(numbers(body.center_of_mass).ravel(), [0, 0, length / 2])
+        np.testing.assert_allclose(numbers(body.inertia_about_com), np.diag([side, side, mass * 0.01**2 / 2]))
+    layout = item.segment_layout("C")
     parameters = item.mechanism.parameters
-    np.testing.assert_allclose([numbers(x, parameters).item() for x in layout.lengths], lengths)
-    assert layout.links == tuple(tuple(f"C_{i}_{axis}" for axis in "xyz") for i in range(3))
+    np.testing.assert_allclose([numbers(x, parameters).item() for x in layout.link_lengths], lengths)
+    assert layout.link_joints == tuple(tuple(f"C_{i}_{axis}" for axis in "xyz") for i in range(3))
 
 
 def test_rigidity_becomes_stiffness_by_the_lengths_about_a_joint():
     lengths = [0.1, 0.3, 0.2]
     shared = {"bend": 2.0, "twist": 1.5, "damping": 0.1, "rigidity": True, "link_lengths": lengths}
-    trunk = Segment("A", 0.0, 0.6, 0.01, clamped=True, **shared)
-    branch = Segment("B", 0.0, 0.6, 0.01, parent="A", at_link=1, twist_damping=0.3, **shared)
-    held = Segment("D", 0.0, 0.6, 0.01, parent="A", clamped=True, **shared)
+    trunk = Segment("A", 0.0, 0.6, 0.01, clamped_at_base=True, **shared)
+    branch = Segment("B", 0.0, 0.6, 0.01, parent="A", parent_link_index=1, twist_damping=0.3, **shared)
+    held = Segment("D", 0.0, 0.6, 0.01, parent="A", clamped_at_base=True, **shared)
     springs = stiffness(flexible_object([trunk, branch, held]))
     between = [2 / (0.1 + 0.3), 2 / (0.3 + 0.2)]
     first = {"A": 2 / 0.1, "B": 2 / (0.3 + 0.1), "D": 2 / 0.1}
@@ -68,38 +68,48 @@ def test_rigidity_becomes_stiffness_by_the_lengths_about_a_joint():
 
 def test_units_say_whether_a_rigidity_is_meant():
     stiff = flexible_object([Segment("A", 1.0, 1.0, 0.1)]).mechanism.parameters
-    rigid = flexible_object([Segment("A", 1.0, 1.0, 0.1, rigidity=True)]).mechanism.parameters
+    rigid = flexible_object([Segment("A", 1.0, 1.0, 0.1, stiffness_per_curvature=True)]).mechanism.parameters
     assert (stiff["A.bend"].unit, stiff["A.damping"].unit) == ("N m/rad", "N m s/rad")
     assert (rigid["A.bend"].unit, rigid["A.damping"].unit) == ("N m^2", "N m^2 s")
 
 
 def test_branches_at_inner_links():
     trunk = Segment("P", 0.6, 0.3, 0.01, links=3)
-    turn = roll_pitch_yaw(math.pi / 2, 0.0, 0.0)
-    item = flexible_object([trunk, Segment("a", 0.2, 0.1, 0.01, links=2, parent="P", at_link=0, rotation=turn)])
+    turn = rotation_from_rpy(math.pi / 2, 0.0, 0.0)
+    item = flexible_object(
+        [trunk, Segment("a", 0.2, 0.1, 0.01, links=2, parent="P", parent_link_index=0, rest_rotation=turn)]
+    )
     joint = item.mechanism.joints[item.mechanism.joint_index("a_0_x")]
-    assert item.mechanism.joint_names[joint.parent] == "P_0_z"
+    assert item.mechanism.joint_names[joint.parent_index] == "P_0_z"
     np.testing.assert_allclose(positions(item, ["w_a", "w_P"]), [[0, -0.2, 0.2], [0, 0, 0.6]], atol=1e-15)
 
 
 def test_another_order_of_turns():
-    item = flexible_object([Segment("A", 1.0, 1.0, 0.1, links=1, joint_order="zyx")])
+    item = flexible_object([Segment("A", 1.0, 1.0, 0.1, links=1, joint_axes="zyx")])
     assert item.mechanism.joint_names == ("A_0_z", "A_0_y", "A_0_x")
     assert [bool(joint.bodies) for joint in item.mechanism.joints] == [False, False, True]
 
 
 def test_a_flat_beam_that_bends_one_way():
     beam = Segment(
-        "B", 0.6, 0.3, links=3, section=(0.001, 0.08), joint_order="y", bend=1.2, rigidity=True, clamped=True
+        "B",
+        0.6,
+        0.3,
+        links=3,
+        cross_section=(0.001, 0.08),
+        joint_axes="y",
+        bend=1.2,
+        stiffness_per_curvature=True,
+        clamped_at_base=True,
     )
     item = flexible_object([beam])
     assert item.mechanism.joint_names == ("B_0_y", "B_1_y", "B_2_y")
-    assert {spring.axis for spring in item.elastic} == {"y"}
+    assert {spring.axis for spring in item.elastic_joints} == {"y"}
     assert [stiffness(item)[f"B_{i}_y"][0] for i in range(3)] == pytest.approx([2 * 1.2 / 0.2, 1.2 / 0.2, 1.2 / 0.2])
     x, y, z = 0.001**2 / 12, 0.08**2 / 12, 0.2**2 / 12
-    for joint in item.mechanism.numeric().joints:
-        np.testing.assert_allclose(numbers(joint.bodies[0].about_com), 0.1 * np.diag([y + z, x + z, x + y]))
-    layout = item.segment("B")
+    for joint in item.mechanism.with_numeric_values().joints:
+        np.testing.assert_allclose(numbers(joint.bodies[0].inertia_about_com), 0.1 * np.diag([y + z, x + z, x + y]))
+    layout = item.segment_layout("B")
     assert numbers(layout.radius, item.mechanism.parameters).item() == pytest.approx(math.hypot(0.001, 0.08) / 2)
 
 
@@ -111,8 +121,8 @@ def test_polyline_is_reproduced_by_forward_kinematics(seed, count):
     start *= np.sign(np.linalg.det(start))
     first, *later = polyline_rotations(vertices, start)
     lengths = np.linalg.norm(np.diff(vertices, axis=0), axis=1)
-    segment = Segment("C", 0.0, 1.0, 0.01, link_lengths=lengths, rotation=first, link_rotations=later)
-    item = flexible_object([segment], foot=transform(start, vertices[0]))
+    segment = Segment("C", 0.0, 1.0, 0.01, link_lengths=lengths, rest_rotation=first, link_rest_rotations=later)
+    item = flexible_object([segment], root_placement=homogeneous_transform(start, vertices[0]))
     tips = positions(item, [f"C_{i}_tip" for i in range(len(lengths))])
     np.testing.assert_allclose(tips, vertices[1:], atol=1e-9)
 
@@ -138,11 +148,11 @@ def test_polyline_turns_the_shortest_way():
 def test_inertia_is_physical_for_every_theta(length, mass, radius, links, unequal, seed):
     shares = np.random.default_rng(seed).uniform(0.2, 1.0, links) if unequal else None
     item = flexible_object([Segment("C", 1.0, 1.0, 0.1, links=links, link_lengths=shares)])
-    numeric = item.mechanism.numeric({"C.length": length, "C.mass": mass, "C.radius": radius})
+    numeric = item.mechanism.with_numeric_values({"C.length": length, "C.mass": mass, "C.radius": radius})
     bodies = [body for joint in numeric.joints for body in joint.bodies]
     assert sum(float(body.mass) for body in bodies) == pytest.approx(mass)
     for body in bodies:
-        tensor = numbers(body.about_com)
+        tensor = numbers(body.inertia_about_com)
         np.testing.assert_array_equal(tensor, tensor.T)
         moments = np.linalg.eigvalsh(tensor)
         assert moments[0] > 0
@@ -188,7 +198,7 @@ def test_negative_stiffness_is_refused():
 
 def test_unknown_segment_has_a_near_name():
     with pytest.raises(ModelError, match="did you mean 'T1'"):
-        y_object().segment("T11")
+        y_object().segment_layout("T11")
 
 
 @pytest.mark.parametrize(

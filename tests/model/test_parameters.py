@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from yid_ocp.errors import ConfigError, ModelError, YidError, choices, nearest
+from yid_ocp.errors import ConfigError, ModelError, YidError, nearest_name_hint, unknown_name_details
 from yid_ocp.model import Parameter, Parameters
 
 NUMBERS = st.floats(-1e6, 1e6, allow_nan=False)
@@ -49,7 +49,7 @@ def test_changed_sets_keep_order_and_symbols(three):
     assert (changed["T1.bend"].value, changed["T1.bend"].lower, changed["T1.bend"].upper) == (5.0, 1.0, 6.0)
     assert three["T1.bend"].value == 3.0
     assert ca.is_equal(changed["T1.bend"].symbol, three["T1.bend"].symbol)
-    more = three.joined([Parameter("a", 1.0, "1")], [Parameter("b", 2.0, "1")])
+    more = three.with_added([Parameter("a", 1.0, "1")], [Parameter("b", 2.0, "1")])
     assert more.names == (*three.names, "a", "b")
 
 
@@ -80,7 +80,7 @@ def test_vector_is_a_round_trip(values, data):
         (lambda p: p.with_bounds({"T1.bend": (4.0, 5.0)}), ["T1.bend = 3 N m/rad", "4 to 5"]),
         (lambda p: p.with_bounds({"bend": (4.0, 5.0)}), ["'bend'"]),
         (lambda p: p.bounds(["T2.bend"]), ["'T2.bend'", "'T1.bend'"]),
-        (lambda p: p.joined([Parameter("T1.bend", 1.0, "1")]), ["named twice", "T1.bend"]),
+        (lambda p: p.with_added([Parameter("T1.bend", 1.0, "1")]), ["named twice", "T1.bend"]),
         (lambda p: Parameter("x", math.inf, "1"), ["x = inf"]),
         (lambda p: Parameter("x", 1.0, "1", lower=2.0), ["x = 1 1", "2 to inf"]),
     ],
@@ -101,21 +101,21 @@ def test_an_error_has_its_parts_on_lines_of_their_own():
 
 
 def test_nearest_name():
-    assert nearest("left_s3", ["left_s0", "head"]) == "did you mean 'left_s0'?"
-    assert nearest("zzz", ["b", "a"]) == "known: a, b"
-    assert nearest("zzz", []) == "known: none"
-    assert nearest("W_t1", ["w_T2", "w_T1"]) == "did you mean 'w_T1'?"
+    assert nearest_name_hint("left_s3", ["left_s0", "head"]) == "did you mean 'left_s0'?"
+    assert nearest_name_hint("zzz", ["b", "a"]) == "known: a, b"
+    assert nearest_name_hint("zzz", []) == "known: none"
+    assert nearest_name_hint("W_t1", ["w_T2", "w_T1"]) == "did you mean 'w_T1'?"
 
 
 def test_names_are_listed_once_and_long_lists_are_cut():
     few, many, more = ["b", "a"], [f"joint_{i}" for i in range(30)], [f"frame_{i}" for i in range(70)]
-    assert choices("zzz", few) == {"allowed": "b, a", "hint": ""}
-    assert choices("zzz", []) == {"allowed": "none", "hint": ""}
+    assert unknown_name_details("zzz", few) == {"allowed": "b, a", "hint": ""}
+    assert unknown_name_details("zzz", []) == {"allowed": "none", "hint": ""}
     # nothing is near: all of them, for somebody who looks for a name
-    assert choices("zzz", many) == {"allowed": ", ".join(many), "hint": ""}
-    said = choices("joint_7x", many)
+    assert unknown_name_details("zzz", many) == {"allowed": ", ".join(many), "hint": ""}
+    said = unknown_name_details("joint_7x", many)
     assert said["hint"] == "did you mean 'joint_7'?"
     assert said["allowed"].startswith("joint_7, ")
     assert said["allowed"].endswith(" and 22 more")
-    assert choices("zzz", more)["allowed"] == ", ".join(more[:8]) + " and 62 more"
-    assert nearest("zzz", more).count("frame_") == 8
+    assert unknown_name_details("zzz", more)["allowed"] == ", ".join(more[:8]) + " and 62 more"
+    assert nearest_name_hint("zzz", more).count("frame_") == 8

@@ -10,25 +10,25 @@ import pytest
 
 from yid_ocp.errors import ModelError
 from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object, forward_kinematics
-from yid_ocp.model.cable import Cable, cable_system
-from yid_ocp.model.rotations import roll_pitch_yaw, transform
+from yid_ocp.model.cable import CableTopology, cable_system
+from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 
 
 def branched(links=4, **more):
     return flexible_object(
         (
             Segment("T1", 0.8, 0.08, 0.03, links, **more),
-            Segment("T2", 0.5, 0.04, 0.01, links, parent="T1", rotation=roll_pitch_yaw(-0.8, 0.0, 0.0)),
+            Segment("T2", 0.5, 0.04, 0.01, links, parent="T1", rest_rotation=rotation_from_rpy(-0.8, 0.0, 0.0)),
         ),
-        transform(np.eye(3), [0.1, 0.2, 0.3]),
+        homogeneous_transform(np.eye(3), [0.1, 0.2, 0.3]),
     )
 
 
 def places(tree: Mechanism, names, q=None, values=None):
     """Poses (4, 4) of frames at a configuration."""
     q = np.zeros(len(tree.joints)) if q is None else q
-    kinematics = forward_kinematics(tree.numeric(values), ca.SX(ca.DM(q)))
-    return [np.array(ca.DM(kinematics.pose(name).matrix())) for name in names]
+    kinematics = forward_kinematics(tree.with_numeric_values(values), ca.SX(ca.DM(q)))
+    return [np.array(ca.DM(kinematics.frame_pose(name).homogeneous_matrix())) for name in names]
 
 
 def bent(tree: Mechanism):
@@ -81,11 +81,11 @@ def test_points_stay_when_the_tree_is_put_together():
     """On a robot, after another joint was inserted before it, and with numbers for its parameters."""
     base = flexible_object([Segment("B", 0.3, 0.1, 0.01, 2)]).mechanism
     base = replace(base, frames={name: frame for name, frame in base.frames.items() if name != "object_root"})
-    tree = base.joined(branched().mechanism, "B:50%", transform(np.eye(3), [1.0, 0.0, 0.0]))
+    tree = base.with_mechanism(branched().mechanism, "B:50%", homogeneous_transform(np.eye(3), [1.0, 0.0, 0.0]))
     found = places(tree, ["B:50%", "T1:40%"])
     np.testing.assert_allclose(found[0][:3, 3], [0.0, 0.0, 0.15], atol=1e-12)
     np.testing.assert_allclose(found[1][:3, 3], [1.1, 0.2, 0.15 + 0.3 + 0.32], atol=1e-12)
-    more = tree.inserted(2, [replace(tree.joints[0], name="extra")])
+    more = tree.with_inserted_joints(2, [replace(tree.joints[0], name="extra")])
     [again] = places(more, ["T1:40%"])
     np.testing.assert_allclose(again, found[1], atol=1e-12)
 
@@ -96,20 +96,20 @@ def test_a_grasp_holds_a_point_along_a_segment():
         system = System.build(
             None, objects=[(branched(links), None, None)], grasps=[Grasp("hand", "object_root", "T1:40%")]
         )
-        q = ca.SX(ca.DM(np.zeros(system.size)))
-        gap = system.grasps[0].residual(forward_kinematics(system.mechanism.numeric(), q))
+        q = ca.SX(ca.DM(np.zeros(system.n_coordinates)))
+        gap = system.grasps[0].constraint_residual(forward_kinematics(system.mechanism.with_numeric_values(), q))
         assert np.linalg.norm(np.array(ca.DM(gap))) == pytest.approx(0.32)
 
 
 def test_sensors_may_see_it():
-    system = System.build(None, objects=[(branched(), None, None)], points=["w_T1", "T2:30%"])
-    assert system.points == ("w_T1", "T2:30%")
+    system = System.build(None, objects=[(branched(), None, None)], point_frames=["w_T1", "T2:30%"])
+    assert system.point_frames == ("w_T1", "T2:30%")
 
 
 def test_a_cable_is_counted_from_clamp_to_clamp():
     parent = ("a", "b", "c", "d", "e")
     shape = {name: [0.1 * i, 0.0, 0.0] for i, name in enumerate(parent)} | {"f": [0.2, 0.0, 0.1]}
-    cable = Cable(parent, {"child": ("c", "f")}, shape)
+    cable = CableTopology(parent, {"child": ("c", "f")}, shape)
     tree = cable_system(dict.fromkeys(cable.edges, 0.1), cable).mechanism
     along = places(tree, ["parent:0%", "parent:12.5%", "parent:25%", "parent:50%", "parent:100%", "child:50%"])
     a, b, c, e, f = places(tree, ["a", "b", "c", "e", "f"])

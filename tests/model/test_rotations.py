@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from yid_ocp.model.rotations import (
-    about_axis,
-    angles_of,
-    roll_pitch_yaw,
-    snapped,
-    symbolic_roll_pitch_yaw,
-    transform,
-    turn,
+    axis_angle_rotation,
+    homogeneous_transform,
+    rotation_from_rpy,
+    rpy_from_rotation,
+    snap_to_unit_entries,
+    symbolic_axis_rotation,
+    symbolic_rotation_from_rpy,
 )
 
 ANGLES = st.floats(-math.pi, math.pi)
@@ -32,8 +32,10 @@ def numbers(expression: ca.SX) -> np.ndarray:
 @given(axis=AXES, angle=ANGLES)
 def test_a_turn_about_an_axis(axis, angle):
     expected = Rotation.from_rotvec(angle * np.array(axis)).as_matrix()
-    np.testing.assert_allclose(turn(axis, math.sin(angle), math.cos(angle)), expected, rtol=0, atol=1e-14)
-    symbolic = about_axis(axis, ca.SX(angle))
+    np.testing.assert_allclose(
+        axis_angle_rotation(axis, math.sin(angle), math.cos(angle)), expected, rtol=0, atol=1e-14
+    )
+    symbolic = symbolic_axis_rotation(axis, ca.SX(angle))
     assert symbolic.is_dense()
     np.testing.assert_allclose(numbers(symbolic), expected, rtol=0, atol=1e-14)
 
@@ -41,35 +43,35 @@ def test_a_turn_about_an_axis(axis, angle):
 @given(roll=ANGLES, pitch=ANGLES, yaw=ANGLES)
 def test_roll_pitch_yaw(roll, pitch, yaw):
     expected = Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()
-    np.testing.assert_allclose(roll_pitch_yaw(roll, pitch, yaw), expected, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(rotation_from_rpy(roll, pitch, yaw), expected, rtol=0, atol=1e-14)
     symbols = [ca.SX(value) for value in (roll, pitch, yaw)]
-    np.testing.assert_allclose(numbers(symbolic_roll_pitch_yaw(*symbols)), expected, rtol=0, atol=1e-14)
-    level = symbolic_roll_pitch_yaw(symbols[0], symbols[1])
-    np.testing.assert_allclose(numbers(level), roll_pitch_yaw(roll, pitch, 0.0), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(numbers(symbolic_rotation_from_rpy(*symbols)), expected, rtol=0, atol=1e-14)
+    level = symbolic_rotation_from_rpy(symbols[0], symbols[1])
+    np.testing.assert_allclose(numbers(level), rotation_from_rpy(roll, pitch, 0.0), rtol=0, atol=1e-14)
 
 
 @given(roll=ANGLES, pitch=st.one_of(ANGLES, st.just(math.pi / 2), st.just(-math.pi / 2)), yaw=ANGLES)
 def test_angles_of_a_rotation_give_it_back(roll, pitch, yaw):
-    rotation = roll_pitch_yaw(roll, pitch, yaw)
-    found = angles_of(rotation)
+    rotation = rotation_from_rpy(roll, pitch, yaw)
+    found = rpy_from_rotation(rotation)
     assert abs(found[1]) <= math.pi / 2
-    np.testing.assert_allclose(roll_pitch_yaw(*found), rotation, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(rotation_from_rpy(*found), rotation, rtol=0, atol=1e-14)
 
 
 def test_a_turn_about_a_coordinate_axis_keeps_exact_zeros():
     """The step's equations stay small because products with these zeros vanish."""
-    matrix = about_axis((0.0, -1.0, 0.0), ca.SX.sym("angle"))
+    matrix = symbolic_axis_rotation((0.0, -1.0, 0.0), ca.SX.sym("angle"))
     assert [i for i in range(9) if matrix[i].is_zero()] == [1, 3, 5, 7]
     assert matrix[4].is_one()
 
 
 def test_entries_next_to_0_and_1_are_meant_to_be_these():
     matrix = np.array([[1 - 1e-12, 1e-12, -1 + 1e-12], [1 + 1e-10, 0.5, -1e-10]])
-    rounded = snapped(matrix)
+    rounded = snap_to_unit_entries(matrix)
     np.testing.assert_array_equal(rounded, [[1.0, 0.0, -1.0], [1 + 1e-10, 0.5, -1e-10]])
     assert matrix[0, 0] != 1.0
 
 
 def test_a_transform_turns_then_moves():
-    matrix = transform(roll_pitch_yaw(0.0, 0.0, math.pi / 2), [1.0, 2.0, 3.0])
+    matrix = homogeneous_transform(rotation_from_rpy(0.0, 0.0, math.pi / 2), [1.0, 2.0, 3.0])
     np.testing.assert_allclose(matrix @ [1.0, 0.0, 0.0, 1.0], [1.0, 3.0, 3.0, 1.0], atol=1e-15)

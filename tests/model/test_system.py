@@ -15,13 +15,13 @@ from yid_ocp.model import (
     Parameter,
     Parameters,
     Segment,
+    StepTerms,
     System,
-    Terms,
     flexible_object,
     forward_kinematics,
 )
-from yid_ocp.model.mechanism import merged
-from yid_ocp.model.rotations import roll_pitch_yaw
+from yid_ocp.model.mechanism import merge_bodies
+from yid_ocp.model.rotations import rotation_from_rpy
 from yid_ocp.model.system import floating_clamp
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.model.y_object import y_object
@@ -38,8 +38,8 @@ def robot(urdf_folder):
 
 def test_sizes_of_the_paper_systems(single_arm, dual_arm):
     alone = System.build(objects=[(y_object(), None, None)])
-    assert [system.size for system in (alone, single_arm, dual_arm)] == [36, 43, 50]
-    assert [system.constraint_count for system in (alone, single_arm, dual_arm)] == [0, 3, 6]
+    assert [system.n_coordinates for system in (alone, single_arm, dual_arm)] == [36, 43, 50]
+    assert [system.n_constraints for system in (alone, single_arm, dual_arm)] == [0, 3, 6]
     assert [len(system.driven) for system in (alone, single_arm, dual_arm)] == [0, 7, 14]
 
 
@@ -48,11 +48,11 @@ def test_configuration_order_of_the_paper(dual_arm):
     sides = [name.split("_")[0] for name in names]
     assert sides == ["left"] * 7 + ["right"] * 7 + ["T1"] * 12 + ["T2"] * 12 + ["T3"] * 12
     assert names[:3] == ("left_s0", "left_s1", "left_e0")
-    assert dual_arm.points == ("w_T1", "w_T2", "w_T3")
+    assert dual_arm.point_frames == ("w_T1", "w_T2", "w_T3")
     assert dual_arm.driven_indices == tuple(range(14))
     assert dual_arm.free_indices == tuple(range(50))
-    assert [segment.name for segment in dual_arm.segments] == ["T1", "T2", "T3"]
-    assert dual_arm.segment("T2").parent == "T1"
+    assert [segment.name for segment in dual_arm.segment_layouts] == ["T1", "T2", "T3"]
+    assert dual_arm.segment_layout("T2").parent_segment == "T1"
 
 
 def test_parameters_of_all_parts(single_arm):
@@ -67,7 +67,7 @@ def test_forces_and_energy(robot):
     cable = flexible_object([Segment("C", 0.5, 0.1, 0.01, links=1, bend=2.0, twist=3.0, damping=0.1)])
     objects = [(cable, "tool", None)]
     system = System.build(robot, objects=objects, driven=["swing", "spin"], damping={"slide": 0.7})
-    theta, n = system.parameters.vector(), system.size
+    theta, n = system.parameters.vector(), system.n_coordinates
     x, u = ca.SX.sym("x", n), ca.SX.sym("u", 2)
     outputs = [system.viscous_force(x), system.input_force(u, x, x), system.elastic_energy(x)]
     viscous, driven, energy = ca.Function("f", [x, u, system.parameters.symbols], outputs)(
@@ -89,18 +89,18 @@ def test_forces_and_energy(robot):
 @pytest.mark.parametrize(("kind", "count"), [("point", 3), ("axis", 5), ("weld", 6)])
 def test_grasp_equations(kind, count):
     """Zero where holder, turned and offset, meets the held frame; linear in small displacements."""
-    tree = floating_clamp("one").joined(floating_clamp("two"))
-    turn = roll_pitch_yaw(0.3, -0.5, 0.9)
-    grasp = Grasp("g", "one", "two", kind, ca.SX(ca.DM(turn)), ca.SX(ca.DM([0.1, 0.2, 0.3])), slip=ca.SX(0.05))
+    tree = floating_clamp("one").with_mechanism(floating_clamp("two"))
+    turn = rotation_from_rpy(0.3, -0.5, 0.9)
+    grasp = Grasp("g", "one", "two", kind, ca.SX(ca.DM(turn)), ca.SX(ca.DM([0.1, 0.2, 0.3])), axial_slip=ca.SX(0.05))
     system = System.build(tree, grasps=[grasp])
-    assert grasp.equations == system.constraint_count == count
+    assert grasp.n_equations == system.n_constraints == count
     # `two` turned as Rx Ry Rz, its origin 0.05 m ahead of the grasped point along its own z
     ry = np.arcsin(turn[0, 2])
     angles = [np.arctan2(-turn[1, 2], turn[2, 2]), ry, np.arctan2(-turn[0, 1], turn[0, 0])]
     q = np.concatenate([np.zeros(6), np.array([0.1, 0.2, 0.3]) + 0.05 * turn[:, 2], angles])
 
     def residual(q):
-        return numbers(system.constraints(forward_kinematics(tree, ca.SX(ca.DM(q))))).ravel()
+        return numbers(system.constraint_residual(forward_kinematics(tree, ca.SX(ca.DM(q))))).ravel()
 
     np.testing.assert_allclose(residual(q), 0.0, atol=1e-15)
     shifted = q.copy()
@@ -131,7 +131,7 @@ class Heavier:
         return replace(system, gravity=system.gravity * (1 + self.parameters.symbols[0]))
 
     def terms(self, state):
-        return Terms()
+        return StepTerms()
 
     def measure(self, channel, output, state):
         return output
@@ -153,8 +153,8 @@ def test_effects_are_appended(robot):
 
 
 def test_points_may_be_chosen(robot):
-    assert System.build(robot, points=["tool", "nose"]).points == ("tool", "nose")
-    assert System.build(robot).points == ()
+    assert System.build(robot, point_frames=["tool", "nose"]).point_frames == ("tool", "nose")
+    assert System.build(robot).point_frames == ()
 
 
 WRONG = {
@@ -168,11 +168,11 @@ WRONG = {
     "holder": (lambda robot: System.build(robot, grasps=[Grasp("g", "tol", "nose")]), ["'tol'", "'tool'"]),
     "held": (lambda robot: System.build(robot, grasps=[Grasp("g", "tool", "noses")]), ["'noses'", "'nose'"]),
     "grasp_twice": (lambda robot: System.build(robot, grasps=[Grasp("g", "tool", "nose")] * 2), ["'g'", "grasps"]),
-    "point": (lambda robot: System.build(robot, points=["w_T1"]), ["'w_T1'"]),
+    "point": (lambda robot: System.build(robot, point_frames=["w_T1"]), ["'w_T1'"]),
     "gravity": (lambda robot: System.build(robot, gravity=[9.81]), ["gravity", "three numbers"]),
     "frame": (lambda robot: System.build(robot, objects=[(y_object(), "rotr", None)]), ["'rotr'", "'rotor'"]),
     "objects": (lambda robot: System.build(objects=[(y_object(), None, None)] * 2), ["two parts", "'T1_0_tip'"]),
-    "segment": (lambda robot: System.build(robot).segment("T1"), ["segment 'T1'"]),
+    "segment": (lambda robot: System.build(robot).segment_layout("T1"), ["segment 'T1'"]),
 }
 
 
@@ -194,7 +194,7 @@ def test_a_clamp_has_six_massless_coordinates():
     clamp = floating_clamp("hand", frame="palm")
     assert clamp.joint_names == ("hand_x", "hand_y", "hand_z", "hand_rx", "hand_ry", "hand_rz")
     assert [j.kind for j in clamp.joints] == ["prismatic"] * 3 + ["revolute"] * 3
-    assert clamp.parents == (-1, 0, 1, 2, 3, 4)
-    assert all(merged(j.bodies) is None for j in clamp.joints)
-    assert clamp.frame("palm").joint == 5
-    assert floating_clamp("hand").frame("hand").joint == 5
+    assert clamp.parent_indices == (-1, 0, 1, 2, 3, 4)
+    assert all(merge_bodies(j.bodies) is None for j in clamp.joints)
+    assert clamp.frame("palm").joint_index == 5
+    assert floating_clamp("hand").frame("hand").joint_index == 5

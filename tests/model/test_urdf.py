@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from yid_ocp.errors import ModelError
 from yid_ocp.model import Mechanism
 from yid_ocp.model import urdf as urdf_files
-from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, merged
-from yid_ocp.model.rotations import roll_pitch_yaw, transform
+from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, merge_bodies
+from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.system import floating_clamp
-from yid_ocp.model.urdf import read_urdf, robot_file, urdf_text
+from yid_ocp.model.urdf import mechanism_to_urdf, read_urdf, resolve_urdf_path
 from yid_ocp.model.y_object import y_object
 
 LINK = '<link name="{name}"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
@@ -54,25 +54,29 @@ def numbers(expression) -> np.ndarray:
 
 
 def assert_equal_mechanisms(one, two, tolerance=1e-12):
-    one, two = one.numeric(), two.numeric()
+    one, two = one.with_numeric_values(), two.with_numeric_values()
     assert one.joint_names == two.joint_names
     assert set(one.frames) <= set(two.frames)
     for a, b in zip(one.joints, two.joints, strict=True):
-        assert (a.kind, a.parent) == (b.kind, b.parent)
-        for key in ("lower", "upper", "effort_limit", "velocity_limit"):
+        assert (a.kind, a.parent_index) == (b.kind, b.parent_index)
+        for key in ("lower_limit", "upper_limit", "effort_limit", "velocity_limit"):
             assert getattr(a, key) == getattr(b, key)
         np.testing.assert_allclose(a.axis, b.axis, rtol=0, atol=tolerance)
-        pairs = [(a.placement.matrix(), b.placement.matrix())]
-        body, other = merged(a.bodies), merged(b.bodies)
+        pairs = [(a.placement.homogeneous_matrix(), b.placement.homogeneous_matrix())]
+        body, other = merge_bodies(a.bodies), merge_bodies(b.bodies)
         assert (body is None) == (other is None)
         if body is not None and other is not None:
-            pairs += [(body.mass, other.mass), (body.com, other.com), (body.about_com, other.about_com)]
+            pairs += [
+                (body.mass, other.mass),
+                (body.center_of_mass, other.center_of_mass),
+                (body.inertia_about_com, other.inertia_about_com),
+            ]
         for x, y in pairs:
             np.testing.assert_allclose(numbers(x), numbers(y), rtol=tolerance, atol=tolerance)
     for name, frame in one.frames.items():
-        assert frame.joint == two.frames[name].joint
-        expected = numbers(two.frames[name].placement.matrix())
-        np.testing.assert_allclose(numbers(frame.placement.matrix()), expected, rtol=0, atol=tolerance)
+        assert frame.joint_index == two.frames[name].joint_index
+        expected = numbers(two.frames[name].placement.homogeneous_matrix())
+        np.testing.assert_allclose(numbers(frame.placement.homogeneous_matrix()), expected, rtol=0, atol=tolerance)
 
 
 def test_kept_joints_in_the_order_given(urdf_folder):
@@ -80,19 +84,24 @@ def test_kept_joints_in_the_order_given(urdf_folder):
     robot = read_urdf(urdf_folder / "mixed_joints.urdf", joints=names)
     # parents come first, the rest as given
     assert robot.joint_names == ("slide", "swing", "nod", "spin")
-    assert robot.parents == (-1, 0, 1, 0)
+    assert robot.parent_indices == (-1, 0, 1, 0)
     assert robot.name == "mixed_joints"
-    assert robot.ancestors(robot.joint_index("nod")) == (0, 1, 2)
-    assert robot.ancestors(-1) == ()
+    assert robot.ancestor_joints(robot.joint_index("nod")) == (0, 1, 2)
+    assert robot.ancestor_joints(-1) == ()
 
 
 def test_limits_and_kinds(urdf_folder):
     robot = read_urdf(urdf_folder / "mixed_joints.urdf")
     by_name = dict(zip(robot.joint_names, robot.joints, strict=True))
     slide, spin = by_name["slide"], by_name["spin"]
-    assert (slide.kind, slide.unit, slide.lower, slide.upper) == ("prismatic", "m", -0.4, 0.6)
+    assert (slide.kind, slide.coordinate_unit, slide.lower_limit, slide.upper_limit) == ("prismatic", "m", -0.4, 0.6)
     assert (slide.effort_limit, slide.velocity_limit) == (120.0, 0.8)
-    assert (spin.kind, spin.unit, spin.lower, spin.upper) == ("revolute", "rad", -math.inf, math.inf)
+    assert (spin.kind, spin.coordinate_unit, spin.lower_limit, spin.upper_limit) == (
+        "revolute",
+        "rad",
+        -math.inf,
+        math.inf,
+    )
     assert (spin.effort_limit, spin.velocity_limit) == (30.0, 6.0)
     np.testing.assert_allclose(slide.axis, [1 / 3, 2 / 3, 2 / 3], rtol=1e-15)
 
@@ -103,9 +112,11 @@ def test_mass_parameters_scale_what_a_joint_carries(urdf_folder):
     # rotor, bracket, fork and finger; lever and nose
     assert robot.parameters["spin.mass"].value == pytest.approx(0.9 + 0.35 + 0.6)
     assert robot.parameters["swing.mass"].value == pytest.approx(0.8 + 0.25)
-    nominal, heavy = robot.numeric().joints[0], robot.numeric({"spin.mass": 2 * 1.85}).joints[0]
-    np.testing.assert_allclose(numbers(heavy.bodies[0].about_com), 2 * numbers(nominal.bodies[0].about_com))
-    np.testing.assert_allclose(numbers(heavy.bodies[0].com), numbers(nominal.bodies[0].com))
+    nominal, heavy = robot.with_numeric_values().joints[0], robot.with_numeric_values({"spin.mass": 2 * 1.85}).joints[0]
+    np.testing.assert_allclose(
+        numbers(heavy.bodies[0].inertia_about_com), 2 * numbers(nominal.bodies[0].inertia_about_com)
+    )
+    np.testing.assert_allclose(numbers(heavy.bodies[0].center_of_mass), numbers(nominal.bodies[0].center_of_mass))
     plain = read_urdf(urdf_folder / "mixed_joints.urdf", parametric=False)
     assert len(plain.parameters) == 0
 
@@ -120,11 +131,11 @@ def test_a_locked_joint_stands_at_its_value_or_within_its_range(urdf_folder):
     assert fixed.joint_names == ("spin",)
     from yid_ocp.model import forward_kinematics
 
-    long = forward_kinematics(whole.numeric(), ca.SX(ca.DM(q)))
-    short = forward_kinematics(fixed.numeric(), ca.SX(ca.DM([0.0])))
+    long = forward_kinematics(whole.with_numeric_values(), ca.SX(ca.DM(q)))
+    short = forward_kinematics(fixed.with_numeric_values(), ca.SX(ca.DM([0.0])))
     for frame in ("nose", "tool", "lever", "ground"):
-        expected = numbers(long.pose(frame).matrix())
-        np.testing.assert_allclose(numbers(short.pose(frame).matrix()), expected, atol=1e-14)
+        expected = numbers(long.frame_pose(frame).homogeneous_matrix())
+        np.testing.assert_allclose(numbers(short.frame_pose(frame).homogeneous_matrix()), expected, atol=1e-14)
 
 
 @pytest.mark.parametrize("robot", ["package:baxter", "package:panda", "package:ur5", "mixed_joints", "turntable"])
@@ -132,7 +143,7 @@ def test_urdf_round_trip(robot, urdf_folder, tmp_path):
     source = robot if robot.startswith("package:") else urdf_folder / f"{robot}.urdf"
     mechanism = read_urdf(source)
     path = tmp_path / "again.urdf"
-    path.write_text(urdf_text(mechanism), encoding="utf-8")
+    path.write_text(mechanism_to_urdf(mechanism), encoding="utf-8")
     again = read_urdf(path, parametric=False)
     assert_equal_mechanisms(mechanism, again)
     assert again.name == mechanism.name
@@ -142,40 +153,40 @@ def test_round_trip_of_changed_parameters(tmp_path):
     mechanism = y_object().mechanism
     values = {"T1.length": 1.0, "T2.mass": 0.1, "T3.radius": 0.03}
     path = tmp_path / "y.urdf"
-    path.write_text(urdf_text(mechanism, values), encoding="utf-8")
-    assert_equal_mechanisms(mechanism.numeric(values), read_urdf(path, parametric=False))
+    path.write_text(mechanism_to_urdf(mechanism, values), encoding="utf-8")
+    assert_equal_mechanisms(mechanism.with_numeric_values(values), read_urdf(path, parametric=False))
 
 
 def test_round_trip_with_names_that_clash_and_half_open_ranges(tmp_path):
     """A frame called like the link that the writer would make, a joint called like its fixed joint."""
-    body = (Inertia.of(1.0, [0, 0, 0.1], np.eye(3)),)
-    shifted = Placement.of(transform(np.eye(3), [0.0, 0.0, 0.5]))
+    body = (Inertia.from_values(1.0, [0, 0, 0.1], np.eye(3)),)
+    shifted = Placement.from_matrix(homogeneous_transform(np.eye(3), [0.0, 0.0, 0.5]))
     joints = (
-        Joint("a", "revolute", -1, shifted, (0.0, 0.0, 1.0), body, lower=-1.0),
+        Joint("a", "revolute", -1, shifted, (0.0, 0.0, 1.0), body, lower_limit=-1.0),
         Joint("b_fixed", "prismatic", 0, shifted, (0.0, 1.0, 0.0), body, effort_limit=5e4),
     )
     frames = {"a_link": Frame(1, shifted), "world": Frame(0, shifted), "b": Frame(-1, shifted)}
     mechanism = Mechanism("clash", joints, frames)
     path = tmp_path / "clash.urdf"
-    path.write_text(urdf_text(mechanism), encoding="utf-8")
+    path.write_text(mechanism_to_urdf(mechanism), encoding="utf-8")
     assert_equal_mechanisms(mechanism, read_urdf(path, parametric=False))
 
 
 @given(roll=ANGLES, pitch=st.one_of(ANGLES, st.floats(-1e-6, 1e-6).map(lambda x: math.pi / 2 - abs(x))), yaw=ANGLES)
 def test_any_orientation_survives_the_round_trip(tmp_path_factory, roll, pitch, yaw):
-    placement = Placement.of(transform(roll_pitch_yaw(roll, pitch, yaw), [0.1, -0.2, 0.3]))
+    placement = Placement.from_matrix(homogeneous_transform(rotation_from_rpy(roll, pitch, yaw), [0.1, -0.2, 0.3]))
     mechanism = Mechanism("one", (Joint("j", "revolute", -1, placement, (0.0, 0.0, 1.0)),), {})
     path = tmp_path_factory.mktemp("urdf") / "one.urdf"
-    path.write_text(urdf_text(mechanism), encoding="utf-8")
+    path.write_text(mechanism_to_urdf(mechanism), encoding="utf-8")
     assert_equal_mechanisms(mechanism, read_urdf(path, parametric=False))
 
 
 def test_a_point_mass_needs_no_inertia(tmp_path):
     point = '<link name="b"><inertial><mass value="2"/></inertial></link>'
     path = urdf(tmp_path, link("a"), point, joint("j", "a", "b"))
-    body = read_urdf(path).numeric().joints[0].bodies[0]
+    body = read_urdf(path).with_numeric_values().joints[0].bodies[0]
     assert float(body.mass) == 2.0
-    np.testing.assert_array_equal(numbers(body.about_com), np.zeros((3, 3)))
+    np.testing.assert_array_equal(numbers(body.inertia_about_com), np.zeros((3, 3)))
 
 
 BROKEN = {
@@ -222,8 +233,8 @@ def test_a_broken_urdf_is_refused(name, tmp_path):
         (lambda path: read_urdf(path, joints=["bolt"]), ["movable joint 'bolt'"]),
         (lambda path: read_urdf(path).joint_index("slider"), ["'slider'", "'slide'", "mixed_joints"]),
         (lambda path: read_urdf(path).frame("tol"), ["frame 'tol'", "'tool'"]),
-        (lambda path: read_urdf(path).joined(read_urdf(path)), ["two parts", "'bracket'"]),
-        (lambda path: read_urdf(path).joined(floating_clamp("c"), "rotr"), ["'rotr'", "'rotor'"]),
+        (lambda path: read_urdf(path).with_mechanism(read_urdf(path)), ["two parts", "'bracket'"]),
+        (lambda path: read_urdf(path).with_mechanism(floating_clamp("c"), "rotr"), ["'rotr'", "'rotor'"]),
     ],
 )
 def test_errors_name_what_is_wrong_and_what_is_near(urdf_folder, action, words):
@@ -244,7 +255,7 @@ def test_a_tool_that_is_not_mounted_is_left_out(tmp_path):
     bare = read_urdf(path, exclude_links=["hand"])
     assert bare.joint_names == ("turn",)
     assert set(bare.frames) == {"base", "arm"}
-    assert float(bare.numeric().joints[0].bodies[0].mass) == 1.0
+    assert float(bare.with_numeric_values().joints[0].bodies[0].mass) == 1.0
     with pytest.raises(ModelError, match=r"(?s)no link 'hands' to leave out.*did you mean 'hand'"):
         read_urdf(path, exclude_links=["hands"])
     with pytest.raises(ModelError, match="joint 'grip' carries a link that is left out"):
@@ -310,7 +321,9 @@ def test_a_joint_that_follows_is_locked_where_its_leader_stands(tmp_path, caplog
     file = follower(tmp_path)
     assert read_urdf(file).joint_names == ("first",)
     assert "'second' follows 'first'" in caplog.text
-    pose = np.array(ca.DM(read_urdf(file, joints=(), locked={"first": 0.2}).frames["tip"].placement.matrix()))
+    pose = np.array(
+        ca.DM(read_urdf(file, joints=(), locked={"first": 0.2}).frames["tip"].placement.homogeneous_matrix())
+    )
     angle = 0.2 + (0.5 - 2 * 0.2)
     np.testing.assert_allclose(pose[:2, :2], [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
 
@@ -323,7 +336,7 @@ def test_a_joint_that_follows_cannot_be_chosen(tmp_path):
 
 
 def test_mechanisms_that_ship_with_the_package_are_found_by_name(urdf_folder) -> None:
-    assert robot_file("default:turntable.urdf").samefile(urdf_folder / "turntable.urdf")
+    assert resolve_urdf_path("default:turntable.urdf").samefile(urdf_folder / "turntable.urdf")
 
 
 def test_and_where_a_wheel_put_them(urdf_folder, tmp_path, monkeypatch) -> None:
@@ -334,6 +347,6 @@ def test_and_where_a_wheel_put_them(urdf_folder, tmp_path, monkeypatch) -> None:
     files = [Installed("../../../share/yid_ocp/urdf/turntable.urdf"), Installed("yid_ocp/cli.py")]
     monkeypatch.setattr(urdf_files, "__file__", str(tmp_path / "site-packages" / "yid_ocp" / "model" / "urdf.py"))
     monkeypatch.setattr(urdf_files.metadata, "files", {"yid-ocp": files}.__getitem__)
-    assert robot_file("default:turntable.urdf") == urdf_folder / "turntable.urdf"
+    assert resolve_urdf_path("default:turntable.urdf") == urdf_folder / "turntable.urdf"
     with pytest.raises(ModelError, match="no URDF"):
-        robot_file("default:cli.py")
+        resolve_urdf_path("default:cli.py")

@@ -10,7 +10,7 @@ from placed_frames import numbers, positions
 
 from yid_ocp.errors import OutputError
 from yid_ocp.model import flexible_object
-from yid_ocp.model.rotations import transform
+from yid_ocp.model.rotations import homogeneous_transform
 from yid_ocp.model.y_object import write_y_urdf, y_object, y_segments
 
 
@@ -21,9 +21,9 @@ def test_the_paper_y():
     assert names[:4] == ("T1_0_x", "T1_0_y", "T1_0_z", "T1_1_x")
     assert names[12:15] == ("T2_0_x", "T2_0_y", "T2_0_z")
     assert names[-1] == "T3_3_z"
-    assert item.mechanism.parents[12] == item.mechanism.parents[24] == 11
-    assert {s.kind for s in item.elastic if s.axis == "z"} == {"twist"}
-    assert {s.kind for s in item.elastic if s.axis != "z"} == {"bend"}
+    assert item.mechanism.parent_indices[12] == item.mechanism.parent_indices[24] == 11
+    assert {s.deformation for s in item.elastic_joints if s.axis == "z"} == {"twist"}
+    assert {s.deformation for s in item.elastic_joints if s.axis != "z"} == {"bend"}
     expected = {"T1": (0.813, 0.064, 0.032), "T2": (0.610, 0.015, 0.025), "T3": (0.737, 0.016, 0.019)}
     for name, numbers_ in expected.items():
         values = [item.mechanism.parameters[f"{name}.{key}"].value for key in ("length", "mass", "radius")]
@@ -40,7 +40,7 @@ def test_the_paper_y_stands_where_it_should():
     np.testing.assert_allclose(junction, foot + np.array([0, 0, 0.813]))
     np.testing.assert_allclose(left, junction + 0.610 * half * np.array([0, 1, 1]), atol=1e-15)
     np.testing.assert_allclose(right, junction + 0.737 * half * np.array([0, -1, 1]), atol=1e-15)
-    moved = flexible_object(y_segments(), transform(np.eye(3), [0.0, 0.0, 1.0]))
+    moved = flexible_object(y_segments(), homogeneous_transform(np.eye(3), [0.0, 0.0, 1.0]))
     np.testing.assert_allclose(positions(moved, ["w_T1"])[0], [0, 0, 1.813])
     assert flexible_object(y_segments()).mechanism.joint_names == item.mechanism.joint_names
 
@@ -55,9 +55,11 @@ def test_checked_in_urdf_is_what_the_generator_writes(urdf_folder, tmp_path):
 
 def test_a_share_of_the_weight_leaves_the_inertia_whole():
     whole, half = y_object(), y_object(gravity_fraction=0.5)
-    for a, b in zip(whole.mechanism.numeric().joints, half.mechanism.numeric().joints, strict=True):
+    for a, b in zip(
+        whole.mechanism.with_numeric_values().joints, half.mechanism.with_numeric_values().joints, strict=True
+    ):
         for body, light in zip(a.bodies, b.bodies, strict=True):
             assert float(light.mass) == float(body.mass)
-            np.testing.assert_array_equal(numbers(light.about_com), numbers(body.about_com))
+            np.testing.assert_array_equal(numbers(light.inertia_about_com), numbers(body.inertia_about_com))
             assert body.gravity_fraction is None
             assert float(light.gravity_fraction) == 0.5

@@ -11,22 +11,22 @@ from small_problems import pendulum_step, taken
 
 from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.errors import ConfigError, YidError
-from yid_ocp.planning.criteria import Precision, Separation
-from yid_ocp.planning.experiment import Experiment
-from yid_ocp.planning.improve import Search
-from yid_ocp.planning.information import informative
+from yid_ocp.planning.information_plan import plan_informative_motion
+from yid_ocp.planning.informative_motion_search import InformativeMotionSearch
+from yid_ocp.planning.optimality_criteria import DOptimality, EffectDiscrimination
 from yid_ocp.planning.options import PlanLimits, PlanOptions
-from yid_ocp.planning.rows import Values
+from yid_ocp.planning.plan_constraints import ValueWithJacobian
+from yid_ocp.planning.planned_experiment import PlannedExperiment
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 
 FREE = ("elbow.stiffness", "elbow.damping")
 OPTIONS = PlanOptions(
     goal="information",
     duration=1.0,
-    settle=0.4,
-    knots=4,
-    starts=2,
-    limits=PlanLimits(acceleration=15.0, spring_angle=1.0),
+    hold_duration=0.4,
+    n_spline_coefficients=4,
+    n_random_starts=2,
+    limits=PlanLimits(max_acceleration=15.0, max_spring_angle=1.0),
 )
 
 
@@ -49,7 +49,7 @@ def driven_problem(limited_urdf):
 
 @pytest.fixture(scope="module")
 def told(moved_problem):
-    return informative(moved_problem, OPTIONS)
+    return plan_informative_motion(moved_problem, OPTIONS)
 
 
 def values_of(problem):
@@ -64,51 +64,56 @@ def some_motion(experiment, seed=0, size=0.1):
 
 
 def test_sensors_tell_as_much_in_a_second_as_in_the_recording(driven_problem):
-    experiment = Experiment.of(driven_problem, values_of(driven_problem), OPTIONS)
+    experiment = PlannedExperiment.from_options(driven_problem, values_of(driven_problem), OPTIONS)
     w = some_motion(experiment)
-    planned, base = experiment.as_configured(w), driven_problem
+    planned, base = experiment.estimation_problem(w), driven_problem
     spent = base.episodes[0].grid.steps * base.step.time_step
-    for new, old in zip(planned.episodes[0].samples, base.episodes[0].samples, strict=True):
-        assert new.sensor.channels == old.sensor.channels
+    for new, old in zip(planned.episodes[0].measurements, base.episodes[0].samples, strict=True):
+        assert new.sensor.channel_names == old.sensor.channels
         length = len(new.node) * (new.node[1] - new.node[0]) * base.step.time_step
         np.testing.assert_allclose(
             np.sum(new.weight**2, axis=0) / length, np.sum(old.weight**2, axis=0) / spent, rtol=1e-9
         )
-    joints = experiment.recording(w).joints
-    np.testing.assert_allclose(joints.position[:, 0], experiment.mover.positions(w)[: len(joints.t), 0], atol=1e-12)
+    joints = experiment.noise_free_recording(w).joints
+    np.testing.assert_allclose(
+        joints.position[:, 0], experiment.simulator.joint_positions(w)[: len(joints.t), 0], atol=1e-12
+    )
     assert np.ravel(joints.effort_std) == pytest.approx(0.3)
     # the model itself, driven by these torques, goes where they came from
-    evaluation = planned.evaluate(planned.start)
-    pairs = zip(planned.episodes[0].samples, evaluation.episodes[0].predicted, strict=True)
-    assert max(np.abs(samples.whitened(predicted)).max() for samples, predicted in pairs) < 0.1
+    evaluation = planned.evaluate(planned.initial_unknowns)
+    pairs = zip(planned.episodes[0].measurements, evaluation.episode_predictions[0].predicted_outputs, strict=True)
+    assert max(np.abs(samples.whitened_residual(predicted)).max() for samples, predicted in pairs) < 0.1
 
 
 @pytest.mark.parametrize("kind", ["moved_problem", "driven_problem"])
 def test_slopes_are_derivatives_of_the_sensitivities(kind, request):
     problem = request.getfixturevalue(kind)
-    experiment = Experiment.of(problem, values_of(problem), OPTIONS)
+    experiment = PlannedExperiment.from_options(problem, values_of(problem), OPTIONS)
     w, way = some_motion(experiment), some_motion(experiment, 1, 1.0)
-    rows, e = experiment.rows(w), 1e-4
-    slope = np.tensordot(way.ravel(), experiment.slopes(w, rows), 1)
-    central = (experiment.rows(w + e * way) - experiment.rows(w - e * way)) / (2 * e)
+    rows, e = experiment.search_sensitivities(w), 1e-4
+    slope = np.tensordot(way.ravel(), experiment.sensitivity_derivatives(w, rows), 1)
+    central = (experiment.search_sensitivities(w + e * way) - experiment.search_sensitivities(w - e * way)) / (2 * e)
     np.testing.assert_allclose(slope, central, atol=2e-3 * np.abs(central).max())
 
 
 def test_prescribed_arms_tell_what_identifiability_says(moved_problem):
-    experiment = Experiment.of(moved_problem, values_of(moved_problem), OPTIONS)
+    experiment = PlannedExperiment.from_options(moved_problem, values_of(moved_problem), OPTIONS)
     w = some_motion(experiment, size=0.3)
-    searched, judged = experiment.rows(w), identifiability(experiment.as_configured(w)).information
+    searched, judged = (
+        experiment.search_sensitivities(w),
+        identifiability(experiment.estimation_problem(w)).fisher_information,
+    )
     # the search sees fewer samples of points, each telling more
     np.testing.assert_allclose(np.diag(searched.T @ searched), np.diag(judged), rtol=0.05)
 
 
 def test_driven_arms_tell_about_what_the_innovations_say(driven_problem):
-    experiment = Experiment.of(driven_problem, values_of(driven_problem), OPTIONS)
+    experiment = PlannedExperiment.from_options(driven_problem, values_of(driven_problem), OPTIONS)
     for seed in range(3):
         w = some_motion(experiment, seed, 0.3)
         std = []
-        for rows in (experiment.rows(w), experiment.judged(w)):
-            std.append(np.sqrt(np.diag(Precision((0, 1), (0, 1)).covariance(rows))[:2]))
+        for rows in (experiment.search_sensitivities(w), experiment.configured_sensitivities(w)):
+            std.append(np.sqrt(np.diag(DOptimality((0, 1), (0, 1)).column_covariance(rows))[:2]))
         np.testing.assert_allclose(np.log(std[0]), np.log(std[1]), atol=0.5)
 
 
@@ -116,28 +121,30 @@ def test_driven_arms_tell_about_what_the_innovations_say(driven_problem):
 
 ROWS = np.random.default_rng(4).normal(size=(30, 7))
 CRITERIA = {
-    "all": Precision((0, 1, 2), (0, 1, 2)),
-    "one": Precision((1,), (0, 1, 2)),
-    "apart": Separation(((3,), (4, 5)), (np.array([[2.0]]), np.diag([0.5, 3.0])), (0, 1, 2, 3, 4, 5)),
+    "all": DOptimality((0, 1, 2), (0, 1, 2)),
+    "one": DOptimality((1,), (0, 1, 2)),
+    "apart": EffectDiscrimination(((3,), (4, 5)), (np.array([[2.0]]), np.diag([0.5, 3.0])), (0, 1, 2, 3, 4, 5)),
 }
 
 
 @pytest.mark.parametrize("name", CRITERIA)
 def test_criteria_know_their_derivatives(name):
     criterion, way, e = CRITERIA[name], np.random.default_rng(5).normal(size=ROWS.shape), 1e-6
-    _, slope = criterion.value(ROWS)
-    central = (criterion.value(ROWS + e * way)[0] - criterion.value(ROWS - e * way)[0]) / (2 * e)
+    _, slope = criterion.value_and_gradient(ROWS)
+    central = (criterion.value_and_gradient(ROWS + e * way)[0] - criterion.value_and_gradient(ROWS - e * way)[0]) / (
+        2 * e
+    )
     assert float(np.sum(slope * way)) == pytest.approx(central, rel=1e-6)
 
 
 def test_precision_is_that_of_the_marginal_standard_deviation():
     wide = np.vstack([1e3 * ROWS, np.eye(7)[3:]])
     covariance = np.linalg.inv(wide.T @ wide)
-    one, both = (Precision(chosen, (0, 1, 2)).value(wide)[0] for chosen in ((1,), (0, 1)))
+    one, both = (DOptimality(chosen, (0, 1, 2)).value_and_gradient(wide)[0] for chosen in ((1,), (0, 1)))
     assert one == pytest.approx(-0.5 * np.log(covariance[1, 1]), abs=1e-5)
     assert both == pytest.approx(-0.5 * np.log(np.linalg.det(covariance[:2, :2])), abs=1e-5)
     # with no data a parameter is known to within 400 %
-    assert CRITERIA["one"].value(np.zeros((1, 7)))[0] == pytest.approx(-np.log(4.0))
+    assert CRITERIA["one"].value_and_gradient(np.zeros((1, 7)))[0] == pytest.approx(-np.log(4.0))
 
 
 def test_distances_are_what_others_cannot_explain():
@@ -145,11 +152,11 @@ def test_distances_are_what_others_cannot_explain():
     rows = np.zeros((6, 7))
     rows[[0, 1, 2], [3, 4, 5]] = 50.0, 20.0, 10.0
     rows[0, 0] = 1e4  # a free parameter does to the data what the first effect does
-    first, second = criterion.distances(rows)[[0, 1], [1, 0]]
+    first, second = criterion.effect_distances(rows)[[0, 1], [1, 0]]
     assert first < 0.2
     assert second == pytest.approx(np.sqrt((10.0**2 + 30.0**2) / 2))
     rows[3, 3] = 7.0  # now a reading of its own
-    assert criterion.distances(rows)[0, 1] == pytest.approx(14.0, rel=1e-3)
+    assert criterion.effect_distances(rows)[0, 1] == pytest.approx(14.0, rel=1e-3)
 
 
 # -- the search -------------------------------------------------------------------------------------------------------
@@ -165,8 +172,8 @@ def made_up(rows, limits, size, low, high):
     experiment = SimpleNamespace(mover=mover, rows=rows, slopes=slopes, still=np.zeros((size, 1)))
     values, upper = limits
     bounded = [SimpleNamespace(unit=np.ones(len(upper)), lower=-np.inf * np.ones(len(upper)), upper=np.array(upper))]
-    kept = SimpleNamespace(bounded=bounded, limits=lambda rolled, w: Values(*values(w.ravel())))
-    return Search(experiment, kept, Precision((0, 1), (0, 1)), np.array([low]), np.array([high]))
+    kept = SimpleNamespace(bounded=bounded, limits=lambda rolled, w: ValueWithJacobian(*values(w.ravel())))
+    return InformativeMotionSearch(experiment, kept, DOptimality((0, 1), (0, 1)), np.array([low]), np.array([high]))
 
 
 def straight(matrix):
@@ -208,7 +215,7 @@ def test_a_curved_limit_is_kept_on_the_way_and_in_the_end():
 
 def test_the_motion_tells_more_than_those_it_came_from(told, moved_problem):
     assert told.reached, told.message
-    assert len(told.starts) == OPTIONS.starts
+    assert len(told.starts) == OPTIONS.n_random_starts
     assert all(start.value > start.first + 0.3 for start in told.starts)
     assert told.best == int(np.argmax([start.judged for start in told.starts]))
     before = identifiability(moved_problem)
@@ -224,7 +231,7 @@ def test_it_starts_and_ends_at_rest_within_limits(told):
     assert np.abs(told.acceleration).max() <= 15.0 * (1 + 1e-6)
     assert np.abs(told.effort).max() <= 0.9 * 40.0 * (1 + 1e-6)
     assert np.all(np.abs(told.position) <= 1.2 + 1e-9)
-    elbow = told.mover.step.system.mechanism.joint_index("elbow")
+    elbow = told.simulator.step.system.mechanism.joint_index("elbow")
     assert np.abs(told.rollout.state[::2, elbow]).max() <= 1.0
     # what tells much goes to the limits
     assert told.active
@@ -232,32 +239,37 @@ def test_it_starts_and_ends_at_rest_within_limits(told):
 
 
 def test_one_parameter_is_told_better_where_it_alone_counts(moved_problem, told):
-    alone = informative(moved_problem, replace(OPTIONS, inform=("elbow.damping",)))
-    assert alone.parameters["elbow.damping"].after <= 1.02 * told.parameters["elbow.damping"].after
+    alone = plan_informative_motion(moved_problem, replace(OPTIONS, identify=("elbow.damping",)))
+    assert alone.parameter_precisions["elbow.damping"].std_planned <= 1.02 * told.parameters["elbow.damping"].after
 
 
 def test_the_same_seed_gives_the_same_motion(moved_problem):
-    options = replace(OPTIONS, starts=1, iterations=2)
-    first, again, other = (informative(moved_problem, replace(options, seed=seed)) for seed in (0, 0, 1))
-    np.testing.assert_array_equal(first.unknowns, again.unknowns)
-    assert not np.allclose(first.unknowns, other.unknowns)
+    options = replace(OPTIONS, n_random_starts=1, max_iterations=2)
+    first, again, other = (plan_informative_motion(moved_problem, replace(options, seed=seed)) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first.spline_coefficients, again.spline_coefficients)
+    assert not np.allclose(first.spline_coefficients, other.spline_coefficients)
 
 
 def test_two_effects_are_moved_apart(driven_problem):
     pair = ("joint_coulomb@shoulder", "joint_viscous@shoulder")
-    options = replace(OPTIONS, separate=pair, starts=2)
-    found = informative(driven_problem, options)
-    assert set(found.distances) == {pair, pair[::-1]}
-    for before, after in found.distances.values():
+    options = replace(OPTIONS, discriminate=pair, n_random_starts=2)
+    found = plan_informative_motion(driven_problem, options)
+    assert set(found.effect_distances) == {pair, pair[::-1]}
+    for before, after in found.effect_distances.values():
         assert after > 1.5 * before
 
 
 def test_effects_of_twice_the_size_lie_twice_as_far_apart(driven_problem):
-    pair, quick = ("joint_coulomb@shoulder", "joint_viscous@shoulder"), replace(OPTIONS, starts=1, iterations=1)
+    pair, quick = (
+        ("joint_coulomb@shoulder", "joint_viscous@shoulder"),
+        replace(OPTIONS, n_random_starts=1, max_iterations=1),
+    )
     told = []
     for factor in (1.0, 2.0):
         sizes = {pair[0]: {"tau_c": 0.2 * factor}, pair[1]: {"b": 0.05 * factor}}
-        told.append(informative(driven_problem, replace(quick, separate=pair), None, sizes).distances)
+        told.append(
+            plan_informative_motion(driven_problem, replace(quick, discriminate=pair), None, sizes).effect_distances
+        )
     for key in told[0]:
         assert told[1][key][0] == pytest.approx(2 * told[0][key][0], rel=1e-3)
 
@@ -266,13 +278,13 @@ def test_a_parameter_that_nothing_sees_is_named_and_the_others_are_told(limited_
     problem = problem_of(limited_urdf, free=("elbow.stiffness", "shoulder.damping"), prescribed=("shoulder",))
     sensors = {"joints.effort": SensorOptions(use=False)}
     blind = problem.with_options(replace(problem.options, sensors=sensors))
-    found = informative(blind, replace(OPTIONS, starts=1, iterations=3))
-    assert set(found.unseen) == {"shoulder.damping"}
-    assert found.parameters["shoulder.damping"].after == np.inf
-    assert found.parameters["shoulder.damping"].together == np.inf
-    assert found.parameters["elbow.stiffness"].after < 1.0
+    found = plan_informative_motion(blind, replace(OPTIONS, n_random_starts=1, max_iterations=3))
+    assert set(found.unobservable_parameters) == {"shoulder.damping"}
+    assert found.parameter_precisions["shoulder.damping"].std_planned == np.inf
+    assert found.parameter_precisions["shoulder.damping"].std_combined == np.inf
+    assert found.parameter_precisions["elbow.stiffness"].std_planned < 1.0
     with pytest.raises(ConfigError) as caught:
-        informative(blind, replace(OPTIONS, inform=("shoulder.damping",)))
+        plan_informative_motion(blind, replace(OPTIONS, identify=("shoulder.damping",)))
     for word in ("no motion informs shoulder.damping", "no sensor sees it to first order", "standard deviations"):
         assert word in str(caught.value)
 
@@ -281,7 +293,7 @@ def test_a_parameter_that_nothing_sees_is_named_and_the_others_are_told(limited_
     ("more", "words"),
     [
         ({"inform": ("elbow.stifness",)}, ("no parameter 'elbow.stifness'", "did you mean 'elbow.stiffness'?")),
-        ({"inform": ("lower.mass",)}, ("plan.inform",)),
+        ({"inform": ("lower.mass",)}, ("plan.identify",)),
         ({"inform": ()}, ("no parameter is to be told", "elbow.stiffness")),
         ({"inform": FREE, "separate": ("joint_viscous@elbow",)}, ("one of the two",)),
         ({"separate": ("joint_viscous@elbow",)}, ("1 effect is to be separated", "two effects or more")),
@@ -289,12 +301,15 @@ def test_a_parameter_that_nothing_sees_is_named_and_the_others_are_told(limited_
         ({"separate": ("joint_viscus@elbow", "joint_coulomb@elbow")}, ("no effect 'joint_viscus'", "joint_viscous")),
         ({"separate": ("joint_viscous@elbw", "joint_coulomb@elbow")}, ("elbw", "elbow")),
         ({"posture": {"shoulder": 1.5}}, ("0.3 beyond its limit",)),
-        ({"limits": PlanLimits(effort=1e-4)}, ("pass their limits before they move", "shoulder", "where 0.004")),
+        (
+            {"limits": PlanLimits(effort_fraction=1e-4)},
+            ("pass their limits before they move", "shoulder", "where 0.004"),
+        ),
         ({"starts": 0}, ("starts = 0", "from 1")),
     ],
 )
 def test_what_is_refused(moved_problem, more, words):
     with pytest.raises(YidError) as caught:
-        informative(moved_problem, replace(OPTIONS, **more))
+        plan_informative_motion(moved_problem, replace(OPTIONS, **more))
     for word in words:
         assert word in str(caught.value), str(caught.value)

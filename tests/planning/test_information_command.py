@@ -11,10 +11,10 @@ from small_problems import pendulum_step, taken
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording
-from yid_ocp.data.hdf5 import write_recording
-from yid_ocp.report.summaries import plan_summary, planning_command
-from yid_ocp.report.terminal import lines
-from yid_ocp.workflow.information import next_plan
+from yid_ocp.data.recording_hdf5 import write_recording
+from yid_ocp.report.summaries import _planning_command, plan_summary
+from yid_ocp.report.terminal import terminal_lines
+from yid_ocp.workflow.information_planning import next_plan_settings
 from yid_ocp.workflow.plan import run_plan
 
 CONFIG = """\
@@ -66,19 +66,19 @@ def diagnosed(folder, stiffness, verdict="confusable"):
 
 def test_the_run_folder_says_what_is_told_and_what_limits_it(config, tmp_path):
     outcome = run_plan(load_config(config), tmp_path / "out")
-    assert outcome.ok, outcome.result["message"]
+    assert outcome.is_successful, outcome.result["message"]
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     assert result["format"] == "yid-plan/1"
     assert result["goal"] == "information"
     assert {"recording.h5", "csv", "trajectory.json", "report.html"} <= {p.name for p in (tmp_path / "out").iterdir()}
     planned = read_recording(tmp_path / "out" / "recording.h5")
-    np.testing.assert_allclose(planned.joints.position, outcome.plan.position)
+    np.testing.assert_allclose(planned.joints.position, outcome.plan.joint_positions)
     page = (tmp_path / "out" / "report.html").read_text()
     assert '<section id="information">' in page
-    words = "\n".join(lines(plan_summary(result)))
-    for name, known in outcome.plan.parameters.items():
-        assert result["parameters"][name]["std_relative_after"] == pytest.approx(known.after)
-        assert f"± {100 * known.after:.2g} %" in words
+    words = "\n".join(terminal_lines(plan_summary(result)))
+    for name, known in outcome.plan.parameter_precisions.items():
+        assert result["parameters"][name]["std_relative_after"] == pytest.approx(known.std_planned)
+        assert f"± {100 * known.std_planned:.2g} %" in words
     assert "tells most" in words
     assert all(name in words for names in result["limits_reached"].values() for name in names)
     assert "the parameters are those of the configuration" in words
@@ -87,32 +87,32 @@ def test_the_run_folder_says_what_is_told_and_what_limits_it(config, tmp_path):
 def test_a_diagnosis_hands_over_its_parameters_and_effects(config, tmp_path):
     folder = diagnosed(tmp_path / "diagnosed", 4.0)
     alike = [[{"kind": label.partition("@")[0], "location": label.partition("@")[2]} for label in PAIR]]
-    section = next_plan(alike, folder)
+    section = next_plan_settings(alike, folder)
     assert section == {"goal": "information", "separate": list(PAIR), "run": str(folder)}
-    assert next_plan([], folder) is None
-    command = planning_command(section)
+    assert next_plan_settings([], folder) is None
+    command = _planning_command(section)
     assert command.startswith(f"yid-ocp plan {folder / 'config.yaml'} --set plan.goal=information")
-    overrides = [f"plan.separate=[{', '.join(PAIR)}]", f"plan.run={folder}", "plan.iterations=3"]
+    overrides = [f"plan.discriminate=[{', '.join(PAIR)}]", f"plan.parameter_run={folder}", "plan.max_iterations=3"]
     assert all(f"'{text}'" in command or text in command for text in overrides[:2])
     outcome = run_plan(load_config(config, overrides), tmp_path / "out")
     assert outcome.result["from"]["parameters"] == {"elbow.stiffness": 4.0, "elbow.damping": 0.2}
     pairs = {(entry["effect"], entry["explained_by"]) for entry in outcome.result["distances"]}
     assert pairs == {PAIR, PAIR[::-1]}
     assert all(entry["after"] > entry["before"] for entry in outcome.result["distances"])
-    assert f"{PAIR[0]}" in "\n".join(lines(plan_summary(outcome.result)))
+    assert f"{PAIR[0]}" in "\n".join(terminal_lines(plan_summary(outcome.result)))
 
 
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        (["plan.inform=[elbow.stifness]"], ("no parameter 'elbow.stifness'", "did you mean", "pendulum.yaml")),
-        (["plan.separate=[joint_viscous@shoulder]"], ("two effects or more",)),
+        (["plan.identify=[elbow.stifness]"], ("no parameter 'elbow.stifness'", "did you mean", "pendulum.yaml")),
+        (["plan.discriminate=[joint_viscous@shoulder]"], ("two effects or more",)),
         (["parameters.elbow.stiffness.free=false", "parameters.elbow.damping.free=false"],
          ("no parameter is free",)),
         (["recordings.estimate=[]"], ("no recording to estimate on",)),
-        (["plan.run=nowhere"], ("no finished run of `solve` or `diagnose`", "plan.run")),
-        (["plan.limits.effort=0.0001"], ("pass their limits before they move", "plan.limits")),
-        (["plan.duration=0.1", "plan.settle=0.1"], ("too short", "plan.duration")),
+        (["plan.parameter_run=nowhere"], ("no finished run of `solve` or `diagnose`", "plan.parameter_run")),
+        (["plan.limits.effort_fraction=0.0001"], ("pass their limits before they move", "plan.limits")),
+        (["plan.duration=0.1", "plan.hold_duration=0.1"], ("too short", "plan.duration")),
     ],
 )  # fmt: skip
 def test_wrong_input_leaves_nothing(config, refused, settings, words):
@@ -121,5 +121,5 @@ def test_wrong_input_leaves_nothing(config, refused, settings, words):
 
 def test_other_goals_do_not_take_a_diagnosis(config, tmp_path, refused):
     folder = diagnosed(tmp_path / "diagnosed", 4.0)
-    settings = ["plan.goal=place", "plan.point=tip", "plan.shift=[0,0.1,0]", f"plan.run={folder}"]
+    settings = ["plan.goal=place", "plan.point=tip", "plan.target_offset=[0,0.1,0]", f"plan.parameter_run={folder}"]
     refused(config, settings, ("run folder of another command (yid-diagnosis/1)",))

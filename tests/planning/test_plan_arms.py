@@ -11,19 +11,19 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording
 from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.rollout import simulate
-from yid_ocp.planning.points import Points
-from yid_ocp.workflow.build import recording_file
+from yid_ocp.planning.frame_positions import FramePositions
+from yid_ocp.workflow.build import recording_path
 from yid_ocp.workflow.plan import run_plan
 
 STIFF = "parameters={T*.bend: {initial: 15}, T*.twist: {initial: 10}}"
 COARSE = {
-    "plan_place": ("model.object.links=2", "plan.shift=[-0.01, 0.02, 0.015]"),
+    "plan_place": ("model.object.links=2", "plan.target_offset=[-0.01, 0.02, 0.015]"),
     "plan_cable": ("model.object.segments.cable.links=4",),
 }
 
 
 def planned(repository, tmp_path, name, *overrides):
-    run = load_config(repository / "configs" / f"{name}.yaml", [*overrides, "output.report=false"])
+    run = load_config(repository / "configs" / f"{name}.yaml", [*overrides, "output.write_report=false"])
     return run, run_plan(run, tmp_path / "out")
 
 
@@ -57,14 +57,21 @@ def test_the_middle_of_a_cable_stays_below_a_lid(repository, tmp_path):
     lid = 0.5 * (height.max() + free.plan.place[2])
     assert height.max() > lid + 1e-3, "the free motion must pass the lid for this to be a test"
     box = f"plan.box=[[0.0, -1.0, -0.6], [1.5, 1.0, {lid}]]"
-    _, kept = planned(repository, tmp_path / "kept", "plan_cable", *quick, box, "plan.inside=['cable:50%']")
+    _, kept = planned(repository, tmp_path / "kept", "plan_cable", *quick, box, "plan.frames_in_box=['cable:50%']")
     assert kept.ok, kept.result["message"]
     assert kept.plan.points["cable:50%"][:, 2].max() < lid + 2e-4
 
 
 def test_a_path_of_the_free_tip_is_followed_as_far_as_it_says(repository, tmp_path):
-    path = ("plan.goal=path", "plan.via=[[-0.01, 0.01, 0.02]]", "plan.duration=1.6", "plan.knots=8")
-    run, outcome = planned(repository, tmp_path, "plan_place", *COARSE["plan_place"], *path, "plan.tolerance=0.004")
+    path = (
+        "plan.goal=path",
+        "plan.waypoint_offsets=[[-0.01, 0.01, 0.02]]",
+        "plan.duration=1.6",
+        "plan.n_spline_coefficients=8",
+    )
+    run, outcome = planned(
+        repository, tmp_path, "plan_place", *COARSE["plan_place"], *path, "plan.position_tolerance=0.004"
+    )
     assert outcome.ok, outcome.result["message"]
     tip, t = outcome.plan.points["w_T3"], outcome.plan.t
     halfway = tip[int(np.argmin(np.abs(t - 0.8)))] - tip[0]
@@ -77,20 +84,24 @@ def test_a_path_of_the_free_tip_is_followed_as_far_as_it_says(repository, tmp_pa
 
 def test_two_arms_bring_the_junction_to_a_place_and_keep_hold_of_it(repository, tmp_path):
     name = "dual_arm_vision"
-    way = "plan={point: w_T1, shift: [0.03, 0.03, 0.0], duration: 0.8, settle: 0.3}"
+    way = "plan={point: w_T1, target_offset: [0.03, 0.03, 0.0], duration: 0.8, hold_duration: 0.3}"
     run, outcome = planned(repository, tmp_path, name, "model.object.links=2", STIFF, way)
     assert outcome.ok, outcome.result["message"]
     assert outcome.result["swing"] < run.plan.swing
     found = outcome.plan
     # it begins where the recording does, and both arms take part
-    recorded = read_recording(recording_file(run.recordings.estimate[0])).joints
+    recorded = read_recording(recording_path(run.recordings.estimate[0])).joints
     first = recorded.position[0, [recorded.names.index(name) for name in found.joints]]
     np.testing.assert_allclose(found.position[0], first, atol=5e-3)
     travel = dict(zip(found.joints, np.ptp(found.position, axis=0), strict=True))
     assert min(max(v for k, v in travel.items() if k.startswith(side)) for side in ("left", "right")) > 0.01
-    system, theta = found.mover.step.system, found.mover.theta
-    names = [end for grasp in system.grasps for end in (grasp.holder, grasp.held)]
-    at = Points(system, names).at(found.state[:, : system.size], theta)[0].reshape(len(found.t), -1, 2, 3)
+    system, theta = found.simulator.step.system, found.simulator.theta
+    names = [end for grasp in system.grasps for end in (grasp.holder_frame, grasp.held)]
+    at = (
+        FramePositions(system, names)
+        .positions_and_jacobian(found.state[:, : system.size], theta)[0]
+        .reshape(len(found.t), -1, 2, 3)
+    )
     assert np.abs(at[:, :, 0] - at[:, :, 1]).max() < 1e-8
 
 
@@ -102,8 +113,8 @@ def test_an_arm_that_holds_nothing_cannot_move_the_object(repository, tmp_path):
 @pytest.mark.parametrize(
     ("limit", "words"),
     [
-        ("effort=0.4", ("left_s1 at rest where the motion begins", "beyond its limit", "plan.limits.effort")),
-        ("spring_angle=0.001", ("at rest", "rad", "plan.limits.spring_angle")),
+        ("effort=0.4", ("left_s1 at rest where the motion begins", "beyond its limit", "plan.limits.effort_fraction")),
+        ("spring_angle=0.001", ("at rest", "rad", "plan.limits.max_spring_angle")),
     ],
 )
 def test_limits_that_rest_itself_passes_are_refused(repository, tmp_path, limit, words):
@@ -116,12 +127,12 @@ def test_limits_that_rest_itself_passes_are_refused(repository, tmp_path, limit,
 def test_a_real_cable_in_two_clamps_is_at_rest_before_it_is_moved(repository, tmp_path):
     file = repository / "configs" / "deft_bdlo1.yaml"
     run = load_config(file)
-    if not recording_file(run.recordings.estimate[0]).is_file():
+    if not recording_path(run.recordings.estimate[0]).is_file():
         pytest.skip("its recordings are not here")
-    way = "plan={point: p6, shift: [0.02, 0.02, 0.0], duration: 1.0, knots: 4}"
+    way = "plan={point: p6, target_offset: [0.02, 0.02, 0.0], duration: 1.0, n_spline_coefficients: 4}"
     run, outcome = planned(repository, tmp_path, "deft_bdlo1", way)
     assert outcome.ok, outcome.result["message"]
     first = outcome.plan.state[0]
-    held = simulate(outcome.plan.mover.step, outcome.plan.mover.theta, first, 20).state[-1]
+    held = simulate(outcome.plan.simulator.step, outcome.plan.simulator.theta, first, 20).state[-1]
     np.testing.assert_allclose(held, first, atol=1e-7)
     np.testing.assert_allclose(outcome.plan.points["p6"][-1], outcome.result["place"], atol=run.plan.tolerance)

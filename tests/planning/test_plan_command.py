@@ -12,7 +12,7 @@ import pytest
 from yid_ocp.cli import main
 from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording
-from yid_ocp.workflow.plan import identified, planning_step, run_plan
+from yid_ocp.workflow.plan import compile_planning_step, identified_parameters, run_plan
 from yid_ocp.workflow.simulate import run_simulate
 
 CONFIG = """\
@@ -52,7 +52,7 @@ def solved(folder, stiffness, std, status="converged", **more):
 
 def test_the_run_folder_is_what_simulate_and_robots_read(config, tmp_path):
     outcome = run_plan(load_config(config), tmp_path / "out")
-    assert outcome.ok, outcome.result["message"]
+    assert outcome.is_successful, outcome.result["message"]
     assert outcome.result["format"] == "yid-plan/1"
     assert {path.name for path in outcome.folder.iterdir()} >= {
         "recording.h5", "csv", "trajectory.json", "result.json", "report.html", "config.yaml", "log.jsonl"
@@ -62,7 +62,7 @@ def test_the_run_folder_is_what_simulate_and_robots_read(config, tmp_path):
     assert "of how uncertain that is" in page
     message = json.loads((outcome.folder / "trajectory.json").read_text())
     assert message["joint_names"] == ["shoulder"]
-    assert [p["positions"][0] for p in message["points"]] == pytest.approx(outcome.plan.position[:, 0].tolist())
+    assert [p["positions"][0] for p in message["points"]] == pytest.approx(outcome.plan.joint_positions[:, 0].tolist())
     times = [p["time_from_start"]["sec"] + 1e-9 * p["time_from_start"]["nanosec"] for p in message["points"]]
     assert times == pytest.approx(outcome.plan.t.tolist())
 
@@ -70,17 +70,17 @@ def test_the_run_folder_is_what_simulate_and_robots_read(config, tmp_path):
     planned = read_recording(file)
     again = load_config(config, [f"recordings.estimate=[{file}]"])
     done = run_simulate(again, tmp_path / "again")
-    assert done.ok, done.result["message"]
+    assert done.is_successful, done.result["message"]
     np.testing.assert_allclose(done.recording.points[0].position, planned.points[0].position, atol=1e-6)
 
 
 def test_parameters_and_their_uncertainty_come_from_a_run_of_solve(config, tmp_path):
     folder = solved(tmp_path / "solved", 4.0, 0.25)
-    run = load_config(config, [f"plan.run={folder}"])
-    step = planning_step(run)
-    theta, known, source = identified(run, step)
+    run = load_config(config, [f"plan.parameter_run={folder}"])
+    step = compile_planning_step(run)
+    theta, known, source = identified_parameters(run, step)
     assert theta[step.system.parameters.index("elbow.stiffness")] == 4.0
-    assert known.names == ("elbow.stiffness",)
+    assert known.parameter_names == ("elbow.stiffness",)
     assert known.covariance.tolist() == [[0.0625]]
     assert source["parameters"] == {"elbow.stiffness": 4.0}
     outcome = run_plan(run, tmp_path / "out")
@@ -89,9 +89,9 @@ def test_parameters_and_their_uncertainty_come_from_a_run_of_solve(config, tmp_p
 
 def test_what_is_not_known_is_not_counted_and_said(config, tmp_path):
     folder = solved(tmp_path / "solved", 4.0, np.inf)
-    run = load_config(config, [f"plan.run={folder}"])
-    _, known, source = identified(run, planning_step(run))
-    assert known.names == ()
+    run = load_config(config, [f"plan.parameter_run={folder}"])
+    _, known, source = identified_parameters(run, compile_planning_step(run))
+    assert known.parameter_names == ()
     assert source["uncertainty_unknown"] == ["elbow.stiffness"]
 
 
@@ -106,10 +106,10 @@ def test_a_plan_that_fails_says_so(config, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        (["plan.shift=[0, 3, 0]"], ("out of reach", "mm off", "pendulum.yaml")),
-        (["plan.run=nowhere"], ("no finished run of `solve`", "plan.run")),
+        (["plan.target_offset=[0, 3, 0]"], ("out of reach", "mm off", "pendulum.yaml")),
+        (["plan.parameter_run=nowhere"], ("no finished run of `solve`", "plan.parameter_run")),
         (["plan.goal=throw"], ("plan.goal", "place, path, box")),
-        (["plan.limits.velocity=2"], ("plan.limits.velocity", "up to 1")),
+        (["plan.limits.velocity_fraction=2"], ("plan.limits.velocity_fraction", "up to 1")),
         (["plan.point=tup"], ("no frame 'tup'", "did you mean 'tip'?")),
     ],
 )
@@ -119,14 +119,14 @@ def test_wrong_input_leaves_nothing(config, refused, settings, words):
 
 def test_a_folder_of_another_kind_is_refused(config, tmp_path, capsys):
     failed = solved(tmp_path / "failed", 4.0, 0.1, status="failed")
-    assert main(["plan", str(config), "--out", str(tmp_path / "out"), "--set", f"plan.run={failed}"]) == 2
+    assert main(["plan", str(config), "--out", str(tmp_path / "out"), "--set", f"plan.parameter_run={failed}"]) == 2
     assert "failed: made up" in capsys.readouterr().err
 
 
 def test_a_run_with_effects_that_the_model_lacks_is_refused(config, tmp_path, capsys):
     more = {"point_mass@tip.mass": {"value": 0.1, "free": True}}
     folder = solved(tmp_path / "solved", 4.0, 0.1, **more)
-    chosen = ("plan", str(config), "--out", str(tmp_path / "out"), "--set", f"plan.run={folder}")
+    chosen = ("plan", str(config), "--out", str(tmp_path / "out"), "--set", f"plan.parameter_run={folder}")
     assert main(list(chosen)) == 2
     told = capsys.readouterr().err
     assert "was solved with point_mass@tip, which this model does not have" in told

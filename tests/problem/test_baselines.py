@@ -3,7 +3,13 @@ import pytest
 
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.errors import DataError
-from yid_ocp.problem.validation import linear_carry, move_with_clamps, positions, prediction_error, stay
+from yid_ocp.problem.prediction_errors import (
+    clamp_displacement_baseline,
+    constant_position_baseline,
+    interpolated_displacement_baseline,
+    measured_positions,
+    position_rmse,
+)
 
 PARENT = ("p0", "p1", "p2", "p3", "p4")
 NAMES = (*PARENT, "c1", "c2")
@@ -23,25 +29,25 @@ def recording():
 
 
 def test_stay_repeats_the_last_given_frame(recording):
-    predicted = stay(recording, NAMES)
-    np.testing.assert_array_equal(predicted[:2], positions(recording, NAMES)[:2])
+    predicted = constant_position_baseline(recording, NAMES)
+    np.testing.assert_array_equal(predicted[:2], measured_positions(recording, NAMES)[:2])
     np.testing.assert_array_equal(predicted[2:], np.broadcast_to(predicted[1], (9, 7, 3)))
 
 
 def test_all_points_move_with_the_mean_of_the_clamps(recording):
-    predicted = move_with_clamps(recording, ("p2", "c1"), ("p0", "p4"))
+    predicted = clamp_displacement_baseline(recording, ("p2", "c1"), ("p0", "p4"))
     np.testing.assert_allclose(predicted[-1, :, 2], 2e-3 * 9)
     np.testing.assert_allclose(predicted[-1, :, :2], [[0.2, 0.0], [0.2, 0.1]])
 
 
 def test_linear_carry_interpolates_along_the_arc_and_children_follow_their_junction(recording):
-    predicted = linear_carry(recording, ("p1", "p2", "p3", "c1", "c2"), PARENT, CHILDREN)
+    predicted = interpolated_displacement_baseline(recording, ("p1", "p2", "p3", "c1", "c2"), PARENT, CHILDREN)
     # arc length as in the last given frame; the ends' heights differ by 2 mm there, which lengthens the chain by 1e-5
     np.testing.assert_allclose(predicted[-1, :, 2] / 9e-3, [1.4, 1.8, 2.6, 1.8, 1.8], rtol=1e-3)
 
 
 def test_linear_carry_between_inner_points_holds_the_ends_beyond_them(recording):
-    predicted = linear_carry(recording, ("p2",), PARENT, CHILDREN, clamped=("p0", "p1", "p4"))
+    predicted = interpolated_displacement_baseline(recording, ("p2",), PARENT, CHILDREN, clamped=("p0", "p1", "p4"))
     np.testing.assert_allclose(predicted[-1, 0, 2], 3 * 9e-3 * 0.25, rtol=1e-3)
 
 
@@ -52,9 +58,9 @@ def test_baselines_never_look_at_free_points_after_the_given_frames(recording):
     other = Recording(points=(PointGroup("points", NAMES, recording.points[0].t, seen),), name="other")
     free = ("p1", "p2", "p3", "c1", "c2")
     for method in (
-        lambda r: stay(r, free),
-        lambda r: move_with_clamps(r, free, ("p0", "p4")),
-        lambda r: linear_carry(r, free, PARENT, CHILDREN),
+        lambda r: constant_position_baseline(r, free),
+        lambda r: clamp_displacement_baseline(r, free, ("p0", "p4")),
+        lambda r: interpolated_displacement_baseline(r, free, PARENT, CHILDREN),
     ):
         np.testing.assert_array_equal(method(recording)[2:], method(other)[2:])
 
@@ -63,20 +69,20 @@ def test_prediction_error_is_euclidean_and_leaves_out_given_frames_and_gaps():
     measured, predicted = np.zeros((4, 2, 3)), np.zeros((4, 2, 3))
     predicted[:2] = 100.0
     predicted[2:, 0] = [3.0, 4.0, 0.0]
-    assert prediction_error(predicted, measured) == pytest.approx(np.sqrt(25 / 2))
+    assert position_rmse(predicted, measured) == pytest.approx(np.sqrt(25 / 2))
     measured[2:, 1] = np.nan
-    assert prediction_error(predicted, measured) == pytest.approx(5.0)
-    assert np.isnan(prediction_error(predicted, np.full_like(measured, np.nan)))
+    assert position_rmse(predicted, measured) == pytest.approx(5.0)
+    assert np.isnan(position_rmse(predicted, np.full_like(measured, np.nan)))
 
 
 @pytest.mark.parametrize(
     ("call", "text"),
     [
-        (lambda r: stay(r, ("p9",)), "not recorded"),
-        (lambda r: stay(r, ("p1",), given=0), "given = 0"),
-        (lambda r: stay(r, ("p1",), given=11), "given = 11"),
-        (lambda r: linear_carry(r, ("c1",), PARENT), "belongs to no branch"),
-        (lambda r: prediction_error(np.zeros((3, 1, 3)), np.zeros((4, 1, 3))), "differ in shape"),
+        (lambda r: constant_position_baseline(r, ("p9",)), "not recorded"),
+        (lambda r: constant_position_baseline(r, ("p1",), given=0), "given = 0"),
+        (lambda r: constant_position_baseline(r, ("p1",), given=11), "given = 11"),
+        (lambda r: interpolated_displacement_baseline(r, ("c1",), PARENT), "belongs to no branch"),
+        (lambda r: position_rmse(np.zeros((3, 1, 3)), np.zeros((4, 1, 3))), "differ in shape"),
     ],
 )
 def test_what_cannot_be_predicted_is_said(recording, call, text):
@@ -89,4 +95,4 @@ def test_a_point_hidden_in_the_given_frame_is_said(recording):
     seen[1, 2] = np.nan
     hidden = Recording(points=(PointGroup("points", NAMES, recording.points[0].t, seen),), name="hidden")
     with pytest.raises(DataError, match="'p2' is not seen"):
-        stay(hidden, ("p2",))
+        constant_position_baseline(hidden, ("p2",))

@@ -4,28 +4,33 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from yid_ocp.data.edges import edge_lengths, measured
-from yid_ocp.data.hdf5 import read_recording
+from yid_ocp.data.edge_lengths import _measured_positions, median_edge_lengths
 from yid_ocp.data.recording import PointGroup, Recording
+from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.errors import DataError, ModelError
 from yid_ocp.integrator.rollout import simulate
-from yid_ocp.integrator.statics import Statics
+from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import forward_kinematics
 from yid_ocp.model.cable import (
-    BranchOptions,
-    Cable,
+    CableBranchOptions,
     CableOptions,
+    CableTopology,
     cable_system,
-    free_parameters,
-    length_values,
-    read_vertices,
+    edge_length_parameters,
+    estimable_parameters,
+    read_vertex_positions,
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.grid import Grid
-from yid_ocp.problem.inputs import prescribed_path
-from yid_ocp.problem.low_pass import LowPass
-from yid_ocp.problem.validation import linear_carry, point_errors, positions, prediction_error
+from yid_ocp.problem.low_pass_filter import LowPassFilter
+from yid_ocp.problem.prediction_errors import (
+    interpolated_displacement_baseline,
+    measured_positions,
+    point_rmse_by_recording,
+    position_rmse,
+)
+from yid_ocp.problem.recorded_inputs import prescribed_path
+from yid_ocp.problem.time_grid import TimeGrid
 from yid_ocp.solvers import GaussNewton, solve
 
 PARENT = tuple(f"p{i}" for i in range(7))
@@ -47,24 +52,24 @@ def line(at, towards, length):
 def cable_options(cable, recordings, noise, model_error, path_cutoff=8.0, options=None):
     """Of each recording what a prediction may use: the clamps throughout, free vertices in the first two frames."""
     options = options or CableOptions()
-    known = {r.name: length_values(cable, edge_lengths(cable.edges, [r], 2)) for r in recordings}
-    names = [name for name in free_parameters(cable, options) if name.endswith(".rest")]
+    known = {r.name: edge_length_parameters(cable, median_edge_lengths(cable.edges, [r], 2)) for r in recordings}
+    names = [name for name in estimable_parameters(cable, options) if name.endswith(".rest")]
     return ProblemOptions(
         initial_state="fitted_to_points",
         path_cutoff=path_cutoff,
         sensors={"points": SensorOptions(std=model_error, points=cable.free)},
-        clamps=cable.clamps,
-        priors=dict.fromkeys(names, 0.2),
-        start_window=PERIOD,
-        start_std=noise,
-        start_parameters=("clamp_start.roll", "clamp_end.roll") if options.end == "weld" else ("clamp_start.roll",),
-        recording_values=known if options.lengths_per_recording else {},
+        clamp_paths=cable.clamps,
+        prior_stds=dict.fromkeys(names, 0.2),
+        start_fit_window=PERIOD,
+        start_point_noise_std=noise,
+        start_fit_parameters=("clamp_start.roll", "clamp_end.roll") if options.end == "weld" else ("clamp_start.roll",),
+        parameters_by_recording=known if options.lengths_per_recording else {},
     )
 
 
 @pytest.fixture(scope="module")
 def cable():
-    return Cable(PARENT, {"c": CHILD}, UNDEFORMED)
+    return CableTopology(PARENT, {"c": CHILD}, UNDEFORMED)
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +85,7 @@ def clamps():
 
 
 def as_recording(cable, t, courses, name="made"):
-    rest = cable.shape(cable.vertices)
+    rest = cable.undeformed_polyline(cable.vertices)
     seen = np.stack([courses.get(v, np.tile(rest[i], (len(t), 1))) for i, v in enumerate(cable.vertices)], axis=1)
     return Recording(points=(PointGroup("points", cable.vertices, t, seen),), name=name)
 
@@ -89,21 +94,26 @@ def as_recording(cable, t, courses, name="made"):
 def twin(cable, clamps):
     """The compiled step of a cable, and a recording made with it at known values, from rest."""
     t, held = clamps
-    options = CableOptions(default=BranchOptions(bend=1e-3, twist=2e-3, damping=1e-4), lengths_per_recording=False)
+    options = CableOptions(
+        default_branch=CableBranchOptions(bend_rigidity=1e-3, twist_rigidity=2e-3, bend_damping=1e-4),
+        lengths_per_recording=False,
+    )
     stub = as_recording(cable, t, held)
-    system = cable_system(edge_lengths(cable.edges, [as_recording(cable, t, {})]), cable, options)
+    system = cable_system(median_edge_lengths(cable.edges, [as_recording(cable, t, {})]), cable, options)
     step = compile_step(system, PERIOD)
-    path = prescribed_path(stub, system, Grid(0.0, PERIOD, len(t) - 1), LowPass(np.inf), cable.clamps)
+    path = prescribed_path(stub, system, TimeGrid(0.0, PERIOD, len(t) - 1), LowPassFilter(np.inf), cable.clamps)
     theta = system.parameters.vector(TRUTH)
-    rest = Statics(step).solve(path[0], theta)
-    assert rest.converged, rest.message
+    rest = EquilibriumSolver(step).solve(path[0], theta)
+    assert rest.is_converged, rest.message
     swept = simulate(step, theta, rest.state, len(t) - 1, None, path)
-    assert swept.status.ok, swept.status.message
-    q = ca.SX.sym("q", system.size)
+    assert swept.status.is_converged, swept.status.message
+    q = ca.SX.sym("q", system.n_coordinates)
     kinematics = forward_kinematics(system.mechanism, q)
-    places = ca.Function("places", [q, system.parameters.symbols], [kinematics.position(v) for v in cable.vertices])
+    places = ca.Function(
+        "places", [q, system.parameters.symbols], [kinematics.frame_position(v) for v in cable.vertices]
+    )
     seen = {
-        v: np.stack([np.array(places(s[: system.size], theta)[i]).ravel() for s in swept.state])
+        v: np.stack([np.array(places(s[: system.n_coordinates], theta)[i]).ravel() for s in swept.state])
         for i, v in enumerate(cable.vertices)
     }
     return step, options, as_recording(cable, t, seen, "twin")
@@ -114,7 +124,7 @@ def test_a_cable_names_segments_clamps_junctions_and_vertices(cable, twin):
     assert [s.name for s in system.segments] == ["parent", "c"]
     assert system.prescribed[:6] == tuple(f"clamp_start_{k}" for k in ("x", "y", "z", "rx", "ry", "rz"))
     assert set(cable.vertices) | {"junction_c", "clamp_start", "clamp_end"} <= set(system.mechanism.frames)
-    assert system.constraint_count == 5
+    assert system.n_constraints == 5
     assert cable.free == ("p2", "p3", "p4", "c1", "c2")
     assert cable.held == ("p0", "p1", "p5", "p6")
 
@@ -123,7 +133,9 @@ def test_the_undeformed_model_has_the_undeformed_shape(cable, twin):
     system = twin[0].system
     q = ca.SX.sym("q", system.size)
     kinematics = forward_kinematics(system.mechanism, q)
-    places = ca.Function("places", [q, system.parameters.symbols], [kinematics.position(v) for v in cable.vertices])
+    places = ca.Function(
+        "places", [q, system.parameters.symbols], [kinematics.frame_position(v) for v in cable.vertices]
+    )
     at = np.array([np.array(p).ravel() for p in places(np.zeros(system.size), system.parameters.vector())])
     shape = cable.shape(cable.vertices)
 
@@ -136,7 +148,7 @@ def test_the_undeformed_model_has_the_undeformed_shape(cable, twin):
 def test_every_row_of_the_axis_constraint_matches_its_derivatives(twin):
     e = twin[0].equations
     phi = ca.Function("phi", [e.q1, e.z1, e.lam, e.theta, e.time_step], [e.constraint, ca.jacobian(e.constraint, e.q1)])
-    closed = ca.Function("closed", e.arguments, [e.pulls.before, e.pulls.before_by_q])
+    closed = ca.Function("closed", e.arguments, [e.constraint_impulses.before, e.constraint_impulses.before_force_by_q])
     random = np.random.default_rng(3)
     q, lam = random.normal(scale=0.4, size=e.q0.numel()), random.normal(size=5)
     theta = twin[0].system.parameters.vector()
@@ -157,13 +169,13 @@ def test_the_values_of_a_twin_are_found_from_its_vertices(cable, twin):
     )
     free = ("parent.bend", "parent.damping", "c.bend")
     problem = EstimationProblem(step, [recording], free, settings)
-    before = point_errors(problem, problem.start, cable.free)["twin"]
+    before = point_rmse_by_recording(problem, problem.initial_unknowns, cable.free)["twin"]
     solution = solve(problem, GaussNewton())
     # what the points leave open of the start follows the stiffnesses with which it was fitted, so once more
-    problem = problem.with_free(free, dict(zip(free, solution.x, strict=True)))
+    problem = problem.with_free_parameters(free, dict(zip(free, solution.x, strict=True)))
     solution = solve(problem, GaussNewton())
     np.testing.assert_allclose(solution.x, [TRUTH[name] for name in free], rtol=0.08)
-    after = point_errors(problem, solution.x, cable.free)["twin"]
+    after = point_rmse_by_recording(problem, solution.x, cable.free)["twin"]
     assert after < 5e-4
     assert before > 10 * after
 
@@ -173,11 +185,11 @@ def test_the_roll_of_a_clamp_is_found_from_two_frames(cable, twin):
     settings = cable_options(cable, [recording], 1e-6, 1e-3, path_cutoff=np.inf, options=options)
     problem = EstimationProblem(step, [recording], ("parent.bend",), settings, TRUTH | {"clamp_start.roll": -2.0})
     episode = problem.episodes[0]
-    fitted = episode.start
+    fitted = episode.fixed_initial_state
     # of least elastic energy, not of equilibrium: weight turns the child's root by a little
-    assert fitted.values["clamp_start.roll"] == pytest.approx(TRUTH["clamp_start.roll"], abs=0.15)
-    result = problem.predictor.run(episode, problem.theta, np.zeros(0), False)
-    np.testing.assert_allclose(result.predicted[0][0], episode.samples[0].value[0], atol=1e-5)
+    assert fitted.fitted_parameters["clamp_start.roll"] == pytest.approx(TRUTH["clamp_start.roll"], abs=0.15)
+    result = problem.predictor.predict_episode(episode, problem.theta, np.zeros(0), False)
+    np.testing.assert_allclose(result.predicted_outputs[0][0], episode.measurements[0].value[0], atol=1e-5)
 
 
 def test_held_out_starts_use_no_frame_after_the_second(cable, twin):
@@ -188,29 +200,33 @@ def test_held_out_starts_use_no_frame_after_the_second(cable, twin):
     other = Recording(points=(replace(recording.points[0], position=seen),), name="other")
     settings = cable_options(cable, [recording, other], 1e-6, 1e-3, options=options)
     problem = EstimationProblem(step, [recording], ("parent.bend",), settings, None, [other])
-    first = problem.predictor.run(problem.episodes[0], problem.theta, np.zeros(0), False)
-    [(_, second)] = problem.validate(problem.start)
-    np.testing.assert_array_equal(first.predicted[0], second.predicted[0])
+    first = problem.predictor.predict_episode(problem.episodes[0], problem.theta, np.zeros(0), False)
+    [(_, second)] = problem.predict_held_out(problem.initial_unknowns)
+    np.testing.assert_array_equal(first.predicted_outputs[0], second.predicted_outputs[0])
 
 
 def test_edges_are_as_long_as_measured(cable):
     t = PERIOD * np.arange(4)
     seen = {v: np.tile(1.25 * np.asarray(UNDEFORMED[v]), (4, 1)) for v in cable.vertices}
     recording = as_recording(cable, t, seen)
-    lengths = edge_lengths(cable.edges, [recording])
+    lengths = median_edge_lengths(cable.edges, [recording])
     expected = 1.25 * np.linalg.norm(np.subtract(UNDEFORMED["c2"], UNDEFORMED["c1"]))
     assert lengths["c1", "c2"] == pytest.approx(expected)
-    values = length_values(cable, edge_lengths(cable.edges, [recording], 2))
+    values = edge_length_parameters(cable, median_edge_lengths(cable.edges, [recording], 2))
     assert values["c.length_1"] == pytest.approx(expected)
-    assert set(values) <= set(cable_system(edge_lengths(cable.edges, [recording]), cable).parameters.names)
-    np.testing.assert_array_equal(measured(recording, "c1"), seen["c1"])
+    assert set(values) <= set(cable_system(median_edge_lengths(cable.edges, [recording]), cable).parameters.names)
+    np.testing.assert_array_equal(_measured_positions(recording, "c1"), seen["c1"])
 
 
 def test_free_parameters_are_parameters(cable):
-    options = CableOptions(memory=0.5, rest_angles=True, default=BranchOptions(twist_damping=True))
+    options = CableOptions(
+        shape_memory=0.5, has_rest_angle_parameters=True, default_branch=CableBranchOptions(separate_twist_damping=True)
+    )
     recording = as_recording(cable, PERIOD * np.arange(4), {})
-    names = free_parameters(cable, options)
-    assert set(names) <= set(cable_system(edge_lengths(cable.edges, [recording]), cable, options).parameters.names)
+    names = estimable_parameters(cable, options)
+    assert set(names) <= set(
+        cable_system(median_edge_lengths(cable.edges, [recording]), cable, options).parameters.names
+    )
     assert {"parent.memory", "c.twist_damping", "parent_3_y.rest", "c_0_x.rest"} <= set(names)
     assert not any(name.endswith(".mass") for name in names)
 
@@ -226,34 +242,36 @@ def test_free_parameters_are_parameters(cable):
 )
 def test_a_cable_that_does_not_fit_together_is_refused(arguments, text):
     with pytest.raises(ModelError, match=text):
-        Cable(*arguments, UNDEFORMED)
+        CableTopology(*arguments, UNDEFORMED)
 
 
 def test_vertices_are_read_from_a_table(tmp_path):
     path = tmp_path / "vertices.csv"
     path.write_text("point,x,y,z\np0,1,2,3\n")
-    np.testing.assert_array_equal(read_vertices(path)["p0"], [1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(read_vertex_positions(path)["p0"], [1.0, 2.0, 3.0])
     path.write_text("point,x,y\np0,1,2\n")
     with pytest.raises(DataError, match="malformed"):
-        read_vertices(path)
+        read_vertex_positions(path)
     with pytest.raises(DataError, match="cannot be read"):
-        read_vertices(tmp_path / "none.csv")
+        read_vertex_positions(tmp_path / "none.csv")
 
 
 def test_a_real_cable_is_predicted_better_than_by_carrying_it_along(repository):
     folder = repository.parent / "shared" / "recordings" / "deft"
     if not folder.is_dir():
         pytest.skip(f"the recordings are not there: {folder}")
-    cable = Cable(
+    cable = CableTopology(
         tuple(f"p{i}" for i in range(13)),
         {"a": ("p4", "a1", "a2", "a3", "a4"), "b": ("p8", "b1", "b2", "b3")},
-        read_vertices(folder / "bdlo1_undeformed.csv"),
+        read_vertex_positions(folder / "bdlo1_undeformed.csv"),
     )
     recording = read_recording(folder / "bdlo1_train_021.h5")
-    options = CableOptions(memory=0.75)
-    step = compile_step(cable_system(edge_lengths(cable.edges, [recording]), cable, options), PERIOD)
+    options = CableOptions(shape_memory=0.75)
+    step = compile_step(cable_system(median_edge_lengths(cable.edges, [recording]), cable, options), PERIOD)
     settings = cable_options(cable, [recording], 2e-4, 0.1, options=options)
-    problem = EstimationProblem(step, [recording], free_parameters(cable, options), settings)
-    error = point_errors(problem, problem.start, cable.free)[recording.name]
-    carried = linear_carry(recording, cable.free, cable.parent, cable.children, cable.held)
-    assert error < 0.5 * prediction_error(carried, positions(recording, cable.free))
+    problem = EstimationProblem(step, [recording], estimable_parameters(cable, options), settings)
+    error = point_rmse_by_recording(problem, problem.initial_unknowns, cable.free_vertices)[recording.name]
+    carried = interpolated_displacement_baseline(
+        recording, cable.free_vertices, cable.parent_vertices, cable.child_vertices, cable.clamped_vertices
+    )
+    assert error < 0.5 * position_rmse(carried, measured_positions(recording, cable.free_vertices))

@@ -10,7 +10,11 @@ import pytest
 from small_problems import pendulum_step, taken
 
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.constant_errors import ConstantErrors, slopes_by_constants, without_constants
+from yid_ocp.problem.constant_sensor_errors import (
+    ConstantErrorModel,
+    constant_error_sensitivities,
+    subtract_estimated_biases,
+)
 from yid_ocp.problem.options import SensorOptions
 from yid_ocp.solvers import GaussNewton, MultipleShooting, solve
 
@@ -48,10 +52,12 @@ def test_the_map_is_that_of_generalised_least_squares():
     rng = np.random.default_rng(3)
     slopes, columns = rng.standard_normal((40, 3)) * [0.1, 2.0, 30.0], rng.standard_normal((40, 5))
     covariance = np.eye(40) + slopes @ slopes.T
-    made = ConstantErrors.of(slopes).whitened(columns)
+    made = ConstantErrorModel.from_sensitivities(slopes).whiten(columns)
     np.testing.assert_allclose(made.T @ made, columns.T @ np.linalg.solve(covariance, columns), rtol=1e-9)
     expected = -slopes.T @ np.linalg.solve(covariance, columns[:, 0])
-    np.testing.assert_allclose(ConstantErrors.of(slopes).estimated(columns[:, 0]), expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        ConstantErrorModel.from_sensitivities(slopes).estimate_errors(columns[:, 0]), expected, rtol=1e-9, atol=1e-12
+    )
 
 
 def test_a_stated_constant_is_what_an_offset_of_every_recording_beside_its_prior_would_be(urdf_folder):
@@ -61,7 +67,7 @@ def test_a_stated_constant_is_what_an_offset_of_every_recording_beside_its_prior
     assert found.cost == pytest.approx(other.cost, rel=1e-9)
     for name in free:
         assert found.parameters[name].value == pytest.approx(other.parameters[name].value, rel=1e-3)
-    shot = solve(stated, MultipleShooting(transcription="symbolic", iterations=1), restarts=False)
+    shot = solve(stated, MultipleShooting(transcription="symbolic", max_iterations=1), restarts=False)
     assert "without the constant errors" in shot.message
     plain = solve(arm(urdf_folder, 0.0, free, prescribed=tuple(BIAS)), GaussNewton(), restarts=False)
     assert plain.cost > found.cost + 10.0
@@ -77,12 +83,14 @@ def test_beside_noise_that_drives_other_joints_too(urdf_folder):
     given = ProblemOptions(path_cutoff=math.inf, weak_prior_factor=0.0, sensors=sensors)
     stated = EstimationProblem(step, recorded, ("elbow.mass",), given)
     bare = replace(given, sensors={"joints.effort": SensorOptions(std=0.05, bias_std={"shoulder": 0.1, "elbow": 0.0})})
-    spelt = EstimationProblem(step, recorded, ("elbow.mass", name), replace(bare, priors={name: 0.5}))
-    assert stated.episodes[0].has_constant_errors
-    assert not spelt.episodes[0].has_constant_errors
-    weighted, beside = stated.weighted_at(stated.start), spelt.weighted_at(spelt.start)
-    assert weighted.innovations[0] is not None
-    assert weighted.evaluate(stated.start).cost == pytest.approx(least(beside, spelt.start)[0], rel=1e-6)
+    spelt = EstimationProblem(step, recorded, ("elbow.mass", name), replace(bare, prior_stds={name: 0.5}))
+    assert stated.episodes[0].has_constant_sensor_errors
+    assert not spelt.episodes[0].has_constant_sensor_errors
+    weighted, beside = stated.whitened_at(stated.initial_unknowns), spelt.whitened_at(spelt.initial_unknowns)
+    assert weighted.whitening_filters[0] is not None
+    assert weighted.evaluate(stated.initial_unknowns).cost == pytest.approx(
+        least(beside, spelt.initial_unknowns)[0], rel=1e-6
+    )
 
 
 def test_the_gradient_is_that_of_the_cost(urdf_folder):
@@ -103,7 +111,7 @@ def test_what_is_known_of_constants_is_taken_off_the_samples(urdf_folder):
     for i, (episode, result) in enumerate(zip(problem.episodes, found.episodes, strict=True)):
         [(before, after)] = [
             pair
-            for pair in zip(episode.samples, without_constants(episode.samples, result.predicted), strict=True)
+            for pair in zip(episode.samples, subtract_estimated_biases(episode.samples, result.predicted), strict=True)
             if pair[0].sensor.efforts
         ]
         offsets = [x[spelt.names.index(f"effort_offset@{joint}.offset[{episode.name}]")] for joint in BIAS]
@@ -114,9 +122,9 @@ def test_what_is_known_of_constants_is_taken_off_the_samples(urdf_folder):
 def test_held_out_rows_count_it_and_rows_without_a_constant_stay(urdf_folder):
     problem = arm(urdf_folder, BIAS, ("shoulder.damping",), prescribed=tuple(BIAS))
     [(episode, result)] = problem.validate(problem.start)
-    counted = problem.held_out_rows(0, episode, result).residual
+    counted = problem.held_out_residual(0, episode, result).residual
     plain = np.concatenate([s.rows(y).residual for s, y in zip(episode.samples, result.predicted, strict=True)])
-    slopes = slopes_by_constants(episode.samples)
+    slopes = constant_error_sensitivities(episode.samples)
     rows = np.any(slopes != 0, axis=1)
     np.testing.assert_allclose(counted[~rows], plain[~rows], rtol=1e-14)
     covariance = np.eye(len(plain)) + slopes @ slopes.T

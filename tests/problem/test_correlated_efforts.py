@@ -10,11 +10,11 @@ import pytest
 from small_problems import correlated, efforts, measured, pendulum_step, taken
 
 from yid_ocp.data.recording import JointGroup, Recording
-from yid_ocp.diagnosis.smoother_model import linear_model
+from yid_ocp.diagnosis.smoother_model import linear_residual_models
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.low_pass import LowPass
+from yid_ocp.problem.low_pass_filter import LowPassFilter
 from yid_ocp.solvers import GaussNewton, Lifted, MultipleShooting, SingleShooting, solve
-from yid_ocp.solvers.symbolic import transcribe
+from yid_ocp.solvers.symbolic_transcription import transcribe
 
 NAN = math.nan
 JOINTS = ("shoulder", "elbow")
@@ -25,8 +25,8 @@ CUTOFF, TWINS = 8.0, 40  # [Hz]
 def test_rows_are_independent_whatever_of_a_sample_was_seen():
     correlation = np.array([[[1.0, 0.8, -0.3], [0.8, 1.0, 0.1], [-0.3, 0.1, 1.0]]] * 2)
     made = measured(efforts("a", "b", "c"), [0, 1], [0.0, 0.0], [[1.0, 2.0, 3.0], [4.0, NAN, 6.0]])
-    made = replace(made, correlation=correlation, weight=made.weight * 2.0)
-    mixing = made.mixing.toarray()
+    made = replace(made, noise_correlation=correlation, weight=made.weight * 2.0)
+    mixing = made.decorrelation_matrix.toarray()
     np.testing.assert_allclose(mixing, mixing.T, atol=1e-12)
     covariance = np.zeros((5, 5))
     covariance[:3, :3] = correlation[0]
@@ -34,15 +34,17 @@ def test_rows_are_independent_whatever_of_a_sample_was_seen():
     np.testing.assert_allclose(mixing @ covariance @ mixing, np.eye(5), atol=1e-12)
     predicted = np.array([[0.0, 1.0, 5.0], [1.0, 9.0, 2.0]])
     plain = 2.0 * np.array([-1.0, -1.0, 2.0, -3.0, -4.0])
-    np.testing.assert_allclose(made.rows(predicted).residual, mixing @ plain, rtol=1e-12)
-    np.testing.assert_allclose(made.whitened(predicted)[made.seen], mixing @ plain, rtol=1e-12)
-    assert made.whitened(predicted)[1, 1] == 0.0
+    np.testing.assert_allclose(made.residual_block(predicted).residual, mixing @ plain, rtol=1e-12)
+    np.testing.assert_allclose(made.whitened_residual(predicted)[made.is_used], mixing @ plain, rtol=1e-12)
+    assert made.whitened_residual(predicted)[1, 1] == 0.0
     slopes = np.random.default_rng(0).standard_normal((2, 3, 4))
-    found = made.rows(predicted, slopes, threshold=1.5)
-    np.testing.assert_allclose(found.jacobian, found.factor[:, None] * (mixing @ (2.0 * slopes[made.seen])), rtol=1e-12)
+    found = made.residual_block(predicted, slopes, threshold=1.5)
+    np.testing.assert_allclose(
+        found.jacobian, found.robust_factor[:, None] * (mixing @ (2.0 * slopes[made.is_used])), rtol=1e-12
+    )
     pull = np.random.default_rng(1).standard_normal((2, 3))
-    back = np.einsum("mk,mkd->d", made.pulled(np.where(made.seen, pull, 0.0)), slopes)
-    np.testing.assert_allclose(back, pull[made.seen] @ made.rows(predicted, slopes).jacobian, rtol=1e-12)
+    back = np.einsum("mk,mkd->d", made.whitening_adjoint(np.where(made.is_used, pull, 0.0)), slopes)
+    np.testing.assert_allclose(back, pull[made.is_used] @ made.residual_block(predicted, slopes).jacobian, rtol=1e-12)
 
 
 def arm(step, path, effort, angle=ANGLE, std=EFFORT, free=("shoulder.damping",), cutoff=CUTOFF):
@@ -86,7 +88,7 @@ def correlated_problem(folder, cutoff=math.inf, **how):
     names = ("shoulder.damping", "elbow.damping")
     options = ProblemOptions(weak_prior_factor=0.0, path_cutoff=cutoff)
     made = EstimationProblem(step, [taken(step, 1, steps=40 if math.isinf(cutoff) else 90)], names, options)
-    return made.on([correlated(episode) for episode in made.episodes], ())
+    return made.with_episodes([correlated(episode) for episode in made.episodes], ())
 
 
 @pytest.mark.parametrize(
@@ -105,9 +107,9 @@ def test_derivatives_and_transcriptions_count_what_is_correlated(urdf_folder, ho
     np.testing.assert_allclose(evaluation.jacobian, np.stack(moved, axis=1), rtol=1e-5, atol=1e-5 * np.abs(moved).max())
     np.testing.assert_allclose(problem.gradient(x)[1], evaluation.jacobian.T @ evaluation.residual, rtol=1e-8)
     program = transcribe(problem)
-    arguments, theta = program.arguments, program.block("theta").index.ravel()
+    arguments, theta = program.solver_arguments, program.block("theta").index.ravel()
     arguments["lbx"][theta] = arguments["ubx"][theta] = x
-    solver = program.solver("ipopt", "exact", ipopt={"print_level": 0, "sb": "yes", "tol": 1e-9})
+    solver = program.make_solver("ipopt", "exact", ipopt={"print_level": 0, "sb": "yes", "tol": 1e-9})
     assert float(solver(**arguments)["f"]) == pytest.approx(evaluation.cost, rel=1e-8)
     if "cutoff" in how:  # what is measured of the efforts says little beside points that are this wrong
         return
@@ -120,11 +122,11 @@ def test_derivatives_and_transcriptions_count_what_is_correlated(urdf_folder, ho
 
 def test_unknown_forces_are_seen_as_correlated(urdf_folder):
     problem = correlated_problem(urdf_folder, prescribed=JOINTS)
-    [linear] = linear_model(problem, problem.start, problem.evaluate(problem.start))
-    at = [linear.unknowns.index(joint) for joint in JOINTS]
-    found = sum(interval.by_unknown[:, at].T @ interval.by_unknown[:, at] for interval in linear.intervals)
+    [linear] = linear_residual_models(problem, problem.start, problem.evaluate(problem.start))
+    at = [linear.unknown_names.index(joint) for joint in JOINTS]
+    found = sum(interval.unknown_jacobian[:, at].T @ interval.unknown_jacobian[:, at] for interval in linear.intervals)
     [samples] = (s for s in problem.episodes[0].samples if s.sensor.efforts)
-    slopes = samples.weight[:, :, None] * np.diag(linear.reference[at])
+    slopes = samples.weight[:, :, None] * np.diag(linear.reference_std[at])
     assert np.array_equal(samples.sensor.efforts, JOINTS)
     seen = samples.mixing @ slopes[samples.seen]
     # but for the first and the last step, of which a node sees half
@@ -141,8 +143,8 @@ def test_a_gear_does_not_give_way_to_the_noise_of_an_effort_that_is_compared(urd
         arm(step, path, made, angle=0.0, free=(name,)).episodes[0]
         for made in (effort, effort + 0.3 * rng.standard_normal(effort.shape), effort + 2.0)
     )
-    inner, gain = slice(50, -50), LowPass(CUTOFF).gains(0.01)[0]
-    np.testing.assert_allclose(clean.load[inner], LowPass(CUTOFF)(clean.grid.times, effort)[inner], atol=0.02)
+    inner, gain = slice(50, -50), LowPassFilter(CUTOFF).noise_gains(0.01)[0]
+    np.testing.assert_allclose(clean.load[inner], LowPassFilter(CUTOFF)(clean.grid.times, effort)[inner], atol=0.02)
     assert np.std((noisy.load - clean.load)[inner]) < 0.5 * 0.3 * gain
     # what the model does not know of a load is measured all the same
     np.testing.assert_allclose((heavier.load - clean.load)[inner], 2.0, atol=1e-6)

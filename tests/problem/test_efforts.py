@@ -13,7 +13,7 @@ from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.low_pass import LowPass, effort_filter
+from yid_ocp.problem.low_pass_filter import LowPassFilter, effort_filter
 from yid_ocp.solvers import GaussNewton, solve
 
 JOINTS = ("shoulder", "elbow")
@@ -65,10 +65,10 @@ def test_neighbours_that_repeat_each_other_are_left_out(arm):
     plain, smooth = (arm(np.zeros((601, 2)), cutoff).episodes[0].samples[0] for cutoff in (math.inf, CUTOFF))
     np.testing.assert_array_equal(plain.node, np.arange(1, 600))
     np.testing.assert_array_equal(smooth.node + np.rint(smooth.fraction), np.arange(77, 524, 10))
-    assert LowPass(CUTOFF).stride(0.01) == 10
-    assert LowPass(CUTOFF).settling == pytest.approx(0.574, abs=1e-3)
-    assert effort_filter(CUTOFF).settling == pytest.approx(0.768, abs=1e-3)
-    assert LowPass(30.0).stride(0.05) == 1
+    assert LowPassFilter(CUTOFF).decorrelation_stride(0.01) == 10
+    assert LowPassFilter(CUTOFF).settling_time == pytest.approx(0.574, abs=1e-3)
+    assert effort_filter(CUTOFF).settling_time == pytest.approx(0.768, abs=1e-3)
+    assert LowPassFilter(30.0).decorrelation_stride(0.05) == 1
 
 
 @pytest.mark.parametrize(("kind", "late"), [(None, 0.0), ("sample", 0.0), ("mean", 0.005), ("command", 0.005)])

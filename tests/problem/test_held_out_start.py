@@ -9,7 +9,7 @@ import pytest
 from small_problems import swinging_pendulum
 
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.episodes import beginning
+from yid_ocp.problem.episodes import truncate_episode
 
 NOISE = 1e-3
 
@@ -43,22 +43,22 @@ def test_an_estimated_start_is_estimated_in_held_out_recordings_too(swinging):
 def test_only_the_first_moments_count(swinging):
     problem = swinging(initial_state="estimated", configuration_std=0.2, velocity_std=1.0)
     episode = problem.held_out[0]
-    found = problem.held_out_offset(0, problem.start)
+    found = problem.held_out_initial_state_offset(0, problem.start)
     assert np.any(found)
     moved = {}
     for first in (50, 5):
         value = episode.samples[0].value.copy()
         value[first:] += 1.0
         changed = replace(episode, samples=(replace(episode.samples[0], value=value),))
-        moved[first] = problem.on(problem.episodes, [changed]).held_out_offset(0, problem.start)
+        moved[first] = problem.on(problem.episodes, [changed]).held_out_initial_state_offset(0, problem.start)
     assert moved[50] == pytest.approx(found, abs=1e-12)
     assert moved[5] != pytest.approx(found, abs=1e-3)
 
 
 def test_the_beginning_of_an_episode_holds_what_was_measured_in_it(swinging):
     episode = swinging().held_out[0]
-    short = beginning(episode, 20)
+    short = truncate_episode(episode, 20)
     assert short.grid.steps == 20
-    assert (short.samples[0].node + short.samples[0].fraction).max() <= 20
-    assert len(short.samples[0].value) == 21
-    assert short.samples[0].span == (0, 20)
+    assert (short.measurements[0].node + short.measurements[0].fraction).max() <= 20
+    assert len(short.measurements[0].value) == 21
+    assert short.measurements[0].predictable_nodes == (0, 20)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from yid_ocp.problem.lag import Lag
+from yid_ocp.problem.first_order_lag import FirstOrderLag
 
 H, N = 0.01, 40
 RNG = np.random.default_rng(4)
@@ -17,8 +17,8 @@ SLOPE = RNG.normal(size=(N, 2, 3))
 BY = np.array([[1.0, 0.0, 0.3], [0.0, 1.0, 0.0]])
 
 
-def lag(first: float = 0.02, second: float = 0.004) -> Lag:
-    return Lag(np.array([first, second]), BY, H)
+def lag(first: float = 0.02, second: float = 0.004) -> FirstOrderLag:
+    return FirstOrderLag(np.array([first, second]), BY, H)
 
 
 def solved(course, time_constant: float, start: float, times: np.ndarray, breaks: np.ndarray) -> np.ndarray:
@@ -35,7 +35,7 @@ def solved(course, time_constant: float, start: float, times: np.ndarray, breaks
 
 
 def test_steps_have_the_mean_of_the_differential_equation() -> None:
-    mean, _ = lag().of_steps(VALUE, None)
+    mean, _ = lag().filter_step_means(VALUE, None)
     breaks = H * np.arange(N + 1)
     fine = H / 20 * (np.arange(20 * N) + 0.5)
     for column, time in enumerate((0.02, 0.004)):
@@ -45,7 +45,7 @@ def test_steps_have_the_mean_of_the_differential_equation() -> None:
 
 
 def test_nodes_follow_straight_lines_between_them() -> None:
-    followed, _ = lag().of_nodes(VALUE, None)
+    followed, _ = lag().filter_node_values(VALUE, None)
     times = H * np.arange(N)
     for column, time in enumerate((0.02, 0.004)):
         x = VALUE[:, column]
@@ -56,12 +56,12 @@ def test_nodes_follow_straight_lines_between_them() -> None:
 
 def test_without_a_time_constant_all_is_followed_at_once() -> None:
     at_once = lag(0.0, 0.0)
-    np.testing.assert_array_equal(at_once.of_steps(VALUE, None)[0], VALUE)
-    np.testing.assert_array_equal(at_once.of_nodes(VALUE, None)[0], VALUE)
+    np.testing.assert_array_equal(at_once.filter_step_means(VALUE, None)[0], VALUE)
+    np.testing.assert_array_equal(at_once.filter_node_values(VALUE, None)[0], VALUE)
     # and there is a slope all the same, that of a delay
-    _, slope = at_once.of_steps(VALUE, None)
+    _, slope = at_once.filter_step_means(VALUE, None)
     np.testing.assert_allclose(slope[1:, 0, 0], -np.diff(VALUE[:, 0]) / H)
-    _, slope = at_once.of_nodes(VALUE, np.zeros((N, 2, 3)))
+    _, slope = at_once.filter_node_values(VALUE, np.zeros((N, 2, 3)))
     np.testing.assert_allclose(slope[2:, 0, 0], -np.diff(VALUE[1:, 0]) / H)
 
 
@@ -69,10 +69,10 @@ def test_of_a_negative_time_constant_the_value_follows() -> None:
     """What a smooth value is said to follow, followed again, is the value."""
     t = 0.001 * np.arange(1200)
     value = np.stack([np.sin(5 * t), np.cos(3 * t)], axis=1)
-    there = Lag(np.array([-0.03, 0.0]), BY, 0.001)
-    back = Lag(np.array([0.03, 0.0]), BY, 0.001)
-    ahead, _ = there.of_nodes(value, None)
-    again, _ = back.of_nodes(ahead, None)
+    there = FirstOrderLag(np.array([-0.03, 0.0]), BY, 0.001)
+    back = FirstOrderLag(np.array([0.03, 0.0]), BY, 0.001)
+    ahead, _ = there.filter_node_values(value, None)
+    again, _ = back.filter_node_values(ahead, None)
     np.testing.assert_allclose(again[300:], value[300:], atol=2e-5)
     assert np.abs(ahead - value)[300:, 0].max() == pytest.approx(0.15, rel=0.02)
     np.testing.assert_array_equal(ahead[:, 1], value[:, 1])
@@ -87,7 +87,7 @@ def test_derivatives_agree_with_differences(form, size) -> None:
     _, slope = getattr(lag(size), form)(VALUE, SLOPE)
     for direction in range(3):
         above, below = (
-            getattr(Lag(np.array([size, 0.004]) + s * BY[:, direction], BY, H), form)(
+            getattr(FirstOrderLag(np.array([size, 0.004]) + s * BY[:, direction], BY, H), form)(
                 VALUE + s * SLOPE[:, :, direction], None
             )[0]
             for s in (1e-7, -1e-7)
@@ -98,7 +98,7 @@ def test_derivatives_agree_with_differences(form, size) -> None:
 @pytest.mark.parametrize("size", [0.02, -0.02])
 def test_a_pull_comes_back_by_the_transpose(size) -> None:
     pull = np.random.default_rng(5).normal(size=(N, 2))
-    _, slope = lag(size).of_nodes(VALUE, SLOPE)
-    back, direct = lag(size).pulled(VALUE, pull)
+    _, slope = lag(size).filter_node_values(VALUE, SLOPE)
+    back, direct = lag(size).node_values_adjoint(VALUE, pull)
     total = np.einsum("kn,knd->d", back, SLOPE) + direct
     np.testing.assert_allclose(total, np.einsum("kn,knd->d", pull, slope), rtol=1e-12)

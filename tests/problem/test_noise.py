@@ -11,14 +11,14 @@ from small_problems import H, correlated, pendulum_step, taken
 
 from yid_ocp.errors import ConfigError
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.evaluation import joined
+from yid_ocp.problem.evaluation import _sensor_whitened_residual
 
 TORQUE, BIAS, ANGLE = 0.3, 0.2, 2e-3
 TRACKED = {"feedback": "proportional", "gains": (9.0,)}
 
 
 def problem_of(folder, *, encoders, period=1, feedback=TRACKED, effects=(), size=1.0, angle=ANGLE, **more):
-    """A pendulum whose shoulder is driven by wrong torques, `period` steps a sample; errors `size` times as large."""
+    """A pendulum whose shoulder is driven by wrong torques, `median_sample_period` steps a sample; errors `size` times as large."""
     step = pendulum_step(folder, effects, driven=("shoulder",))
     made = taken(step, 3, steps=24)
     group = made.joints
@@ -38,14 +38,14 @@ def residual(problem, x, torque=0.0, posture=0.0, reference=None):
     """Residual by the sensors' noise alone of an episode whose torques, first angles and reference are changed."""
     episode = problem.episodes[0]
     errors = replace(episode.errors, offset=np.zeros(1))
-    arm = episode.measured_arm.copy()
+    arm = episode.measured_driven_angles.copy()
     arm[0] += posture
     feedback = episode.feedback
     if reference is not None and feedback is not None:
         feedback = replace(feedback, reference=feedback.reference + reference)
     changed = replace(episode, torque=episode.torque + torque, measured_arm=arm, feedback=feedback, errors=errors)
     result = problem.predictor.run(changed, *problem.split(x, 0), False)
-    return joined(changed.samples, result).residual
+    return _sensor_whitened_residual(changed.samples, result).residual
 
 
 def slopes(change, count, size):
@@ -97,7 +97,7 @@ def test_innovations_weigh_by_the_covariance_of_all_residuals(urdf_folder, how, 
     if together:
         problem = problem.on([correlated(episode) for episode in problem.episodes], ())
     x = problem.start * 1.1
-    plain, weighted = problem.evaluate(x), problem.weighted_at(x).evaluate(x)
+    plain, weighted = problem.evaluate(x), problem.whitened_at(x).evaluate(x)
     rows = problem.rows.data
     covariance = dense_covariance(problem, x, how.get("angle", ANGLE))
     solved = np.linalg.solve(covariance, np.column_stack([plain.residual[rows], plain.jacobian[rows]]))
@@ -114,7 +114,7 @@ def test_with_encoders_the_outcome_does_not_depend_on_the_tracking_filter(urdf_f
     for g in (9.0, gain):
         feedback = {"feedback": "proportional", "gains": (g,)}
         problem = small_gap(problem_of(urdf_folder, encoders=True, feedback=feedback, size=0.1), size=0.1)
-        weighted = problem.weighted_at(problem.start)
+        weighted = problem.whitened_at(problem.start)
         rows = problem.rows.data
         found = weighted.evaluate(problem.start)
         r, jacobian = found.residual[rows], found.jacobian[rows]
@@ -138,7 +138,7 @@ def small_gap(problem, size=1.0):
         for s, y in zip(episode.samples, result.predicted, strict=True)
     )
     angles = result.rollout.state[:, :1] + size * ANGLE * rng.standard_normal((len(result.rollout.state), 1))
-    angles[0] = episode.measured_arm[0]
+    angles[0] = episode.measured_driven_angles[0]
     feedback = episode.feedback
     if feedback is not None:
         feedback = replace(feedback, reference=angles[:-1].copy())
@@ -150,13 +150,13 @@ def test_without_errors_of_inputs_nothing_changes(urdf_folder):
     made = taken(step, 3)
     made = replace(made, joints=replace(made.joints, effort_std=0.0))
     problem = EstimationProblem(step, [made], ("elbow.stiffness",), ProblemOptions(**TRACKED))
-    assert not problem.disturbed
-    assert problem.weighted_at(problem.start) is problem
+    assert not problem.has_process_noise
+    assert problem.whitened_at(problem.initial_unknowns) is problem
 
 
 def test_the_papers_cost_knows_no_noise(urdf_folder):
     problem = problem_of(urdf_folder, encoders=False, weighting="paper")
-    assert not problem.disturbed
+    assert not problem.has_process_noise
     assert {s.sensor.group for s in problem.episodes[0].samples} == {"points_arm", "points_camera"}
 
 
@@ -164,15 +164,15 @@ def test_a_constant_error_is_seen_and_its_spread_said(urdf_folder):
     problem = small_gap(problem_of(urdf_folder, encoders=True))
     episode = problem.episodes[0]
     problem = problem.on([replace(episode, torque=episode.torque + 0.35)], [])
-    weighted = problem.weighted_at(problem.start)
-    ((value, std),) = weighted.torque_offsets(problem.start)
+    weighted = problem.whitened_at(problem.start)
+    ((value, std),) = weighted.estimate_torque_biases(problem.start)
     assert std[0] < BIAS
     assert value[0] == pytest.approx(0.35, abs=4 * std[0])
-    again = weighted.weighted_at(problem.start)
+    again = weighted.whitened_at(problem.start)
     np.testing.assert_allclose(again.episodes[0].errors.offset, value)
-    ((settled, _),) = again.torque_offsets(problem.start)
+    ((settled, _),) = again.estimate_torque_biases(problem.start)
     assert settled[0] == pytest.approx(value[0], abs=0.5 * std[0])
-    assert problem.torque_offsets(problem.start) == [None]
+    assert problem.estimate_torque_biases(problem.start) == [None]
 
 
 @pytest.mark.parametrize("feedback", [TRACKED, {"feedback": "lqr"}], ids=["angles", "angles_and_momenta"])
@@ -180,16 +180,16 @@ def test_a_constant_error_counts_in_what_the_filter_follows_too(urdf_folder, fee
     """The momentum of the measured motion is worked out from recorded torques; weights know what their error does."""
     problem = problem_of(urdf_folder, encoders=False, feedback=feedback)
     x, error = problem.start, 1e-3
-    weighted = problem.weighted_at(x)
-    [episode], [whitening] = weighted.episodes, weighted.innovations
+    weighted = problem.whitened_at(x)
+    [episode], [whitening] = weighted.episodes, weighted.whitening_filters
     group = episode.recording.joints
     wrong = replace(episode.recording, joints=replace(group, effort=group.effort + error))
     again = EstimationProblem(problem.step, [wrong], problem.free, problem.options).episodes[0]
-    other = replace(again, errors=episode.errors)
+    other = replace(again, input_errors=episode.errors)
     found = []
     for each in (episode, other):
         result = weighted.predictor.run(each, *problem.split(x, 0), False)
-        found.append(weighted.predictor.torque_offset(each, result, whitening)[0])
+        found.append(weighted.predictor.estimate_torque_bias(each, result, whitening)[0])
     seen = 1 - (whitening.bias_std[0] / BIAS) ** 2
     assert seen > 0.05
     assert (found[1] - found[0]) / error == pytest.approx(seen, rel=0.01)
@@ -197,25 +197,25 @@ def test_a_constant_error_counts_in_what_the_filter_follows_too(urdf_folder, fee
 
 def test_what_cannot_be_rolled_out_has_no_constant_error(point, monkeypatch):
     problem, x = point
-    weighted = problem.weighted_at(x)
-    assert len(weighted.torque_offsets(x)[0]) == 2
+    weighted = problem.whitened_at(x)
+    assert len(weighted.estimate_torque_biases(x)[0]) == 2
     monkeypatch.setattr(type(weighted.predictor), "run", lambda *_: "it snaps")
-    assert weighted.torque_offsets(x) == [None]
+    assert weighted.estimate_torque_biases(x) == [None]
 
 
 def test_weights_are_frozen_until_they_are_asked_for_again(point):
     problem, x = point
-    weighted = problem.weighted_at(x)
+    weighted = problem.whitened_at(x)
     there, back = weighted.evaluate(1.2 * x), weighted.evaluate(x)
-    assert weighted.innovations[0] is weighted.freeing(problem.free[:1]).innovations[0]
+    assert weighted.whitening_filters[0] is weighted.freeing(problem.free[:1]).whitening_filters[0]
     np.testing.assert_array_equal(back.residual, weighted.evaluate(x).residual)
     assert there.cost != back.cost
-    assert problem.innovations == (None,)
+    assert problem.whitening_filters == (None,)
 
 
 def test_jacobians_of_innovations_are_those_of_differences(urdf_folder):
     problem = small_gap(problem_of(urdf_folder, encoders=True))
-    weighted = problem.weighted_at(problem.start)
+    weighted = problem.whitened_at(problem.start)
     x = problem.start * 1.05
     found = weighted.evaluate(x)
     for i in range(len(x)):
@@ -243,9 +243,9 @@ def test_encoders_are_measurements_where_no_point_of_the_arm_is(urdf_folder, arm
     made = replace(made, points=(group, made.points[1]) if arm else made.points[1:])
     sensors = {} if use is None else {"joints.position": SensorOptions(use=use)}
     problem = EstimationProblem(step, [made], ("elbow.stiffness",), ProblemOptions(sensors=sensors, **TRACKED))
-    found = [s for s in problem.episodes[0].samples if s.sensor.group == "joints.position"]
+    found = [s for s in problem.episodes[0].measurements if s.sensor.group_name == "joints.position"]
     assert bool(found) == expected
-    assert problem.episodes[0].errors.encoders == expected
+    assert problem.episodes[0].input_errors.has_encoder_measurements == expected
     if expected:
         # the first angle is where the rollout starts
         assert found[0].node[0] == 1
@@ -271,7 +271,7 @@ def test_noise_that_nobody_states_is_read_from_the_recording(urdf_folder, said, 
     made = replace(made, joints=replace(made.joints, effort=noisy, effort_std=said))
     with caplog.at_level("WARNING"):
         problem = EstimationProblem(step, [made], ("elbow.stiffness",), ProblemOptions(**TRACKED))
-    assert problem.episodes[0].errors.torque_std[0] == pytest.approx(0.02, rel=0.15)
+    assert problem.episodes[0].input_errors.torque_std[0] == pytest.approx(0.02, rel=0.15)
     assert ("neither recorded nor configured" in caplog.text) == (said is None)
 
 
@@ -280,7 +280,7 @@ def test_torques_beside_encoders_are_never_taken_as_exact(urdf_folder):
     made = taken(step, 3)
     made = replace(made, joints=replace(made.joints, effort_std=0.0), points=made.points[1:])
     problem = EstimationProblem(step, [made], ("elbow.stiffness",), ProblemOptions(**TRACKED))
-    assert problem.episodes[0].errors.torque_std[0] == pytest.approx(1e-3 * np.std(made.joints.effort))
+    assert problem.episodes[0].input_errors.torque_std[0] == pytest.approx(1e-3 * np.std(made.joints.effort))
 
 
 def test_a_step_over_several_samples_averages_their_noise(urdf_folder):
@@ -288,7 +288,7 @@ def test_a_step_over_several_samples_averages_their_noise(urdf_folder):
     made = taken(step, 3, steps=48)
     group = replace(made.joints, t=1.0 + 0.5 * (made.joints.t - 1.0))
     problem = EstimationProblem(step, [replace(made, joints=group)], ("elbow.stiffness",), ProblemOptions(**TRACKED))
-    errors = problem.episodes[0].errors
+    errors = problem.episodes[0].input_errors
     assert errors.torque_std[0] == pytest.approx(0.3 * math.sqrt(0.5))
     assert problem.episodes[0].grid.time_step == H
-    assert len(np.unique(errors.sample)) == problem.episodes[0].grid.steps
+    assert len(np.unique(errors.sample_of_step)) == problem.episodes[0].grid.steps

@@ -25,7 +25,7 @@ def pendulum(urdf_folder):
     taken = {seed: record(seed, 40, bend=0.3) for seed in (1, 2, 3)}
 
     def make(kind):
-        options = ProblemOptions(initial_state=kind, start_window=0.02)
+        options = ProblemOptions(initial_state=kind, start_fit_window=0.02)
         free = ("elbow.damping", "shoulder.damping")
         return EstimationProblem(step, [taken[1], taken[2]], free, options, held_out=[taken[3]])
 
@@ -160,7 +160,7 @@ def test_the_residual_says_what_its_rows_are(pendulum):
             np.testing.assert_array_equal(evaluation.residual[part], samples.whitened(predicted)[samples.seen])
     stated = evaluation.residual[rows.stated_priors]
     assert np.count_nonzero(stated) == 1
-    assert stated[np.flatnonzero(stated)[0]] == pytest.approx(0.01 / problem.options.configuration_std)
+    assert stated[np.flatnonzero(stated)[0]] == pytest.approx(0.01 / problem.options.start_configuration_std)
     # a factor of two of the ten that call one standard deviation
     assert sorted(evaluation.residual[rows.weak_priors]) == pytest.approx([0.0, np.log10(2.0)])
     residual, jacobian = problem.informing(evaluation)

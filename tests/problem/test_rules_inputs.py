@@ -13,19 +13,19 @@ from small_problems import joints, recording, seen
 
 from yid_ocp.errors import DataError
 from yid_ocp.model.cable import ClampPath
-from yid_ocp.problem.grid import Grid
-from yid_ocp.problem.inputs import (
-    held_inputs,
-    held_inputs_slope,
-    joint_loads,
-    measured_angles,
-    point_course,
+from yid_ocp.problem.low_pass_filter import LowPassFilter, effort_filter
+from yid_ocp.problem.recorded_inputs import (
+    _smoothed_point_path,
+    mean_step_inputs,
+    mean_step_inputs_by_delay,
     prescribed_path,
-    sensors_present,
+    recorded_sensors,
+    smoothed_joint_angles,
+    smoothed_joint_efforts,
 )
-from yid_ocp.problem.low_pass import LowPass, effort_filter
+from yid_ocp.problem.time_grid import TimeGrid
 
-PLAIN = LowPass(math.inf)
+PLAIN = LowPassFilter(math.inf)
 
 
 # -- torques ----------------------------------------------------------------------------------------------------------
@@ -40,12 +40,12 @@ def driven(effort, t=None, kind="command"):
 @pytest.mark.parametrize(
     ("grid", "expected"),
     [
-        (Grid(0.0, 0.1, 3), [1.0, 2.0, 4.0]),
-        (Grid(0.0, 0.2, 2), [1.5, 6.0]),
-        (Grid(0.05, 0.1, 2), [1.5, 3.0]),
-        (Grid(0.0, 0.05, 4), [1.0, 1.0, 2.0, 2.0]),
-        (Grid(0.2, 0.1, 4), [4.0, 8.0, 8.0, 8.0]),
-        (Grid(-0.2, 0.1, 3), [1.0, 1.0, 1.0]),
+        (TimeGrid(0.0, 0.1, 3), [1.0, 2.0, 4.0]),
+        (TimeGrid(0.0, 0.2, 2), [1.5, 6.0]),
+        (TimeGrid(0.05, 0.1, 2), [1.5, 3.0]),
+        (TimeGrid(0.0, 0.05, 4), [1.0, 1.0, 2.0, 2.0]),
+        (TimeGrid(0.2, 0.1, 4), [4.0, 8.0, 8.0, 8.0]),
+        (TimeGrid(-0.2, 0.1, 3), [1.0, 1.0, 1.0]),
     ],
     ids=[
         "step by step",
@@ -57,12 +57,12 @@ def driven(effort, t=None, kind="command"):
     ],
 )
 def test_a_torque_is_held_from_sample_to_sample_and_averaged_over_a_step(grid, expected):
-    found = held_inputs(driven([1.0, 2.0, 4.0, 8.0]), ("a",), grid, "run")
+    found = mean_step_inputs(driven([1.0, 2.0, 4.0, 8.0]), ("a",), grid, "run")
     np.testing.assert_allclose(found[:, 0], expected)
 
 
 def test_an_uneven_clock_weighs_samples_by_how_long_they_are_held():
-    found = held_inputs(driven([1.0, 5.0, 9.0], [0.0, 0.15, 0.2]), ("a",), Grid(0.0, 0.2, 1), "run")
+    found = mean_step_inputs(driven([1.0, 5.0, 9.0], [0.0, 0.15, 0.2]), ("a",), TimeGrid(0.0, 0.2, 1), "run")
     np.testing.assert_allclose(found, [[(0.15 * 1.0 + 0.05 * 5.0) / 0.2]])
 
 
@@ -70,7 +70,7 @@ def test_an_uneven_clock_weighs_samples_by_how_long_they_are_held():
     ("delay", "expected"), [(0.0, [1, 2, 4]), (0.1, [1, 1, 2]), (0.05, [1, 1.5, 3]), (-0.1, [2, 4, 8])]
 )
 def test_a_delayed_torque_acts_later(delay, expected):
-    found = held_inputs(driven([1.0, 2.0, 4.0, 8.0]), ("a",), Grid(0.0, 0.1, 3), "run", np.array([delay]))
+    found = mean_step_inputs(driven([1.0, 2.0, 4.0, 8.0]), ("a",), TimeGrid(0.0, 0.1, 3), "run", np.array([delay]))
     np.testing.assert_allclose(found[:, 0], expected)
 
 
@@ -88,85 +88,87 @@ UNEVEN = np.array([0.0, 0.1, 0.25, 0.3, 0.45, 0.5, 0.65])
 @pytest.mark.parametrize("kind", ["sample", None])
 @pytest.mark.parametrize("delay", [0.0, 0.02])
 def test_sampled_torque_is_a_smooth_course_whose_mean_a_step_takes(kind, delay):
-    grid = Grid(0.05, 0.02, 20)
-    found = held_inputs(driven(cubic(UNEVEN), UNEVEN, kind), ("a",), grid, "run", np.array([delay]))
-    expected = np.diff(summed_cubic(grid.times - delay)) / 0.02
+    grid = TimeGrid(0.05, 0.02, 20)
+    found = mean_step_inputs(driven(cubic(UNEVEN), UNEVEN, kind), ("a",), grid, "run", np.array([delay]))
+    expected = np.diff(summed_cubic(grid.node_times - delay)) / 0.02
     np.testing.assert_allclose(found[:, 0], expected, rtol=1e-12)
 
 
 def test_mean_torque_keeps_the_mean_over_every_recorded_interval():
     effort = np.random.default_rng(2).normal(size=12)
     t = 0.1 * np.arange(12)
-    fine = held_inputs(driven(effort, t, "mean"), ("a",), Grid(0.0, 0.025, 44), "run")[:, 0]
+    fine = mean_step_inputs(driven(effort, t, "mean"), ("a",), TimeGrid(0.0, 0.025, 44), "run")[:, 0]
     np.testing.assert_allclose(fine.reshape(11, 4).mean(axis=1), effort[:11], rtol=1e-12)
     times = np.append(t, 1.2)
     smooth = np.diff(times + times**2 - 7 * times**3) / 0.1
-    grid = Grid(0.0, 0.05, 22)
-    found = held_inputs(driven(smooth, t, "mean"), ("a",), grid, "run")[:, 0]
-    times = grid.times
+    grid = TimeGrid(0.0, 0.05, 22)
+    found = mean_step_inputs(driven(smooth, t, "mean"), ("a",), grid, "run")[:, 0]
+    times = grid.node_times
     np.testing.assert_allclose(found, np.diff(times + times**2 - 7 * times**3) / 0.05, rtol=1e-9)
 
 
 @pytest.mark.parametrize(("kind", "first", "last"), [("command", 1, 5), ("sample", 1, 5), ("mean", 0.5, 5.5)])
 def test_beyond_the_recording_torque_is_held(kind, first, last):
     made = driven([1.0, 2.0, 3.0, 4.0, 5.0], kind=kind)
-    before = held_inputs(made, ("a",), Grid(-0.5, 0.1, 3), "run")[:, 0]
+    before = mean_step_inputs(made, ("a",), TimeGrid(-0.5, 0.1, 3), "run")[:, 0]
     np.testing.assert_allclose(before, first, rtol=1e-12)
-    after = held_inputs(made, ("a",), Grid(0.55, 0.1, 3), "run")[:, 0]
+    after = mean_step_inputs(made, ("a",), TimeGrid(0.55, 0.1, 3), "run")[:, 0]
     np.testing.assert_allclose(after, last, rtol=1e-12)
 
 
 @pytest.mark.parametrize("kind", ["command", "sample", "mean"])
 @pytest.mark.parametrize("delay", [0.03, 0.17, -0.04])
 def test_the_slope_by_the_delay_is_that_of_differences(delay, kind):
-    made, grid = driven([1.0, 2.0, 4.0, 8.0, 5.0, 1.0], kind=kind), Grid(0.1, 0.1, 3)
-    ends = [held_inputs(made, ("a",), grid, "run", np.array([delay + sign * 1e-6])) for sign in (1, -1)]
-    found = held_inputs_slope(made, ("a",), grid, "run", np.array([delay]))
+    made, grid = driven([1.0, 2.0, 4.0, 8.0, 5.0, 1.0], kind=kind), TimeGrid(0.1, 0.1, 3)
+    ends = [mean_step_inputs(made, ("a",), grid, "run", np.array([delay + sign * 1e-6])) for sign in (1, -1)]
+    found = mean_step_inputs_by_delay(made, ("a",), grid, "run", np.array([delay]))
     np.testing.assert_allclose(found, (ends[0] - ends[1]) / 2e-6, rtol=1e-6, atol=1e-6)
 
 
 def test_at_a_jump_the_slope_is_the_mean_of_both_sides():
-    made, grid = driven([1.0, 2.0, 4.0, 8.0, 5.0, 1.0]), Grid(0.1, 0.1, 3)
-    sides = [held_inputs_slope(made, ("a",), grid, "run", np.array([delay])) for delay in (1e-3, -1e-3)]
-    np.testing.assert_allclose(held_inputs_slope(made, ("a",), grid, "run", np.zeros(1)), np.mean(sides, axis=0))
+    made, grid = driven([1.0, 2.0, 4.0, 8.0, 5.0, 1.0]), TimeGrid(0.1, 0.1, 3)
+    sides = [mean_step_inputs_by_delay(made, ("a",), grid, "run", np.array([delay])) for delay in (1e-3, -1e-3)]
+    np.testing.assert_allclose(
+        mean_step_inputs_by_delay(made, ("a",), grid, "run", np.zeros(1)), np.mean(sides, axis=0)
+    )
     # beyond the ends the torque is held, and so does not change
-    beyond = held_inputs_slope(made, ("a",), Grid(0.7, 0.1, 2), "run", np.zeros(1))
+    beyond = mean_step_inputs_by_delay(made, ("a",), TimeGrid(0.7, 0.1, 2), "run", np.zeros(1))
     np.testing.assert_array_equal(beyond, np.zeros((2, 1)))
-    before = held_inputs_slope(made, ("a",), Grid(-0.7, 0.1, 2), "run", np.zeros(1))
+    before = mean_step_inputs_by_delay(made, ("a",), TimeGrid(-0.7, 0.1, 2), "run", np.zeros(1))
     np.testing.assert_array_equal(before, np.zeros((2, 1)))
 
 
 def test_nothing_driven_needs_no_torque_and_a_driven_joint_does():
     silent = joints(["a"], [0.0, 0.1], np.zeros((2, 1)))
-    assert held_inputs(silent, (), Grid(0.0, 0.1, 3), "run").shape == (3, 0)
+    assert mean_step_inputs(silent, (), TimeGrid(0.0, 0.1, 3), "run").shape == (3, 0)
     with pytest.raises(DataError, match="no joint effort"):
-        held_inputs(silent, ("a",), Grid(0.0, 0.1, 3), "run")
+        mean_step_inputs(silent, ("a",), TimeGrid(0.0, 0.1, 3), "run")
     with pytest.raises(DataError, match="'b' of the model is not recorded"):
-        held_inputs(driven([1.0, 2.0]), ("b",), Grid(0.0, 0.1, 3), "run")
+        mean_step_inputs(driven([1.0, 2.0]), ("b",), TimeGrid(0.0, 0.1, 3), "run")
 
 
 def test_measured_angles_have_no_kinks_between_samples():
     t = 0.1 * np.arange(8)
     made = joints(["b", "a"], t, np.stack([np.zeros(8), cubic(t)], axis=1))
-    grid = Grid(0.0, 0.025, 28)
-    found = measured_angles(made, ("a",), grid, "run", LowPass(math.inf))
-    np.testing.assert_allclose(found[:, 0], cubic(grid.times), rtol=1e-12)
+    grid = TimeGrid(0.0, 0.025, 28)
+    found = smoothed_joint_angles(made, ("a",), grid, "run", LowPassFilter(math.inf))
+    np.testing.assert_allclose(found[:, 0], cubic(grid.node_times), rtol=1e-12)
 
 
 def test_loads_are_smoothed_and_interpolated():
     t = 0.01 * np.arange(200)
     effort = np.stack([np.ones(200), 3 * t + np.sin(2 * np.pi * 40 * t)], axis=1)
     made = recording(joints(["a", "b"], t, np.zeros((200, 2)), effort=effort))
-    grid = Grid(0.5, 0.025, 20)
-    found = joint_loads(made, ("b", "a"), grid, LowPass(5.0))
-    np.testing.assert_allclose(found[:, 0], 3 * grid.times, atol=1e-3)
+    grid = TimeGrid(0.5, 0.025, 20)
+    found = smoothed_joint_efforts(made, ("b", "a"), grid, LowPassFilter(5.0))
+    np.testing.assert_allclose(found[:, 0], 3 * grid.node_times, atol=1e-3)
     np.testing.assert_allclose(found[:, 1], 1.0, atol=1e-9)
     for without in (
         recording(joints(["a"], t, np.zeros((200, 1)))),
         recording(None, seen(["p"], [0, 1], np.zeros((2, 1, 3)))),
     ):
         with pytest.raises(DataError, match="gears give way"):
-            joint_loads(without, ("a",), grid, PLAIN)
+            smoothed_joint_efforts(without, ("a",), grid, PLAIN)
 
 
 # -- what is there ----------------------------------------------------------------------------------------------------
@@ -185,8 +187,8 @@ def test_loads_are_smoothed_and_interpolated():
     ids=["efforts", "no efforts", "points", "camera by its pose", "camera by its name", "nominal clock"],
 )
 def test_sensors_are_known_by_what_was_recorded(made, expected):
-    assert sensors_present([made]) == expected
-    assert sensors_present([recording(driven([1.0, 2.0])), made]) == expected | {"joints.position", "joints.effort"}
+    assert recorded_sensors([made]) == expected
+    assert recorded_sensors([recording(driven([1.0, 2.0])), made]) == expected | {"joints.position", "joints.effort"}
 
 
 # -- prescribed paths -------------------------------------------------------------------------------------------------
@@ -200,11 +202,11 @@ def test_a_prescribed_joint_follows_its_recorded_positions():
     t = 2.0 + 0.1 * np.arange(11)
     position = np.stack([np.sin(t), t**2], axis=1)
     made = recording(joints(["a", "b"], t, position))
-    grid = Grid(2.0, 0.025, 40)
+    grid = TimeGrid(2.0, 0.025, 40)
     found = prescribed_path(made, moving("b", "a"), grid, PLAIN)
-    np.testing.assert_allclose(found[:, 0], grid.times**2, atol=1e-9)
-    np.testing.assert_allclose(found[:, 1], np.sin(grid.times), atol=1e-4)
-    beyond = prescribed_path(made, moving("b"), Grid(1.9, 0.1, 13), PLAIN)
+    np.testing.assert_allclose(found[:, 0], grid.node_times**2, atol=1e-9)
+    np.testing.assert_allclose(found[:, 1], np.sin(grid.node_times), atol=1e-4)
+    beyond = prescribed_path(made, moving("b"), TimeGrid(1.9, 0.1, 13), PLAIN)
     assert beyond[0, 0] == pytest.approx(4.0)
     assert beyond[-1, 0] == pytest.approx(9.0)
     assert prescribed_path(made, moving(), grid, PLAIN).shape == (41, 0)
@@ -212,7 +214,9 @@ def test_a_prescribed_joint_follows_its_recorded_positions():
 
 def test_a_prescribed_joint_must_be_recorded():
     with pytest.raises(DataError, match="'a' is prescribed but the recording has no joints"):
-        prescribed_path(recording(None, seen(["p"], [0, 1], np.zeros((2, 1, 3)))), moving("a"), Grid(0, 0.1, 3), PLAIN)
+        prescribed_path(
+            recording(None, seen(["p"], [0, 1], np.zeros((2, 1, 3)))), moving("a"), TimeGrid(0, 0.1, 3), PLAIN
+        )
 
 
 def clamped(origin, towards, t=None):
@@ -227,7 +231,7 @@ def test_a_clamp_stands_at_its_point_and_looks_along_its_direction():
     origin = np.cumsum(np.full((8, 3), [0.01, 0.02, -0.01]), axis=0)
     turned = Rotation.from_euler("XYZ", np.stack([np.linspace(0.3, 4.0, 8), np.linspace(-0.5, 0.8, 8), np.zeros(8)], 1))
     made = clamped(origin, origin + turned.apply([0.0, 0.0, 0.25]))
-    grid = Grid(0.0, 0.1, 7)
+    grid = TimeGrid(0.0, 0.1, 7)
     path = prescribed_path(made, moving(*AXES), grid, PLAIN, (ClampPath("end", "o", "d", "zero"),))
     np.testing.assert_allclose(path[:, :3], origin, atol=1e-12)
     np.testing.assert_allclose(path[:, 3], np.linspace(0.3, 4.0, 8), atol=1e-9)
@@ -242,7 +246,7 @@ def test_a_transported_clamp_does_not_turn_about_its_axis():
     t = np.linspace(0.0, 1.0, steps + 1)
     made = clamped(np.zeros((steps + 1, 3)), direction, t)
     path = prescribed_path(
-        made, moving(*AXES), Grid(0.0, 1.0 / steps, steps), PLAIN, (ClampPath("end", "o", "d", "transported"),)
+        made, moving(*AXES), TimeGrid(0.0, 1.0 / steps, steps), PLAIN, (ClampPath("end", "o", "d", "transported"),)
     )
     frames = Rotation.from_euler("XYZ", path[:, 3:])
     turns = (frames[:-1].inv() * frames[1:]).as_rotvec()
@@ -256,26 +260,28 @@ def test_a_clamp_needs_two_points_apart_and_seen_often_enough():
     origin = np.zeros((5, 3))
     with pytest.raises(DataError, match="'o' and 'd' coincide"):
         prescribed_path(
-            clamped(origin, origin), moving(*AXES), Grid(0, 0.1, 4), PLAIN, (ClampPath("end", "o", "d", "zero"),)
+            clamped(origin, origin), moving(*AXES), TimeGrid(0, 0.1, 4), PLAIN, (ClampPath("end", "o", "d", "zero"),)
         )
     hidden = np.tile([0.0, 0.0, 1.0], (5, 1))
     hidden[1, 2] = math.nan
     made = clamped(origin, hidden)
-    np.testing.assert_allclose(point_course(made, "d", Grid(0.0, 0.1, 4), PLAIN), np.tile([0.0, 0.0, 1.0], (5, 1)))
+    np.testing.assert_allclose(
+        _smoothed_point_path(made, "d", TimeGrid(0.0, 0.1, 4), PLAIN), np.tile([0.0, 0.0, 1.0], (5, 1))
+    )
     hidden[2] = math.nan
     with pytest.raises(DataError, match="'d' is seen 3 times"):
-        point_course(clamped(origin, hidden), "d", Grid(0.0, 0.1, 4), PLAIN)
+        _smoothed_point_path(clamped(origin, hidden), "d", TimeGrid(0.0, 0.1, 4), PLAIN)
     with pytest.raises(DataError, match="'x' is not recorded"):
-        point_course(made, "x", Grid(0.0, 0.1, 4), PLAIN)
+        _smoothed_point_path(made, "x", TimeGrid(0.0, 0.1, 4), PLAIN)
 
 
 def test_a_course_is_smoothed_and_stays_where_it_was_seen_last():
     t = 0.01 * np.arange(300)
     line = np.stack([t, 2 * t, 0 * t], axis=1) + 0.1 * np.sin(2 * np.pi * 45 * t)[:, None]
     made = recording(None, seen(["o"], t, line[:, None]))
-    found = point_course(made, "o", Grid(0.5, 0.1, 20), LowPass(5.0))
-    np.testing.assert_allclose(found, np.outer(Grid(0.5, 0.1, 20).times, [1.0, 2.0, 0.0]), atol=2e-3)
-    held = point_course(made, "o", Grid(2.9, 0.1, 3), PLAIN)
+    found = _smoothed_point_path(made, "o", TimeGrid(0.5, 0.1, 20), LowPassFilter(5.0))
+    np.testing.assert_allclose(found, np.outer(TimeGrid(0.5, 0.1, 20).node_times, [1.0, 2.0, 0.0]), atol=2e-3)
+    held = _smoothed_point_path(made, "o", TimeGrid(2.9, 0.1, 3), PLAIN)
     np.testing.assert_allclose(held[2], held[3])
 
 
@@ -286,7 +292,7 @@ def test_a_course_is_smoothed_and_stays_where_it_was_seen_last():
 def test_the_filter_is_butterworths_of_order_four_forth_and_back(frequency):
     step, cutoff = 0.002, 5.0
     t = step * np.arange(10001)
-    found = LowPass(cutoff)(t, np.sin(2 * np.pi * frequency * t)[:, None])[:, 0]
+    found = LowPassFilter(cutoff)(t, np.sin(2 * np.pi * frequency * t)[:, None])[:, 0]
     # bilinear transformation: frequencies are warped
     ratio = math.tan(math.pi * frequency * step) / math.tan(math.pi * cutoff * step)
     middle = slice(3000, 7000)
@@ -296,27 +302,27 @@ def test_the_filter_is_butterworths_of_order_four_forth_and_back(frequency):
 def test_without_a_cutoff_values_are_as_they_were():
     values = np.random.default_rng(1).standard_normal((5, 2))
     assert PLAIN(np.arange(5.0), values) is values
-    assert PLAIN.stride(0.01) == 1
+    assert PLAIN.decorrelation_stride(0.01) == 1
 
 
 def test_an_uneven_clock_is_resampled_in_between():
     t = np.sort(np.concatenate([0.01 * np.arange(400), [1.003, 2.5042]]))
     line = np.stack([2 + 3 * t], axis=1)
-    np.testing.assert_allclose(LowPass(5.0)(t, line), line, atol=2e-4)
+    np.testing.assert_allclose(LowPassFilter(5.0)(t, line), line, atol=2e-4)
 
 
 @pytest.mark.parametrize(
     ("cutoff", "step", "stride"), [(5.0, 0.01, 10), (5.0, 0.02, 5), (10.0, 0.01, 5), (30.0, 0.05, 1), (7.0, 0.01, 7)]
 )
 def test_smoothed_values_tell_something_new_twice_a_period(cutoff, step, stride):
-    assert LowPass(cutoff).stride(step) == stride
+    assert LowPassFilter(cutoff).decorrelation_stride(step) == stride
 
 
 @pytest.mark.parametrize("cutoff", [2.0, 5.0])
 def test_what_lies_beyond_an_end_is_forgotten_after_settling(cutoff):
     """The slowest poles' response has fallen to a thousandth then."""
     step = 0.002
-    settling = LowPass(cutoff).settling
+    settling = LowPassFilter(cutoff).settling_time
     sections = scipy.signal.butter(4, cutoff * 2 * step, output="sos")
     impulse = np.zeros(5000)
     impulse[0] = 1.0
@@ -327,25 +333,25 @@ def test_what_lies_beyond_an_end_is_forgotten_after_settling(cutoff):
     assert settling == pytest.approx(math.log(1e3) / np.abs(poles.real).min(), rel=1e-2)
 
 
-@pytest.mark.parametrize("low_pass", [LowPass(4.0), LowPass(4.0, 2), LowPass(9.0)])
+@pytest.mark.parametrize("low_pass", [LowPassFilter(4.0), LowPassFilter(4.0, 2), LowPassFilter(9.0)])
 def test_at_some_nodes_it_is_the_same_filter(low_pass):
     t, rng = 0.01 * np.arange(301), np.random.default_rng(1)
     values, nodes = rng.standard_normal((301, 2)), np.array([3, 120, 150, 299])
-    made = low_pass.at(nodes, 301, 0.01)
-    np.testing.assert_allclose(made.of(values)[nodes[1:3]], low_pass(t, values)[nodes[1:3]], atol=2e-3)
-    np.testing.assert_array_equal(np.delete(made.of(values), nodes, axis=0), np.delete(values, nodes, axis=0))
+    made = low_pass.node_smoother(nodes, 301, 0.01)
+    np.testing.assert_allclose(made.smooth(values)[nodes[1:3]], low_pass(t, values)[nodes[1:3]], atol=2e-3)
+    np.testing.assert_array_equal(np.delete(made.smooth(values), nodes, axis=0), np.delete(values, nodes, axis=0))
     np.testing.assert_allclose(made.matrix.sum(axis=1), 1.0, rtol=1e-12)
     # what comes before a motion sets in does not count
     assert made.matrix[:, [0]].nnz == 0
     pull = rng.standard_normal((301, 2))
-    assert np.sum(made.pulled(pull) * values) == pytest.approx(np.sum(pull * made.of(values)))
+    assert np.sum(made.smoothing_adjoint(pull) * values) == pytest.approx(np.sum(pull * made.smooth(values)))
 
 
 def test_two_passes_are_one_after_the_other():
     t, values = 0.01 * np.arange(301), np.random.default_rng(1).standard_normal((301, 2))
-    once, twice = LowPass(5.0), effort_filter(5.0)
+    once, twice = LowPassFilter(5.0), effort_filter(5.0)
     np.testing.assert_allclose(twice(t, values)[80:-80], once(t, once(t, values))[80:-80], atol=1e-3)
-    assert twice.settling > once.settling
+    assert twice.settling_time > once.settling_time
     assert (twice.cutoff, twice.passes) == (5.0, 2)
 
 
@@ -355,11 +361,11 @@ def test_gains_turn_white_noise_into_that_of_value_rate_and_second_rate(cutoff):
     step = 0.01
     impulse = np.zeros((4001, 1))
     impulse[2000] = 1.0
-    value = LowPass(cutoff)(step * np.arange(4001), impulse)[:, 0]
+    value = LowPassFilter(cutoff)(step * np.arange(4001), impulse)[:, 0]
     rate = (value[2:] - value[:-2]) / (2 * step)
     second = (value[2:] - 2 * value[1:-1] + value[:-2]) / step**2
     np.testing.assert_allclose(
-        LowPass(cutoff).gains(step), [np.linalg.norm(x) for x in (value, rate, second)], rtol=1e-4
+        LowPassFilter(cutoff).noise_gains(step), [np.linalg.norm(x) for x in (value, rate, second)], rtol=1e-4
     )
 
 
@@ -368,12 +374,12 @@ def test_a_cutoff_lies_between_zero_and_half_the_sampling_rate(cutoff, refused):
     t = 0.01 * np.arange(300)
     if refused:
         with pytest.raises(DataError, match="path_cutoff"):
-            LowPass(cutoff)(t, np.zeros((300, 1)))
+            LowPassFilter(cutoff)(t, np.zeros((300, 1)))
     else:
-        assert LowPass(cutoff)(t, np.ones((300, 1))) == pytest.approx(1.0)
+        assert LowPassFilter(cutoff)(t, np.ones((300, 1))) == pytest.approx(1.0)
 
 
 def test_short_records_are_padded_as_far_as_they_go():
     for count in (5, 20, 40):
         t = 0.01 * np.arange(count)
-        np.testing.assert_allclose(LowPass(3.0)(t, np.ones((count, 1))), 1.0, atol=1e-9)
+        np.testing.assert_allclose(LowPassFilter(3.0)(t, np.ones((count, 1))), 1.0, atol=1e-9)

@@ -9,8 +9,8 @@ import pytest
 from small_problems import efforts, joints, measured, points, recording, seen
 
 from yid_ocp.errors import DataError
-from yid_ocp.problem.grid import Grid, make_grid
-from yid_ocp.problem.measurements import huber, paper_weighting, placed
+from yid_ocp.problem.measurements import huber_loss, place_on_grid, with_paper_weights
+from yid_ocp.problem.time_grid import TimeGrid, make_time_grid
 from yid_ocp.sensors.base import SensorData
 
 NAN = math.nan
@@ -35,13 +35,13 @@ NAN = math.nan
     ],
 )
 def test_a_time_lies_between_two_nodes(t, node, fraction):
-    found_node, found_fraction = Grid(5.0, 0.1, 3).locate([t])
+    found_node, found_fraction = TimeGrid(5.0, 0.1, 3).node_and_fraction([t])
     assert found_node.tolist() == [node]
     assert found_fraction == pytest.approx([fraction], abs=1e-9)
 
 
 def test_nodes_are_evenly_spaced_from_the_start():
-    np.testing.assert_allclose(Grid(5.0, 0.1, 3).times, [5.0, 5.1, 5.2, 5.3])
+    np.testing.assert_allclose(TimeGrid(5.0, 0.1, 3).node_times, [5.0, 5.1, 5.2, 5.3])
 
 
 @pytest.mark.parametrize(
@@ -59,15 +59,15 @@ def test_nodes_are_evenly_spaced_from_the_start():
 def test_a_grid_covers_the_recording_or_as_much_as_is_wanted(last, duration, steps):
     t = 3.0 + np.array([0.0, last])
     made = recording(joints(["a"], t, np.zeros((2, 1))), seen(["p"], [0.0, 9.0], np.zeros((2, 1, 3))))
-    found = make_grid(made, 0.1, duration)
-    assert (found.start, found.time_step, found.steps) == (3.0, 0.1, steps)
+    found = make_time_grid(made, 0.1, duration)
+    assert (found.start_time, found.time_step, found.steps) == (3.0, 0.1, steps)
 
 
 def test_without_joints_points_drive_the_clock_and_too_little_is_refused():
     made = recording(None, seen(["p"], [1.0, 1.4], np.zeros((2, 1, 3))))
-    assert (make_grid(made, 0.1).start, make_grid(made, 0.1).steps) == (1.0, 4)
+    assert (make_time_grid(made, 0.1).start_time, make_time_grid(made, 0.1).steps) == (1.0, 4)
     with pytest.raises(DataError, match=r"0\.4 s of data are shorter than two time steps of 0\.3 s"):
-        make_grid(made, 0.3)
+        make_time_grid(made, 0.3)
 
 
 # -- losses -----------------------------------------------------------------------------------------------------------
@@ -87,13 +87,13 @@ def test_without_joints_points_drive_the_clock_and_too_little_is_refused():
     ],
 )
 def test_hubers_loss_is_square_first_and_then_straight(residual, scale, cost, factor):
-    found, weight = huber(np.array([residual]), scale)
+    found, weight = huber_loss(np.array([residual]), scale)
     assert found == pytest.approx(cost)
     assert weight == pytest.approx([factor])
 
 
 def test_losses_add():
-    cost, factor = huber(np.array([[1.0, 4.0], [0.0, -1.0]]), 2.0)
+    cost, factor = huber_loss(np.array([[1.0, 4.0], [0.0, -1.0]]), 2.0)
     assert cost == pytest.approx(0.5 + 2 * 3 + 0.5)
     np.testing.assert_allclose(factor, [[1.0, math.sqrt(0.5)], [1.0, 1.0]])
 
@@ -105,21 +105,21 @@ TWO = measured(efforts("a", "b"), [0, 1], [0.0, 0.0], [[1.0, NAN], [3.0, 4.0]], 
 
 def test_rows_are_whitened_differences_where_something_was_measured():
     predicted = np.array([[2.0, 9.0], [1.0, 5.0]])
-    np.testing.assert_array_equal(TWO.whitened(predicted), [[2.0, 0.0], [-1.0, 10.0]])
-    found = TWO.rows(predicted)
+    np.testing.assert_array_equal(TWO.whitened_residual(predicted), [[2.0, 0.0], [-1.0, 10.0]])
+    found = TWO.residual_block(predicted)
     np.testing.assert_array_equal(found.residual, [2.0, -1.0, 10.0])
-    np.testing.assert_array_equal(found.factor, [1.0, 1.0, 1.0])
+    np.testing.assert_array_equal(found.robust_factor, [1.0, 1.0, 1.0])
     assert found.cost == pytest.approx(0.5 * (4 + 1 + 100))
     assert found.jacobian is None
-    assert TWO.count == 3
-    np.testing.assert_array_equal(TWO.seen, [[True, False], [True, True]])
+    assert TWO.n_residuals == 3
+    np.testing.assert_array_equal(TWO.is_used, [[True, False], [True, True]])
 
 
 def test_rows_have_the_slopes_of_their_predictions_and_a_robust_weight():
     slopes = np.arange(12.0).reshape(2, 2, 3)
-    found = TWO.rows(np.array([[2.0, 9.0], [1.0, 5.0]]), slopes, threshold=2.5)
+    found = TWO.residual_block(np.array([[2.0, 9.0], [1.0, 5.0]]), slopes, threshold=2.5)
     np.testing.assert_allclose(found.residual, [2.0, -1.0, 5.0])
-    np.testing.assert_allclose(found.factor, [1.0, 1.0, 0.5])
+    np.testing.assert_allclose(found.robust_factor, [1.0, 1.0, 0.5])
     np.testing.assert_allclose(found.jacobian, [[0, 2, 4], [3, 3.5, 4], [45, 50, 55]])
     assert found.cost == pytest.approx(2.0 + 0.5 + 2.5 * (10 - 1.25))
 
@@ -135,22 +135,22 @@ def test_every_output_of_a_point_has_its_channel():
 
 def test_data_are_placed_on_nodes_and_whitened():
     data = SensorData(efforts("a"), np.array([5.05, 5.2]), np.array([[1.0], [NAN]]), np.array([[0.5], [7.0]]))
-    found = placed(data, Grid(5.0, 0.1, 3), "run")
+    found = place_on_grid(data, TimeGrid(5.0, 0.1, 3), "run")
     assert (found.node.tolist(), found.fraction.tolist()) == ([0, 2], [pytest.approx(0.5), 0.0])
     np.testing.assert_array_equal(found.weight, [[2.0], [0.0]])
     np.testing.assert_array_equal(found.std, [[0.5], [NAN]])
-    assert (found.span, found.sensor) == ((0, 3), data.sensor)
+    assert (found.predictable_nodes, found.sensor) == ((0, 3), data.sensor)
     narrow = SensorData(efforts("a"), data.t, data.value, data.std, (1, 2))
-    assert placed(narrow, Grid(5.0, 0.1, 3), "run").span == (1, 2)
+    assert place_on_grid(narrow, TimeGrid(5.0, 0.1, 3), "run").predictable_nodes == (1, 2)
 
 
 @pytest.mark.parametrize("std", [0.0, -1.0, NAN])
 def test_a_noise_level_that_is_not_positive_is_refused_where_something_was_measured(std):
     data = SensorData(efforts("a"), np.array([5.0, 5.1]), np.array([[1.0], [2.0]]), np.array([[0.5], [std]]))
     with pytest.raises(DataError, match="zero or missing"):
-        placed(data, Grid(5.0, 0.1, 3), "run")
+        place_on_grid(data, TimeGrid(5.0, 0.1, 3), "run")
     hidden = SensorData(efforts("a"), data.t, np.array([[1.0], [NAN]]), data.std)
-    assert placed(hidden, Grid(5.0, 0.1, 3), "run").weight.tolist() == [[2.0], [0.0]]
+    assert place_on_grid(hidden, TimeGrid(5.0, 0.1, 3), "run").weight.tolist() == [[2.0], [0.0]]
 
 
 @pytest.mark.parametrize(
@@ -167,7 +167,7 @@ def test_a_noise_level_that_is_not_positive_is_refused_where_something_was_measu
 )
 def test_the_papers_cost_counts_the_end_twice_and_the_start_not_at_all(node, fraction, nearest, weight):
     made = measured(points("p"), [node], [fraction], [[1.0, NAN, 3.0]], weight=[[1e3, 0.0, 1e3]])
-    found = paper_weighting(made, Grid(0.0, 0.1, 3))
+    found = with_paper_weights(made, TimeGrid(0.0, 0.1, 3))
     assert (found.node.tolist(), found.fraction.tolist()) == ([nearest], [0.0])
     np.testing.assert_allclose(found.weight, [[weight, 0.0, weight]])
 
@@ -177,8 +177,8 @@ def test_the_papers_cost_counts_the_end_twice_and_the_start_not_at_all(node, fra
 
 def test_predictions_are_interpolated_between_the_nodes_that_are_needed():
     made = measured(efforts("a", "b"), [2, 2, 5, 9], [0.0, 0.25, 0.0, 0.5], np.zeros((4, 2)))
-    assert made.nodes.tolist() == [2, 3, 5, 9, 10]
-    at_nodes = np.array([[k, k**2] for k in made.nodes], float)
+    assert made.evaluation_nodes.tolist() == [2, 3, 5, 9, 10]
+    at_nodes = np.array([[k, k**2] for k in made.evaluation_nodes], float)
     np.testing.assert_allclose(made.interpolate(at_nodes), [[2, 4], [2.25, 5.25], [5, 25], [9.5, 90.5]])
     deep = np.stack([at_nodes, 10 * at_nodes], axis=2)
     np.testing.assert_allclose(made.interpolate(deep)[:, :, 1], 10 * made.interpolate(at_nodes))
@@ -186,22 +186,24 @@ def test_predictions_are_interpolated_between_the_nodes_that_are_needed():
 
 def test_a_sample_on_its_node_does_not_look_at_the_next_one():
     made = measured(efforts("a"), [2, 3], [0.0, 0.0], np.zeros((2, 1)))
-    assert made.nodes.tolist() == [2, 3]
+    assert made.evaluation_nodes.tolist() == [2, 3]
     np.testing.assert_array_equal(made.interpolate(np.array([[1.0], [NAN]])), [[1.0], [NAN]])
 
 
 @pytest.mark.parametrize("late", [None, (0.0, 1.3), (0.4, 2.0)])
 def test_distributing_is_the_transpose_of_interpolating(late):
     made = measured(efforts("a", "b"), [4, 4, 6, 9], [0.0, 0.25, 0.5, 1.0], np.zeros((4, 2)), span=(0, 10))
-    made = made if late is None else made.late(np.array(late))
+    made = made if late is None else made.delayed_by(np.array(late))
     rng = np.random.default_rng(1)
-    count = len(made.nodes)
+    count = len(made.evaluation_nodes)
     at_nodes, at_samples = rng.standard_normal((count, 2)), rng.standard_normal((4, 2))
-    there, back = made.interpolate(at_nodes), made.distribute(at_samples)
+    there, back = made.interpolate(at_nodes), made.interpolation_adjoint(at_samples)
     assert back.shape == (count, 2)
     assert np.sum(there * at_samples) == pytest.approx(np.sum(at_nodes * back), rel=1e-12)
     deep = rng.standard_normal((4, 2, 3))
-    np.testing.assert_allclose(made.distribute(deep)[:, :, 1], made.distribute(deep[:, :, 1]), atol=1e-12)
+    np.testing.assert_allclose(
+        made.interpolation_adjoint(deep)[:, :, 1], made.interpolation_adjoint(deep[:, :, 1]), atol=1e-12
+    )
 
 
 # -- late samples -----------------------------------------------------------------------------------------------------
@@ -233,21 +235,23 @@ def test_distributing_is_the_transpose_of_interpolating(late):
     ],
 )
 def test_a_late_sample_is_that_of_before_within_the_span(node, fraction, steps, late_node, late_fraction):
-    made = measured(efforts("a"), [node], [fraction], [[1.0]], span=(2, 8)).late(np.array([steps]))
+    made = measured(efforts("a"), [node], [fraction], [[1.0]], span=(2, 8)).delayed_by(np.array([steps]))
     assert made.node.tolist() == [[late_node]]
     np.testing.assert_allclose(made.fraction, [[late_fraction]], atol=1e-12)
 
 
 def test_outputs_are_late_by_different_times_and_their_nodes_have_neighbours():
-    made = measured(efforts("a", "b"), [5, 6], [0.5, 0.0], np.zeros((2, 2)), span=(0, 10)).late(np.array([0.25, 2.0]))
+    made = measured(efforts("a", "b"), [5, 6], [0.5, 0.0], np.zeros((2, 2)), span=(0, 10)).delayed_by(
+        np.array([0.25, 2.0])
+    )
     assert made.node.tolist() == [[5, 3], [5, 4]]
     np.testing.assert_allclose(made.fraction, [[0.25, 0.5], [0.75, 0.0]])
-    assert made.nodes.tolist() == [2, 3, 4, 5, 6]
-    near_start = measured(efforts("a"), [0], [0.0], [[1.0]], span=(0, 3)).late(np.zeros(1))
-    assert near_start.nodes.tolist() == [0, 1]
-    near_end = measured(efforts("a"), [3], [0.0], [[1.0]], span=(0, 3)).late(np.zeros(1))
-    assert near_end.nodes.tolist() == [1, 2, 3]
-    at_nodes = np.array([[k, 10 * k] for k in made.nodes], float)
+    assert made.evaluation_nodes.tolist() == [2, 3, 4, 5, 6]
+    near_start = measured(efforts("a"), [0], [0.0], [[1.0]], span=(0, 3)).delayed_by(np.zeros(1))
+    assert near_start.evaluation_nodes.tolist() == [0, 1]
+    near_end = measured(efforts("a"), [3], [0.0], [[1.0]], span=(0, 3)).delayed_by(np.zeros(1))
+    assert near_end.evaluation_nodes.tolist() == [1, 2, 3]
+    at_nodes = np.array([[k, 10 * k] for k in made.evaluation_nodes], float)
     np.testing.assert_allclose(made.interpolate(at_nodes), [[5.25, 35.0], [5.75, 40.0]])
 
 
@@ -278,20 +282,20 @@ def test_outputs_are_late_by_different_times_and_their_nodes_have_neighbours():
 )
 def test_a_late_sample_changes_by_the_slope_on_its_node_by_the_mean_of_two(node, fraction, steps, rate):
     plain = measured(efforts("a"), [node], [fraction], [[1.0]], span=(2, 8))
-    late = plain.late(np.array([steps]))
-    at_nodes = np.array([[float(k**2)] for k in late.nodes])
-    np.testing.assert_allclose(late.slope(at_nodes, plain, np.array([steps])), [[rate]])
+    late = plain.delayed_by(np.array([steps]))
+    at_nodes = np.array([[float(k**2)] for k in late.evaluation_nodes])
+    np.testing.assert_allclose(late.prediction_rate(at_nodes, plain, np.array([steps])), [[rate]])
     # others beside it make no difference
     several = measured(efforts("a"), [2, node, 8], [0.25, fraction, 0.0], np.ones((3, 1)), span=(2, 8))
-    all_late = several.late(np.array([steps]))
-    at_nodes = np.array([[float(k**2)] for k in all_late.nodes])
-    np.testing.assert_allclose(all_late.slope(at_nodes, several, np.array([steps]))[1], [rate])
+    all_late = several.delayed_by(np.array([steps]))
+    at_nodes = np.array([[float(k**2)] for k in all_late.evaluation_nodes])
+    np.testing.assert_allclose(all_late.prediction_rate(at_nodes, several, np.array([steps]))[1], [rate])
 
 
 def test_late_samples_of_which_a_short_piece_holds_none_change_by_nothing():
     none = measured(efforts("a"), np.zeros(0, int), np.zeros(0), np.zeros((0, 1)), span=(2, 8))
-    late = none.late(np.array([0.5]))
-    assert late.slope(np.zeros((0, 1)), none, np.array([0.5])).shape == (0, 1)
+    late = none.delayed_by(np.array([0.5]))
+    assert late.prediction_rate(np.zeros((0, 1)), none, np.array([0.5])).shape == (0, 1)
     assert late.interpolate(np.zeros((0, 1, 3))).shape == (0, 1, 3)
 
 
@@ -299,12 +303,12 @@ def test_late_samples_of_which_a_short_piece_holds_none_change_by_nothing():
 def test_a_clock_in_other_units_does_not_make_an_endless_rollout(t, time_step):
     made = recording(joints(["a"], t, np.zeros((len(t), 1))))
     with pytest.raises(DataError, match="times are in seconds"):
-        make_grid(made, time_step)
-    assert make_grid(made, 0.1).steps > 2
+        make_time_grid(made, time_step)
+    assert make_time_grid(made, 0.1).steps > 2
 
 
 def test_a_clock_that_jumps_does_not_make_an_endless_rollout():
     t = np.append(np.arange(0.0, 20.0, 0.001), 1e6)
     made = recording(joints(["a"], t, np.zeros((len(t), 1))))
     with pytest.raises(DataError, match="does not jump"):
-        make_grid(made, 0.1)
+        make_time_grid(made, 0.1)

@@ -12,13 +12,13 @@ import scipy.stats
 from made_series import samples, series
 
 from yid_ocp.problem.null_test import (
-    GapLimits,
-    NullTest,
-    more_than_noise,
-    noise_floor,
-    null_test,
-    spread,
-    whitened_beside,
+    GapCriteria,
+    NullTestResult,
+    _variance_inflation,
+    channel_noise_levels,
+    exceeds_noise,
+    run_null_test,
+    whiten_with_extra_errors,
 )
 
 CHI2 = scipy.stats.chi2
@@ -30,7 +30,7 @@ CHI2 = scipy.stats.chi2
     ids=["white", "one lag", "two lags", "a lag apart"],
 )
 def test_coloured_samples_count_less(colour, expected):
-    assert spread(np.array(colour)) == pytest.approx(expected)
+    assert _variance_inflation(np.array(colour)) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(
@@ -46,8 +46,8 @@ def test_coloured_samples_count_less(colour, expected):
     ids=["white", "white less parameters", "coloured", "coloured less parameters", "as many parameters", "too many"],
 )
 def test_the_whole_residual_against_chi_squared(count, value, parameters, colour, degrees, ratio):
-    found = null_test([series(range(count), colour=colour)], np.full(count, value), parameters)
-    assert found.degrees == pytest.approx(degrees)
+    found = run_null_test([series(range(count), colour=colour)], np.full(count, value), parameters)
+    assert found.degrees_of_freedom == pytest.approx(degrees)
     assert found.chi2_per_dof == pytest.approx(ratio)
     assert found.p_value == pytest.approx(CHI2.sf(ratio * degrees, degrees), rel=1e-12)
 
@@ -55,10 +55,10 @@ def test_the_whole_residual_against_chi_squared(count, value, parameters, colour
 def test_several_series_add_and_rows_of_no_series_do_not_count():
     residual = np.array([1.0, 2.0, 3.0, 50.0, 4.0, 60.0])
     parts = [series([0, 1]), series([2, 4], channel="points.other", colour=(1.0, 0.5))]
-    found = null_test(parts, residual, 1)
-    assert found.degrees == pytest.approx(2 + 2 / 1.5 - 1)
+    found = run_null_test(parts, residual, 1)
+    assert found.degrees_of_freedom == pytest.approx(2 + 2 / 1.5 - 1)
     assert found.chi2_per_dof == pytest.approx((1 + 4 + 9 + 16) / 3)
-    assert found.channels == {"points.tip": pytest.approx(2.5), "points.other": pytest.approx(12.5)}
+    assert found.channel_chi2 == {"points.tip": pytest.approx(2.5), "points.other": pytest.approx(12.5)}
 
 
 # -- more than noise --------------------------------------------------------------------------------------------------
@@ -92,14 +92,14 @@ def test_several_series_add_and_rows_of_no_series_do_not_count():
     ],
 )
 def test_more_than_noise_is_sure_among_all_tests_and_worth_a_word(tests, said):
-    made = [NullTest(ratio, 10.0, p, {}, {}, ()) for ratio, p in tests]
-    assert more_than_noise(made) is said
+    made = [NullTestResult(ratio, 10.0, p, {}, {}, ()) for ratio, p in tests]
+    assert exceeds_noise(made) is said
 
 
 def test_the_limits_of_the_gap_are_those_given():
-    found = [NullTest(1.5, 10.0, 0.02, {}, {}, ())]
-    assert more_than_noise(found, GapLimits(level=0.05))
-    assert not more_than_noise(found, GapLimits(level=0.05, smallest_gap=0.5))
+    found = [NullTestResult(1.5, 10.0, 0.02, {}, {}, ())]
+    assert exceeds_noise(found, GapCriteria(significance_level=0.05))
+    assert not exceeds_noise(found, GapCriteria(significance_level=0.05, min_excess_chi2=0.5))
 
 
 # -- beside what else has moved it ------------------------------------------------------------------------------------
@@ -108,21 +108,21 @@ def test_the_limits_of_the_gap_are_those_given():
 def test_a_residual_beside_other_errors_has_unit_covariance():
     rng = np.random.default_rng(0)
     spread = rng.standard_normal((7, 3)) * [0.1, 3.0, 1e6]
-    root = np.array([whitened_beside(unit, spread) for unit in np.eye(7)])
+    root = np.array([whiten_with_extra_errors(unit, spread) for unit in np.eye(7)])
     np.testing.assert_allclose(root @ (np.eye(7) + spread @ spread.T) @ root.T, np.eye(7), atol=1e-4)
 
 
 def test_what_no_other_error_could_have_done_is_left_as_it_is():
     spread = np.array([[2.0], [0.0], [0.0]])
-    found = whitened_beside(np.array([3.0, 5.0, -7.0]), spread)
+    found = whiten_with_extra_errors(np.array([3.0, 5.0, -7.0]), spread)
     np.testing.assert_allclose(found, [3.0 / math.sqrt(5.0), 5.0, -7.0])
 
 
 def test_a_column_that_overflowed_says_nothing():
     spread = np.array([[2.0, math.inf], [0.0, 1.0]])
-    found = whitened_beside(np.array([3.0, 5.0]), spread)
-    np.testing.assert_allclose(found, whitened_beside(np.array([3.0, 5.0]), spread[:, :1]))
-    np.testing.assert_array_equal(whitened_beside(np.array([3.0]), np.array([[math.nan]])), [3.0])
+    found = whiten_with_extra_errors(np.array([3.0, 5.0]), spread)
+    np.testing.assert_allclose(found, whiten_with_extra_errors(np.array([3.0, 5.0]), spread[:, :1]))
+    np.testing.assert_array_equal(whiten_with_extra_errors(np.array([3.0]), np.array([[math.nan]])), [3.0])
 
 
 def test_predictions_by_what_was_estimated_are_noise_in_units_of_their_own():
@@ -134,8 +134,8 @@ def test_predictions_by_what_was_estimated_are_noise_in_units_of_their_own():
     for _ in range(400):
         line = np.linalg.lstsq(fitted, rng.standard_normal(len(near)), rcond=None)[0]
         residual = held @ line - rng.standard_normal(len(far))
-        plain.append(null_test([series(range(40))], residual, 0).p_value)
-        judged.append(null_test([series(range(40))], whitened_beside(residual, held @ factor), 0).p_value)
+        plain.append(run_null_test([series(range(40))], residual, 0).p_value)
+        judged.append(run_null_test([series(range(40))], whiten_with_extra_errors(residual, held @ factor), 0).p_value)
     assert np.mean(np.array(plain) < 0.01) > 0.5
     assert 0.001 < np.mean(np.array(judged) < 0.01) < 0.03
     assert 0.4 < np.median(judged) < 0.6
@@ -161,13 +161,13 @@ def noise(count: int, seed: int) -> np.ndarray:
 
 def test_whiteness_is_that_of_ljung_and_box():
     r = noise(40, 1) + 0.4
-    found = null_test([series(range(40))], r, 0).whiteness
+    found = run_null_test([series(range(40))], r, 0).whiteness_p_values
     assert found == {"points.tip": pytest.approx(ljung_box(r), rel=1e-10)}
 
 
 def test_whiteness_adds_over_the_columns_of_a_channel():
     r = np.concatenate([noise(40, 1), noise(31, 2)])
-    found = null_test([series(range(40)), series(range(40, 71))], r, 0).whiteness
+    found = run_null_test([series(range(40)), series(range(40, 71))], r, 0).whiteness_p_values
     assert found["points.tip"] == pytest.approx(ljung_box(r[:40], r[40:]), rel=1e-10)
 
 
@@ -180,7 +180,7 @@ def test_too_short_a_column_says_nothing_of_whiteness(parts, judged):
     r = [noise(count, 7 + i) for i, count in enumerate(parts)]
     edges = np.cumsum([0, *parts])
     rows = [np.arange(a, b) for a, b in itertools.pairwise(edges)]
-    found = null_test([series(own) for own in rows], np.concatenate(r), 0).whiteness["points.tip"]
+    found = run_null_test([series(own) for own in rows], np.concatenate(r), 0).whiteness_p_values["points.tip"]
     if judged:
         assert found == pytest.approx(ljung_box(*(r[i] for i in judged)), rel=1e-10)
     else:
@@ -190,7 +190,7 @@ def test_too_short_a_column_says_nothing_of_whiteness(parts, judged):
 def test_a_column_of_zeros_and_a_coloured_channel_have_no_whiteness():
     r = np.concatenate([np.zeros(40), noise(40, 3)])
     parts = [series(range(40)), series(range(40, 80), channel="points.other", colour=(1.0, 0.5))]
-    found = null_test(parts, r, 0).whiteness
+    found = run_null_test(parts, r, 0).whiteness_p_values
     assert all(math.isnan(p) for p in found.values())
     assert set(found) == {"points.tip", "points.other"}
 
@@ -229,56 +229,56 @@ def with_p_values(*wanted: float) -> tuple[list, np.ndarray]:
     ],
 )
 def test_windows_are_flagged_by_their_false_discovery_rate(p_values, flagged):
-    found = null_test(*with_p_values(*p_values), 0, level=0.01).windows
+    found = run_null_test(*with_p_values(*p_values), 0, level=0.01).windows
     assert len(found) == 4
-    assert tuple(i for i, entry in enumerate(found) if entry.flagged) == flagged
+    assert tuple(i for i, entry in enumerate(found) if entry.is_flagged) == flagged
 
 
 def test_the_rate_is_the_level():
     parts = with_p_values(0.02, 0.5, 0.6, 0.7)
-    assert [w.flagged for w in null_test(*parts, 0, level=0.1).windows] == [True, False, False, False]
-    assert not any(w.flagged for w in null_test(*parts, 0, level=0.05).windows)
+    assert [w.is_flagged for w in run_null_test(*parts, 0, level=0.1).windows] == [True, False, False, False]
+    assert not any(w.is_flagged for w in run_null_test(*parts, 0, level=0.05).windows)
 
 
 def test_a_window_has_its_excess_in_standard_deviations():
     t = [0.0, 0.2, 0.4, 0.5, 0.9, 2.1]
     residual = np.array([1.0, 2.0, 3.0, 0.5, 0.5, 1.0])
-    found = null_test([series(range(6), t, colour=(1.0, 0.5))], residual, 0).windows
-    assert [(w.begin, w.end) for w in found] == [(0.0, 0.5), (0.5, 1.0), (2.0, 2.1)]
+    found = run_null_test([series(range(6), t, colour=(1.0, 0.5))], residual, 0).windows
+    assert [(w.start_time, w.end_time) for w in found] == [(0.0, 0.5), (0.5, 1.0), (2.0, 2.1)]
     for entry, mean, count in zip(found, (14 / 3, 0.25, 1.0), (3, 2, 1), strict=True):
-        assert entry.z == pytest.approx((mean - 1) * math.sqrt(count / 1.5 / 2))
+        assert entry.z_score == pytest.approx((mean - 1) * math.sqrt(count / 1.5 / 2))
         assert (entry.recording, entry.channel) == ("run", "points.tip")
 
 
 def test_columns_of_a_channel_share_windows_and_recordings_do_not():
     residual = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
     parts = [series([0, 1]), series([2, 3]), series([4], recording="second"), series([5], channel="points.other")]
-    found = null_test(parts, residual, 0).windows
+    found = run_null_test(parts, residual, 0).windows
     assert [(w.recording, w.channel) for w in found] == [
         ("run", "points.tip"),
         ("second", "points.tip"),
         ("run", "points.other"),
     ]
-    assert found[0].z == pytest.approx((30 / 4 - 1) * math.sqrt(2))
-    assert found[1].z == pytest.approx(24 * math.sqrt(0.5))
+    assert found[0].z_score == pytest.approx((30 / 4 - 1) * math.sqrt(2))
+    assert found[1].z_score == pytest.approx(24 * math.sqrt(0.5))
 
 
 def test_windows_are_as_long_as_wanted_and_reach_the_last_sample():
     t = [0.0, 0.25, 0.5, 0.75, 1.0]
     parts = [series(range(3), t[:3]), series([3, 4], t[3:])]
-    found = null_test(parts, np.ones(5), 0, window=0.5).windows
-    assert [(w.begin, w.end) for w in found] == [(0.0, 0.5), (0.5, 1.0), (1.0, 1.0)]
-    assert len(null_test(parts, np.ones(5), 0, window=0.25).windows) == 5
-    assert [(w.begin, w.end) for w in null_test(parts, np.ones(5), 0, window=2.0).windows] == [(0.0, 1.0)]
+    found = run_null_test(parts, np.ones(5), 0, window=0.5).windows
+    assert [(w.start_time, w.end_time) for w in found] == [(0.0, 0.5), (0.5, 1.0), (1.0, 1.0)]
+    assert len(run_null_test(parts, np.ones(5), 0, window=0.25).windows) == 5
+    assert [(w.start_time, w.end_time) for w in run_null_test(parts, np.ones(5), 0, window=2.0).windows] == [(0.0, 1.0)]
 
 
 def test_a_coloured_window_is_less_sure():
     residual = np.full(20, 1.3)
-    white = null_test([series(range(20))], residual, 0, level=0.05).windows[0]
-    coloured = null_test([series(range(20), colour=(1.0, 0.7))], residual, 0, level=0.05).windows[0]
-    assert white.flagged
-    assert not coloured.flagged
-    assert white.z == pytest.approx(coloured.z * math.sqrt(1 + 2 * 0.49))
+    white = run_null_test([series(range(20))], residual, 0, level=0.05).windows[0]
+    coloured = run_null_test([series(range(20), colour=(1.0, 0.7))], residual, 0, level=0.05).windows[0]
+    assert white.is_flagged
+    assert not coloured.is_flagged
+    assert white.z_score == pytest.approx(coloured.z_score * math.sqrt(1 + 2 * 0.49))
 
 
 # -- noise floor ------------------------------------------------------------------------------------------------------
@@ -289,7 +289,7 @@ def test_the_noise_floor_is_the_median_of_each_channel():
     first = samples(["points.a", "points.b"], [[1.0, 9.0], [2.0, nan], [6.0, nan]])
     second = samples(["points.a", "effort"], [[3.0, nan], [4.0, nan]], unit="N m")
     problem = SimpleNamespace(episodes=[SimpleNamespace(samples=[first]), SimpleNamespace(samples=[second])])
-    found = {entry.channel: entry for entry in noise_floor(problem)}
+    found = {entry.channel: entry for entry in channel_noise_levels(problem)}
     assert set(found) == {"points.a", "points.b"}
-    assert (found["points.a"].std, found["points.a"].samples) == (3.0, 5)
-    assert (found["points.b"].std, found["points.b"].samples, found["points.b"].unit) == (9.0, 1, "m")
+    assert (found["points.a"].noise_std, found["points.a"].n_samples) == (3.0, 5)
+    assert (found["points.b"].noise_std, found["points.b"].n_samples, found["points.b"].unit) == (9.0, 1, "m")

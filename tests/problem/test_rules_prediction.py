@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from small_problems import PENDULUM, STEPS, H, pendulum_step, taken
 
-from yid_ocp.integrator.step import Feedback
+from yid_ocp.integrator.step import TrackingFeedback
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.corrections import Inputs
-from yid_ocp.problem.episodes import beginning
+from yid_ocp.problem.episodes import truncate_episode
+from yid_ocp.problem.input_corrections import CorrectedInputs
 
 MISREAD = (("encoder_offset", "shoulder", {"offset": 0.03}), ("effort_gain", "shoulder", {"scale": 0.9}))
 LATE = (("camera_latency", "camera", {"delay": 0.0137}), ("clock_scale", "clock", {"scale": 0.97}))
@@ -137,11 +137,11 @@ def test_a_delay_is_in_true_time(urdf_folder):
     problem = problem_of(urdf_folder, "robust", seeds=(1,))
     samples, theta = problem.episodes[0].samples[1], problem.system.parameters.vector
     values = {"camera_latency@camera.delay": 0.02, "clock_scale@clock.scale": 0.8}
-    late, _ = problem.predictor.lateness(samples, theta(values), ())
+    late, _ = problem.predictor._delay_in_steps(samples, theta(values), ())
     assert late.shape == (6,)
     # a clock that goes slow shows 0.8 s for a second, and 16 ms for a delay of 20 ms
     np.testing.assert_allclose(late, 0.8 * 0.02 / H)
-    assert problem.predictor.lateness(problem.episodes[0].samples[0], theta(values), ()) is None
+    assert problem.predictor._delay_in_steps(problem.episodes[0].samples[0], theta(values), ()) is None
 
 
 def test_an_encoder_that_is_offset_moves_the_path(urdf_folder):
@@ -238,9 +238,9 @@ def test_heavier_joints_have_more_momentum_for_the_filter_to_follow(urdf_folder)
     armature = neutral | {"rotor_inertia@shoulder.armature": 0.05}
     found = problem.predictor.tracked(episode, vector(armature), ("rotor_inertia@shoulder.armature",), none)
     # of the motion up to each node; it begins from a stand
-    rate = np.diff(episode.smooth_arm[:, 0], prepend=episode.smooth_arm[0, 0])[:-1] / H
+    rate = np.diff(episode.smoothed_driven_angles[:, 0], prepend=episode.smoothed_driven_angles[0, 0])[:-1] / H
     np.testing.assert_allclose(found.momentum, np.stack([0.05 * rate, 0 * rate], axis=1), atol=1e-12)
-    np.testing.assert_allclose(found.by_momentum[:, 0, 0], rate, atol=1e-12)
+    np.testing.assert_allclose(found.momentum_shift_sensitivity[:, 0, 0], rate, atol=1e-12)
 
 
 def test_the_filter_of_an_episode_is_the_one_that_was_asked_for(urdf_folder):
@@ -251,7 +251,7 @@ def test_the_filter_of_an_episode_is_the_one_that_was_asked_for(urdf_folder):
     assert [filters[case].feedback for case in ("free", "prescribed", "driven")] == [None] * 3
     tracked = filters["driven, proportional"]
     np.testing.assert_array_equal(tracked.feedback.gain, np.full((STEPS, 1, 1), 9.0))
-    np.testing.assert_array_equal(tracked.feedback.reference, tracked.measured_arm[:-1])
+    np.testing.assert_array_equal(tracked.feedback.reference, tracked.measured_driven_angles[:-1])
     followed = filters["driven, filtered, both"].feedback
     assert followed.index.tolist() == [0, 1, 2, 3]
     assert np.all(followed.gain[0, [0, 1], [0, 1]] > 1.0)
@@ -265,7 +265,9 @@ def test_gains_do_not_know_of_effects(urdf_folder):
     for chosen in (effects, light):
         step = pendulum_step(urdf_folder, chosen, **how)
         options = ProblemOptions(path_cutoff=math.inf)
-        made.append(EstimationProblem(step, [taken(step, 1)], ("elbow.damping",), options).episodes[0].feedback)
+        made.append(
+            EstimationProblem(step, [taken(step, 1)], ("elbow.damping",), options).episodes[0].tracking_feedback
+        )
     np.testing.assert_allclose(made[0].gain, made[1].gain, rtol=1e-9)
     np.testing.assert_allclose(made[0].reference, made[1].reference, rtol=1e-9)
 
@@ -274,10 +276,10 @@ def test_gains_do_not_know_of_effects(urdf_folder):
 def test_an_episode_begins_at_its_first_posture(urdf_folder, case, driven, prescribed):
     episode = problem_of(urdf_folder, case, seeds=(1,)).episodes[0]
     position = episode.recording.joints.position
-    assert episode.measured_arm.shape == (STEPS + 1, driven)
+    assert episode.measured_driven_angles.shape == (STEPS + 1, driven)
     assert episode.path.shape == (STEPS + 1, prescribed)
     np.testing.assert_allclose(episode.posture, position[0], atol=1e-12)
-    np.testing.assert_allclose(np.hstack([episode.measured_arm, episode.path]), position, atol=1e-12)
+    np.testing.assert_allclose(np.hstack([episode.measured_driven_angles, episode.path]), position, atol=1e-12)
     assert episode.torque.shape == (STEPS, driven)
     np.testing.assert_allclose(episode.torque, episode.recording.joints.effort[:-1, :driven], atol=1e-9)
 
@@ -290,14 +292,14 @@ def test_a_filtered_arm_is_smooth_enough_to_be_differenced(urdf_folder):
     made = replace(made, joints=replace(made.joints, position=noisy))
     smooth, plain = (
         EstimationProblem(
-            step, [made], ("elbow.damping",), ProblemOptions(path_cutoff=5.0, feedback=kind, gains=(9.0,))
+            step, [made], ("elbow.damping",), ProblemOptions(path_cutoff=5.0, feedback=kind, proportional_gains=(9.0,))
         )
         for kind in ("lqr", "proportional")
     )
-    rough = [np.abs(np.diff(p.episodes[0].smooth_arm, 2, axis=0)).max() for p in (smooth, plain)]
+    rough = [np.abs(np.diff(p.episodes[0].smoothed_driven_angles, 2, axis=0)).max() for p in (smooth, plain)]
     assert rough[0] < 0.5 * rough[1]
-    np.testing.assert_array_equal(plain.episodes[0].smooth_arm, plain.episodes[0].measured_arm)
-    np.testing.assert_array_equal(smooth.episodes[0].measured_arm, plain.episodes[0].measured_arm)
+    np.testing.assert_array_equal(plain.episodes[0].smoothed_driven_angles, plain.episodes[0].measured_driven_angles)
+    np.testing.assert_array_equal(smooth.episodes[0].measured_driven_angles, plain.episodes[0].measured_driven_angles)
 
 
 # -- the first part of an episode -------------------------------------------------------------------------------------
@@ -307,7 +309,7 @@ def test_a_filtered_arm_is_smooth_enough_to_be_differenced(urdf_folder):
 def test_the_beginning_of_an_episode_is_predicted_as_in_the_whole(urdf_folder, case):
     problem = problem_of(urdf_folder, case, seeds=(1,))
     whole = problem.episodes[0]
-    short = problem.on([beginning(whole, 10)], ())
+    short = problem.on([truncate_episode(whole, 10)], ())
     x = moved(problem)
     one, two = problem.evaluate(x, False).episodes[0], short.evaluate(x, False).episodes[0]
     assert short.episodes[0].grid.steps == 10
@@ -319,51 +321,60 @@ def test_the_beginning_of_an_episode_is_predicted_as_in_the_whole(urdf_folder, c
         early = before.node + before.fraction <= last + 1e-9
         np.testing.assert_array_equal(samples.value, before.value[early])
         np.testing.assert_allclose(two.predicted[k], one.predicted[k][early], atol=1e-9)
-    assert beginning(whole, 99).grid.steps == STEPS
+    assert truncate_episode(whole, 99).grid.steps == STEPS
 
 
 # -- filters and efforts ----------------------------------------------------------------------------------------------
 
 
 def test_filters_follow_the_true_angles_and_momenta():
-    feedback = Feedback(np.array([0, 1, 4, 5]), np.ones((3, 2, 4)), np.zeros((3, 4)))
+    feedback = TrackingFeedback(np.array([0, 1, 4, 5]), np.ones((3, 2, 4)), np.zeros((3, 4)))
     arm, measured = np.full((4, 2), [1.0, 2.0]), np.zeros((4, 2))
     momentum = np.full((3, 2), [10.0, 20.0])
-    inputs = Inputs(np.zeros((3, 2)), np.zeros(2), np.zeros((4, 0)), arm)
-    assert inputs.guided(feedback, (0, 1), measured) is feedback
-    assert inputs.guided(None, (0, 1), measured) is None
-    angles = replace(inputs, by_arm=np.zeros((4, 2, 1))).guided(feedback, (0, 1), measured)
+    inputs = CorrectedInputs(np.zeros((3, 2)), np.zeros(2), np.zeros((4, 0)), arm)
+    assert inputs.corrected_feedback(feedback, (0, 1), measured) is feedback
+    assert inputs.corrected_feedback(None, (0, 1), measured) is None
+    angles = replace(inputs, driven_angles_sensitivity=np.zeros((4, 2, 1))).corrected_feedback(
+        feedback, (0, 1), measured
+    )
     np.testing.assert_array_equal(angles.reference, np.full((3, 4), [1.0, 2.0, 0.0, 0.0]))
-    momenta = replace(inputs, momentum=momentum).guided(feedback, (0, 1), measured)
+    momenta = replace(inputs, momentum_shift=momentum).corrected_feedback(feedback, (0, 1), measured)
     np.testing.assert_array_equal(momenta.reference, np.full((3, 4), [0.0, 0.0, 10.0, 20.0]))
     assert not feedback.reference.any()
-    swapped = replace(inputs, by_arm=np.zeros((4, 2, 1))).guided(feedback, (1, 0), measured)
+    swapped = replace(inputs, driven_angles_sensitivity=np.zeros((4, 2, 1))).corrected_feedback(
+        feedback, (1, 0), measured
+    )
     np.testing.assert_array_equal(swapped.reference[:, :2], np.full((3, 2), [2.0, 1.0]))
 
 
 def test_a_moving_reference_moves_the_torque_by_the_gain():
     gain = np.arange(24.0).reshape(3, 2, 4)
-    feedback = Feedback(np.array([0, 1, 4, 5]), gain, np.zeros((3, 4)))
+    feedback = TrackingFeedback(np.array([0, 1, 4, 5]), gain, np.zeros((3, 4)))
     by_arm, by_momentum = np.zeros((4, 2, 1)), np.zeros((3, 2, 1))
     by_arm[:, 1], by_momentum[:, 0] = 1.0, 2.0
-    plain = Inputs(np.zeros((3, 2)), np.zeros(2), np.zeros((4, 0)), np.zeros((4, 2)))
-    assert plain.torque_directions(feedback, (0, 1), 1) is None
+    plain = CorrectedInputs(np.zeros((3, 2)), np.zeros(2), np.zeros((4, 0)), np.zeros((4, 2)))
+    assert plain.nominal_torque_tangents(feedback, (0, 1), 1) is None
     by_torque = np.full((3, 2, 1), 100.0)
-    full = replace(plain, by_torque=by_torque, by_arm=by_arm, by_momentum=by_momentum)
-    np.testing.assert_array_equal(full.torque_directions(None, (0, 1), 1), by_torque)
-    found = full.torque_directions(feedback, (0, 1), 1)
+    full = replace(
+        plain, torque_sensitivity=by_torque, driven_angles_sensitivity=by_arm, momentum_shift_sensitivity=by_momentum
+    )
+    np.testing.assert_array_equal(full.nominal_torque_tangents(None, (0, 1), 1), by_torque)
+    found = full.nominal_torque_tangents(feedback, (0, 1), 1)
     np.testing.assert_array_equal(found[:, :, 0], 100.0 + gain[:, :, 1] + 2 * gain[:, :, 2])
     np.testing.assert_array_equal(by_torque, np.full((3, 2, 1), 100.0))
-    alone = replace(plain, by_momentum=by_momentum).torque_directions(feedback, (0, 1), 1)
+    alone = replace(plain, momentum_shift_sensitivity=by_momentum).nominal_torque_tangents(feedback, (0, 1), 1)
     np.testing.assert_array_equal(alone[:, :, 0], 2 * gain[:, :, 2])
 
 
 def test_known_coordinates_are_driven_then_prescribed():
-    inputs = Inputs(np.zeros((3, 1)), np.zeros(1), np.array([[5.0, 6.0], [0, 0]]), np.array([[4.0], [0.0]]))
-    assert inputs.posture.tolist() == [4.0, 5.0, 6.0]
-    np.testing.assert_array_equal(inputs.by_posture(2), np.zeros((3, 2)))
+    inputs = CorrectedInputs(np.zeros((3, 1)), np.zeros(1), np.array([[5.0, 6.0], [0, 0]]), np.array([[4.0], [0.0]]))
+    assert inputs.initial_known_coordinates.tolist() == [4.0, 5.0, 6.0]
+    np.testing.assert_array_equal(inputs.initial_known_coordinates_sensitivity(2), np.zeros((3, 2)))
     by_path = np.arange(8.0).reshape(2, 2, 2)
-    np.testing.assert_array_equal(replace(inputs, by_path=by_path).by_posture(2), [[0, 0], [0, 1], [2, 3]])
+    np.testing.assert_array_equal(
+        replace(inputs, prescribed_path_sensitivity=by_path).initial_known_coordinates_sensitivity(2),
+        [[0, 0], [0, 1], [2, 3]],
+    )
 
 
 @pytest.mark.parametrize(
@@ -377,7 +388,7 @@ def test_predicted_efforts_have_the_noise_of_encoders_in_them(urdf_folder, posit
     sensors = {"joints.position": SensorOptions(std=stated)}
     options = ProblemOptions(path_cutoff=math.inf, sensors=sensors)
     problem = EstimationProblem(step, [made], ("elbow.damping",), options)
-    effort = next(s for s in problem.episodes[0].samples if s.sensor.efforts)
+    effort = next(s for s in problem.episodes[0].measurements if s.sensor.effort_joints)
     # a second difference of white noise is larger by the root of 1 + 4 + 1
     acceleration = angle * math.sqrt(6.0) / H**2
     inertia = 0.0208 + 0.25**2 + 0.008 + 0.6 * 0.7**2

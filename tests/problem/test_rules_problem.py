@@ -14,9 +14,14 @@ from small_problems import PENDULUM, H, pendulum_step, recording, seen, taken
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.episodes import apparent_inertia, beginning, coupled_inertia
+from yid_ocp.problem.episodes import _joint_mass_matrices, mass_matrix_diagonal, truncate_episode
 from yid_ocp.problem.evaluation import ResidualRows
-from yid_ocp.problem.unknowns import Unknowns, check_bounds, replaced, soft_logarithm
+from yid_ocp.problem.unknown_vector import (
+    UnknownVectorLayout,
+    check_parameter_bounds,
+    soft_logarithm,
+    with_named_entries,
+)
 
 FREE = ("shoulder.stiffness", "elbow.stiffness", "elbow.rest")
 START = {"shoulder.stiffness": 6.0, "elbow.stiffness": 3.0, "elbow.rest": 0.1}
@@ -46,11 +51,11 @@ def tip(q):
 
 # -- the unknown vector -----------------------------------------------------------------------------------------------
 
-LAYOUT = Unknowns(("a", "b"), ("l",), ("q.x", "p.x"), ("one", "two"))
+LAYOUT = UnknownVectorLayout(("a", "b"), ("l",), ("q.x", "p.x"), ("one", "two"))
 
 
 def test_unknowns_are_shared_ones_then_those_of_every_recording():
-    assert LAYOUT.names == (
+    assert LAYOUT.unknown_names == (
         "a",
         "b",
         "l[one]",
@@ -60,17 +65,19 @@ def test_unknowns_are_shared_ones_then_those_of_every_recording():
         "start.q.x[two]",
         "start.p.x[two]",
     )
-    assert LAYOUT.parameters == ("a", "b", "l")
-    assert LAYOUT.columns(0).tolist() == [0, 1, 2, 3, 4]
-    assert LAYOUT.columns(1).tolist() == [0, 1, 5, 6, 7]
+    assert LAYOUT.free_parameters == ("a", "b", "l")
+    assert LAYOUT.recording_columns(0).tolist() == [0, 1, 2, 3, 4]
+    assert LAYOUT.recording_columns(1).tolist() == [0, 1, 5, 6, 7]
 
 
 def test_blocks_and_values_find_their_places():
     block = np.arange(10.0).reshape(2, 5)
-    wide = LAYOUT.placed(block, 1)
+    wide = LAYOUT.scatter_columns(block, 1)
     np.testing.assert_array_equal(wide[1], [5, 6, 0, 0, 0, 7, 8, 9])
-    np.testing.assert_array_equal(LAYOUT.spread([1, 2], [3], [4, 5]), [1, 2, 3, 4, 5, 3, 4, 5])
-    np.testing.assert_array_equal(replaced(np.array([1.0, 2.0]), ("a", "b"), {"b": 7.0, "c": 9.0}), [1.0, 7.0])
+    np.testing.assert_array_equal(LAYOUT.pack([1, 2], [3], [4, 5]), [1, 2, 3, 4, 5, 3, 4, 5])
+    np.testing.assert_array_equal(
+        with_named_entries(np.array([1.0, 2.0]), ("a", "b"), {"b": 7.0, "c": 9.0}), [1.0, 7.0]
+    )
 
 
 def test_a_recording_has_its_own_values_and_start(make):
@@ -111,7 +118,7 @@ def test_joints_are_coupled_by_the_inertia_of_every_configuration(momentum, free
         np.column_stack([momentum(free_step, q[::-1], velocity, theta)[::-1] for velocity in np.eye(2)[::-1]])
         for q in angles
     ]
-    found = coupled_inertia(free_step, theta, ("elbow", "shoulder"), angles)
+    found = _joint_mass_matrices(free_step, theta, ("elbow", "shoulder"), angles)
     np.testing.assert_allclose(found, matrices, rtol=1e-9)
     assert found[0, 0, 1] == pytest.approx(found[0, 1, 0]) != found[1, 0, 1]
 
@@ -127,14 +134,14 @@ def test_an_estimated_start_has_a_prior_in_angles_and_momenta(make, momentum, fr
     # two rods: 1/3 m l^2 and more about the shoulder
     assert inertia == pytest.approx([0.0208 + 0.25**2 + 0.008 + 0.6 * 0.7**2, 0.008 + 0.6 * 0.2**2], rel=1e-9)
     np.testing.assert_allclose(problem.start_std, [0.07, 0.07, 0.3 * inertia[0], 0.3 * inertia[1]], rtol=1e-9)
-    np.testing.assert_allclose(apparent_inertia(free_step, theta, ("elbow", "shoulder")), inertia[::-1], rtol=1e-9)
+    np.testing.assert_allclose(mass_matrix_diagonal(free_step, theta, ("elbow", "shoulder")), inertia[::-1], rtol=1e-9)
     assert problem.names[3:] == tuple(f"start.{kind}.{joint}[run_1]" for kind in "qp" for joint in PENDULUM)
-    assert problem.predictor.start_rows == (0, 1, 2, 3)
+    assert problem.predictor.estimated_state_indices == (0, 1, 2, 3)
 
 
 def test_without_estimated_starts_there_are_none(make):
     problem = make()
-    assert problem.predictor.start_rows == ()
+    assert problem.predictor.estimated_state_indices == ()
     assert problem.start_std.shape == (0,)
     assert problem.names == FREE
 
@@ -211,7 +218,7 @@ def test_the_residual_is_made_of_measurements_then_priors(make):
     residual, jacobian = problem.informing(evaluation)
     np.testing.assert_array_equal(residual, evaluation.residual[:229])
     np.testing.assert_array_equal(jacobian, evaluation.jacobian[:229])
-    assert ResidualRows.of((), 2, 3) == ResidualRows((), slice(0, 0), slice(0, 2), slice(2, 5))
+    assert ResidualRows.from_episodes((), 2, 3) == ResidualRows((), slice(0, 0), slice(0, 2), slice(2, 5))
 
 
 @pytest.mark.parametrize("stated", [None, 2.0], ids=["small", "more than a metre"])
@@ -299,16 +306,16 @@ def test_a_held_out_start_balances_its_prior_and_its_first_moments(make, held, c
     options = {"initial_state": "estimated", "configuration_std": configuration, "velocity_std": velocity}
     problem = make(held_out=held, **options)
     x = problem.start
-    short = beginning(problem.held_out[1], 20)
+    short = truncate_episode(problem.held_out[1], 20)
     theta, _ = problem.split(x, 0)
 
     def rows(offset):
         result = problem.predictor.run(short, theta, offset, False)
-        parts = [s.whitened(y).ravel() for s, y in zip(short.samples, result.predicted, strict=True)]
+        parts = [s.whitened_residual(y).ravel() for s, y in zip(short.measurements, result.predicted, strict=True)]
         return np.concatenate([*parts, offset / problem.start_std])
 
     best = scipy.optimize.least_squares(rows, np.zeros(4), x_scale=problem.start_std, xtol=1e-12, ftol=1e-14)
-    found = problem.held_out_offset(1, x)
+    found = problem.held_out_initial_state_offset(1, x)
     np.testing.assert_allclose(found / problem.start_std, best.x / problem.start_std, atol=2e-3)
 
 
@@ -319,9 +326,9 @@ def test_held_out_recordings_are_predicted_with_shared_parameters_only(make, hel
     assert [episode.name for episode, _ in found] == ["run_8", "run_9"]
     for i, (episode, result) in enumerate(found):
         theta = problem.system.parameters.vector({"elbow.stiffness": 4.0, "elbow.rest": 0.1})
-        expected = problem.predictor.run(episode, theta, problem.held_out_offset(i, x), False)
+        expected = problem.predictor.run(episode, theta, problem.held_out_initial_state_offset(i, x), False)
         np.testing.assert_allclose(result.predicted[0], expected.predicted[0], atol=1e-12)
-        assert np.any(problem.held_out_offset(i, x))
+        assert np.any(problem.held_out_initial_state_offset(i, x))
 
 
 def test_a_held_out_part_of_a_recording_shares_its_start(make):
@@ -329,14 +336,14 @@ def test_a_held_out_part_of_a_recording_shares_its_start(make):
     part = replace(problem.episodes[1], shares_start_of=1)
     split = problem.on(problem.episodes, [part])
     x = problem.vector({name: 0.01 * i for i, name in enumerate(problem.names[3:])})
-    assert split.held_out_offset(0, x).tolist() == problem.split(x, 1)[1].tolist()
+    assert split.held_out_initial_state_offset(0, x).tolist() == problem.split(x, 1)[1].tolist()
     np.testing.assert_array_equal(
         split.validate(x)[0][1].predicted[0], problem.evaluate(x, False).episodes[1].predicted[0]
     )
 
 
 def test_a_start_at_rest_needs_no_offset(make, held):
-    assert make(held_out=held).held_out_offset(0, np.array([6.0, 3.0, 0.1])).shape == (0,)
+    assert make(held_out=held).held_out_initial_state_offset(0, np.array([6.0, 3.0, 0.1])).shape == (0,)
 
 
 def test_the_first_moments_are_at_least_two_steps_of_a_fifth_of_a_second(make, held):
@@ -347,8 +354,8 @@ def test_the_first_moments_are_at_least_two_steps_of_a_fifth_of_a_second(make, h
         changed = value.copy()
         changed[first:] += 0.3
         moved = replace(episode, samples=(replace(episode.samples[0], value=changed),))
-        found = problem.on(problem.episodes, [moved]).held_out_offset(0, problem.start)
-        assert np.allclose(found, problem.held_out_offset(0, problem.start), atol=1e-12) is same
+        found = problem.on(problem.episodes, [moved]).held_out_initial_state_offset(0, problem.start)
+        assert np.allclose(found, problem.held_out_initial_state_offset(0, problem.start), atol=1e-12) is same
 
 
 # -- other problems like it -------------------------------------------------------------------------------------------
@@ -373,16 +380,16 @@ def test_problems_that_free_other_parameters_share_all_else(make):
 def test_problems_prepared_anew_keep_what_is_not_changed(make, held):
     problem = make(held_out=held, values={"elbow.damping": 0.7}, priors={"elbow.rest": 0.1}, local=("elbow.rest",))
     index = problem.system.parameters.index
-    shorter = problem.shortened(0.1)
+    shorter = problem.truncated_to(0.1)
     assert (shorter.episodes[0].grid.steps, shorter.held_out, shorter.free) == (10, (), FREE)
     assert shorter.theta[index("elbow.damping")] == 0.7
     changed = problem.with_options(replace(problem.options, weak_prior_factor=3.0))
     assert (changed.options.weak_prior_factor, len(changed.held_out), changed.free) == (3.0, 2, FREE)
-    fewer = problem.with_free(("elbow.stiffness",), {"elbow.stiffness": 5.0})
+    fewer = problem.with_free_parameters(("elbow.stiffness",), {"elbow.stiffness": 5.0})
     assert (fewer.free, fewer.options.local, fewer.options.priors) == (("elbow.stiffness",), (), {})
     assert fewer.start.tolist() == [5.0]
     assert fewer.theta[index("elbow.damping")] == 0.7
-    kept = problem.with_free(("elbow.rest",))
+    kept = problem.with_free_parameters(("elbow.rest",))
     assert (kept.options.local, kept.options.priors) == (("elbow.rest",), {"elbow.rest": 0.1})
     assert len(kept.held_out) == 2
 
@@ -422,14 +429,14 @@ def test_a_free_parameter_has_room_about_its_start(bounds, words):
     lower, upper = bounds
     system = SimpleNamespace(parameters=Parameters([Parameter("k", lower, "N m/rad", lower, upper)]))
     with pytest.raises(ConfigError, match=words):
-        check_bounds(system, ("k",), np.array([3.0]))
-    check_bounds(system, (), np.array([3.0]))
+        check_parameter_bounds(system, ("k",), np.array([3.0]))
+    check_parameter_bounds(system, (), np.array([3.0]))
 
 
 @pytest.mark.parametrize("value", [0.0, 3.0, 5.0])
 def test_a_start_may_lie_on_a_bound(value):
     system = SimpleNamespace(parameters=Parameters([Parameter("k", 1.0, "N m/rad", 0.0, 5.0)]))
-    check_bounds(system, ("k",), np.array([value]))
+    check_parameter_bounds(system, ("k",), np.array([value]))
 
 
 def test_there_must_be_something_to_estimate_on(free_step):

@@ -14,8 +14,8 @@ from small_problems import H, efforts, measured, pendulum_step, points, taken
 
 from yid_ocp.errors import DataError
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.start import StartFit, _speed
-from yid_ocp.problem.validation import channel_errors, point_errors
+from yid_ocp.problem.initial_state_fit import InitialStateFitter, _speed
+from yid_ocp.problem.prediction_errors import point_rmse_by_recording, rmse_by_channel
 
 NAN = math.nan
 
@@ -45,7 +45,7 @@ def at(node, q, std=1e-3, both=True, **more):
 def solved(step, samples, window=0.02, posture=(), path=None, **values):
     theta = step.system.parameters.vector(values)
     path = np.zeros((30, len(step.system.prescribed))) if path is None else path
-    return StartFit(step).solve(np.array(posture), samples, theta, window, path)
+    return InitialStateFitter(step).fit_to_points(np.array(posture), samples, theta, window, path)
 
 
 def momentum_at(step, momentum, q, v):
@@ -172,10 +172,10 @@ def test_parameters_are_fitted_along_with_the_start(urdf_folder):
         value = np.concatenate([elbow(q), tip(q)]).reshape(2, 3)
         turned = value @ Rotation.from_rotvec([turn, 0, 0]).as_matrix().T
         camera = measured(points("lower", "tip", pose=pose, group="camera"), [0], [0.0], turned.reshape(1, 6), sharp)
-        found = StartFit(step, (TURN,)).solve(
+        found = InitialStateFitter(step, (TURN,)).fit_to_points(
             np.zeros(0), [here, camera], step.system.parameters.vector(), 0.02, np.zeros((30, 0))
         )
-        assert found.values[TURN] == pytest.approx(turn, abs=1e-4)
+        assert found.fitted_parameters[TURN] == pytest.approx(turn, abs=1e-4)
         np.testing.assert_allclose(found.state[:2], q, atol=1e-4)
 
 
@@ -187,33 +187,33 @@ def swung(step, seed=4, std=0.02):
 
 
 def test_a_problem_fits_its_starts_once_at_its_own_parameters(step):
-    options = ProblemOptions(initial_state="fitted_to_points", start_window=0.01)
+    options = ProblemOptions(initial_state="fitted_to_points", start_fit_window=0.01)
     problem = EstimationProblem(step, [swung(step)], ("elbow.stiffness",), options, held_out=[swung(step, 5)])
-    expected = solved(step, problem.episodes[0].samples, 0.01)
-    np.testing.assert_allclose(problem.episodes[0].start.state, expected.state)
+    expected = solved(step, problem.episodes[0].measurements, 0.01)
+    np.testing.assert_allclose(problem.episodes[0].fixed_initial_state.state, expected.state)
     moved = problem.evaluate([9.0], False)
-    np.testing.assert_allclose(moved.episodes[0].rollout.state[0], expected.state)
-    assert moved.warm == (None,)
-    assert problem.held_out[0].start is None
-    [(held, result)] = problem.validate([9.0])
-    own = solved(step, problem.held_out[0].samples, 0.01, **{"elbow.stiffness": 9.0})
-    np.testing.assert_allclose(held.start.state, own.state)
+    np.testing.assert_allclose(moved.episode_predictions[0].rollout.state[0], expected.state)
+    assert moved.equilibrium_guesses == (None,)
+    assert problem.held_out[0].fixed_initial_state is None
+    [(held, result)] = problem.predict_held_out([9.0])
+    own = solved(step, problem.held_out[0].measurements, 0.01, **{"elbow.stiffness": 9.0})
+    np.testing.assert_allclose(held.fixed_initial_state.state, own.state)
     np.testing.assert_allclose(result.rollout.state[0], own.state)
 
 
 def test_the_points_of_a_start_may_have_a_noise_of_their_own(step):
-    usual = ProblemOptions(initial_state="fitted_to_points", start_window=0.01)
-    sharp = replace(usual, start_std=1e-4)
+    usual = ProblemOptions(initial_state="fitted_to_points", start_fit_window=0.01)
+    sharp = replace(usual, start_point_noise_std=1e-4)
     states = []
     for options in (usual, sharp):
         problem = EstimationProblem(step, [swung(step)], ("elbow.stiffness",), options)
-        states.append(problem.episodes[0].start.state[:2])
-        assert problem.episodes[0].samples[0].weight[0, 0] == pytest.approx(50.0)
-    misses = [np.linalg.norm(tip(q) - problem.episodes[0].samples[0].value[0]) for q in states]
+        states.append(problem.episodes[0].fixed_initial_state.state[:2])
+        assert problem.episodes[0].measurements[0].weight[0, 0] == pytest.approx(50.0)
+    misses = [np.linalg.norm(tip(q) - problem.episodes[0].measurements[0].value[0]) for q in states]
     assert misses[1] < misses[0]
     again = EstimationProblem(step, [swung(step)], ("elbow.stiffness",), sharp)
     weight = np.full((25, 3), 1e4)
-    exact = replace(again.episodes[0].samples[0], weight=weight)
+    exact = replace(again.episodes[0].measurements[0], weight=weight)
     np.testing.assert_allclose(states[1], solved(step, [exact], 0.01).state[:2], atol=1e-9)
 
 
@@ -221,43 +221,45 @@ def test_known_starts_and_values_are_taken_as_they_are(step):
     state = np.array([0.3, 0.2, 0.05, -0.02])
     options = ProblemOptions(
         initial_state="fitted_to_points",
-        known_start={"run_4": state},
-        recording_values={"run_4": {"elbow.rest": 0.5}},
+        known_initial_states={"run_4": state},
+        parameters_by_recording={"run_4": {"elbow.rest": 0.5}},
     )
     problem = EstimationProblem(step, [swung(step)], ("elbow.stiffness",), options)
-    rollout = problem.evaluate([4.0], False).episodes[0].rollout
+    rollout = problem.evaluate([4.0], False).episode_predictions[0].rollout
     np.testing.assert_array_equal(rollout.state[0], state)
-    theta = problem.predictor.own_theta(problem.episodes[0], problem.theta)
+    theta = problem.predictor.episode_theta(problem.episodes[0], problem.theta)
     assert theta[problem.system.parameters.index("elbow.rest")] == 0.5
     assert problem.theta[problem.system.parameters.index("elbow.rest")] == 0.1
-    start = problem.start_state(problem.episodes[0], problem.theta)
+    start = problem.initial_state(problem.episodes[0], problem.theta)
     np.testing.assert_array_equal(start.state, state)
-    assert (start.by_unknowns.shape, start.rest, start.message) == ((4, 1), None, "")
-    assert not start.by_unknowns.any()
+    assert (start.state_sensitivity.shape, start.equilibrium, start.failure_message) == ((4, 1), None, "")
+    assert not start.state_sensitivity.any()
     with pytest.raises(Exception, match="known_start"):
-        EstimationProblem(step, [swung(step)], ("elbow.stiffness",), replace(options, known_start={"run_4": state[:3]}))
+        EstimationProblem(
+            step, [swung(step)], ("elbow.stiffness",), replace(options, known_initial_states={"run_4": state[:3]})
+        )
 
 
 def test_an_estimated_start_is_offset_from_a_known_one(step):
     state = np.array([0.3, 0.2, 0.05, -0.02])
-    options = ProblemOptions(initial_state="estimated", known_start={"run_4": state})
+    options = ProblemOptions(initial_state="estimated", known_initial_states={"run_4": state})
     problem = EstimationProblem(step, [swung(step)], ("elbow.stiffness",), options)
     offset = np.array([0.01, 0.02, 0.003, 0.004])
-    rollout = problem.evaluate(np.concatenate([[3.0], offset]), False).episodes[0].rollout
+    rollout = problem.evaluate(np.concatenate([[3.0], offset]), False).episode_predictions[0].rollout
     np.testing.assert_allclose(rollout.state[0], state + offset)
-    start = problem.start_state(problem.episodes[0], problem.theta, offset)
+    start = problem.initial_state(problem.episodes[0], problem.theta, offset)
     np.testing.assert_allclose(start.state, state + offset)
-    np.testing.assert_array_equal(start.by_unknowns, np.hstack([np.zeros((4, 1)), np.eye(4)]))
+    np.testing.assert_array_equal(start.state_sensitivity, np.hstack([np.zeros((4, 1)), np.eye(4)]))
 
 
 def test_a_start_at_rest_that_does_not_exist_is_said(step):
     problem = EstimationProblem(step, [swung(step)], ("elbow.rest",), ProblemOptions())
     theta = problem.system.parameters.vector() * 1.0
     theta[problem.system.parameters.index("elbow.rest")] = 1e8
-    start = problem.start_state(problem.episodes[0], theta)
-    assert start.message.startswith("run_4: no equilibrium")
-    assert start.by_unknowns.shape == (4, 1)
-    assert not start.rest.converged
+    start = problem.initial_state(problem.episodes[0], theta)
+    assert start.failure_message.startswith("run_4: no equilibrium")
+    assert start.state_sensitivity.shape == (4, 1)
+    assert not start.equilibrium.is_converged
 
 
 # -- how fast it starts -----------------------------------------------------------------------------------------------
@@ -289,26 +291,26 @@ def test_errors_are_euclidean_for_points_and_plain_for_efforts():
     result = SimpleNamespace(
         predicted=(np.array([[3.0, 4, 0, 1, 0, 0], [0, 0, 1, 5, 5, 5]]), np.array([[4.0], [6.0], [9.0]]))
     )
-    found = channel_errors([result, result], [SimpleNamespace(samples=(tips, loads))] * 2)
+    found = rmse_by_channel([result, result], [SimpleNamespace(samples=(tips, loads))] * 2)
     assert found == {
         "points.a": {"rmse": pytest.approx(math.sqrt(13.0)), "unit": "m", "n": 4},
         "points.b": {"rmse": 1.0, "unit": "m", "n": 2},
         "joints.effort.j": {"rmse": pytest.approx(math.sqrt(12.5)), "unit": "N m", "n": 4},
     }
     hidden = measured(efforts("j"), [0], [0.0], [[NAN]])
-    assert channel_errors([SimpleNamespace(predicted=(np.zeros((1, 1)),))], [SimpleNamespace(samples=(hidden,))]) == {}
+    assert rmse_by_channel([SimpleNamespace(predicted=(np.zeros((1, 1)),))], [SimpleNamespace(samples=(hidden,))]) == {}
 
 
 def test_errors_of_points_in_all_recordings(step):
     problem = EstimationProblem(
         step, [swung(step), swung(step, 6)], ("elbow.stiffness",), ProblemOptions(), held_out=[swung(step, 5)]
     )
-    found = point_errors(problem, [3.0], ("tip",))
+    found = point_rmse_by_recording(problem, [3.0], ("tip",))
     assert set(found) == {"run_4", "run_5", "run_6"}
     for i, episode in enumerate(problem.episodes):
-        predicted = problem.evaluate([3.0], False).episodes[i].predicted[0]
-        error = np.linalg.norm(predicted - episode.samples[0].value, axis=1)[2:]
+        predicted = problem.evaluate([3.0], False).episode_predictions[i].predicted_outputs[0]
+        error = np.linalg.norm(predicted - episode.measurements[0].value, axis=1)[2:]
         assert found[episode.name] == pytest.approx(math.sqrt(np.mean(error**2)))
-    assert point_errors(problem, [3.0], ("lower",)) == {}
+    assert point_rmse_by_recording(problem, [3.0], ("lower",)) == {}
     failing = EstimationProblem(step, [swung(step)], ("elbow.rest",), ProblemOptions())
-    assert math.isnan(point_errors(failing, [1e8], ("tip",))["run_4"])
+    assert math.isnan(point_rmse_by_recording(failing, [1e8], ("tip",))["run_4"])

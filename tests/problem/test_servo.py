@@ -10,15 +10,15 @@ import pytest
 from small_problems import PENDULUM, H, joints, pendulum_step, recording
 
 from yid_ocp.data.recording import Recording
-from yid_ocp.effects import SENSORS, candidates, make_effect
+from yid_ocp.effects import SENSOR_KINDS, candidate_effects, make_effect
 from yid_ocp.errors import DataError
-from yid_ocp.integrator.rollout import applied_torque, simulate
-from yid_ocp.integrator.statics import Statics
+from yid_ocp.integrator.rollout import applied_joint_torque, simulate
+from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.model.drives import KNEE, PositionServos
+from yid_ocp.model.servos_and_springs import TORQUE_LIMIT_POWER, PositionServoOptions
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.grid import Grid
-from yid_ocp.problem.inputs import held_inputs
+from yid_ocp.problem.recorded_inputs import mean_step_inputs
+from yid_ocp.problem.time_grid import TimeGrid
 from yid_ocp.solvers import GaussNewton
 
 VALUES = {
@@ -41,7 +41,7 @@ def step(urdf_folder):
 
 
 def servo_step(folder, effects=(), commands="held", gravity_compensation=False):
-    return pendulum_step(folder, effects, driven=PENDULUM, servos=PositionServos(commands, gravity_compensation))
+    return pendulum_step(folder, effects, driven=PENDULUM, servos=PositionServoOptions(commands, gravity_compensation))
 
 
 def commanded(steps: int = 40, period: float = H, position=None, command=None) -> Recording:
@@ -66,20 +66,22 @@ def test_the_torque_is_that_of_a_spring_and_a_damper_within_a_limit(step, demand
     theta = system.parameters.vector(VALUES)
     command = np.array([0.3 + (demand + 4.0 * 0.7) / 60.0, 0.0])
     found = np.array(torque(command, [0.3, 0.0], [0.7, 0.0], theta)).ravel()
-    assert found[0] == pytest.approx(demand / (1 + (abs(demand) / 9.0) ** KNEE) ** (1 / KNEE))
+    assert found[0] == pytest.approx(
+        demand / (1 + (abs(demand) / 9.0) ** TORQUE_LIMIT_POWER) ** (1 / TORQUE_LIMIT_POWER)
+    )
     assert abs(found[0]) < 9.0
     assert found[1] == 0.0
 
 
 def test_a_clip_is_what_the_limit_is_away_from_its_corner(step) -> None:
     for ratio, most in ((0.5, 1e-3), (0.9, 0.012), (1.0, 0.045), (1.1, 0.013)):
-        assert abs(ratio / (1 + ratio**KNEE) ** (1 / KNEE) - min(ratio, 1.0)) < most
+        assert abs(ratio / (1 + ratio**TORQUE_LIMIT_POWER) ** (1 / TORQUE_LIMIT_POWER) - min(ratio, 1.0)) < most
 
 
 def test_it_rests_where_its_servos_balance_the_weight(step) -> None:
     theta, command = step.system.parameters.vector(VALUES), np.array([0.4, -0.3])
-    rest = Statics(step).solve(command, theta, command)
-    assert rest.converged
+    rest = EquilibriumSolver(step).solve(command, theta, command)
+    assert rest.is_converged
     sag = command - rest.state[:2]
     weight = -9.81 * np.array(
         [
@@ -89,35 +91,39 @@ def test_it_rests_where_its_servos_balance_the_weight(step) -> None:
         ]
     )
     demand = np.array([60.0, 25.0]) * sag
-    torque = demand / (1 + (np.abs(demand) / [9.0, 3.0]) ** KNEE) ** (1 / KNEE)
+    torque = demand / (1 + (np.abs(demand) / [9.0, 3.0]) ** TORQUE_LIMIT_POWER) ** (1 / TORQUE_LIMIT_POWER)
     np.testing.assert_allclose(torque, -weight, rtol=1e-8)
     still = simulate(step, theta, rest.state, 30, np.tile(command, (30, 1)))
     np.testing.assert_allclose(still.state, np.tile(rest.state, (31, 1)), atol=1e-9)
     for i in range(2):
         moved = command.copy()
         moved[i] += 1e-5
-        change = (Statics(step).solve(moved, theta, moved).state - rest.state) / 1e-5
-        np.testing.assert_allclose(rest.by_torque[:, i], change, rtol=1e-3, atol=1e-4)
+        change = (EquilibriumSolver(step).solve(moved, theta, moved).state - rest.state) / 1e-5
+        np.testing.assert_allclose(rest.state_by_torque[:, i], change, rtol=1e-3, atol=1e-4)
     # without a command, that which holds the posture is looked for
-    held = Statics(step).solve(command, theta)
+    held = EquilibriumSolver(step).solve(command, theta)
     np.testing.assert_allclose(held.state[:2], command, atol=1e-3)
-    assert np.all((held.torque - command) * sag > 0)
+    assert np.all((held.holding_torque - command) * sag > 0)
 
 
 def test_the_torque_along_a_rollout_is_what_moves_it(step) -> None:
     made = problem_of(step, commanded(), ["shoulder.damping"])
-    [result] = made.evaluate(made.start, False).episodes
-    torque = applied_torque(step, made.theta, result.rollout)
+    [result] = made.evaluate(made.initial_unknowns, False).episode_predictions
+    torque = applied_joint_torque(step, made.theta, result.rollout)
     q = result.rollout.state[:, :2]
     rate, middle = np.diff(q, axis=0) / H, (q[1:] + q[:-1]) / 2
     demand = np.array([60.0, 25.0]) * (result.rollout.torque - middle) - np.array([4.0, 1.5]) * rate
-    np.testing.assert_allclose(torque, demand / (1 + (np.abs(demand) / [9.0, 3.0]) ** KNEE) ** (1 / KNEE), rtol=1e-9)
+    np.testing.assert_allclose(
+        torque,
+        demand / (1 + (np.abs(demand) / [9.0, 3.0]) ** TORQUE_LIMIT_POWER) ** (1 / TORQUE_LIMIT_POWER),
+        rtol=1e-9,
+    )
 
 
 def test_a_controller_that_carries_the_arm_leaves_no_sag(urdf_folder) -> None:
     carried = servo_step(urdf_folder, gravity_compensation=True)
     command = np.array([0.9, 0.4])
-    rest = Statics(carried).solve(command, carried.system.parameters.vector(VALUES), command)
+    rest = EquilibriumSolver(carried).solve(command, carried.system.parameters.vector(VALUES), command)
     np.testing.assert_allclose(rest.state[:2], command, atol=1e-8)
 
 
@@ -126,7 +132,7 @@ def test_a_servo_far_stiffer_than_the_step_is_stable(step) -> None:
     theta = step.system.parameters.vector(VALUES | stiff | {f"{joint}.servo_torque_limit": 1e5 for joint in PENDULUM})
     command = np.tile([0.5, 0.5], (60, 1))
     run = simulate(step, theta, np.zeros(step.sizes["nx"]), 60, command)
-    assert run.status.ok
+    assert run.status.is_converged
     assert np.abs(run.state[:, :2]).max() < 1.1
     np.testing.assert_allclose(run.state[-1, :2], 0.5, atol=2e-3)
 
@@ -138,9 +144,9 @@ def test_commands_are_held_or_interpolated_and_late(urdf_folder, commands, expec
     system = servo_step(urdf_folder, commands=commands).system
     t = np.array([0.0, 0.2, 0.4])
     group = joints(PENDULUM, t, np.zeros((3, 2)), position_command=np.array([[1.0, 0.0], [3.0, 0.0], [2.0, 0.0]]))
-    found = held_inputs(group, PENDULUM, Grid(0.0, 0.1, 4), "run", servos=system.servos)
+    found = mean_step_inputs(group, PENDULUM, TimeGrid(0.0, 0.1, 4), "run", servos=system.servos)
     np.testing.assert_allclose(found[:, 0], expected)
-    late = held_inputs(group, PENDULUM, Grid(0.1, 0.1, 3), "run", np.array([0.1, 0.0]), system.servos)
+    late = mean_step_inputs(group, PENDULUM, TimeGrid(0.1, 0.1, 3), "run", np.array([0.1, 0.0]), system.servos)
     np.testing.assert_allclose(late[:, 0], expected[:3])
 
 
@@ -155,41 +161,41 @@ def test_slopes_are_those_of_differences(urdf_folder, commands, period) -> None:
         if "@" in name
     }
     made = problem_of(step, commanded(round(0.4 / period), period), free, values)
-    x = made.start
+    x = made.initial_unknowns
     at = made.evaluate(x)
     assert at.ok, at.message
-    for i, name in enumerate(made.names):
+    for i, name in enumerate(made.unknown_names):
         width = 1e-6 * max(1.0, abs(x[i])) if "tightness" not in name else 1e-4 * x[i]
         ends = []
         for sign in (1, -1):
             there = x.copy()
             there[i] += sign * width
-            ends.append(made.evaluate(there, False).residual[made.rows.data])
+            ends.append(made.evaluate(there, False).residual[made.residual_rows.data])
         numeric = (ends[0] - ends[1]) / (2 * width)
-        exact = at.jacobian[made.rows.data, i]
+        exact = at.jacobian[made.residual_rows.data, i]
         assert np.abs(exact - numeric).max() < 1e-4 * np.abs(exact).max() + 1e-6, name
 
 
 def test_nothing_drives_it_wrong_and_no_filter_follows_its_encoders(step) -> None:
     made = problem_of(step, commanded(), ["shoulder.servo_gain"])
     [episode] = made.episodes
-    assert episode.feedback is None
-    assert episode.errors is None
-    assert [samples.sensor.group for samples in episode.samples] == ["joints.position"]
+    assert episode.tracking_feedback is None
+    assert episode.input_errors is None
+    assert [samples.sensor.group_name for samples in episode.measurements] == ["joints.position"]
     np.testing.assert_allclose(episode.torque, episode.recording.joints.position_command[:-1])
 
 
 def test_what_it_is_is_found_again(step) -> None:
     quiet = commanded(60)
     truth = problem_of(step, quiet, ["shoulder.servo_gain"])
-    [seen] = truth.evaluate(truth.start, False).episodes[0].predicted
+    [seen] = truth.evaluate(truth.initial_unknowns, False).episode_predictions[0].predicted_outputs
     angles = np.vstack([quiet.joints.position[:1], seen])
     made = replace(quiet, joints=replace(quiet.joints, position=angles))
     names = [f"{joint}.servo_{what}" for joint in PENDULUM for what in ("gain", "damping")] + ["shoulder.servo_delay"]
     wrong = {"shoulder.servo_gain": 90.0, "shoulder.servo_damping": 2.0, "shoulder.servo_delay": 0.0}
     problem = problem_of(step, made, names, wrong)
-    solution = GaussNewton().run(problem, problem.start, None)
-    for name, value in problem.named(solution.x).items():
+    solution = GaussNewton().minimize_cost(problem, problem.initial_unknowns, None)
+    for name, value in problem.named_values(solution.x).items():
         assert value == pytest.approx(VALUES[name], rel=1e-3, abs=1e-5), name
 
 
@@ -202,10 +208,10 @@ def test_without_commands_it_says_what_is_missing(step) -> None:
 
 
 def test_effects_on_efforts_are_none_of_a_servo(step) -> None:
-    kinds = {kind for kind, place in candidates(step.system, SENSORS) if place in PENDULUM}
+    kinds = {kind for kind, place in candidate_effects(step.system, SENSOR_KINDS) if place in PENDULUM}
     assert {"servo_gain", "servo_delay", "servo_saturation", "backlash", "encoder_offset"} <= kinds
     assert not kinds & {"effort_gain", "effort_offset", "effort_lag", "series_elasticity"}
-    without = {kind for kind, _ in candidates(step.system, ["joints.position"])}
+    without = {kind for kind, _ in candidate_effects(step.system, ["joints.position"])}
     assert {"servo_gain", "servo_delay", "servo_saturation", "backlash"} <= without
 
 
@@ -215,10 +221,10 @@ def test_neutral_it_changes_nothing_and_shows_at_once(urdf_folder, step, kind) -
     plain = problem_of(step, commanded(), free)
     with_it = problem_of(servo_step(urdf_folder, [(kind, "shoulder", {})]), commanded(), free)
     [effect] = with_it.system.effects
-    both = [made.evaluate(made.start).residual for made in (plain, with_it)]
+    both = [made.evaluate(made.initial_unknowns).residual for made in (plain, with_it)]
     np.testing.assert_allclose(both[0], both[1], atol=1e-8)
     freed = problem_of(with_it.step, commanded(), [*effect.amplitudes])
-    slope = freed.evaluate(freed.start).jacobian[: len(both[0]), 0]
+    slope = freed.evaluate(freed.initial_unknowns).jacobian[: len(both[0]), 0]
     low, high = effect.prior_range[effect.amplitudes[0]]
     assert np.abs(slope).max() * (high - low) > 1.0
 
@@ -229,30 +235,32 @@ def test_a_servo_delay_and_a_gain_are_what_the_servo_itself_could_be(urdf_folder
         servo_step(urdf_folder, [("servo_delay", "shoulder", {"delay": 0.013})]), made, ["shoulder.damping"]
     )
     same = problem_of(step, made, ["shoulder.damping"], {"shoulder.servo_delay": 0.03})
-    np.testing.assert_allclose(*(p.evaluate(p.start).residual for p in (late, same)), atol=1e-9)
+    np.testing.assert_allclose(*(p.evaluate(p.initial_unknowns).residual for p in (late, same)), atol=1e-9)
     weak = problem_of(servo_step(urdf_folder, [("servo_gain", "shoulder", {"scale": 0.7})]), made, ["shoulder.damping"])
     less = {"shoulder.servo_gain": 42.0, "shoulder.servo_damping": 2.8}
     same = problem_of(step, made, ["shoulder.damping"], less)
-    np.testing.assert_allclose(*(p.evaluate(p.start).residual for p in (weak, same)), atol=1e-9)
+    np.testing.assert_allclose(*(p.evaluate(p.initial_unknowns).residual for p in (weak, same)), atol=1e-9)
 
 
 def test_a_saturation_reports_its_limit_and_binds_like_the_servos_own(urdf_folder, step) -> None:
     made, far = commanded(), {"shoulder.servo_torque_limit": 2e4}
     limited = servo_step(urdf_folder, [("servo_saturation", "shoulder", {"limit": 5.0})])
     [effect] = limited.system.effects
-    name = effect.amplitudes[0]
-    told = effect.reported({name: 5.0**-KNEE}, {name: 0.01 * KNEE * 5.0**-KNEE})["limit"]
+    name = effect.amplitude_names[0]
+    told = effect.reported(
+        {name: 5.0**-TORQUE_LIMIT_POWER}, {name: 0.01 * TORQUE_LIMIT_POWER * 5.0**-TORQUE_LIMIT_POWER}
+    )["limit"]
     assert (told.value, told.std, told.unit) == (pytest.approx(5.0), pytest.approx(0.05), "N m")
     one = problem_of(limited, made, ["shoulder.damping"], far)
     other = problem_of(step, made, ["shoulder.damping"], {"shoulder.servo_torque_limit": 5.0})
-    np.testing.assert_allclose(*(p.evaluate(p.start).residual for p in (one, other)), atol=1e-6)
+    np.testing.assert_allclose(*(p.evaluate(p.initial_unknowns).residual for p in (one, other)), atol=1e-6)
 
 
 def test_play_is_taken_up_on_the_side_of_the_torque(urdf_folder) -> None:
     """A hand's weight against a stop: the encoder reads half the width beyond the joint, the servo acts on that."""
     step = servo_step(urdf_folder, [("backlash", "shoulder", {"width": 0.02})])
     theta, command = step.system.parameters.vector(VALUES), np.array([0.8, 0.0])
-    rest = Statics(step).solve(command, theta, command)
+    rest = EquilibriumSolver(step).solve(command, theta, command)
     q, play = rest.state[0], rest.state[4]
     torque = 60.0 * (command[0] - q - play)
     assert torque > 1.0
@@ -260,7 +268,7 @@ def test_play_is_taken_up_on_the_side_of_the_torque(urdf_folder) -> None:
     still = simulate(step, theta, rest.state, 20, np.tile(command, (20, 1)))
     np.testing.assert_allclose(still.state[-1], rest.state, atol=1e-9)
     made = problem_of(step, commanded(command=np.tile(command, (41, 1))), ["shoulder.damping"])
-    [angles] = made.evaluate(made.start, False).episodes[0].predicted
+    [angles] = made.evaluate(made.initial_unknowns, False).episode_predictions[0].predicted_outputs
     assert angles[-1, 0] == pytest.approx(q + play, abs=1e-6)
 
 
@@ -269,28 +277,30 @@ def test_a_zero_that_is_off_moves_readings_and_commands_alike(urdf_folder, step)
     offset = servo_step(urdf_folder, [("encoder_offset", "shoulder", {"offset": 0.03})], gravity_compensation=True)
     plain = servo_step(urdf_folder, gravity_compensation=True)
     made = [problem_of(s, commanded(), ["shoulder.damping"]) for s in (plain, offset)]
-    first, second = (p.evaluate(p.start, False).episodes[0] for p in made)
-    np.testing.assert_allclose(second.predicted[0][0], first.predicted[0][0], atol=1e-9)
+    first, second = (p.evaluate(p.initial_unknowns, False).episode_predictions[0] for p in made)
+    np.testing.assert_allclose(second.predicted_outputs[0][0], first.predicted_outputs[0][0], atol=1e-9)
     np.testing.assert_allclose(first.rollout.state[0, 0] - second.rollout.state[0, 0], 0.03, atol=1e-9)
 
 
 def test_the_compiled_step_agrees(urdf_folder) -> None:
     slow = servo_step(urdf_folder, EFFECTS)
     fast = compile_step(slow.system, H)
-    if not fast.compiled:
+    if not fast.is_compiled:
         pytest.skip("no C compiler")
     runs = [problem_of(s, commanded(), ["shoulder.servo_gain", "elbow.servo_delay"]) for s in (slow, fast)]
-    one, other = (p.evaluate(p.start) for p in runs)
+    one, other = (p.evaluate(p.initial_unknowns) for p in runs)
     np.testing.assert_allclose(one.residual, other.residual, atol=1e-7)
     np.testing.assert_allclose(one.jacobian, other.jacobian, rtol=1e-6, atol=1e-6)
 
 
 def test_an_estimated_start_frees_the_arm_as_well(step) -> None:
     made = problem_of(step, commanded(), ["shoulder.damping"], initial_state="estimated")
-    assert {"start.q.shoulder[made]", "start.p.elbow[made]"} <= set(made.names)
+    assert {"start.q.shoulder[made]", "start.p.elbow[made]"} <= set(made.unknown_names)
 
 
 def test_the_effect_is_an_effect_of_the_servos_joint_only(step) -> None:
-    assert make_effect("servo_gain", "elbow", step.system).neutral == {"servo_gain@elbow.scale": 1.0}
-    assert candidates(replace(step.system, servos={}, driven=()), SENSORS)
-    assert "servo_gain" not in {kind for kind, _ in candidates(replace(step.system, servos={}, driven=()), SENSORS)}
+    assert make_effect("servo_gain", "elbow", step.system).neutral_values == {"servo_gain@elbow.scale": 1.0}
+    assert candidate_effects(replace(step.system, servos={}, driven=()), SENSOR_KINDS)
+    assert "servo_gain" not in {
+        kind for kind, _ in candidate_effects(replace(step.system, servos={}, driven=()), SENSOR_KINDS)
+    }

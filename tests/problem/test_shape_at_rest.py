@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from small_problems import joints, recording, seen
 
-from yid_ocp.integrator.statics import Statics
+from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.preparation import FIRST
+from yid_ocp.problem.equilibrium_and_loads import _MAX_FIRST_SAMPLE_TIME
 from yid_ocp.sensors import sensor_function
 from yid_ocp.sensors.points import PointSensor
 
@@ -32,16 +32,16 @@ def buckled(urdf_folder):
         objects=[(rod, None, placement)],
         grasps=[Grasp("hand", "tip", "w_T1", "point")],
         prescribed=["shoulder", "elbow"],
-        points=["w_T1", MIDDLE],
+        point_frames=["w_T1", MIDDLE],
     )
     step = compile_step(system, 0.01, use_compiler=False)
-    statics, theta = Statics(step), system.parameters.vector()
+    statics, theta = EquilibriumSolver(step), system.parameters.vector()
     least = statics.solve(POSTURE, theta)
-    across = least.state[: system.size].copy()
+    across = least.state[: system.n_coordinates].copy()
     across[2:] *= -1.0
     mirrored = statics.solve(POSTURE, theta, None, across)
-    assert least.converged
-    assert mirrored.converged
+    assert least.is_converged
+    assert mirrored.is_converged
     assert np.abs(least.state - mirrored.state).max() > 0.5
     return step, least.state, mirrored.state
 
@@ -83,7 +83,7 @@ def test_a_recording_starts_in_the_shape_that_its_first_points_show(buckled, whi
 
 def test_points_that_come_late_or_that_no_shape_is_near_leave_the_least_energy(buckled):
     step, least, mirrored = buckled
-    assert problem_of(step, mirrored, first=FIRST + 0.1).episodes[0].near is None
+    assert problem_of(step, mirrored, first=_MAX_FIRST_SAMPLE_TIME + 0.1).episodes[0].near is None
     # an error of some standard deviations is what is to be found out, not another shape
     assert problem_of(step, mirrored, std=0.2).episodes[0].near is None
     assert problem_of(step, least, first=0.0, initial_state="fitted_to_points").held_out[0].near is None

@@ -11,7 +11,7 @@ from small_problems import pendulum_step, taken
 import yid_ocp as yid
 from yid_ocp.errors import ConfigError
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.validation import channel_errors
+from yid_ocp.problem.prediction_errors import rmse_by_channel
 
 FREE = ["elbow.stiffness", "elbow.damping"]
 
@@ -31,7 +31,7 @@ def test_what_is_simulated_is_what_is_found(problem):
     again = EstimationProblem(problem.step, [made], FREE, problem.options)
     solution = yid.solve(again)
     at_truth = again.evaluate(again.vector(truth), derivatives=False)
-    assert np.abs(at_truth.residual[again.rows.data]).max() < 1e-9
+    assert np.abs(at_truth.residual[again.residual_rows.data]).max() < 1e-9
     for name, value in truth.items():
         # but for the weak prior
         assert solution.parameters[name].value == pytest.approx(value, rel=0.02)
@@ -58,13 +58,13 @@ def test_a_parameter_that_is_not_there_is_named(problem):
 
 def test_residuals_are_those_of_the_result(problem):
     solution = yid.solve(problem, yid.GaussNewton())
-    errors = channel_errors(solution.predicted, problem.episodes)
-    found = solution.residuals()
+    errors = rmse_by_channel(solution.episode_predictions, problem.episodes)
+    found = solution.channel_predictions()
     assert {entry.channel: entry.rmse for entry in found} == pytest.approx({k: v["rmse"] for k, v in errors.items()})
     for entry in found:
         assert entry.unit == errors[entry.channel]["unit"]
         assert entry.t.shape == (len(entry.measured),)
-        assert entry.measured.shape == entry.predicted.shape == entry.std.shape
+        assert entry.measured.shape == entry.predicted.shape == entry.noise_std.shape
         assert np.array_equal(entry.residual, entry.predicted - entry.measured, equal_nan=True)
     tip = next(entry for entry in found if entry.channel.endswith(".tip"))
     group = problem.episodes[0].recording.points[0]
@@ -73,14 +73,14 @@ def test_residuals_are_those_of_the_result(problem):
 
 
 def test_the_method_that_is_not_named_is_gauss_newton(problem):
-    assert yid.solve(problem).method == "gauss_newton"
+    assert yid.solve(problem).solver_name == "gauss_newton"
     assert np.array_equal(yid.solve(problem).x, yid.solve(problem, yid.GaussNewton()).x)
 
 
 def test_a_frame_has_every_parameter_and_its_interval(problem, monkeypatch):
     pytest.importorskip("pandas")
     solution = yid.solve(problem)
-    frame = solution.to_frame()
+    frame = solution.to_dataframe()
     assert set(frame.index[:2]) == set(FREE)
     assert set(frame.index) == set(solution.parameters)
     assert list(frame.columns) == ["value", "std", "lower", "upper", "unit", "verdict", "free", "initial"]
@@ -94,5 +94,5 @@ def test_a_frame_has_every_parameter_and_its_interval(problem, monkeypatch):
             assert [abs(row["lower"]), abs(row["upper"])] == ends
     monkeypatch.setitem(__import__("sys").modules, "pandas", None)
     with pytest.raises(ConfigError, match="pandas is not installed") as caught:
-        solution.to_frame()
+        solution.to_dataframe()
     assert "yid-ocp[pandas]" in caught.value.hint

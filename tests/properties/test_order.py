@@ -42,7 +42,7 @@ class Motion:
         p = momentum(step, self.q, self.v, theta)
         rollout = roll(step, theta, self.q, p, count, torque=torque)
         assert rollout.status.ok, rollout.status.message
-        n = self.system.size
+        n = self.system.n_coordinates
         return rollout.state[-1, :n], rollout.state[-1, n : 2 * n]
 
     def slopes(self, split, roll, momentum):
@@ -59,7 +59,7 @@ class Motion:
 def mixed_joints(urdf_folder):
     robot = read_urdf(urdf_folder / "mixed_joints.urdf")
     system = System.build(robot, driven=["spin", "extend"], damping=0.4)
-    n = system.size
+    n = system.n_coordinates
     rng = np.random.default_rng(1)
     return Motion(system, rng.uniform(-0.4, 0.4, n), rng.normal(size=n), np.array([2.0, 8.0]), 0.4, (40, 80, 160, 320))
 
@@ -76,7 +76,7 @@ def y_alone(urdf_folder):
     driven = ["T1_3_x", "T2_1_y"]
     system = System.build(objects=[(y_object(), None, None)], driven=driven)
     rng = np.random.default_rng(2)
-    q, v = 0.05 * rng.normal(size=system.size), 0.2 * rng.normal(size=system.size)
+    q, v = 0.05 * rng.normal(size=system.n_coordinates), 0.2 * rng.normal(size=system.n_coordinates)
     return Motion(system, q, v, np.array([0.8, 0.3]), 0.02, (100, 200, 400), SLOW_OBJECT)
 
 

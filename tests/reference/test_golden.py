@@ -9,7 +9,7 @@ import pytest
 from yid_ocp.integrator import compiler
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import forward_kinematics
-from yid_ocp.model.mechanism import merged
+from yid_ocp.model.mechanism import merge_bodies
 
 NAMES = ("single", "dual")
 TIPS = {"wT1": "w_T1", "wT2": "w_T2", "wT3": "w_T3", "left": "left_gripper", "right": "right_gripper"}
@@ -39,9 +39,9 @@ def compare_derivatives(trep, step, theta, k):
 
 def test_sizes(case):
     trep, system, step, _ = case
-    assert step.compiled == (compiler.compiler() is not None)
+    assert step.is_compiled == (compiler._compiler_path() is not None)
     assert step.time_step == float(trep.dt)
-    assert (system.size, system.constraint_count) == (trep.q.shape[1], trep.lam.shape[1])
+    assert (system.size, system.n_constraints) == (trep.q.shape[1], trep.lam.shape[1])
 
 
 def test_every_step(case):
@@ -67,7 +67,7 @@ def test_start_of_the_rollout(case, roll):
 def test_interpreter(name, golden, paper_systems, theta_golden):
     trep = golden(name)
     step = compile_step(paper_systems[name], 0.01, "left", "node", use_compiler=False)
-    assert not step.compiled
+    assert not step.is_compiled
     for k in (0, 1, 120, 299):
         compare_step(trep, step, theta_golden(name), k)
     compare_derivatives(trep, step, theta_golden(name), 10)
@@ -77,7 +77,7 @@ def test_measured_points(case):
     trep, system, _, theta = case
     q = ca.SX.sym("q", system.size)
     kinematics = forward_kinematics(system.mechanism, q)
-    points = ca.horzcat(*(kinematics.position(name) for name in ("w_T1", "w_T2", "w_T3")))
+    points = ca.horzcat(*(kinematics.frame_position(name) for name in ("w_T1", "w_T2", "w_T3")))
     function = ca.Function("points", [q, system.parameters.symbols], [points])
     for k in range(0, 300, 30):
         np.testing.assert_allclose(np.array(function(trep.q[k + 1], theta)).T, trep.w[k], rtol=0, atol=1e-10)
@@ -97,13 +97,13 @@ def test_model_numbers(case):
         assert joint.parent == node["parent"]
         np.testing.assert_allclose(number(joint.placement.matrix()), node["X"], rtol=0, atol=1e-10)
         np.testing.assert_array_equal(joint.axis, np.eye(3)["xyz".index(node["axis"])])
-        body = merged(joint.bodies)
+        body = merge_bodies(joint.bodies)
         if body is None:
             assert not node["mass"]
         else:
             assert float(body.mass) == pytest.approx(node["mass"], abs=1e-10)
-            np.testing.assert_allclose(number(body.com).ravel(), node["com"], rtol=0, atol=1e-10)
-            np.testing.assert_allclose(number(body.about_com), node["I"], rtol=0, atol=1e-10)
+            np.testing.assert_allclose(number(body.center_of_mass).ravel(), node["com"], rtol=0, atol=1e-10)
+            np.testing.assert_allclose(number(body.inertia_about_com), node["I"], rtol=0, atol=1e-10)
         stiffness = springs.get(joint.name)
         if stiffness is None:
             assert node["stiffness"] is None
@@ -118,5 +118,5 @@ def test_model_tips_and_grasps(case):
         frame = mechanism.frame(TIPS[name])
         assert frame.joint == tip["node"]
         np.testing.assert_allclose(number(frame.placement.matrix()), tip["X"], rtol=0, atol=1e-10)
-    grasps = [[grasp.holder, grasp.held] for grasp in system.grasps]
+    grasps = [[grasp.holder_frame, grasp.held] for grasp in system.grasps]
     assert grasps == [[TIPS[holder], TIPS[held]] for holder, held in trep.model["grasps"]]

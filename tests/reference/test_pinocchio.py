@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from yid_ocp.model import Mechanism, forward_kinematics, rotations
-from yid_ocp.model.kinematics import mass_matrix, rigid_body, second_derivatives
-from yid_ocp.model.urdf import read_urdf, robot_description_file
+from yid_ocp.model.kinematics import lagrangian_second_derivatives, mass_matrix, rigid_body_derivatives
+from yid_ocp.model.urdf import example_robot_urdf, read_urdf
 from yid_ocp.model.y_object import y_object
 
 pin = pytest.importorskip("pinocchio", reason="the reference needs Pinocchio: pip install pin")
@@ -44,14 +44,18 @@ class Twin:
         n = len(self.mechanism.joints)
         q, v, a = (ca.SX.sym(name, n) for name in "qva")
         kinematics = forward_kinematics(self.mechanism, q)
-        rigid = rigid_body(kinematics, v, ca.SX(ca.DM(GRAVITY)))
-        by_qv = second_derivatives(rigid, self.mechanism)[1]
+        rigid = rigid_body_derivatives(kinematics, v, ca.SX(ca.DM(GRAVITY)))
+        by_qv = lagrangian_second_derivatives(rigid, self.mechanism)[1]
         M = mass_matrix(rigid, self.mechanism)
-        effort = M @ a + by_qv.T @ v - rigid.by_q
+        effort = M @ a + by_qv.T @ v - rigid.lagrangian_by_q
         frames = list(self.mechanism.frames)
-        poses = [kinematics.pose(name).matrix() for name in frames]
-        jacobians = [ca.vertcat(kinematics.point_jacobian(name), kinematics.angular_jacobian(name)) for name in frames]
-        dynamics = ca.Function("dynamics", [q, v, a], [M, rigid.by_q, effort, rigid.kinetic, rigid.potential])
+        poses = [kinematics.frame_pose(name).homogeneous_matrix() for name in frames]
+        jacobians = [
+            ca.vertcat(kinematics.position_jacobian(name), kinematics.angular_jacobian(name)) for name in frames
+        ]
+        dynamics = ca.Function(
+            "dynamics", [q, v, a], [M, rigid.lagrangian_by_q, effort, rigid.kinetic_energy, rigid.potential_energy]
+        )
         return frames, ca.Function("poses", [q], poses), ca.Function("jacobians", [q], jacobians), dynamics
 
     @property
@@ -77,7 +81,7 @@ class Twin:
 def twin(request, urdf_folder):
     """Read without rounding nearly exact entries, which Pinocchio does not do either."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rotations, "SNAP", 0.0)
+        patch.setattr(rotations, "_SNAP_TOLERANCE", 0.0)
         return make_twin(urdf_folder, *ROBOTS[request.param])
 
 
@@ -85,18 +89,18 @@ def make_twin(urdf_folder, file, joints, locked):
     if file is None or file == "y_object.urdf":
         path = urdf_folder / "y_object.urdf"
     elif file.startswith("package:"):
-        path = robot_description_file(file.removeprefix("package:"))
+        path = example_robot_urdf(file.removeprefix("package:"))
     else:
         path = urdf_folder / file
     if file is None:
-        mechanism = y_object().mechanism.numeric()
+        mechanism = y_object().mechanism.with_numeric_values()
     else:
-        mechanism = read_urdf(path, joints=joints, locked=locked).numeric()
+        mechanism = read_urdf(path, joints=joints, locked=locked).with_numeric_values()
     full = pin.buildModelFromUrdf(str(path))
     full.gravity.linear = GRAVITY
     if joints is None:
         return Twin(mechanism, full)
-    whole = Twin(read_urdf(path).numeric(), full)
+    whole = Twin(read_urdf(path).with_numeric_values(), full)
     values = [locked.get(name, 0.0) for name in whole.mechanism.joint_names]
     out = [i for i in range(1, full.njoints) if full.names[i] not in joints]
     return Twin(mechanism, pin.buildReducedModel(full, out, whole.configuration(values)))
@@ -158,11 +162,11 @@ def test_mass_matrix_gravity_and_inverse_dynamics(twin):
 
 @pytest.mark.parametrize("robot", ["baxter", "ur5"])
 def test_rounding_of_nearly_exact_placements_moves_nothing_visibly(robot, monkeypatch):
-    rounded = read_urdf(f"package:{robot}").numeric()
-    monkeypatch.setattr(rotations, "SNAP", 0.0)
-    exact = read_urdf(f"package:{robot}").numeric()
+    rounded = read_urdf(f"package:{robot}").with_numeric_values()
+    monkeypatch.setattr(rotations, "_SNAP_TOLERANCE", 0.0)
+    exact = read_urdf(f"package:{robot}").with_numeric_values()
     moved = [
-        np.max(np.abs(np.array(ca.DM(a.placement.matrix() - b.placement.matrix()))))
+        np.max(np.abs(np.array(ca.DM(a.placement.homogeneous_matrix() - b.placement.homogeneous_matrix()))))
         for a, b in zip(rounded.joints, exact.joints, strict=True)
     ]
     assert 0 < max(moved) < 1e-11
@@ -175,14 +179,14 @@ def test_generated_object_has_the_frames_of_its_urdf(urdf_folder):
 
 @pytest.mark.parametrize("file", ["mixed_joints.urdf", "turntable.urdf"])
 def test_second_derivatives_against_automatic_differentiation(urdf_folder, file):
-    mechanism = read_urdf(urdf_folder / file).numeric()
+    mechanism = read_urdf(urdf_folder / file).with_numeric_values()
     n = len(mechanism.joints)
     q, v = ca.SX.sym("q", n), ca.SX.sym("v", n)
-    rigid = rigid_body(forward_kinematics(mechanism, q), v, ca.SX(ca.DM(GRAVITY)))
-    lagrangian = rigid.kinetic - rigid.potential
+    rigid = rigid_body_derivatives(forward_kinematics(mechanism, q), v, ca.SX(ca.DM(GRAVITY)))
+    lagrangian = rigid.kinetic_energy - rigid.potential_energy
     by_q, by_v = ca.gradient(lagrangian, q), ca.gradient(lagrangian, v)
     expected = [by_q, by_v, ca.jacobian(by_q, q), ca.jacobian(by_q, v), ca.jacobian(by_v, v)]
-    actual = [rigid.by_q, rigid.by_v, *second_derivatives(rigid, mechanism)]
+    actual = [rigid.lagrangian_by_q, rigid.lagrangian_by_v, *lagrangian_second_derivatives(rigid, mechanism)]
     difference = ca.Function("difference", [q, v], [ca.densify(a - e) for a, e in zip(actual, expected, strict=True)])
     rng = np.random.default_rng(3)
     for _ in range(5):

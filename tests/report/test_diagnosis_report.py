@@ -12,15 +12,15 @@ import pytest
 
 from yid_ocp.data import JointGroup, Recording, write_recording
 from yid_ocp.diagnosis import Thresholds, diagnose
-from yid_ocp.diagnosis.events import Event, Events, Fall, Force
-from yid_ocp.diagnosis.pulses import Pulse
-from yid_ocp.report import charts, figures
-from yid_ocp.report.charts import Change, Ranked, Row
-from yid_ocp.report.figures import Curve
+from yid_ocp.diagnosis.events import DisturbanceEvent, EventForceSeries, EventSet, Overspeed
+from yid_ocp.diagnosis.pulse_detection import DetectedPulse
+from yid_ocp.report import categorical_charts, figures
+from yid_ocp.report.categorical_charts import BeforeAfter, RankedCandidate, TimeMapRow
+from yid_ocp.report.figures import TimePlot
 from yid_ocp.report.html import write_report
-from yid_ocp.report.sections import Findings
+from yid_ocp.report.sections import ReportData
 from yid_ocp.workflow.build import load_problem
-from yid_ocp.workflow.diagnose import predictions
+from yid_ocp.workflow.diagnose import _held_out_predictions
 
 KNOWN = {"command": "yid-ocp diagnose 'a b.yaml'", "next_plan": None, "versions": {"python": "3"}, "date": "today"}
 CHAPTERS = ("gap", "where", "which", "alike", "curves", "absorbed")
@@ -50,7 +50,7 @@ def found(tmp_path_factory, urdf_folder):
         for problem_episodes in (nominal.episodes, nominal.held_out):
             for episode in problem_episodes:
                 theta = nominal.theta
-                swept = nominal.predictor.run(episode, theta, np.zeros(0), False)
+                swept = nominal.predictor.predict_episode(episode, theta, np.zeros(0), False)
                 effort = np.vstack([swept.rollout.effort, swept.rollout.effort[-1:]])[:151]
                 joints = recordings[episode.name].joints
                 effort = effort + rub * np.sign(np.gradient(joints.position, axis=0)) * [0, 1]
@@ -61,7 +61,7 @@ def found(tmp_path_factory, urdf_folder):
                 )
         text = (folder / "p.yaml").read_text().replace("[a.h5]", f"[a_{rub}.h5]").replace("[b.h5]", f"[b_{rub}.h5]")
         (folder / f"p_{rub}.yaml").write_text(text)
-    limits = Thresholds(effects=1)
+    limits = Thresholds(max_effects=1)
     rubbing, clean = load_problem(folder / "p_0.05.yaml"), load_problem(folder / "p_0.0.yaml")
     return {
         "effect": diagnose(rubbing, ["joint_coulomb", "effort_offset"], thresholds=limits),
@@ -72,8 +72,8 @@ def found(tmp_path_factory, urdf_folder):
 
 def page_of(finding, file) -> str:
     result = json.loads(json.dumps(finding.to_dict() | KNOWN))
-    more = {"finding": finding, "predictions": predictions(finding)}
-    assert write_report(file, Findings("run", "", result, more=more))
+    more = {"finding": finding, "predictions": _held_out_predictions(finding)}
+    assert write_report(file, ReportData("run", "", result, section_data=more))
     return file.read_text(encoding="utf-8").split("<body>")[1]
 
 
@@ -115,7 +115,7 @@ def test_the_words_beside_the_pictures_say_what_is_seen(found, tmp_path):
 def test_a_map_without_a_sure_value_shows_what_was_expected_beforehand(found, tmp_path):
     finding = found["effect"]
     smoothed = finding.smoothed
-    trace = smoothed.traces[0]
+    trace = smoothed.smoothed_unknowns[0]
     prior = np.sqrt([smoothed.variance[source] for source in trace.sources])
     vague = replace(trace, std=np.broadcast_to(0.9 * prior, trace.std.shape))
     page = page_of(replace(finding, smoothed=replace(smoothed, traces=(vague,))), tmp_path / "r.html")
@@ -125,7 +125,7 @@ def test_a_map_without_a_sure_value_shows_what_was_expected_beforehand(found, tm
 
 def test_a_result_alone_gives_words_and_tables(found, tmp_path):
     result = found["effect"].to_dict() | KNOWN
-    assert write_report(tmp_path / "r.html", Findings("run", "", result))
+    assert write_report(tmp_path / "r.html", ReportData("run", "", result))
     page = (tmp_path / "r.html").read_text(encoding="utf-8").split("<body>")[1]
     assert "joint_coulomb@elbow" in page
     assert '<div class="plot"' not in page
@@ -135,14 +135,20 @@ def test_a_result_alone_gives_words_and_tables(found, tmp_path):
 
 
 def test_changes_of_very_different_sizes_get_a_logarithmic_axis():
-    close = charts.changes({"a": Change(2.0, 1.0), "b": Change(3.0, None, mark=1.0)}, "x [m]", ("1", "2", "3"))
-    far = charts.changes({"a": Change(20.0, 0.1), "b": Change(3.0, 1.0)}, "x [m]", ("1", "2", "3"))
+    close = categorical_charts.before_after_figure(
+        {"a": BeforeAfter(2.0, 1.0), "b": BeforeAfter(3.0, None, reference=1.0)}, "x [m]", ("1", "2", "3")
+    )
+    far = categorical_charts.before_after_figure(
+        {"a": BeforeAfter(20.0, 0.1), "b": BeforeAfter(3.0, 1.0)}, "x [m]", ("1", "2", "3")
+    )
     assert (close.layout.xaxis.type, far.layout.xaxis.type) == (None, "log")
     assert [trace.name for trace in close.data[1:]] == ["1", "2", "3"]
 
 
 def test_bars_of_what_cannot_be_told_do_not_widen_the_axis():
-    figure = charts.changes({"a": Change(2.0, 1.0, float("inf"), 1e7)}, "x", ("1", "2", ""))
+    figure = categorical_charts.before_after_figure(
+        {"a": BeforeAfter(2.0, 1.0, float("inf"), 1e7)}, "x", ("1", "2", "")
+    )
     assert figure.layout.xaxis.range[1] < 3.0
     assert figure.data[1].error_x.array is None
     assert figure.data[2].error_x.array == (2e7,)
@@ -150,8 +156,8 @@ def test_bars_of_what_cannot_be_told_do_not_widen_the_axis():
 
 def test_a_map_keeps_its_groups_together_and_its_gaps_empty():
     values = np.array([1.0, np.nan, -4000.0])
-    rows = [Row(name, group, values, ["", "", ""]) for name, group in (("x", "a"), ("y", "a"), ("z", "b"))]
-    figure = charts.time_map(np.array([0.0, 0.1, 0.2, 0.3]), rows, "deviations")
+    rows = [TimeMapRow(name, group, values, ["", "", ""]) for name, group in (("x", "a"), ("y", "a"), ("z", "b"))]
+    figure = categorical_charts.time_map_figure(np.array([0.0, 0.1, 0.2, 0.3]), rows, "deviations")
     heat = figure.data[0]
     assert heat.z[0][1] is None
     assert heat.zmax == -heat.zmin > 0
@@ -162,26 +168,35 @@ def test_a_map_keeps_its_groups_together_and_its_gaps_empty():
 
 
 def test_a_ranking_says_what_lies_beyond_its_axis():
-    entries = [Ranked("good", (90.0, 80.0, 95.0), 88.0), Ranked("bad", (-900.0, -2000.0, -100.0), 1.0)]
-    figure = charts.ranking([*entries, Ranked("untried", None, 0.5)], "closed [%]", "promised [%]")
+    entries = [
+        RankedCandidate("good", (90.0, 80.0, 95.0), 88.0),
+        RankedCandidate("bad", (-900.0, -2000.0, -100.0), 1.0),
+    ]
+    figure = categorical_charts.candidate_ranking_figure(
+        [*entries, RankedCandidate("untried", None, 0.5)], "closed [%]", "promised [%]"
+    )
     assert [a.text for a in figure.layout.annotations] == ["◀ -900"]
     assert figure.layout.yaxis.categoryarray == ("untried", "bad", "good")
-    alone = charts.ranking([Ranked("untried", None, 0.5)], "closed", "promised")
+    alone = categorical_charts.candidate_ranking_figure([RankedCandidate("untried", None, 0.5)], "closed", "promised")
     assert [trace.type for trace in alone.data] == ["bar"]
 
 
 def test_a_band_is_shaded_about_the_noise():
     t = np.linspace(0.0, 1.0, 5)
-    figure = figures.over_time([Curve("error", t[:0], t[:0], {"line": (t, t)}, 0.2)], "red", {"line": "blue"})
+    figure = figures.time_plots_figure(
+        [TimePlot("error", t[:0], t[:0], {"line": (t, t)}, 0.2)], "red", {"line": "blue"}
+    )
     assert (figure.layout.shapes[0].y0, figure.layout.shapes[0].y1) == (-0.2, 0.2)
 
 
 def test_events_are_marked_on_the_time_axis_told_and_listed(found, tmp_path):
     t = np.linspace(0, 2, 21)
-    pulse = Pulse(0.5, 1.0, 0.7, False, 0.05, 1e-9)
-    event = Event("run", "elbow", "elbow", "force", 0.5, 1.0, 0.7, pulse.impulse, 0.0125, "N m", pulse)
-    events = Events(
-        (event,), (Fall("run", "elbow", 1.5),), (Force("run", "elbow", "N m", t, pulse.values(t), 0.1 + 0 * t),)
+    pulse = DetectedPulse(0.5, 1.0, 0.7, False, 0.05, 1e-9)
+    event = DisturbanceEvent("run", "elbow", "elbow", "force", 0.5, 1.0, 0.7, pulse.impulse, 0.0125, "N m", pulse)
+    events = EventSet(
+        (event,),
+        (Overspeed("run", "elbow", 1.5),),
+        (EventForceSeries("run", "elbow", "N m", t, pulse.evaluate_at(t), 0.1 + 0 * t),),
     )
     page = page_of(replace(found["no_gap"], events=events), tmp_path / "report.html")
     assert 'id="events"' in page
@@ -193,7 +208,7 @@ def test_events_are_marked_on_the_time_axis_told_and_listed(found, tmp_path):
 
 def test_spans_are_shaded():
     t = np.linspace(0, 3, 31)
-    figure = figures.over_time([Curve("a", t, t, {}, spans=[(1.0, 2.0)])], "#000000", {})
+    figure = figures.time_plots_figure([TimePlot("a", t, t, {}, marked_intervals=[(1.0, 2.0)])], "#000000", {})
     (shape,) = figure.layout.shapes
     assert (shape.x0, shape.x1) == (1.0, 2.0)
 
@@ -201,9 +216,9 @@ def test_spans_are_shaded():
 def test_long_names_of_rows_have_the_room_they_need():
     name = "effort_offset@panda_joint1.offset"
     made = [
-        charts.estimates({name: (1.0, 0.1, 0.0, True)}, "N m"),
-        charts.side_by_side({name: {"run": (1.0, 0.1)}}, "N m"),
-        charts.changes({name: Change(2.0, 1.0)}, "x", ("1", "2", "3")),
-        charts.matrix([name], np.eye(1), "row", "column"),
+        categorical_charts.estimates_figure({name: (1.0, 0.1, 0.0, True)}, "N m"),
+        categorical_charts.values_by_source_figure({name: {"run": (1.0, 0.1)}}, "N m"),
+        categorical_charts.before_after_figure({name: BeforeAfter(2.0, 1.0)}, "x", ("1", "2", "3")),
+        categorical_charts.matrix_figure([name], np.eye(1), "row", "column"),
     ]
     assert all(figure.layout.yaxis.automargin for figure in made)

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from yid_ocp.report import terminal
-from yid_ocp.report.html import _script_name, share_script
-from yid_ocp.report.summaries import SUMMARIES
+from yid_ocp.report.html import _script_name, write_shared_plotly_script
+from yid_ocp.report.summaries import SUMMARY_BY_FORMAT
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 COMMANDS = {
@@ -22,7 +22,7 @@ COMMANDS = {
     "simulate": ("--noise",),
     "identifiability": ("--what-if", "--intervals", "all"),
     "inspect": ("--entry", "p1[elbow]"),
-    "diagnose": ("--set", "diagnosis.candidates=[joint_coulomb, effort_offset]", "--set", "diagnosis.effects=1"),
+    "diagnose": ("--set", "diagnosis.candidates=[joint_coulomb, effort_offset]", "--set", "diagnosis.max_effects=1"),
     "compare": ("--set", "compare.methods={gauss_newton: {}, single_shooting: {}}"),
 }
 SIZES = [(1400, "light"), (400, "dark")]
@@ -113,7 +113,7 @@ def solved_page(tmp_path_factory, pendulum_data) -> Path:
 
 def test_a_page_says_what_the_terminal_says(solved_page):
     result = json.loads((solved_page.parent / "result.json").read_text())
-    said = terminal.lines(SUMMARIES[result["format"]](result))
+    said = terminal.terminal_lines(SUMMARY_BY_FORMAT[result["format"]](result))
     assert_same_words("\n".join([*said, "run folder: x"]), text_of(solved_page.read_text(encoding="utf-8")))
 
 
@@ -127,7 +127,7 @@ def test_a_browser_draws_a_page_without_a_complaint(solved_page, width, scheme, 
 def test_a_page_finds_the_script_that_its_folder_shares(solved_page, tmp_path):
     page = tmp_path / "runs" / "one" / "report.html"
     page.parent.mkdir(parents=True)
-    share_script(tmp_path)
+    write_shared_plotly_script(tmp_path)
     told = re.sub(r'<script type="text/plain" id="packed">[^<]+</script>',
                   f'<script src="../../{_script_name()}"></script>', solved_page.read_text())  # fmt: skip
     page.write_text(told)

@@ -18,8 +18,8 @@ import pytest
 
 from yid_ocp.errors import OutputError
 from yid_ocp.report import figures, sections
-from yid_ocp.report.html import number, write_report
-from yid_ocp.report.sections import SECTIONS, Findings
+from yid_ocp.report.html import _format_number, write_report
+from yid_ocp.report.sections import REPORT_SECTIONS, ReportData
 from yid_ocp.workflow.solve import solve_result
 
 
@@ -63,11 +63,11 @@ def solved(tmp_path_factory, urdf_folder):
     return problem, solve(problem, GaussNewton())
 
 
-def findings(solved, **changes) -> Findings:
+def findings(solved, **changes) -> ReportData:
     problem, solution = solved
     made = {"command": "yid-ocp solve p.yaml", "date": "2026-01-02 03:04:05+00:00"}
     result = solve_result(problem, solution, []) | made | {"inputs": {"a": "0" * 64}, "versions": {"python": "3"}}
-    return Findings("run <one>", "A & B.", result | changes, problem, solution)
+    return ReportData("run <one>", "A & B.", result | changes, problem, solution)
 
 
 def test_a_whole_report_is_one_self_contained_page(solved, tmp_path):
@@ -115,8 +115,8 @@ def test_a_failed_solve_gets_no_verdicts(solved, tmp_path):
 
 
 def test_sections_may_have_nothing_to_say():
-    empty = Findings("x", "", {"format": "other/1"})
-    assert all(SECTIONS[name].prepare(empty) is None for name in SECTIONS)
+    empty = ReportData("x", "", {"format": "other/1"})
+    assert all(REPORT_SECTIONS[name].prepare_context(empty) is None for name in REPORT_SECTIONS)
 
 
 def test_a_new_section_is_a_file_and_a_template(solved, tmp_path, monkeypatch):
@@ -128,7 +128,7 @@ def test_a_new_section_is_a_file_and_a_template(solved, tmp_path, monkeypatch):
     )
     (tmp_path / "weather.html").write_text("<p>The sky was {{ sky }}.</p>")
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(SECTIONS, "_entries", dict(SECTIONS._entries))
+    monkeypatch.setattr(REPORT_SECTIONS, "_entries", dict(REPORT_SECTIONS._entries))
     importlib.import_module("weather_section")
     monkeypatch.delitem(sys.modules, "weather_section")
     assert write_report(tmp_path / "r.html", findings(solved))
@@ -136,12 +136,12 @@ def test_a_new_section_is_a_file_and_a_template(solved, tmp_path, monkeypatch):
     assert "<h2>The weather</h2>" in body
     assert "The sky was blue &amp; dry." in body
     assert body.index('id="verdict"') < body.index('id="weather"') < body.index('id="fit"')
-    assert SECTIONS["weather"].prepare(Findings("x", "", {"format": "other/1"})) is None
+    assert REPORT_SECTIONS["weather"].prepare_context(ReportData("x", "", {"format": "other/1"})) is None
 
 
 def test_every_file_of_sections_is_found():
     folder = Path(sections.__file__).parent
-    assert set(SECTIONS) == {path.stem for path in folder.glob("*.py")} - {"__init__", "base"}
+    assert set(REPORT_SECTIONS) == {path.stem for path in folder.glob("*.py")} - {"__init__", "base"}
 
 
 def test_without_the_extra_there_is_a_notice_and_no_report(solved, tmp_path, monkeypatch, caplog):
@@ -158,21 +158,23 @@ def test_a_report_that_cannot_be_written(solved, tmp_path):
 
 
 def test_numbers_for_people():
-    assert number(None) == "–"
-    assert number(3.14159265) == "3.142"
-    assert number(7) == "7"
+    assert _format_number(None) == "–"
+    assert _format_number(3.14159265) == "3.142"
+    assert _format_number(7) == "7"
 
 
 def test_long_curves_are_thinned_and_gaps_stay():
     t = np.linspace(0.0, 10.0, 50_000)
     measured = np.sin(t)
     measured[:10_000] = np.nan
-    figure = figures.over_time(figures.compared("x", "m", t, measured, 0 * t + 1e-3, {"predicted": np.sin(t)}))
-    assert max(len(trace.x) for trace in figure.data) <= figures.LONGEST
+    figure = figures.time_plots_figure(
+        figures.prediction_and_residual_plots("x", "m", t, measured, 0 * t + 1e-3, {"predicted": np.sin(t)})
+    )
+    assert max(len(trace.x) for trace in figure.data) <= figures._MAX_CURVE_POINTS
     assert np.isnan(figure.data[0].y[0])
 
 
 def test_cost_history_has_a_curve_for_each_horizon():
-    figure = figures.cost_history([5.0, 3.0, 9.0, 2.0], ["first 1 s", "first 1 s", "", ""])
+    figure = figures.cost_history_figure([5.0, 3.0, 9.0, 2.0], ["first 1 s", "first 1 s", "", ""])
     assert [trace.name for trace in figure.data] == ["first 1 s", "whole recordings"]
     assert [list(trace.x) for trace in figure.data] == [[0, 1], [2, 3]]

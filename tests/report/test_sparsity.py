@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from yid_ocp.analysis.patterns import Pattern, Span
+from yid_ocp.analysis.sparsity_patterns import NamedRange, SparsityPattern
 from yid_ocp.errors import OutputError
-from yid_ocp.report.sparsity import EVERY, draw_patterns
+from yid_ocp.report.sparsity import _MAX_SINGLE_LABELS, draw_sparsity_patterns
 
 
 @pytest.fixture
@@ -27,14 +27,14 @@ def drawn(monkeypatch):
 def pattern(height=6, width=8, **more):
     mask = np.random.default_rng(0).random((height, width)) < 0.4
     rows = (
-        Span("del", 0, height - 2),
-        Span("internal", height - 2, height - 2),
-        Span("constraint", height - 2, height),
+        NamedRange("del", 0, height - 2),
+        NamedRange("internal", height - 2, height - 2),
+        NamedRange("constraint", height - 2, height),
     )
-    columns = (Span("q1", 0, width - 3), Span("lam", width - 3, width))
+    columns = (NamedRange("q1", 0, width - 3), NamedRange("lam", width - 3, width))
     row_labels = (*(f"T{1 + i // 3}_{i % 3}_x" for i in range(height - 2)), "left.x", "left.y")
     column_labels = (*(f"T{1 + i // 3}_{i % 3}_x" for i in range(width - 3)), "left.x", "left.y", "left.z")
-    return Pattern("dR_dy", "a step", mask, rows, columns, row_labels, column_labels, **more)
+    return SparsityPattern("dR_dy", "a step", mask, rows, columns, row_labels, column_labels, **more)
 
 
 def shown(axes):
@@ -43,10 +43,10 @@ def shown(axes):
 
 def test_a_picture_shows_the_pattern_with_its_names(drawn, tmp_path):
     entry = pattern()
-    draw_patterns(tmp_path / "p.png", [[entry]])
+    draw_sparsity_patterns(tmp_path / "p.png", [[entry]])
     assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
     (axes,) = drawn[0].get_axes()
-    np.testing.assert_array_equal(shown(axes) > 0, entry.mask)
+    np.testing.assert_array_equal(shown(axes) > 0, entry.nonzero_mask)
     assert [label.get_text() for label in axes.get_xticklabels()] == list(entry.column_labels)
     assert [label.get_text() for label in axes.get_yticklabels()] == list(entry.row_labels)
     np.testing.assert_array_equal(axes.get_yticks(), np.arange(6))
@@ -59,14 +59,14 @@ def test_a_picture_shows_the_pattern_with_its_names(drawn, tmp_path):
     assert [label.get_text() for label in top.get_xticklabels()] == ["q1", "lam"]
     assert list(top.get_xticks()) == [2.0, 6.0]
     assert [label.get_text() for label in right.get_yticklabels()] == ["del", "constraint"]
-    assert axes.get_title() == f"a step\n6 x 8, {entry.nonzeros} entries can differ from zero"
+    assert axes.get_title() == f"a step\n6 x 8, {entry.n_nonzeros} entries can differ from zero"
 
 
 def test_marked_entries_are_told_from_the_others(drawn, tmp_path):
     entry = pattern()
-    marked = np.zeros_like(entry.mask)
+    marked = np.zeros_like(entry.nonzero_mask)
     marked[:2] = True
-    draw_patterns(tmp_path / "p.png", [[pattern(marked=marked, marked_as="not zero at the rest")]])
+    draw_sparsity_patterns(tmp_path / "p.png", [[pattern(marked=marked, marked_as="not zero at the rest")]])
     (axes,) = drawn[0].get_axes()
     np.testing.assert_array_equal(shown(axes) == 2, entry.mask & marked)
     np.testing.assert_array_equal(shown(axes) > 0, entry.mask)
@@ -74,8 +74,8 @@ def test_marked_entries_are_told_from_the_others(drawn, tmp_path):
 
 
 def test_many_rows_share_the_label_of_their_owner(drawn, tmp_path):
-    height = EVERY + 9
-    draw_patterns(tmp_path / "p.png", [[pattern(height)]])
+    height = _MAX_SINGLE_LABELS + 9
+    draw_sparsity_patterns(tmp_path / "p.png", [[pattern(height)]])
     (axes,) = drawn[0].get_axes()
     labels = [label.get_text() for label in axes.get_yticklabels()]
     owners = [f"T{1 + i // 3}" for i in range(height - 2)]
@@ -87,12 +87,12 @@ def test_many_rows_share_the_label_of_their_owner(drawn, tmp_path):
 
 def test_patterns_stand_beside_each_other_and_empty_ones_are_left_out(drawn, tmp_path):
     empty = pattern()
-    empty = Pattern("B_u", "no torque", np.zeros((6, 0), bool), empty.rows, (), empty.row_labels, ())
-    draw_patterns(tmp_path / "p.png", [[pattern(), pattern(6, 12)], [empty], [pattern(9, 5), empty]])
+    empty = SparsityPattern("B_u", "no torque", np.zeros((6, 0), bool), empty.row_blocks, (), empty.row_labels, ())
+    draw_sparsity_patterns(tmp_path / "p.png", [[pattern(), pattern(6, 12)], [empty], [pattern(9, 5), empty]])
     assert [shown(axes).shape for axes in drawn[0].get_axes()] == [(6, 8), (6, 12), (9, 5)]
 
 
 def test_a_picture_that_cannot_be_written_is_said(tmp_path):
     with pytest.raises(OutputError, match="cannot be written") as caught:
-        draw_patterns(tmp_path / "nowhere" / "p.png", [[pattern()]])
+        draw_sparsity_patterns(tmp_path / "nowhere" / "p.png", [[pattern()]])
     assert str(tmp_path / "nowhere") in str(caught.value.where)

@@ -9,9 +9,9 @@ import pytest
 
 from yid_ocp.data import JointGroup, Recording
 from yid_ocp.report import summaries, terminal
-from yid_ocp.report.blocks import Command, Statement, Table
-from yid_ocp.solvers.judgement import verdict
-from yid_ocp.solvers.words import PREDICATES, VERDICT_WORDS
+from yid_ocp.report.summary_blocks import CodeBlock, SummaryStatement, SummaryTable
+from yid_ocp.solvers.fit_messages import VERDICT_PREDICATES, VERDICT_WORDS
+from yid_ocp.solvers.uncertainty import parameter_verdict
 
 GOOD = {"chi2_per_dof": 1.03, "p_value": 0.3, "explains": True, "believed": True, "worse_than_guess": []}
 BAD = {"chi2_per_dof": 41.7, "p_value": 0.0, "explains": False, "believed": True, "worse_than_guess": []}
@@ -42,7 +42,7 @@ def judged(said: str) -> dict:
 
 
 def told(summary: str, result: dict) -> list[str]:
-    return terminal.lines(getattr(summaries, summary)(result))
+    return terminal.terminal_lines(getattr(summaries, summary)(result))
 
 
 def line_of(lines: list[str], name: str) -> str:
@@ -50,9 +50,9 @@ def line_of(lines: list[str], name: str) -> str:
 
 
 def test_every_verdict_has_its_words():
-    possible = {verdict(1.0, std) for std in (0.01, 1.0, 100.0, float("inf"))} | {"fixed"}
-    possible |= {verdict(1.0, 0.01, explains=False), verdict(1.0, 0.01, at_bound=True)}
-    assert set(PREDICATES) == set(VERDICT_WORDS) == possible
+    possible = {parameter_verdict(1.0, std) for std in (0.01, 1.0, 100.0, float("inf"))} | {"fixed"}
+    possible |= {parameter_verdict(1.0, 0.01, explains=False), parameter_verdict(1.0, 0.01, at_bound=True)}
+    assert set(VERDICT_PREDICATES) == set(VERDICT_WORDS) == possible
     assert VERDICT_WORDS["identifiable"] == "found"
 
 
@@ -198,26 +198,26 @@ def test_a_simulation_that_failed_and_one_that_did_not():
 
 def test_a_recording_in_a_table():
     recording = Recording(JointGroup(("a", "b"), np.array([0.0, 0.1]), np.zeros((2, 2))))
-    lines = terminal.recording_summary(recording)
+    lines = terminal.recording_summary_lines(recording)
     assert lines[2].split() == ["joints", "2", "a,", "b"]
     assert lines[-1] == "0.1 s"
 
 
 def test_blocks_on_a_terminal():
-    table = Table([("a", "b"), ("1", "2")], "a title for the page")
-    assert terminal.lines([]) == []
-    assert terminal.lines([table, Statement("said"), table, replace(table, long=True), Command("do it\nnow")]) == [
+    table = SummaryTable([("a", "b"), ("1", "2")], "a title for the page")
+    assert terminal.terminal_lines([]) == []
+    assert terminal.terminal_lines([table, SummaryStatement("said"), table, replace(table, is_page_only=True), CodeBlock("do it\nnow")]) == [
         "a  b", "-  -", "1  2", "", "said", "", "a  b", "-  -", "1  2", "", "  do it", "  now",
     ]  # fmt: skip
-    prose = terminal.lines([Statement("A sentence of some length. " * 9 + "It ends.")])
+    prose = terminal.terminal_lines([SummaryStatement("A sentence of some length. " * 9 + "It ends.")])
     assert len(prose) > 1
-    assert max(map(len, prose)) <= terminal.PROSE
-    note = terminal.lines([Statement("a note " * 40)])
+    assert max(map(len, prose)) <= terminal._PROSE_WIDTH
+    note = terminal.terminal_lines([SummaryStatement("a note " * 40)])
     assert all(line.startswith("  ") for line in note[1:])
 
 
 def test_a_table_leaves_out_columns_without_an_entry():
-    lines = terminal.table([("a", "", "long head"), ("1", "", "x"), ("22", "", "")])
+    lines = terminal.aligned_table_lines([("a", "", "long head"), ("1", "", "x"), ("22", "", "")])
     assert lines == ["a   long head", "--  ---------", "1   x", "22"]
 
 
@@ -243,5 +243,5 @@ def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
     said = told("diagnose_summary", result | {"next_plan": section})
     assert line_of([line.strip() for line in said], "yid-ocp plan").split() == [
         "yid-ocp", "plan", "runs/mine/config.yaml", "--set", "plan.goal=information", "--set",
-        "'plan.separate=[density@T3,", "point_mass@w_T3]'", "--set", "plan.run=runs/mine",
+        "'plan.discriminate=[density@T3,", "point_mass@w_T3]'", "--set", "plan.parameter_run=runs/mine",
     ]  # fmt: skip

@@ -10,7 +10,7 @@ import pytest
 
 from yid_ocp.model import Mechanism, Segment, System, flexible_object
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement
-from yid_ocp.model.rotations import roll_pitch_yaw, transform
+from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.sensors import Sensor, sensor_function
 
 Read = Callable[..., np.ndarray]
@@ -18,14 +18,14 @@ Read = Callable[..., np.ndarray]
 
 @pytest.fixture(scope="session")
 def system() -> System:
-    along = Placement.of(transform(np.eye(3), [0.0, 0.0, 0.5]))
-    body = Inertia.of(1.0, [0.0, 0.0, 0.25], np.diag([0.02, 0.02, 0.001]))
+    along = Placement.from_matrix(homogeneous_transform(np.eye(3), [0.0, 0.0, 0.5]))
+    body = Inertia.from_values(1.0, [0.0, 0.0, 0.25], np.diag([0.02, 0.02, 0.001]))
     upper = Joint("left_a", "revolute", -1, Placement.identity(), (0.0, 1.0, 0.0), (body,))
     lower = Joint("left_b", "revolute", 0, along, (1.0, 0.0, 0.0), (body,))
     robot = Mechanism("arm", (upper, lower), {"left_gripper": Frame(1, along)})
     segments = (
         Segment("T1", 0.4, 0.08, 0.03, 2),
-        Segment("T2", 0.3, 0.04, 0.01, 1, parent="T1", rotation=roll_pitch_yaw(-0.8, 0.0, 0.0)),
+        Segment("T2", 0.3, 0.04, 0.01, 1, parent="T1", rest_rotation=rotation_from_rpy(-0.8, 0.0, 0.0)),
     )
     return System.build(robot, objects=[(flexible_object(segments), None, None)], prescribed=robot.joint_names)
 
@@ -37,9 +37,9 @@ def read() -> Read:
     def outputs(
         system: System, sensor: Sensor, q: Sequence[float] | None = None, effort: Sequence[float] | None = None
     ) -> np.ndarray:
-        n = system.size
+        n = system.n_coordinates
         function = sensor_function(system, sensor, ())
-        state = (np.zeros(n) if q is None else q, np.zeros(len(system.internal)))
+        state = (np.zeros(n) if q is None else q, np.zeros(len(system.internal_coordinates)))
         loads = np.zeros(n) if effort is None else effort
         return np.array(ca.densify(function(*state, loads, system.parameters.vector())[0])).ravel()
 

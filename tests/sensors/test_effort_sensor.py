@@ -19,13 +19,13 @@ def test_it_says_what_it_measures() -> None:
 
 
 def test_it_reads_the_efforts_of_its_joints_in_its_own_order(system, read) -> None:
-    effort = np.arange(1.0, system.size + 1)
+    effort = np.arange(1.0, system.n_coordinates + 1)
     a, b = (system.mechanism.joint_index(name) for name in ("left_a", "left_b"))
     assert read(system, SENSOR, effort=effort) == pytest.approx([effort[b], effort[a]])
 
 
 def test_effects_change_the_channel_that_they_sit_on(system, read) -> None:
-    effort = np.zeros(system.size)
+    effort = np.zeros(system.n_coordinates)
     effort[[system.mechanism.joint_index(name) for name in ("left_a", "left_b")]] = [2.0, 5.0]
     gain = make_effect("effort_gain", "left_a", system, {"scale": 0.9})
     offset = make_effect("effort_offset", "left_a", system, {"offset": 0.3})

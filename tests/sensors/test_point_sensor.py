@@ -9,34 +9,34 @@ import pytest
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ModelError
 from yid_ocp.model import forward_kinematics
-from yid_ocp.model.rotations import roll_pitch_yaw, transform
+from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.sensors import PointSensor, Sensor
 
-POSE = transform(roll_pitch_yaw(0.3, -0.2, 1.0), [2.0, 0.5, 0.4])
+POSE = homogeneous_transform(rotation_from_rpy(0.3, -0.2, 1.0), [2.0, 0.5, 0.4])
 CAMERA = PointSensor("points_camera", ("joint", "tip"), ("w_T1", "w_T2"), tuple(map(tuple, POSE)))
 MOCAP = PointSensor("points_mocap", ("joint", "tip"), ("w_T1", "w_T2"))
 
 
 def test_it_says_what_it_measures() -> None:
     assert isinstance(CAMERA, Sensor)
-    assert CAMERA.channels == ("points_camera.joint", "points_camera.tip")
-    assert (CAMERA.unit, CAMERA.width) == ("m", 3)
-    assert CAMERA.frames == ("w_T1", "w_T2")
-    assert CAMERA.camera is not None
-    np.testing.assert_allclose(np.array(ca.DM(CAMERA.camera.matrix())), POSE)
-    assert MOCAP.camera is None
+    assert CAMERA.channel_names == ("points_camera.joint", "points_camera.tip")
+    assert (CAMERA.unit, CAMERA.outputs_per_channel) == ("m", 3)
+    assert CAMERA.frame_names == ("w_T1", "w_T2")
+    assert CAMERA.camera_pose is not None
+    np.testing.assert_allclose(np.array(ca.DM(CAMERA.camera_pose.homogeneous_matrix())), POSE)
+    assert MOCAP.camera_pose is None
 
 
 def test_it_reads_where_its_frames_are(system, read) -> None:
-    q = np.random.default_rng(0).uniform(-0.5, 0.5, system.size)
-    kinematics = forward_kinematics(system.mechanism.numeric(), ca.SX(ca.DM(q)))
-    expected = [np.array(ca.DM(kinematics.position(frame))).ravel() for frame in MOCAP.frames]
+    q = np.random.default_rng(0).uniform(-0.5, 0.5, system.n_coordinates)
+    kinematics = forward_kinematics(system.mechanism.with_numeric_values(), ca.SX(ca.DM(q)))
+    expected = [np.array(ca.DM(kinematics.frame_position(frame))).ravel() for frame in MOCAP.frame_names]
     assert read(system, MOCAP, q) == pytest.approx(np.concatenate(expected))
     assert read(system, CAMERA, q) == pytest.approx(np.concatenate(expected)), "points stand in the world"
 
 
 def test_a_point_worked_out_by_hand(system, read) -> None:
-    q = np.zeros(system.size)
+    q = np.zeros(system.n_coordinates)
     a, b = 0.3, -0.7
     q[[system.mechanism.joint_index(name) for name in ("left_a", "left_b")]] = a, b
     along = 0.5 + 0.5 * math.cos(b)
@@ -67,7 +67,7 @@ def test_a_frame_that_is_not_there_is_refused(system, read) -> None:
 
 def test_points_along_a_segment(system, read) -> None:
     """Halfway along two links lies the joint between them; a quarter beyond it, half of the second link."""
-    q = np.random.default_rng(1).uniform(-0.5, 0.5, system.size)
+    q = np.random.default_rng(1).uniform(-0.5, 0.5, system.n_coordinates)
     found = read(system, PointSensor("points", ("a", "b", "c", "d"), ("T1:50%", "T1_0_tip", "T1:75%", "w_T1")), q)
     half, joint, further, tip = found.reshape(4, 3)
     assert half == pytest.approx(joint)

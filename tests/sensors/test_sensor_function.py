@@ -9,7 +9,7 @@ import pytest
 
 from yid_ocp.effects import make_effect
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.model.system import MidpointState, NodeState, System, Terms
+from yid_ocp.model.system import MidpointState, NodeState, StepTerms, System
 from yid_ocp.sensors import EffortSensor, PointSensor, Sensor, sensor_function
 
 LABEL = "drift@left"
@@ -27,8 +27,8 @@ class Drift:
     def modify(self, system: System) -> System:
         return system
 
-    def terms(self, state: MidpointState) -> Terms:
-        return Terms()
+    def terms(self, state: MidpointState) -> StepTerms:
+        return StepTerms()
 
     def measure(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
         memory = self.internal[f"{LABEL}.memory"]
@@ -50,9 +50,15 @@ def whole(system: System) -> System:
 @pytest.mark.parametrize("sensor", [CAMERA, EFFORT], ids=["points", "effort"])
 def test_outputs_have_a_row_for_every_reading(whole: System, sensor: Sensor) -> None:
     function = sensor_function(whole, sensor, NAMES)
-    rows = sensor.width * len(sensor.channels)
+    rows = sensor.outputs_per_channel * len(sensor.channel_names)
     shapes = [function.size_out(i) for i in range(5)]
-    assert shapes == [(rows, 1), (rows, whole.size), (rows, 1), (rows, whole.size), (rows, len(NAMES))]
+    assert shapes == [
+        (rows, 1),
+        (rows, whole.n_coordinates),
+        (rows, 1),
+        (rows, whole.n_coordinates),
+        (rows, len(NAMES)),
+    ]
     assert sensor_function(whole, sensor, ()).size_out(4) == (rows, 0)
 
 
@@ -61,13 +67,18 @@ def test_derivatives_agree_with_differences(whole: System, sensor: Sensor) -> No
     rng = np.random.default_rng(1)
     function = sensor_function(whole, sensor, NAMES)
     at = [
-        rng.uniform(-0.6, 0.6, whole.size),
+        rng.uniform(-0.6, 0.6, whole.n_coordinates),
         np.array([0.4]),
-        rng.uniform(-1, 1, whole.size),
+        rng.uniform(-1, 1, whole.n_coordinates),
         whole.parameters.vector(),
     ]
     exact = [np.array(ca.densify(value)) for value in function(*at)[1:]]
-    columns = [range(whole.size), range(1), range(whole.size), [whole.parameters.index(name) for name in NAMES]]
+    columns = [
+        range(whole.n_coordinates),
+        range(1),
+        range(whole.n_coordinates),
+        [whole.parameters.index(name) for name in NAMES],
+    ]
     step = 1e-6
     for which, indices in enumerate(columns):
         differences = []
@@ -83,11 +94,11 @@ def test_derivatives_agree_with_differences(whole: System, sensor: Sensor) -> No
 
 def test_effects_act_one_after_the_other_on_every_channel(whole: System) -> None:
     """effort 3 N m at left_b: gain 0.8, then the drift 0.2 (0.5^2 + sin 2), which left_a gets alone."""
-    effort = np.zeros(whole.size)
+    effort = np.zeros(whole.n_coordinates)
     a, b = (whole.mechanism.joint_index(name) for name in ("left_a", "left_b"))
     effort[a], effort[b] = 2.0, 3.0
     assert a == 0
     function = sensor_function(whole, EFFORT, ())
-    read = np.array(function(np.zeros(whole.size), [0.5], effort, whole.parameters.vector())[0]).ravel()
+    read = np.array(function(np.zeros(whole.n_coordinates), [0.5], effort, whole.parameters.vector())[0]).ravel()
     drift = 0.2 * (0.25 + np.sin(2.0))
     assert read == pytest.approx([2.0 + drift, 0.8 * 3.0 + drift])

@@ -10,8 +10,8 @@ from made_series import samples
 
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem.evaluation import Evaluation, ResidualRows
-from yid_ocp.problem.options import JointPrior
-from yid_ocp.solvers.base import Iterate, Outcome, Status
+from yid_ocp.problem.options import MultivariateGaussianPrior
+from yid_ocp.solvers.base import Iterate, SolverResult, Status
 
 
 def linear(matrix, residual=None):
@@ -62,7 +62,11 @@ class MadeUp:
         self.bounds = np.full(size, lower), np.full(size, upper)
         self.scales = np.abs(self.start) if scales is None else np.array(scales, float)
         self.options = SimpleNamespace(
-            believed=True, weighting=weighting, priors=dict(priors or {}), path_cutoff=np.inf, joint_prior=JointPrior()
+            believed=True,
+            weighting=weighting,
+            priors=dict(priors or {}),
+            path_cutoff=np.inf,
+            joint_prior=MultivariateGaussianPrior(),
         )
         self.disturbed = False
         values = [*self.start, *fixed]
@@ -93,7 +97,7 @@ class MadeUp:
     def rows(self) -> ResidualRows:
         total = self._count
         data = total - self._stated - self._weak
-        made = ResidualRows.of(self.episodes, self._stated, self._weak)
+        made = ResidualRows.from_episodes(self.episodes, self._stated, self._weak)
         return ResidualRows(made.measurements, slice(0, data), slice(data, data + self._stated), slice(data, total))
 
     def informing(self, evaluation: Evaluation) -> tuple[np.ndarray, np.ndarray]:
@@ -133,11 +137,13 @@ class Steps:
         self._paths, self._status = list(paths), status
         self.runs: list[tuple[list[float], float]] = []
 
-    def run(self, problem: MadeUp, start: np.ndarray, callback: Callable[[Iterate], None] | None) -> Outcome:
+    def run(self, problem: MadeUp, start: np.ndarray, callback: Callable[[Iterate], None] | None) -> SolverResult:
         self.runs.append((start.tolist(), problem.duration))
         path = self._paths.pop(0) if self._paths else [start]
         history = tuple(Iterate(i, 1.0, np.array(x, float), 0.0, i + 1, 0.0) for i, x in enumerate(path))
         for entry in history:
             if callback is not None:
                 callback(entry)
-        return Outcome(self._status, f"run {len(self.runs)}", np.array(path[-1], float), history, len(path), "warm")
+        return SolverResult(
+            self._status, f"run {len(self.runs)}", np.array(path[-1], float), history, len(path), "warm"
+        )

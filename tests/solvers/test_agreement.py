@@ -11,11 +11,11 @@ import pytest
 
 from yid_ocp.data import read_recording
 from yid_ocp.errors import SolverError
-from yid_ocp.integrator.step import compile_alike, compile_step
+from yid_ocp.integrator.step import compile_step, compile_step_like
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import GaussNewton, Lifted, MultipleShooting, SingleShooting, Status, SteepestDescent, solve
-from yid_ocp.solvers.symbolic import transcribe
-from yid_ocp.solvers.transcription import Transcription
+from yid_ocp.solvers.compiled_transcription import CompiledTranscription
+from yid_ocp.solvers.symbolic_transcription import transcribe
 
 FREE = ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twist")
 SEEN = ("T1.bend", "T1.twist", "T2.bend")
@@ -47,7 +47,7 @@ def within(solution, reference, deviations=0.1):
 def test_gauss_newton_recovers_the_truth_of_another_engine(make_problem, recording):
     solution = solve(make_problem(), GaussNewton())
     assert solution.status == Status.CONVERGED
-    assert 0.9 < solution.fit.chi2_per_dof < 1.2
+    assert 0.9 < solution.goodness_of_fit.chi2_per_dof < 1.2
     for name, entry in solution.parameters.items():
         if entry.free and entry.verdict == "identifiable":
             assert abs(entry.value - recording.truth[name]) < max(0.05 * recording.truth[name], 3 * entry.std), name
@@ -110,7 +110,7 @@ def test_fifty_variables_from_far_away(two_arms, solver):
     solution = solve(two_arms, solver)
     assert solution.status == Status.CONVERGED, solution.message
     assert "starts" not in solution.message
-    assert solution.iterations <= 40
+    assert solution.n_iterations <= 40
     assert solution.cost == pytest.approx(single.cost, abs=0.2)
     found = [name for name, entry in single.parameters.items() if entry.verdict == "identifiable"]
     assert found == ["T1.bend", "T1.twist", "T2.bend", "T3.bend"]
@@ -121,14 +121,16 @@ def test_fifty_variables_from_far_away(two_arms, solver):
 
 def test_steepest_descent_lowers_the_papers_cost(make_problem):
     problem = make_problem(free=("T1.bend", "T2.bend"), duration=2.0, weighting="paper")
-    solution = solve(problem, SteepestDescent(iterations=60, trial="spectral"))
+    solution = solve(problem, SteepestDescent(max_iterations=60, first_trial_step="spectral"))
     assert solution.history[-1].cost < 0.05 * solution.history[0].cost
     assert solution.parameters["T1.bend"].value == pytest.approx(22.0, rel=0.05)
 
 
 def test_steepest_descent_with_a_memory_returns_the_best_point(make_problem):
     problem = make_problem(free=("T1.bend", "T2.bend"), duration=2.0, weighting="paper")
-    solution = solve(problem, SteepestDescent(trial="spectral", memory=10, gradient_tolerance=1e-4))
+    solution = solve(
+        problem, SteepestDescent(first_trial_step="spectral", nonmonotone_memory=10, gradient_tolerance=1e-4)
+    )
     costs = [entry.cost for entry in solution.history]
     assert solution.status == Status.CONVERGED
     assert any(after > before for before, after in itertools.pairwise(costs))
@@ -148,7 +150,7 @@ def test_bounds_are_respected(one_arm, recording, make_problem):
     problem = make_problem(free=("T1.bend", "T2.bend"), duration=0.5)
     system = problem.system
     narrow = replace(system, parameters=system.parameters.with_bounds({"T1.bend": (0.0, 15.0)}))
-    step = compile_alike(problem.step, narrow)
+    step = compile_step_like(problem.step, narrow)
     problem = EstimationProblem(step, [recording], problem.free, problem.options)
     for solver in (GaussNewton(), SingleShooting(), MultipleShooting(node_interval=10)):
         solution = solve(problem, solver)
@@ -159,8 +161,8 @@ def test_bounds_are_respected(one_arm, recording, make_problem):
 def test_open_loop_is_for_multiple_shooting(make_problem):
     """Without feedback the arm leaves the measured motion; a second of it can be rolled out, three cannot."""
     problem = make_problem(free=("T1.bend", "T2.bend"), feedback="none", duration=1.0)
-    single = GaussNewton(iterations=15).run(problem, problem.start, None)
-    nodes = MultipleShooting(node_interval=10).run(problem, problem.start, None)
+    single = GaussNewton(max_iterations=15).minimize_cost(problem, problem.start, None)
+    nodes = MultipleShooting(node_interval=10).minimize_cost(problem, problem.start, None)
     assert nodes.status == Status.CONVERGED, nodes.message
     assert nodes.history[-1].cost == pytest.approx(single.history[-1].cost, rel=1e-3)
     assert nodes.x == pytest.approx([22.0, 10.7], rel=0.1)
@@ -171,18 +173,18 @@ def test_open_loop_is_for_multiple_shooting(make_problem):
 def test_limited_memory_is_refused_with_a_reason(short):
     solver = MultipleShooting(ipopt={"hessian_approximation": "limited-memory"})
     with pytest.raises(SolverError, match="limited-memory"):
-        solver.run(short, short.start, None)
+        solver.minimize_cost(short, short.start, None)
 
 
 def test_recording_shorter_than_a_node_interval(short):
     with pytest.raises(SolverError, match="fewer than one node interval"):
-        MultipleShooting(node_interval=1000).run(short, short.start, None)
+        MultipleShooting(node_interval=1000).minimize_cost(short, short.start, None)
 
 
 def test_iteration_limit_is_a_status_with_the_best_point(make_problem):
     problem = make_problem(free=SEEN, duration=0.4)
-    few = (MultipleShooting(node_interval=10, iterations=2), MultipleShooting(iterations=2))
-    for solver in (GaussNewton(iterations=1), *few):
+    few = (MultipleShooting(node_interval=10, max_iterations=2), MultipleShooting(max_iterations=2))
+    for solver in (GaussNewton(max_iterations=1), *few):
         solution = solve(problem, solver)
         assert solution.status == Status.ITERATION_LIMIT
         assert np.all(np.isfinite(solution.x))
@@ -190,14 +192,14 @@ def test_iteration_limit_is_a_status_with_the_best_point(make_problem):
 
 
 def test_trial_points_that_cannot_be_worked_out_are_told_in_the_status_and_not_on_stderr(short, monkeypatch, capfd):
-    plain = Transcription.constraints
+    plain = CompiledTranscription.constraints
 
     def broken(self, w, derivatives):
         value, jacobian = plain(self, w, derivatives)
         return (value if derivatives else value * np.nan), jacobian
 
-    monkeypatch.setattr(Transcription, "constraints", broken)
-    found = MultipleShooting(node_interval=10, iterations=3).run(short, short.start, None)
+    monkeypatch.setattr(CompiledTranscription, "constraints", broken)
+    found = MultipleShooting(node_interval=10, max_iterations=3).minimize_cost(short, short.start, None)
     assert found.status == Status.STALLED
     assert "trial points could not be worked out" in found.message
     assert capfd.readouterr() == ("", "")
@@ -205,16 +207,16 @@ def test_trial_points_that_cannot_be_worked_out_are_told_in_the_status_and_not_o
 
 def test_eliminated_steps_are_for_the_compiled_form(short):
     with pytest.raises(SolverError, match="node_interval = 10 with the symbolic transcription"):
-        MultipleShooting(node_interval=10, transcription="symbolic").run(short, short.start, None)
+        MultipleShooting(node_interval=10, transcription="symbolic").minimize_cost(short, short.start, None)
     with pytest.raises(SolverError, match="transcription = 'callback'"):
-        MultipleShooting(transcription="callback").run(short, short.start, None)
+        MultipleShooting(transcription="callback").minimize_cost(short, short.start, None)
 
 
 def test_more_memory_than_there_is_ends_with_a_status(make_problem, monkeypatch, caplog):
     problem = make_problem(free=("T1.bend",), duration=0.1)
-    monkeypatch.setattr("yid_ocp.solvers.multiple_shooting.free_memory", lambda: 1e6)
+    monkeypatch.setattr("yid_ocp.solvers.multiple_shooting.available_memory", lambda: 1e6)
     with caplog.at_level("INFO"):
-        found = MultipleShooting().run(problem, problem.start, None)
+        found = MultipleShooting().minimize_cost(problem, problem.start, None)
     assert found.status == Status.FAILED
     assert found.x == pytest.approx(problem.start)
     assert "of memory, of which 0.001 GB are free" in found.message
@@ -226,10 +228,10 @@ def test_a_program_that_ipopt_cannot_begin_is_a_status_and_silent(make_problem, 
 
     def lost(*arguments):
         program = transcribe(*arguments)
-        return program.adding(ca.log(program["theta"][0] - 100.0))
+        return program.with_user_terms(ca.log(program["theta"][0] - 100.0))
 
     monkeypatch.setattr("yid_ocp.solvers.multiple_shooting.transcribe", lost)
-    found = MultipleShooting(iterations=3).run(problem, problem.start, None)
+    found = MultipleShooting(max_iterations=3).minimize_cost(problem, problem.start, None)
     assert found.status in (Status.STALLED, Status.FAILED)
     assert "IPOPT: Invalid_Number_Detected" in found.message
     assert np.all(np.isfinite(found.x))

@@ -29,7 +29,7 @@ def agree(one, other, deviations):
 def test_all_noise_has_one_optimum_as_covariance_and_as_unknowns(repository, name):
     """From 3 N m/rad, with 44 000 to 60 000 unknowns; errors of torques are unknowns here, a covariance there."""
     problem = load_problem(repository / "configs" / f"{name}.yaml")
-    assert problem.disturbed
+    assert problem.has_process_noise
     single = solve(problem, GaussNewton())
     solution = solve(problem, MultipleShooting())
     assert solution.status == Status.CONVERGED, solution.message
@@ -57,7 +57,7 @@ def test_two_thousand_steps_of_two_arms_are_solved_in_silence(paper_systems, cle
     assert problem.episodes[0].grid.steps == 2000
     solution = solve(problem, MultipleShooting(), restarts=False)
     assert solution.status == Status.CONVERGED, solution.message
-    reference = solve(problem, GaussNewton(), start=solution.x, restarts=False)
+    reference = solve(problem, GaussNewton(), initial_unknowns=solution.x, restarts=False)
     assert solution.cost == pytest.approx(reference.cost, abs=0.1)
     assert np.all(np.isfinite(solution.x))
     assert capfd.readouterr() == ("", "")

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.integrator.step import compile_alike
+from yid_ocp.integrator.step import compile_step_like
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.solvers.guess import guess
+from yid_ocp.solvers.initial_guess import guess_node_states
 
 START = np.array([5.0, 4.0])
 
@@ -43,33 +43,33 @@ def test_larger_parameters_are_tried_until_states_fit(problem, misfits, taken, t
         told.append(factor)
         return misfits[factor]
 
-    found = guess(problem, nodes_of(problem), START, misfit)
+    found = guess_node_states(problem, nodes_of(problem), START, misfit)
     np.testing.assert_allclose(found.x, taken * START)
     assert list(dict.fromkeys(told)) == tried
-    rest = problem.start_state(problem.episodes[0], problem.split(found.x, 0)[0])
-    np.testing.assert_allclose(found.begins[0].state, rest.state, atol=1e-9)
+    rest = problem.initial_state(problem.episodes[0], problem.split(found.x, 0)[0])
+    np.testing.assert_allclose(found.initial_states[0].state, rest.state, atol=1e-9)
 
 
 def test_what_fits_is_the_rollout_and_what_does_not_is_rest_where_the_arm_was(problem):
     nodes, episode = nodes_of(problem), problem.episodes[0]
     driven = list(problem.system.driven_indices)
     rolled = problem.evaluate(START).episodes[0].rollout
-    found = guess(problem, nodes, START, lambda i, state, pull, x: 1.0)
-    np.testing.assert_allclose(found.states[0], rolled.state, atol=1e-9)
+    found = guess_node_states(problem, nodes, START, lambda i, state, pull, x: 1.0)
+    np.testing.assert_allclose(found.node_states[0], rolled.state, atol=1e-9)
     np.testing.assert_allclose(found.multipliers[0], rolled.multipliers, atol=1e-9)
 
     def strays(i, state, pull, x):
-        return 1e3 * np.abs(state[:, driven] - episode.measured_arm).max() + 20.0
+        return 1e3 * np.abs(state[:, driven] - episode.measured_driven_angles).max() + 20.0
 
-    found = guess(problem, nodes, START, strays)
-    np.testing.assert_allclose(found.states[0][:, driven], episode.measured_arm, atol=1e-12)
-    assert np.abs(rolled.state[:, driven] - episode.measured_arm).max() > 1e-4
+    found = guess_node_states(problem, nodes, START, strays)
+    np.testing.assert_allclose(found.node_states[0][:, driven], episode.measured_driven_angles, atol=1e-12)
+    assert np.abs(rolled.state[:, driven] - episode.measured_driven_angles).max() > 1e-4
 
 
 def test_bounds_hold_larger_parameters_back(one_arm, recording):
     parameters = one_arm.system.parameters.with_bounds({"T1.bend": (0.0, 12.0)})
     system = replace(one_arm.system, parameters=parameters)
-    step = compile_alike(one_arm, system)
+    step = compile_step_like(one_arm, system)
     problem = EstimationProblem(step, [recording], ("T1.bend", "T2.bend"), ProblemOptions(duration=0.1))
     told = []
 
@@ -77,6 +77,6 @@ def test_bounds_hold_larger_parameters_back(one_arm, recording):
         told.append(x.tolist())
         return 1e3
 
-    guess(problem, nodes_of(problem), START, misfit)
+    guess_node_states(problem, nodes_of(problem), START, misfit)
     tried = [list(pair) for pair in dict.fromkeys(map(tuple, told))]
     assert tried == [[5.0, 4.0], [12.0, 16.0], [10.0, 8.0], [12.0, 40.0]]

@@ -11,9 +11,9 @@ from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.solvers import GaussNewton, Status, solve
-from yid_ocp.virtual.engine import Simulation
-from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, virtual_experiment
-from yid_ocp.virtual.motion import Excitation, multisine
+from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, run_virtual_experiment
+from yid_ocp.virtual.mujoco_simulation import SimulationOptions
+from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 
 pytest.importorskip("mujoco")
 
@@ -26,7 +26,7 @@ FINE, COARSE, DURATION = 12, 5, 3.0
 def arm_with_cable(links: int, mode: str) -> System:
     """A UR5 that carries 1 m of cable, bending alone."""
     how = {"bend": TRUTH["cable.bend"], "damping": TRUTH["cable.damping"], "rigidity": True, "clamped": True}
-    cable = flexible_object([Segment("cable", 1.0, 0.1, 0.006, links=links, joint_order="xy", **how)], name="cable")
+    cable = flexible_object([Segment("cable", 1.0, 0.1, 0.006, links=links, joint_axes="xy", **how)], name="cable")
     robot = read_urdf("package:ur5", joints=list(JOINTS))
     parts = {"objects": [(cable, "tool0", None)], "points": ("w_cable",), "damping": dict.fromkeys(JOINTS, 1.0)}
     return System.build(robot, **parts, **{mode: list(JOINTS)})
@@ -35,12 +35,12 @@ def arm_with_cable(links: int, mode: str) -> System:
 @pytest.fixture(scope="module")
 def recording():
     system = arm_with_cable(FINE, "driven")
-    excitation = Excitation(duration=DURATION, travel=0.15)
-    motion = multisine(system, None, seed=3, posture=POSTURE, excitation=excitation)
-    simulation = Simulation(duration=DURATION, time_step=1e-3)
-    camera = PointCamera(rate=30.0, std=1e-3, gaps=False)
-    how = VirtualExperiment(motion=motion, posture=POSTURE, simulation=simulation, camera=camera, seed=3)
-    return virtual_experiment(system, None, how)
+    excitation = MultisineOptions(duration=DURATION, gripper_travel=0.15)
+    motion = random_multisine(system, None, seed=3, initial_joint_angles=POSTURE, excitation=excitation)
+    simulation = SimulationOptions(duration=DURATION, time_step=1e-3)
+    camera = PointCamera(frame_rate=30.0, point_std=1e-3, has_dropouts=False)
+    how = VirtualExperiment(motion=motion, initial_joint_angles=POSTURE, simulation=simulation, camera=camera, seed=3)
+    return run_virtual_experiment(system, None, how)
 
 
 def solved(recording, links):

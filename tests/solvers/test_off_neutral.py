@@ -10,11 +10,11 @@ from yid_ocp.effects import make_effect
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
-from yid_ocp.model.drives import Spring
+from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, Status, solve
-from yid_ocp.solvers.off_neutral import off_neutral
+from yid_ocp.solvers.effect_initialization import initialize_free_effects
 
 H, STEPS, STD = 0.01, 150, 0.02
 JOINTS = ("shoulder", "elbow")
@@ -26,7 +26,7 @@ def moved(urdf_folder):
 
     def make(kind, truth, free, seed=0):
         robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-        plain = System.build(robot, springs={"shoulder": Spring(6.0, 0.1)}, prescribed=JOINTS)
+        plain = System.build(robot, springs={"shoulder": RobotJointSpring(6.0, 0.1)}, prescribed=JOINTS)
         system = plain.with_effects([make_effect(kind, "elbow", plain)])
         step = compile_step(system, H, use_compiler=False)
         t = H * np.arange(STEPS + 1)
@@ -60,7 +60,7 @@ def test_a_spring_relaxed_elsewhere_is_found_from_its_neutral_value(moved, stiff
 def test_from_its_neutral_value_a_spring_that_would_have_to_push_stays_at_zero(moved):
     """What the start off neutral is for: relaxed at zero, the spring would need a stiffness below zero."""
     problem = moved("joint_spring", {"stiffness": 8.0, "rest_angle": 1.8}, ("stiffness", "rest_angle"))
-    held = GaussNewton().run(problem, problem.start, None)
+    held = GaussNewton().minimize_cost(problem, problem.start, None)
     assert held.x[1] == 0.0
 
 
@@ -74,25 +74,25 @@ def test_a_spring_that_is_not_there_is_found_to_be_none(moved):
 
 def test_an_amplitude_seen_at_its_neutral_value_begins_there(moved):
     problem = moved("joint_viscous", {"b": 0.3}, ("b",))
-    np.testing.assert_array_equal(off_neutral(problem, problem.start), problem.start)
+    np.testing.assert_array_equal(initialize_free_effects(problem, problem.start), problem.start)
     fixed = moved("joint_spring", {"stiffness": 8.0, "rest_angle": 1.4}, ())
-    np.testing.assert_array_equal(off_neutral(fixed, fixed.start), fixed.start)
+    np.testing.assert_array_equal(initialize_free_effects(fixed, fixed.start), fixed.start)
 
 
 def test_an_effect_that_was_given_a_value_begins_there(moved):
     problem = moved("joint_spring", {"stiffness": 8.0, "rest_angle": 1.4}, ("stiffness", "rest_angle"))
     begun = problem.at({"joint_spring@elbow.stiffness": 2.0})
-    np.testing.assert_array_equal(off_neutral(begun, begun.start), begun.start)
+    np.testing.assert_array_equal(initialize_free_effects(begun, begun.start), begun.start)
 
 
 def test_a_start_that_cannot_be_rolled_out_is_drawn_back(moved, monkeypatch):
     problem = moved("joint_spring", {"stiffness": 8.0, "rest_angle": 1.4}, ("stiffness", "rest_angle"))
-    whole, plain = off_neutral(problem, problem.start), problem.evaluate
+    whole, plain = initialize_free_effects(problem, problem.start), problem.evaluate
 
     def stiff(x, derivatives=True, warm=None):
         found = plain(x, derivatives, warm)
         return found if x[1] < 0.6 * whole[1] else type(found)(np.inf, found.residual, None, False, "it snaps", ())
 
     monkeypatch.setattr(problem, "evaluate", stiff)
-    drawn = off_neutral(problem, problem.start)
+    drawn = initialize_free_effects(problem, problem.start)
     assert drawn[1] == pytest.approx(0.5 * whole[1])

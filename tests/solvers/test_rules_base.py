@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from made_problems import MadeUp, Steps, linear
 
-from yid_ocp.solvers.base import Recorder, Solution, Status, projected_gradient, solve
+from yid_ocp.solvers.base import IterationRecorder, Solution, Status, projected_gradient_norm, solve
 
 
 def test_a_solution_has_the_deviations_of_free_parameters():
@@ -36,24 +36,24 @@ def test_a_solution_has_the_deviations_of_free_parameters():
     ],
 )
 def test_a_gradient_that_pushes_against_a_bound_does_not_count(x, gradient, expected):
-    found = projected_gradient(np.array(x), np.array(gradient), np.zeros(2), np.full(2, 2.0), np.array([1.0, 2.0]))
+    found = projected_gradient_norm(np.array(x), np.array(gradient), np.zeros(2), np.full(2, 2.0), np.array([1.0, 2.0]))
     assert found == expected
 
 
 def test_a_recorder_keeps_points_as_they_were_and_tells_them():
     told = []
-    recorder = Recorder(told.append)
+    recorder = IterationRecorder(told.append)
     x = np.array([1.0])
-    recorder.evaluations = 3
-    recorder.accept(9.0, x, 0.5, "first")
+    recorder.n_evaluations = 3
+    recorder.record_iterate(9.0, x, 0.5, "first")
     x[0] = 2.0
-    recorder.accept(8.0, x, 0.25)
+    recorder.record_iterate(8.0, x, 0.25)
     first, second = recorder.history
     assert told == [first, second]
-    assert (first.iteration, first.cost, first.x[0], first.gradient, first.evaluations) == (0, 9.0, 1.0, 0.5, 3)
+    assert (first.iteration, first.cost, first.x[0], first.gradient_norm, first.n_evaluations) == (0, 9.0, 1.0, 0.5, 3)
     assert (first.note, second.note, second.iteration) == ("first", "", 1)
     assert 0 <= first.seconds <= second.seconds < 5
-    Recorder(None).accept(1.0, x, 0.0)
+    IterationRecorder(None).record_iterate(1.0, x, 0.0)
 
 
 # -- restarts ---------------------------------------------------------------------------------------------------------
@@ -74,13 +74,13 @@ def test_a_good_fit_is_not_started_again():
     solution = solve(MadeUp(misfit(lambda x: 4.9)), solver)
     assert solver.runs == [([1.0], 10.0)]
     assert solution.message == "run 1"
-    assert (solution.status, solution.method, solution.iterations, solution.evaluations) == (
+    assert (solution.status, solution.solver_name, solution.n_iterations, solution.n_evaluations) == (
         Status.CONVERGED,
         "made_up",
         1,
         2,
     )
-    assert solution.fit.chi2_per_dof == pytest.approx(4.9)
+    assert solution.goodness_of_fit.chi2_per_dof == pytest.approx(4.9)
     assert solution.cost == pytest.approx(0.5 * 9 * 4.9)
 
 
@@ -93,7 +93,7 @@ def test_a_poor_fit_is_started_again_from_multiples_of_the_start_and_the_best_is
     assert solution.message == "run 3 (best of 4 starts)"
     notes = ["", *(f"start {n} of at most 4: initial values x {x}" for n, x in ((2, 4), (3, 2), (4, 10)))]
     assert [entry.note for entry in solution.history] == [entry.note for entry in told] == notes
-    assert (solution.evaluations, solution.iterations) == (4, 3)
+    assert (solution.n_evaluations, solution.n_iterations) == (4, 3)
     assert len(told) == 4
 
 
@@ -151,7 +151,7 @@ def test_a_fit_that_cannot_be_evaluated_has_failed():
     solution = solve(problem, Steps([[9.0]], [[9.0]], [[9.0]], [[9.0]]))
     assert (solution.status, solution.message, solution.evaluation) == (Status.FAILED, "it snaps", None)
     assert solution.cost == math.inf
-    assert math.isnan(solution.fit.chi2_per_dof)
+    assert math.isnan(solution.goodness_of_fit.chi2_per_dof)
     paper = MadeUp(misfit({1.0: 2.0, 4.0: 2.0}.get), weighting="paper")
     solver = Steps([[9.0]])
     assert solve(paper, solver).status == Status.CONVERGED
@@ -208,7 +208,7 @@ def test_a_start_that_fails_is_approached_over_longer_and_longer_horizons():
         "first 5 s",
         "",
     ]
-    assert (solution.evaluations, len(told)) == (6, 6)
+    assert (solution.n_evaluations, len(told)) == (6, 6)
 
 
 def test_horizons_that_fail_are_skipped_and_the_rest_is_left_out_once_the_whole_holds():
@@ -260,7 +260,7 @@ def test_passes_begin_where_the_last_one_ended_and_end_when_one_changes_nothing(
     assert problem.frozen == [([1.0], None), ([2.0], "warm"), ([2.5], "warm")]
     assert solution.x.tolist() == [2.5]
     assert solution.problem.frozen_at == [2.5]
-    assert solution.evaluations == 5
+    assert solution.n_evaluations == 5
     assert len(solution.history) == 5
     assert "sensors' noise alone" not in solution.message
 
@@ -302,7 +302,7 @@ def test_beside_such_noise_a_fit_that_explains_nothing_is_started_again_nearby()
     solver = Carrying(*there, [[2.5], [2.5]], [[2.5]])
     solution = solve(Disturbed(rows), solver)
     assert [2.5] in [start for start, _ in solver.runs]
-    assert (solution.x.tolist(), solution.fit.explains) == ([2.5], True)
+    assert (solution.x.tolist(), solution.goodness_of_fit.explains) == ([2.5], True)
     assert "(best of 2 starts)" in solution.message
     assert {entry.note for entry in solution.history} == {"", "start 2 of at most 3: best fit x 1.25"}
     poor = Carrying(*there, [[2.5], [2.1]], [[2.1]], [[3.2], [2.2]], [[2.2]])
@@ -350,8 +350,11 @@ def test_a_recording_that_its_torques_as_they_are_cannot_follow_has_the_reason_i
         return SimpleNamespace(disturbed=True, weighted_by_sensors=lambda: plain)
 
     fitted = solve(MadeUp(misfit(lambda x: 1.0)), Steps())
-    assert replace(fitted, evaluation=smoothed, problem=known(True)).predicted == ("plain a", "plain b")
-    assert replace(fitted, evaluation=smoothed, problem=known(False)).predicted == ({"episode": "a"}, "b falls")
+    assert replace(fitted, evaluation=smoothed, problem=known(True)).episode_predictions == ("plain a", "plain b")
+    assert replace(fitted, evaluation=smoothed, problem=known(False)).episode_predictions == (
+        {"episode": "a"},
+        "b falls",
+    )
     calm = SimpleNamespace(disturbed=False)
-    assert replace(fitted, evaluation=smoothed, problem=calm).predicted == ("smoothed a", "smoothed b")
-    assert replace(fitted, evaluation=None, problem=calm).predicted == ()
+    assert replace(fitted, evaluation=smoothed, problem=calm).episode_predictions == ("smoothed a", "smoothed b")
+    assert replace(fitted, evaluation=None, problem=calm).episode_predictions == ()

@@ -9,10 +9,10 @@ import pytest
 from made_problems import MadeUp, Steps, linear
 
 from yid_ocp.errors import DataError, SolverError
-from yid_ocp.problem.unknowns import soft_logarithm
+from yid_ocp.problem.unknown_vector import soft_logarithm
 from yid_ocp.solvers import GaussNewton, Status, solve
-from yid_ocp.solvers.gauss_newton import PATIENCE
-from yid_ocp.solvers.linear_model import promised, settled
+from yid_ocp.solvers.gauss_newton import _PATIENCE_STEPS
+from yid_ocp.solvers.linear_model import is_stationary, predicted_reduction
 
 
 def with_weak_prior(target, std=0.1, start=3.0):
@@ -29,7 +29,7 @@ def with_weak_prior(target, std=0.1, start=3.0):
 
 def test_an_unknown_clipped_to_its_bound_at_zero_comes_back():
     problem = with_weak_prior(2.0)
-    found = GaussNewton().run(problem, np.zeros(1), None)
+    found = GaussNewton().minimize_cost(problem, np.zeros(1), None)
     assert found.status == Status.CONVERGED
     assert found.x[0] == pytest.approx(2.0, abs=1e-2)
 
@@ -42,10 +42,10 @@ def test_a_short_step_beside_a_steep_row_is_no_end():
         return np.array([10 * (x[0] - 1.0), wall]), np.array([[10.0, 0.0], [-1.0, 1e9]])
 
     problem = MadeUp(rows, (3.0, 1.0), lower=-np.inf)
-    assert not settled(problem, np.array([3.0, 0.0]), problem.evaluate([3.0, 0.0]))
+    assert not is_stationary(problem, np.array([3.0, 0.0]), problem.evaluate([3.0, 0.0]))
     end = np.array([1.0, -2e-9])
-    assert settled(problem, end, problem.evaluate(end))
-    found = GaussNewton(iterations=3).run(problem, np.array([3.0, 0.0]), None)
+    assert is_stationary(problem, end, problem.evaluate(end))
+    found = GaussNewton(max_iterations=3).minimize_cost(problem, np.array([3.0, 0.0]), None)
     assert found.status != Status.CONVERGED
 
 
@@ -64,7 +64,7 @@ def test_a_short_step_beside_a_steep_row_is_no_end():
 )
 def test_a_point_is_an_end_where_no_step_within_the_bounds_promises_much(x, residual, expected):
     problem = MadeUp(lambda at, duration: (np.array(residual), np.eye(2)), (1.0, 1.0), upper=9.0, count=2)
-    assert settled(problem, np.array(x), problem.evaluate(x)) is expected
+    assert is_stationary(problem, np.array(x), problem.evaluate(x)) is expected
 
 
 @pytest.mark.parametrize(
@@ -74,14 +74,14 @@ def test_a_point_is_an_end_where_no_step_within_the_bounds_promises_much(x, resi
 )
 def test_no_step_longer_than_the_unknowns_size_counts(size, slope, residual, expected):
     problem = MadeUp(linear([[slope]], [residual]), lower=-np.inf, scales=(size,))
-    assert settled(problem, np.zeros(1), problem.evaluate([0.0])) is expected
+    assert is_stationary(problem, np.zeros(1), problem.evaluate([0.0])) is expected
 
 
 def test_what_nothing_informs_keeps_no_search_from_its_end():
     problem = MadeUp(lambda x, duration: (np.array([50.0]), np.array([[1e-9]])), (1.0,))
-    assert settled(problem, np.ones(1), problem.evaluate([1.0]))
+    assert is_stationary(problem, np.ones(1), problem.evaluate([1.0]))
     none = MadeUp(linear(np.zeros((2, 0)), [3.0, 3.0]), ())
-    assert settled(none, np.zeros(0), none.evaluate(np.zeros(0)))
+    assert is_stationary(none, np.zeros(0), none.evaluate(np.zeros(0)))
 
 
 def test_a_part_of_a_large_cost_is_as_little_as_a_part_of_the_noise():
@@ -89,13 +89,13 @@ def test_a_part_of_a_large_cost_is_as_little_as_a_part_of_the_noise():
         return np.array([1.0, 100.0]), np.array([[1.0], [0.0]])
 
     problem = MadeUp(rows, (1.0,), lower=-np.inf)
-    assert settled(problem, np.ones(1), problem.evaluate([1.0]))
+    assert is_stationary(problem, np.ones(1), problem.evaluate([1.0]))
 
 
 def test_the_promise_of_a_step_is_the_fall_of_a_linear_models_cost():
     jacobian, residual, step = np.array([[1.0, 2.0], [0.5, -1.0]]), np.array([3.0, -1.0]), np.array([0.2, -0.4])
     after = residual + jacobian @ step
-    assert promised(jacobian, residual, step) == pytest.approx(0.5 * (residual @ residual - after @ after))
+    assert predicted_reduction(jacobian, residual, step) == pytest.approx(0.5 * (residual @ residual - after @ after))
 
 
 def test_a_method_that_stops_short_has_not_converged_whatever_it_says():
@@ -117,14 +117,14 @@ def failing_beyond(limit):
 
 def test_a_horizon_too_short_for_a_filter_is_left_out():
     problem = MadeUp(failing_beyond(3.0), count=10)
-    whole = problem.shortened
+    whole = problem.truncated_to
 
     def shortened(duration):
         if duration < 2.0:
             raise DataError("0.6 s of efforts are too short for a filter of 8 Hz")
         return whole(duration)
 
-    problem.shortened = shortened
+    problem.truncated_to = shortened
     solver = Steps([[2.0]], [[2.0]])
     solution = solve(problem, solver)
     assert [duration for _, duration in solver.runs] == [2.5, 10.0]
@@ -157,14 +157,14 @@ def winding(steepness, pull, wound=40.0, size=0.2):
 def test_steps_that_are_worth_nothing_beside_the_noise_are_an_end():
     """The pull is worth 0.4 of a standard deviation; a hundredth of it is gained in twenty steps."""
     problem = winding(1e4, 0.4, size=1.0)
-    found = solve(problem, GaussNewton(iterations=100), start=[0.0, 0.0], restarts=False)
+    found = solve(problem, GaussNewton(max_iterations=100), initial_unknowns=[0.0, 0.0], restarts=False)
     assert found.status == Status.CONVERGED
-    assert found.iterations == PATIENCE
+    assert found.n_iterations == _PATIENCE_STEPS
     assert "moved nothing by a tenth of its standard deviation" in found.message
 
 
 @pytest.mark.parametrize(("steepness", "pull"), [(1e4, 2.5), (1e2, 1.5)], ids=["worth more", "quick enough"])
 def test_what_is_worth_a_standard_deviation_or_is_gained_is_none(steepness, pull):
     problem = winding(steepness, pull, size=1.0)
-    found = GaussNewton(iterations=PATIENCE + 5).run(problem, np.zeros(2), None)
-    assert not found.worn_out
+    found = GaussNewton(max_iterations=_PATIENCE_STEPS + 5).minimize_cost(problem, np.zeros(2), None)
+    assert not found.stopped_at_noise_level

@@ -12,34 +12,34 @@ from made_problems import MadeUp, linear
 from small_problems import PENDULUM, pendulum_step, taken
 
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.null_test import GapLimits, residual_series
-from yid_ocp.solvers.judgement import (
-    ENOUGH_CHANNELS,
-    MOST_ASKED,
-    NO_FIT,
-    Estimate,
-    Fit,
-    bound_side,
-    by_profile,
-    counting_misfit,
-    estimates,
-    judge_fit,
-    one_sided,
-    parameter_names,
-    standing_std,
-    stands_by_itself,
-    typical_sizes,
-    uncertainty,
-    verdict,
+from yid_ocp.problem.null_test import GapCriteria, residual_channels
+from yid_ocp.solvers.uncertainty import (
+    _MAX_CHECKED_PARAMETERS,
+    _MIN_CLUSTER_CHANNELS,
+    _UNKNOWN_FIT,
+    GoodnessOfFit,
+    ParameterEstimate,
+    _bound_side,
+    _cost_checked_std,
+    _misfit_sandwich_covariance,
+    _one_sided_interval,
+    assess_goodness_of_fit,
+    covariance_and_chi2,
+    is_std_sufficient,
+    parameter_estimates,
+    parameter_unknown_names,
+    parameter_verdict,
+    typical_parameter_sizes,
+    with_profile_interval,
 )
 
-GOOD, BAD = Fit(1.0, 0.5, True), Fit(9.0, 0.0, False)
+GOOD, BAD = GoodnessOfFit(1.0, 0.5, True), GoodnessOfFit(9.0, 0.0, False)
 
 # -- verdicts ---------------------------------------------------------------------------------------------------------
 
 
 def stiffness(value, std, said, lower=0.0, upper=math.inf):
-    return Estimate(value, std, "N m/rad", 3.0, lower, upper, True, said)
+    return ParameterEstimate(value, std, "N m/rad", 3.0, lower, upper, True, said)
 
 
 @pytest.mark.parametrize(
@@ -62,13 +62,13 @@ def stiffness(value, std, said, lower=0.0, upper=math.inf):
     ],
 )
 def test_no_verdict_and_no_spread_contradicts_a_profile(value, std, said, interval, expected, spread):
-    found = by_profile(stiffness(value, std, said), interval, 10.0)
+    found = with_profile_interval(stiffness(value, std, said), interval, 10.0)
     assert (found.verdict, found.interval, found.value) == (expected, interval, value)
     assert found.std == pytest.approx(spread, rel=1e-12)
 
 
 def test_an_upper_bound_within_reach_ends_an_interval():
-    found = by_profile(stiffness(8.0, 2.0, "weak", upper=10.0), (5.0, None), 5.0)
+    found = with_profile_interval(stiffness(8.0, 2.0, "weak", upper=10.0), (5.0, None), 5.0)
     assert (found.verdict, found.std) == ("weak", 2.0)
 
 
@@ -82,7 +82,7 @@ def test_an_upper_bound_within_reach_ends_an_interval():
     ],
 )
 def test_small_and_weak_values_do_not_stand_by_themselves(value, std, said, expected):
-    assert stands_by_itself(stiffness(value, std, said)) is expected
+    assert is_std_sufficient(stiffness(value, std, said)) is expected
 
 
 @pytest.mark.parametrize(
@@ -104,14 +104,14 @@ def test_small_and_weak_values_do_not_stand_by_themselves(value, std, said, expe
     ],
 )
 def test_a_verdict_goes_by_the_relative_standard_deviation(value, std, said):
-    assert verdict(value, std) == said
+    assert parameter_verdict(value, std) == said
 
 
 # -- uncertainty ------------------------------------------------------------------------------------------------------
 
 
 def judged(problem, at=None):
-    return uncertainty(problem, problem.evaluate(np.zeros(len(problem.start)) if at is None else np.array(at)))
+    return covariance_and_chi2(problem, problem.evaluate(np.zeros(len(problem.start)) if at is None else np.array(at)))
 
 
 def test_the_covariance_is_the_inverse_of_the_information():
@@ -180,7 +180,7 @@ def test_a_direction_between_two_unknowns_is_known_though_neither_is():
 @pytest.mark.parametrize("ok", [True, False])
 def test_without_a_jacobian_nothing_is_known(ok):
     problem = MadeUp(linear(np.eye(2)) if ok else lambda x, duration: None, (1.0, 1.0), count=2)
-    covariance, chi2 = uncertainty(problem, problem.evaluate(np.zeros(2), derivatives=False))
+    covariance, chi2 = covariance_and_chi2(problem, problem.evaluate(np.zeros(2), derivatives=False))
     assert covariance.shape == (2, 2)
     assert np.all(np.isnan(covariance))
     assert math.isnan(chi2)
@@ -214,7 +214,7 @@ def test_without_a_jacobian_nothing_is_known(ok):
     ],
 )
 def test_what_may_be_said_of_a_parameter(value, std, scale, explains, at_bound, said):
-    assert verdict(value, std, scale=scale, explains=explains, at_bound=at_bound) == said
+    assert parameter_verdict(value, std, scale=scale, explains=explains, at_bound=at_bound) == said
 
 
 # -- does the model explain the data ----------------------------------------------------------------------------------
@@ -232,26 +232,26 @@ def of_size(square, count=400, **more):
 )
 def test_a_fit_explains_what_is_not_surely_and_relevantly_more_than_noise(square, count, explains):
     problem = of_size(square, count)
-    assert judge_fit(problem, problem.evaluate([1.0])).explains is explains
+    assert assess_goodness_of_fit(problem, problem.evaluate([1.0])).explains is explains
 
 
 def test_a_fit_is_judged_by_the_limits_of_a_diagnosis():
     problem = of_size(1.2)
     found = problem.evaluate([1.0])
-    assert judge_fit(problem, found, GapLimits(level=1e-6)).explains
-    assert judge_fit(problem, found, GapLimits(smallest_gap=0.5)).explains
-    half = judge_fit(problem, found, GapLimits(noise_fraction=0.5))
-    assert half.chi2_per_dof == pytest.approx(4 * judge_fit(problem, found).chi2_per_dof)
+    assert assess_goodness_of_fit(problem, found, GapCriteria(significance_level=1e-6)).explains
+    assert assess_goodness_of_fit(problem, found, GapCriteria(min_excess_chi2=0.5)).explains
+    half = assess_goodness_of_fit(problem, found, GapCriteria(noise_fraction=0.5))
+    assert half.chi2_per_dof == pytest.approx(4 * assess_goodness_of_fit(problem, found).chi2_per_dof)
 
 
 def test_a_cost_that_is_not_whitened_is_judged_in_units_of_noise():
     problem = of_size(9.0 * 0.01**2, weighting="paper", noise=0.01)
-    assert judge_fit(problem, problem.evaluate([1.0])).chi2_per_dof == pytest.approx(9.0, rel=0.01)
+    assert assess_goodness_of_fit(problem, problem.evaluate([1.0])).chi2_per_dof == pytest.approx(9.0, rel=0.01)
 
 
 def test_without_a_rollout_nothing_is_explained():
     problem = MadeUp(lambda x, duration: None, count=3)
-    assert judge_fit(problem, problem.evaluate([1.0])) is NO_FIT
+    assert assess_goodness_of_fit(problem, problem.evaluate([1.0])) is _UNKNOWN_FIT
 
 
 # -- misfit -----------------------------------------------------------------------------------------------------------
@@ -264,8 +264,8 @@ def constant(residual):
 
 def widened(problem):
     found = problem.evaluate([0.0])
-    covariance, _ = uncertainty(problem, found)
-    return math.sqrt(counting_misfit(problem, found, covariance)[0, 0] / covariance[0, 0])
+    covariance, _ = covariance_and_chi2(problem, found)
+    return math.sqrt(_misfit_sandwich_covariance(problem, found, covariance)[0, 0] / covariance[0, 0])
 
 
 def test_a_misfit_that_stays_for_long_counts_as_one_and_one_that_alternates_as_many():
@@ -282,8 +282,8 @@ def test_a_misfit_of_one_block_or_of_none_widens_nothing():
         MadeUp(linear(np.zeros((3, 0))), ()),
     ):
         found = problem.evaluate(np.zeros(len(problem.start)))
-        covariance, _ = uncertainty(problem, found)
-        np.testing.assert_array_equal(counting_misfit(problem, found, covariance), covariance)
+        covariance, _ = covariance_and_chi2(problem, found)
+        np.testing.assert_array_equal(_misfit_sandwich_covariance(problem, found, covariance), covariance)
 
 
 def test_noise_alone_is_counted_about_once():
@@ -297,20 +297,20 @@ def test_a_constant_misfit_of_every_channel_of_a_recording_counts_as_one_each(ur
     options = ProblemOptions(path_cutoff=np.inf, weak_prior_factor=0.0)
     recordings = [taken(step, seed, camera=False, steps=200) for seed in range(3)]
     problem = EstimationProblem(step, recordings, ("elbow.mass",), options)
-    found, series = problem.evaluate(problem.start), residual_series(problem)
+    found, series = problem.evaluate(problem.initial_unknowns), residual_channels(problem)
     offset = np.random.default_rng(2).choice([-3.0, 3.0], len(series))
     moved = np.zeros(len(found.residual))
     for own, size in zip(series, offset, strict=True):
-        moved[own.rows] = size
+        moved[own.residual_indices] = size
     found = replace(found, residual=moved)
     slope = found.jacobian[:, 0]
-    scores = np.array([size * slope[own.rows].sum() for own, size in zip(series, offset, strict=True)])
+    scores = np.array([size * slope[own.residual_indices].sum() for own, size in zip(series, offset, strict=True)])
     scores -= scores.mean()
     expected = scores @ scores * len(series) / (len(series) - 1) / (slope @ slope) ** 2
-    plain, _ = uncertainty(problem, found)
-    assert len(series) >= ENOUGH_CHANNELS
+    plain, _ = covariance_and_chi2(problem, found)
+    assert len(series) >= _MIN_CLUSTER_CHANNELS
     assert expected > 3 * plain[0, 0]
-    assert counting_misfit(problem, found, plain)[0, 0] == pytest.approx(expected)
+    assert _misfit_sandwich_covariance(problem, found, plain)[0, 0] == pytest.approx(expected)
 
 
 # -- what the cost bears out ------------------------------------------------------------------------------------------
@@ -329,7 +329,7 @@ def test_a_standard_deviation_that_the_cost_does_not_bear_out_grows(top, kept):
     problem = MadeUp(saturating(top), lower=-np.inf, scales=(1.0,))
     x = np.zeros(1)
     found = problem.evaluate(x)
-    std = standing_std(problem, x, found, uncertainty(problem, found)[0])[0]
+    std = _cost_checked_std(problem, x, found, covariance_and_chi2(problem, found)[0])[0]
     # at 1.96 standard deviations the cost is that of a saturated prediction: 0.5^2 in place of 3.84
     assert std == pytest.approx(1.0 if kept else 1.96 / 0.5, rel=0.01)
 
@@ -338,7 +338,7 @@ def test_a_well_known_parameter_is_not_asked_again():
     problem = MadeUp(linear([[100.0]]), (1.0,))
     found = problem.evaluate([1.0])
     before = len(problem.asked)
-    standing_std(problem, np.ones(1), found, uncertainty(problem, found)[0] * 1e-8)
+    _cost_checked_std(problem, np.ones(1), found, covariance_and_chi2(problem, found)[0] * 1e-8)
     assert len(problem.asked) == before
 
 
@@ -347,14 +347,14 @@ def test_a_well_known_parameter_is_not_asked_again():
 
 @pytest.mark.parametrize(("value", "side"), [(0.0, -1), (1e-5, -1), (1e-3, 0), (5.0, 0), (10.0 - 1e-5, 1), (10.0, 1)])
 def test_a_value_near_its_bound_lies_at_it(value, side):
-    assert bound_side(value, 0.0, 10.0, 1.0) == side
+    assert _bound_side(value, 0.0, 10.0, 1.0) == side
 
 
 def test_the_interval_of_a_parameter_at_its_bound_has_one_side():
-    assert one_sided(0.0, 2.0, -1, 0.0) == pytest.approx((0.0, 1.645 * 2.0), abs=1e-3)
-    assert one_sided(9.0, 2.0, 1, 0.0) == pytest.approx((9.0 - 1.645 * 2.0, 9.0), abs=1e-3)
+    assert _one_sided_interval(0.0, 2.0, -1, 0.0) == pytest.approx((0.0, 1.645 * 2.0), abs=1e-3)
+    assert _one_sided_interval(9.0, 2.0, 1, 0.0) == pytest.approx((9.0 - 1.645 * 2.0, 9.0), abs=1e-3)
     # far beyond the bound only the slope counts: slope d = 2.71/2
-    steep = one_sided(0.0, 2.0, -1, 100.0)
+    steep = _one_sided_interval(0.0, 2.0, -1, 100.0)
     assert steep[1] == pytest.approx(1.353 / 100.0, rel=0.01)
 
 
@@ -363,7 +363,7 @@ def test_the_interval_of_a_parameter_at_its_bound_has_one_side():
 
 def estimated(problem, x, covariance, fit=GOOD):
     x = np.asarray(x, float)
-    return estimates(problem, x, problem.evaluate(x), np.asarray(covariance, float), fit)
+    return parameter_estimates(problem, x, problem.evaluate(x), np.asarray(covariance, float), fit)
 
 
 def test_every_parameter_has_its_estimate_and_fixed_ones_are_said_to_be():
@@ -419,12 +419,15 @@ def test_a_stiffness_well_known_to_be_near_zero_is_found():
 
 
 def test_the_size_that_a_parameter_might_have():
-    assert typical_sizes(MadeUp(linear(np.eye(1)), (3.0,)), np.ones(1))["k0"] == 3.0
-    assert typical_sizes(MadeUp(linear(np.eye(1)), (3.0,), upper=8.0), np.ones(1))["k0"] == 4.0
-    assert typical_sizes(MadeUp(linear(np.eye(1)), (3.0,), upper=8.0, priors={"k0": 0.5}), np.ones(1))["k0"] == 0.5
+    assert typical_parameter_sizes(MadeUp(linear(np.eye(1)), (3.0,)), np.ones(1))["k0"] == 3.0
+    assert typical_parameter_sizes(MadeUp(linear(np.eye(1)), (3.0,), upper=8.0), np.ones(1))["k0"] == 4.0
+    assert (
+        typical_parameter_sizes(MadeUp(linear(np.eye(1)), (3.0,), upper=8.0, priors={"k0": 0.5}), np.ones(1))["k0"]
+        == 0.5
+    )
     three = MadeUp(linear(np.eye(2)), (3.0, 5.0), fixed=(9.0,))
-    assert typical_sizes(three, np.array([1.0, 5.0]))["k0"] == 7.0
-    assert typical_sizes(three, np.array([1.0, 0.0]))["k0"] == 9.0
+    assert typical_parameter_sizes(three, np.array([1.0, 5.0]))["k0"] == 7.0
+    assert typical_parameter_sizes(three, np.array([1.0, 0.0]))["k0"] == 9.0
 
 
 @pytest.mark.parametrize(("scale", "expected"), [(1e-7, "not_identifiable"), (1.0, "identifiable")])
@@ -443,14 +446,14 @@ def test_rounding_below_zero_is_no_variance_and_no_unknowns_need_none():
 def test_initial_states_are_no_parameters_and_a_parameter_of_the_start_is_one():
     names = ("k", "start.speed_scale", "rest[run]", "start.q.elbow[run]", "start.p.elbow[run]")
     problem = SimpleNamespace(names=names, shared=("k", "start.speed_scale"), local=("rest",))
-    assert parameter_names(problem) == names[:3]
+    assert parameter_unknown_names(problem) == names[:3]
 
 
-@pytest.mark.parametrize(("count", "asked"), [(MOST_ASKED, True), (MOST_ASKED + 1, False)])
+@pytest.mark.parametrize(("count", "asked"), [(_MAX_CHECKED_PARAMETERS, True), (_MAX_CHECKED_PARAMETERS + 1, False)])
 def test_of_many_parameters_none_is_asked(count, asked):
     problem = MadeUp(linear(np.eye(count)), np.ones(count))
     x = np.ones(count)
     found = problem.evaluate(x)
     before = len(problem.asked)
-    standing_std(problem, x, found, np.eye(count))
+    _cost_checked_std(problem, x, found, np.eye(count))
     assert (len(problem.asked) > before) is asked

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from yid_ocp.solvers import words
+from yid_ocp.solvers import fit_messages
 
 
 @pytest.mark.parametrize(
@@ -20,7 +20,7 @@ from yid_ocp.solvers import words
     ],
 )
 def test_an_interval_may_have_open_ends(interval, expected):
-    assert words.interval_words(*interval) == expected
+    assert fit_messages.interval_text(*interval) == expected
 
 
 @pytest.mark.parametrize(
@@ -36,23 +36,23 @@ def test_an_interval_may_have_open_ends(interval, expected):
     ],
 )
 def test_a_value_is_told_with_what_is_known_of_it(std, interval, expected):
-    assert words.parameter_words(22.1234, std, interval) == expected
+    assert fit_messages.parameter_text(22.1234, std, interval) == expected
 
 
 @pytest.mark.parametrize("chi2", [None, math.nan])
 @pytest.mark.parametrize("explains", [True, False])
 def test_a_fit_without_a_misfit_is_not_judged(chi2, explains):
-    assert words.fit_words(chi2, explains) == "whether the model explains the recordings is not known"
+    assert fit_messages.fit_message(chi2, explains) == "whether the model explains the recordings is not known"
 
 
 def test_a_fit_is_told_with_its_misfit_and_what_follows():
-    assert words.fit_words(1.0449, True).endswith("to within their noise (chi2 per degree of freedom is 1.04)")
-    bad = words.fit_words(9.0, False)
+    assert fit_messages.fit_message(1.0449, True).endswith("to within their noise (chi2 per degree of freedom is 1.04)")
+    bad = fit_messages.fit_message(9.0, False)
     assert "does not explain the recordings (chi2 per degree of freedom is 9," in bad
-    assert bad.endswith(words.REMEDY)
+    assert bad.endswith(fit_messages._DIAGNOSE_HINT)
 
 
 def test_tables_say_the_same_as_sentences():
-    assert words.VERDICT_WORDS["weak"] == "weakly determined"
-    assert words.VERDICT_WORDS["not_identifiable"] == "cannot be found"
-    assert set(words.VERDICT_WORDS) == set(words.PREDICATES)
+    assert fit_messages.VERDICT_WORDS["weak"] == "weakly determined"
+    assert fit_messages.VERDICT_WORDS["not_identifiable"] == "cannot be found"
+    assert set(fit_messages.VERDICT_WORDS) == set(fit_messages.VERDICT_PREDICATES)

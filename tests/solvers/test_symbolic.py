@@ -12,15 +12,15 @@ from small_problems import PENDULUM, STEPS, pendulum_step, taken
 
 import yid_ocp
 from yid_ocp.errors import SolverError
+from yid_ocp.integrator.nlp_stage import nlp_stage
 from yid_ocp.integrator.rollout import simulate
-from yid_ocp.integrator.stage import stage
-from yid_ocp.integrator.statics import Statics
+from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.solvers import GaussNewton, MultipleShooting, Status, solve
-from yid_ocp.solvers.program import Block, NonlinearProgram
-from yid_ocp.solvers.symbolic import transcribe, unknown_vector
-from yid_ocp.solvers.terms import Local, Residual, Term
-from yid_ocp.solvers.transcription import Transcription
+from yid_ocp.solvers.compiled_transcription import CompiledTranscription
+from yid_ocp.solvers.nonlinear_program import NonlinearProgram, VectorBlock
+from yid_ocp.solvers.program_terms import LocalFunction, ProgramTerm, ResidualTerm
+from yid_ocp.solvers.symbolic_transcription import transcribe, unknowns_from_program
 
 TRACKED = {"feedback": "proportional", "gains": (9.0,)}
 CASES = {
@@ -97,7 +97,7 @@ def test_along_a_rollout_it_has_the_problems_cost_residual_and_no_defects(proble
     assert np.abs(defects).max() < 1e-7
     if math.isinf(problem.options.huber_threshold):
         np.testing.assert_allclose(np.sort(residual.ravel()), np.sort(evaluation.residual), rtol=0, atol=1e-8)
-    np.testing.assert_allclose(unknown_vector(problem, program, w), x, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(unknowns_from_program(problem, program, w), x, rtol=0, atol=1e-9)
 
 
 def test_its_reduced_gradient_is_the_problems(problem):
@@ -107,7 +107,7 @@ def test_its_reduced_gradient_is_the_problems(problem):
     w, _ = rolled_out(problem, program, x)
     gradient, jacobian = values_at(program, w, program.grad_f, program.jac_g)
     own = [program.variables["theta"].index.ravel()] if problem.shared else []
-    rows, n = list(problem.predictor.start_rows), problem.step.sizes["n"]
+    rows, n = list(problem.predictor.estimated_state_indices), problem.step.sizes["n"]
     for episode in problem.episodes:
         if problem.local:
             own.append(program.variables[f"local[{episode.name}]"].index.ravel())
@@ -123,7 +123,8 @@ def test_its_reduced_gradient_is_the_problems(problem):
     if rows:
         # the program holds the first state where the problem holds its offset from rest, which moves with theta
         begin = [
-            problem.start_state(e, problem.split(x, i)[0]).by_unknowns[rows] for i, e in enumerate(problem.episodes)
+            problem.initial_state(e, problem.split(x, i)[0]).state_sensitivity[rows]
+            for i, e in enumerate(problem.episodes)
         ]
         count = len(problem.shared)
         for i, by in enumerate(begin):
@@ -136,30 +137,30 @@ def test_its_reduced_gradient_is_the_problems(problem):
 def test_it_is_the_kernels_transcription(make_problem):
     """Values and Jacobians of equations and residuals agree to 1e-9; starts do once the rest is eliminated."""
     problem = make_problem(duration=0.15)
-    other = Transcription(problem, 1)
+    other = CompiledTranscription(problem, 1)
     program = transcribe(problem)
     rng = np.random.default_rng(1)
-    small = other.guess(problem.start)
+    small = other.initial_guess(problem.start)
     small = small + 1e-3 * rng.standard_normal(len(small))
     layout, n, count = other.layouts[0], other.n, len(problem.shared)
-    place = np.zeros(other.size, int)
+    place = np.zeros(other.n_variables, int)
     place[:count] = program.block("theta").index.ravel()
-    place[layout.state[:, :n]], place[layout.state[:, n : 2 * n]] = (
+    place[layout.state_indices[:, :n]], place[layout.state_indices[:, n : 2 * n]] = (
         program.block("q").index.T,
         program.block("p").index.T,
     )
-    place[layout.multipliers] = program.block("lam").index.T
-    w = program.start.copy()
+    place[layout.multiplier_indices] = program.block("lam").index.T
+    w = program.initial_guess.copy()
     w[place] = small
     theta = problem.split(small[:count], 0)[0]
-    rest = problem.start_state(problem.episodes[0], theta, guess=other.warm[0]).rest
+    rest = problem.initial_state(problem.episodes[0], theta, guess=other.equilibrium_guesses[0]).rest
     at = program.block("rest").index.ravel()
     w[at] = np.concatenate([rest.state[list(problem.functions.statics.unknown)], rest.constraint_force])
     expressions = (program.g, program.jac_g, program.residual, program.jac_r, program.f)
     g, jac_g, r, jac_r, f = values_at(program, w, *expressions)
     defects, slopes = other.constraints(small, True)
     residual, by_w, cost = other.residual(small, True)
-    begins, first = program.constraints[0].size, len(defects) - program.constraints[1].size
+    begins, first = program.constraint_terms[0].n_values, len(defects) - program.constraint_terms[1].n_values
 
     def close(actual, expected):
         scale = max(1.0, np.abs(expected).max())
@@ -181,9 +182,12 @@ def test_both_forms_have_one_solution(urdf_folder):
     problem = problem_of(urdf_folder, "driven, proportional", seeds=(1,))
     tight = {"tol": 1e-12, "acceptable_iter": 0, "mu_init": 1e-12, "mu_target": 1e-15}
     forms = [MultipleShooting(transcription=form, ipopt=tight) for form in ("symbolic", "compiled")]
-    found = [one.run(problem, problem.start, None) for one in (*forms, MultipleShooting(hessian="exact", ipopt=tight))]
+    found = [
+        one.minimize_cost(problem, problem.start, None)
+        for one in (*forms, MultipleShooting(hessian="exact", ipopt=tight))
+    ]
     assert [one.status for one in found] == [Status.CONVERGED] * 3, [one.message for one in found]
-    std = np.sqrt(np.diag(solve(problem, GaussNewton(), start=found[1].x, restarts=False).covariance))
+    std = np.sqrt(np.diag(solve(problem, GaussNewton(), initial_unknowns=found[1].x, restarts=False).covariance))
     for one in (found[0], found[2]):
         assert np.all(np.abs(one.x - found[1].x) <= 1e-9 * np.maximum(std, np.abs(one.x)))
         assert one.history[-1].cost == pytest.approx(found[1].history[-1].cost, rel=1e-9)
@@ -201,7 +205,7 @@ def test_internal_coordinates_are_among_the_states(paper_systems, recording, one
     )
     program = transcribe(problem)
     assert program.block("z").index.shape == (step.sizes["nz"], 6)
-    x = problem.start * 4
+    x = problem.initial_unknowns * 4
     w, evaluation = rolled_out(problem, program, x)
     cost, defects = values_at(program, w, program.f, program.g)
     assert cost.item() == pytest.approx(evaluation.cost, rel=1e-8)
@@ -223,7 +227,7 @@ def test_it_solves_what_gauss_newton_solves(urdf_folder, case):
     problem = problem_of(urdf_folder, case)
     solution = solve(problem, MultipleShooting(hessian="exact", ipopt={"acceptable_iter": 0}), restarts=False)
     assert solution.status == Status.CONVERGED, solution.message
-    single = solve(problem, GaussNewton(cost_tolerance=1e-12), start=solution.x, restarts=False)
+    single = solve(problem, GaussNewton(cost_tolerance=1e-12), initial_unknowns=solution.x, restarts=False)
     assert single.cost == pytest.approx(solution.cost, rel=1e-7)
     assert solution.cost < 0.97 * problem.evaluate(problem.start).cost
 
@@ -236,7 +240,7 @@ def test_what_it_does_not_do_is_refused(urdf_folder):
     step = pendulum_step(urdf_folder)
     with pytest.raises(SolverError, match="two recordings are called 'one'"):
         transcribe(EstimationProblem(step, [taken(step, seed, name="one") for seed in (1, 2)], ("elbow.damping",)))
-    known = ProblemOptions(recording_values={"run_1": {"elbow.damping": 0.3}})
+    known = ProblemOptions(parameters_by_recording={"run_1": {"elbow.damping": 0.3}})
     with pytest.raises(SolverError, match=r"elbow.damping is free and has a known value"):
         transcribe(EstimationProblem(step, [taken(step, 1)], ("elbow.damping",), known))
 
@@ -248,16 +252,16 @@ def test_blocks_are_named_after_what_they_hold(urdf_folder):
         program["q"]
     assert program["q[run_2]"].shape == (2, STEPS + 1)
     assert program["torque[run_1]"].shape == (1, STEPS)
-    names = program.names()
+    names = program.variable_names()
     assert len(set(names)) == len(names) == program.w.numel()
     assert names[0] == "theta.elbow.damping"
     assert "q[run_2].elbow.3" in names
-    rows = program.row_names()
+    rows = program.constraint_names()
     assert len(set(rows)) == len(rows) == program.g.numel()
     assert "step[run_1].del[shoulder].7" in rows
-    given = values_at(program, program.start, program["torque[run_1]"])[0]
+    given = values_at(program, program.initial_guess, program["torque[run_1]"])[0]
     np.testing.assert_array_equal(given, problem.episodes[0].torque.T)
-    np.testing.assert_array_equal(program.arguments["x0"], program.start)
+    np.testing.assert_array_equal(program.solver_arguments["x0"], program.initial_guess)
 
 
 # -- noise that drives the motion -------------------------------------------------------------------------------------
@@ -277,31 +281,35 @@ def test_errors_as_unknowns_have_the_likelihood_of_innovations(urdf_folder, enco
     points = tuple(g for g in made.points if not encoders or g.name == "points_camera")
     options = ProblemOptions(sensors={"joints.position": SensorOptions(use=encoders)}, **feedback)
     first = EstimationProblem(step, [replace(made, joints=group, points=points)], ("elbow.damping",), options)
-    x, rng = first.start, np.random.default_rng(5)
-    episode, errors = first.episodes[0], first.episodes[0].errors
+    x, rng = first.initial_unknowns, np.random.default_rng(5)
+    episode, errors = first.episodes[0], first.episodes[0].input_errors
     # measured is what an open loop does, which is then what the tracking filter follows, and some noise of all kinds
-    plain = first.on([replace(episode, feedback=None)], ()).evaluate(x).episodes[0]
-    if episode.feedback is not None:
-        index = episode.feedback.index
-        episode = replace(episode, feedback=replace(episode.feedback, reference=plain.rollout.state[:-1, index]))
+    plain = first.with_episodes([replace(episode, tracking_feedback=None)], ()).evaluate(x).episode_predictions[0]
+    if episode.tracking_feedback is not None:
+        index = episode.tracking_feedback.state_indices
+        episode = replace(
+            episode, tracking_feedback=replace(episode.tracking_feedback, reference=plain.rollout.state[:-1, index])
+        )
     samples = tuple(
         replace(
             s,
             value=y + size * 1e-4 * rng.standard_normal(y.shape),
-            weight=np.where(s.seen, 1e4 / size, 0.0),
+            weight=np.where(s.is_used, 1e4 / size, 0.0),
         )
-        for s, y in zip(episode.samples, plain.predicted, strict=True)
+        for s, y in zip(episode.measurements, plain.predicted_outputs, strict=True)
     )
-    wrong = errors.torque_std * rng.standard_normal(len(np.unique(errors.sample)))[errors.sample][:, None]
-    episode = replace(episode, samples=samples, torque=episode.torque + wrong + 1.5 * errors.bias_std)
-    problem = first.on([episode], ())
-    expected = problem.weighted_at(x).evaluate(x).cost
-    assert problem.weighted_by_sensors().evaluate(x).cost > 3 * expected
+    wrong = (
+        errors.torque_std * rng.standard_normal(len(np.unique(errors.sample_of_step)))[errors.sample_of_step][:, None]
+    )
+    episode = replace(episode, measurements=samples, torque=episode.torque + wrong + 1.5 * errors.torque_bias_std)
+    problem = first.with_episodes([episode], ())
+    expected = problem.whitened_at(x).evaluate(x).cost
+    assert problem.whitened_by_sensor_noise().evaluate(x).cost > 3 * expected
     program = transcribe(problem)
-    arguments = program.arguments
+    arguments = program.solver_arguments
     theta = program.block("theta").index.ravel()
     arguments["lbx"][theta] = arguments["ubx"][theta] = x
-    solver = program.solver("ipopt", "exact", ipopt={"print_level": 0, "sb": "yes", "tol": 1e-9, "max_iter": 50})
+    solver = program.make_solver("ipopt", "exact", ipopt={"print_level": 0, "sb": "yes", "tol": 1e-9, "max_iter": 50})
     found = solver(**arguments)
     assert solver.stats()["success"], solver.stats()["return_status"]
     # beside encoders no torque is taken as better than a thousandth: errors are then not small enough to be linear;
@@ -309,21 +317,21 @@ def test_errors_as_unknowns_have_the_likelihood_of_innovations(urdf_folder, enco
     exact = not encoders and feedback["feedback"] != "lqr"
     assert float(found["f"]) == pytest.approx(expected, rel=1e-4 if exact else 4e-3)
     assert ("angle_error[run_3]" in program.variables) is (not encoders and feedback["feedback"] != "none")
-    assert program.block("torque_error").index.shape == (1, len(np.unique(errors.sample)))
+    assert program.block("torque_error").index.shape == (1, len(np.unique(errors.sample_of_step)))
 
 
 def test_a_fit_among_noise_is_judged_by_its_likelihood(urdf_folder):
     step = pendulum_step(urdf_folder, driven=("shoulder",))
     problem = EstimationProblem(step, [taken(step, 1)], ("elbow.damping", "elbow.stiffness"), ProblemOptions(**TRACKED))
-    assert problem.disturbed
+    assert problem.has_process_noise
     single = solve(problem, GaussNewton(cost_tolerance=1e-10), restarts=False)
     solution = solve(problem, MultipleShooting(), restarts=False)
     left_out = solve(problem, MultipleShooting(transcription="compiled"), restarts=False)
     assert "without the noise" not in solution.message
     assert "without the noise" in left_out.message
     assert solution.cost == pytest.approx(single.cost, rel=0.02)
-    assert left_out.problem.innovations == (None,)
-    assert solution.problem.innovations != (None,)
+    assert left_out.problem.whitening_filters == (None,)
+    assert solution.problem.whitening_filters != (None,)
 
 
 # -- without measurements ---------------------------------------------------------------------------------------------
@@ -332,38 +340,40 @@ def test_a_fit_among_noise_is_judged_by_its_likelihood(urdf_folder):
 def test_a_motion_is_planned_with_the_same_stages(urdf_folder):
     """Free torques bring a pendulum from rest to rest elsewhere, and the rollout under them goes there."""
     step, count = pendulum_step(urdf_folder, driven=("shoulder",)), 80
-    one, nx = stage(step.equations, step.time_step), step.sizes["nx"]
+    one, nx = nlp_stage(step.equations, step.time_step), step.sizes["nx"]
     none = ca.SX(0, 1)
     v = ca.vertcat(one.x0, one.x1, one.lam, one.u)
-    slopes = ca.horzcat(*(one.slopes[name] for name in ("x0", "x1", "lam", "u")))
+    slopes = ca.horzcat(*(one.residual_jacobians[name] for name in ("x0", "x1", "lam", "u")))
     states = np.arange((count + 1) * nx).reshape(count + 1, nx)
     torques = states.size + np.arange(count)[:, None]
     theta = step.system.parameters.vector()
     nothing = np.zeros((count, 0), int)
-    moved = Term(
+    moved = ProgramTerm(
         "step",
-        one.names,
-        Local("step", [v, none, one.theta], one.rows, slopes),
+        one.residual_names,
+        LocalFunction("step", [v, none, one.theta], one.residual, slopes),
         np.hstack([states[:-1], states[1:], torques]),
         nothing,
         np.arange(len(theta)),
     )
     u = ca.SX.sym("u")
-    effort = Term("effort", ("u",), Local("effort", [u, none, none], 0.1 * u), torques, nothing, np.zeros(0, int))
+    effort = ProgramTerm(
+        "effort", ("u",), LocalFunction("effort", [u, none, none], 0.1 * u), torques, nothing, np.zeros(0, int)
+    )
     start, end = np.zeros(4), np.array([0.6, 0.0, 0.0, 0.0])
-    rest = Statics(step).solve([0.0], theta)
+    rest = EquilibriumSolver(step).solve([0.0], theta)
     start[:2] = rest.state[:2]
-    end[1] = Statics(step).solve([0.6], theta).state[1]
+    end[1] = EquilibriumSolver(step).solve([0.6], theta).state[1]
     size = states.size + count
     lower, upper = np.full(size, -np.inf), np.full(size, np.inf)
     for at, state in ((states[0], start), (states[-1], end)):
         lower[at] = upper[at] = state
     lower[torques], upper[torques] = -8.0, 8.0
     program = NonlinearProgram(
-        {"q": Block(states[:, :2].T, PENDULUM), "u": Block(torques.T, ("shoulder",), "N m")},
+        {"q": VectorBlock(states[:, :2].T, PENDULUM), "u": VectorBlock(torques.T, ("shoulder",), "N m")},
         {},
         (moved,),
-        (Residual(effort),),
+        (ResidualTerm(effort),),
         lower,
         upper,
         np.zeros(size),
@@ -372,8 +382,8 @@ def test_a_motion_is_planned_with_the_same_stages(urdf_folder):
         ca.MX.sym("w", size),
         ca.MX.sym("p", len(theta)),
     )
-    solver = program.solver("ipopt", "exact", ipopt={"print_level": 0, "sb": "yes", "tol": 1e-10})
-    w = np.array(solver(**program.arguments)["x"]).ravel()
+    solver = program.make_solver("ipopt", "exact", ipopt={"print_level": 0, "sb": "yes", "tol": 1e-10})
+    w = np.array(solver(**program.solver_arguments)["x"]).ravel()
     assert solver.stats()["success"]
     rollout = simulate(step, theta, start, count, w[torques], np.zeros((count + 1, 0)))
     np.testing.assert_allclose(rollout.state[-1], end, atol=1e-6)

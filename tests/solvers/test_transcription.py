@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from yid_ocp.solvers.transcription import Transcription
+from yid_ocp.solvers.compiled_transcription import CompiledTranscription
 
 
 @pytest.mark.parametrize("weighting", ["whitened", "paper"])
@@ -29,9 +29,9 @@ def test_gradients_of_the_cost_agree(make_problem, weighting):
 @pytest.mark.parametrize(("interval", "initial_state"), [(1, "equilibrium"), (5, "equilibrium"), (1, "estimated")])
 def test_transcription_jacobians_match_differences(make_problem, interval, initial_state):
     problem = make_problem(duration=0.15, initial_state=initial_state)
-    transcription = Transcription(problem, interval)
+    transcription = CompiledTranscription(problem, interval)
     rng = np.random.default_rng(1)
-    w = transcription.guess(problem.start * 4)
+    w = transcription.initial_guess(problem.start * 4)
     w = w + 1e-4 * rng.normal(size=len(w))
     direction = rng.normal(size=len(w)) * np.maximum(np.abs(w), 1e-3)
     size = 1e-6
@@ -47,13 +47,13 @@ def test_transcription_jacobians_match_differences(make_problem, interval, initi
 
 def test_exact_curvature_matches_differences(make_problem):
     problem = make_problem(free=("T1.bend", "T2.bend"), duration=0.05)
-    transcription = Transcription(problem, 1)
-    w = transcription.guess(problem.start * 4)
+    transcription = CompiledTranscription(problem, 1)
+    w = transcription.initial_guess(problem.start * 4)
     rng = np.random.default_rng(2)
     weights = rng.normal(size=len(transcription.constraints(w, False)[0]))
     start_rows = problem.step.sizes["nx"]
     weights[:start_rows] = 0.0
-    hessian = transcription.curvature(w, weights)
+    hessian = transcription.constraint_hessian(w, weights)
     direction = rng.normal(size=len(w)) * np.maximum(np.abs(w), 1e-3)
     size = 1e-5
     ends = [transcription.constraints(w + sign * size * direction, True)[1].T @ weights for sign in (1, -1)]

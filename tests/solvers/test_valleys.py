@@ -29,7 +29,7 @@ def ringing(x, horizon):
 
 def disturbed(start):
     problem = MadeUp(ringing, [start], duration=2.0)
-    problem.disturbed = True
+    problem.has_process_noise = True
     return problem
 
 
@@ -38,7 +38,7 @@ def test_a_start_is_proposed_where_the_cost_rises_less_than_the_fit_predicts():
     found = base._other_valleys(problem, problem.evaluate(np.array([ALIAS])), np.array([ALIAS]))
     assert found
     assert any(abs(x[0] / ALIAS - factor) < 1e-9 for x in found for factor in (1.6, 2.5))
-    assert len(found) <= base.OTHERS
+    assert len(found) <= base._MAX_LOCAL_MINIMUM_STARTS
 
 
 def test_no_start_is_proposed_for_what_has_one_valley():
@@ -46,14 +46,14 @@ def test_no_start_is_proposed_for_what_has_one_valley():
         return np.array([(x[0] - 2.0) / 0.2, 0.0, 0.0]), np.array([[1 / 0.2], [0.0], [0.0]])
 
     problem = MadeUp(straight, [2.0])
-    problem.disturbed = True
+    problem.has_process_noise = True
     assert base._other_valleys(problem, problem.evaluate(np.array([2.0])), np.array([2.0])) == []
 
 
 @pytest.mark.parametrize("sure", [True, False], ids=["well known", "no noise drives the motion"])
 def test_nothing_is_evaluated_where_nothing_is_doubtful(sure):
     problem = disturbed(ALIAS)
-    problem.disturbed = sure
+    problem.has_process_noise = sure
     at = problem.evaluate(np.array([ALIAS]))
     if sure:
         at = type(at)(at.cost, at.residual, 1e3 * at.jacobian, at.ok, at.message, at.episodes)
@@ -64,13 +64,13 @@ def test_nothing_is_evaluated_where_nothing_is_doubtful(sure):
 
 def test_a_search_that_ends_in_the_wrong_valley_goes_on_from_the_other(monkeypatch):
     problem = disturbed(1.3)
-    problem.weighted_at = lambda x, warm=None, rounds=1: problem
+    problem.whitened_at = lambda x, warm=None, rounds=1: problem
     # no other reason to start again
     monkeypatch.setattr(base, "_good_fit", lambda *_: True)
     monkeypatch.setattr(base, "_doubtful", lambda *_: np.zeros(1, bool))
-    monkeypatch.setattr(base, "NEARBY", ())
-    alone = solve(problem, GaussNewton(iterations=40), restarts=False)
+    monkeypatch.setattr(base, "_NEARBY_START_FACTORS", ())
+    alone = solve(problem, GaussNewton(max_iterations=40), restarts=False)
     assert alone.x[0] == pytest.approx(ALIAS, rel=0.15), "by itself it stays with the alias"
-    found = solve(problem, GaussNewton(iterations=40))
+    found = solve(problem, GaussNewton(max_iterations=40))
     assert found.x[0] == pytest.approx(TRUE, rel=1e-3)
     assert any(step.note.endswith(": another valley") for step in found.history)

@@ -5,8 +5,8 @@ from functools import cache
 import pytest
 from virtual_examples import SEEDS, SYSTEMS, TRUTH, Runs
 
-from yid_ocp.virtual.engine import SimulatedRun, Simulation, simulate_in_mujoco
-from yid_ocp.virtual.motion import multisine
+from yid_ocp.virtual.mujoco_simulation import SimulationOptions, SimulationResult, simulate_in_mujoco
+from yid_ocp.virtual.multisine_motion import random_multisine
 
 
 @pytest.fixture(scope="session")
@@ -14,8 +14,8 @@ def runs() -> Runs:
     """runs(arms, time step [s], duration [s]): the paper's system, five seconds where nothing else is said."""
 
     @cache
-    def run(arms: int, step: float, duration: float = 5.0) -> SimulatedRun:
-        motion = multisine(SYSTEMS[arms], TRUTH, seed=SEEDS[arms])
-        return simulate_in_mujoco(SYSTEMS[arms], TRUTH, motion, Simulation(duration, time_step=step))
+    def run(arms: int, step: float, duration: float = 5.0) -> SimulationResult:
+        motion = random_multisine(SYSTEMS[arms], TRUTH, seed=SEEDS[arms])
+        return simulate_in_mujoco(SYSTEMS[arms], TRUTH, motion, SimulationOptions(duration, time_step=step))
 
     return run

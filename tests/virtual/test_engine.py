@@ -11,14 +11,20 @@ import pytest
 from virtual_examples import SYSTEMS, TRUTH, Runs
 
 from yid_ocp.errors import ConfigError, DataError, ModelError
-from yid_ocp.model.kinematics import forward_kinematics, rigid_body
+from yid_ocp.model.kinematics import forward_kinematics, rigid_body_derivatives
 from yid_ocp.model.system import Grasp, System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.model.y_object import y_object
-from yid_ocp.virtual.engine import Scene, SimulatedRun, Simulation, settle, simulate_in_mujoco
-from yid_ocp.virtual.mjcf import compiled_model, mujoco_xml
-from yid_ocp.virtual.motion import multisine
-from yid_ocp.virtual.posture import initial_posture
+from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
+from yid_ocp.virtual.mjcf import compile_mjcf, mujoco_xml
+from yid_ocp.virtual.mujoco_simulation import (
+    MujocoScene,
+    SimulationOptions,
+    SimulationResult,
+    settle_to_equilibrium,
+    simulate_in_mujoco,
+)
+from yid_ocp.virtual.multisine_motion import random_multisine
 
 mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
 
@@ -26,25 +32,27 @@ mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: 
 @pytest.mark.parametrize("arms", [1, 2])
 def test_grasps_hold(runs: Runs, arms: int) -> None:
     run, system = runs(arms, 1e-4), SYSTEMS[arms]
-    assert run.grasp_error.max() < 1e-4
-    q = ca.SX.sym("q", system.size)
-    phi = ca.Function("phi", [q], [system.constraints(forward_kinematics(system.mechanism.numeric(), q))])
+    assert run.grasp_separation.max() < 1e-4
+    q = ca.SX.sym("q", system.n_coordinates)
+    phi = ca.Function(
+        "phi", [q], [system.constraint_residual(forward_kinematics(system.mechanism.with_numeric_values(), q))]
+    )
     gaps = np.array([phi(row) for row in run.q]).reshape(len(run.t), -1, 3)
-    np.testing.assert_allclose(np.linalg.norm(gaps, axis=2), run.grasp_error, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(gaps, axis=2), run.grasp_separation, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("arms", [1, 2])
 def test_halving_the_inner_step_changes_little(runs: Runs, arms: int) -> None:
     coarse, fine = runs(arms, 1e-4), runs(arms, 5e-5, 2.0)
     np.testing.assert_array_equal(coarse.t[:201], fine.t)
-    assert np.linalg.norm(coarse.points[:201] - fine.points, axis=-1).max() < 5e-5
+    assert np.linalg.norm(coarse.point_positions[:201] - fine.point_positions, axis=-1).max() < 5e-5
 
 
 @pytest.mark.parametrize("arms", [1, 2])
 def test_the_motion_excites_the_object_at_moderate_speed(runs: Runs, arms: int) -> None:
     run, system = runs(arms, 1e-4), SYSTEMS[arms]
-    held = [system.points.index(grasp.held) for grasp in system.grasps]
-    extent = np.ptp(run.points[:, held], axis=0).max(-1)
+    held = [system.point_frames.index(grasp.held_frame) for grasp in system.grasps]
+    extent = np.ptp(run.point_positions[:, held], axis=0).max(-1)
     assert np.all((extent > 0.1) & (extent < 0.25))
     assert np.abs(run.v[:, list(system.driven_indices)]).max() < 1.5
     limits = [system.mechanism.joints[j].effort_limit for j in system.driven_indices]
@@ -54,11 +62,11 @@ def test_the_motion_excites_the_object_at_moderate_speed(runs: Runs, arms: int) 
 @pytest.mark.parametrize("arms", [1, 2])
 def test_starts_in_static_equilibrium_of_the_symbolic_equations(runs: Runs, arms: int) -> None:
     run, system = runs(arms, 1e-4), SYSTEMS[arms]
-    q, u = ca.SX.sym("q", system.size), ca.SX.sym("u", len(system.driven))
+    q, u = ca.SX.sym("q", system.n_coordinates), ca.SX.sym("u", len(system.driven))
     kinematics = forward_kinematics(system.mechanism, q)
-    rigid = rigid_body(kinematics, ca.SX(ca.DM.zeros(system.size)), system.gravity)
-    force = rigid.by_q - ca.gradient(system.elastic_energy(q), q) + system.input_force(u, q, q)
-    jacobian = ca.jacobian(system.constraints(kinematics), q)
+    rigid = rigid_body_derivatives(kinematics, ca.SX(ca.DM.zeros(system.n_coordinates)), system.gravity)
+    force = rigid.lagrangian_by_q - ca.gradient(system.elastic_energy(q), q) + system.input_force(u, q, q)
+    jacobian = ca.jacobian(system.constraint_residual(kinematics), q)
     function = ca.Function("statics", [q, u, system.parameters.symbols], [force, jacobian])
     load, gradient = (
         np.array(ca.densify(e)) for e in function(run.q[0], run.effort[0], system.parameters.vector(TRUTH))
@@ -66,7 +74,7 @@ def test_starts_in_static_equilibrium_of_the_symbolic_equations(runs: Runs, arms
     multiplier = np.linalg.lstsq(gradient.T, load, rcond=None)[0]
     assert np.abs(load - gradient.T @ multiplier).max() < 1e-5
     assert np.abs(run.v[0]).max() == 0.0
-    posture = initial_posture(system, TRUTH)
+    posture = grasping_joint_angles(system, TRUTH)
     start = dict(zip(system.mechanism.joint_names, run.q[0], strict=True))
     assert all(abs(start[name] - angle) < 1e-5 for name, angle in posture.items())
 
@@ -74,28 +82,32 @@ def test_starts_in_static_equilibrium_of_the_symbolic_equations(runs: Runs, arms
 @pytest.mark.parametrize("kind", ["axis", "weld"])
 def test_other_grasps_hold(kind: str) -> None:
     system = SYSTEMS[1]
-    posture = initial_posture(system)
-    q = ca.SX.sym("q", system.size)
-    kinematics = forward_kinematics(system.mechanism.numeric(), q)
-    rotation = kinematics.pose("left_gripper").rotation.T @ kinematics.pose("w_T2").rotation
+    posture = grasping_joint_angles(system)
+    q = ca.SX.sym("q", system.n_coordinates)
+    kinematics = forward_kinematics(system.mechanism.with_numeric_values(), q)
+    rotation = kinematics.frame_pose("left_gripper").rotation.T @ kinematics.frame_pose("w_T2").rotation
     start = [posture.get(name, 0.0) for name in system.mechanism.joint_names]
     turned = ca.SX(ca.densify(ca.Function("r", [q], [rotation])(start)))
-    grasp = Grasp("left", "left_gripper", "w_T2", kind, rotation=turned)  # type: ignore[arg-type]
+    grasp = Grasp("left", "left_gripper", "w_T2", kind, held_orientation=turned)  # type: ignore[arg-type]
     system = replace(system, grasps=(grasp,))
-    motion = multisine(system, TRUTH, seed=1, posture=posture)
-    run = simulate_in_mujoco(system, TRUTH, motion, Simulation(0.8, time_step=2e-4), posture=posture)
-    phi = ca.Function("phi", [q], [system.constraints(forward_kinematics(system.mechanism.numeric(), q))])
+    motion = random_multisine(system, TRUTH, seed=1, initial_joint_angles=posture)
+    run = simulate_in_mujoco(
+        system, TRUTH, motion, SimulationOptions(0.8, time_step=2e-4), initial_joint_angles=posture
+    )
+    phi = ca.Function(
+        "phi", [q], [system.constraint_residual(forward_kinematics(system.mechanism.with_numeric_values(), q))]
+    )
     assert np.abs(run.q[-1] - run.q[0]).max() > 0.02
     residual = np.array([np.array(phi(row)).ravel() for row in run.q])
-    assert residual.shape[1] == grasp.equations
+    assert residual.shape[1] == grasp.n_equations
     assert np.abs(residual).max() < 1e-4
 
 
 def test_what_a_slow_recording_keeps_of_a_fast_controller() -> None:
-    motion = multisine(SYSTEMS[1], TRUTH, seed=1)
+    motion = random_multisine(SYSTEMS[1], TRUTH, seed=1)
 
-    def run(**choices: Any) -> SimulatedRun:
-        return simulate_in_mujoco(SYSTEMS[1], TRUTH, motion, Simulation(0.4, time_step=2.5e-4, **choices))
+    def run(**choices: Any) -> SimulationResult:
+        return simulate_in_mujoco(SYSTEMS[1], TRUTH, motion, SimulationOptions(0.4, time_step=2.5e-4, **choices))
 
     finely = run(rate=1000.0)
     sample = run(rate=100.0, controller_rate=1000.0, effort_kind="sample")
@@ -103,7 +115,7 @@ def test_what_a_slow_recording_keeps_of_a_fast_controller() -> None:
     for coarse in (sample, mean):
         assert len(coarse.t) == 41
         np.testing.assert_array_equal(coarse.q, finely.q[::10])
-        np.testing.assert_array_equal(coarse.points, finely.points[::10])
+        np.testing.assert_array_equal(coarse.point_positions, finely.point_positions[::10])
     np.testing.assert_array_equal(sample.effort, finely.effort[::10])
     np.testing.assert_allclose(mean.effort[:-1], finely.effort[:-1].reshape(40, 10, -1).mean(1), rtol=0, atol=1e-12)
     np.testing.assert_array_equal(mean.effort[-1], finely.effort[-1])
@@ -126,12 +138,12 @@ def test_what_a_slow_recording_keeps_of_a_fast_controller() -> None:
 )
 def test_rates_that_do_not_fit_are_refused(choices: dict[str, Any], match: str) -> None:
     with pytest.raises(ConfigError, match=match):
-        Simulation(**choices)
+        SimulationOptions(**choices)
 
 
 def test_simulations_that_do_not_fit_are_refused() -> None:
     system = SYSTEMS[1]
-    motion = multisine(system, seed=0)
+    motion = random_multisine(system, seed=0)
     with pytest.raises(ModelError, match="driven joints"):
         simulate_in_mujoco(replace(system, driven=system.driven[:3], prescribed=system.driven[3:]), None, motion)
 
@@ -139,7 +151,7 @@ def test_simulations_that_do_not_fit_are_refused() -> None:
 def test_without_mujoco_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(DataError, match=r"yid-ocp\[blind\]"):
-        simulate_in_mujoco(SYSTEMS[1], None, multisine(SYSTEMS[1], seed=0))
+        simulate_in_mujoco(SYSTEMS[1], None, random_multisine(SYSTEMS[1], seed=0))
 
 
 def test_the_constraint_solver_converges_on_a_fine_chain() -> None:
@@ -151,11 +163,11 @@ def test_the_constraint_solver_converges_on_a_fine_chain() -> None:
         driven=coarse.driven,
         damping=0.1,
     )
-    assert fine.size > 80  # MuJoCo takes sparse matrices for more than 60, if it is let
-    model = compiled_model(mujoco_xml(fine, {name: 2 * value for name, value in TRUTH.items()}, time_step=1e-4))
-    scene = Scene.of(fine, mujoco, model)
+    assert fine.n_coordinates > 80  # MuJoCo takes sparse matrices for more than 60, if it is let
+    model = compile_mjcf(mujoco_xml(fine, {name: 2 * value for name, value in TRUTH.items()}, time_step=1e-4))
+    scene = MujocoScene.from_model(fine, mujoco, model)
     scene.data.qpos[:] = model.qpos_spring
-    for name, angle in initial_posture(coarse, TRUTH).items():
+    for name, angle in grasping_joint_angles(coarse, TRUTH).items():
         scene.data.qpos[model.joint(name).id] = angle + 0.1  # beside what is held, as where an object hangs bent
     mujoco.mj_step(model, scene.data, nstep=3)
     assert scene.data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number == 0
@@ -167,15 +179,15 @@ def test_grippers_beside_what_they_hold_close_at_a_short_step_too(
 ) -> None:
     monkeypatch.chdir(tmp_path)  # MuJoCo leaves a log where it is
     system = SYSTEMS[2]
-    model = compiled_model(mujoco_xml(system, TRUTH, time_step=5e-5))
-    scene = Scene.of(system, mujoco, model)
+    model = compile_mjcf(mujoco_xml(system, TRUTH, time_step=5e-5))
+    scene = MujocoScene.from_model(system, mujoco, model)
     scene.data.qpos[:] = model.qpos_spring
-    for name, angle in initial_posture(system, TRUTH).items():
+    for name, angle in grasping_joint_angles(system, TRUTH).items():
         scene.data.qpos[model.joint(name).id] = angle + 0.1
-    balance = settle(scene, np.array(model.dof_damping))
-    scene.data.qfrc_applied[scene.driven] = balance
+    balance = settle_to_equilibrium(scene, np.array(model.dof_damping))
+    scene.data.qfrc_applied[scene.moved_joint_ids] = balance
     mujoco.mj_forward(model, scene.data)
-    gaps = [np.diff(scene.data.site_xpos[ends], axis=0) for ends in scene.ends]
+    gaps = [np.diff(scene.data.site_xpos[ends], axis=0) for ends in scene.grasp_site_ids]
     assert np.abs(gaps).max() < 1e-7
     # at rest as it is simulated from here on, with grasps as firm as the step allows
     assert np.abs(scene.data.qacc).max() < 0.01
@@ -197,6 +209,6 @@ def test_a_state_that_is_lost_is_told(later: bool, said: str, tmp_path: Path, mo
                 data.qfrc_passive[:] += 1e14
 
     system = SYSTEMS[1]
-    motion = multisine(system, TRUTH, seed=1)
+    motion = random_multisine(system, TRUTH, seed=1)
     with pytest.raises(ModelError, match=said):
-        simulate_in_mujoco(system, TRUTH, motion, Simulation(0.1), injected=Thrown())
+        simulate_in_mujoco(system, TRUTH, motion, SimulationOptions(0.1), injected=Thrown())

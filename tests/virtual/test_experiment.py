@@ -11,13 +11,19 @@ import pytest
 from virtual_examples import SEEDS, SYSTEMS, TRUTH, Runs
 
 import yid_ocp
-from yid_ocp.data.hdf5 import read_recording
 from yid_ocp.data.recording import JointGroup, Recording
+from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.errors import ConfigError
-from yid_ocp.virtual.engine import Simulation, simulate_in_mujoco
-from yid_ocp.virtual.experiment import ArmNoise, PointCamera, VirtualExperiment, paper_system, virtual_experiment
-from yid_ocp.virtual.motion import Excitation, multisine
-from yid_ocp.virtual.posture import initial_posture
+from yid_ocp.virtual.experiment import (
+    ArmSensorNoise,
+    PointCamera,
+    VirtualExperiment,
+    baxter_foam_y_system,
+    run_virtual_experiment,
+)
+from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
+from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
+from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 
 mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
 
@@ -26,9 +32,9 @@ DEFAULTS = Path(yid_ocp.__file__).parent / "data" / "defaults"
 
 def test_recording_has_what_the_sensors_saw(runs: Runs) -> None:
     system, run = SYSTEMS[1], runs(1, 2e-4)
-    motion = multisine(system, TRUTH, seed=SEEDS[1])
-    simulation = Simulation(time_step=2e-4)
-    recording = virtual_experiment(system, TRUTH, VirtualExperiment(motion=motion, simulation=simulation, seed=5))
+    motion = random_multisine(system, TRUTH, seed=SEEDS[1])
+    simulation = SimulationOptions(time_step=2e-4)
+    recording = run_virtual_experiment(system, TRUTH, VirtualExperiment(motion=motion, simulation=simulation, seed=5))
     joints = recording.joints
     assert joints is not None
     assert joints.velocity is not None
@@ -38,33 +44,33 @@ def test_recording_has_what_the_sensors_saw(runs: Runs) -> None:
     assert np.std(joints.velocity - run.v[:, :7]) == pytest.approx(5e-3, rel=0.1)
     arm, camera = recording.points
     assert (arm.name, arm.names, arm.sensor) == ("points_arm", ("w_T2",), "arm")
-    assert np.std(arm.position[:, 0] - run.points[:, 1]) == pytest.approx(1e-3, rel=0.1)
+    assert np.std(arm.position[:, 0] - run.point_positions[:, 1]) == pytest.approx(1e-3, rel=0.1)
     assert (camera.name, camera.names, camera.sensor) == ("points_camera", ("w_T1", "w_T3"), "camera")
     assert np.diff(camera.t).max() > 1.0
     assert 0.2 < np.diff(camera.t).min() < 0.45
     for column, point in enumerate(camera.names):
-        truth = run.points[:, system.points.index(point)]
+        truth = run.point_frames[:, system.point_frames.index(point)]
         path = np.column_stack([np.interp(camera.t, run.t, truth[:, axis]) for axis in range(3)])
         assert np.nanmax(np.abs(camera.position[:, column] - path)) < 5 * 5e-3
     assert camera.pose is not None
-    assert np.linalg.norm(camera.pose[:3, 3] - run.points[0].mean(0)) == pytest.approx(2.0)
-    assert TRUTH.items() <= recording.truth.items()
-    assert all(name.rpartition(".")[2] in ("bend", "twist", "damping", "mass") for name in recording.truth)
+    assert np.linalg.norm(camera.pose[:3, 3] - run.point_positions[0].mean(0)) == pytest.approx(2.0)
+    assert TRUTH.items() <= recording.true_parameters.items()
+    assert all(name.rpartition(".")[2] in ("bend", "twist", "damping", "mass") for name in recording.true_parameters)
     assert "MuJoCo" in recording.description
 
 
 def test_sensors_have_their_own_noise() -> None:
     system = SYSTEMS[1]
-    motion = multisine(system, TRUTH, seed=1)
+    motion = random_multisine(system, TRUTH, seed=1)
 
-    often_hidden = PointCamera(missing=0.5)
+    often_hidden = PointCamera(hidden_probability=0.5)
 
-    def record(seed: int, camera: PointCamera | None = often_hidden, noise: ArmNoise | None = None) -> Recording:
-        simulation = Simulation(3.0, time_step=5e-4)
-        experiment = VirtualExperiment(motion, None, simulation, noise or ArmNoise(), camera, seed=seed)
-        return virtual_experiment(system, TRUTH, experiment)
+    def record(seed: int, camera: PointCamera | None = often_hidden, noise: ArmSensorNoise | None = None) -> Recording:
+        simulation = SimulationOptions(3.0, time_step=5e-4)
+        experiment = VirtualExperiment(motion, None, simulation, noise or ArmSensorNoise(), camera, seed=seed)
+        return run_virtual_experiment(system, TRUTH, experiment)
 
-    first, again, blind, other = record(1), record(1), record(1, None, ArmNoise(effort=0.3)), record(2)
+    first, again, blind, other = record(1), record(1), record(1, None, ArmSensorNoise(effort_std=0.3)), record(2)
     for a, b in zip(first.points, again.points, strict=True):
         np.testing.assert_array_equal(a.position, b.position)
     np.testing.assert_array_equal(first.joints.position, blind.joints.position)
@@ -77,18 +83,21 @@ def test_sensors_have_their_own_noise() -> None:
 
 def test_torques_are_off_by_a_constant_and_by_white_noise() -> None:
     system = SYSTEMS[1]
-    motion = multisine(system, TRUTH, seed=1)
+    motion = random_multisine(system, TRUTH, seed=1)
     white = (0.02, 0.04, 0.06, 0.08, 0.1, 0.12, 0.14)
 
-    def joints(noise: ArmNoise, seed: int = 1) -> JointGroup:
-        simulation = Simulation(2.0, time_step=1e-3, controller_rate=200.0, effort_kind="sample")
+    def joints(noise: ArmSensorNoise, seed: int = 1) -> JointGroup:
+        simulation = SimulationOptions(2.0, time_step=1e-3, controller_rate=200.0, effort_kind="sample")
         experiment = VirtualExperiment(motion, None, simulation, noise, None, seed=seed)
-        group = virtual_experiment(system, TRUTH, experiment).joints
+        group = run_virtual_experiment(system, TRUTH, experiment).joints
         assert group is not None
         return group
 
-    clean, noisy = joints(ArmNoise()), joints(ArmNoise(effort=white, effort_bias=0.3))
-    other, unstated = joints(ArmNoise(effort_bias=0.3), 2), joints(ArmNoise(effort_bias=0.3, stated=False))
+    clean, noisy = joints(ArmSensorNoise()), joints(ArmSensorNoise(effort_std=white, effort_bias_std=0.3))
+    other, unstated = (
+        joints(ArmSensorNoise(effort_bias_std=0.3), 2),
+        joints(ArmSensorNoise(effort_bias_std=0.3, records_effort_std=False)),
+    )
     assert (clean.effort_kind, clean.effort_std, clean.effort_bias_std) == ("sample", 0.0, 0.0)
     assert noisy.effort_bias_std == 0.3
     np.testing.assert_array_equal(noisy.effort_std, white)
@@ -104,14 +113,16 @@ def test_torques_are_off_by_a_constant_and_by_white_noise() -> None:
 
 
 def test_experiments_that_do_not_fit_are_refused() -> None:
-    experiment = VirtualExperiment(multisine(SYSTEMS[1], seed=0), camera=PointCamera(("w_T9",)))
+    experiment = VirtualExperiment(random_multisine(SYSTEMS[1], seed=0), camera=PointCamera(("w_T9",)))
     with pytest.raises(ConfigError, match="w_T9"):
-        virtual_experiment(SYSTEMS[1], None, experiment)
-    brief = Simulation(0.1, time_step=1e-3)
+        run_virtual_experiment(SYSTEMS[1], None, experiment)
+    brief = SimulationOptions(0.1, time_step=1e-3)
     with pytest.raises(ConfigError, match="2 standard deviations for 7 joints"):
-        virtual_experiment(SYSTEMS[1], None, VirtualExperiment(None, None, brief, ArmNoise(effort=(0.1, 0.2))))
+        run_virtual_experiment(
+            SYSTEMS[1], None, VirtualExperiment(None, None, brief, ArmSensorNoise(effort_std=(0.1, 0.2)))
+        )
     with pytest.raises(ConfigError, match="arms = 3"):
-        paper_system(3)
+        baxter_foam_y_system(3)
 
 
 @pytest.mark.parametrize("rough", [True, False], ids=["embedded", "clean"])
@@ -124,7 +135,7 @@ def test_recordings_of_the_papers_experiments(rough: bool, clean: Path) -> None:
         arms = 1 if path.name.startswith("single") else 2
         assert recording.joint_names == SYSTEMS[arms].driven
         assert recording.duration == pytest.approx(5.0)
-        assert TRUTH.items() <= recording.truth.items()
+        assert TRUTH.items() <= recording.true_parameters.items()
         assert "MuJoCo" in recording.description
         expected = {"points_arm"} | ({"points_camera"} if "_no_vision" not in path.name else set())
         assert {group.name for group in recording.points} == expected
@@ -156,12 +167,18 @@ def recipe() -> ModuleType:
 def test_recordings_are_reproducible(kind: str, clean: Path) -> None:
     made = recipe()
     torques, system = getattr(made, kind), SYSTEMS[2]
-    posture = initial_posture(system, made.TRUTH, offsets=made.OFFSETS[2])
-    excitation = Excitation(travel=torques.travel[2], shake=torques.shake)
-    motion = multisine(
-        system, made.TRUTH, seed=torques.motion_seeds[2, "estimate"], posture=posture, excitation=excitation
+    posture = grasping_joint_angles(system, made.TRUTH, offsets=made.OFFSETS[2])
+    excitation = MultisineOptions(gripper_travel=torques.travel[2], shake_torque_rms=torques.shake_torque_rms)
+    motion = random_multisine(
+        system,
+        made.TRUTH,
+        seed=torques.motion_seeds[2, "estimate"],
+        initial_joint_angles=posture,
+        excitation=excitation,
     )
-    run = simulate_in_mujoco(system, made.TRUTH, motion, replace(torques.simulation, duration=1.0), posture=posture)
+    run = simulate_in_mujoco(
+        system, made.TRUTH, motion, replace(torques.simulation, duration=1.0), initial_joint_angles=posture
+    )
     joints = read_recording((DEFAULTS if torques.white else clean) / "dual_arm_no_vision_estimate.h5").joints
     assert joints is not None
     if not torques.white:
@@ -179,13 +196,13 @@ def test_recordings_are_reproducible(kind: str, clean: Path) -> None:
 def test_rough_recordings_are_as_rough_as_a_real_arm_and_within_its_limits(arms: int, purpose: str) -> None:
     made, system = recipe(), SYSTEMS[arms]
     rough = made.ROUGH
-    posture = initial_posture(system, made.TRUTH, offsets=made.OFFSETS[arms])
-    excitation = Excitation(travel=rough.travel[arms], shake=rough.shake)
-    motion = multisine(
-        system, made.TRUTH, seed=rough.motion_seeds[arms, purpose], posture=posture, excitation=excitation
+    posture = grasping_joint_angles(system, made.TRUTH, offsets=made.OFFSETS[arms])
+    excitation = MultisineOptions(gripper_travel=rough.travel[arms], shake_torque_rms=rough.shake_torque_rms)
+    motion = random_multisine(
+        system, made.TRUTH, seed=rough.motion_seeds[arms, purpose], initial_joint_angles=posture, excitation=excitation
     )
     simulation = replace(rough.simulation, time_step=2.5e-4)
-    run = simulate_in_mujoco(system, made.TRUTH, motion, simulation, posture=posture)
+    run = simulate_in_mujoco(system, made.TRUTH, motion, simulation, initial_joint_angles=posture)
     assert made.within_limits(system, run)
     noise = np.sqrt(6) * np.array(arms * rough.white)  # of the second difference
     second = np.hypot(np.diff(run.effort, 2, axis=0).std(0), noise)

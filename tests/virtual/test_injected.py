@@ -13,25 +13,25 @@ from yid_ocp.effects import EFFECTS, make_effect
 from yid_ocp.errors import ConfigError
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import MidpointState
-from yid_ocp.virtual.engine import Simulation
-from yid_ocp.virtual.experiment import VirtualExperiment, paper_system
+from yid_ocp.virtual.experiment import VirtualExperiment, baxter_foam_y_system
 from yid_ocp.virtual.injected import (
-    FORCED,
-    KINDS,
-    MODELLED,
-    SENSOR_ERRORS,
+    _FORCE_KINDS,
+    _MUJOCO_MODEL_KINDS,
+    _SENSOR_ERROR_KINDS,
+    INJECTABLE_KINDS,
     InjectedEffect,
-    InjectedTerms,
-    injected_experiment,
-    with_sensor_error,
+    _InjectedTerms,
+    _with_sensor_error,
+    run_injected_experiment,
 )
 from yid_ocp.virtual.mjcf import mujoco_xml
-from yid_ocp.virtual.motion import multisine
-from yid_ocp.virtual.outside import OUTSIDE
+from yid_ocp.virtual.mujoco_simulation import SimulationOptions
+from yid_ocp.virtual.multisine_motion import random_multisine
+from yid_ocp.virtual.out_of_library_effects import OUT_OF_LIBRARY_EFFECTS
 
 mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
 
-SYSTEM = paper_system(1)
+SYSTEM = baxter_foam_y_system(1)
 TRUTH = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T3.bend": 11.5, "T3.twist": 9.7}
 SIZES = {
     "kelvin_voigt@T1": {"tau": 0.05},
@@ -52,11 +52,11 @@ def passive(effects, q, v):
     model = mujoco.MjModel.from_xml_string(mujoco_xml(SYSTEM, TRUTH))
     order = [model.joint(name).id for name in SYSTEM.mechanism.joint_names]
     data = mujoco.MjData(model)
-    injected = InjectedTerms(SYSTEM, TRUTH, effects)
-    injected.prepare(model)
-    injected.begin(data)
+    injected = _InjectedTerms(SYSTEM, TRUTH, effects)
+    injected.edit_model(model)
+    injected.start_motion(data)
     data.qpos[order], data.qvel[order] = q, v
-    mujoco.set_mjcb_passive(injected.force)
+    mujoco.set_mjcb_passive(injected.add_forces)
     try:
         mujoco.mj_forward(model, data)
     finally:
@@ -68,15 +68,19 @@ def symbolic(kind, location, values, q, v):
     """The library's generalized force."""
     effect = make_effect(kind, location, SYSTEM, values)
     changed = SYSTEM.with_effects([effect])
-    sq, sv = ca.SX.sym("q", SYSTEM.size), ca.SX.sym("v", SYSTEM.size)
+    sq, sv = ca.SX.sym("q", SYSTEM.n_coordinates), ca.SX.sym("v", SYSTEM.n_coordinates)
     none = ca.SX(0, 1)
-    u, reaction = ca.SX.sym("u", len(SYSTEM.driven)), ca.SX.sym("r", SYSTEM.constraint_count)
+    u, reaction = ca.SX.sym("u", len(SYSTEM.driven)), ca.SX.sym("r", SYSTEM.n_constraints)
     state = MidpointState(
         changed, forward_kinematics(changed.mechanism, sq), sq, sv, none, none, u, reaction, {}, ca.SX(1)
     )
-    terms = effect.terms(state)
+    terms = effect.step_terms(state)
     total = ca.gradient(terms.lagrangian, sq)
-    for force in (terms.force, terms.viscous, None if terms.closed is None else terms.closed.force):
+    for force in (
+        terms.generalized_force,
+        terms.dissipative_force,
+        None if terms.force_with_derivatives is None else terms.force_with_derivatives.force,
+    ):
         total = total if force is None else total + force
     function = ca.Function("f", [sq, sv, changed.parameters.symbols], [total])
     return np.array(ca.densify(function(q, v, changed.parameters.vector(TRUTH)))).ravel()
@@ -86,7 +90,7 @@ def symbolic(kind, location, values, q, v):
 def test_forces_are_those_of_the_library(label):
     kind, _, place = label.partition("@")
     rng = np.random.default_rng(3)
-    q, v = rng.uniform(-0.4, 0.4, SYSTEM.size), rng.uniform(-1, 1, SYSTEM.size)
+    q, v = rng.uniform(-0.4, 0.4, SYSTEM.n_coordinates), rng.uniform(-1, 1, SYSTEM.n_coordinates)
     with_it, _ = passive([InjectedEffect(kind, place, SIZES[label])], q, v)
     without, _ = passive([], q, v)
     expected = symbolic(kind, place, SIZES[label], q, v)
@@ -97,7 +101,7 @@ def test_forces_are_those_of_the_library(label):
 
 def test_weight_is_taken_away_without_the_inertia():
     rng = np.random.default_rng(4)
-    q, v = rng.uniform(-0.4, 0.4, SYSTEM.size), np.zeros(SYSTEM.size)
+    q, v = rng.uniform(-0.4, 0.4, SYSTEM.n_coordinates), np.zeros(SYSTEM.n_coordinates)
     lifted = passive([InjectedEffect("gravity_scale", "object", {"fraction": -1.0})], q, v)[0] - passive([], q, v)[0]
     effect = make_effect("gravity_scale", "object", SYSTEM, {"fraction": -1.0})
     weightless, heavy = (
@@ -117,7 +121,7 @@ def test_weight_is_taken_away_without_the_inertia():
 
 
 def test_a_rotor_is_an_armature():
-    q = np.zeros(SYSTEM.size)
+    q = np.zeros(SYSTEM.n_coordinates)
     _, armature = passive([InjectedEffect("rotor_inertia", "left_e1", {"armature": 0.3})], q, q)
     assert armature[SYSTEM.mechanism.joint_index("left_e1")] == 0.3
 
@@ -158,7 +162,7 @@ def reading(duration=1.0) -> Recording:
 def test_errors_of_joint_sensors_are_those_of_the_table(label, values, channel, expected):
     kind, _, place = label.partition("@")
     recording = reading()
-    wrong = with_sensor_error(recording, SYSTEM, InjectedEffect(kind, place, values))
+    wrong = _with_sensor_error(recording, SYSTEM, InjectedEffect(kind, place, values))
     assert getattr(wrong.joints, channel)[:, 1] == pytest.approx(expected(recording))
     other = getattr(wrong.joints, channel)[:, 2]
     assert other == pytest.approx(getattr(recording.joints, channel)[:, 2])
@@ -166,7 +170,7 @@ def test_errors_of_joint_sensors_are_those_of_the_table(label, values, channel, 
 
 def test_what_is_recorded_late_acts_later():
     recording = reading()
-    wrong = with_sensor_error(recording, SYSTEM, InjectedEffect("effort_delay", "left", {"delay": 0.05}))
+    wrong = _with_sensor_error(recording, SYSTEM, InjectedEffect("effort_delay", "left", {"delay": 0.05}))
     assert wrong.joints.effort[:-6] == pytest.approx(recording.joints.effort[5:-1], abs=1e-9)
 
 
@@ -175,7 +179,7 @@ def test_errors_of_cameras_are_those_of_the_table():
     true = recording.points[0].position
 
     def seen(kind, **values):
-        return with_sensor_error(recording, SYSTEM, InjectedEffect(kind, "camera", values)).points[0]
+        return _with_sensor_error(recording, SYSTEM, InjectedEffect(kind, "camera", values)).points[0]
 
     assert seen("camera_translation", x=0.01, y=0.0, z=-0.01).position == pytest.approx(
         true + np.array([0.01, 0.0, -0.01])
@@ -190,25 +194,25 @@ def test_errors_of_cameras_are_those_of_the_table():
 
 
 def test_an_effect_acts_on_a_whole_recording_and_leaves_no_trace_of_itself():
-    motion = multisine(SYSTEM, TRUTH, seed=1)
-    experiment = VirtualExperiment(motion, simulation=Simulation(0.3, time_step=2e-4), seed=2)
+    motion = random_multisine(SYSTEM, TRUTH, seed=1)
+    experiment = VirtualExperiment(motion, simulation=SimulationOptions(0.3, time_step=2e-4), seed=2)
     hysteresis = InjectedEffect("hysteresis", "T1", {"stiffness": 9.0, "yield_angle": 0.1})
-    clean = injected_experiment(SYSTEM, TRUTH, (), experiment)
-    pushed = injected_experiment(SYSTEM, TRUTH, [hysteresis], experiment)
-    again = injected_experiment(SYSTEM, TRUTH, (), experiment)
+    clean = run_injected_experiment(SYSTEM, TRUTH, (), experiment)
+    pushed = run_injected_experiment(SYSTEM, TRUTH, [hysteresis], experiment)
+    again = run_injected_experiment(SYSTEM, TRUTH, (), experiment)
     assert np.abs(pushed.joints.effort - clean.joints.effort).max() > 1e-3
     assert again.joints.effort == pytest.approx(clean.joints.effort, abs=0)
 
 
 def test_every_kind_is_done_once_and_what_is_outside_is_not_in_the_library():
-    assert len(set(KINDS)) == len(KINDS)
-    assert set(KINDS) <= set(EFFECTS)
-    assert not set(OUTSIDE) & set(EFFECTS)
+    assert len(set(INJECTABLE_KINDS)) == len(INJECTABLE_KINDS)
+    assert set(INJECTABLE_KINDS) <= set(EFFECTS)
+    assert not set(OUT_OF_LIBRARY_EFFECTS) & set(EFFECTS)
     tested_elsewhere = {"rotor_inertia", "standard_linear_solid", "hysteresis", *TWINS}
-    assert {label.partition("@")[0] for label in SIZES} | tested_elsewhere == {*MODELLED, *FORCED}
-    assert set(SENSOR_ERRORS) <= set(KINDS)
+    assert {label.partition("@")[0] for label in SIZES} | tested_elsewhere == {*_MUJOCO_MODEL_KINDS, *_FORCE_KINDS}
+    assert set(_SENSOR_ERROR_KINDS) <= set(INJECTABLE_KINDS)
 
 
 def test_a_kind_that_cannot_be_done_is_refused():
     with pytest.raises(ConfigError, match="grasp_slip"):
-        injected_experiment(SYSTEM, TRUTH, [InjectedEffect("grasp_slip", "left", {})])
+        run_injected_experiment(SYSTEM, TRUTH, [InjectedEffect("grasp_slip", "left", {})])

@@ -9,10 +9,10 @@ from virtual_examples import SYSTEMS, TRUTH, clamped_beam
 
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model.flexible import Segment, flexible_object
-from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body
+from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_derivatives
 from yid_ocp.model.mechanism import Frame, Placement
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.model.system import Grasp, MidpointState, System, Terms, floating_clamp
+from yid_ocp.model.system import Grasp, MidpointState, StepTerms, System, floating_clamp
 from yid_ocp.virtual.mjcf import mujoco_xml
 
 mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
@@ -24,27 +24,27 @@ mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: 
         (SYSTEMS[1], TRUTH),
         (SYSTEMS[2], {**TRUTH, "T2.mass": 0.03, "T3.length": 0.9, "left_w0.mass": 3.0}),
         (clamped_beam(), {"B.length": 0.6}),
-        (replace(clamped_beam(), points=("w_B", "B:40%")), {}),
+        (replace(clamped_beam(), point_frames=("w_B", "B:40%")), {}),
     ],
     ids=["single", "dual", "clamp", "along"],
 )
 def test_mechanics_equals_the_symbolic_one(system: System, values: dict[str, float]) -> None:
-    q, v = ca.SX.sym("q", system.size), ca.SX.sym("v", system.size)
+    q, v = ca.SX.sym("q", system.n_coordinates), ca.SX.sym("v", system.n_coordinates)
     kinematics = forward_kinematics(system.mechanism, q)
-    rigid = rigid_body(kinematics, v, system.gravity)
-    bias = ca.jtimes(rigid.by_v, q, v) - rigid.by_q
+    rigid = rigid_body_derivatives(kinematics, v, system.gravity)
+    bias = ca.jtimes(rigid.lagrangian_by_v, q, v) - rigid.lagrangian_by_q
     passive = system.viscous_force(v) - ca.gradient(system.elastic_energy(q), q)
-    points = ca.horzcat(*(kinematics.position(name) for name in system.points))
+    points = ca.horzcat(*(kinematics.frame_position(name) for name in system.point_frames))
     ours = ca.Function(
         "ours", [q, v, system.parameters.symbols], [mass_matrix(rigid, system.mechanism), bias, passive, points]
     )
     model = mujoco.MjModel.from_xml_string(mujoco_xml(system, values))
     data = mujoco.MjData(model)
     order = [model.joint(name).id for name in system.mechanism.joint_names]
-    assert model.nv == system.size
+    assert model.nv == system.n_coordinates
     rng = np.random.default_rng(0)
     for _ in range(3):
-        posture, velocity = rng.uniform(-1, 1, system.size), rng.uniform(-1, 1, system.size)
+        posture, velocity = rng.uniform(-1, 1, system.n_coordinates), rng.uniform(-1, 1, system.n_coordinates)
         data.qpos[order], data.qvel[order] = posture, velocity
         mujoco.mj_forward(model, data)
         mass = np.zeros((model.nv, model.nv))
@@ -54,7 +54,7 @@ def test_mechanics_equals_the_symbolic_one(system: System, values: dict[str, flo
         np.testing.assert_allclose(mass[np.ix_(order, order)], expected[0], rtol=0, atol=1e-9)
         np.testing.assert_allclose(data.qfrc_bias[order], expected[1].ravel(), rtol=0, atol=1e-9)
         np.testing.assert_allclose(data.qfrc_passive[order], expected[2].ravel(), rtol=0, atol=1e-9)
-        seen = np.array([data.site(name).xpos for name in system.points])
+        seen = np.array([data.site(name).xpos for name in system.point_frames])
         np.testing.assert_allclose(seen, expected[3].T, rtol=0, atol=1e-9)
 
 
@@ -70,8 +70,8 @@ class Pull:
     def modify(self, system: System) -> System:
         return system
 
-    def terms(self, state: MidpointState) -> Terms:
-        return Terms(force=self.parameters["pull@T1.force"].symbol * state.v)  # type: ignore[attr-defined]
+    def terms(self, state: MidpointState) -> StepTerms:
+        return StepTerms(generalized_force=self.parameters["pull@T1.force"].symbol * state.v)  # type: ignore[attr-defined]
 
 
 def test_what_mujoco_cannot_express_is_refused() -> None:

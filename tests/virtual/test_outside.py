@@ -7,26 +7,26 @@ import math
 import numpy as np
 import pytest
 
-from yid_ocp.virtual.engine import Simulation
-from yid_ocp.virtual.experiment import VirtualExperiment, paper_system
-from yid_ocp.virtual.injected import InjectedEffect, InjectedTerms, injected_experiment
+from yid_ocp.virtual.experiment import VirtualExperiment, baxter_foam_y_system
+from yid_ocp.virtual.injected import InjectedEffect, _InjectedTerms, run_injected_experiment
 from yid_ocp.virtual.mjcf import mujoco_xml
-from yid_ocp.virtual.motion import multisine
-from yid_ocp.virtual.outside import (
-    CORD,
-    CREASE_ANGLE,
-    DRIFT_TIME,
-    MAGNET_AT,
-    MAGNET_SIZE,
-    OUTSIDE,
-    SLIPS,
-    WALL_AT,
-    WARM,
+from yid_ocp.virtual.mujoco_simulation import SimulationOptions
+from yid_ocp.virtual.multisine_motion import random_multisine
+from yid_ocp.virtual.out_of_library_effects import (
+    _CORD_LENGTH,
+    _CREASE_ANGLE,
+    _DRIFT_TIME,
+    _MAGNET_DISTANCE,
+    _MAGNET_POLE_SIZE,
+    _SLIP_TIMES,
+    _WALL_DISTANCE,
+    _WARM_UP_TIME,
+    OUT_OF_LIBRARY_EFFECTS,
 )
 
 mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
 
-SYSTEM = paper_system(1)
+SYSTEM = baxter_foam_y_system(1)
 TRUTH = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T3.bend": 11.5, "T3.twist": 9.7}
 
 
@@ -36,10 +36,10 @@ class Bench:
     def __init__(self, kind, location, size, running=True):
         self.model = mujoco.MjModel.from_xml_string(mujoco_xml(SYSTEM, TRUTH))
         self.data = mujoco.MjData(self.model)
-        self.terms = InjectedTerms(SYSTEM, TRUTH, [InjectedEffect(kind, location, {"size": size})])
-        self.terms.prepare(self.model)
+        self.terms = _InjectedTerms(SYSTEM, TRUTH, [InjectedEffect(kind, location, {"size": size})])
+        self.terms.edit_model(self.model)
         if running:
-            self.terms.begin(self.data)
+            self.terms.start_motion(self.data)
         self.force(np.zeros(self.model.nv))  # what is anchored somewhere is anchored by this state
         self.began = {joint: self.place(joint) for joint in ("left_w0", joints_of("T3", 2)[-1])}
 
@@ -52,7 +52,7 @@ class Bench:
     def force(self, q, v=None, time=0.0):
         self.at(q, v, time)
         self.data.qfrc_passive[:] = 0.0
-        self.terms.force(self.model, self.data)
+        self.terms.add_forces(self.model, self.data)
         return np.array(self.data.qfrc_passive)
 
     def place(self, joint):
@@ -63,7 +63,7 @@ class Bench:
 
 
 def joints_of(segment, *axes):
-    return [link[axis] for link in SYSTEM.segment(segment).links for axis in axes]
+    return [link[axis] for link in SYSTEM.segment_layout(segment).link_joints for axis in axes]
 
 
 def slope(bench, potential, q, step=1e-6):
@@ -90,21 +90,21 @@ def moved(bench, joint):
 
 def cord(joint, hung):
     anchor = np.array([0.0, 0.0, hung])
-    return lambda bench: 0.5 * 20.0 * max(np.linalg.norm(moved(bench, joint) - anchor) - CORD, 0.0) ** 2
+    return lambda bench: 0.5 * 20.0 * max(np.linalg.norm(moved(bench, joint) - anchor) - _CORD_LENGTH, 0.0) ** 2
 
 
 def pole(bench):
-    away = np.array([MAGNET_AT, 0.0, 0.0]) - moved(bench, TIP)
-    return 0.5 * 0.3 * MAGNET_SIZE * math.log(away @ away + MAGNET_SIZE**2)
+    away = np.array([_MAGNET_DISTANCE, 0.0, 0.0]) - moved(bench, TIP)
+    return 0.5 * 0.3 * _MAGNET_POLE_SIZE * math.log(away @ away + _MAGNET_POLE_SIZE**2)
 
 
 def soft_wall(bench):
-    return 0.5 * 30.0 * max(moved(bench, TIP)[1] - WALL_AT, 0.0) ** 2
+    return 0.5 * 30.0 * max(moved(bench, TIP)[1] - _WALL_DISTANCE, 0.0) ** 2
 
 
 def creased(bench):
-    bent = bench.data.qpos[bench.address(*SYSTEM.segment("T1").links[1][:2])]
-    return -0.5 * 12.0 * max(np.linalg.norm(bent) - CREASE_ANGLE, 0.0) ** 2
+    bent = bench.data.qpos[bench.address(*SYSTEM.segment_layout("T1").link_joints[1][:2])]
+    return -0.5 * 12.0 * max(np.linalg.norm(bent) - _CREASE_ANGLE, 0.0) ** 2
 
 
 def crossed(bench):
@@ -119,8 +119,8 @@ def lopsided(bench):
 @pytest.mark.parametrize(
     ("kind", "place", "size", "potential"),
     [
-        ("tether", "T3", 20.0, cord(TIP, -CORD)),
-        ("tether", "left_w0", 20.0, cord("left_w0", CORD)),
+        ("tether", "T3", 20.0, cord(TIP, -_CORD_LENGTH)),
+        ("tether", "left_w0", 20.0, cord("left_w0", _CORD_LENGTH)),
         ("magnet", "T3", 0.3, pole),
         ("wall", "T3", 30.0, soft_wall),
         ("crease", "T1", 12.0, creased),
@@ -145,7 +145,7 @@ def test_a_drifting_stiffness_softens_with_time():
     bench = Bench("stiffness_drift", "T1", 0.4)
     at = bench.address(*joints_of("T1", 0, 1, 2))
     stiffness = np.array([22.0, 22.0, 13.6] * 4)
-    half = bench.force(q, time=DRIFT_TIME / 2)
+    half = bench.force(q, time=_DRIFT_TIME / 2)
     assert half[at] == pytest.approx(0.2 * stiffness * q[at])
     assert np.count_nonzero(half) == len(at)
     assert not bench.force(q, time=0.0).any()
@@ -163,10 +163,10 @@ def test_one_way_damping_brakes_one_way_only():
 
 def test_one_way_damping_of_a_light_branch_asks_nothing_of_the_arm():
     """1 N m s/rad is some hundred times what an explicit step bears there: the arm would be told to hold 1000 N m."""
-    motion = multisine(SYSTEM, TRUTH, seed=1)
-    experiment = VirtualExperiment(motion, simulation=Simulation(0.3, time_step=2e-4), seed=2)
+    motion = random_multisine(SYSTEM, TRUTH, seed=1)
+    experiment = VirtualExperiment(motion, simulation=SimulationOptions(0.3, time_step=2e-4), seed=2)
     clean, braked = (
-        injected_experiment(SYSTEM, TRUTH, effects, experiment).joints.effort
+        run_injected_experiment(SYSTEM, TRUTH, effects, experiment).joints.effort
         for effects in ((), [InjectedEffect("one_way_damping", "T3", {"size": 1.0})])
     )
     assert 1e-4 < np.abs(braked - clean).max() < 5.0
@@ -176,7 +176,7 @@ def test_a_cold_gear_brakes_until_it_is_warm():
     bench = Bench("warming_gear", "left_s1", 3.0)
     v = np.ones(bench.model.nv)
     [at] = bench.address("left_s1")
-    forces = [bench.force(np.zeros(bench.model.nv), v, time)[at] for time in (0.0, WARM, 10 * WARM)]
+    forces = [bench.force(np.zeros(bench.model.nv), v, time)[at] for time in (0.0, _WARM_UP_TIME, 10 * _WARM_UP_TIME)]
     assert forces == pytest.approx([-3.0, -3.0 / math.e, 0.0], abs=2e-4)
 
 
@@ -205,7 +205,7 @@ def test_a_slipping_grasp_has_moved_along_the_tube_after_every_slip():
     site = bench.model.site("grasp_left_held").id
     begin = bench.model.site_pos[site].copy()
     moved = []
-    for time in (SLIPS[0] - 0.01, 0.5 * sum(SLIPS), SLIPS[1] + 1.0):
+    for time in (_SLIP_TIMES[0] - 0.01, 0.5 * sum(_SLIP_TIMES), _SLIP_TIMES[1] + 1.0):
         bench.force(np.zeros(bench.model.nv), time=time)
         moved.append(bench.model.site_pos[site] - begin)
     assert np.array(moved) == pytest.approx(np.array([[0, 0, 0], [0, 0, -0.008], [0, 0, -0.016]]), abs=1e-12)
@@ -220,7 +220,7 @@ def test_torque_ripples_with_the_angle_and_wind_waits_for_the_motion():
 
 
 def test_none_is_forgotten():
-    assert set(OUTSIDE) == {
+    assert set(OUT_OF_LIBRARY_EFFECTS) == {
         *("tether", "magnet", "wall", "crease", "cross_stiffness", "quadratic_stiffness", "stiffness_drift"),
         *("one_way_damping", "warming_gear", "saturating_drive", "shifting_load", "slipping_grasp"),
         *("torque_ripple", "gusts"),

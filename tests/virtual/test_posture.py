@@ -10,24 +10,26 @@ from yid_ocp.model.flexible import Segment, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import Grasp, System
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.virtual.posture import initial_posture
+from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
 
 mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
 
 
 def test_initial_posture_reaches_the_tubes_within_the_limits() -> None:
     for arms, system in SYSTEMS.items():
-        posture = initial_posture(system)
+        posture = grasping_joint_angles(system)
         assert len(posture) == 7 * arms
         for name, angle in posture.items():
             joint = system.mechanism.joints[system.mechanism.joint_index(name)]
-            assert joint.lower <= angle <= joint.upper
-        q = ca.SX.sym("q", system.size)
-        phi = ca.Function("phi", [q], [system.constraints(forward_kinematics(system.mechanism.numeric(), q))])
+            assert joint.lower_limit <= angle <= joint.upper_limit
+        q = ca.SX.sym("q", system.n_coordinates)
+        phi = ca.Function(
+            "phi", [q], [system.constraint_residual(forward_kinematics(system.mechanism.with_numeric_values(), q))]
+        )
         full = [posture.get(name, 0.0) for name in system.mechanism.joint_names]
         assert np.abs(np.array(phi(full))).max() < 1e-8
     with pytest.raises(ModelError, match="miss the grasped points"):
-        initial_posture(SYSTEMS[1], {"T1.length": 3.0})
+        grasping_joint_angles(SYSTEMS[1], {"T1.length": 3.0})
 
 
 def test_other_robots_start_from_the_middle_of_their_range() -> None:
@@ -39,5 +41,5 @@ def test_other_robots_start_from_the_middle_of_their_range() -> None:
     system = System.build(
         robot, objects=[(beam, None, placement)], grasps=[Grasp("hand", "panda_hand", "w_B")], driven=names
     )
-    posture = initial_posture(system)
+    posture = grasping_joint_angles(system)
     assert set(names) <= set(posture)

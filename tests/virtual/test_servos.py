@@ -8,18 +8,18 @@ import pytest
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ModelError
-from yid_ocp.export.manifest import said_of_effects, said_of_parameters
+from yid_ocp.export.format_support import effect_support, parameter_support
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
-from yid_ocp.model.drives import KNEE, PositionServos
+from yid_ocp.model.servos_and_springs import TORQUE_LIMIT_POWER, PositionServoOptions
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.virtual.engine import Simulation
-from yid_ocp.virtual.experiment import ArmNoise, PointCamera, VirtualExperiment
-from yid_ocp.virtual.injected import InjectedEffect, injected_experiment
+from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperiment
+from yid_ocp.virtual.injected import InjectedEffect, run_injected_experiment
 from yid_ocp.virtual.mjcf import mujoco_xml
-from yid_ocp.virtual.motion import Excitation, multisine
-from yid_ocp.virtual.replay import replay
+from yid_ocp.virtual.mujoco_replay import replay_in_mujoco
+from yid_ocp.virtual.mujoco_simulation import SimulationOptions
+from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 
 mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
 
@@ -35,19 +35,19 @@ VALUES = {
 @pytest.fixture(scope="module")
 def arm() -> System:
     robot = read_urdf("default:servo_arm.urdf")
-    return System.build(robot, driven=JOINTS, servos=PositionServos(), damping=0.02, points=["gripper"])
+    return System.build(robot, driven=JOINTS, servos=PositionServoOptions(), damping=0.02, point_frames=["gripper"])
 
 
 def played(arm: System, *effects: InjectedEffect) -> Recording:
-    excitation = Excitation(speed=2.0, duration=1.0, band=(0.5, 2.0))
+    excitation = MultisineOptions(max_joint_speed=2.0, duration=1.0, frequency_band=(0.5, 2.0))
     experiment = VirtualExperiment(
-        motion=multisine(arm, VALUES, seed=4, posture=POSTURE, excitation=excitation),
-        posture=POSTURE,
-        simulation=Simulation(1.0, rate=50.0, time_step=1e-4),
-        noise=ArmNoise(position=1e-6, velocity=1e-6),
-        camera=PointCamera(std=1e-6, rate=50.0, gaps=False, missing=0.0, pose=np.eye(4)),
+        motion=random_multisine(arm, VALUES, seed=4, initial_joint_angles=POSTURE, excitation=excitation),
+        initial_joint_angles=POSTURE,
+        simulation=SimulationOptions(1.0, sample_rate=50.0, time_step=1e-4),
+        arm_noise=ArmSensorNoise(position_std=1e-6, velocity_std=1e-6),
+        camera=PointCamera(point_std=1e-6, frame_rate=50.0, has_dropouts=False, hidden_probability=0.0, pose=np.eye(4)),
     )
-    return injected_experiment(arm, VALUES, effects, experiment)
+    return run_injected_experiment(arm, VALUES, effects, experiment)
 
 
 @pytest.fixture(scope="module")
@@ -59,9 +59,9 @@ def evaluated(system: System, recording: Recording) -> tuple[float, np.ndarray]:
     """Cost, and angles by our equations under the recorded commands, shape (N + 1, 5) [rad]."""
     step = compile_step(system, 0.005, use_compiler=False)
     problem = EstimationProblem(step, [recording], ["pan.damping"], None, VALUES)
-    found = problem.evaluate(problem.start, derivatives=False)
+    found = problem.evaluate(problem.initial_unknowns, derivatives=False)
     assert found.ok, found.message
-    return found.cost, np.asarray(found.episodes[0].rollout.state[::4, : len(JOINTS)])
+    return found.cost, np.asarray(found.episode_predictions[0].rollout.state[::4, : len(JOINTS)])
 
 
 def test_a_virtual_experiment_records_commands_and_no_efforts(recording: Recording) -> None:
@@ -113,10 +113,10 @@ def test_export_says_that_a_servo_is_native_in_mjcf_alone(arm: System) -> None:
     effects += [("servo_saturation", "lift", {"limit": 0.9}), ("backlash", "elbow", {"width": 0.01})]
     system = arm.with_effects([make_effect(kind, place, arm, values) for kind, place, values in effects])
     values = dict(zip(system.parameters.names, system.parameters.vector(VALUES), strict=True))
-    said = said_of_effects(system, values, "mjcf")
+    said = effect_support(system, values, "mjcf")
     assert [said[f"{kind}@{place}"].status for kind, place, _ in effects] == ["native"] * 3 + ["not representable"]
     for form, status in (("mjcf", "native"), ("urdf", "not representable"), ("sdf", "not representable")):
-        own = said_of_parameters(system, said_of_effects(system, values, form), form)
+        own = parameter_support(system, effect_support(system, values, form), form)
         assert {own[f"wrist_flex.servo_{name}"].status for name in ("gain", "damping", "delay", "torque_limit")} == {
             status
         }
@@ -125,13 +125,13 @@ def test_export_says_that_a_servo_is_native_in_mjcf_alone(arm: System) -> None:
     pan, lift = model.actuator("pan"), model.actuator("lift")
     assert (pan.gainprm[0], pan.biasprm[1], pan.biasprm[2]) == pytest.approx((32.0, -32.0, -1.6))
     assert model.actuator_delay[pan.id] == pytest.approx(0.045)
-    limit = (3.0**-KNEE + 0.9**-KNEE) ** (-1 / KNEE)
+    limit = (3.0**-TORQUE_LIMIT_POWER + 0.9**-TORQUE_LIMIT_POWER) ** (-1 / TORQUE_LIMIT_POWER)
     assert lift.forcerange == pytest.approx([-limit, limit])
 
 
 def test_an_exported_model_replays_its_commands(arm: System, recording: Recording) -> None:
     values = dict(zip(arm.parameters.names, arm.parameters.vector(VALUES), strict=True))
-    error = replay(mujoco_xml(arm, values, emulate=True, actuators=True), arm, recording)["joints.position"]
+    error = replay_in_mujoco(mujoco_xml(arm, values, emulate=True, actuators=True), arm, recording)["joints.position"]
     assert error.rmse < 1e-3
-    wrong = replay(mujoco_xml(arm, values | {"pan.servo_gain": 10.0}, actuators=True), arm, recording)
+    wrong = replay_in_mujoco(mujoco_xml(arm, values | {"pan.servo_gain": 10.0}, actuators=True), arm, recording)
     assert wrong["joints.position"].rmse > 5 * error.rmse

@@ -11,13 +11,13 @@ import pytest
 
 from yid_ocp.effects import EFFECTS, make_effect
 from yid_ocp.errors import ModelError
-from yid_ocp.export.manifest import said_of_effects
+from yid_ocp.export.format_support import effect_support
 from yid_ocp.model import Grasp, Segment, System, flexible_object
-from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body
+from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_derivatives
 from yid_ocp.model.system import MidpointState
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.virtual.mjcf import compiled_model, mujoco_xml
-from yid_ocp.virtual.terms import Evaluator, joint_terms
+from yid_ocp.virtual.mjcf import compile_mjcf, mujoco_xml
+from yid_ocp.virtual.rigid_body_terms import ParameterEvaluator, joint_dynamics
 
 mujoco = pytest.importorskip("mujoco", reason="exported models need MuJoCo: pip install 'yid-ocp[blind]'")
 
@@ -100,27 +100,27 @@ def test_mechanics_equals_the_symbolic_one(system: System, kind: str) -> None:
     if kind == "cubic_stiffness" and not hasattr(mujoco.MjModel, "jnt_stiffnesspoly"):
         pytest.skip("this MuJoCo has no polynomial stiffness")
     changed = with_effect(system, kind, *MECHANICAL[kind])
-    q, v = ca.SX.sym("q", changed.size), ca.SX.sym("v", changed.size)
+    q, v = ca.SX.sym("q", changed.n_coordinates), ca.SX.sym("v", changed.n_coordinates)
     kinematics = forward_kinematics(changed.mechanism, q)
-    rigid = rigid_body(kinematics, v, changed.gravity)
+    rigid = rigid_body_derivatives(kinematics, v, changed.gravity)
     [effect] = changed.effects
     none = ca.SX(0, 1)
-    terms = effect.terms(MidpointState(changed, kinematics, q, v, none, none, none, none, {}, ca.SX(1)))
+    terms = effect.step_terms(MidpointState(changed, kinematics, q, v, none, none, none, none, {}, ca.SX(1)))
     passive = changed.viscous_force(v) - ca.gradient(changed.elastic_energy(q), q) + ca.gradient(terms.lagrangian, q)
-    for joint, compliance in changed.compliant.items():
+    for joint, compliance in changed.joint_compliances.items():
         at = changed.mechanism.joint_index(joint)
-        passive[at] -= (q[at] + changed.relaxing[joint] * v[at]) / compliance
-    if terms.viscous is not None:
-        passive += terms.viscous
+        passive[at] -= (q[at] + changed.joint_relaxation_times[joint] * v[at]) / compliance
+    if terms.dissipative_force is not None:
+        passive += terms.dissipative_force
     mass = mass_matrix(rigid, changed.mechanism) + ca.hessian(terms.lagrangian, v)[0]
-    bias = ca.jtimes(rigid.by_v, q, v) - rigid.by_q
+    bias = ca.jtimes(rigid.lagrangian_by_v, q, v) - rigid.lagrangian_by_q
     ours = ca.Function("ours", [q, v, changed.parameters.symbols], [mass, bias, passive])
-    model = compiled_model(mujoco_xml(changed))
+    model = compile_mjcf(mujoco_xml(changed))
     data = mujoco.MjData(model)
     order = [model.joint(name).id for name in changed.mechanism.joint_names]
     rng = np.random.default_rng(0)
     for _ in range(2):
-        posture, velocity = rng.uniform(-1, 1, changed.size), rng.uniform(-1, 1, changed.size)
+        posture, velocity = rng.uniform(-1, 1, changed.n_coordinates), rng.uniform(-1, 1, changed.n_coordinates)
         data.qpos[order], data.qvel[order] = posture, velocity
         mujoco.mj_forward(model, data)
         full = np.zeros((model.nv, model.nv))
@@ -135,16 +135,16 @@ def test_mechanics_equals_the_symbolic_one(system: System, kind: str) -> None:
 @pytest.mark.parametrize("kind", [*MECHANICAL, *OTHERS])
 def test_what_is_said_of_it(system: System, kind: str) -> None:
     location, values, *status = (*MECHANICAL[kind], "native") if kind in MECHANICAL else OTHERS[kind]
-    [said] = said_of_effects(with_effect(system, kind, location, values), {}, "mjcf").values()
+    [said] = effect_support(with_effect(system, kind, location, values), {}, "mjcf").values()
     assert [said.status] == status
     neutral = with_effect(system, kind, location, {})
-    assert said_of_effects(neutral, {}, "mjcf")[f"{kind}@{location}"].how.startswith("neutral")
+    assert effect_support(neutral, {}, "mjcf")[f"{kind}@{location}"].how.startswith("neutral")
 
 
 def test_what_has_no_term_is_refused(system: System) -> None:
     for kind, (location, values, status) in OTHERS.items():
         changed = with_effect(system, kind, location, values)
-        [said] = said_of_effects(changed, {}, "mjcf").values()
+        [said] = effect_support(changed, {}, "mjcf").values()
         motion = not said.how.startswith("what a sensor reads")
         if kind == "junction_compliance" or (status == "not representable" and motion):
             with pytest.raises(ModelError):
@@ -157,7 +157,7 @@ def test_what_has_no_term_is_refused(system: System) -> None:
 
 def test_a_part_of_the_weight(system: System) -> None:
     changed = with_effect(system, "gravity_scale", "object", {"fraction": -0.4})
-    model, whole = (compiled_model(mujoco_xml(s)) for s in (changed, system))
+    model, whole = (compile_mjcf(mujoco_xml(s)) for s in (changed, system))
     light, heavy = mujoco.MjData(model), mujoco.MjData(whole)
     for m, d in ((model, light), (whole, heavy)):
         d.qpos[:] = np.linspace(-0.5, 0.5, m.nq)
@@ -180,7 +180,7 @@ def test_recorded_torques_become_those_that_act(system: System) -> None:
     for changed, delay in ((system, 0.0), (late, 0.02)):
         if delay and not hasattr(mujoco.MjModel, "actuator_delay"):
             continue
-        model = compiled_model(mujoco_xml(changed, time_step=1e-3, actuators=True))
+        model = compile_mjcf(mujoco_xml(changed, time_step=1e-3, actuators=True))
         data = mujoco.MjData(model)
         at, found = model.joint("elbow").id, []
         for _ in range(120):
@@ -196,14 +196,14 @@ def test_recorded_torques_become_those_that_act(system: System) -> None:
 
 def test_a_grasp_that_gives_way_is_a_tendon(system: System) -> None:
     changed = with_effect(system, *("grasp_compliance", *OTHERS["grasp_compliance"][:2]))
-    model = compiled_model(mujoco_xml(changed, emulate=True))
+    model = compile_mjcf(mujoco_xml(changed, emulate=True))
     data = mujoco.MjData(model)
     data.qpos[:] = 0.1
     mujoco.mj_forward(model, data)
     apart = data.site("grasp_hold_holder").xpos - data.site("grasp_hold_held").xpos
     jacobian = np.zeros((3, model.nv))
     mujoco.mj_jacSite(model, data, jacobian, None, model.site("grasp_hold_held").id)
-    plain = compiled_model(mujoco_xml(replace(changed, grasps=()), emulate=True))
+    plain = compile_mjcf(mujoco_xml(replace(changed, grasps=()), emulate=True))
     other = mujoco.MjData(plain)
     other.qpos[:] = 0.1
     mujoco.mj_forward(plain, other)
@@ -213,8 +213,8 @@ def test_a_grasp_that_gives_way_is_a_tendon(system: System) -> None:
 
 def test_dry_friction_is_friction_of_the_joint(system: System) -> None:
     changed = with_effect(system, "joint_coulomb", "elbow", {"tau_c": 0.4})
-    assert joint_terms(changed, Evaluator(changed))["elbow"].friction == 0.4
-    model = compiled_model(mujoco_xml(changed, emulate=True))
+    assert joint_dynamics(changed, ParameterEvaluator(changed))["elbow"].dry_friction == 0.4
+    model = compile_mjcf(mujoco_xml(changed, emulate=True))
     assert model.dof_frictionloss[model.joint("elbow").id] == 0.4
 
 

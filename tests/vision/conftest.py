@@ -11,23 +11,23 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from yid_ocp.data.hdf5 import read_recording
 from yid_ocp.data.recording import JointGroup, Recording
+from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.errors import DataError
 from yid_ocp.vision import (
+    CameraScene,
     DepthCamera,
     FrameTiming,
-    Scene,
     TrackOptions,
     VirtualCamera,
-    look_at,
+    look_at_pose,
     read_frames,
-    track,
-    virtual_frames,
+    render_virtual_frames,
+    track_object,
 )
-from yid_ocp.vision.fit import ShapeFit
-from yid_ocp.vision.frames import open3d_module
-from yid_ocp.vision.lens import Pinhole
+from yid_ocp.vision.camera_intrinsics import CameraIntrinsics
+from yid_ocp.vision.fit import ShapeFitter
+from yid_ocp.vision.frames import import_open3d
 
 DATA = Path(__file__).parent / "data"
 TRUTH = {
@@ -38,14 +38,14 @@ TRUTH = {
     "T3.bend": 11.5,
     "T3.twist": 9.7,
 }
-POSE = look_at([2.6, 0.0, 0.45], [0.85, 0.0, -0.1])
+POSE = look_at_pose([2.6, 0.0, 0.45], [0.85, 0.0, -0.1])
 LATENCY = 0.06
 
 
 @pytest.fixture(scope="session", autouse=True)
 def open3d():
     try:
-        return open3d_module()
+        return import_open3d()
     except DataError as error:
         pytest.skip(f"vision is not installed: {error.what}")
 
@@ -62,20 +62,24 @@ def system(single_arm):
 
 @pytest.fixture(scope="session")
 def shape(system):
-    return ShapeFit(system)
+    return ShapeFitter(system)
 
 
 @pytest.fixture(scope="session")
 def run(system):
     """Three seconds in MuJoCo."""
     pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo")
-    from yid_ocp.virtual.engine import Simulation, simulate_in_mujoco
-    from yid_ocp.virtual.motion import Excitation, multisine
-    from yid_ocp.virtual.posture import initial_posture
+    from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
+    from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
+    from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 
-    posture = initial_posture(system, TRUTH)
-    motion = multisine(system, TRUTH, seed=1, posture=posture, excitation=Excitation(travel=0.15))
-    return simulate_in_mujoco(system, TRUTH, motion, Simulation(3.0, time_step=2.5e-4), posture=posture)
+    posture = grasping_joint_angles(system, TRUTH)
+    motion = random_multisine(
+        system, TRUTH, seed=1, initial_joint_angles=posture, excitation=MultisineOptions(gripper_travel=0.15)
+    )
+    return simulate_in_mujoco(
+        system, TRUTH, motion, SimulationOptions(3.0, time_step=2.5e-4), initial_joint_angles=posture
+    )
 
 
 @pytest.fixture(scope="session")
@@ -87,7 +91,9 @@ def recording(system, run):
 
 
 # a quarter of an Xtion's pixels, each as good: a test has four times as many frames in the time
-COARSE = DepthCamera(Pinhole.of_view(320, 240, math.radians(58.0)), disparity_std=1 / 32, disparity_step=1 / 16)
+COARSE = DepthCamera(
+    CameraIntrinsics.from_field_of_view(320, 240, math.radians(58.0)), disparity_std=1 / 32, disparity_step=1 / 16
+)
 
 
 @pytest.fixture(scope="session")
@@ -96,13 +102,13 @@ def tracked(system, run, recording, shape):
 
     def make(options=None, outliers=0.0, seed=0, frames=None, stages=(), **timing):
         when = FrameTiming(**{"rate": 4.0, "latency": LATENCY, **timing})
-        scene = Scene(system, "package:baxter")
-        camera = VirtualCamera(POSE, replace(COARSE, outliers=outliers), when, seed=seed)
-        made = virtual_frames(scene, run.t, run.q, camera)
-        seen = made.sequence if frames is None else made.sequence.select(frames)
-        chosen = replace(options or TrackOptions(), points=system.points)
-        found = track(scene, recording, seen, chosen, stages=stages)
-        were = np.array([shape.place(made.course(t)) for t in found.t])
+        scene = CameraScene(system, "package:baxter")
+        camera = VirtualCamera(POSE, replace(COARSE, outlier_probability=outliers), when, seed=seed)
+        made = render_virtual_frames(scene, run.t, run.q, camera)
+        seen = made.sequence if frames is None else made.sequence.select_frames(frames)
+        chosen = replace(options or TrackOptions(), tracked_points=system.points)
+        found = track_object(scene, recording, seen, chosen, stages=stages)
+        were = np.array([shape.place(made.true_configuration_at(t)) for t in found.t])
         errors = np.linalg.norm(found.position - were, axis=2)
         return SimpleNamespace(made=made, track=found, latency=when.latency, errors=errors)
 
@@ -118,10 +124,10 @@ def clean(tracked):
 def small(system):
     """Three small clouds from disk, the joints' recording and where the points really were."""
     truth = json.loads((DATA / "truth.json").read_text())
-    assert tuple(truth["points"]) == system.points
+    assert tuple(truth["points"]) == system.point_frames
     return SimpleNamespace(
         sequence=read_frames(DATA / "frames"),
         recording=read_recording(DATA / "joints.h5"),
         truth=np.array(truth["position"]),
-        clouds=[read_frames(DATA / "frames").load(i) for i in range(3)],
+        clouds=[read_frames(DATA / "frames").load_cloud(i) for i in range(3)],
     )

@@ -10,54 +10,61 @@ from pathlib import Path
 
 import numpy as np
 
-from yid_ocp.data.hdf5 import write_recording
 from yid_ocp.data.recording import JointGroup, Recording
-from yid_ocp.virtual.engine import Simulation, simulate_in_mujoco
-from yid_ocp.virtual.experiment import paper_system
-from yid_ocp.virtual.motion import Excitation, multisine
-from yid_ocp.virtual.posture import initial_posture
+from yid_ocp.data.recording_hdf5 import write_recording
+from yid_ocp.virtual.experiment import baxter_foam_y_system
+from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
+from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
+from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 from yid_ocp.vision import (
-    FilterOptions,
+    CameraScene,
+    CloudFilterOptions,
     FrameSequence,
     FrameTiming,
-    Scene,
     VirtualCamera,
-    look_at,
-    virtual_frames,
-    write_frames,
+    look_at_pose,
+    render_virtual_frames,
+    write_frame_folder,
 )
-from yid_ocp.vision.filters import ObjectRegion, voxel_grid, without_outliers, without_robot
-from yid_ocp.vision.fit import ShapeFit
-from yid_ocp.vision.meshes import Surfaces, numeric_mechanism, robot_meshes
+from yid_ocp.vision.filters import ObjectRegion, is_not_outlier, is_not_robot, voxel_averages
+from yid_ocp.vision.fit import ShapeFitter
+from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, load_robot_meshes, numeric_mechanism
 
 FOLDER = Path(__file__).parent / "data"
 VOXEL = 0.011
 
 
 def main() -> None:
-    system = paper_system(1)
-    posture = initial_posture(system)
-    motion = multisine(system, seed=1, posture=posture, excitation=Excitation(travel=0.15))
-    run = simulate_in_mujoco(system, None, motion, Simulation(1.5, time_step=2.5e-4), posture=posture)
-    camera = VirtualCamera(look_at([2.6, 0.0, 0.45], [0.85, 0.0, -0.1]), timing=FrameTiming(rate=2.7), seed=5)
-    made = virtual_frames(Scene(system, "package:baxter"), run.t, run.q, camera)
+    system = baxter_foam_y_system(1)
+    posture = grasping_joint_angles(system)
+    motion = random_multisine(
+        system, seed=1, initial_joint_angles=posture, excitation=MultisineOptions(gripper_travel=0.15)
+    )
+    run = simulate_in_mujoco(
+        system, None, motion, SimulationOptions(1.5, time_step=2.5e-4), initial_joint_angles=posture
+    )
+    camera = VirtualCamera(look_at_pose([2.6, 0.0, 0.45], [0.85, 0.0, -0.1]), timing=FrameTiming(mean_rate=2.7), seed=5)
+    made = render_virtual_frames(CameraScene(system, "package:baxter"), run.t, run.q, camera)
     tree = numeric_mechanism(system)
-    robot = Surfaces(tree, robot_meshes("package:baxter", tree))
-    region = ObjectRegion(system, FilterOptions())
-    pose, clouds = made.sequence.pose, []
-    for i, q in enumerate(made.q):
-        points = made.sequence.world(i)
-        cloud = voxel_grid(points[region.at(q, pose[:3, 3]).contains(points)], VOXEL)
-        cloud = cloud.keep(without_outliers(cloud, 12, 4.0))
-        cloud = cloud.keep(without_robot(cloud, robot, q, 0.03))
+    robot = ArticulatedSurfaces(tree, load_robot_meshes("package:baxter", tree))
+    region = ObjectRegion(system, CloudFilterOptions())
+    pose, clouds = made.sequence.camera_pose, []
+    for i, q in enumerate(made.true_configurations):
+        points = made.sequence.load_world_cloud(i)
+        cloud = voxel_averages(points[region.bounds_at(q, pose[:3, 3]).contains(points)], VOXEL)
+        cloud = cloud.select(is_not_outlier(cloud, 12, 4.0))
+        cloud = cloud.select(is_not_robot(cloud, robot, q, 0.03))
         clouds.append((cloud.points - pose[:3, 3]) @ pose[:3, :3])
-    write_frames(FrameSequence.of(made.taken, clouds, pose), FOLDER / "frames")
+    write_frame_folder(FrameSequence.from_clouds(made.capture_times, clouds, pose), FOLDER / "frames")
     names = system.driven
     every = slice(None, None, 2)
     joints = JointGroup(names, run.t[every], np.round(run.q[every, : len(names)], 6), position_std=2e-4)
     write_recording(Recording(joints, description="Joints beside three clouds.", source="test"), FOLDER / "joints.h5")
-    shape = ShapeFit(system)
-    truth = {"points": system.points, "position": [np.round(shape.place(q), 5).tolist() for q in made.q]}
+    shape = ShapeFitter(system)
+    truth = {
+        "points": system.point_frames,
+        "position": [np.round(shape.points_at(q), 5).tolist() for q in made.true_configurations],
+    }
     (FOLDER / "truth.json").write_text(json.dumps(truth) + "\n")
 
 

@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from yid_ocp.vision import FrameSequence, Pinhole, look_at
-from yid_ocp.vision.frames import open3d_module
-from yid_ocp.vision.meshes import Mesh
+from yid_ocp.vision import CameraIntrinsics, FrameSequence, look_at_pose
+from yid_ocp.vision.frames import import_open3d
+from yid_ocp.vision.surface_meshes import TriangleMesh
 
-PINHOLE = Pinhole.of_view(320, 240, np.radians(50.0))
+PINHOLE = CameraIntrinsics.from_field_of_view(320, 240, np.radians(50.0))
 EYE, TARGET = (2.6, 0.0, 0.3), (0.85, 0.0, -0.15)
 FOOT = np.array([0.85, 0.0, -0.93])
 LEAN = np.radians(45.0)
@@ -49,21 +49,21 @@ def swept(line, tangents, radius, facets=24):
     faces.append(np.column_stack([np.full(facets, first), (i + 1) % facets, i]))
     top = (len(line) - 1) * facets
     faces.append(np.column_stack([np.full(facets, last), top + i, top + (i + 1) % facets]))
-    return Mesh(vertices, np.concatenate(faces))
+    return TriangleMesh(vertices, np.concatenate(faces))
 
 
 def box(centre, size):
     """A box with its middle somewhere."""
     place = np.eye(4)
     place[:3, 3] = centre
-    return Mesh.box(size).moved(place)
+    return TriangleMesh.box(size).transformed(place)
 
 
 def pole(foot, length, radius):
     """An upright cylinder."""
     place = np.eye(4)
     place[:3, 3] = foot
-    return Mesh.cylinder(radius, 0.0, length).moved(place)
+    return TriangleMesh.cylinder(radius, 0.0, length).transformed(place)
 
 
 @dataclass
@@ -96,16 +96,16 @@ def swaying(k, size=0.35):
     }
 
 
-def seen(meshes: Sequence[Mesh], seed, *, pose=None, pinhole=PINHOLE, noise=NOISE, flying=0.3):
+def seen(meshes: Sequence[TriangleMesh], seed, *, pose=None, pinhole=PINHOLE, noise=NOISE, flying=0.3):
     """Cloud of meshes in the camera's frame, shape (N, 3)."""
-    o3d = open3d_module()
-    camera = look_at(EYE, TARGET) if pose is None else pose
+    o3d = import_open3d()
+    camera = look_at_pose(EYE, TARGET) if pose is None else pose
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    mesh = Mesh.joined(list(meshes))
+    mesh = TriangleMesh.concatenate(list(meshes))
     scene.add_triangles(
         o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32))
     )
-    rays = pinhole.rays
+    rays = pinhole.pixel_rays
     directions = rays @ camera[:3, :3].T
     packed = np.concatenate([np.broadcast_to(camera[:3, 3], directions.shape), directions], axis=-1)
     depth = scene.cast_rays(o3d.core.Tensor(packed.astype(np.float32)), nthreads=1)["t_hit"].numpy().astype(float)
@@ -115,7 +115,7 @@ def seen(meshes: Sequence[Mesh], seed, *, pose=None, pinhole=PINHOLE, noise=NOIS
     mixed = edge & (rng.random(depth.shape) < flying)
     depth = np.where(mixed, depth + rng.random(depth.shape) * (beside - depth), depth)
     depth = depth + noise * (depth / 2.0) ** 2 * rng.standard_normal(depth.shape)
-    return pinhole.cloud(np.where(depth < 4.0, depth, np.nan))
+    return pinhole.points_from_depth(np.where(depth < 4.0, depth, np.nan))
 
 
 def floor_and_wall():
@@ -125,11 +125,11 @@ def floor_and_wall():
 
 def filmed(object_: SmoothY, frames, things=lambda k: [], *, seed=0, rate=4.0, background=True, still=None):
     """A sequence with its truth: tips of every frame, each (3, 3) in the order w_T1, w_T2, w_T3 [m]."""
-    pose = look_at(EYE, TARGET)
+    pose = look_at_pose(EYE, TARGET)
     clouds, truth = [], []
     for k in range(frames):
         meshes, tips = object_.rods(swaying(k) if still is None else still)
         around = floor_and_wall() if background else []
         clouds.append(seen([*meshes, *around, *things(k)], [seed, k]))
         truth.append([tips[name] for name in ("w_T1", "w_T2", "w_T3")])
-    return FrameSequence.of(np.arange(frames) / rate, clouds, pose), np.array(truth)
+    return FrameSequence.from_clouds(np.arange(frames) / rate, clouds, pose), np.array(truth)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.errors import DataError
-from yid_ocp.vision import Pinhole, look_at, read_frames
+from yid_ocp.vision import CameraIntrinsics, look_at_pose, read_frames
 
 rosbags = pytest.importorskip("rosbags", reason="bags need rosbags: pip install 'yid-ocp[bags]'")
 from rosbags.rosbag1 import Writer as Writer1  # noqa: E402
@@ -14,13 +14,13 @@ from rosbags.rosbag2 import StoragePlugin  # noqa: E402
 from rosbags.rosbag2 import Writer as Writer2  # noqa: E402
 from rosbags.typesys import Stores, get_typestore  # noqa: E402
 
-POSE = look_at([2.0, 0.5, 0.3], [0.0, 0.0, 0.0])
+POSE = look_at_pose([2.0, 0.5, 0.3], [0.0, 0.0, 0.0])
 START = 1_700_000_000 * 10**9
 CLOUDS = [np.random.default_rng(i).uniform(0.5, 2.0, (5 + i, 3)).astype(np.float32) for i in range(3)]
 COLOURS = [np.random.default_rng(i).integers(0, 256, (5 + i, 3)).astype(np.uint8) for i in range(3)]
 DEPTH = np.arange(1200, 1200 + 6 * 8, dtype=np.uint16).reshape(6, 8)
 DEPTH[0, :2] = 0
-LENS = Pinhole(8, 6, 10.0, 11.0, 3.5, 2.5, "plumb_bob", (-0.2, 0.05, 1e-3, -1e-3, 0.0))
+LENS = CameraIntrinsics(8, 6, 10.0, 11.0, 3.5, 2.5, "plumb_bob", (-0.2, 0.05, 1e-3, -1e-3, 0.0))
 STAMPS = (0.3, 0.1, 0.2)
 """Since the first joint states [s]; messages come out of order."""
 KINDS = ("ros1", "ros2", "mcap")
@@ -152,12 +152,12 @@ def test_clouds(tmp_path, kind, big):
         for stamp, cloud, colours in zip(STAMPS, CLOUDS, COLOURS, strict=True):
             bag.cloud(stamp, cloud, colours)
     sequence = read_frames(bag.path, pose=POSE)
-    assert np.allclose(sequence.t, STAMPS, atol=1e-9)
+    assert np.allclose(sequence.stamps, STAMPS, atol=1e-9)
     for i in (2, 0, 1):
-        assert np.array_equal(sequence.load(i), CLOUDS[i].astype(float))
-        assert np.array_equal(sequence.colours(i), COLOURS[i])
-    assert np.allclose(sequence.select([1]).colours(0), COLOURS[1])
-    assert np.allclose(read_frames(bag.path, pose=POSE, unit="mm").load(0), 1e-3 * CLOUDS[0])
+        assert np.array_equal(sequence.load_cloud(i), CLOUDS[i].astype(float))
+        assert np.array_equal(sequence.load_colours(i), COLOURS[i])
+    assert np.allclose(sequence.select_frames([1]).load_colours(0), COLOURS[1])
+    assert np.allclose(read_frames(bag.path, pose=POSE, unit="mm").load_cloud(0), 1e-3 * CLOUDS[0])
 
 
 @pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
@@ -166,15 +166,15 @@ def test_depth_images_with_the_lens_of_the_camera(tmp_path, kind, encoding):
     image = DEPTH if encoding == "16UC1" else (1e-3 * DEPTH).astype(np.float32)
     with Bag(tmp_path, kind) as bag:
         bag.info()
-        bag.info(Pinhole(8, 6, 1.0, 1.0, 0.0, 0.0), topic="/camera/colour/camera_info")
+        bag.info(CameraIntrinsics(8, 6, 1.0, 1.0, 0.0, 0.0), topic="/camera/colour/camera_info")
         bag.image(0.5, image, encoding)
         bag.image(0.1, image, "rgb8", topic="/camera/colour/image_raw")
     sequence = read_frames(bag.path, pose=POSE)
-    assert np.array_equal(sequence.t, [0.0])  # without joint states, since the first frame
+    assert np.array_equal(sequence.stamps, [0.0])  # without joint states, since the first frame
     assert sequence.intrinsics == LENS
-    assert np.allclose(sequence.load(0), LENS.cloud(1e-3 * DEPTH), atol=1e-6)
-    assert len(sequence.load(0)) == 46
-    assert sequence.colours(0) is None
+    assert np.allclose(sequence.load_cloud(0), LENS.points_from_depth(1e-3 * DEPTH), atol=1e-6)
+    assert len(sequence.load_cloud(0)) == 46
+    assert sequence.load_colours(0) is None
 
 
 def test_rectified_images_have_no_distortion(tmp_path):
@@ -182,7 +182,7 @@ def test_rectified_images_have_no_distortion(tmp_path):
         bag.info()
         bag.image(0.0, DEPTH, "16UC1", topic="/camera/depth/image_rect")
     lens = read_frames(bag.path, pose=POSE).intrinsics
-    assert (lens.fx, lens.fy, lens.cx, lens.cy, lens.distorted) == (20.0, 22.0, 3.5, 2.5, False)
+    assert (lens.fx, lens.fy, lens.cx, lens.cy, lens.has_distortion) == (20.0, 22.0, 3.5, 2.5, False)
 
 
 def test_a_file_of_a_realsense_camera(tmp_path):
@@ -190,12 +190,12 @@ def test_a_file_of_a_realsense_camera(tmp_path):
     sensor = "/device_0/sensor_0"
     with Bag(tmp_path, "ros1") as bag:
         bag.info(topic=f"{sensor}/Depth_0/info/camera_info")
-        bag.info(Pinhole(8, 6, 1.0, 1.0, 0.0, 0.0), topic="/device_0/sensor_1/Color_0/info/camera_info")
+        bag.info(CameraIntrinsics(8, 6, 1.0, 1.0, 0.0, 0.0), topic="/device_0/sensor_1/Color_0/info/camera_info")
         bag.put(f"{sensor}/option/Depth_Units/value", bag.make("std_msgs/msg/Float32", data=1e-4))
         bag.image(0.0, DEPTH, "mono16", topic=f"{sensor}/Depth_0/image/data")
         bag.image(0.0, DEPTH.astype(np.uint8), "rgb8", topic="/device_0/sensor_1/Color_0/image/data")
     sequence = read_frames(bag.path, pose=POSE)
-    assert np.allclose(sequence.load(0), LENS.cloud(1e-4 * DEPTH), atol=1e-9)
+    assert np.allclose(sequence.load_cloud(0), LENS.points_from_depth(1e-4 * DEPTH), atol=1e-9)
 
 
 def test_messages_without_stamps_have_the_time_of_recording(tmp_path):
@@ -203,7 +203,7 @@ def test_messages_without_stamps_have_the_time_of_recording(tmp_path):
         bag.info()
         bag.image(0.7, DEPTH, "16UC1")
         bag.image(None, DEPTH, "16UC1")
-    assert np.allclose(read_frames(bag.path, pose=POSE).t, [0.0, 1e-3], atol=1e-9)
+    assert np.allclose(read_frames(bag.path, pose=POSE).stamps, [0.0, 1e-3], atol=1e-9)
 
 
 def test_messages_of_one_time_are_told_apart(tmp_path):
@@ -212,7 +212,7 @@ def test_messages_of_one_time_are_told_apart(tmp_path):
             bag.log = START
             bag.cloud(stamp, cloud)
     sequence = read_frames(bag.path, pose=POSE)
-    assert {len(sequence.load(i)) for i in range(3)} == {5, 6, 7}
+    assert {len(sequence.load_cloud(i)) for i in range(3)} == {5, 6, 7}
 
 
 @pytest.mark.parametrize(
@@ -224,7 +224,11 @@ def test_messages_of_one_time_are_told_apart(tmp_path):
         (lambda bag: bag.joints(0), {}, "no clouds and no depth images"),
         (lambda bag: [bag.cloud(0, CLOUDS[0], topic=name) for name in ("/a", "/b")], {}, "2 topics of clouds"),
         (lambda bag: bag.image(0, DEPTH, "16UC1"), {}, "intrinsics are not known"),
-        (lambda bag: [bag.image(0, DEPTH, "16UC1"), bag.info(Pinhole(8, 6, 0, 0, 0, 0))], {}, "is not calibrated"),
+        (
+            lambda bag: [bag.image(0, DEPTH, "16UC1"), bag.info(CameraIntrinsics(8, 6, 0, 0, 0, 0))],
+            {},
+            "is not calibrated",
+        ),
         (lambda bag: [bag.image(0, DEPTH, "16UC1"), bag.info(model="odd")], {}, "the distortion is 'odd'"),
     ],
 )
@@ -241,8 +245,8 @@ def test_a_cloud_without_places_and_a_cut_off_one_are_bad_frames(tmp_path):
         bag.cloud(0.1, CLOUDS[1])
     sequence = read_frames(bag.path, pose=POSE)
     with pytest.raises(DataError, match="the cloud has the fields x, y, i"):
-        sequence.load(0)
-    assert np.array_equal(sequence.load(1), CLOUDS[1].astype(float))
+        sequence.load_cloud(0)
+    assert np.array_equal(sequence.load_cloud(1), CLOUDS[1].astype(float))
 
 
 def test_damaged_bags_and_other_files_are_refused(tmp_path):

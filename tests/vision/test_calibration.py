@@ -11,23 +11,23 @@ from scipy.spatial.transform import Rotation
 
 from yid_ocp.errors import DataError
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.vision import CalibrationOptions, ClockOptions, Pinhole, look_at
-from yid_ocp.vision.calibration import as_given, calibrate
-from yid_ocp.vision.clock import agreed, is_late, own_offset
-from yid_ocp.vision.meshes import Surfaces, robot_meshes
-from yid_ocp.vision.registration import (
-    CLOCK,
-    DRIFT,
-    SCALE,
-    SHIFT,
-    SIZE,
-    Arm,
+from yid_ocp.vision import CameraCalibrationOptions, CameraClockOptions, CameraIntrinsics, look_at_pose
+from yid_ocp.vision.calibration import calibrate_camera, calibration_as_given
+from yid_ocp.vision.camera_registration import (
+    CLOCK_DRIFT_INDEX,
+    CLOCK_OFFSET_INDEX,
+    DEPTH_SCALE_INDEX,
+    STATE_SIZE,
+    TRANSLATION_SLICE,
+    ArmSurface,
+    CalibrationEquations,
+    CalibrationFrame,
     CameraState,
-    Glimpse,
-    Rows,
     _at_least,
-    robust_sum,
+    evaluate_robust_cost,
 )
+from yid_ocp.vision.clock import estimate_stamp_delay, find_on_time_frames, is_stamped_late
+from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, load_robot_meshes
 
 ARM = """<robot name="arm"><link name="base"><visual><geometry><box size="0.3 0.3 0.2"/></geometry></visual></link>
 <joint name="yaw" type="revolute"><parent link="base"/><child link="upper"/><origin xyz="0 0 0.1"/><axis xyz="0 0 1"/>
@@ -44,8 +44,8 @@ ARM = """<robot name="arm"><link name="base"><visual><geometry><box size="0.3 0.
 <link name="hand"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
 <visual><origin xyz="0.08 0 0"/><geometry><box size="0.16 0.2 0.05"/></geometry></visual></link></robot>"""
 
-POSE = look_at([1.9, 0.6, 0.8], [0.2, 0.0, 0.35])
-LENS = Pinhole.of_view(200, 150, math.radians(58.0))
+POSE = look_at_pose([1.9, 0.6, 0.8], [0.2, 0.0, 0.35])
+LENS = CameraIntrinsics.from_field_of_view(200, 150, math.radians(58.0))
 NOISE = 0.004  # [m]
 POINTS = np.array([[0.5, 0.3, 0.5], [0.6, -0.3, 0.2], [0.3, 0.0, -0.2]])
 
@@ -63,23 +63,23 @@ def robot(tmp_path_factory):
     file = tmp_path_factory.mktemp("arm") / "arm.urdf"
     file.write_text(ARM)
     tree = read_urdf(file, parametric=False)
-    return Surfaces(tree, robot_meshes(file, tree))
+    return ArticulatedSurfaces(tree, load_robot_meshes(file, tree))
 
 
 def arm_of(robot, motion=lively):
-    return Arm(robot, motion, lambda q: np.zeros((0, 3)), 0.08)
+    return ArmSurface(robot, motion, lambda q: np.zeros((0, 3)), 0.08)
 
 
 def clouds(robot, times, rng, motion=lively, scale=1.0, pose=POSE):
     """What a camera measures of the arm before a wall: noise along the rays, and pixels that fly at edges."""
     found = []
     for t in times:
-        depth, cosine, _ = robot.cast(LENS, pose, motion(t))
+        depth, cosine, _ = robot.render_depth_image(LENS, pose, motion(t))
         depth = np.where(np.isfinite(depth), depth, 3.2)
         flying = rng.random(depth.shape) < 0.02
         depth = np.where(flying, depth + rng.uniform(-0.3, 0.3, depth.shape), depth)
         depth = depth + NOISE * rng.standard_normal(depth.shape)
-        found.append(LENS.cloud(np.where(cosine > 0.12, depth * scale, 3.2 * scale)))
+        found.append(LENS.points_from_depth(np.where(cosine > 0.12, depth * scale, 3.2 * scale)))
     return found
 
 
@@ -97,19 +97,23 @@ def found_of(robot, seed, *, turn=0.0, shift=0.0, scale=1.0, latency=0.0, drift=
     motion = options.pop("motion", lively)
     times = 1.0 + (np.arange(frames) + rng.uniform(0.1, 0.9, frames)) * duration / frames
     stamps = times + latency + drift * times + options.pop("late", np.zeros(frames))
-    seen = [Glimpse(float(s), c) for s, c in zip(stamps, clouds(robot, times, rng, motion, scale), strict=True)]
-    clock = options.pop("clock", ClockOptions())
+    seen = [
+        CalibrationFrame(float(s), c) for s, c in zip(stamps, clouds(robot, times, rng, motion, scale), strict=True)
+    ]
+    clock = options.pop("clock", CameraClockOptions())
     pose = told_pose(turn, shift, rng)
-    found = calibrate(arm_of(robot, motion), seen, pose, rng, CalibrationOptions(**options), clock)
-    about = found.state.about
+    found = calibrate_camera(arm_of(robot, motion), seen, pose, rng, CameraCalibrationOptions(**options), clock)
+    about = found.camera_state.clock_reference_stamp
     return found, CameraState(POSE, 1 / scale, 0.0, latency + drift * (about - latency), drift, about)
 
 
 def displaced(found, true):
     """By how much, and in how many standard deviations, points of the world are off, shape (N, 3)."""
-    error = found.state.world(true.measured(POINTS)) - POINTS
+    error = found.camera_state.to_world(true.to_measured(POINTS)) - POINTS
     nothing = np.zeros_like(POINTS)
-    return error, error / found.common_std(POINTS, nothing, np.full(len(POINTS), found.state.about))
+    return error, error / found.shared_point_std(
+        POINTS, nothing, np.full(len(POINTS), found.camera_state.clock_reference_stamp)
+    )
 
 
 # -- the state --------------------------------------------------------------------------------------------------------
@@ -118,43 +122,45 @@ def displaced(found, true):
 def test_slopes_of_the_state_are_derivatives():
     rng = np.random.default_rng(0)
     state = CameraState(POSE, 1.03, 0.02, 0.1, 1e-3, 5.0)
-    seen = state.measured(POINTS)
-    assert np.allclose(state.world(seen), POINTS, atol=1e-12)
-    slopes = state.slopes(POINTS)
-    for k in range(CLOCK):
-        change = np.zeros(SIZE)
+    seen = state.to_measured(POINTS)
+    assert np.allclose(state.to_world(seen), POINTS, atol=1e-12)
+    slopes = state.point_jacobian(POINTS)
+    for k in range(CLOCK_OFFSET_INDEX):
+        change = np.zeros(STATE_SIZE)
         change[k] = 1e-6
-        ahead, behind = state.moved(change).world(seen), state.moved(-change).world(seen)
+        ahead, behind = state.with_change(change).to_world(seen), state.with_change(-change).to_world(seen)
         # the offset acts on measured depths, the factor on those with it: the same to first order in both
         assert np.allclose((ahead - behind) / 2e-6, slopes[:, :, k], atol=0.05 * np.abs(slopes[:, :, k]).max() + 1e-6)
-    change = 0.05 * rng.standard_normal(SIZE)
-    assert np.allclose(state.moved(change).minus(state), change, atol=1e-12)
-    assert state.time(7.0) == pytest.approx(7.0 - 0.1 - 2e-3)
+    change = 0.05 * rng.standard_normal(STATE_SIZE)
+    assert np.allclose(state.with_change(change).difference_from(state), change, atol=1e-12)
+    assert state.to_joint_time(7.0) == pytest.approx(7.0 - 0.1 - 2e-3)
 
 
 def test_slopes_of_the_rows_are_derivatives(robot):
     rng = np.random.default_rng(1)
     [cloud] = clouds(robot, [1.7], rng)
-    state, arm = CameraState(POSE, about=1.2), arm_of(robot)
-    points = state.world(cloud)
-    glimpse = Glimpse(1.7, cloud[arm.near(points, 1.7, 0.02)][::7])
-    rows = arm.rows(state, glimpse, 0.1, along=True)
+    state, arm = CameraState(POSE, clock_reference_stamp=1.2), arm_of(robot)
+    points = state.to_world(cloud)
+    glimpse = CalibrationFrame(1.7, cloud[arm.is_near_surface(points, 1.7, 0.02)][::7])
+    rows = arm.calibration_equations(state, glimpse, 0.1, along=True)
     for k, step in (
-        (SHIFT.start, 1e-4),
-        (SHIFT.start + 2, 1e-4),
+        (TRANSLATION_SLICE.start, 1e-4),
+        (TRANSLATION_SLICE.start + 2, 1e-4),
         (0, 1e-4),
-        (SCALE, 1e-4),
-        (CLOCK, 1e-3),
-        (DRIFT, 1e-3),
+        (DEPTH_SCALE_INDEX, 1e-4),
+        (CLOCK_OFFSET_INDEX, 1e-3),
+        (CLOCK_DRIFT_INDEX, 1e-3),
     ):
-        change = np.zeros(SIZE)
+        change = np.zeros(STATE_SIZE)
         change[k] = step
-        ahead, behind = (arm.rows(state.moved(sign * change), glimpse, 0.1, along=True) for sign in (1, -1))
-        if len(ahead.error) == len(behind.error) == len(rows.error):
-            slope = (ahead.error - behind.error) / (2 * step)
-            off = np.abs(slope - rows.slope[:, k])
+        ahead, behind = (
+            arm.calibration_equations(state.with_change(sign * change), glimpse, 0.1, along=True) for sign in (1, -1)
+        )
+        if len(ahead.residuals) == len(behind.residuals) == len(rows.residuals):
+            slope = (ahead.residuals - behind.residuals) / (2 * step)
+            off = np.abs(slope - rows.jacobian[:, k])
             # rays near an edge meet another facet
-            assert np.median(off) < 0.05 * np.abs(rows.slope[:, k]).max() + 1e-4
+            assert np.median(off) < 0.05 * np.abs(rows.jacobian[:, k]).max() + 1e-4
 
 
 # -- what it finds ----------------------------------------------------------------------------------------------------
@@ -174,10 +180,10 @@ def test_pose_depth_and_clock_are_found(robot, wrong):
     error, relative = displaced(found, true)
     assert np.abs(error).max() < 0.01
     assert np.abs(relative).max() < 4
-    std = math.sqrt(found.covariance[CLOCK, CLOCK])
+    std = math.sqrt(found.state_covariance[CLOCK_OFFSET_INDEX, CLOCK_OFFSET_INDEX])
     assert std < 0.01
-    assert abs(found.state.offset - true.offset) < 4 * std
-    assert found.presence.there > 0.9
+    assert abs(found.camera_state.clock_offset - true.clock_offset) < 4 * std
+    assert found.arm_visibility.there > 0.9
     assert ("the told camera sees the arm" in found.message) == bool("turn" in wrong or "scale" in wrong)
 
 
@@ -186,8 +192,8 @@ def test_standard_deviations_are_honest(robot):
     z = []
     for seed in range(6):
         found, true = found_of(robot, 10 + seed, turn=1.0, shift=0.01, latency=0.05, frames=6)
-        error = found.state.minus(true) / np.sqrt(np.diag(found.covariance))
-        z.append([error[CLOCK], *displaced(found, true)[1].ravel()])
+        error = found.camera_state.difference_from(true) / np.sqrt(np.diag(found.state_covariance))
+        z.append([error[CLOCK_OFFSET_INDEX], *displaced(found, true)[1].ravel()])
     size = np.sqrt(np.mean(np.square(z), axis=0))
     assert size.max() < 2.2
     assert size[0] > 0.2
@@ -196,9 +202,11 @@ def test_standard_deviations_are_honest(robot):
 
 def rows_of(errors, places):
     """Frames of points that all have the slope one by the first unknown."""
-    slope = np.eye(1, SIZE)
+    slope = np.eye(1, STATE_SIZE)
     return [
-        Rows(np.repeat(slope, len(error), axis=0), error, np.column_stack([place, np.zeros((len(place), 3), int)]))
+        CalibrationEquations(
+            np.repeat(slope, len(error), axis=0), error, np.column_stack([place, np.zeros((len(place), 3), int)])
+        )
         for error, place in zip(errors, places, strict=True)
     ]
 
@@ -213,8 +221,8 @@ def test_errors_alike_in_a_frame_or_on_a_patch_count_as_one_and_others_only_once
     by_patch = own * 0.1 + 1e-2 * rng.standard_normal(patches)[np.newaxis, places[0]]
 
     def variance(errors):
-        found = robust_sum(rows_of(errors, places), 10.0)
-        return found.blocks[0, 0] / found.hessian[0, 0]
+        found = evaluate_robust_cost(rows_of(errors, places), 10.0)
+        return found.score_covariance[0, 0] / found.hessian[0, 0]
 
     alone = variance(own)
     assert variance(by_frame) / alone == pytest.approx(patches * each, rel=0.5)
@@ -227,9 +235,9 @@ def test_one_frame_at_its_minimum_has_the_errors_of_its_patches():
     """The sum over a frame is zero at the minimum: without a least value its errors would seem to be none."""
     rng = np.random.default_rng(1)
     error = np.tile(1e-2 * rng.standard_normal(50), 2) * np.repeat([1.0, -1.0], 50)
-    found = robust_sum(rows_of([error], [np.arange(100)]), 10.0)
+    found = evaluate_robust_cost(rows_of([error], [np.arange(100)]), 10.0)
     assert abs(found.gradient[0]) < 1e-9 * found.hessian[0, 0]
-    assert found.blocks[0, 0] / found.hessian[0, 0] == pytest.approx(0.41, rel=0.3)
+    assert found.score_covariance[0, 0] / found.hessian[0, 0] == pytest.approx(0.41, rel=0.3)
 
 
 def test_a_matrix_at_least_another_one_in_every_direction():
@@ -244,13 +252,15 @@ def test_a_matrix_at_least_another_one_in_every_direction():
 
 def test_drift_is_found_where_the_recording_is_long(robot):
     found, _ = found_of(robot, 5, drift=1e-3, duration=60.0, frames=12, latency=0.05)
-    std = math.sqrt(found.covariance[DRIFT, DRIFT])
+    std = math.sqrt(found.state_covariance[CLOCK_DRIFT_INDEX, CLOCK_DRIFT_INDEX])
     assert std < 2.5e-4
-    assert abs(found.state.drift - 1e-3) < 4 * std
+    assert abs(found.camera_state.clock_drift - 1e-3) < 4 * std
     assert "drift" in found.message
-    assert np.abs(found.state.time(61.0 + 0.05 + 0.061) - 61.0) < 0.02
+    assert np.abs(found.camera_state.to_joint_time(61.0 + 0.05 + 0.061) - 61.0) < 0.02
     short, _ = found_of(robot, 5)
-    assert math.sqrt(short.covariance[DRIFT, DRIFT]) > 2 * std, "four seconds tell little of it"
+    assert math.sqrt(short.state_covariance[CLOCK_DRIFT_INDEX, CLOCK_DRIFT_INDEX]) > 2 * std, (
+        "four seconds tell little of it"
+    )
     assert "drift" not in short.message
 
 
@@ -258,15 +268,24 @@ def test_frames_stamped_late_do_not_pull(robot):
     late = np.zeros(8)
     late[[2, 5]] = 0.15
     found, true = found_of(robot, 6, late=late)
-    assert abs(found.state.offset - true.offset) < max(4 * math.sqrt(found.covariance[CLOCK, CLOCK]), 0.004)
+    assert abs(found.camera_state.clock_offset - true.clock_offset) < max(
+        4 * math.sqrt(found.state_covariance[CLOCK_OFFSET_INDEX, CLOCK_OFFSET_INDEX]), 0.004
+    )
     rng = np.random.default_rng(0)
     [cloud] = clouds(robot, [2.6], rng)
     for by, expected in ((0.0, False), (0.15, True)):
-        stamp = 2.6 + found.state.offset + by
-        own = own_offset(arm_of(robot), found.state, stamp, found.state.world(cloud), rng, found.usual.misfit)
+        stamp = 2.6 + found.camera_state.clock_offset + by
+        own = estimate_stamp_delay(
+            arm_of(robot),
+            found.camera_state,
+            stamp,
+            found.camera_state.to_world(cloud),
+            rng,
+            found.on_time_frames.median_square_distance,
+        )
         assert own.delay == pytest.approx(by, abs=max(4 * own.std, 0.01))
-        assert is_late(own, ClockOptions()) is expected
-    assert agreed([None]).on_time == ()
+        assert is_stamped_late(own, CameraClockOptions()) is expected
+    assert find_on_time_frames([None]).frame_indices == ()
 
 
 # -- a pose that is kept ----------------------------------------------------------------------------------------------
@@ -276,27 +295,27 @@ def test_a_kept_pose_that_the_arm_contradicts_is_said_and_counted(robot):
     before = np.zeros(3)
     for shift, turn in ((0.0, 0.0), (0.03, 2.0)):
         found, true = found_of(robot, 7, shift=shift, turn=turn, fix_pose=True)
-        assert np.array_equal(found.state.pose, found.told.pose)
-        assert found.state.factor == 1.0
+        assert np.array_equal(found.camera_state.pose, found.prior_state.pose)
+        assert found.camera_state.depth_scale == 1.0
         assert ("contradicts" in found.message) == (shift > 0)
         assert np.abs(displaced(found, true)[1]).max() < 3
-        std = np.linalg.norm(found.common_std(POINTS, np.zeros((3, 3)), np.zeros(3)), axis=1)
+        std = np.linalg.norm(found.shared_point_std(POINTS, np.zeros((3, 3)), np.zeros(3)), axis=1)
         assert (std > before).all(), "a worse pose never gives smaller standard deviations"
         before = std
-        assert abs(found.state.offset - true.offset) < 0.02, "the clock is found all the same"
+        assert abs(found.camera_state.clock_offset - true.clock_offset) < 0.02, "the clock is found all the same"
 
 
 def test_speed_and_time_enter_the_standard_deviation(robot):
     found, _ = found_of(robot, 8)
-    about = found.state.about
-    rest, fast = (found.common_std(POINTS, np.full((3, 3), v), np.full(3, about)) for v in (0.0, 2.0))
-    clock = math.sqrt(found.covariance[CLOCK, CLOCK])
+    about = found.camera_state.clock_reference_stamp
+    rest, fast = (found.shared_point_std(POINTS, np.full((3, 3), v), np.full(3, about)) for v in (0.0, 2.0))
+    clock = math.sqrt(found.state_covariance[CLOCK_OFFSET_INDEX, CLOCK_OFFSET_INDEX])
     assert (fast > 0.8 * 2.0 * clock).all()
-    assert (found.common_std(POINTS, np.full((3, 3), 2.0), np.full(3, about + 100)) > fast).all()
+    assert (found.shared_point_std(POINTS, np.full((3, 3), 2.0), np.full(3, about + 100)) > fast).all()
     assert (rest > 0).all()
-    nothing = as_given(POSE, ClockOptions(offset=0.1))
-    assert nothing.common_std(POINTS, np.ones((3, 3)), np.zeros(3)) == pytest.approx(0.0)
-    assert nothing.state.time(1.0) == pytest.approx(0.9)
+    nothing = calibration_as_given(POSE, CameraClockOptions(initial_offset=0.1))
+    assert nothing.shared_point_std(POINTS, np.ones((3, 3)), np.zeros(3)) == pytest.approx(0.0)
+    assert nothing.camera_state.to_joint_time(1.0) == pytest.approx(0.9)
 
 
 # -- refused ----------------------------------------------------------------------------------------------------------
@@ -306,17 +325,21 @@ def test_refused_where_the_arm_does_not_tell(robot):
     with pytest.raises(DataError, match="moves too little") as caught:
         found_of(robot, 9, motion=still)
     assert "search: 0" in caught.value.hint
-    found, true = found_of(robot, 9, motion=still, clock=ClockOptions(search=0.0), turn=2.0, shift=0.02)
+    found, true = found_of(
+        robot, 9, motion=still, clock=CameraClockOptions(search_half_width=0.0), turn=2.0, shift=0.02
+    )
     assert np.abs(displaced(found, true)[1]).max() < 4
     assert "as given" in found.message
-    away = look_at([1.9, 0.6, 0.8], [4.0, 0.6, 0.8])
+    away = look_at_pose([1.9, 0.6, 0.8], [4.0, 0.6, 0.8])
     rng = np.random.default_rng(0)
-    nothing = [Glimpse(t, c) for t, c in zip((1.0, 2.0, 3.0), clouds(robot, [1.0, 2.0, 3.0], rng), strict=True)]
-    options, clock = CalibrationOptions(fix_pose=True), ClockOptions(search=0.0)
+    nothing = [
+        CalibrationFrame(t, c) for t, c in zip((1.0, 2.0, 3.0), clouds(robot, [1.0, 2.0, 3.0], rng), strict=True)
+    ]
+    options, clock = CameraCalibrationOptions(fix_pose=True), CameraClockOptions(search_half_width=0.0)
     with pytest.raises(DataError, match="in view in 0 frames"):
-        calibrate(arm_of(robot), nothing, away, rng, CalibrationOptions(), clock, "there")
-    kept = calibrate(arm_of(robot), nothing, away, rng, options, clock)
-    assert kept.frames == 0
+        calibrate_camera(arm_of(robot), nothing, away, rng, CameraCalibrationOptions(), clock, "there")
+    kept = calibrate_camera(arm_of(robot), nothing, away, rng, options, clock)
+    assert kept.n_frames == 0
     assert "as given: it is in view in 0 frames" in kept.message
 
 
@@ -325,10 +348,11 @@ def test_refused_where_the_camera_sees_through_the_arm(robot):
     rng = np.random.default_rng(0)
     times = np.linspace(1.0, 4.0, 6)
     other = [
-        Glimpse(t, c) for t, c in zip(times, clouds(robot, times, rng, lambda t: lively(1.7 * t + 9)), strict=True)
+        CalibrationFrame(t, c)
+        for t, c in zip(times, clouds(robot, times, rng, lambda t: lively(1.7 * t + 9)), strict=True)
     ]
     with pytest.raises(DataError, match="cannot be calibrated"):
-        calibrate(arm_of(robot), other, POSE, rng, CalibrationOptions(), ClockOptions())
+        calibrate_camera(arm_of(robot), other, POSE, rng, CameraCalibrationOptions(), CameraClockOptions())
     empty = [replace(g, points=g.points[g.points[:, 2] > 3.0]) for g in other]
     with pytest.raises(DataError, match="cannot be calibrated"):
-        calibrate(arm_of(robot), empty, POSE, rng, CalibrationOptions(), ClockOptions())
+        calibrate_camera(arm_of(robot), empty, POSE, rng, CameraCalibrationOptions(), CameraClockOptions())

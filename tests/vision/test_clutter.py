@@ -9,11 +9,19 @@ from smooth_rods import EYE, TARGET, SmoothY, box, filmed, floor_and_wall, pole,
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.model.system import System
 from yid_ocp.model.y_object import y_object
-from yid_ocp.vision import ExtraMesh, FilterOptions, FrameSequence, Scene, TrackOptions, look_at, track
-from yid_ocp.vision.clutter import Background, extra_meshes, foreign
-from yid_ocp.vision.evidence import Thing, Tubes
-from yid_ocp.vision.filters import of_colours
-from yid_ocp.vision.meshes import numeric_mechanism
+from yid_ocp.vision import (
+    CameraScene,
+    CloudFilterOptions,
+    ExtraMesh,
+    FrameSequence,
+    TrackOptions,
+    look_at_pose,
+    track_object,
+)
+from yid_ocp.vision.clutter import BackgroundPoints, extra_meshes_by_joint, group_foreign_objects
+from yid_ocp.vision.filters import has_any_colour
+from yid_ocp.vision.shape_evidence import ForeignCluster, TubeLinks
+from yid_ocp.vision.surface_meshes import numeric_mechanism
 
 FRAMES = 2
 NAMES = ["w_T1", "w_T2", "w_T3"]
@@ -27,17 +35,23 @@ def alone():
 
 
 def measured(alone, sequence, truth, extra=(), empty=None, **options):
-    found = track(Scene(alone, extra=extra), None, sequence, TrackOptions(points=alone.points, **options), empty=empty)
-    good = [frame.index for frame in found.frames if frame.good]
-    order = [NAMES.index(name) for name in found.names]
+    found = track_object(
+        CameraScene(alone, extra_meshes=extra),
+        None,
+        sequence,
+        TrackOptions(tracked_points=alone.point_frames, **options),
+        empty=empty,
+    )
+    good = [frame.index for frame in found.frame_reports if frame.is_good]
+    order = [NAMES.index(name) for name in found.point_names]
     return found, found.position - truth[good][:, order]
 
 
 def emptied(things):
     """The scene without the object."""
-    pose = look_at(EYE, TARGET)
+    pose = look_at_pose(EYE, TARGET)
     clouds = [seen([*floor_and_wall(), *things(k)], [9, k]) for k in range(2)]
-    return FrameSequence.of([0.0, 1.0], clouds, pose)
+    return FrameSequence.from_clouds([0.0, 1.0], clouds, pose)
 
 
 @pytest.mark.parametrize(
@@ -60,12 +74,12 @@ def test_things_in_reach_neither_drop_frames_nor_mislead(alone, things, junction
 def test_messages_name_the_thing_and_what_helps(alone):
     sequence, truth = filmed(SmoothY(), FRAMES, lambda k: [box(*TABLE)])
     found, _ = measured(alone, sequence, truth)
-    thing = found.things[0]
+    thing = found.foreign_objects[0]
     assert thing.centre == pytest.approx([0.7, 0.5, -0.18], abs=0.15)
     assert thing.size[1] == pytest.approx(0.8, abs=0.1)
     assert not thing.moving
     assert thing.frames == FRAMES
-    assert "track.options.background: frames" in thing.text
+    assert "track.options.background_estimation: frames" in thing.text
     assert thing.text in found.notes
 
 
@@ -83,11 +97,11 @@ def test_every_remedy_takes_the_table_away(alone):
 def test_an_empty_scene_is_a_background():
     rng = np.random.default_rng(0)
     wall = np.column_stack([rng.uniform(0, 1, (20000, 2)), 0.003 * rng.standard_normal(20000)])
-    background = Background.empty_scene([wall[::2], wall[1::2]], 0.008, 0.006)
+    background = BackgroundPoints.from_empty_scene([wall[::2], wall[1::2]], 0.008, 0.006)
     asked = np.array([[0.5, 0.5, 0.01], [0.5, 0.5, 0.06], [2.0, 0.5, 0.0]])
     assert background.contains(asked).tolist() == [True, False, False]
     assert background.contains(asked, 0.05).tolist() == [True, True, False]
-    assert not Background().contains(asked).any()
+    assert not BackgroundPoints().contains(asked).any()
 
 
 def test_what_stands_still_is_a_background_but_for_the_object():
@@ -96,8 +110,8 @@ def test_what_stands_still_is_a_background_but_for_the_object():
     rod = np.column_stack([rng.uniform(0, 0.3, 2000), 0.01 * rng.standard_normal((2000, 2))])
     elsewhere = [np.array([0.0, 1.0 + k, 0.0]) + rng.uniform(-0.05, 0.05, (3000, 3)) for k in range(4)]
     clouds = [np.concatenate([heap, rod, other]) for other in elsewhere]
-    shape = Tubes(np.array([[[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]]]), np.array([0.02]), (0,), np.array([0.3]))
-    background = Background.still(clouds, [shape] * 4, 0.016, 0.006, 0.045)
+    shape = TubeLinks(np.array([[[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]]]), np.array([0.02]), (0,), np.array([0.3]))
+    background = BackgroundPoints.from_static_points(clouds, [shape] * 4, 0.016, 0.006, 0.045)
     assert background.contains(heap).mean() > 0.95
     assert not background.contains(rod).any()
     assert not background.contains(elsewhere[0]).any()
@@ -109,7 +123,7 @@ def test_what_moves_with_a_link_is_told_from_what_moves_by_itself():
     size, box_ = np.full(3, 0.1), (np.zeros(3), np.ones(3))
 
     def looked(place):
-        return [(t, [Thing(np.asarray(place(t), float), size, 100)]) for t in times]
+        return [(t, [ForeignCluster(np.asarray(place(t), float), size, 100)]) for t in times]
 
     for place, moving, link, help_ in (
         (lambda t: [0.5, 0.5, 0.5], False, "", "background"),
@@ -117,41 +131,41 @@ def test_what_moves_with_a_link_is_told_from_what_moves_by_itself():
         (lambda t: [0.5, 0.3 * t, 0.5], True, "", "take it out of view"),
         (lambda t: [3.0, 0.3 * t, 0.5], True, "", "lower and upper"),
     ):
-        [thing] = foreign(looked(place), 6, 0.006, box_, links.__getitem__, False)
+        [thing] = group_foreign_objects(looked(place), 6, 0.006, box_, links.__getitem__, False)
         assert (thing.moving, thing.link, thing.frames) == (moving, link, 6)
         assert help_ in thing.text
-    [thing] = foreign(looked(lambda t: [0.5, 0.3 * t, 0.5]), 6, 0.006, box_, links.__getitem__, True)
+    [thing] = group_foreign_objects(looked(lambda t: [0.5, 0.3 * t, 0.5]), 6, 0.006, box_, links.__getitem__, True)
     assert "colour" in thing.text
     still = looked(lambda t: [0.5, 0.5, 0.5])
     for left_out in (False, True):  # what is done already is no advice
-        [thing] = foreign(still, 6, 0.006, box_, links.__getitem__, False, left_out)
+        [thing] = group_foreign_objects(still, 6, 0.006, box_, links.__getitem__, False, left_out)
         assert ("background: frames" in thing.text) != left_out
         assert "film the scene without object and robot" in thing.text
 
 
 def test_extra_meshes_hang_on_links(system):
     tree = numeric_mechanism(system)
-    made = extra_meshes(
-        [ExtraMesh(frame="left_gripper", box=(0.1, 0.1, 0.1)), ExtraMesh(sphere=0.2, xyz=(1, 2, 3))], tree
+    made = extra_meshes_by_joint(
+        [ExtraMesh(parent_frame="left_gripper", box=(0.1, 0.1, 0.1)), ExtraMesh(sphere=0.2, xyz=(1, 2, 3))], tree
     )
-    assert set(made) == {-1, tree.frames["left_gripper"].joint}
+    assert set(made) == {-1, tree.frames["left_gripper"].joint_index}
     assert made[-1][0].vertices.mean(axis=0) == pytest.approx([1, 2, 3], abs=0.01)
     with pytest.raises(ConfigError, match="no link 'left_griper'"):
-        extra_meshes([ExtraMesh(frame="left_griper", sphere=0.1)], tree)
+        extra_meshes_by_joint([ExtraMesh(parent_frame="left_griper", sphere=0.1)], tree)
     with pytest.raises(ConfigError, match="box and sphere"):
-        extra_meshes([ExtraMesh(box=(1, 1, 1), sphere=0.1)], tree)
+        extra_meshes_by_joint([ExtraMesh(box=(1, 1, 1), sphere=0.1)], tree)
     with pytest.raises(ModelError, match="no mesh"):
-        extra_meshes([ExtraMesh(mesh="nowhere.stl")], tree)
+        extra_meshes_by_joint([ExtraMesh(mesh="nowhere.stl")], tree)
 
 
 def test_colours_in_light_and_shade():
     red = [200, 40, 30]
     seen = np.array([[200, 40, 30], [100, 18, 13], [40, 200, 30], [120, 120, 120], [0, 0, 0]])
-    assert of_colours(seen, [red], 0.2).tolist() == [True, True, False, False, False]
-    assert of_colours(seen, [red, [128, 128, 128]], 0.2).tolist() == [True, True, False, True, True]
+    assert has_any_colour(seen, [red], 0.2).tolist() == [True, True, False, False, False]
+    assert has_any_colour(seen, [red, [128, 128, 128]], 0.2).tolist() == [True, True, False, True, True]
 
 
 def test_a_colour_mask_needs_colours(alone):
     sequence, truth = filmed(SmoothY(), 1)
     with pytest.raises(DataError, match="no colours"):
-        measured(alone, sequence, truth, filters=FilterOptions(colours=((200.0, 40.0, 30.0),)))
+        measured(alone, sequence, truth, filters=CloudFilterOptions(object_colours=((200.0, 40.0, 30.0),)))

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from yid_ocp.cli import main
-from yid_ocp.data.hdf5 import read_recording
-from yid_ocp.vision.pictures import STAGES
-from yid_ocp.vision.track import Tracker
+from yid_ocp.data.recording_hdf5 import read_recording
+from yid_ocp.vision.track import FrameTracker
+from yid_ocp.vision.track_figures import _STAGE_NAMES
 from yid_ocp.workflow import track as command
 
 CONFIG = """\
@@ -19,7 +19,7 @@ model:
   robot: package:baxter
   arms:
     joints: [left_s0, left_s1, left_e0, left_e1, left_w0, left_w1, left_w2]
-  object: {{kind: y}}
+  object: {{kind: foam_y}}
   grasp:
     left: {{holder: left_gripper, held: w_T2}}
 recordings:
@@ -74,19 +74,19 @@ def test_track_makes_a_recording_that_solve_reads(whole, small, system):
     assert result["camera"]["estimated"] is False  # the clouds hold no arm
     assert len(result["inputs"]) == 4
     pictures = sorted(path.stem.rpartition("_")[2] for path in (whole.folder / "pictures").glob("*.png"))
-    assert pictures == sorted(STAGES)
+    assert pictures == sorted(_STAGE_NAMES)
     assert (whole.folder / "track.png").is_file()
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (["track.frames=nowhere"], "no such folder of frames"),
+        (["track.frames_path=nowhere"], "no such folder of frames"),
         (["recordings.estimate=[]"], "no recording with the joint angles"),
-        (["track.options.clock.offset=50"], "their clocks are not the same"),
-        (["track.pose=[[1,0,0,0],[0,1,0,0],[0,0,2,0],[0,0,0,1]]"], "not a rigid transform"),
+        (["track.options.clock.initial_offset=50"], "their clocks are not the same"),
+        (["track.camera_pose=[[1,0,0,0],[0,1,0,0],[0,0,2,0],[0,0,0,1]]"], "not a rigid transform"),
         (["track.options.d_mix=0.02"], "did you mean 'd_max'"),
-        (["track.options.filters.padding=-1"], "padding = -1"),
+        (["track.options.filters.robot_padding=-1"], "padding = -1"),
     ],
 )
 def test_wrong_input_is_said_and_leaves_nothing(cli, config, tmp_path, settings, message):
@@ -99,7 +99,7 @@ def test_wrong_input_is_said_and_leaves_nothing(cli, config, tmp_path, settings,
 
 
 def test_without_a_good_frame_the_reasons_and_pictures_are_left(cli, config, tmp_path):
-    done = cli("track", config, "--out", tmp_path / "run", "--set", "track.unit=mm")
+    done = cli("track", config, "--out", tmp_path / "run", "--set", "track.length_unit=mm")
     assert done.code == 2
     assert "not one frame could be used" in done.err
     assert str(tmp_path / "run") in done.err
@@ -123,7 +123,7 @@ def result_of(folder):
 
 def test_what_an_interrupted_run_did_is_used(cli, config, whole, tmp_path, monkeypatch):
     """Killed after the first frame: the next run does the others alone, with the same result to the last bit."""
-    worked, work = [], Tracker.frame
+    worked, work = [], FrameTracker.track_frame
 
     def interrupted(self, index, common):
         if len(worked) == 1:
@@ -131,7 +131,7 @@ def test_what_an_interrupted_run_did_is_used(cli, config, whole, tmp_path, monke
         worked.append(index)
         return work(self, index, common)
 
-    monkeypatch.setattr(Tracker, "frame", interrupted)
+    monkeypatch.setattr(FrameTracker, "track_frame", interrupted)
     assert cli("track", config, "--out", tmp_path / "run").code not in (0, 1)
     assert not (tmp_path / "run").exists()
     assert (tmp_path / "run.partial").is_dir()
@@ -141,9 +141,9 @@ def test_what_an_interrupted_run_did_is_used(cli, config, whole, tmp_path, monke
         later.append(index)
         return work(self, index, common)
 
-    monkeypatch.setattr(Tracker, "frame", counted)
-    monkeypatch.setattr(Tracker, "common", None)  # it is known
-    assert cli("track", config, "--out", tmp_path / "run", "--set", "track.pictures=0").code == 0
+    monkeypatch.setattr(FrameTracker, "track_frame", counted)
+    monkeypatch.setattr(FrameTracker, "calibrate_sequence", None)  # it is known
+    assert cli("track", config, "--out", tmp_path / "run", "--set", "track.n_drawn_frames=0").code == 0
     assert len(later) == 2
     assert not set(later) & set(worked)
     assert not (tmp_path / "run.partial").exists()
@@ -154,7 +154,7 @@ def test_what_an_interrupted_run_did_is_used(cli, config, whole, tmp_path, monke
 
 
 def test_several_workers_find_the_same(cli, config, whole, tmp_path):
-    done = cli("track", config, "--out", tmp_path / "two", "--set", "track.pictures=0", "--workers", "2")
+    done = cli("track", config, "--out", tmp_path / "two", "--set", "track.n_drawn_frames=0", "--workers", "2")
     assert done.code == 0, done.err
     assert result_of(tmp_path / "two") == result_of(whole.folder)
 
@@ -164,8 +164,8 @@ def test_the_examples_run(cli, repository, tmp_path, name):
     pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo")
     file = repository / "configs" / f"{name}.yaml"
     short = ("duration=1.2", "rate=4.0", "dropped=0.0")
-    arguments = [part for setting in short for part in ("--set", f"track.virtual.{setting}")]
-    quick = ("--quiet", "--set", "track.pictures=0", "--set", "track.keep_frames=true")
+    arguments = [part for setting in short for part in ("--set", f"track.virtual_frames.{setting}")]
+    quick = ("--quiet", "--set", "track.n_drawn_frames=0", "--set", "track.keep_frames=true")
     done = cli("track", file, "--out", tmp_path / "run", *arguments, *quick)
     assert done.code == 0, done.err
     assert done.out.strip() == str(tmp_path / "run")
@@ -178,7 +178,7 @@ def test_the_examples_run(cli, repository, tmp_path, name):
 def test_a_flag_keeps_the_told_pose(repository, monkeypatch):
     asked = []
     monkeypatch.setattr(command, "run_track", lambda run, *rest: asked.append(run.track.options.calibration.fix_pose))
-    monkeypatch.setattr(command, "carry_out", lambda work, *rest: work(None))
+    monkeypatch.setattr(command, "run_and_print", lambda work, *rest: work(None))
     config = str(repository / "configs" / "track_single_arm.yaml")
     assert main(["track", config]) == main(["track", config, "--fix-pose"]) == 0
     assert asked == [False, True]

@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from yid_ocp.data.hdf5 import read_recording
+from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.vision import TrackOptions
 
 
@@ -25,7 +25,7 @@ def test_the_example_runs(text, repository, tmp_path, monkeypatch, capsys):
 def test_the_settings_exist(text):
     options = TrackOptions()
     known = {field.name for field in dataclasses.fields(options)}
-    for part in ("filters", "walk", "fit", "clock", "calibration"):
+    for part in ("filters", "skeleton", "shape_fit", "clock", "calibration"):
         known |= {field.name for field in dataclasses.fields(getattr(options, part))}
     _, _, table = text.partition("| stage |")
     rows = [line for line in table.splitlines()[1:] if line.startswith("| ") and line.count("|") == 4]

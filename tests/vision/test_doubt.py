@@ -9,8 +9,8 @@ from smooth_rods import Y_LENGTHS, Y_RADII, SmoothY, filmed
 from yid_ocp.errors import DataError
 from yid_ocp.model.system import System
 from yid_ocp.model.y_object import y_object
-from yid_ocp.vision import FilterOptions, Scene, TrackOptions, track
-from yid_ocp.vision.doubt import Sizes
+from yid_ocp.vision import CameraScene, CloudFilterOptions, TrackOptions, track_object
+from yid_ocp.vision.dimension_check import DimensionCheck
 
 FRAMES = 5
 NAMES = ["w_T1", "w_T2", "w_T3"]
@@ -31,9 +31,11 @@ def measured(alone):
         key = str((lengths, radii, frames, options))
         if key not in kept:
             sequence, truth = filmed(SmoothY(Y_LENGTHS | (lengths or {}), Y_RADII | (radii or {})), frames)
-            found = track(Scene(alone), None, sequence, TrackOptions(points=alone.points, **options))
-            good = [frame.index for frame in found.frames if frame.good]
-            order = [NAMES.index(name) for name in found.names]
+            found = track_object(
+                CameraScene(alone), None, sequence, TrackOptions(tracked_points=alone.point_frames, **options)
+            )
+            good = [frame.index for frame in found.frame_reports if frame.is_good]
+            order = [NAMES.index(name) for name in found.point_names]
             kept[key] = found, found.position - truth[good][:, order]
         return kept[key]
 
@@ -41,14 +43,14 @@ def measured(alone):
 
 
 def ratio(found, name):
-    return np.exp(found.sizes.change[found.sizes.names.index(name)])
+    return np.exp(found.dimensions.log_ratio[found.dimensions.names.index(name)])
 
 
 def test_right_sizes_are_not_doubted(measured):
     found, error = measured()
-    assert found.sizes.frames == FRAMES
-    assert not found.sizes.doubted.any()
-    assert not found.sizes.messages
+    assert found.dimensions.n_frames == FRAMES
+    assert not found.dimensions.is_contradicted.any()
+    assert not found.dimensions.messages
     assert np.nanmax(np.linalg.norm(error, axis=2)) < 0.006
     assert np.isfinite(error).mean() > 0.9
 
@@ -56,9 +58,9 @@ def test_right_sizes_are_not_doubted(measured):
 @pytest.mark.parametrize(("factor", "value"), [(1.1, "811 mm"), (0.9, "663 mm")])
 def test_a_wrong_length_is_said_and_its_point_is_not_written(measured, factor, value):
     found, error = measured({"T3": factor * Y_LENGTHS["T3"]})
-    assert found.sizes.doubted.tolist() == [False, False, True, False, False, False]
+    assert found.dimensions.is_contradicted.tolist() == [False, False, True, False, False, False]
     assert ratio(found, "T3.length") == pytest.approx(factor, abs=0.02)
-    [message] = found.sizes.messages
+    [message] = found.dimensions.messages
     assert "T3.length seems to be wrong" in message
     assert "the model says 737 mm" in message
     assert "estimate: [length]" in message
@@ -82,9 +84,9 @@ def test_a_wrong_length_further_up_moves_everything_and_is_found(measured):
 
 def test_radii_wrong_by_a_third_are_said_and_enter_the_standard_deviation(measured):
     found, error = measured(radii={name: 1.3 * radius for name, radius in Y_RADII.items()})
-    sizes = found.sizes
-    assert sizes.doubted.tolist() == [False, False, False, True, True, True]
-    assert np.exp(sizes.change[3:]) == pytest.approx(1.3, abs=0.1)
+    sizes = found.dimensions
+    assert sizes.is_contradicted.tolist() == [False, False, False, True, True, True]
+    assert np.exp(sizes.log_ratio[3:]) == pytest.approx(1.3, abs=0.1)
     # the camera's side of a thicker tube is nearer to it: all points are off by that, and say so
     assert np.nanmean((error / found.std) ** 2) < 1.5
     plain, _ = measured()
@@ -99,10 +101,10 @@ def test_estimated_radii_are_used(measured):
 
 def test_an_end_outside_of_the_filters_box_tells_nothing_of_a_length(measured, alone):
     """What was cut off by a filter is no missing end."""
-    found, _ = measured(filters=FilterOptions(lower=(0.0, -0.45, -2.0), upper=(2.0, 2.0, 2.0)))
-    i = found.sizes.names.index("T3.length")
-    assert not found.sizes.doubted[i]
-    assert all(np.isnan(frame.fit.ends[1]) for frame in found.frames if frame.fit is not None)
+    found, _ = measured(filters=CloudFilterOptions(box_lower=(0.0, -0.45, -2.0), box_upper=(2.0, 2.0, 2.0)))
+    i = found.dimensions.names.index("T3.length")
+    assert not found.dimensions.is_contradicted[i]
+    assert all(np.isnan(frame.shape_fit.end_offsets[1]) for frame in found.frame_reports if frame.shape_fit is not None)
 
 
 def test_what_sizes_do_to_points():
@@ -113,7 +115,7 @@ def test_what_sizes_do_to_points():
     change = np.array([0.05, 0.05])  # five and two and a half standard deviations
 
     def std(used):
-        return Sizes(("a.length", "a.radius"), np.ones(2), change, covariance, used, 5).std_of(moves)[0]
+        return DimensionCheck(("a.length", "a.radius"), np.ones(2), change, covariance, used, 5).point_std(moves)[0]
 
     assert std((False, False)) == pytest.approx([0.05, 0.0, 0.0])
     assert std((True, False)) == pytest.approx([0.01, 0.0, 0.0])
@@ -125,7 +127,7 @@ def test_a_refusal_names_the_sizes_that_cannot_be_right():
     covariance, change = np.diag([0.01**2, 0.02**2]), np.array([0.1, 0.05])
 
     def clause(used):
-        return Sizes(("a.length", "a.radius"), np.ones(2), change, covariance, used, 5).contradiction
+        return DimensionCheck(("a.length", "a.radius"), np.ones(2), change, covariance, used, 5).contradiction_message
 
     told = "the object seems to be other than the model says (a.length 1000 mm where 1105 mm fits)"
     assert clause((False, False)) == told

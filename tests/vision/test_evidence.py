@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from yid_ocp.vision.evidence import Sight, Tubes, gather, slender
-from yid_ocp.vision.residuals import along_sight, nearest_way
-from yid_ocp.vision.view import View
+from yid_ocp.vision.occlusion import OcclusionMap
+from yid_ocp.vision.shape_evidence import CloudObservation, TubeLinks, assess_shape, tube_like_nodes_and_points
+from yid_ocp.vision.surface_residuals import line_of_sight_residuals, nearest_surface_residuals
 
 CAMERA = np.zeros(3)
 RADIUS, NEAR = 0.02, 0.045
-TUBES = Tubes(
+TUBES = TubeLinks(
     np.array([[[-0.3, 0.0, 2.0], [0.0, 0.0, 2.0]], [[0.0, 0.0, 2.0], [0.3, 0.0, 2.0]]]),
     np.array([RADIUS, RADIUS]),
     (1,),
@@ -34,100 +34,104 @@ def wall(x, y, z, step=0.006):
 
 def asked(points, behind=None, removed=None):
     everything = points if behind is None else np.concatenate([points, behind])
-    view = View(everything, np.eye(4))
-    return gather(TUBES, Sight(points, np.ones(len(points)), points[::50], CAMERA, view, removed), NEAR)
+    view = OcclusionMap(everything, np.eye(4))
+    return assess_shape(
+        TUBES, CloudObservation(points, np.ones(len(points)), points[::50], CAMERA, view, removed), NEAR
+    )
 
 
 def test_a_whole_tube_has_points_everywhere_and_nothing_else():
     found = asked(tube())
-    assert found.filled.tolist() == [1.0, 1.0]
-    assert found.empty.tolist() == [0.0, 0.0]
-    assert not found.things
-    assert not found.contested.any()
-    assert found.ends == pytest.approx([0.0], abs=0.006)
-    assert found.distance < 0.003
-    assert found.noise == pytest.approx(0.002, rel=0.4)
+    assert found.covered_fraction.tolist() == [1.0, 1.0]
+    assert found.visibly_empty_fraction.tolist() == [0.0, 0.0]
+    assert not found.foreign_clusters
+    assert not found.is_contested.any()
+    assert found.end_offsets == pytest.approx([0.0], abs=0.006)
+    assert found.mean_distance < 0.003
+    assert found.noise_std == pytest.approx(0.002, rel=0.4)
 
 
 def test_a_gap_is_empty_unless_something_hides_it():
     points = np.concatenate([tube(high=-0.25), tube(low=-0.05)])
     bare = asked(points)
-    assert bare.empty[0] == pytest.approx(0.6, abs=0.11)
-    assert bare.spoken_for[0] <= 0.5
+    assert bare.visibly_empty_fraction[0] == pytest.approx(0.6, abs=0.11)
+    assert bare.visible_coverage[0] <= 0.5
     before = asked(points, wall((-0.2, 0.0), (-0.05, 0.05), 1.2))
-    assert before.empty[0] == 0.0
-    assert before.spoken_for[0] == 1.0
-    assert before.filled[0] <= 0.5
+    assert before.visibly_empty_fraction[0] == 0.0
+    assert before.visible_coverage[0] == 1.0
+    assert before.covered_fraction[0] <= 0.5
     left_out = asked(points, removed=lambda places: places[:, 0] < 0.0)
-    assert left_out.empty[0] == 0.0
+    assert left_out.visibly_empty_fraction[0] == 0.0
 
 
 @pytest.mark.parametrize("high", [0.2, 0.26, 0.36, 0.45])
 def test_where_the_points_end(high):
     """Along a tube that is shorter or longer than the shape."""
-    assert asked(tube(high=high)).ends == pytest.approx([high - 0.3], abs=0.008)
+    assert asked(tube(high=high)).end_offsets == pytest.approx([high - 0.3], abs=0.008)
 
 
 def test_an_end_that_is_hidden_or_contested_tells_nothing():
-    assert np.isnan(asked(tube(high=0.2), wall((0.05, 0.2), (-0.05, 0.05), 1.2)).ends).all()
+    assert np.isnan(asked(tube(high=0.2), wall((0.05, 0.2), (-0.05, 0.05), 1.2)).end_offsets).all()
     touching = wall((0.22, 0.45), (-0.2, 0.2), 1.985)
-    assert np.isnan(asked(np.concatenate([tube(high=0.22), touching])).ends).all()
+    assert np.isnan(asked(np.concatenate([tube(high=0.22), touching])).end_offsets).all()
 
 
 def test_things_are_set_apart_and_contested_only_where_they_touch():
     apart = asked(np.concatenate([tube(), wall((-0.3, 0.3), (0.1, 0.3), 2.0)]))
-    [thing] = apart.things
+    [thing] = apart.foreign_clusters
     assert thing.centre == pytest.approx([0.0, 0.2, 2.0], abs=0.02)
-    assert thing.size == pytest.approx([0.6, 0.2, 0.0], abs=0.02)
-    assert not apart.contested.any()
+    assert thing.extent == pytest.approx([0.6, 0.2, 0.0], abs=0.02)
+    assert not apart.is_contested.any()
     # a hand about the tube's start
     points = np.concatenate([tube(low=-0.2), wall((-0.3, -0.2), (-0.1, 0.1), 1.985)])
     held = asked(points)
-    assert held.contested[points[:, 0] < -0.17].sum() > 50
-    assert not held.contested[points[:, 0] > 0.0].any()
+    assert held.is_contested[points[:, 0] < -0.17].sum() > 50
+    assert not held.is_contested[points[:, 0] > 0.0].any()
     # on a wall all of it
     around = wall((-0.3, 0.3), (-0.2, 0.2), 1.985)
     flat = asked(np.concatenate([tube(), around[np.abs(around[:, 1]) > RADIUS]]))
-    assert flat.filled.max() == 0.0
+    assert flat.covered_fraction.max() == 0.0
 
 
 def test_points_on_a_swath_are_wider_than_the_tube():
-    assert (asked(tube()).swath < (0.1 * RADIUS) ** 2).all()
+    assert (asked(tube()).excess_variance < (0.1 * RADIUS) ** 2).all()
     blurred = asked(tube(wide=1.8))
-    assert np.sqrt(blurred.swath) == pytest.approx(RADIUS * np.sqrt((1.8**2 - 1) / 3), rel=0.15)
+    assert np.sqrt(blurred.excess_variance) == pytest.approx(RADIUS * np.sqrt((1.8**2 - 1) / 3), rel=0.15)
 
 
 def test_tubes_are_slender_and_walls_are_not():
     points = np.concatenate([tube(), wall((-0.3, 0.3), (0.3, 0.6), 2.0)])
     nodes = np.array([[-0.1, 0.0, 1.985], [0.1, 0.0, 1.985], [0.0, 0.45, 2.0]])
-    thin, mine = slender(Sight(points, np.ones(len(points)), nodes, CAMERA), RADIUS)
+    thin, mine = tube_like_nodes_and_points(CloudObservation(points, np.ones(len(points)), nodes, CAMERA), RADIUS)
     assert thin.tolist() == [True, True, False]
     assert mine.sum() == len(tube())
 
 
-@pytest.mark.parametrize("ask", [nearest_way, along_sight])
+@pytest.mark.parametrize("ask", [nearest_surface_residuals, line_of_sight_residuals])
 def test_residuals_move_as_their_derivatives_say(ask):
     points = tube(noise=0.003)[::7]
-    base = ask(TUBES.corners, TUBES.radius, points, CAMERA)
+    base = ask(TUBES.link_ends, TUBES.radius, points, CAMERA)
     step = 1e-6
     for corner in range(2):
         for axis in range(3):
-            moved = TUBES.corners.copy()
+            moved = TUBES.link_ends.copy()
             moved[:, corner, axis] += step
             other = ask(moved, TUBES.radius, points, CAMERA)
-            both, here, there = np.intersect1d(base.index, other.index, return_indices=True)
-            same = base.link[here] == other.link[there]
+            both, here, there = np.intersect1d(base.point_indices, other.point_indices, return_indices=True)
+            same = base.link_indices[here] == other.link_indices[there]
             # lines of sight turn a little about an axis that tilts: of the order of the noise
-            change = (other.error[there] - base.error[here])[same] / step
+            change = (other.signed_distance[there] - base.signed_distance[here])[same] / step
             assert len(both) > 50
-            assert change == pytest.approx(base.rows[here, 3 * corner + axis][same], abs=0.12)
-    grown = ask(TUBES.corners, TUBES.radius + step, points, CAMERA)
-    _, here, there = np.intersect1d(base.index, grown.index, return_indices=True)
-    assert (grown.error[there] - base.error[here]) / step == pytest.approx(base.by_radius[here], abs=1e-4)
+            assert change == pytest.approx(base.jacobian_by_link_ends[here, 3 * corner + axis][same], abs=0.12)
+    grown = ask(TUBES.link_ends, TUBES.radius + step, points, CAMERA)
+    _, here, there = np.intersect1d(base.point_indices, grown.point_indices, return_indices=True)
+    assert (grown.signed_distance[there] - base.signed_distance[here]) / step == pytest.approx(
+        base.derivative_by_radius[here], abs=1e-4
+    )
 
 
 def test_noise_along_the_sight_leaves_the_radius():
     """The mean error of a tube of the right radius is nothing along the sight; the nearest way it is not."""
     points = np.concatenate([tube(noise=0.005, seed=seed) for seed in range(8)])
-    found = along_sight(TUBES.corners, TUBES.radius, points, CAMERA)
-    assert abs(found.error.mean()) < 0.0004
+    found = line_of_sight_residuals(TUBES.link_ends, TUBES.radius, points, CAMERA)
+    assert abs(found.signed_distance.mean()) < 0.0004

@@ -4,9 +4,16 @@ import numpy as np
 import pytest
 
 from yid_ocp.errors import ConfigError
-from yid_ocp.vision import FilterOptions
-from yid_ocp.vision.filters import Cloud, ObjectRegion, voxel_grid, weighted_median, without_outliers, without_robot
-from yid_ocp.vision.meshes import Surfaces, numeric_mechanism, robot_meshes
+from yid_ocp.vision import CloudFilterOptions
+from yid_ocp.vision.filters import (
+    ObjectRegion,
+    WeightedCloud,
+    is_not_outlier,
+    is_not_robot,
+    voxel_averages,
+    weighted_median,
+)
+from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, load_robot_meshes, numeric_mechanism
 
 CAMERA = np.array([2.6, 0.0, 0.45])
 
@@ -14,12 +21,12 @@ CAMERA = np.array([2.6, 0.0, 0.45])
 def test_voxels_keep_weight_and_centroid():
     rng = np.random.default_rng(0)
     points = rng.uniform(-0.3, 0.3, (5000, 3))
-    cloud = voxel_grid(points, 0.05)
-    assert cloud.weight.sum() == 5000
-    assert np.allclose(np.average(cloud.points, axis=0, weights=cloud.weight), points.mean(0))
+    cloud = voxel_averages(points, 0.05)
+    assert cloud.point_weights.sum() == 5000
+    assert np.allclose(np.average(cloud.points, axis=0, weights=cloud.point_weights), points.mean(0))
     assert len(cloud) <= 13**3
-    assert len(voxel_grid(points, 1e-5)) == 5000
-    assert len(voxel_grid(np.empty((0, 3)), 0.05)) == 0
+    assert len(voxel_averages(points, 1e-5)) == 5000
+    assert len(voxel_averages(np.empty((0, 3)), 0.05)) == 0
 
 
 def test_weighted_median():
@@ -33,31 +40,31 @@ def test_outliers_go_and_the_surface_stays(share):
     count = 8000
     plane = np.column_stack([rng.uniform(-0.5, 0.5, (count, 2)), 0.004 * rng.standard_normal(count)])
     wrong = rng.uniform(-0.6, 0.6, (round(count * share / (1 - share)), 3))
-    cloud = voxel_grid(np.concatenate([plane, wrong]), 0.008)
+    cloud = voxel_averages(np.concatenate([plane, wrong]), 0.008)
     far = np.abs(cloud.points[:, 2]) > 0.05
-    stays = without_outliers(cloud, 12, 4.0)
+    stays = is_not_outlier(cloud, 12, 4.0)
     assert stays[~far].mean() > 0.85
     assert share == 0 or stays[far].mean() < 0.05
-    assert not without_outliers(cloud.keep(np.arange(5)), 12, 4.0).any()
+    assert not is_not_outlier(cloud.select(np.arange(5)), 12, 4.0).any()
 
 
 def test_the_robot_goes_with_its_padding(system, run):
     tree = numeric_mechanism(system)
-    meshes = robot_meshes("package:baxter", tree)
-    robot = Surfaces(tree, meshes)
+    meshes = load_robot_meshes("package:baxter", tree)
+    robot = ArticulatedSurfaces(tree, meshes)
     wrist = system.mechanism.joint_index("left_w1")
     for q in (run.q[0], run.q[-1]):
-        pose = robot.poses(q)[robot.joints.index(wrist)]
-        surface = meshes[wrist].moved(pose).vertices[::20]
-        assert not without_robot(Cloud(surface, np.ones(len(surface))), robot, q, 0.01).any()
+        pose = robot.part_poses_at(q)[robot.part_joints.index(wrist)]
+        surface = meshes[wrist].transformed(pose).vertices[::20]
+        assert not is_not_robot(WeightedCloud(surface, np.ones(len(surface))), robot, q, 0.01).any()
         away = surface + np.array([0.0, 0.0, 3.0])
-        assert without_robot(Cloud(away, np.ones(len(away))), robot, q, 0.01).all()
-    tip = run.points[0][system.points.index("w_T1")][None]
-    assert without_robot(Cloud(tip, np.ones(1)), robot, run.q[0], 0.03).all()
+        assert is_not_robot(WeightedCloud(away, np.ones(len(away))), robot, q, 0.01).all()
+    tip = run.point_frames[0][system.point_frames.index("w_T1")][None]
+    assert is_not_robot(WeightedCloud(tip, np.ones(1)), robot, run.q[0], 0.03).all()
 
 
 def test_where_the_object_can_be(system, run):
-    region = ObjectRegion(system, FilterOptions()).at(run.q[0], CAMERA)
+    region = ObjectRegion(system, CloudFilterOptions()).bounds_at(run.q[0], CAMERA)
     foot = np.array([0.85, 0.0, -0.93])
     inside = {
         "floor": foot + np.array([0.3, 0.0, 0.02]),
@@ -66,14 +73,16 @@ def test_where_the_object_can_be(system, run):
     }
     for reason, point in inside.items():
         assert not region.contains(point[None])[0], reason
-    assert region.contains(run.points.reshape(-1, 3)).all()
+    assert region.contains(run.point_positions.reshape(-1, 3)).all()
     assert region.contains((foot + np.array([0.0, 0.0, 0.1]))[None]).all()
-    box = FilterOptions(lower=(0.5, -2.0, -2.0), upper=(2.0, 2.0, 0.0), floor=-0.9, behind=None)
-    region = ObjectRegion(system, box).at(run.q[0], CAMERA)
+    box = CloudFilterOptions(
+        box_lower=(0.5, -2.0, -2.0), box_upper=(2.0, 2.0, 0.0), floor_height=-0.9, max_depth_behind_base=None
+    )
+    region = ObjectRegion(system, box).bounds_at(run.q[0], CAMERA)
     points = np.array([[0.85, 0.0, -0.1], [0.4, 0.0, -0.1], [0.85, 0.0, 0.1], [0.85, 0.0, -0.91]])
     assert region.contains(points).tolist() == [True, False, False, False]
 
 
 def test_options_are_checked():
     with pytest.raises(ConfigError, match="padding = -1"):
-        FilterOptions(padding=-1.0)
+        CloudFilterOptions(robot_padding=-1.0)

@@ -8,15 +8,22 @@ import numpy as np
 import pytest
 
 from yid_ocp.errors import DataError, OutputError
-from yid_ocp.vision import XTION, FrameSequence, Pinhole, look_at, read_frames, write_frames
+from yid_ocp.vision import (
+    XTION_INTRINSICS,
+    CameraIntrinsics,
+    FrameSequence,
+    look_at_pose,
+    read_frames,
+    write_frame_folder,
+)
 
 CLOUD = np.array([[0.1, -0.2, 2.0], [0.0, 0.3, 1.5], [-0.4, 0.1, 2.25]])
-POSE = look_at([2.0, 0.5, 0.3], [0.0, 0.0, 0.0])
+POSE = look_at_pose([2.0, 0.5, 0.3], [0.0, 0.0, 0.0])
 
 
 @pytest.fixture
 def folder(tmp_path):
-    write_frames(FrameSequence.of([0.5, 0.9], [CLOUD, CLOUD[:2]], POSE), tmp_path / "sequence")
+    write_frame_folder(FrameSequence.from_clouds([0.5, 0.9], [CLOUD, CLOUD[:2]], POSE), tmp_path / "sequence")
     return tmp_path / "sequence"
 
 
@@ -27,20 +34,20 @@ def changed(folder, **entries):
 
 
 def test_xtion_is_58_degrees_wide():
-    left, right = XTION.rays[240, 0], XTION.rays[240, -1]
+    left, right = XTION_INTRINSICS.pixel_rays[240, 0], XTION_INTRINSICS.pixel_rays[240, -1]
     cosine = left @ right / np.linalg.norm(left) / np.linalg.norm(right)
     assert np.degrees(np.arccos(cosine)) == pytest.approx(58.0, abs=0.2)
-    assert (XTION.width, XTION.height) == (640, 480)
+    assert (XTION_INTRINSICS.width, XTION_INTRINSICS.height) == (640, 480)
 
 
 def test_depth_to_cloud():
-    camera = Pinhole(4, 3, 2.0, 4.0, 1.0, 1.0)
+    camera = CameraIntrinsics(4, 3, 2.0, 4.0, 1.0, 1.0)
     depth = np.full((3, 4), np.nan)
     depth[2, 3] = 2.0
     depth[0, 0] = 0.0
-    assert np.allclose(camera.cloud(depth), [[2.0, 0.5, 2.0]])
+    assert np.allclose(camera.points_from_depth(depth), [[2.0, 0.5, 2.0]])
     with pytest.raises(DataError, match="shape"):
-        camera.cloud(np.ones((4, 3)))
+        camera.points_from_depth(np.ones((4, 3)))
 
 
 def test_look_at_puts_the_target_ahead():
@@ -50,11 +57,11 @@ def test_look_at_puts_the_target_ahead():
 
 def test_a_sequence_survives_the_disk(folder):
     sequence = read_frames(folder)
-    assert np.array_equal(sequence.t, [0.5, 0.9])
-    assert np.allclose(sequence.pose, POSE)
-    assert np.allclose(sequence.load(0), CLOUD, atol=1e-6)
-    assert np.allclose(sequence.world(1), CLOUD[:2] @ POSE[:3, :3].T + POSE[:3, 3], atol=1e-6)
-    assert sequence.select([1]).names == ("000001.ply",)
+    assert np.array_equal(sequence.stamps, [0.5, 0.9])
+    assert np.allclose(sequence.camera_pose, POSE)
+    assert np.allclose(sequence.load_cloud(0), CLOUD, atol=1e-6)
+    assert np.allclose(sequence.load_world_cloud(1), CLOUD[:2] @ POSE[:3, :3].T + POSE[:3, 3], atol=1e-6)
+    assert sequence.select_frames([1]).frame_names == ("000001.ply",)
 
 
 COLOURS = np.array([[255, 0, 7], [1, 2, 3], [9, 200, 0]], np.uint8)
@@ -75,8 +82,8 @@ def test_formats_of_clouds(open3d, folder, ending, coloured):
         open3d.io.write_point_cloud(str(file), cloud)
     (folder / "timestamps.csv").write_text(f"file,t\nother{ending},3.5\n")
     sequence = read_frames(folder)
-    assert np.allclose(sequence.load(0), CLOUD, atol=1e-6)
-    assert np.array_equal(sequence.colours(0), COLOURS) if coloured else sequence.colours(0) is None
+    assert np.allclose(sequence.load_cloud(0), CLOUD, atol=1e-6)
+    assert np.array_equal(sequence.load_colours(0), COLOURS) if coloured else sequence.load_colours(0) is None
 
 
 @pytest.mark.parametrize(
@@ -96,17 +103,17 @@ def test_damaged_clouds_are_refused(folder, name, make, message):
     make(folder / name)
     (folder / "timestamps.csv").write_text(f"file,t\n{name},3.5\n")
     with pytest.raises(DataError, match=message):
-        read_frames(folder).load(0)
+        read_frames(folder).load_cloud(0)
 
 
 def test_a_lens_with_distortion_survives_the_disk(tmp_path):
-    camera = Pinhole(8, 6, 10.0, 10.0, 3.5, 2.5, "equidistant", (0.01, 0.0, 0.0, 0.0))
+    camera = CameraIntrinsics(8, 6, 10.0, 10.0, 3.5, 2.5, "equidistant", (0.01, 0.0, 0.0, 0.0))
     depth = np.full((6, 8), 1.5)
-    sequence = FrameSequence(np.array([0.1]), ("a",), POSE, lambda i: camera.cloud(depth), camera)
-    write_frames(sequence, tmp_path / "sequence", depth=[depth])
+    sequence = FrameSequence(np.array([0.1]), ("a",), POSE, lambda i: camera.points_from_depth(depth), camera)
+    write_frame_folder(sequence, tmp_path / "sequence", depth=[depth])
     again = read_frames(tmp_path / "sequence")
     assert again.intrinsics == camera
-    assert np.allclose(again.load(0), sequence.load(0), atol=1e-3)
+    assert np.allclose(again.load_cloud(0), sequence.load_cloud(0), atol=1e-3)
     changed(tmp_path / "sequence", intrinsics={**again.intrinsics.__dict__, "coefficients": ["far"]})
     with pytest.raises(DataError, match="coefficients are"):
         read_frames(tmp_path / "sequence")
@@ -114,26 +121,26 @@ def test_a_lens_with_distortion_survives_the_disk(tmp_path):
 
 def test_units_and_frames_of_clouds(folder):
     changed(folder, unit="mm")
-    assert np.allclose(read_frames(folder).load(0), 1e-3 * CLOUD)
-    assert np.allclose(read_frames(folder, unit="m").load(0), CLOUD, atol=1e-6)
+    assert np.allclose(read_frames(folder).load_cloud(0), 1e-3 * CLOUD)
+    assert np.allclose(read_frames(folder, unit="m").load_cloud(0), CLOUD, atol=1e-6)
     changed(folder, unit="m", frame="world")
-    assert np.allclose(read_frames(folder).world(0), CLOUD, atol=1e-6)
+    assert np.allclose(read_frames(folder).load_world_cloud(0), CLOUD, atol=1e-6)
 
 
 def test_depth_images(tmp_path):
-    camera = Pinhole(8, 6, 10.0, 10.0, 3.5, 2.5)
+    camera = CameraIntrinsics(8, 6, 10.0, 10.0, 3.5, 2.5)
     depth = np.linspace(1.0, 2.0, 48).reshape(6, 8)
     depth[0, :3] = np.nan
-    sequence = FrameSequence(np.array([0.1]), ("a",), POSE, lambda i: camera.cloud(depth), camera)
-    write_frames(sequence, tmp_path / "sequence", depth=[depth])
+    sequence = FrameSequence(np.array([0.1]), ("a",), POSE, lambda i: camera.points_from_depth(depth), camera)
+    write_frame_folder(sequence, tmp_path / "sequence", depth=[depth])
     again = read_frames(tmp_path / "sequence")
     assert again.intrinsics == camera
-    assert np.allclose(again.load(0), sequence.load(0), atol=1e-3)
+    assert np.allclose(again.load_cloud(0), sequence.load_cloud(0), atol=1e-3)
     changed(tmp_path / "sequence", intrinsics=None)
     with pytest.raises(DataError, match="intrinsics are missing"):
         read_frames(tmp_path / "sequence")
     with pytest.raises(OutputError, match="intrinsics"):
-        write_frames(FrameSequence.of([0.1], [CLOUD], POSE), tmp_path / "other", depth=[depth])
+        write_frame_folder(FrameSequence.from_clouds([0.1], [CLOUD], POSE), tmp_path / "other", depth=[depth])
 
 
 @pytest.mark.parametrize(
@@ -183,9 +190,9 @@ def test_broken_files_fail_when_loaded(folder, capfd):
     (folder / "000001.ply").unlink()
     sequence = read_frames(folder)
     with pytest.raises(DataError, match="empty or cannot be read"):
-        sequence.load(0)
+        sequence.load_cloud(0)
     with pytest.raises(DataError, match="missing"):
-        sequence.load(1)
+        sequence.load_cloud(1)
     assert "ply" not in capfd.readouterr().out.lower()
     shutil.rmtree(folder)
     with pytest.raises(DataError, match="no such folder"):
@@ -196,4 +203,4 @@ def test_more_points_than_a_file_can_hold_are_refused(folder):
     cloud = next(folder.glob("*.ply"))
     cloud.write_bytes(cloud.read_bytes().replace(b"element vertex 3", b"element vertex 3000000000"))
     with pytest.raises(DataError, match=r"declares 3e\+09 points"):
-        read_frames(folder).load(0)
+        read_frames(folder).load_cloud(0)

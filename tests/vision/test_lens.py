@@ -6,21 +6,23 @@ import numpy as np
 import pytest
 
 from yid_ocp.errors import DataError
-from yid_ocp.vision import Pinhole
+from yid_ocp.vision import CameraIntrinsics
 
 LENSES = {
-    "none": Pinhole(64, 48, 60.0, 61.0, 31.0, 24.5),
-    "plumb_bob": Pinhole(64, 48, 60.0, 61.0, 31.0, 24.5, "plumb_bob", (-0.25, 0.08, 1e-3, -2e-3, 0.01)),
-    "four": Pinhole(64, 48, 60.0, 61.0, 31.0, 24.5, "plumb_bob", (0.1, -0.05, 1e-3, 2e-3)),
-    "rational": Pinhole(64, 48, 60.0, 61.0, 31.0, 24.5, "rational_polynomial", (0.5, 0.1, 1e-3, -1e-3, 0, 0.6, 0.2, 0)),
-    "equidistant": Pinhole(64, 48, 30.0, 30.0, 31.0, 24.5, "equidistant", (0.02, -0.01, 0.003, 0.0)),
+    "none": CameraIntrinsics(64, 48, 60.0, 61.0, 31.0, 24.5),
+    "plumb_bob": CameraIntrinsics(64, 48, 60.0, 61.0, 31.0, 24.5, "plumb_bob", (-0.25, 0.08, 1e-3, -2e-3, 0.01)),
+    "four": CameraIntrinsics(64, 48, 60.0, 61.0, 31.0, 24.5, "plumb_bob", (0.1, -0.05, 1e-3, 2e-3)),
+    "rational": CameraIntrinsics(
+        64, 48, 60.0, 61.0, 31.0, 24.5, "rational_polynomial", (0.5, 0.1, 1e-3, -1e-3, 0, 0.6, 0.2, 0)
+    ),
+    "equidistant": CameraIntrinsics(64, 48, 30.0, 30.0, 31.0, 24.5, "equidistant", (0.02, -0.01, 0.003, 0.0)),
 }
 
 
 @pytest.mark.parametrize("name", LENSES)
 def test_a_ray_appears_at_its_pixel(name):
     lens = LENSES[name]
-    pixels = lens.project(lens.rays.reshape(-1, 3)).reshape(48, 64, 2)
+    pixels = lens.project_to_pixels(lens.pixel_rays.reshape(-1, 3)).reshape(48, 64, 2)
     u, v = np.meshgrid(np.arange(64), np.arange(48))
     assert np.abs(pixels - np.stack([u, v], axis=-1)).max() < 2e-3
 
@@ -32,28 +34,28 @@ def test_the_formula_of_ros():
     factor = 1 + k1 * square + k2 * square**2 + k3 * square**3
     u = 60 * (x * factor + 2 * p1 * x * y + p2 * (square + 2 * x**2)) + 31.0
     v = 61 * (y * factor + p1 * (square + 2 * y**2) + 2 * p2 * x * y) + 24.5
-    assert np.allclose(LENSES["plumb_bob"].project([[0.4, 0.2, 2.0]]), [[u, v]])
+    assert np.allclose(LENSES["plumb_bob"].project_to_pixels([[0.4, 0.2, 2.0]]), [[u, v]])
     angle = np.arctan(np.sqrt(square))
     bent = angle + 0.02 * angle**3 - 0.01 * angle**5 + 0.003 * angle**7
     assert np.allclose(
-        LENSES["equidistant"].project([[0.4, 0.2, 2.0]]),
+        LENSES["equidistant"].project_to_pixels([[0.4, 0.2, 2.0]]),
         [[30 * x * bent / np.sqrt(square) + 31.0, 30 * y * bent / np.sqrt(square) + 24.5]],
     )
 
 
 def test_a_wall_is_flat_through_any_lens():
     for lens in LENSES.values():
-        cloud = lens.cloud(np.full((48, 64), 2.0))
+        cloud = lens.points_from_depth(np.full((48, 64), 2.0))
         assert np.allclose(cloud[:, 2], 2.0)
-        seen = lens.project(cloud)
+        seen = lens.project_to_pixels(cloud)
         assert len(np.unique(np.rint(seen), axis=0)) == len(cloud)
 
 
 def test_pixels_that_a_lens_does_not_have_are_no_points():
     """A barrel that turns back: its corners have no direction."""
-    lens = Pinhole(64, 48, 30.0, 30.0, 31.5, 23.5, "plumb_bob", (-0.6, 0.0, 0.0, 0.0))
-    assert np.isnan(lens.rays[0, 0]).any()
-    cloud = lens.cloud(np.ones((48, 64)))
+    lens = CameraIntrinsics(64, 48, 30.0, 30.0, 31.5, 23.5, "plumb_bob", (-0.6, 0.0, 0.0, 0.0))
+    assert np.isnan(lens.pixel_rays[0, 0]).any()
+    cloud = lens.points_from_depth(np.ones((48, 64)))
     assert np.isfinite(cloud).all()
     assert len(cloud) < 48 * 64
 
@@ -68,5 +70,5 @@ def test_pixels_that_a_lens_does_not_have_are_no_points():
 )
 def test_unknown_distortions_are_refused(model, coefficients, message):
     with pytest.raises(DataError, match=message):
-        Pinhole(64, 48, 60.0, 60.0, 32.0, 24.0, model, coefficients)
-    assert not Pinhole(64, 48, 60.0, 60.0, 32.0, 24.0, model, (0.0,) * 5).distorted
+        CameraIntrinsics(64, 48, 60.0, 60.0, 32.0, 24.0, model, coefficients)
+    assert not CameraIntrinsics(64, 48, 60.0, 60.0, 32.0, 24.0, model, (0.0,) * 5).has_distortion

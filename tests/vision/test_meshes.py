@@ -6,8 +6,15 @@ import pytest
 from yid_ocp.errors import DataError, ModelError
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.vision import Pinhole, look_at
-from yid_ocp.vision.meshes import Mesh, Surfaces, mesh_file, numeric_mechanism, robot_meshes, tube_meshes
+from yid_ocp.vision import CameraIntrinsics, look_at_pose
+from yid_ocp.vision.surface_meshes import (
+    ArticulatedSurfaces,
+    TriangleMesh,
+    _resolve_mesh_path,
+    load_robot_meshes,
+    numeric_mechanism,
+    tube_meshes_by_joint,
+)
 
 
 @pytest.fixture(scope="module")
@@ -16,11 +23,13 @@ def ball(urdf_folder):
     tree = read_urdf(urdf_folder / "double_pendulum.urdf", parametric=False)
     placed = np.eye(4)
     placed[:3, 3] = [0.0, 5.0, 0.0]
-    return Surfaces(tree, {1: Mesh.sphere(0.1), -1: Mesh.box([1.0, 1.0, 1.0]).moved(placed)})
+    return ArticulatedSurfaces(
+        tree, {1: TriangleMesh.sphere(0.1), -1: TriangleMesh.box([1.0, 1.0, 1.0]).transformed(placed)}
+    )
 
 
 def centre(surfaces, q):
-    return surfaces.poses(q)[surfaces.joints.index(1)][:3, 3]
+    return surfaces.part_poses_at(q)[surfaces.part_joints.index(1)][:3, 3]
 
 
 def test_distances_follow_the_joints(ball):
@@ -29,19 +38,19 @@ def test_distances_follow_the_joints(ball):
         directions = np.random.default_rng(0).standard_normal((50, 3))
         directions /= np.linalg.norm(directions, axis=1)[:, None]
         radii = np.linspace(0.05, 0.3, 50)
-        found = ball.distance(middle + radii[:, None] * directions, q, 0.15)
+        found = ball.distance_to_surface(middle + radii[:, None] * directions, q, 0.15)
         expected = np.abs(radii - 0.1)
         assert np.allclose(found[expected < 0.145], expected[expected < 0.145], atol=6e-4)
         assert np.isinf(found[expected > 0.155]).all()
-    assert np.isfinite(ball.distance(np.array([[0.0, 5.0, 0.6]]), [0, 0], 0.2)).all()
-    assert np.isinf(ball.distance(np.array([[0.0, 5.0, 0.6]]), [0, 0], 0.2, moving_only=True)).all()
+    assert np.isfinite(ball.distance_to_surface(np.array([[0.0, 5.0, 0.6]]), [0, 0], 0.2)).all()
+    assert np.isinf(ball.distance_to_surface(np.array([[0.0, 5.0, 0.6]]), [0, 0], 0.2, moving_only=True)).all()
 
 
 def test_closest_points_give_the_way_out(ball):
     q = [0.3, 0.2]
     direction = np.array([0.6, 0.0, 0.8])
     points = centre(ball, q) + np.array([[0.14], [0.08], [0.5]]) * direction
-    distance, normal, part = ball.closest(points, q, 0.2)
+    distance, normal, part = ball.nearest_moving_surface(points, q, 0.2)
     assert np.allclose(distance[:2], [0.04, 0.02], atol=6e-4)
     assert np.allclose(normal[0], direction, atol=0.05)
     assert np.allclose(normal[1], -direction, atol=0.08)  # from the surface to the point, inwards here
@@ -53,52 +62,52 @@ def test_rays_meet_a_ball_where_it_is(ball):
     q = [0.4, -0.1]
     middle = centre(ball, q)
     eye = middle + np.array([1.2, 0.3, 0.1])
-    camera = Pinhole(41, 31, 60.0, 60.0, 20.0, 15.0)
-    depth, cosine, part = ball.cast(camera, look_at(eye, middle), q)
+    camera = CameraIntrinsics(41, 31, 60.0, 60.0, 20.0, 15.0)
+    depth, cosine, part = ball.render_depth_image(camera, look_at_pose(eye, middle), q)
     away = np.linalg.norm([1.2, 0.3, 0.1])
     assert depth[15, 20] == pytest.approx(away - 0.1, abs=1e-3)
     assert cosine[15, 20] == pytest.approx(1.0, abs=0.01)
-    rays = camera.rays / np.linalg.norm(camera.rays, axis=2)[..., None]
+    rays = camera.pixel_rays / np.linalg.norm(camera.pixel_rays, axis=2)[..., None]
     miss = away * np.sqrt(1 - rays[..., 2] ** 2)
     assert np.isfinite(depth[miss < 0.097]).all()
     assert np.isinf(depth[miss > 0.103]).all()
-    behind, _, nobody = ball.cast(camera, look_at(eye, 2 * eye - middle), q)
+    behind, _, nobody = ball.render_depth_image(camera, look_at_pose(eye, 2 * eye - middle), q)
     assert np.isinf(behind).all()
     assert (nobody == -1).all()
-    assert ((part == ball.joints.index(1)) == np.isfinite(depth)).all()
+    assert ((part == ball.part_joints.index(1)) == np.isfinite(depth)).all()
 
 
 def test_baxters_meshes_are_found_and_move(system):
     tree = numeric_mechanism(system)
-    meshes = robot_meshes("package:baxter", tree)
+    meshes = load_robot_meshes("package:baxter", tree)
     assert set(meshes) == {-1, *system.driven_indices}
     finger = meshes[system.mechanism.joint_index("left_w2")].vertices
     assert 0.1 < finger[:, 2].max() < 0.5
-    assert set(robot_meshes("package:baxter", tree, "collision")) <= set(meshes)
+    assert set(load_robot_meshes("package:baxter", tree, "collision")) <= set(meshes)
 
 
 def test_tubes_have_their_lengths_and_radii(system):
-    meshes = tube_meshes(system)
+    meshes = tube_meshes_by_joint(system)
     link = meshes[system.mechanism.joint_index("T3_3_z")].vertices
     assert link[:, 2].max() == pytest.approx(0.737 / 4)
     assert np.abs(link[:, :2]).max() == pytest.approx(0.019)
     assert len(meshes) == 12
-    thin = tube_meshes(system, {"T3.radius": 0.01})[system.mechanism.joint_index("T3_3_z")].vertices
+    thin = tube_meshes_by_joint(system, {"T3.radius": 0.01})[system.mechanism.joint_index("T3_3_z")].vertices
     assert np.abs(thin[:, :2]).max() == pytest.approx(0.01)
 
 
 def test_what_cannot_be_seen_is_said(tmp_path, urdf_folder):
     tree = read_urdf(urdf_folder / "double_pendulum.urdf", parametric=False)
     with pytest.raises(DataError, match="no object"):
-        tube_meshes(System.build(tree))
+        tube_meshes_by_joint(System.build(tree))
     with pytest.raises(ModelError, match="no URDF file"):
-        robot_meshes(tmp_path / "none.urdf", tree)
+        load_robot_meshes(tmp_path / "none.urdf", tree)
     bare = tmp_path / "bare.urdf"
     bare.write_text('<robot name="bare"><link name="base"/></robot>')
     with pytest.raises(ModelError, match="no visual meshes"):
-        robot_meshes(bare, tree)
+        load_robot_meshes(bare, tree)
     with pytest.raises(ModelError, match="is not there"):
-        mesh_file("package://nobody/mesh.dae", bare)
+        _resolve_mesh_path("package://nobody/mesh.dae", bare)
 
 
 def test_names_of_mesh_files(tmp_path):
@@ -107,6 +116,6 @@ def test_names_of_mesh_files(tmp_path):
     (package / "mesh.stl").write_text("")
     urdf = package / "urdf" / "arm.urdf"
     for name in ("package://arm/mesh.stl", "../mesh.stl", f"file://{package}/mesh.stl"):
-        assert mesh_file(name, urdf).resolve() == package / "mesh.stl"
+        assert _resolve_mesh_path(name, urdf).resolve() == package / "mesh.stl"
     package.rename(tmp_path / "share" / "arm_1.2")  # a package's folder need not bear its name
-    assert mesh_file("package://arm/mesh.stl", tmp_path / "share" / "arm_1.2" / "urdf" / "arm.urdf").is_file()
+    assert _resolve_mesh_path("package://arm/mesh.stl", tmp_path / "share" / "arm_1.2" / "urdf" / "arm.urdf").is_file()

@@ -9,18 +9,26 @@ import numpy as np
 import pytest
 
 from yid_ocp.cli import main
-from yid_ocp.data.hdf5 import read_recording
+from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.model.flexible import Segment, flexible_object
 from yid_ocp.model.system import System
-from yid_ocp.vision import FilterOptions, FrameSequence, Scene, TrackOptions, look_at, track, write_frames
-from yid_ocp.vision.ends import touching
+from yid_ocp.vision import (
+    CameraScene,
+    CloudFilterOptions,
+    FrameSequence,
+    TrackOptions,
+    look_at_pose,
+    track_object,
+    write_frame_folder,
+)
+from yid_ocp.vision.root_selection import is_self_touching
 
 MILLIMETRE = 1e-3
 RADIUS = 0.006
-TABLE = look_at([0.0, 0.0, 1.0], [0.0, 0.0, 0.0], up=(0, 1, 0))
-WALL = look_at([1.2, 0.0, -0.4], [0.0, 0.0, -0.4])
-OPTIONS = TrackOptions(root="free", filters=FilterOptions(voxel=0.004), std_floor=0.002)
+TABLE = look_at_pose([0.0, 0.0, 1.0], [0.0, 0.0, 0.0], up=(0, 1, 0))
+WALL = look_at_pose([1.2, 0.0, -0.4], [0.0, 0.0, -0.4])
+OPTIONS = TrackOptions(root_placement="free", filters=CloudFilterOptions(voxel_size=0.004), min_point_std=0.002)
 CONFIG = """\
 model:
   robot: null
@@ -28,7 +36,7 @@ model:
     kind: segments
     segments: {rope: {length: 1.0, mass: 0.1, radius: 0.006, links: 16}}
   points: ["rope:0%", w_rope]
-track: {frames: FRAMES, pictures: 1, options: {root: free, root_near: [-0.5, 0, 0], filters: {voxel: 0.004}}}
+track: {frames_path: FRAMES, n_drawn_frames: 1, options: {root_placement: free, approximate_root_position: [-0.5, 0, 0], filters: {voxel_size: 0.004}}}
 """
 
 
@@ -55,7 +63,9 @@ def seen(places, pose, rng, count=3500, noise=MILLIMETRE):
 
 def film(lines, pose, **how):
     rng = np.random.default_rng(7)
-    return FrameSequence.of(0.2 * np.arange(len(lines)), [seen(places, pose, rng, **how) for places in lines], pose)
+    return FrameSequence.from_clouds(
+        0.2 * np.arange(len(lines)), [seen(places, pose, rng, **how) for places in lines], pose
+    )
 
 
 def snake(k):
@@ -73,7 +83,9 @@ def swing(k):
 @pytest.fixture(scope="module")
 def rope():
     segment = Segment("rope", 1.0, 0.1, RADIUS, links=16)
-    return System.build(objects=[(flexible_object([segment]), None, None)], points=("rope:0%", "rope:50%", "w_rope"))
+    return System.build(
+        objects=[(flexible_object([segment]), None, None)], point_frames=("rope:0%", "rope:50%", "w_rope")
+    )
 
 
 def ends(places):
@@ -81,36 +93,40 @@ def ends(places):
 
 
 def errors(found, lines):
-    truth = np.array([ends(lines[frame.index]) for frame in found.frames if frame.good])
+    truth = np.array([ends(lines[frame.index]) for frame in found.frame_reports if frame.is_good])
     return np.linalg.norm(found.position - truth, axis=2), found.position - truth
 
 
 def test_a_rope_on_a_table(rope):
     lines = [snake(k) for k in range(4)]
-    found = track(Scene(rope), None, film(lines, TABLE), replace(OPTIONS, root_near=(-0.5, 0.0, 0.0)))
+    found = track_object(
+        CameraScene(rope), None, film(lines, TABLE), replace(OPTIONS, approximate_root_position=(-0.5, 0.0, 0.0))
+    )
     apart, off = errors(found, lines)
     assert len(found.t) == 4
     assert apart.max() < 4 * MILLIMETRE
     assert (np.abs(off) < 3 * found.std).all()
-    assert "root_near" in found.note
-    other = track(Scene(rope), None, film(lines[:1], TABLE), replace(OPTIONS, root_near=(0.5, 0.0, 0.0)))
+    assert "root_near" in found.root_note
+    other = track_object(
+        CameraScene(rope), None, film(lines[:1], TABLE), replace(OPTIONS, approximate_root_position=(0.5, 0.0, 0.0))
+    )
     assert np.linalg.norm(other.position[0, 0] - lines[0][-1]) < 4 * MILLIMETRE
-    assert found.recording(None).points[0].names == ("rope:0%", "rope:50%", "w_rope")
+    assert found.to_recording(None).points[0].names == ("rope:0%", "rope:50%", "w_rope")
 
 
 @pytest.mark.parametrize(("root", "word"), [("fixed", "stays in its place"), ("free", "higher")])
 def test_the_root_of_a_hanging_rope_is_found(rope, root, word):
     lines = [swing(k) for k in range(5)]
-    found = track(Scene(rope), None, film(lines, WALL), replace(OPTIONS, root=root))
+    found = track_object(CameraScene(rope), None, film(lines, WALL), replace(OPTIONS, root_placement=root))
     assert errors(found, lines)[0].max() < 5 * MILLIMETRE
-    assert word in found.note
+    assert word in found.root_note
 
 
 def test_a_rope_that_hands_turn_over_keeps_its_root(rope):
     """The end that was lower goes above the other; nothing but the frames before says which one it is."""
     turns = np.linspace(0.0, 0.9 * np.pi, 8)
     lines = [swing(1) @ np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]]).T for a in turns]
-    found = track(Scene(rope), None, film([places - [0, 0, 0.4] for places in lines], WALL), OPTIONS)
+    found = track_object(CameraScene(rope), None, film([places - [0, 0, 0.4] for places in lines], WALL), OPTIONS)
     roots = found.position[:, 0] + [0, 0, 0.4]
     truth = [np.array([places[k] for places in lines]) for k in (0, -1)]
     assert min(np.linalg.norm(roots - places, axis=1).max() for places in truth) < 5 * MILLIMETRE
@@ -118,9 +134,9 @@ def test_a_rope_that_hands_turn_over_keeps_its_root(rope):
 
 def test_either_end_where_nothing_tells(rope):
     lines = [snake(k) for k in range(2)]
-    found = track(Scene(rope), None, film(lines, TABLE), OPTIONS)
-    assert "either end" in found.note
-    assert all(frame.other is not None for frame in found.frames)
+    found = track_object(CameraScene(rope), None, film(lines, TABLE), OPTIONS)
+    assert "either end" in found.root_note
+    assert all(frame.alternative_fit is not None for frame in found.frame_reports)
 
 
 def test_branches_tell_where_the_root_is():
@@ -129,7 +145,7 @@ def test_branches_tell_where_the_root_is():
         Segment(name, length, 0.1, RADIUS, links=4, parent="stem") for name, length in (("a", 0.3), ("b", 0.2))
     ]
     names = ("stem:0%", "w_stem", "w_a", "w_b")
-    system = System.build(objects=[(flexible_object(segments), None, None)], points=names)
+    system = System.build(objects=[(flexible_object(segments), None, None)], point_frames=names)
 
     def bow(start, angle, length, curve):
         s = np.linspace(0.0, length, 3000)
@@ -144,9 +160,9 @@ def test_branches_tell_where_the_root_is():
         counts = (1600, 1200, 800)
         clouds.append(np.concatenate([seen(p, TABLE, rng, count=n) for p, n in zip(parts, counts, strict=True)]))
         truth.append([stem[0], *(part[-1] for part in parts)])
-    found = track(Scene(system), None, FrameSequence.of(np.arange(3.0), clouds, TABLE), OPTIONS)
+    found = track_object(CameraScene(system), None, FrameSequence.from_clouds(np.arange(3.0), clouds, TABLE), OPTIONS)
     assert np.linalg.norm(found.position - truth, axis=2).max() < 4 * MILLIMETRE
-    assert "lengths and branches" in found.note
+    assert "lengths and branches" in found.root_note
 
 
 def crossing(s):
@@ -169,7 +185,7 @@ def folded(s):
 )
 def test_what_cannot_be_followed_is_refused_with_the_reason(rope, make, reason):
     with pytest.raises(DataError, match="not one frame could be used") as caught:
-        track(Scene(rope), None, film([make()], TABLE), OPTIONS)
+        track_object(CameraScene(rope), None, film([make()], TABLE), OPTIONS)
     assert reason in caught.value.what
 
 
@@ -178,21 +194,21 @@ def test_shapes_that_touch_themselves():
         return np.stack([places[:-1], places[1:]], axis=1)
 
     radius = np.full(40, RADIUS)
-    assert not touching(links(snake(2)[::50]), radius[:39])
+    assert not is_self_touching(links(snake(2)[::50]), radius[:39])
     cross = line(crossing, 1.0)[::50]
-    assert touching(links(cross), radius[:39])
+    assert is_self_touching(links(cross), radius[:39])
     cross[:, 2] = np.linspace(0.0, 0.3, 40)  # a coil crosses nothing
-    assert not touching(links(cross), radius[:39])
+    assert not is_self_touching(links(cross), radius[:39])
 
 
 def test_a_robot_says_where_the_root_is(rope):
     with pytest.raises(ConfigError, match="a robot holds the object"):
-        track(Scene(rope, "package:baxter"), None, film([snake(0)], TABLE), OPTIONS)
+        track_object(CameraScene(rope, "package:baxter"), None, film([snake(0)], TABLE), OPTIONS)
 
 
 def test_the_command_needs_no_recording(tmp_path, capsys):
     lines = [snake(k) for k in range(2)]
-    write_frames(film(lines, TABLE), tmp_path / "frames")
+    write_frame_folder(film(lines, TABLE), tmp_path / "frames")
     (tmp_path / "rope.yaml").write_text(CONFIG.replace("FRAMES", str(tmp_path / "frames")))
     assert main(["track", str(tmp_path / "rope.yaml"), "--out", str(tmp_path / "run")]) == 0, capsys.readouterr().err
     group = read_recording(tmp_path / "run" / "recording.h5").points[0]

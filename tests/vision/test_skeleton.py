@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from yid_ocp.errors import ConfigError
-from yid_ocp.vision import WalkOptions
-from yid_ocp.vision.filters import Cloud
-from yid_ocp.vision.skeleton import connect, skeleton, walk
+from yid_ocp.vision import SkeletonOptions
+from yid_ocp.vision.filters import WeightedCloud
+from yid_ocp.vision.skeleton import _spanning_forest, _thin_to_nodes, extract_skeleton
 
 FOOT, FORK = np.zeros(3), np.array([0.0, 0.0, 0.8])
 ENDS = (np.array([0.0, 0.4, 1.2]), np.array([0.0, -0.5, 1.3]))
@@ -20,7 +20,7 @@ def letter(seed=0, count=900, spread=0.008):
         t = rng.uniform(0, 1, count)
         parts.append(start + t[:, None] * (end - start) + spread * rng.standard_normal((count, 3)))
     points = np.concatenate(parts)
-    return Cloud(points, np.ones(len(points)))
+    return WeightedCloud(points, np.ones(len(points)))
 
 
 def from_bones(points):
@@ -34,7 +34,7 @@ def from_bones(points):
 
 def test_nodes_lie_on_the_centre_lines():
     cloud = letter()
-    nodes, size, label = walk(cloud, np.random.default_rng(0))
+    nodes, size, label = _thin_to_nodes(cloud, np.random.default_rng(0))
     assert np.median(from_bones(nodes)) < 0.005
     assert from_bones(nodes).max() < 0.02
     assert size.sum() == (label >= 0).sum()
@@ -47,21 +47,21 @@ def test_nodes_lie_on_the_centre_lines():
 
 def test_the_walk_begins_at_the_lowest_point():
     for down, end in (((0, 0, -1), FOOT), ((0, 0, 1), ENDS[1]), ((0, 1, 0), ENDS[0])):
-        nodes, _, _ = walk(letter(), np.random.default_rng(0), down=down)
+        nodes, _, _ = _thin_to_nodes(letter(), np.random.default_rng(0), down=down)
         assert np.linalg.norm(nodes[0] - end) < 0.05
         # from there it goes on to neighbours
         assert np.linalg.norm(np.diff(nodes[:6], axis=0), axis=1).max() < 0.1
 
 
 def test_the_same_seed_gives_the_same_nodes_and_another_hardly_others():
-    one, two, other = (walk(letter(), np.random.default_rng(seed))[0] for seed in (1, 1, 2))
+    one, two, other = (_thin_to_nodes(letter(), np.random.default_rng(seed))[0] for seed in (1, 1, 2))
     assert np.array_equal(one, two)
     assert abs(len(other) - len(one)) < 0.15 * len(one)
 
 
 def test_the_graph_is_a_tree_along_the_tubes():
-    found = skeleton(letter(), np.random.default_rng(0))
-    assert len(set(found.part.tolist())) == 1
+    found = extract_skeleton(letter(), np.random.default_rng(0))
+    assert len(set(found.component_of_node.tolist())) == 1
     assert len(found.edges) == len(found.nodes) - 1
     middles = found.nodes[found.edges].mean(axis=1)
     assert from_bones(middles).max() < 0.02
@@ -72,32 +72,36 @@ def test_two_parts_and_a_stray_heap():
     far = np.random.default_rng(3).normal([0.5, 0.5, 0.5], 0.01, (60, 3))
     near = np.abs(cloud.points[:, 2] - 0.4) > 0.15  # a gap across the trunk
     points = np.concatenate([cloud.points[near], far])
-    found = skeleton(Cloud(points, np.ones(len(points))), np.random.default_rng(0))
-    assert set(found.part.tolist()) == {0, 1}
-    assert not found.connected[-60:].any()
-    weights = [found.size[found.part == part].sum() for part in (0, 1)]
+    found = extract_skeleton(WeightedCloud(points, np.ones(len(points))), np.random.default_rng(0))
+    assert set(found.component_of_node.tolist()) == {0, 1}
+    assert not found.has_node[-60:].any()
+    weights = [found.node_weights[found.component_of_node == part].sum() for part in (0, 1)]
     assert weights[0] > weights[1]
 
 
 def test_too_little_gives_nothing():
-    few = Cloud(np.random.default_rng(0).uniform(-1, 1, (30, 3)), np.ones(30))
-    assert len(skeleton(few, np.random.default_rng(0)).nodes) == 0
-    empty = skeleton(Cloud(np.empty((0, 3)), np.empty(0)), np.random.default_rng(0))
-    assert len(empty.nodes) == len(empty.edges) == len(empty.label) == 0
-    assert connect(np.zeros((1, 3)))[1].tolist() == [0]
+    few = WeightedCloud(np.random.default_rng(0).uniform(-1, 1, (30, 3)), np.ones(30))
+    assert len(extract_skeleton(few, np.random.default_rng(0)).nodes) == 0
+    empty = extract_skeleton(WeightedCloud(np.empty((0, 3)), np.empty(0)), np.random.default_rng(0))
+    assert len(empty.nodes) == len(empty.edges) == len(empty.node_of_point) == 0
+    assert _spanning_forest(np.zeros((1, 3)))[1].tolist() == [0]
 
 
 def test_points_at_one_place_do_not_hang_it():
-    cloud = Cloud(np.zeros((500, 3)), np.ones(500))
-    nodes, _, label = walk(cloud, np.random.default_rng(0))
+    cloud = WeightedCloud(np.zeros((500, 3)), np.ones(500))
+    nodes, _, label = _thin_to_nodes(cloud, np.random.default_rng(0))
     assert len(nodes) == 10
     assert (label >= 0).all()
     ring = 0.069 * np.column_stack([np.cos(np.arange(40)), np.sin(np.arange(40)), np.zeros(40)])
-    walk(Cloud(ring, np.ones(40)), np.random.default_rng(0), WalkOptions(radius=0.01, least=1))
+    _thin_to_nodes(
+        WeightedCloud(ring, np.ones(40)),
+        np.random.default_rng(0),
+        SkeletonOptions(neighbour_radius=0.01, min_segment_points=1),
+    )
 
 
 def test_options_are_checked():
     with pytest.raises(ConfigError, match="neighbours = 1"):
-        WalkOptions(neighbours=1)
+        SkeletonOptions(segment_neighbours=1)
     with pytest.raises(ConfigError, match="radius = 0"):
-        WalkOptions(radius=0.0)
+        SkeletonOptions(neighbour_radius=0.0)

@@ -7,12 +7,20 @@ import pytest
 from matplotlib.image import imread
 from scipy.spatial.transform import Rotation
 
-from yid_ocp.data.hdf5 import read_recording, write_recording
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.errors import ConfigError, DataError, ModelError
-from yid_ocp.vision import CalibrationOptions, ClockOptions, FilterOptions, FrameSequence, Scene, TrackOptions, track
-from yid_ocp.vision.pictures import STAGES, draw_stages, draw_track
-from yid_ocp.vision.registration import CLOCK, CameraState
+from yid_ocp.vision import (
+    CameraCalibrationOptions,
+    CameraClockOptions,
+    CameraScene,
+    CloudFilterOptions,
+    FrameSequence,
+    TrackOptions,
+    track_object,
+)
+from yid_ocp.vision.camera_registration import CLOCK_OFFSET_INDEX, CameraState
+from yid_ocp.vision.track_figures import _STAGE_NAMES, draw_frame_stages, draw_track
 
 MILLIMETRE = 1e-3
 
@@ -49,12 +57,12 @@ def test_the_seed_hardly_matters(system, recording, clean):
     clouds = [chosen.load(i) for i in range(2)]
     seen = replace(chosen, load=clouds.__getitem__)
     known = {
-        "clock": ClockOptions(offset=clean.latency, search=0.0),
-        "calibration": CalibrationOptions(fix_pose=True),
+        "clock": CameraClockOptions(initial_offset=clean.latency, search_half_width=0.0),
+        "calibration": CameraCalibrationOptions(fix_pose=True),
     }
-    scene = Scene(system, "package:baxter")
+    scene = CameraScene(system, "package:baxter")
     first, other, again = (
-        track(scene, recording, seen, TrackOptions(seed=seed, points=system.points, **known)).position
+        track_object(scene, recording, seen, TrackOptions(seed=seed, tracked_points=system.points, **known)).position
         for seed in (1, 2, 1)
     )
     assert np.abs(first - other).max() < 2 * MILLIMETRE
@@ -73,9 +81,9 @@ def test_the_camera_and_its_clock_are_found(clean):
     camera, made = clean.track.calibration, clean.made.sequence
     assert camera.frames == len(made)
     std = np.sqrt(np.diag(camera.covariance))
-    true = CameraState(made.pose, offset=clean.latency, about=camera.state.about)
+    true = CameraState(made.pose, clock_offset=clean.latency, clock_reference_stamp=camera.state.clock_reference_stamp)
     assert (np.abs(camera.state.minus(true)) < 4 * std).all()
-    assert std[CLOCK] < 0.01
+    assert std[CLOCK_OFFSET_INDEX] < 0.01
     assert "clock offset" in camera.message
     assert camera.presence.there > 0.9
     assert (clean.track.common <= clean.track.std).all()
@@ -100,17 +108,26 @@ def test_a_displaced_camera_is_put_right_or_said(system, recording, clean):
     pose[:3, 3] += [0.03, -0.025, 0.02]
     pose[:3, :3] = Rotation.from_rotvec([0.02, -0.01, 0.03]).as_matrix() @ pose[:3, :3]
     stds = []
-    for options in (TrackOptions(), TrackOptions(calibration=CalibrationOptions(fix_pose=True), point_std_max=0.2)):
-        options = replace(options, d_max=4.0, worse=20.0, gap_max=0.2, least_covered=0.0)
-        found = track(Scene(system, "package:baxter"), recording, replace(sequence, pose=pose), options)
-        assert "sees the arm" in found.calibration.message or "contradicts" in found.calibration.message
+    for options in (
+        TrackOptions(),
+        TrackOptions(calibration=CameraCalibrationOptions(fix_pose=True), max_point_std=0.2),
+    ):
+        options = replace(
+            options,
+            max_distance_in_radii=4.0,
+            max_distance_ratio=20.0,
+            max_grasp_gap_change=0.2,
+            min_visible_coverage=0.0,
+        )
+        found = track_object(CameraScene(system, "package:baxter"), recording, replace(sequence, pose=pose), options)
+        assert "sees the arm" in found.camera_calibration.message or "contradicts" in found.camera_calibration.message
         truth = np.array([found._place(clean.made.course(t)) for t in found.t])[:, [0, 2]]
         errors = found.position - truth
         assert np.nanmean((errors / found.std) ** 2) < 1.5
         if not stds:
             assert np.nanmax(np.linalg.norm(errors, axis=2)) < 15 * MILLIMETRE
-            assert np.allclose(found.group().pose, sequence.pose, atol=0.02)
-            assert "one error of all frames" in found.group().sensor
+            assert np.allclose(found.to_point_group().pose, sequence.pose, atol=0.02)
+            assert "one error of all frames" in found.to_point_group().sensor
         stds.append(np.nanmedian(found.std))
     assert stds[1] > 2 * stds[0]
 
@@ -120,7 +137,7 @@ def test_without_motion_the_clock_has_to_be_given(system, clean, small):
     still = Recording(replace(joints, position=np.tile(joints.position[:1], (len(joints.t), 1))))
     sequence = clean.made.sequence.select([0, 1, 2])
     with pytest.raises(DataError, match="cannot be calibrated by the arm"):
-        track(Scene(system, "package:baxter"), still, sequence)
+        track_object(CameraScene(system, "package:baxter"), still, sequence)
 
 
 # -- what it leaves ---------------------------------------------------------------------------------------------------
@@ -138,7 +155,7 @@ def test_a_recording_that_solve_reads(tmp_path, clean, recording, system):
     assert group.names == system.points
     assert np.array_equal(group.t, clean.track.t)
     assert np.array_equal(group.position, clean.track.position)
-    assert (group.std >= TrackOptions().std_floor).all()
+    assert (group.std >= TrackOptions().min_point_std).all()
     assert np.array_equal(group.pose, clean.track.calibration.state.pose)
     assert again.description.startswith("Before.")
     assert "clock offset" in again.description
@@ -156,10 +173,10 @@ def test_positions_of_a_straight_object_stay_with_their_points(clean, recording)
 
 
 def test_the_points_are_those_that_no_arm_holds(system, small):
-    found = track(Scene(system), small.recording, small.sequence)
-    assert found.names == ("w_T1", "w_T3")
+    found = track_object(CameraScene(system), small.recording, small.sequence)
+    assert found.point_names == ("w_T1", "w_T3")
     with pytest.raises(ConfigError, match="no point 'w_T9'"):
-        track(Scene(system), small.recording, small.sequence, TrackOptions(points=("w_T9",)))
+        track_object(CameraScene(system), small.recording, small.sequence, TrackOptions(tracked_points=("w_T9",)))
 
 
 def test_the_spline_passes_through_the_good_frames(clean, system):
@@ -175,8 +192,8 @@ def test_the_spline_passes_through_the_good_frames(clean, system):
 def test_pictures_of_every_stage(clean, tmp_path):
     [stages] = clean.track.stages
     assert stages.name == "frame 3"
-    files = draw_stages(stages, tmp_path / "pictures")
-    assert [file.stem.rpartition("_")[2] for file in files] == list(STAGES)
+    files = draw_frame_stages(stages, tmp_path / "pictures")
+    assert [file.stem.rpartition("_")[2] for file in files] == list(_STAGE_NAMES)
     draw_track(clean.track, tmp_path / "track.png")
     for file in (*files, tmp_path / "track.png"):
         image = imread(file)
@@ -186,8 +203,8 @@ def test_pictures_of_every_stage(clean, tmp_path):
 
 def test_progress_is_reported(system, small):
     calls = []
-    track(
-        Scene(system),
+    track_object(
+        CameraScene(system),
         small.recording,
         small.sequence,
         progress=lambda done, total, text: calls.append((done, total, text)),
@@ -199,10 +216,12 @@ def test_progress_is_reported(system, small):
 
 
 def test_a_small_sequence_from_disk(system, small):
-    found = track(Scene(system), small.recording, small.sequence, TrackOptions(points=system.points))
+    found = track_object(
+        CameraScene(system), small.recording, small.sequence, TrackOptions(tracked_points=system.point_frames)
+    )
     errors = np.linalg.norm(found.position - small.truth, axis=2)
     assert errors.max() < 8 * MILLIMETRE
-    assert [frame.raw for frame in found.frames] == [len(cloud) for cloud in small.clouds]
+    assert [frame.n_raw_points for frame in found.frame_reports] == [len(cloud) for cloud in small.clouds]
 
 
 # -- bad input: a clear error, or a dropped frame with the reason -----------------------------------------------------
@@ -211,7 +230,7 @@ def test_a_small_sequence_from_disk(system, small):
 def spoilt(small, **changes):
     """The small frame sequence with some clouds or stamps replaced."""
     clouds = [changes.get(f"cloud{i}", cloud) for i, cloud in enumerate(small.clouds)]
-    return FrameSequence.of(changes.get("t", small.sequence.t), clouds, small.sequence.pose)
+    return FrameSequence.from_clouds(changes.get("t", small.sequence.stamps), clouds, small.sequence.camera_pose)
 
 
 @pytest.mark.parametrize(
@@ -226,18 +245,18 @@ def spoilt(small, **changes):
     ],
 )
 def test_one_bad_cloud_does_not_stop_the_rest(system, small, cloud, reason):
-    found = track(Scene(system), small.recording, spoilt(small, cloud1=cloud(small.clouds[1])))
-    assert [frame.good for frame in found.frames] == [True, False, True]
-    assert reason in found.frames[1].reason
+    found = track_object(CameraScene(system), small.recording, spoilt(small, cloud1=cloud(small.clouds[1])))
+    assert [frame.is_good for frame in found.frame_reports] == [True, False, True]
+    assert reason in found.frame_reports[1].drop_reason
     assert len(found.t) == 2
-    assert sum(found.dropped.values()) == 1
+    assert sum(found.drop_reason_counts.values()) == 1
 
 
 def test_random_points_are_no_object(system, small):
     rng = np.random.default_rng(0)
     dust = small.clouds[1] + rng.uniform(-0.3, 0.3, small.clouds[1].shape)
-    found = track(Scene(system), small.recording, spoilt(small, cloud1=dust))
-    assert not found.frames[1].good
+    found = track_object(CameraScene(system), small.recording, spoilt(small, cloud1=dust))
+    assert not found.frame_reports[1].is_good
 
 
 @pytest.mark.parametrize(
@@ -251,7 +270,7 @@ def test_random_points_are_no_object(system, small):
 def test_nothing_but_bad_clouds_is_an_error(system, small, cloud, message):
     clouds = {f"cloud{i}": cloud(points) for i, points in enumerate(small.clouds)}
     with pytest.raises(DataError, match="not one frame could be used") as caught:
-        track(Scene(system), small.recording, spoilt(small, **clouds))
+        track_object(CameraScene(system), small.recording, spoilt(small, **clouds))
     assert message in caught.value.what
     assert caught.value.what.endswith(f"({len(small.clouds)} of {len(small.clouds)})")  # all for one reason
     assert "other than the model says" not in caught.value.what
@@ -259,34 +278,41 @@ def test_nothing_but_bad_clouds_is_an_error(system, small, cloud, message):
 
 
 def test_all_points_filtered(system, small):
-    options = TrackOptions(filters=FilterOptions(lower=(0.0, 0.0, 5.0)))
+    options = TrackOptions(filters=CloudFilterOptions(box_lower=(0.0, 0.0, 5.0)))
     with pytest.raises(DataError, match="no point lies where the object can be"):
-        track(Scene(system), small.recording, small.sequence, options)
+        track_object(CameraScene(system), small.recording, small.sequence, options)
 
 
 def test_stamps_out_of_order_duplicated_or_missing(system, small):
-    t = small.sequence.t
+    t = small.sequence.stamps
     clouds = [*small.clouds, small.clouds[0], small.clouds[0]]
-    sequence = FrameSequence.of(
-        [t[2], t[0], t[1], t[0], np.nan], [clouds[2], *clouds[:2], *clouds[3:]], small.sequence.pose
+    sequence = FrameSequence.from_clouds(
+        [t[2], t[0], t[1], t[0], np.nan], [clouds[2], *clouds[:2], *clouds[3:]], small.sequence.camera_pose
     )
-    found = track(Scene(system), small.recording, sequence)
+    found = track_object(CameraScene(system), small.recording, sequence)
     assert np.array_equal(found.t, t)
-    assert [frame.index for frame in found.frames] == [1, 3, 2, 0, 4]
-    assert "a duplicate" in found.frames[1].reason
-    assert "not a number" in found.frames[4].reason
-    straight = track(Scene(system), small.recording, small.sequence)
+    assert [frame.index for frame in found.frame_reports] == [1, 3, 2, 0, 4]
+    assert "a duplicate" in found.frame_reports[1].drop_reason
+    assert "not a number" in found.frame_reports[4].drop_reason
+    straight = track_object(CameraScene(system), small.recording, small.sequence)
     assert np.abs(found.position - straight.position).max() < 2 * MILLIMETRE
 
 
 def test_the_time_of_another_clock(system, small):
     with pytest.raises(DataError, match="their clocks are not the same") as caught:
-        track(Scene(system), small.recording, spoilt(small, t=small.sequence.t + 1.7e9))
+        track_object(CameraScene(system), small.recording, spoilt(small, t=small.sequence.stamps + 1.7e9))
     assert "give the clock offset" in caught.value.hint
-    options = TrackOptions(clock=ClockOptions(offset=1.7e9))
-    assert len(track(Scene(system), small.recording, spoilt(small, t=small.sequence.t + 1.7e9), options).t) == 3
-    late = track(Scene(system), small.recording, spoilt(small, t=[*small.sequence.t[:2], 99.0]))
-    assert late.frames[2].reason == "there are no joint angles at its time"
+    options = TrackOptions(clock=CameraClockOptions(initial_offset=1.7e9))
+    assert (
+        len(
+            track_object(
+                CameraScene(system), small.recording, spoilt(small, t=small.sequence.stamps + 1.7e9), options
+            ).stamps
+        )
+        == 3
+    )
+    late = track_object(CameraScene(system), small.recording, spoilt(small, t=[*small.sequence.stamps[:2], 99.0]))
+    assert late.frame_reports[2].drop_reason == "there are no joint angles at its time"
 
 
 def test_a_file_that_cannot_be_read(system, small):
@@ -295,25 +321,27 @@ def test_a_file_that_cannot_be_read(system, small):
             raise DataError("the cloud is empty or cannot be read")
         return small.clouds[index]
 
-    found = track(Scene(system), small.recording, replace(small.sequence, load=load))
-    assert found.frames[1].reason == "the cloud is empty or cannot be read"
+    found = track_object(CameraScene(system), small.recording, replace(small.sequence, load_cloud=load))
+    assert found.frame_reports[1].drop_reason == "the cloud is empty or cannot be read"
 
 
 def test_a_recording_that_does_not_fit(system, small, urdf_folder):
     joints = small.recording.joints
     with pytest.raises(DataError, match="no joint angles"):
-        track(
-            Scene(system), Recording(points=(PointGroup("points", ("a",), [0.0], np.zeros((1, 1, 3))),)), small.sequence
+        track_object(
+            CameraScene(system),
+            Recording(points=(PointGroup("points", ("a",), [0.0], np.zeros((1, 1, 3))),)),
+            small.sequence,
         )
     names = ("left_s9", *joints.names[1:])
     with pytest.raises(DataError, match="joint 'left_s0' of the model is not recorded"):
-        track(Scene(system), Recording(JointGroup(names, joints.t, joints.position)), small.sequence)
+        track_object(CameraScene(system), Recording(JointGroup(names, joints.t, joints.position)), small.sequence)
     with pytest.raises(ModelError, match="no visual meshes"):
-        track(Scene(system, urdf_folder / "double_pendulum.urdf"), small.recording, small.sequence)
+        track_object(CameraScene(system, urdf_folder / "double_pendulum.urdf"), small.recording, small.sequence)
     with pytest.raises(DataError, match="pose of the camera is missing"):
-        FrameSequence.of([0.0], [small.clouds[0]], None)
+        FrameSequence.from_clouds([0.0], [small.clouds[0]], None)
     with pytest.raises(ConfigError, match="d_max = 0"):
-        TrackOptions(d_max=0.0)
+        TrackOptions(max_distance_in_radii=0.0)
 
 
 @pytest.mark.slow

@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from yid_ocp.vision import Pinhole
-from yid_ocp.vision.view import View
+from yid_ocp.vision import CameraIntrinsics
+from yid_ocp.vision.occlusion import OcclusionMap
 
 POSE = np.eye(4)  # at the origin, looking along z
 PLACE, RADIUS = np.array([[0.0, 0.0, 2.0]]), np.array([0.02])
@@ -30,24 +30,24 @@ def patch(centre, size, step=0.004):
     ],
 )
 def test_a_place_without_points_is_hidden_or_empty(points, hidden):
-    assert View(points, POSE).hidden(PLACE, RADIUS, 0.01).tolist() == [hidden]
+    assert OcclusionMap(points, POSE).is_hidden(PLACE, RADIUS, 0.01).tolist() == [hidden]
     # what is expected to be asked about saves work and changes nothing
     for expected in (PLACE, PLACE + 0.3, np.empty((0, 3))):
-        assert View(points, POSE, expected=expected).hidden(PLACE, RADIUS, 0.01).tolist() == [hidden]
+        assert OcclusionMap(points, POSE, expected_points=expected).is_hidden(PLACE, RADIUS, 0.01).tolist() == [hidden]
 
 
 def test_nothing_is_seen_beside_the_picture():
-    camera = Pinhole(320, 240, 300.0, 300.0, 159.5, 119.5)
+    camera = CameraIntrinsics(320, 240, 300.0, 300.0, 159.5, 119.5)
     behind = patch([0.0, 0.0, 4.0], 1.0)
     places = np.array([[0.0, 0.0, 2.0], [1.2, 0.0, 2.0], [0.0, 0.0, -1.0]])
-    assert View(behind, POSE, camera).hidden(places, np.full(3, 0.02), 0.01).tolist() == [False, True, True]
+    assert OcclusionMap(behind, POSE, camera).is_hidden(places, np.full(3, 0.02), 0.01).tolist() == [False, True, True]
 
 
 def test_the_picture_ends_where_points_stand_along_its_side():
     wall = patch([0.0, 0.0, 4.0], 2.0, 0.02)  # fills the picture, which is 0.5 wide in x/z
     places = np.array([[0.2, 0.0, 2.0], [0.6, 0.0, 2.0]])
     radius = np.full(2, 0.02)
-    assert View(wall, POSE).hidden(places, radius, 0.01).tolist() == [False, True]
+    assert OcclusionMap(wall, POSE).is_hidden(places, radius, 0.01).tolist() == [False, True]
     # a cloud of the object alone has no such side: what is missing beside it is missing
     rod = np.column_stack([np.linspace(-0.2, 0.2, 200), np.zeros(200), np.full(200, 2.0)])
-    assert View(rod, POSE).hidden(places, radius, 0.01).tolist() == [False, False]
+    assert OcclusionMap(rod, POSE).is_hidden(places, radius, 0.01).tolist() == [False, False]

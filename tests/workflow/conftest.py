@@ -23,7 +23,7 @@ def rubbing(tmp_path_factory, pendulum_data):
     text = pendulum_data.text.replace(str(pendulum_data.folder), str(folder))
     file = folder / "rubbing.yaml"
     file.write_text(
-        f"{text}diagnosis: {{candidates: [joint_coulomb, effort_offset, link_mass@elbow], effects: 1}}\n"
-        "output: {report: false}\n"
+        f"{text}diagnosis: {{candidates: [joint_coulomb, effort_offset, link_mass@elbow], max_effects: 1}}\n"
+        "output: {write_report: false}\n"
     )
     return file

@@ -11,8 +11,8 @@ import numpy as np
 from yid_ocp.config.reader import load_config
 from yid_ocp.data import write_recording
 from yid_ocp.data.recording import PointGroup, Recording
-from yid_ocp.virtual.engine import Simulation
-from yid_ocp.virtual.experiment import ArmNoise, PointCamera, VirtualExperiment, virtual_experiment
+from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperiment, run_virtual_experiment
+from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.workflow.build import build_system
 
 TRUTH = {"north.bend": 0.5, "east.bend": 0.3}
@@ -85,16 +85,16 @@ def configuration(
 def record(folder: Path, branches: Sequence[str], links: int = 12, duration: float = 1.5) -> None:
     """`cross.h5`: joint angles, and four points seen at 50 Hz to half a millimetre."""
     run = load_config(configuration(folder, links, branches, mode="driven"))
-    camera = PointCamera(std=5e-4, rate=50.0, gaps=False, missing=0.0, pose=np.eye(4))
+    camera = PointCamera(point_std=5e-4, frame_rate=50.0, has_dropouts=False, hidden_probability=0.0, pose=np.eye(4))
     experiment = VirtualExperiment(
-        posture={"roll": 0.0, "pitch": 0.0},
-        simulation=Simulation(duration, time_step=2e-4),
-        noise=ArmNoise(position=0.0),
+        initial_joint_angles={"roll": 0.0, "pitch": 0.0},
+        simulation=SimulationOptions(duration, time_step=2e-4),
+        arm_noise=ArmSensorNoise(position_std=0.0),
         camera=camera,
         seed=5,
-        name="cross",
+        recording_name="cross",
     )
-    made = virtual_experiment(build_system(run), None, experiment)
+    made = run_virtual_experiment(build_system(run), None, experiment)
     points = tuple(PointGroup("points_mocap", g.names, g.t, g.position, g.std, "mocap") for g in made.points)
     joints = replace(made.joints, effort=None, effort_std=None)
     write_recording(Recording(joints, points, source="test", name="cross"), folder / "cross.h5")

@@ -10,9 +10,9 @@ import numpy as np
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.data.recording import PointGroup, Recording
-from yid_ocp.virtual.engine import Simulation
-from yid_ocp.virtual.experiment import ArmNoise, PointCamera, VirtualExperiment, virtual_experiment
-from yid_ocp.virtual.motion import Excitation, multisine
+from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperiment, run_virtual_experiment
+from yid_ocp.virtual.mujoco_simulation import SimulationOptions
+from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 from yid_ocp.workflow.build import build_system
 
 START = 1_700_000_000 * 10**9
@@ -112,22 +112,22 @@ def simulated(
     points: Mapping[str, str],
     seed: int,
     duration: float,
-    excitation: Excitation | None = None,
+    excitation: MultisineOptions | None = None,
 ) -> Recording:
     """Joints at 100 Hz without efforts, points at 50 Hz to half a millimetre under names of their own."""
     file = folder / "truth.yaml"
     file.write_text(text)
     system = build_system(load_config(file))
-    excitation = excitation or Excitation(speed=1.0, duration=duration, band=(0.3, 1.5))
+    excitation = excitation or MultisineOptions(max_joint_speed=1.0, duration=duration, frequency_band=(0.3, 1.5))
     experiment = VirtualExperiment(
-        motion=multisine(system, None, seed=seed, posture=posture, excitation=excitation),
-        posture=posture,
-        simulation=Simulation(duration, time_step=2e-4),
-        noise=ArmNoise(position=1e-4),
-        camera=PointCamera(std=5e-4, rate=50.0, gaps=False, missing=0.0, pose=np.eye(4)),
+        motion=random_multisine(system, None, seed=seed, initial_joint_angles=posture, excitation=excitation),
+        initial_joint_angles=posture,
+        simulation=SimulationOptions(duration, time_step=2e-4),
+        arm_noise=ArmSensorNoise(position_std=1e-4),
+        camera=PointCamera(point_std=5e-4, frame_rate=50.0, has_dropouts=False, hidden_probability=0.0, pose=np.eye(4)),
         seed=seed,
     )
-    made = virtual_experiment(system, None, experiment)
+    made = run_virtual_experiment(system, None, experiment)
     [seen] = made.points
     names = tuple(points[name] for name in seen.names)
     return Recording(made.joints, (PointGroup("points", names, seen.t, seen.position, None, "mocap"),), name="run")

@@ -9,9 +9,9 @@ from here import Here
 
 from yid_ocp.data import read_recording, write_recording
 from yid_ocp.errors import ConfigError, OutputError
-from yid_ocp.workflow.batch import batch_members, run_batch
+from yid_ocp.workflow.batch import list_batch_runs, run_batch
 
-QUICK = ("output.report=false", "output.discretisation=none", "recordings.held_out=[]")
+QUICK = ("output.write_report=false", "output.discretisation_check=none", "recordings.held_out=[]")
 
 
 @pytest.fixture
@@ -30,12 +30,12 @@ def names(outcome):
 
 
 def test_a_failing_run_stops_no_other_and_is_tried_again(pendulum, pendulum_data, fleet, tmp_path):
-    members = batch_members([pendulum], str(fleet / "*.h5"), QUICK)
+    members = list_batch_runs([pendulum], str(fleet / "*.h5"), QUICK)
     assert [member.name for member in members] == ["monday", "spoiled", "tuesday"]
     out = tmp_path / "batch"
     first = run_batch(members, out, workers=Here())
     assert names(first) == {"monday": "converged", "spoiled": "error", "tuesday": "converged"}
-    assert not first.ok
+    assert not first.is_successful
     told = {entry["name"]: entry for entry in first.result["runs"]}
     assert "DataError" in told["spoiled"]["message"]
     for name in ("monday", "tuesday"):
@@ -53,7 +53,7 @@ def test_a_failing_run_stops_no_other_and_is_tried_again(pendulum, pendulum_data
     kept = (out / "runs" / "monday" / "result.json").stat().st_mtime_ns
     write_recording(read_recording(fleet / "monday.h5"), fleet / "spoiled.h5")
     second = run_batch(members, out, workers=Here())
-    assert second.ok
+    assert second.is_successful
     assert (out / "runs" / "monday" / "result.json").stat().st_mtime_ns == kept
     write_recording(read_recording(fleet / "tuesday.h5"), fleet / "monday.h5")
     third = run_batch(members, out, workers=Here())
@@ -66,7 +66,7 @@ def test_robots_are_configurations_and_what_differs_has_no_history(pendulum, wri
     other = written(pendulum_data.text.replace("rest: 0.2", "rest: 0.25"), "other.yaml")
     broken = written(pendulum_data.text.replace("free: true", "fre: true"), "broken.yaml")
     outcome = run_batch(
-        batch_members([pendulum, other, broken], None, QUICK),
+        list_batch_runs([pendulum, other, broken], None, QUICK),
         tmp_path / "batch",
         workers=Here(),
     )
@@ -76,7 +76,7 @@ def test_robots_are_configurations_and_what_differs_has_no_history(pendulum, wri
 
 
 def test_a_fleet_is_diagnosed(rubbing, tmp_path):
-    outcome = run_batch(batch_members([rubbing]), tmp_path / "batch", "diagnose", Here())
+    outcome = run_batch(list_batch_runs([rubbing]), tmp_path / "batch", "diagnose", Here())
     (entry,) = outcome.result["runs"]
     assert entry["effects"] == ["joint_coulomb@elbow"]
     assert entry["status"] == json.loads((tmp_path / "batch/runs/rubbing/result.json").read_text())["verdict"]
@@ -87,23 +87,23 @@ def test_names_are_told_apart(pendulum, written, pendulum_data, tmp_path):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "run.h5").write_bytes(b"")
     (tmp_path / "a" / "run.yaml").write_text(pendulum_data.text)
-    found = batch_members([pendulum], str(tmp_path / "*" / "run.h5"))
+    found = list_batch_runs([pendulum], str(tmp_path / "*" / "run.h5"))
     assert [member.name for member in found] == ["run", "run-2"]
-    found = batch_members([pendulum, tmp_path / "a" / "run.yaml"], str(tmp_path / "**" / "run.h5"))
+    found = list_batch_runs([pendulum, tmp_path / "a" / "run.yaml"], str(tmp_path / "**" / "run.h5"))
     assert [member.name for member in found] == ["pendulum-run", "pendulum-run-2", "run-run", "run-run-2"]
 
 
 def test_what_cannot_be_a_batch_is_refused(pendulum, tmp_path):
     with pytest.raises(ConfigError, match=r"no recording matches(.|\n)*nowhere/\*\.h5(.|\n)*in quotes"):
-        batch_members([pendulum], "nowhere/*.h5")
+        list_batch_runs([pendulum], "nowhere/*.h5")
     with pytest.raises(ConfigError, match=r"no such configuration(.|\n)*did you mean 'pendulum.yaml'"):
-        batch_members(["pendulun.yaml"])
+        list_batch_runs(["pendulun.yaml"])
     with pytest.raises(ConfigError, match="given twice"):
-        batch_members([pendulum, pendulum])
+        list_batch_runs([pendulum, pendulum])
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes").write_text("")
     with pytest.raises(OutputError, match="no batch"):
-        run_batch(batch_members([pendulum]), tmp_path / "full", workers=Here())
+        run_batch(list_batch_runs([pendulum]), tmp_path / "full", workers=Here())
 
 
 def test_the_command_runs_the_fleet_in_processes(cli, pendulum, fleet, tmp_path):

@@ -12,14 +12,14 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.errors import ConfigError, DataError, OutputError
 from yid_ocp.workflow import blind
 from yid_ocp.workflow.blind import run_blind
-from yid_ocp.workflow.experiments import VARIATIONS, experiments_of
+from yid_ocp.workflow.blind_experiments import EXPERIMENT_VARIATIONS, list_experiments
 
 SETTINGS = (
     "model.arms.mode=driven",
     "recordings.held_out=[]",
     "diagnosis.candidates=[joint_viscous, joint_coulomb]",
-    "problem.compiler=true",
-    "output.report=false",
+    "problem.use_compiler=true",
+    "output.write_report=false",
 )
 
 
@@ -32,7 +32,7 @@ def driven(pendulum):
 @pytest.mark.slow
 def test_a_proof_is_sealed_answered_and_not_done_again(driven, tmp_path, monkeypatch):
     folder = tmp_path / "proof"
-    sealed_at, first = [], blind.diagnosed
+    sealed_at, first = [], blind.diagnose_case_task
 
     def watched(**arguments):
         """What a diagnosis is told, and whether the labels were committed to before."""
@@ -41,7 +41,7 @@ def test_a_proof_is_sealed_answered_and_not_done_again(driven, tmp_path, monkeyp
         return first(**arguments)
 
     watched.__module__, watched.__qualname__ = first.__module__, first.__qualname__
-    monkeypatch.setattr(blind, "diagnosed", watched)
+    monkeypatch.setattr(blind, "diagnose_case_task", watched)
     outcome = run_blind([driven], folder, 2, 3, workers=Here())
     text = (folder / "sealed" / "labels.json").read_bytes()
     assert sealed_at == [hashlib.sha256(text).hexdigest()] * 2
@@ -74,7 +74,7 @@ def test_what_cannot_be_proved_is_refused(driven, pendulum, tmp_path, cli, monke
     with pytest.raises(ConfigError, match="seed = -1"):
         run_blind([driven], tmp_path / "proof", 2, -1, workers=Here())
     assert not (tmp_path / "proof").exists()
-    monkeypatch.setattr("yid_ocp.parallel.cluster.CONNECTING", 0.5)
+    monkeypatch.setattr("yid_ocp.parallel.dask_cluster._CONNECT_TIMEOUT", 0.5)
     options = [part for setting in SETTINGS for part in ("--set", setting)]
     done = cli("blind", pendulum, *options, "--scheduler", "127.0.0.1:1", "--out", tmp_path / "proof")
     assert done.code == 2
@@ -83,12 +83,14 @@ def test_what_cannot_be_proved_is_refused(driven, pendulum, tmp_path, cli, monke
 
 def test_an_experiment_is_varied_as_far_as_its_configuration_allows(repository, driven, pendulum):
     whole = repository / "configs" / "single_arm_vision.yaml"
-    experiments, chains = experiments_of({"whole": whole, "pendulum": pendulum}, 1, "report")
-    assert {name for name in experiments if name.startswith("whole")} == {f"whole.{name}" for name in VARIATIONS}
+    experiments, chains = list_experiments({"whole": whole, "pendulum": pendulum}, 1, "report")
+    assert {name for name in experiments if name.startswith("whole")} == {
+        f"whole.{name}" for name in EXPERIMENT_VARIATIONS
+    }
     # there is nothing to take out of its hands
     of_pendulum = {name.partition(".")[2] for name in experiments if name.startswith("pendulum")}
-    assert of_pendulum == {name for name, varied in VARIATIONS.items() if not varied.bare}
-    assert chains == {f"whole.{name}" for name, varied in VARIATIONS.items() if not varied.bare}
-    bare = experiments["whole.bare_arm_efforts"].simulated()
+    assert of_pendulum == {name for name, varied in EXPERIMENT_VARIATIONS.items() if not varied.is_without_object}
+    assert chains == {f"whole.{name}" for name, varied in EXPERIMENT_VARIATIONS.items() if not varied.is_without_object}
+    bare = experiments["whole.bare_arm_efforts"].simulation_settings()
     assert bare.model.object is None
     assert bare.model.arms.mode == "driven"

@@ -8,24 +8,24 @@ import pytest
 
 import yid_ocp as yid
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import SegmentedObject, YObject, dump_config
+from yid_ocp.config.settings import FoamYSettings, SegmentedObjectSettings, dump_config
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model import forward_kinematics
 from yid_ocp.workflow.build import (
+    _arms_are_estimated_states,
     build_problem,
     build_system,
     load_problem,
     load_system,
     problem_options,
     read_recordings,
-    tracked,
 )
 
 
 @pytest.mark.parametrize(("name", "size", "constraints"), [("single_arm_vision", 43, 3), ("dual_arm_vision", 50, 6)])
 def test_the_papers_systems(repository, paper_systems, name, size, constraints):
     system = yid.load_system(repository / "configs" / f"{name}.yaml")
-    assert (system.size, system.constraint_count) == (size, constraints)
+    assert (system.n_coordinates, system.n_constraints) == (size, constraints)
     reference = paper_systems["single" if size == 43 else "dual"]
     assert system.mechanism.joint_names == reference.mechanism.joint_names
     assert system.parameters.names == reference.parameters.names
@@ -36,10 +36,10 @@ def test_the_papers_systems(repository, paper_systems, name, size, constraints):
 def test_parameters_of_a_run(written):
     run = load_config(
         written(
-            "model: {object: {kind: y}}\n"
+            "model: {object: {kind: foam_y}}\n"
             "parameters:\n"
             "  T*.bend: {initial: 5, free: true, bounds: [0, 50]}\n"
-            "  T2.bend: {initial: 7, prior: 2.0}\n"
+            "  T2.bend: {initial: 7, prior_std: 2.0}\n"
             "  T1.mass: {initial: 0.07}\n"
         )
     )
@@ -48,7 +48,7 @@ def test_parameters_of_a_run(written):
     assert system.parameters["T3.bend"].upper == 50
     assert system.parameters["T1.mass"].value == 0.07
     options = problem_options(run, system)
-    assert options.priors == {"T2.bend": 2.0}
+    assert options.prior_stds == {"T2.bend": 2.0}
 
 
 def test_an_object_of_segments_on_a_robots_hand(written):
@@ -68,42 +68,46 @@ def test_an_object_of_segments_on_a_robots_hand(written):
             "parameters: {beam.bend: {initial: 1.3}, tip.damping: {initial: 0.001}}\n"
         )
     )
-    assert isinstance(run.model.object, SegmentedObject)
+    assert isinstance(run.model.object, SegmentedObjectSettings)
     system = build_system(run)
-    assert system.size == 7 + 15 + 6
+    assert system.n_coordinates == 7 + 15 + 6
     assert len(system.prescribed) == 7
     assert system.parameters["beam.bend"].unit == "N m^2"
     assert system.parameters["tip.damping"].value == 0.001
-    finer = build_system(run, finer=2)
-    assert finer.size == 7 + 30 + 12
+    finer = build_system(run, link_division=2)
+    assert finer.n_coordinates == 7 + 30 + 12
     assert finer.parameters["beam.bend"].value == 1.3
     assert finer.parameters["tip.bend"].value == 6.0
     assert finer.parameters["tip.damping"].value == 0.002
-    kinematics = forward_kinematics(finer.mechanism.numeric(), ca.SX(ca.DM(np.zeros(finer.size))))
-    same = forward_kinematics(system.mechanism.numeric(), ca.SX(ca.DM(np.zeros(system.size))))
+    kinematics = forward_kinematics(finer.mechanism.with_numeric_values(), ca.SX(ca.DM(np.zeros(finer.n_coordinates))))
+    same = forward_kinematics(system.mechanism.with_numeric_values(), ca.SX(ca.DM(np.zeros(system.n_coordinates))))
     for fine, coarse in (("tip_1_tip", "tip_0_tip"), ("w_tip", "w_tip"), ("beam_5_tip", "beam_2_tip")):
-        assert np.allclose(np.array(ca.DM(kinematics.position(fine))), np.array(ca.DM(same.position(coarse))))
+        assert np.allclose(
+            np.array(ca.DM(kinematics.frame_position(fine))), np.array(ca.DM(same.frame_position(coarse)))
+        )
 
 
 def test_a_branch_stays_at_its_place_of_a_finer_parent(written):
     text = (
         "model:\n  object:\n    kind: segments\n    segments:\n"
         "      a: {length: 0.4, mass: 0.1, radius: 0.01, links: 4}\n"
-        "      b: {length: 0.1, mass: 0.1, radius: 0.01, links: 1, parent: a, at_link: 0}\n"
+        "      b: {length: 0.1, mass: 0.1, radius: 0.01, links: 1, parent: a, parent_link_index: 0}\n"
     )
     for finer in (1, 2, 3):
         system = build_system(load_config(written(text)), finer)
-        kinematics = forward_kinematics(system.mechanism.numeric(), ca.SX(ca.DM(np.zeros(system.size))))
-        assert np.allclose(np.array(ca.DM(kinematics.position("b:0%"))).ravel(), [0, 0, 0.1])
+        kinematics = forward_kinematics(
+            system.mechanism.with_numeric_values(), ca.SX(ca.DM(np.zeros(system.n_coordinates)))
+        )
+        assert np.allclose(np.array(ca.DM(kinematics.frame_position("b:0%"))).ravel(), [0, 0, 0.1])
 
 
 def test_more_links_keep_the_stiffness_of_a_tube(written):
-    run = load_config(written("model: {object: {kind: y, mount: {xyz: [0, 0, 1]}}, damping: 0.02}\n"))
-    assert isinstance(run.model.object, YObject)
-    finer = build_system(run, finer=2)
+    run = load_config(written("model: {object: {kind: foam_y, mount: {xyz: [0, 0, 1]}}, damping: 0.02}\n"))
+    assert isinstance(run.model.object, FoamYSettings)
+    finer = build_system(run, link_division=2)
     assert finer.parameters["T1.bend"].value == 6.0
     assert finer.parameters["T1.damping"].value == 0.04
-    assert finer.size == 72
+    assert finer.n_coordinates == 72
 
 
 def test_springs_on_joints(written, urdf_folder):
@@ -125,7 +129,7 @@ def test_springs_on_joints(written, urdf_folder):
 def test_effects_bring_their_parameters(written):
     text = (
         "model:\n"
-        "  object: {kind: y}\n"
+        "  object: {kind: foam_y}\n"
         "  effects:\n"
         "    - {kind: kelvin_voigt, location: T3}\n"
         "    - {kind: density, location: T2, values: {scale: 1.1}}\n"
@@ -154,7 +158,7 @@ def test_errors_of_the_model_name_the_setting(written):
         ("model:\n  robot: package:baxterr\n", "line 2: model.robot"),
         ("model:\n  robot: package:baxter\n  damping: {left_s9: 1}\n", "line 3: model.damping.left_s9"),
         ("model:\n  object: {kind: segments, segments: {a: {mass: 1, radius: 0.1}}}\n", "line 2: model.object"),
-        ("model:\n  object: {kind: y}\n  points: [w_T9]\n", "line 1: model"),
+        ("model:\n  object: {kind: foam_y}\n  points: [w_T9]\n", "line 1: model"),
     ):
         with pytest.raises((ConfigError, ModelError)) as caught:
             load_system(written(text))
@@ -164,10 +168,15 @@ def test_errors_of_the_model_name_the_setting(written):
 def test_a_problem_from_a_file(repository):
     problem = load_problem(
         repository / "configs" / "single_arm_vision.yaml",
-        ["model.object.links=1", "problem.compiler=false", "problem.duration=0.3", "sensors.points_camera.use=false"],
+        [
+            "model.object.links=1",
+            "problem.use_compiler=false",
+            "problem.duration=0.3",
+            "sensors.points_camera.use=false",
+        ],
     )
     assert problem.free == tuple(f"T{i}.{kind}" for i in (1, 2, 3) for kind in ("bend", "twist"))
-    assert [s.sensor.group for s in problem.episodes[0].samples] == ["points_arm"]
+    assert [s.sensor.group_name for s in problem.episodes[0].measurements] == ["points_arm"]
     assert len(problem.held_out) == 1
     assert (
         build_problem(load_config(repository / "configs" / "single_arm_vision.yaml"), problem.step).free == problem.free
@@ -177,7 +186,7 @@ def test_a_problem_from_a_file(repository):
 SEGMENTED = (
     "model:\n  object:\n    kind: segments\n    segments:\n"
     "      a: {length: 0.4, mass: 0.1, radius: 0.01, links: 2}\n"
-    "      b: {length: 0.4, mass: 0.1, radius: 0.01, links: 2, parent: a, rigidity: true, twist_damping: true}\n"
+    "      b: {length: 0.4, mass: 0.1, radius: 0.01, links: 2, parent: a, stiffness_per_curvature: true, separate_twist_damping: true}\n"
     "parameters:\n  '*.bend': {initial: 5, bounds: [1, 8]}\n  a.twist: {initial: 2}\n  b.damping: {initial: 0.3}\n"
 )
 
@@ -193,15 +202,15 @@ def test_a_stiffness_stands_under_parameters_alone(written):
 
 
 def test_more_links_scale_what_is_said_of_a_stiffness_per_joint(written):
-    finer = build_system(load_config(written(SEGMENTED)), finer=3).parameters
+    finer = build_system(load_config(written(SEGMENTED)), link_division=3).parameters
     assert [finer[name].value for name in ("a.bend", "a.twist", "b.bend", "b.damping")] == [15, 6, 5, 0.3]
     assert finer["a.damping"].value == pytest.approx(0.15)
     assert (finer["a.bend"].lower, finer["a.bend"].upper) == (3, 24)
     assert (finer["b.bend"].lower, finer["b.bend"].upper) == (1, 8)
-    finer = build_system(load_config(written(SEGMENTED.split("parameters:")[0])), finer=3).parameters
+    finer = build_system(load_config(written(SEGMENTED.split("parameters:")[0])), link_division=3).parameters
     assert [finer[name].value for name in ("a.bend", "a.twist", "b.bend")] == [9, 9, 3]
-    foam = load_config(written("model: {object: {kind: y}}\nparameters: {T1.bend: {initial: 10}}\n"))
-    finer = build_system(foam, finer=2).parameters
+    foam = load_config(written("model: {object: {kind: foam_y}}\nparameters: {T1.bend: {initial: 10}}\n"))
+    finer = build_system(foam, link_division=2).parameters
     assert [finer[name].value for name in ("T1.bend", "T2.bend")] == [20, 6]
 
 
@@ -215,7 +224,7 @@ def test_link_lengths_as_parameters(written):
 
 
 BY_JOINT = (
-    "model:\n  robot: {urdf}\n  arms: {{mode: passive}}\n  object: {{kind: y}}\n  damping: {{hinge: 0.2{more}}}\n"
+    "model:\n  robot: {urdf}\n  arms: {{mode: passive}}\n  object: {{kind: foam_y}}\n  damping: {{hinge: 0.2{more}}}\n"
 )
 
 
@@ -229,26 +238,32 @@ def test_damping_by_joint_says_that_of_the_object_too(written, urdf_folder):
     assert "line 5: model.damping" in caught.value.where
     assert "`object`" in caught.value.allowed
     with pytest.raises(ConfigError, match="there is no joint 'object'"):
-        load_system(written(BY_JOINT.format(urdf=urdf, more=", object: 1").replace("object: {kind: y}", "points: []")))
+        load_system(
+            written(BY_JOINT.format(urdf=urdf, more=", object: 1").replace("object: {kind: foam_y}", "points: []"))
+        )
 
 
 def test_a_problem_has_the_options_of_its_section(written):
     run = load_config(
         written(
-            "model: {object: {kind: y}}\n"
+            "model: {object: {kind: foam_y}}\n"
             "sensors: {points: {std: 0.1}}\n"
-            "problem: {weighting: paper, huber_threshold: 3, start_parameters: [T1.mass], duration: 2}\n"
-            "parameters: {T1.bend: {prior: 2, local: true}}\n"
+            "problem: {weighting: paper, huber_threshold: 3, start_fit_parameters: [T1.mass], duration: 2}\n"
+            "parameters: {T1.bend: {prior_std: 2, per_recording: true}}\n"
         )
     )
     options = problem_options(run, build_system(run))
     assert (options.weighting, options.huber_threshold, options.duration) == ("paper", 3.0, 2.0)
-    assert (options.start_parameters, options.local, options.priors) == (("T1.mass",), ("T1.bend",), {"T1.bend": 2.0})
+    assert (options.start_fit_parameters, options.local_parameters, options.prior_stds) == (
+        ("T1.mass",),
+        ("T1.bend",),
+        {"T1.bend": 2.0},
+    )
     assert options.sensors["points"].std == 0.1
-    wrong = load_config(written("model: {object: {kind: y}}\nproblem: {start_parameters: [T1.mas]}\n"))
+    wrong = load_config(written("model: {object: {kind: foam_y}}\nproblem: {start_fit_parameters: [T1.mas]}\n"))
     with pytest.raises(ConfigError, match=r"there is no parameter 'T1.mas'") as caught:
         problem_options(wrong, build_system(wrong))
-    assert "line 2: problem.start_parameters" in caught.value.where
+    assert "line 2: problem.start_fit_parameters" in caught.value.where
 
 
 @pytest.mark.parametrize(
@@ -264,14 +279,14 @@ def test_a_problem_has_the_options_of_its_section(written):
 )
 def test_prescribed_arms_that_hold_an_object_are_states(repository, file, overrides, expected):
     run = load_config(repository / "configs" / f"{file}.yaml", overrides)
-    assert tracked(run) is expected
+    assert _arms_are_estimated_states(run) is expected
     system = build_system(run)
     assert bool(system.driven) == (expected or run.model.arms.mode == "driven")
 
 
 def test_their_encoders_are_measurements_and_the_points_of_the_arm_are_not(repository):
     file = repository / "configs" / "dual_arm_vision.yaml"
-    run = load_config(file, ["model.arms.mode=prescribed", "recordings.held_out=[]", "problem.compiler=false"])
+    run = load_config(file, ["model.arms.mode=prescribed", "recordings.held_out=[]", "problem.use_compiler=false"])
     options = problem_options(run, build_system(run), read_recordings(run, "estimate"))
     used = {group: said.use for group, said in options.sensors.items()}
     assert used == {"joints.position": True, "points_arm": False}

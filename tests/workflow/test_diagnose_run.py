@@ -10,10 +10,10 @@ import h5py
 import numpy as np
 import pytest
 
-from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
-from yid_ocp.diagnosis.refit import SOLVER
+from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG, load_config
+from yid_ocp.diagnosis.refit import REFIT_SOLVER
 from yid_ocp.workflow.diagnose import run_diagnose
-from yid_ocp.workflow.folder import reproducing
+from yid_ocp.workflow.run_folder import _reproducing_command
 
 
 def without_times(folder) -> dict:
@@ -38,9 +38,9 @@ def counted(monkeypatch):
     class Counting:
         def run(self, *arguments):
             calls.count += 1
-            return SOLVER.run(*arguments)
+            return REFIT_SOLVER.minimize_cost(*arguments)
 
-    monkeypatch.setattr(import_module("yid_ocp.diagnosis.refit"), "SOLVER", Counting())
+    monkeypatch.setattr(import_module("yid_ocp.diagnosis.refit_with_effects"), "SOLVER", Counting())
     return calls
 
 
@@ -86,7 +86,7 @@ def test_a_changed_configuration_resumes_nothing(rubbing, tmp_path, monkeypatch,
         run_diagnose(load_config(rubbing), None, Interrupting(after=1))
     assert (tmp_path / "runs" / "rubbing-diagnose.partial" / "refits.json").is_file()
     caplog.clear()
-    outcome = run_diagnose(load_config(rubbing, ["diagnosis.level=0.02"]))
+    outcome = run_diagnose(load_config(rubbing, ["diagnosis.significance_level=0.02"]))
     assert sum("not resumed" in record.getMessage() for record in caplog.records) == 1
     assert '"resumed"' not in (outcome.folder / "log.jsonl").read_text()
     assert list((tmp_path / "runs").iterdir()) == [outcome.folder]
@@ -117,6 +117,12 @@ def test_the_result_says_how_sure_a_closure_is_and_where_the_unknown_forces_are(
 
 def test_the_command_that_gives_a_result_again(rubbing, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    changed = load_config(rubbing, ["diagnosis.level=0.02"])
-    assert reproducing(changed, tmp_path / "runs" / "a b", "diagnose") == "yid-ocp diagnose 'runs/a b/config.yaml'"
-    assert reproducing(load_config(None, (), DIAGNOSIS_DEFAULT), tmp_path, "diagnose") == "yid-ocp diagnose"
+    changed = load_config(rubbing, ["diagnosis.significance_level=0.02"])
+    assert (
+        _reproducing_command(changed, tmp_path / "runs" / "a b", "diagnose")
+        == "yid-ocp diagnose 'runs/a b/config.yaml'"
+    )
+    assert (
+        _reproducing_command(load_config(None, (), DEFAULT_DIAGNOSIS_CONFIG), tmp_path, "diagnose")
+        == "yid-ocp diagnose"
+    )

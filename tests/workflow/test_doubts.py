@@ -10,11 +10,11 @@ import pytest
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording, write_recording
-from yid_ocp.data.doubt import Doubt
+from yid_ocp.data.issues import Issue
 from yid_ocp.errors import DataError
 from yid_ocp.solvers import solve
 from yid_ocp.workflow.build import build_problem, build_system
-from yid_ocp.workflow.doubts import is_modelled, of_one
+from yid_ocp.workflow.recording_issues import _is_modelled, single_recording_issues
 
 
 @pytest.fixture
@@ -58,7 +58,7 @@ def without(begin, end):
 
 def test_a_run_on_good_recordings_says_nothing(cli, damaged, tmp_path):
     file = damaged()
-    done = cli("solve", file, "--out", tmp_path / "run", "--strict", "--set", "output.report=false")
+    done = cli("solve", file, "--out", tmp_path / "run", "--strict", "--set", "output.write_report=false")
     assert done.code == 0, done.err
     assert "in doubt" not in done.out
     result = json.loads((tmp_path / "run" / "result.json").read_text())
@@ -88,12 +88,12 @@ def test_the_doubt_alone_forbids_to_trust_what_a_model_explains(damaged):
     """With the noise stated ten times larger everything is explained; then a doubt is all that is left."""
     run = load_config(damaged())
     problem = build_problem(run)
-    doubt = Doubt("effort_sign", "made up", "not_trusted", 5.0, "", "damaged")
+    doubt = Issue("effort_sign", "made up", "not_trusted", 5.0, "", "damaged")
     for weight, verdict in (("warning", "identifiable"), ("not_trusted", "not_trusted")):
-        said = problem.with_options(replace(problem.options, doubts=(replace(doubt, weight=weight),)))
+        said = problem.with_options(replace(problem.options, data_issues=(replace(doubt, weight=weight),)))
         solution = solve(said, run.solver)
-        assert solution.fit.explains
-        assert solution.fit.believed == (weight == "warning")
+        assert solution.goodness_of_fit.explains
+        assert solution.goodness_of_fit.believed == (weight == "warning")
         assert solution.parameters["shoulder.stiffness"].verdict == verdict
 
 
@@ -124,7 +124,7 @@ def test_times_that_are_not_seconds_stop_a_run_at_once(cli, damaged, tmp_path, l
 
 
 def test_gaps_are_cut_out_and_said(cli, damaged, tmp_path):
-    done = cli("solve", damaged(without(0.55, 0.66)), "--out", tmp_path / "run", "--set", "output.report=false")
+    done = cli("solve", damaged(without(0.55, 0.66)), "--out", tmp_path / "run", "--set", "output.write_report=false")
     assert done.code == 0, done.err
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     assert [doubt["cause"] for doubt in result["doubts"]] == ["gap"]
@@ -138,7 +138,7 @@ def test_the_same_data_twice_count_once(damaged):
     write_recording(read_recording(file.parent / "damaged.h5"), file.parent / "again.h5")
     twice = build_problem(load_config(file, ["recordings.estimate=[damaged.h5, again.h5]"]))
     assert [episode.name for episode in twice.episodes] == [episode.name for episode in once.episodes]
-    assert [doubt.cause for doubt in twice.options.doubts] == ["same_data"]
+    assert [doubt.cause for doubt in twice.options.data_issues] == ["same_data"]
     with pytest.raises(DataError, match="both estimated on and held out"):
         build_problem(load_config(file, ["recordings.held_out=[again.h5]"]))
 
@@ -146,9 +146,9 @@ def test_the_same_data_twice_count_once(damaged):
 def test_times_since_1970_give_the_same_problem(damaged):
     usual = build_problem(load_config(damaged()))
     late = build_problem(load_config(damaged(joints(t=lambda group: group.t + 1.7e9))))
-    assert late.options.doubts == ()
-    assert np.allclose(late.episodes[0].path, usual.episodes[0].path, atol=1e-5)
-    assert late.episodes[0].samples[0].count == usual.episodes[0].samples[0].count
+    assert late.options.data_issues == ()
+    assert np.allclose(late.episodes[0].prescribed_path, usual.episodes[0].prescribed_path, atol=1e-5)
+    assert late.episodes[0].measurements[0].n_residuals == usual.episodes[0].measurements[0].n_residuals
 
 
 NAMED = {
@@ -161,7 +161,9 @@ NAMED = {
 def test_points_listed_by_name_that_are_not_there_are_an_error(repository, what):
     setting, name = NAMED[what]
     file = repository / "configs" / "single_arm_vision.yaml"
-    run = load_config(file, [f"sensors.points_camera={{{setting}}}", "problem.compiler=false", "model.object.links=1"])
+    run = load_config(
+        file, [f"sensors.points_camera={{{setting}}}", "problem.use_compiler=false", "model.object.links=1"]
+    )
     with pytest.raises(DataError, match=name) as caught:
         build_problem(run)
     assert "did you mean 'w_T" in str(caught.value)
@@ -175,18 +177,18 @@ def test_what_the_model_has_as_an_effect_is_no_doubt(repository, clean, tmp_path
     settings = [f"recordings.estimate=[{tmp_path / 'moved.h5'}]", "recordings.held_out=[]"]
     file = repository / "configs" / "single_arm_no_vision.yaml"
     run = load_config(file, settings)
-    (doubt,) = of_one(run, build_system(run), moved)
+    (doubt,) = single_recording_issues(run, build_system(run), moved)
     assert (doubt.cause, doubt.channel) == ("encoder_offset", "position.left_e1")
     assert doubt.setting == "model.effects: [{kind: encoder_offset, location: left_e1, values: {offset: 0.05}}]"
     answered = load_config(file, [*settings, doubt.setting.replace(": ", "=", 1)])
-    assert of_one(answered, build_system(answered), moved) == []
+    assert single_recording_issues(answered, build_system(answered), moved) == []
 
 
 @pytest.mark.parametrize("effect", ["effort_delay, location: left", "effort_lag, location: left_e1"])
 def test_a_delay_and_a_lag_both_answer_late_efforts(repository, effect):
     file = repository / "configs" / "single_arm_no_vision.yaml"
-    late = Doubt("effort_lag", "efforts are late", "not_trusted", 3.0, "shift their times", "", "joints", "effort")
+    late = Issue("effort_lag", "efforts are late", "not_trusted", 3.0, "shift their times", "", "joints", "effort")
     plain = load_config(file)
-    assert not is_modelled(build_system(plain), late)
+    assert not _is_modelled(build_system(plain), late)
     answered = load_config(file, [f"model.effects=[{{kind: {effect}}}]"])
-    assert is_modelled(build_system(answered), late)
+    assert _is_modelled(build_system(answered), late)

@@ -9,10 +9,10 @@ from here import Here
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.errors import SolverError, WorkerError
-from yid_ocp.workflow import elsewhere
-from yid_ocp.workflow.identifiability import Question, run_identifiability
+from yid_ocp.workflow import identifiability_tasks
+from yid_ocp.workflow.identifiability import IdentifiabilityOptions, run_identifiability
 
-QUICK = ("output.report=false",)
+QUICK = ("output.write_report=false",)
 KEYS = ("parameters", "directions", "profiles", "what_if", "correlations", "fit")
 
 
@@ -24,17 +24,19 @@ def read(outcome):
 @pytest.mark.parametrize("name", ["springs_torsion", "springs_series_joint"])
 def test_workers_find_what_one_process_does(repository, tmp_path, name):
     run = load_config(repository / "configs" / f"{name}.yaml", QUICK)
-    asked = Question(intervals="all", what_if=True, start="unknown", grasp_std=0.01)
-    alone = run_identifiability(run, tmp_path / "alone", question=asked)
-    shared = run_identifiability(run, tmp_path / "shared", question=asked, workers=Here())
+    asked = IdentifiabilityOptions(
+        interval_parameters="all", rank_changes=True, start_knowledge="unknown", grasp_offset_std=0.01
+    )
+    alone = run_identifiability(run, tmp_path / "alone", options=asked)
+    shared = run_identifiability(run, tmp_path / "shared", options=asked, workers=Here())
     assert read(shared) == read(alone)
     assert {path.name for path in tmp_path.iterdir()} == {"alone", "shared"}
 
 
 def test_an_interrupted_run_goes_on(repository, tmp_path, monkeypatch):
     run = load_config(repository / "configs" / "springs_series_joint.yaml", QUICK)
-    asked = Question(intervals="all")
-    names, done = [], elsewhere.profiled
+    asked = IdentifiabilityOptions(interval_parameters="all")
+    names, done = [], identifiability_tasks.profile_parameter
 
     def twice(name, **arguments):
         if len(names) == 1:
@@ -43,12 +45,12 @@ def test_an_interrupted_run_goes_on(repository, tmp_path, monkeypatch):
         return done(name=name, **arguments)
 
     twice.__module__, twice.__qualname__ = done.__module__, done.__qualname__
-    monkeypatch.setattr(elsewhere, "profiled", twice)
+    monkeypatch.setattr(identifiability_tasks, "profile_parameter", twice)
     with pytest.raises(KeyboardInterrupt):
-        run_identifiability(run, tmp_path / "run", question=asked, workers=Here())
+        run_identifiability(run, tmp_path / "run", options=asked, workers=Here())
     assert len(list((tmp_path / "run.partial" / "tasks").glob("*.json"))) == 1
-    monkeypatch.setattr(elsewhere, "profiled", done)
-    outcome = run_identifiability(run, tmp_path / "run", question=asked, workers=Here())
+    monkeypatch.setattr(identifiability_tasks, "profile_parameter", done)
+    outcome = run_identifiability(run, tmp_path / "run", options=asked, workers=Here())
     assert set(outcome.result["profiles"]) == {"spring_1.stiffness", "spring_2.stiffness"}
     assert not (tmp_path / "run.partial").exists()
 
@@ -57,9 +59,11 @@ def test_a_part_that_fails_is_said(repository, tmp_path, monkeypatch):
     def failing(name, **arguments):
         raise SolverError(f"no {name}", hint="mend it")
 
-    failing.__module__, failing.__qualname__ = "yid_ocp.workflow.elsewhere", "profiled"
-    monkeypatch.setattr(elsewhere, "profiled", failing)
+    failing.__module__, failing.__qualname__ = "yid_ocp.workflow.identifiability_tasks", "profiled"
+    monkeypatch.setattr(identifiability_tasks, "profile_parameter", failing)
     run = load_config(repository / "configs" / "springs_series_joint.yaml", QUICK)
     words = r"2 of 2 tasks failed, spring_1.stiffness with SolverError: no spring_1.stiffness(.|\n)*mend it"
     with pytest.raises(WorkerError, match=words):
-        run_identifiability(run, tmp_path / "run", question=Question(intervals="all"), workers=Here())
+        run_identifiability(
+            run, tmp_path / "run", options=IdentifiabilityOptions(interval_parameters="all"), workers=Here()
+        )

@@ -10,11 +10,11 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
+from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG, load_config
 from yid_ocp.config.settings import dump_config
 from yid_ocp.workflow.build import build_system, read_recordings
 from yid_ocp.workflow.diagnose import run_diagnose
-from yid_ocp.workflow.export_model import export_model, manifest_file
+from yid_ocp.workflow.export_model import _manifest_path, export_model
 
 mujoco = pytest.importorskip("mujoco", reason="exported models need MuJoCo: pip install 'yid-ocp[blind]'")
 
@@ -22,7 +22,7 @@ mujoco = pytest.importorskip("mujoco", reason="exported models need MuJoCo: pip 
 def written_run(folder, effects, run):
     """A run folder as `diagnose` leaves it that found the truth of the embedded recordings, and some effects."""
     system = build_system(run)
-    truth = read_recordings(run, "estimate")[0].truth
+    truth = read_recordings(run, "estimate")[0].true_parameters
     values = {p.name: p.value for p in system.parameters} | effects
     values |= {name: value for name, value in truth.items() if name.endswith((".bend", ".twist"))}
     free = {*(name for name in values if name.endswith((".bend", ".twist"))), *effects}
@@ -39,7 +39,7 @@ def written_run(folder, effects, run):
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory):
-    run = load_config(None, default=DIAGNOSIS_DEFAULT)
+    run = load_config(None, default=DEFAULT_DIAGNOSIS_CONFIG)
     return written_run(tmp_path_factory.mktemp("found") / "run", {"kelvin_voigt@T1.tau": 0.05}, run)
 
 
@@ -58,7 +58,7 @@ def test_the_embedded_diagnosis_in_mujoco(cli, found, tmp_path) -> None:
     done = cli("export", found, "--out", out)
     assert done.code == 0, done.err
     assert "kelvin_voigt@T1  native" in done.out
-    manifest = json.loads(manifest_file(out).read_text())
+    manifest = json.loads(_manifest_path(out).read_text())
     gate_holds(manifest["gate"])
     assert manifest["effects"] == {"kelvin_voigt@T1": {"status": "native", "how": "damping of joints"}}
     entry = manifest["parameters"]["kelvin_voigt@T1.tau"]
@@ -73,14 +73,14 @@ def test_the_embedded_diagnosis_in_mujoco(cli, found, tmp_path) -> None:
     assert model.nu == len(system.driven)
     pinocchio = pytest.importorskip("pinocchio", minversion="4.0", reason="constraints between sites need Pinocchio 4")
     other = pinocchio.buildModelFromMJCF(str(out))
-    assert other.nv == model.nv == system.size
+    assert other.nv == model.nv == system.n_coordinates
     assert sum(body.mass for body in other.inertias) == pytest.approx(model.body_mass.sum())
 
 
 @pytest.mark.slow
 def test_what_a_diagnosis_found_in_mujoco(tmp_path) -> None:
-    run = load_config(None, default=DIAGNOSIS_DEFAULT)
-    run_diagnose(replace(run, output=replace(run.output, report=False)), tmp_path / "run")
+    run = load_config(None, default=DEFAULT_DIAGNOSIS_CONFIG)
+    run_diagnose(replace(run, output=replace(run.output, write_report=False)), tmp_path / "run")
     gate_holds(export_model(tmp_path / "run", tmp_path / "y.xml")["gate"])
 
 
@@ -97,7 +97,7 @@ def test_urdf_loads_in_three_readers(found, tmp_path) -> None:
     assert [j.name for j in robot.joints if j.type != "fixed"] == list(system.mechanism.joint_names)
     ours = pinocchio.buildModelFromUrdf(str(out))
     model = mujoco.MjModel.from_xml_path(str(out))
-    assert ours.nv == model.nv == system.size
+    assert ours.nv == model.nv == system.n_coordinates
     assert sum(body.mass for body in ours.inertias) == pytest.approx(model.body_mass.sum(), abs=1e-6)
     bend = manifest["parameters"]["T1.bend"]["value"]
     assert model.dof_damping[model.joint("T1_2_y").dofadr[0]] == pytest.approx(0.05 + 0.05 * bend)
@@ -128,7 +128,7 @@ def test_sdf_has_springs_too(found, tmp_path) -> None:
 def test_what_cannot_be_said_is_left_out_and_listed(tmp_path) -> None:
     effects = {"hysteresis@T2.stiffness": 0.4, "hysteresis@T2.yield_angle": 0.1, "kelvin_voigt@T1.tau": 0.05}
     effects |= {"junction_compliance@w_T1.compliance": 0.02, "joint_coulomb@left_e1.tau_c": 0.5}
-    coarse = load_config(None, ["model.object.links=1"], DIAGNOSIS_DEFAULT)
+    coarse = load_config(None, ["model.object.links=1"], DEFAULT_DIAGNOSIS_CONFIG)
     both = written_run(tmp_path / "both", effects, coarse)
     said = replace(coarse, recordings=replace(coarse.recordings, held_out=(), estimate=()))
     (both / "config.yaml").write_text(dump_config(said))
@@ -151,7 +151,7 @@ def test_what_cannot_be_said_is_left_out_and_listed(tmp_path) -> None:
 
 
 def test_a_configuration_that_starts_at_the_estimates(cli, pendulum, tmp_path) -> None:
-    config = pendulum.read_text() + "output: {report: false, discretisation: none}\n"
+    config = pendulum.read_text() + "output: {write_report: false, discretisation_check: none}\n"
     pendulum.write_text(config)
     assert cli("solve", pendulum, "--out", "first").code == 0
     first = json.loads((tmp_path / "first" / "result.json").read_text())
@@ -197,13 +197,13 @@ def test_wrong_input_leaves_nothing(cli, found, pendulum_data, tmp_path) -> None
 
 
 def test_no_model_without_its_manifest(cli, found, tmp_path) -> None:
-    manifest_file(tmp_path / "y.urdf").mkdir()
+    _manifest_path(tmp_path / "y.urdf").mkdir()
     assert cli("export", found, "--format", "urdf", "--out", tmp_path / "y.urdf").code == 2
     assert not (tmp_path / "y.urdf").exists()
 
 
 def test_prescribed_joints_are_moved_as_recorded(cli, pendulum, tmp_path) -> None:
-    assert cli("solve", pendulum, "--out", "run", "--set", "output.report=false").code == 0
+    assert cli("solve", pendulum, "--out", "run", "--set", "output.write_report=false").code == 0
     manifest = export_model("run", tmp_path / "pendulum.xml")
     [(name, entry)] = manifest["gate"]["channels"].items()
     assert (name, entry["unit"]) == ("joints.effort", "N m")

@@ -12,7 +12,7 @@ import pytest
 from yid_ocp.config.reader import load_config
 from yid_ocp.errors import OutputError
 from yid_ocp.files import file_sha256
-from yid_ocp.workflow.folder import new_run_folder
+from yid_ocp.workflow.run_folder import new_run_folder
 
 
 @pytest.fixture
@@ -22,17 +22,17 @@ def settings(pendulum):
 
 def test_a_folder_appears_when_the_block_ends(settings, tmp_path):
     with new_run_folder(settings, tmp_path / "run") as folder:
-        folder.write("a.txt", "a")
+        folder.write_text_file("a.txt", "a")
         assert not (tmp_path / "run").exists()
-        assert folder.path != folder.target
-    assert folder.path == folder.target == tmp_path / "run"
+        assert folder.path != folder.final_path
+    assert folder.path == folder.final_path == tmp_path / "run"
     assert {path.name for path in folder.path.iterdir()} == {"a.txt", "log.jsonl"}
 
 
 def test_a_folder_that_is_left_by_an_error_is_not_there(settings, tmp_path):
     def failing() -> None:
         with new_run_folder(settings, tmp_path / "deep" / "run") as folder:
-            folder.write("a.txt", "a")
+            folder.write_text_file("a.txt", "a")
             raise KeyError("a")
 
     with pytest.raises(KeyError):
@@ -42,8 +42,8 @@ def test_a_folder_that_is_left_by_an_error_is_not_there(settings, tmp_path):
 
 def test_begin_and_finish_say_what_a_result_was_made_from(settings, pendulum_data, tmp_path):
     with new_run_folder(settings, tmp_path / "run") as folder:
-        folder.begin(settings, "test")
-        written = folder.finish({"format": "x", "value": math.inf, "deep": {"list": [1.0, math.nan]}})
+        folder.begin_run(settings, "test")
+        written = folder.write_result({"format": "x", "value": math.inf, "deep": {"list": [1.0, math.nan]}})
     assert load_config(tmp_path / "run" / "config.yaml").solver == settings.solver
     assert json.loads((tmp_path / "run" / "result.json").read_text(), parse_constant=pytest.fail) == written
     assert written["value"] is None
@@ -58,7 +58,7 @@ def test_begin_and_finish_say_what_a_result_was_made_from(settings, pendulum_dat
 
 def test_many_notes_on_one_key_are_one(settings, tmp_path):
     with new_run_folder(settings, tmp_path / "run") as folder:
-        written = folder.finish({name: {"std": math.inf} for name in "abcd"} | {"z": {"std": math.nan}})
+        written = folder.write_result({name: {"std": math.inf} for name in "abcd"} | {"z": {"std": math.nan}})
     assert written["notes"] == ["std is infinite (4 times)", "z.std is not known"]
 
 
@@ -78,7 +78,7 @@ def test_a_folder_in_use_is_refused_and_an_unnamed_one_is_numbered(settings, tmp
     for name, message in (("used", "not empty"), ("used/file", "that of a file")):
         with pytest.raises(OutputError, match=message), new_run_folder(settings, name):
             pass
-    monkeypatch.setattr("yid_ocp.workflow.folder.time.strftime", lambda _: "now")
+    monkeypatch.setattr("yid_ocp.workflow.run_folder.time.strftime", lambda _: "now")
     for _ in range(2):
         with new_run_folder(settings, None, "check"):
             pass
@@ -86,12 +86,12 @@ def test_a_folder_in_use_is_refused_and_an_unnamed_one_is_numbered(settings, tmp
 
 
 def test_a_name_is_reserved_from_the_start(settings, tmp_path, monkeypatch):
-    monkeypatch.setattr("yid_ocp.workflow.folder.time.strftime", lambda _: "now")
+    monkeypatch.setattr("yid_ocp.workflow.run_folder.time.strftime", lambda _: "now")
     monkeypatch.chdir(tmp_path)
     with contextlib.ExitStack() as runs:
         folders = [runs.enter_context(new_run_folder(settings, None, "check")) for _ in range(3)]
         for i, folder in enumerate(folders):
-            folder.write("number.txt", str(i))
+            folder.write_text_file("number.txt", str(i))
     names = ["pendulum-check-now", "pendulum-check-now-2", "pendulum-check-now-3"]
     assert [(tmp_path / "runs" / name / "number.txt").read_text() for name in names] == ["0", "1", "2"]
 
@@ -109,7 +109,7 @@ def test_a_name_that_another_run_has_is_refused_before_the_work(settings, tmp_pa
 @pytest.mark.parametrize("kind", ["folder", "file"])
 def test_a_result_is_not_lost_because_its_name_was_taken(settings, tmp_path, caplog, kind):
     with new_run_folder(settings, tmp_path / "run") as folder:
-        folder.write("a.txt", "mine")
+        folder.write_text_file("a.txt", "mine")
         taken = tmp_path / "run" / "theirs" if kind == "folder" else tmp_path / "run"
         taken.parent.mkdir(exist_ok=True)
         taken.write_text("theirs")
@@ -127,7 +127,7 @@ def test_what_a_killed_run_left_is_cleared_away_and_what_lives_stays(settings, t
     foreign = tmp_path / ".foreign.partial"
     foreign.mkdir()
     with new_run_folder(settings, tmp_path / "lives") as alive:
-        alive.write("a.txt", "a")
+        alive.write_text_file("a.txt", "a")
         with new_run_folder(settings, tmp_path / "other"):
             assert (alive.path / "a.txt").is_file()
     assert {path.name for path in tmp_path.iterdir() if path.is_dir()} >= {"lives", "other", ".foreign.partial"}
@@ -153,6 +153,6 @@ def test_a_full_disk_names_the_folder_that_was_asked_for(settings, tmp_path, mon
         pytest.raises(OutputError, match="No space left") as caught,
         new_run_folder(settings, tmp_path / "runs" / "run") as folder,
     ):
-        folder.write("a.txt", "a")
+        folder.write_text_file("a.txt", "a")
     assert caught.value.where == str(tmp_path / "runs" / "run" / "a.txt")
     assert not (tmp_path / "runs").exists()

@@ -8,14 +8,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.analysis.history import Estimates
+from yid_ocp.analysis.estimate_history import RunEstimates
 from yid_ocp.config.reader import load_config
-from yid_ocp.data.hdf5 import write_recording
 from yid_ocp.data.recording import PointGroup, Recording
-from yid_ocp.diagnosis.baseline import with_baseline
+from yid_ocp.data.recording_hdf5 import write_recording
+from yid_ocp.diagnosis.baseline_comparison import with_baseline_prior
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.solvers import GaussNewton, MultipleShooting, solve
-from yid_ocp.workflow.baseline import earlier_runs, read_estimates, recordings_without, with_effects_of
+from yid_ocp.workflow.baseline_runs import (
+    baseline_estimates,
+    load_reference_recordings,
+    read_estimates,
+    with_baseline_effects,
+)
 from yid_ocp.workflow.build import build_problem, build_system, read_recordings
 from yid_ocp.workflow.report import run_report
 from yid_ocp.workflow.simulate import run_simulate
@@ -26,16 +31,16 @@ model:
     kind: segments
     mount: {xyz: [0.1, 0.2, 0.3], rpy: [0.0, 1.5707963267948966, 0.0]}
     segments:
-      beam: {length: 0.1, mass: 0.1, section: [0.03, 0.03], links: 2, rigidity: true, clamped: true, joint_order: y}
+      beam: {length: 0.1, mass: 0.1, cross_section: [0.03, 0.03], links: 2, stiffness_per_curvature: true, clamped_at_base: true, joint_axes: y}
   frames:
-    mark: {frame: w_beam, straight: true}
+    mark: {parent_frame: w_beam, marker_reference_pose: true}
 recordings: {estimate: [beam.h5]}
 sensors: {points: {std: 1.0e-4}}
 parameters:
   beam.bend: {free: true, initial: 0.02}
   beam.damping: {free: true, initial: 5.0e-5}
-problem: {time_step: 0.01, compiler: false, initial_state: estimated, duration: 0.4}
-output: {report: false, discretisation: none}
+problem: {time_step: 0.01, use_compiler: false, initial_state: estimated, duration: 0.4}
+output: {write_report: false, discretisation_check: none}
 """
 STRAIGHT = np.array([0.2, 0.2, 0.32])  # the tip's face is at 0.2, 0.2, 0.3
 
@@ -44,7 +49,7 @@ def blank(straight=STRAIGHT, name="mark"):
     t = np.arange(41) * 0.01
     position = np.broadcast_to(STRAIGHT - np.array([0.0, 0.0, 0.004]), (41, 1, 3))
     points = (PointGroup("points", (name,), t, position, 1e-4),)
-    return Recording(None, points, straight=None if straight is None else straight[None, :])
+    return Recording(None, points, marker_reference_pose=None if straight is None else straight[None, :])
 
 
 def settings(folder, recording=None, overrides=()):
@@ -64,9 +69,9 @@ def test_a_marker_sits_where_straight_says_in_the_frame_that_carries_it(tmp_path
 def test_every_recording_has_its_own_places_of_markers(tmp_path):
     run = settings(tmp_path)
     other = replace(blank(STRAIGHT + np.array([0.0, 0.005, 0.0])), name="other")
-    problem = build_problem(run, without=[other])
-    assert problem.options.recording_values["beam"]["mark.y"] == pytest.approx(0.0, abs=1e-9)
-    assert problem.options.recording_values["other"]["mark.y"] == pytest.approx(0.005, abs=1e-9)
+    problem = build_problem(run, reference_recordings=[other])
+    assert problem.options.parameters_by_recording["beam"]["mark.y"] == pytest.approx(0.0, abs=1e-9)
+    assert problem.options.parameters_by_recording["other"]["mark.y"] == pytest.approx(0.005, abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -74,10 +79,20 @@ def test_every_recording_has_its_own_places_of_markers(tmp_path):
     [
         ((), blank(None), DataError, "where its markers were"),
         ((), blank(name="elsewhere"), ConfigError, "'mark' is no point"),
-        (("model.frames.mark.frame=w_bean",), None, ConfigError, "sits on nothing of the object"),
+        (("model.frames.mark.parent_frame=w_bean",), None, ConfigError, "sits on nothing of the object"),
         (("model.arms.joints=[elbow]",), None, ConfigError, "the model has no robot"),
-        (("model.clamps={jaw: {origin: mark, towards: mark}}",), None, ConfigError, "one point for both ends"),
-        (("model.clamps={jaw: {origin: a, towards: b}}", "model.object.mount.frame=jaw"), None, ConfigError, "moves"),
+        (
+            ("model.clamps={jaw: {origin_point: mark, z_axis_point: mark}}",),
+            None,
+            ConfigError,
+            "one point for both ends",
+        ),
+        (
+            ("model.clamps={jaw: {origin_point: a, z_axis_point: b}}", "model.object.mount.parent_frame=jaw"),
+            None,
+            ConfigError,
+            "moves",
+        ),
     ],
 )
 def test_what_an_object_without_a_robot_cannot_have_is_refused_in_words(tmp_path, overrides, recording, kind, words):
@@ -93,8 +108,8 @@ def test_a_moved_clamp_carries_the_object_and_stands_in_what_is_simulated(tmp_pa
     base, ahead, tip = np.array([0.1, 0.2, 0.3]), np.array([0.1, 0.2, 0.25]), np.array([0.1, 0.2, 0.2])
     position = np.stack([base + rise, ahead + rise, tip + rise], axis=1)
     recording = Recording(None, (PointGroup("points", ("a", "b", "w_beam"), t, position, 1e-4),))
-    clamp = "model.clamps={jaw: {origin: a, towards: b}}"
-    mount = ("model.object.mount={}", "model.object.mount={frame: jaw}")
+    clamp = "model.clamps={jaw: {origin_point: a, z_axis_point: b}}"
+    mount = ("model.object.mount={}", "model.object.mount={parent_frame: jaw}")
     run = settings(tmp_path, recording, (clamp, "model.frames={}", *mount, "problem.initial_state=equilibrium"))
     problem = build_problem(run)
     assert problem.system.prescribed == tuple(f"jaw_{part}" for part in ("x", "y", "z", "rx", "ry", "rz"))
@@ -137,29 +152,29 @@ def folder_of(path, values=(0.02, 5e-5), std=(2e-4, 1e-6), correlation=0.5, **mo
 def test_a_baseline_is_a_joint_prior_about_its_values(tmp_path):
     run = settings(tmp_path)
     known = read_estimates(folder_of(tmp_path / "old", values=(0.018, 4e-5)))
-    problem = with_baseline(build_problem(run), known)
-    at = [problem.names.index(name) for name in ("beam.bend", "beam.damping")]
-    assert problem.start[at] == pytest.approx([0.018, 4e-5])
-    moved = problem.start.copy()
+    problem = with_baseline_prior(build_problem(run), known)
+    at = [problem.unknown_names.index(name) for name in ("beam.bend", "beam.damping")]
+    assert problem.initial_unknowns[at] == pytest.approx([0.018, 4e-5])
+    moved = problem.initial_unknowns.copy()
     moved[at] += [3e-4, -1e-6]
-    residual, rows = problem.prior(moved)
-    apart = moved[at] - problem.start[at]
+    residual, rows = problem.prior_residual(moved)
+    apart = moved[at] - problem.initial_unknowns[at]
     expected = apart @ np.linalg.solve(known.covariance, apart)
     assert residual @ residual == pytest.approx(expected, rel=1e-9)
-    assert rows @ (moved - problem.start) == pytest.approx(residual, rel=1e-9)
+    assert rows @ (moved - problem.initial_unknowns) == pytest.approx(residual, rel=1e-9)
 
 
 def test_the_baselines_effects_stay_in_the_model(tmp_path):
     run = settings(tmp_path)
-    known = Estimates(
+    known = RunEstimates(
         "old", ("kelvin_voigt@beam.tau",), np.array([0.01]), np.array([[1e-6]]),
         effects={"kelvin_voigt@beam": {"tau": 0.01}},
     )  # fmt: skip
     with pytest.raises(ConfigError, match="the effect kelvin_voigt@beam"):
-        with_baseline(build_problem(run), known)
-    problem = with_baseline(build_problem(with_effects_of(run, (known,))), known)
+        with_baseline_prior(build_problem(run), known)
+    problem = with_baseline_prior(build_problem(with_baseline_effects(run, (known,))), known)
     assert "kelvin_voigt@beam.tau" in problem.free
-    assert problem.named(problem.start)["kelvin_voigt@beam.tau"] == pytest.approx(0.01)
+    assert problem.named_values(problem.initial_unknowns)["kelvin_voigt@beam.tau"] == pytest.approx(0.01)
 
 
 @pytest.mark.parametrize(
@@ -181,14 +196,14 @@ def test_a_baseline_of_another_model_is_refused_by_what_differs(tmp_path):
     (tmp_path / "old" / "config.yaml").write_text(BEAM.replace("links: 2", "links: 3"), encoding="utf-8")
     run = settings(tmp_path, None, ("diagnosis.baseline=[old]",))
     with pytest.raises(ConfigError, match=r"model\.object differs"):
-        earlier_runs(run)
+        baseline_estimates(run)
 
 
 def test_recordings_of_the_baseline_are_those_without_what_is_looked_for(tmp_path):
     folder = folder_of(tmp_path / "old")
     (folder / "config.yaml").write_text(BEAM.replace("[beam.h5]", "[../beam.h5]"), encoding="utf-8")
     run = settings(tmp_path, None, ("diagnosis.baseline=[old]",))
-    [found], message = recordings_without(run)
+    [found], message = load_reference_recordings(run)
     assert (found.name, message) == ("beam (without)", "")
     assert found.sha256 == read_recordings(run, "estimate")[0].sha256
 
@@ -198,7 +213,7 @@ def test_report_says_what_drifted_and_writes_the_history(tmp_path):
     outcome = run_report(folders, tmp_path / "history")
     written = json.loads((tmp_path / "history" / "history.json").read_text(encoding="utf-8"))
     assert written["format"] == "yid-history/1"
-    assert outcome.history.drifted == ("beam.bend",)
+    assert outcome.history.drifted_parameters == ("beam.bend",)
     assert [entry["name"] for entry in written["runs"] if entry["distrusted"]] == [str(folders[3])]
     assert "beam.bend is not the same in all runs" in (tmp_path / "history" / "report.html").read_text(encoding="utf-8")
     later = folder_of(tmp_path / "later", baseline={"runs": [str(folders[0])]})
@@ -213,7 +228,7 @@ def test_a_program_with_node_states_has_the_same_joint_prior(tmp_path):
     """`python -m pytest -m slow tests/workflow/test_held.py`: some seconds in IPOPT."""
     run = settings(tmp_path, None, ("problem.initial_state=equilibrium",))
     known = read_estimates(folder_of(tmp_path / "old", values=(0.018, 4e-5)))
-    problem = with_baseline(build_problem(run), known)
+    problem = with_baseline_prior(build_problem(run), known)
     rolled, program = (solve(problem, method) for method in (GaussNewton(), MultipleShooting()))
     assert program.cost == pytest.approx(rolled.cost, rel=1e-6)
     assert program.x == pytest.approx(rolled.x, rel=1e-3)

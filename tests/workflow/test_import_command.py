@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from yid_ocp.cli import main, parser
+from yid_ocp.cli import build_argument_parser, main
 from yid_ocp.data import read_recording
 from yid_ocp.files import file_sha256
 
@@ -156,9 +156,9 @@ def test_a_bad_import_says_what_is_wrong_and_writes_nothing(
 
 def test_every_flag_is_a_key_of_the_section() -> None:
     from yid_ocp.config.settings import ImportSettings
-    from yid_ocp.options import options_of
+    from yid_ocp.options import dataclass_options
 
-    known: Callable[..., object] = parser().parse_args
+    known: Callable[..., object] = build_argument_parser().parse_args
     given = vars(known(["import", "x"]))
     others = {"command", "module", "file", "out", "preview", "config", "quiet", "json"}
-    assert set(given) - others == set(options_of(ImportSettings))
+    assert set(given) - others == set(dataclass_options(ImportSettings))

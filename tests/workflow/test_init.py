@@ -14,7 +14,7 @@ from ruamel.yaml import YAML
 
 from yid_ocp.cli import main
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.schema import schema
+from yid_ocp.config.schema import config_json_schema
 from yid_ocp.data import JointGroup, PointGroup, Recording, read_recording, write_recording
 from yid_ocp.workflow.build import build_system, parameter_settings
 
@@ -84,10 +84,10 @@ def test_the_file_loads_and_says_what_was_recorded(bench: Path, capsys: pytest.C
     assert run.sensors["joints.position"].std == pytest.approx(1e-4, rel=0.2)
     system = build_system(run)
     assert system.prescribed == ("roll", "pitch")
-    assert {"cable:50%", "w_cable"} <= set(system.points)
+    assert {"cable:50%", "w_cable"} <= set(system.point_frames)
     text = (bench / "run.yaml").read_text()
     assert text.startswith("# yaml-language-server: $schema=yid-ocp.schema.json\n")
-    jsonschema.validate(YAML(typ="safe").load(text), schema())
+    jsonschema.validate(YAML(typ="safe").load(text), config_json_schema())
     assert (bench / "yid-ocp.schema.json").is_file()
     keys = [line for line in text.splitlines() if line.strip() and not line.strip().startswith(("#", "joints:"))]
     bare = [line for line in keys if "#" not in line and not line.rstrip().endswith(":")]
@@ -152,7 +152,7 @@ def test_commands_without_efforts_are_followed_by_servos(bench: Path, capsys: py
     assert "mode: servo: commanded positions were recorded" in capsys.readouterr().out
     run = load_config("run.yaml")
     assert run.model.arms.mode == "servo"
-    assert run.model.arms.servo.commands == "held"
+    assert run.model.arms.servo.command_interpolation == "held"
     system = build_system(run)
     assert set(system.servos) == set(system.driven) == {"roll", "pitch"}
     free = {name for name, said in parameter_settings(run, system.parameters).items() if said.free}
@@ -180,7 +180,7 @@ def test_a_tree_gets_its_markers_where_they_are(bench: Path) -> None:
     assert init("--object", "tree", "--branch", "up=0.5,0.05,0.004", "--branch", "side=0.3,0.03,0.004,0,1.57,0") == 0
     run = load_config("run.yaml")
     assert run.sensors["points"].frames == {"m1": "up:40%", "m2": "w_up"}
-    assert {"w_up", "w_side", "up:40%"} == set(build_system(run).points)
+    assert {"w_up", "w_side", "up:40%"} == set(build_system(run).point_frames)
 
 
 def test_a_file_of_another_tool_is_imported_along(bench: Path) -> None:

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from yid_ocp.analysis.symbols import StepSymbols
+from yid_ocp.analysis.step_symbols import StepSymbols
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Grasp, Segment, System, flexible_object
-from yid_ocp.model.rotations import roll_pitch_yaw, transform
+from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.workflow import inspect
@@ -23,7 +23,7 @@ TIMES = 0.01 * np.arange(31)
 def hanging():
     """hanging(start): a rod of two links under the ceiling, an eighth of a radian aside; the ends of both are seen."""
     rod = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=2, bend=4.0, twist=3.0)])
-    down = transform(roll_pitch_yaw(math.pi, 0.0, 0.0), np.zeros(3))
+    down = homogeneous_transform(rotation_from_rpy(math.pi, 0.0, 0.0), np.zeros(3))
     step = compile_step(System.build(objects=[(rod, None, down)]), 0.01, use_compiler=False)
     aside = 0.3 * np.array([math.sin(0.125), 0.0, -math.cos(0.125)])
     place = np.tile(np.stack([aside, 2 * aside]), (len(TIMES), 1, 1))
@@ -38,7 +38,7 @@ def hanging():
 
 def said(problem):
     point = inspect._point(problem.step, problem)
-    symbols = StepSymbols.of(problem.step.equations)
+    symbols = StepSymbols.from_equations(problem.step.equations)
     rows = inspect._linearised(problem.step, point)[1]
     return point, {entry.parameter: entry for entry in inspect._dependence(problem.step, symbols, problem, point, rows)}
 
@@ -66,23 +66,25 @@ def test_a_recording_whose_start_is_fitted(hanging):
     assert found["T1.mass"].along is None
     assert "to first order" in found["T1.bend"].words
     at = inspect._columns_at(problem.step, point)
-    symbols = StepSymbols.of(problem.step.equations)
+    symbols = StepSymbols.from_equations(problem.step.equations)
     assert len(at) == len(symbols.column_names)
-    assert at[symbols.column("q0[T1_0_y]")] == point.state[1]
-    assert at[symbols.column("T1.bend")] == problem.theta[problem.system.parameters.index("T1.bend")]
+    assert at[symbols.column_index("q0[T1_0_y]")] == point.state[1]
+    assert at[symbols.column_index("T1.bend")] == problem.theta[problem.system.parameters.index("T1.bend")]
     # the step is taken: its equation holds
-    assert symbols.entry("del[T1_0_y]").value(symbols.all_columns, at) == pytest.approx(0.0, abs=1e-10)
+    assert symbols.equation_entry("del[T1_0_y]").numeric_value(symbols.column_symbols, at) == pytest.approx(
+        0.0, abs=1e-10
+    )
 
 
 def test_what_has_no_rest_is_looked_at_where_all_is_zero(urdf_folder):
     """A rod whose end is a metre away from the hand that should hold it."""
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     rod = flexible_object([Segment("T1", 0.3, 0.1, 0.02, links=2, bend=4.0, twist=3.0)])
-    far = transform(np.eye(3), (2.0, 0.0, 0.0))
+    far = homogeneous_transform(np.eye(3), (2.0, 0.0, 0.0))
     grasps = [Grasp("hand", "tip", "w_T1")]
     system = System.build(robot, objects=[(rod, None, far)], grasps=grasps, driven=["shoulder", "elbow"])
     step = compile_step(system, 0.01, use_compiler=False)
     point = inspect._point(step, None)
-    assert point.words.startswith("zero, since there is no rest: ")
-    assert not point.resting
+    assert point.description.startswith("zero, since there is no rest: ")
+    assert not point.is_equilibrium
     assert not np.any(point.state)

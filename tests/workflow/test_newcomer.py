@@ -29,7 +29,7 @@ from made_newcomer import (
 
 from yid_ocp.cli import main
 from yid_ocp.config.reader import load_config
-from yid_ocp.virtual.motion import Excitation
+from yid_ocp.virtual.multisine_motion import MultisineOptions
 from yid_ocp.workflow.build import load_problem
 
 UR5_NUMBERS = ("--object", "cable", "--length", "1", "--mass", "0.1", "--radius", "0.005")
@@ -70,7 +70,7 @@ def test_a_bag_becomes_a_problem_that_is_right_at_the_truth(desk: Path) -> None:
     run = load_config("cable.yaml")
     assert run.model.object is not None
     assert run.sensors["points"].frames == {"middle": "cable:50%", "tip": "w_cable"}
-    problem = load_problem("cable.yaml", ["problem.compiler=false"])
+    problem = load_problem("cable.yaml", ["problem.use_compiler=false"])
     assert set(problem.free) == set(UR5_TRUTH)
     at_truth = problem.evaluate(problem.vector(UR5_TRUTH), derivatives=False)
     count = sum(len(group.t) * 3 * len(group.names) for group in recording.points)
@@ -107,7 +107,7 @@ def test_a_cross_on_a_panda(desk: Path) -> None:
 @pytest.mark.slow
 def test_a_rod_on_an_arm_of_servos(desk: Path) -> None:
     """Commands and angles are all that the arm says; what it holds is called a cable until somebody names it."""
-    excitation = Excitation(speed=2.5, duration=3.0, band=(0.3, 2.0))
+    excitation = MultisineOptions(max_joint_speed=2.5, duration=3.0, frequency_band=(0.3, 2.0))
     bags = [
         write_mcap(
             simulated(desk, servo_text(), SERVO_POSTURE, SERVO_POINTS, seed, 3.0, excitation), desk / f"run_{seed}"

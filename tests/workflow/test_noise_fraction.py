@@ -12,10 +12,10 @@ from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
-from yid_ocp.model.drives import Spring
+from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.workflow.diagnose import in_units_of_noise
+from yid_ocp.workflow.diagnose import _with_noise_only_stds
 
 SHARE = 0.25
 SENSORS = {
@@ -28,8 +28,8 @@ SENSORS = {
 @pytest.fixture(scope="module")
 def step(urdf_folder):
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    springs = {"elbow": Spring(3.0, 0.1)}
-    system = System.build(robot, prescribed=["shoulder"], springs=springs, damping=0.1, points=["tip"])
+    springs = {"elbow": RobotJointSpring(3.0, 0.1)}
+    system = System.build(robot, prescribed=["shoulder"], springs=springs, damping=0.1, point_frames=["tip"])
     return compile_step(system, 0.01, use_compiler=False)
 
 
@@ -55,8 +55,8 @@ def problem_of(step, position_std=None, **changed):
 def driven(urdf_folder):
     """A shoulder whose recorded torques are wrong, seen by the tip or by its own encoder."""
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    springs = {"elbow": Spring(3.0, 0.1)}
-    system = System.build(robot, driven=["shoulder"], springs=springs, damping=0.1, points=["tip"])
+    springs = {"elbow": RobotJointSpring(3.0, 0.1)}
+    system = System.build(robot, driven=["shoulder"], springs=springs, damping=0.1, point_frames=["tip"])
     step = compile_step(system, 0.01, use_compiler=False)
 
     def problem(**sensors):
@@ -66,7 +66,7 @@ def driven(urdf_folder):
         joints = JointGroup(("shoulder",), t, angle, effort=torque, **noise)
         tip = np.tile([0.0, 0.1, 0.4], (41, 1, 1)) + 0.02 * np.random.default_rng(1).standard_normal((41, 1, 3))
         recording = Recording(joints, (PointGroup("points", ("tip",), t, tip),), name="made")
-        options = ProblemOptions(sensors=sensors, priors={"elbow.rest": 0.05})
+        options = ProblemOptions(sensors=sensors, prior_stds={"elbow.rest": 0.05})
         return EstimationProblem(step, [recording], ("elbow.stiffness", "elbow.rest"), options)
 
     return problem
@@ -83,15 +83,15 @@ STATED = {
 def test_errors_of_torques_shrink_like_all_other_noise(driven, encoders):
     use = {True: {"joints.position": replace(STATED["joints.position"], use=True)}, False: {}}[encoders]
     problem = driven(**STATED | use)
-    shrunk = in_units_of_noise(problem, settings())
+    shrunk = _with_noise_only_stds(problem, settings())
     x = problem.start * 1.1
-    one, other = (made.weighted_at(x, rounds=2) for made in (problem, shrunk))
+    one, other = (made.whitened_at(x, rounds=2) for made in (problem, shrunk))
     before, after = one.evaluate(x), other.evaluate(x)
-    assert one.innovations[0] is not None
-    assert other.innovations[0] is not None
+    assert one.whitening_filters[0] is not None
+    assert other.whitening_filters[0] is not None
     np.testing.assert_allclose(after.residual, before.residual / SHARE, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(after.jacobian, before.jacobian / SHARE, rtol=1e-6, atol=1e-6)
-    (value, std), (smaller_value, smaller_std) = one.torque_offsets(x)[0], other.torque_offsets(x)[0]
+    (value, std), (smaller_value, smaller_std) = one.estimate_torque_biases(x)[0], other.estimate_torque_biases(x)[0]
     np.testing.assert_allclose(smaller_value, value, rtol=1e-6)
     np.testing.assert_allclose(smaller_std, SHARE * std, rtol=1e-6)
 
@@ -106,7 +106,7 @@ def test_errors_of_torques_shrink_like_all_other_noise(driven, encoders):
 )
 def test_a_fraction_of_an_unstated_error_of_torques_is_refused(driven, group, entry, words):
     with pytest.raises(ConfigError, match=words):
-        in_units_of_noise(driven(**STATED | {group: entry}), settings())
+        _with_noise_only_stds(driven(**STATED | {group: entry}), settings())
 
 
 def settings(share=SHARE):
@@ -118,8 +118,8 @@ def settings(share=SHARE):
 
 def test_every_row_is_so_many_times_larger_and_the_fit_the_same(step):
     problem = problem_of(step)
-    shrunk = in_units_of_noise(problem, settings())
-    assert shrunk.rows == problem.rows
+    shrunk = _with_noise_only_stds(problem, settings())
+    assert shrunk.residual_rows == problem.rows
     rows = problem.rows
     assert [part.stop - part.start for part in (rows.stated_priors, rows.weak_priors)] == [3, 1]
     for seed in range(3):
@@ -132,10 +132,10 @@ def test_every_row_is_so_many_times_larger_and_the_fit_the_same(step):
 
 def test_a_whole_fraction_and_no_weak_prior_stay_as_they_are(step):
     problem = problem_of(step, weak_prior_factor=0.0)
-    assert in_units_of_noise(problem, settings(1.0)) is problem
-    shrunk = in_units_of_noise(problem, settings())
+    assert _with_noise_only_stds(problem, settings(1.0)) is problem
+    shrunk = _with_noise_only_stds(problem, settings())
     assert shrunk.options.weak_prior_factor == 0.0
-    assert shrunk.rows == problem.rows
+    assert shrunk.residual_rows == problem.residual_rows
 
 
 @pytest.mark.parametrize(
@@ -153,11 +153,11 @@ def test_a_fraction_of_what_is_not_stated_is_refused(step, sensors, recorded, wo
     missing = EstimationProblem.__new__(EstimationProblem)
     missing.__dict__.update(problem.__dict__, options=replace(problem.options, sensors=sensors))
     with pytest.raises(ConfigError, match=words):
-        in_units_of_noise(missing, settings())
+        _with_noise_only_stds(missing, settings())
 
 
 @pytest.mark.parametrize("recorded", [None, 0.0])
 def test_encoders_without_noise_need_none(step, recorded):
     sensors = {"points": SENSORS["points"], "joints.effort": SensorOptions(std=0.3)}
-    shrunk = in_units_of_noise(problem_of(step, recorded, sensors=sensors), settings())
+    shrunk = _with_noise_only_stds(problem_of(step, recorded, sensors=sensors), settings())
     assert shrunk.options.sensors["joints.effort"] == SensorOptions(std=0.3 * SHARE)

@@ -18,7 +18,7 @@ from yid_ocp.errors import ConfigError
 from yid_ocp.files import file_sha256
 from yid_ocp.workflow import plugins
 from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.folder import used_versions
+from yid_ocp.workflow.run_folder import software_versions
 
 EFFECT = """
 from yid_ocp.effects.base import EFFECTS, EffectBase, Quantity, on_joint, robot_joints
@@ -49,7 +49,7 @@ def kinds(monkeypatch):
     before = set(EFFECTS)
     monkeypatch.setattr(plugins, "_loaded", {})
     yield before
-    EFFECTS.forget(set(EFFECTS) - before)
+    EFFECTS.unregister(set(EFFECTS) - before)
 
 
 def configured(file, *names):
@@ -103,15 +103,15 @@ def test_a_file_that_is_missing_or_changed(kinds, pendulum) -> None:
 def test_distributions_are_found_by_their_entry_point(kinds, pendulum, monkeypatch) -> None:
     (pendulum.parent / "constant_effect.py").write_text(EFFECT.format(kind="constant"))
     monkeypatch.syspath_prepend(str(pendulum.parent))
-    entry = metadata.EntryPoint("constant", "constant_effect", plugins.GROUP)
+    entry = metadata.EntryPoint("constant", "constant_effect", plugins._ENTRY_POINT_GROUP)
     found = replace_dist(entry, SimpleNamespace(name="my-effects", version="1.2"))
     monkeypatch.setattr(plugins, "_installed", lambda: [found])
-    assert used_versions()["entry point constant"] == "my-effects 1.2"
+    assert software_versions()["entry point constant"] == "my-effects 1.2"
     build_system(load_config(pendulum))
     assert "constant" in EFFECTS
     plugins._loaded.clear()  # as if a script had imported it before
     build_system(load_config(pendulum))
-    broken = replace_dist(metadata.EntryPoint("gone", "no_such_module", plugins.GROUP), found.dist)
+    broken = replace_dist(metadata.EntryPoint("gone", "no_such_module", plugins._ENTRY_POINT_GROUP), found.dist)
     monkeypatch.setattr(plugins, "_installed", lambda: [broken])
     with pytest.raises(ConfigError, match=r"entry point gone raised ModuleNotFoundError(.|\n)*my-effects 1.2"):
         build_system(load_config(pendulum))
@@ -129,7 +129,7 @@ def test_a_diagnosis_names_it_and_its_command_repeats_the_result(kinds, rubbing,
     file.write_text(f"plugins: [own.py]\n{text}")
     script = f"import sys; sys.path[:0] = [{str(repository)!r}]; from yid_ocp.cli import main; sys.exit(main())"
     results = []
-    command = ["diagnose", str(file), "--set", "output.report=false"]
+    command = ["diagnose", str(file), "--set", "output.write_report=false"]
     for name in ("first", "second"):
         run = [sys.executable, "-c", script, *command, "--out", str(tmp_path / name)]
         done = subprocess.run(run, cwd=tmp_path, capture_output=True, text=True, check=False)

@@ -9,10 +9,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from yid_ocp.report.blocks import Statement
+from yid_ocp.report.summary_blocks import SummaryStatement
 from yid_ocp.solvers import Iterate
-from yid_ocp.workflow.command import carry_out
-from yid_ocp.workflow.progress import SILENT, BarProgress, PlainProgress, duration_words, shown
+from yid_ocp.workflow.command_runner import run_and_print
+from yid_ocp.workflow.progress_display import NULL_PROGRESS, LineProgress, _BarProgress, _format_duration, show_progress
 
 ENTRY = Iterate(3, 12.5, np.zeros(1), 0.1, 4, 1.25, "first 2 s")
 
@@ -23,25 +23,25 @@ def asked(quiet: bool = False, program: bool = False) -> argparse.Namespace:
 
 def report(progress) -> None:
     """Two stages, the first with an iterate, the second with a hundred parts."""
-    progress.stage("solving")
-    progress.iterate(ENTRY)
-    progress.stage("tracking")
+    progress.begin_stage("solving")
+    progress.report_iterate(ENTRY)
+    progress.begin_stage("tracking")
     for i in range(101):
-        progress.advance(i, 100, f"frame {i}")
+        progress.report_parts_done(i, 100, f"frame {i}")
 
 
 def test_lines_for_stages_iterates_and_tenths(capsys):
-    report(PlainProgress())
+    report(LineProgress())
     lines = capsys.readouterr().err.splitlines()
     assert lines[:3] == ["solving ...", "  iteration 3, cost 12.5, 1.2 s, first 2 s", "tracking ..."]
     assert lines[3:] == [f"  {10 * i} of 100, frame {10 * i}" for i in range(1, 11)]
 
 
 def test_the_tenths_begin_again_with_every_stage(capsys):
-    progress = PlainProgress()
+    progress = LineProgress()
     for _ in range(2):
-        progress.stage("tracking")
-        progress.advance(5, 10, "half")
+        progress.begin_stage("tracking")
+        progress.report_parts_done(5, 10, "half")
     assert capsys.readouterr().err.count("5 of 10, half") == 2
 
 
@@ -49,16 +49,16 @@ def test_the_tenths_begin_again_with_every_stage(capsys):
 def clock(monkeypatch):
     """A clock that is set by hand."""
     now = [100.0]
-    monkeypatch.setattr("yid_ocp.workflow.progress.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("yid_ocp.workflow.progress_display.time.monotonic", lambda: now[0])
     return now
 
 
 def test_the_time_left_counts_what_this_run_did(capsys, clock):
-    progress = PlainProgress()
-    progress.stage("diagnosing")
+    progress = LineProgress()
+    progress.begin_stage("diagnosing")
     for done, now in ((10, 100.0), (12, 160.0), (19, 370.0), (20, 400.0)):
         clock[0] = now
-        progress.advance(done, 20, f"case {done}")
+        progress.report_parts_done(done, 20, f"case {done}")
     lines = capsys.readouterr().err.splitlines()[1:]
     # ten were done before and took nothing; two in a minute leave eight for four minutes
     assert lines == [
@@ -70,15 +70,15 @@ def test_the_time_left_counts_what_this_run_did(capsys, clock):
 
 
 def test_slow_parts_have_a_line_each_and_quick_ones_one_in_ten(capsys, clock):
-    progress = PlainProgress()
-    progress.stage("diagnosing")
+    progress = LineProgress()
+    progress.begin_stage("diagnosing")
     for done in range(4):
         clock[0] += 30.0
-        progress.advance(done, 1000, f"case {done}")
+        progress.report_parts_done(done, 1000, f"case {done}")
     assert len(capsys.readouterr().err.splitlines()) == 5
     for done in range(4, 99):
         clock[0] += 0.01
-        progress.advance(done, 1000, f"case {done}")
+        progress.report_parts_done(done, 1000, f"case {done}")
     assert capsys.readouterr().err == ""
 
 
@@ -86,7 +86,7 @@ def test_slow_parts_have_a_line_each_and_quick_ones_one_in_ten(capsys, clock):
     ("seconds", "words"), [(0.4, "0 s"), (89.0, "89 s"), (90.0, "2 min"), (5399.0, "90 min"), (9000.0, "2.5 h")]
 )
 def test_times_for_people(seconds, words):
-    assert duration_words(seconds) == words
+    assert _format_duration(seconds) == words
 
 
 class Bars:
@@ -112,15 +112,15 @@ class Bars:
 
 def test_a_bar_moves_with_its_stage_and_is_a_line_when_the_next_begins(clock):
     bars = Bars()
-    progress = BarProgress(bars)
-    progress.advance(1, 2, "before any stage")
-    progress.stage("solving")
-    progress.iterate(ENTRY)
+    progress = _BarProgress(bars)
+    progress.report_parts_done(1, 2, "before any stage")
+    progress.begin_stage("solving")
+    progress.report_iterate(ENTRY)
     clock[0] += 7.0
-    progress.stage("tracking")
-    progress.advance(1, 4, "frame 1")
-    progress.close()
-    progress.close()
+    progress.begin_stage("tracking")
+    progress.report_parts_done(1, 4, "frame 1")
+    progress.finish_stage()
+    progress.finish_stage()
     assert bars.calls == [
         ("add", "solving", None),
         ("update", 1, {"description": "solving: iteration 3, cost 12.5, 1.2 s, first 2 s"}),
@@ -134,19 +134,19 @@ def test_a_bar_moves_with_its_stage_and_is_a_line_when_the_next_begins(clock):
 
 
 def test_what_is_shown_depends_on_who_looks(capsys, monkeypatch):
-    with shown(asked(quiet=True)) as progress:
-        assert progress is SILENT
+    with show_progress(asked(quiet=True)) as progress:
+        assert progress is NULL_PROGRESS
         report(progress)
     assert capsys.readouterr().err == ""
-    with shown(asked()) as progress:
-        assert isinstance(progress, PlainProgress)
-    with shown(asked(program=True)) as progress:
-        assert progress is SILENT
+    with show_progress(asked()) as progress:
+        assert isinstance(progress, LineProgress)
+    with show_progress(asked(program=True)) as progress:
+        assert progress is NULL_PROGRESS
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    with shown(asked(program=True)) as progress:
-        assert isinstance(progress, BarProgress)
-    with shown(asked()) as progress:
-        assert isinstance(progress, BarProgress)
+    with show_progress(asked(program=True)) as progress:
+        assert isinstance(progress, _BarProgress)
+    with show_progress(asked()) as progress:
+        assert isinstance(progress, _BarProgress)
         report(progress)
 
 
@@ -160,11 +160,11 @@ def test_a_command_ends_with_its_table_and_its_folder(tmp_path, monkeypatch, cap
     monkeypatch.chdir(tmp_path)
 
     def work(progress):
-        progress.stage("working")
+        progress.begin_stage("working")
         return Outcome(tmp_path / "runs" / "x")
 
-    said = [Statement("a = 1"), Statement("done")]
-    outcome = carry_out(work, lambda result: said if result == {"a": 1} else [], asked(quiet=quiet))
+    said = [SummaryStatement("a = 1"), SummaryStatement("done")]
+    outcome = run_and_print(work, lambda result: said if result == {"a": 1} else [], asked(quiet=quiet))
     captured = capsys.readouterr()
     assert outcome.folder == tmp_path / "runs" / "x"
     if quiet:
@@ -176,5 +176,5 @@ def test_a_command_ends_with_its_table_and_its_folder(tmp_path, monkeypatch, cap
 def test_a_folder_elsewhere_is_named_in_full(tmp_path, monkeypatch, capsys):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    carry_out(lambda progress: Outcome(tmp_path / "there"), lambda result: [], asked())
+    run_and_print(lambda progress: Outcome(tmp_path / "there"), lambda result: [], asked())
     assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "there")

@@ -7,9 +7,9 @@ from made_cross import TRUTH, configuration, record
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.report.summaries import solve_summary
-from yid_ocp.report.terminal import lines
+from yid_ocp.report.terminal import terminal_lines
 from yid_ocp.workflow.check import run_check
-from yid_ocp.workflow.refine import wanted
+from yid_ocp.workflow.discretisation_check import requested_refinements
 from yid_ocp.workflow.solve import run_solve
 
 pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
@@ -38,7 +38,7 @@ def judged(result, links):
 def test_too_few_links_are_told_and_counted(folder, tmp_path):
     """A branch of twelve links estimated with four: a quarter too stiff, known from the data to half a percent."""
     run = load_config(configuration(folder, 4, ["north"], 1.5))
-    assert wanted(run) == ("links", "time_step")
+    assert requested_refinements(run) == ("links", "time_step")
     result = run_solve(run, tmp_path / "run").result
     error, alone, counted, entry = judged(result, 4)["north.bend"]
     assert error > 0.15
@@ -49,7 +49,7 @@ def test_too_few_links_are_told_and_counted(folder, tmp_path):
     # with twice the links it is nearer to the truth by what is said
     moved = result["discretisation"]["north.bend"]["links"] / TRUTH["north.bend"]
     assert -error < moved < -0.4 * error
-    told = lines(solve_summary(result))
+    told = terminal_lines(solve_summary(result))
     assert any(line.startswith("with twice the links these move by more than the data's") for line in told)
 
 
@@ -57,9 +57,9 @@ def test_settings_say_what_is_refined(folder, tmp_path):
     file = configuration(folder, 4, ["north"])
     said = {"none": set(), "time_step": {"time_step"}, "both": {"links", "time_step"}}
     for setting, tried in said.items():
-        run = load_config(file, [f"output.discretisation={setting}", "solver.iterations=1"])
-        assert set(wanted(run)) == tried
-    result = run_solve(load_config(file, ["output.discretisation=none"]), tmp_path / "none").result
+        run = load_config(file, [f"output.discretisation_check={setting}", "solver.max_iterations=1"])
+        assert set(requested_refinements(run)) == tried
+    result = run_solve(load_config(file, ["output.discretisation_check=none"]), tmp_path / "none").result
     assert result["discretisation"] == {}
     _, alone, *_ = result["parameters"]["north.bend"], result["parameters"]["north.bend"]["std"]
     assert alone < 0.02 * TRUTH["north.bend"]
@@ -85,7 +85,7 @@ def test_a_cross_of_few_links_is_not_called_found(tmp_path):
     record(tmp_path, WHOLE)
     largest = {}
     for links in (4, 8):
-        run = load_config(configuration(tmp_path, links, WHOLE, 1.2), ["problem.compiler=true"])
+        run = load_config(configuration(tmp_path, links, WHOLE, 1.2), ["problem.use_compiler=true"])
         found = judged(run_solve(run, tmp_path / f"run_{links}").result, links)
         assert set(found) == set(TRUTH)
         largest[links] = max(abs(error) for error, *_ in found.values())

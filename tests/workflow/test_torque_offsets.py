@@ -10,15 +10,15 @@ import pytest
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
-from yid_ocp.model.drives import Spring
+from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.simulated import recorded
-from yid_ocp.report.inspection import _noise_words
-from yid_ocp.report.tables import offset_rows
-from yid_ocp.report.terminal import table
+from yid_ocp.problem.synthetic_recording import recording_from_prediction
+from yid_ocp.report.model_summaries import _noise_words
+from yid_ocp.report.tables import torque_offset_rows
+from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.workflow.check import _input_noise
-from yid_ocp.workflow.torque_offsets import torque_offsets
+from yid_ocp.workflow.torque_offset_results import estimated_torque_offsets
 
 STEPS, OFFSET, WHITE, ANGLE = 200, 0.2, 0.05, 1e-4
 
@@ -26,7 +26,7 @@ STEPS, OFFSET, WHITE, ANGLE = 200, 0.2, 0.05, 1e-4
 @pytest.fixture(scope="module")
 def step(urdf_folder):
     tree = read_urdf(urdf_folder / "double_pendulum.urdf")
-    system = System.build(tree, driven=("shoulder",), springs={"elbow": Spring(3.0)}, damping=0.2)
+    system = System.build(tree, driven=("shoulder",), springs={"elbow": RobotJointSpring(3.0)}, damping=0.2)
     return compile_step(system, 0.01, use_compiler=False)
 
 
@@ -34,7 +34,7 @@ def problem_of(step, *, bias=OFFSET, white=WHITE, held_out=True, options=None):
     """A pendulum under torques that are 0.3 N m too large, in one recording to estimate on and one held out."""
     t = 0.01 * np.arange(STEPS + 1)
     torque = np.sin(6 * t)[:, None]
-    options = options or ProblemOptions(feedback="proportional", gains=(9.0,))
+    options = options or ProblemOptions(feedback="proportional", proportional_gains=(9.0,))
     first = Recording(
         JointGroup(
             ("shoulder",), t, np.zeros((STEPS + 1, 1)), effort=torque, effort_std=white, effort_bias_std=bias,
@@ -45,7 +45,7 @@ def problem_of(step, *, bias=OFFSET, white=WHITE, held_out=True, options=None):
     )  # fmt: skip
     made = EstimationProblem(step, [first], ("elbow.stiffness",), replace(options, feedback="none", gains=None))
     episode = made.episodes[0]
-    swept = made.predictor.run(episode, *made.split(made.start, 0), False)
+    swept = made.predictor.predict_episode(episode, *made.split(made.initial_unknowns, 0), False)
     joints = replace(first.joints, position=swept.rollout.state[:, :1], effort=torque + 0.3)
     recordings = [replace(first, joints=joints, name=name) for name in ("first", "second")]
     return EstimationProblem(
@@ -55,22 +55,24 @@ def problem_of(step, *, bias=OFFSET, white=WHITE, held_out=True, options=None):
 
 def test_offsets_of_all_recordings_are_told_with_what_was_expected(step):
     problem = problem_of(step)
-    assert torque_offsets(problem, problem.start) == {}
-    weighted = problem.weighted_at(problem.start, rounds=2)
-    found = torque_offsets(weighted, problem.start)
+    assert estimated_torque_offsets(problem, problem.start) == {}
+    weighted = problem.whitened_at(problem.start, rounds=2)
+    found = estimated_torque_offsets(weighted, problem.start)
     assert list(found) == ["first", "second"]
     for entry in found.values():
         own = entry["shoulder"]
         assert own["prior_std"] == OFFSET
         assert own["std"] < 0.1 * OFFSET
         assert own["value"] == pytest.approx(0.3, abs=4 * own["std"])
-    assert list(torque_offsets(problem_of(step, held_out=False).weighted_at(problem.start), problem.start)) == ["first"]
+    assert list(
+        estimated_torque_offsets(problem_of(step, held_out=False).whitened_at(problem.start), problem.start)
+    ) == ["first"]
 
 
 def test_where_offsets_are_no_part_of_the_model_nothing_is_said(step):
     problem = problem_of(step, bias=0.0)
-    assert torque_offsets(problem.weighted_at(problem.start), problem.start) == {}
-    assert offset_rows({"torque_offsets": {}}) == offset_rows({}) == []
+    assert estimated_torque_offsets(problem.whitened_at(problem.start), problem.start) == {}
+    assert torque_offset_rows({"torque_offsets": {}}) == torque_offset_rows({}) == []
 
 
 def entry(value, prior=0.3):
@@ -79,21 +81,21 @@ def entry(value, prior=0.3):
 
 def test_the_table_has_a_row_for_a_joint_and_a_column_for_a_recording():
     offsets = {"a": {"s0": entry(0.4), "e0": entry(-0.1)}, "b": {"s0": entry(0.2, 0.1)}}
-    rows = offset_rows({"torque_offsets": offsets})
+    rows = torque_offset_rows({"torque_offsets": offsets})
     assert rows == [
         ("torque offset [N m]", "a", "b", "expected"),
         ("s0", "0.40 ± 0.01", "0.20 ± 0.01", "± 0.3, ± 0.1"),
         ("e0", "-0.10 ± 0.01", "", "± 0.3"),
     ]
     many = {f"run {i}": {"s0": entry(0.1)} for i in range(6)}
-    assert offset_rows({"torque_offsets": many})[-1][0] == "2 more recordings are in result.json"
-    assert table(rows)[0].split() == ["torque", "offset", "[N", "m]", "a", "b", "expected"]
+    assert torque_offset_rows({"estimated_torque_offsets": many})[-1][0] == "2 more recordings are in result.json"
+    assert aligned_table_lines(rows)[0].split() == ["torque", "offset", "[N", "m]", "a", "b", "expected"]
 
 
 def simulated(problem, seed):
     episode = problem.episodes[0]
     outcome = problem.predictor.run(episode, *problem.split(problem.start, 0), False)
-    return recorded(problem.predictor, episode, outcome, problem.theta, seed).joints
+    return recording_from_prediction(problem.predictor, episode, outcome, problem.theta, seed).joints
 
 
 def test_simulated_torques_are_wrong_as_the_estimation_expects_and_say_so(step):
@@ -110,7 +112,7 @@ def test_simulated_torques_are_wrong_as_the_estimation_expects_and_say_so(step):
 
 def test_settings_come_before_what_the_recording_says(step):
     sensors = {"joints.effort": SensorOptions(std={"shoulder": 0.4}, bias_std=0.7)}
-    options = ProblemOptions(feedback="proportional", gains=(9.0,), sensors=sensors)
+    options = ProblemOptions(feedback="proportional", proportional_gains=(9.0,), sensors=sensors)
     made = simulated(problem_of(step, options=options), 1)
     assert (made.effort_std, made.effort_bias_std) == (0.4, 0.7)
 

@@ -8,25 +8,25 @@ import h5py
 import numpy as np
 import pytest
 
-from yid_ocp.diagnosis.events import NOTHING
+from yid_ocp.diagnosis.events import NO_EVENTS
 from yid_ocp.errors import OutputError
 from yid_ocp.solvers import GaussNewton, solve
 from yid_ocp.workflow.build import load_problem
-from yid_ocp.workflow.held_out import held_out_entry
-from yid_ocp.workflow.trajectories import write_diagnosis_trajectories, write_trajectories
+from yid_ocp.workflow.held_out_errors import prediction_error_entry
+from yid_ocp.workflow.trajectories import write_diagnosis_trajectories, write_solve_trajectories
 
 
 @pytest.fixture
 def solved(pendulum):
     problem = load_problem(pendulum)
     solution = solve(problem, GaussNewton())
-    return problem, solution, problem.validate(solution.x)
+    return problem, solution, problem.predict_held_out(solution.x)
 
 
 def test_a_solution_with_its_predictions(solved, tmp_path):
     problem, solution, held_out = solved
     unpredicted = [(held_out[0][0], "step 3 did not converge")]
-    write_trajectories(tmp_path / "t.h5", problem, solution, unpredicted)
+    write_solve_trajectories(tmp_path / "t.h5", problem, solution, unpredicted)
     with h5py.File(tmp_path / "t.h5") as file:
         assert file.attrs["format"] == "yid-trajectories/1"
         assert list(file["unknowns"].attrs["names"]) == list(solution.names)
@@ -56,7 +56,7 @@ def test_a_solution_with_its_predictions(solved, tmp_path):
 def test_a_diagnosis_without_a_gap_has_predictions_alone(solved, tmp_path):
     ((episode, outcome),) = solved[2]
     other = SimpleNamespace(predicted=[2 * array for array in outcome.predicted])
-    finding = SimpleNamespace(smoothed=None, events=NOTHING)
+    finding = SimpleNamespace(smoothed=None, events=NO_EVENTS)
     write_diagnosis_trajectories(tmp_path / "t.h5", finding, [(episode, outcome, other)])
     with h5py.File(tmp_path / "t.h5") as file:
         assert file.attrs["format"] == "yid-diagnosis-trajectories/1"
@@ -69,19 +69,19 @@ def test_a_diagnosis_without_a_gap_has_predictions_alone(solved, tmp_path):
 
 def test_a_file_that_cannot_be_written(solved, tmp_path):
     with pytest.raises(OutputError, match="does not exist"):
-        write_trajectories(tmp_path / "no" / "t.h5", *solved)
+        write_solve_trajectories(tmp_path / "no" / "t.h5", *solved)
 
 
 def test_a_held_out_recording_beside_a_guess_without_a_model(solved):
     problem, _, held_out = solved
-    entry = held_out_entry(problem, *held_out[0])
+    entry = prediction_error_entry(problem, *held_out[0])
     assert entry["recording"] == "held_out"
     samples = held_out[0][0].samples[0]
     for i, channel in enumerate(samples.sensor.channels):
         error = held_out[0][1].predicted[0][:, i] - samples.value[:, i]
         assert entry["rmse"][channel] == pytest.approx(np.sqrt(np.nanmean(error**2)))
         assert entry["baselines"]["zero"][channel] == pytest.approx(np.sqrt(np.nanmean(samples.value[:, i] ** 2)))
-    failed = held_out_entry(problem, held_out[0][0], "step 3 did not converge")
+    failed = prediction_error_entry(problem, held_out[0][0], "step 3 did not converge")
     assert failed["message"] == "step 3 did not converge"
     assert failed["rmse"] == {}
     assert failed["baselines"] == entry["baselines"]

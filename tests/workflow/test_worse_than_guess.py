@@ -8,8 +8,8 @@ from dataclasses import replace
 import pytest
 
 from yid_ocp.data import read_recording, write_recording
-from yid_ocp.solvers.judgement import Estimate, distrusted
-from yid_ocp.workflow.held_out import guess_doubts
+from yid_ocp.solvers.uncertainty import ParameterEstimate, mark_not_trusted
+from yid_ocp.workflow.held_out_errors import worse_than_baseline_issues
 
 UNITS = {"joints.effort.a": "N m", "joints.effort.b": "N m", "points.p": "m", "points.q": "m"}
 
@@ -33,7 +33,7 @@ EFFORT, POINTS = [("joints", "effort")], [("points", "")]
     ],
 )
 def test_a_sensor_counts_as_a_whole(rmse, guess, places):
-    found = guess_doubts([entry(rmse, guess)], UNITS)
+    found = worse_than_baseline_issues([entry(rmse, guess)], UNITS)
     assert [(doubt.group, doubt.channel) for doubt in found] == places
     assert all((d.cause, d.weight, d.recording) == ("worse_than_guess", "not_trusted", "run") for d in found)
 
@@ -41,20 +41,20 @@ def test_a_sensor_counts_as_a_whole(rmse, guess, places):
 def test_the_best_guess_counts():
     said = entry({"points.p": 0.2}, {"points.p": 0.3})
     said["baselines"]["stays"] = {"points.p": 0.1}
-    (doubt,) = guess_doubts([said], UNITS)
+    (doubt,) = worse_than_baseline_issues([said], UNITS)
     assert doubt.what == "the model is off by 0.2 m (rms), the guess 'stays' without a model by 0.1 m"
     assert doubt.evidence == pytest.approx(0.2 / 0.105)
 
 
 def test_what_was_found_is_not_trusted_and_what_was_not_stays_so():
-    one = Estimate(1.0, 0.1, "N m/rad", 1.0, 0.0, 9.0, True, "identifiable")
+    one = ParameterEstimate(1.0, 0.1, "N m/rad", 1.0, 0.0, 9.0, True, "identifiable")
     known = {
         "found": one,
         "weak": replace(one, verdict="weak"),
         "lost": replace(one, verdict="not_identifiable"),
         "fixed": replace(one, free=False, verdict="fixed"),
     }
-    verdicts = {name: made.verdict for name, made in distrusted(known).items()}
+    verdicts = {name: made.verdict for name, made in mark_not_trusted(known).items()}
     assert verdicts == {"found": "not_trusted", "weak": "not_trusted", "lost": "not_identifiable", "fixed": "fixed"}
 
 
@@ -68,7 +68,7 @@ def test_a_recording_held_out_that_a_guess_predicts_better_withholds_trust(
     (tmp_path / "run.yaml").write_text(
         pendulum_data.text.replace(str(pendulum_data.folder / "held_out.h5"), "held_out.h5")
     )
-    done = cli("solve", tmp_path / "run.yaml", "--out", tmp_path / "run", "--set", "output.report=false")
+    done = cli("solve", tmp_path / "run.yaml", "--out", tmp_path / "run", "--set", "output.write_report=false")
     assert done.code == 0, done.err
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     assert result["fit"]["believed"] is believed

@@ -11,27 +11,27 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.analysis.profile import with_intervals
+from yid_ocp.analysis.profile import with_profile_intervals
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.null_test import USUAL, GapLimits
-from yid_ocp.problem.outcome import EpisodeResult
+from yid_ocp.problem.null_test import DEFAULT_GAP_CRITERIA, GapCriteria
+from yid_ocp.problem.prediction_result import EpisodePrediction
 from yid_ocp.solvers import GaussNewton, Iterate, Solution, Status, solve
-from yid_ocp.solvers.base import Solver, carries_covariance
-from yid_ocp.solvers.judgement import IDENTIFIABLE, Estimate
-from yid_ocp.solvers.words import PREDICATES, VERDICT_WORDS
+from yid_ocp.solvers.base import Solver, uses_process_noise_covariance
+from yid_ocp.solvers.fit_messages import VERDICT_PREDICATES, VERDICT_WORDS
+from yid_ocp.solvers.uncertainty import MAX_IDENTIFIABLE_RELATIVE_STD, ParameterEstimate
 
 Array = NDArray[np.float64]
 
-SAMPLING_PERIOD = 0.02
+_MEMORY_SAMPLING_PERIOD = 0.02
 # Two estimates agree when they differ by less than this many of the larger standard deviation, or by this fraction of
 # the value: below that the methods' own stopping rules show.
-STDS, FRACTION = 2.0, 0.005
-WHOLE = "all noise"  # what the run is called that weighs residuals by the noise that drives the motion too
+_AGREEMENT_STDS, _AGREEMENT_RTOL = 2.0, 0.005
+_ALL_NOISE_LABEL = "all noise"  # what the run is called that weighs residuals by the noise that drives the motion too
 
 
 @dataclass(frozen=True)
-class MethodRun:
+class MethodResult:
     """Solution, cost and computing effort of one estimation method.
 
     Attributes
@@ -40,65 +40,65 @@ class MethodRun:
     solution : Solution
     whitened_cost : float
         Cost of its solution in the problem's own weighting, the same for all methods.
-    held_out : list of (Episode, EpisodeResult or str)
+    held_out_predictions : list of (Episode, EpisodeResult or str)
     wall_seconds, cpu_seconds : float
-    peak_memory : float
+    peak_memory_mib : float
         Largest resident memory of the process during the run [MiB].
     """
 
     method: str
     solution: Solution
     whitened_cost: float
-    held_out: list[tuple[Episode, EpisodeResult | str]]
+    held_out_predictions: list[tuple[Episode, EpisodePrediction | str]]
     wall_seconds: float
     cpu_seconds: float
-    peak_memory: float
+    peak_memory_mib: float
 
 
 @dataclass(frozen=True)
-class Comparison:
+class MethodComparison:
     """Results of all methods on one problem, and where they disagree.
 
     Attributes
     ----------
-    runs : tuple of MethodRun
-    reference : str
+    method_results : tuple of MethodRun
+    reference_method : str
         Method of the lowest cost, with which the others are compared.
-    disturbed : bool
+    has_process_noise : bool
         Whether the problem has process noise, which the methods are compared without.
-    judged : Solution
+    verdict_solution : Solution
         Solution whose verdicts are reported: the reference's or, with process noise, that of a method that models it.
-    judged_held_out : list of (Episode, EpisodeResult or str)
+    verdict_held_out_predictions : list of (Episode, EpisodeResult or str)
         Its predictions of the held-out recordings.
-    agreement : mapping of method to list of str
+    disagreements : mapping of method to list of str
         One sentence for each identifiable parameter on which the method differs, with the likely reason; empty where
         it agrees.
-    explained : tuple of str
+    explanations : tuple of str
         Sentences on the estimates of unidentifiable parameters and, where the truth is known, on the parameters that
         steepest descent left far from it.
     """
 
-    runs: tuple[MethodRun, ...]
-    reference: str
-    disturbed: bool
-    judged: Solution
-    judged_held_out: list[tuple[Episode, EpisodeResult | str]]
-    agreement: Mapping[str, list[str]]
-    explained: tuple[str, ...]
+    method_results: tuple[MethodResult, ...]
+    reference_method: str
+    has_process_noise: bool
+    verdict_solution: Solution
+    verdict_held_out_predictions: list[tuple[Episode, EpisodePrediction | str]]
+    disagreements: Mapping[str, list[str]]
+    explanations: tuple[str, ...]
 
     @property
-    def agree(self) -> bool:
+    def is_consistent(self) -> bool:
         """Whether every method agrees on every identifiable parameter."""
-        return not any(self.agreement.values())
+        return not any(self.disagreements.values())
 
 
-def compare(
+def compare_methods(
     problem: EstimationProblem,
     solvers: Sequence[Solver],
     truth: Mapping[str, float] | None = None,
     callback: Callable[[str, Iterate], None] | None = None,
-    limits: GapLimits = USUAL,
-) -> Comparison:
+    limits: GapCriteria = DEFAULT_GAP_CRITERIA,
+) -> MethodComparison:
     """Run several methods from the same initial values and compare their estimates.
 
     Steepest descent gets the paper's cost (points in metres, no noise levels, no weak prior), the others the problem's,
@@ -136,26 +136,26 @@ def compare(
 
         wall, cpu = time.perf_counter(), time.process_time()
         with _Memory() as memory:
-            solution = solve(own, solver, callback=progress, limits=limits, restarts=not whole.disturbed)
+            solution = solve(own, solver, callback=progress, limits=limits, restarts=not whole.has_process_noise)
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         cost = problem.evaluate(solution.x, derivatives=False).cost
-        runs.append(MethodRun(solver.name, solution, cost, own.validate(solution.x), wall, cpu, memory.peak))
+        runs.append(MethodResult(solver.name, solution, cost, own.predict_held_out(solution.x), wall, cpu, memory.peak))
     best = min(runs, key=lambda run: run.whitened_cost)
     if best.method != "steepest_descent":
-        shown = replace(best, solution=with_intervals(problem, best.solution))
+        shown = replace(best, solution=with_profile_intervals(problem, best.solution))
         runs[runs.index(best)] = best = shown
-    judged, held_out = best.solution, best.held_out
-    if whole.disturbed:
-        able: Solver = next((solver for solver in solvers if carries_covariance(solver)), GaussNewton())
-        judged = solve(whole, able, callback=lambda entry: told(WHOLE, entry), limits=limits)
+    judged, held_out = best.solution, best.held_out_predictions
+    if whole.has_process_noise:
+        able: Solver = next((solver for solver in solvers if uses_process_noise_covariance(solver)), GaussNewton())
+        judged = solve(whole, able, callback=lambda entry: told(_ALL_NOISE_LABEL, entry), limits=limits)
         weighted = judged.problem or whole
-        judged, held_out = with_intervals(weighted, judged), weighted.validate(judged.x)
+        judged, held_out = with_profile_intervals(weighted, judged), weighted.predict_held_out(judged.x)
     agreement = {run.method: _differences(run, best, judged.parameters) for run in runs}
-    explained = tuple(_explanations(runs, judged.parameters, truth or {}, whole.disturbed))
-    return Comparison(tuple(runs), best.method, whole.disturbed, judged, held_out, agreement, explained)
+    explained = tuple(_explanations(runs, judged.parameters, truth or {}, whole.has_process_noise))
+    return MethodComparison(tuple(runs), best.method, whole.has_process_noise, judged, held_out, agreement, explained)
 
 
-def _differences(run: MethodRun, best: MethodRun, judged: Mapping[str, Estimate]) -> list[str]:
+def _differences(run: MethodResult, best: MethodResult, judged: Mapping[str, ParameterEstimate]) -> list[str]:
     """Where a method is not where the best one is, of the parameters that are found."""
     sentences = []
     for name, reference in best.solution.parameters.items():
@@ -163,7 +163,7 @@ def _differences(run: MethodRun, best: MethodRun, judged: Mapping[str, Estimate]
             continue
         entry = run.solution.parameters[name]
         gap = abs(entry.value - reference.value)
-        if gap <= max(STDS * max(entry.std, reference.std), FRACTION * abs(reference.value)):
+        if gap <= max(_AGREEMENT_STDS * max(entry.std, reference.std), _AGREEMENT_RTOL * abs(reference.value)):
             continue
         if run.solution.status != Status.CONVERGED:
             why = f"it ended with '{run.solution.status.value}' before reaching the optimum"
@@ -177,7 +177,7 @@ def _differences(run: MethodRun, best: MethodRun, judged: Mapping[str, Estimate]
 
 
 def _explanations(
-    runs: Sequence[MethodRun], judged: Mapping[str, Estimate], truth: Mapping[str, float], disturbed: bool
+    runs: Sequence[MethodResult], judged: Mapping[str, ParameterEstimate], truth: Mapping[str, float], disturbed: bool
 ) -> list[str]:
     """Where methods sent the parameters that are not found, and where the paper's method went wrong."""
     sentences = []
@@ -186,7 +186,7 @@ def _explanations(
             continue
         known = f" (truth {truth[name]:g})" if name in truth else ""
         places = ", ".join(f"{run.method} {run.solution.parameters[name].value:.3g}" for run in runs)
-        said = PREDICATES[reference.verdict]
+        said = VERDICT_PREDICATES[reference.verdict]
         sentences.append(f"{name}{known} {said}: where it ends is the method's choice ({places})")
     sentences += [
         _descent_errors(run, judged, truth, disturbed) for run in runs if run.method == "steepest_descent" and truth
@@ -194,15 +194,19 @@ def _explanations(
     return sentences
 
 
-def _descent_errors(run: MethodRun, judged: Mapping[str, Estimate], truth: Mapping[str, float], disturbed: bool) -> str:
+def _descent_errors(
+    run: MethodResult, judged: Mapping[str, ParameterEstimate], truth: Mapping[str, float], disturbed: bool
+) -> str:
     """Which parameters a method left far from the truth, and whether these are the ones that the data do not tell."""
     known = {name: entry for name, entry in judged.items() if entry.free and name in truth}
     found = {name: run.solution.parameters[name].value for name in known}
     # the same limit makes a standard deviation too large for an identifiable parameter
-    wrong = [name for name in known if abs(found[name] - truth[name]) > IDENTIFIABLE * abs(truth[name])]
+    wrong = [
+        name for name in known if abs(found[name] - truth[name]) > MAX_IDENTIFIABLE_RELATIVE_STD * abs(truth[name])
+    ]
     verdicts = {name: VERDICT_WORDS[entry.verdict] for name, entry in known.items()}
     hidden = [name for name in known if known[name].verdict != "identifiable"]
-    within = f"within {100 * IDENTIFIABLE:.0f} % of the truth"
+    within = f"within {100 * MAX_IDENTIFIABLE_RELATIVE_STD:.0f} % of the truth"
     if not wrong:
         return f"{run.method} ended {within} everywhere"
     places = ", ".join(f"{name} ({found[name]:.3g} for {truth[name]:.3g}, {verdicts[name]})" for name in wrong)
@@ -239,7 +243,7 @@ class _Memory:
     def _watch(self) -> None:
         while True:
             self.peak = max(self.peak, _resident())
-            if self._stop.wait(SAMPLING_PERIOD):
+            if self._stop.wait(_MEMORY_SAMPLING_PERIOD):
                 return
 
 

@@ -11,38 +11,38 @@ import numpy as np
 import scipy.optimize
 from numpy.typing import NDArray
 
-from yid_ocp.integrator.discrete import ConstraintForce, ForceSplit
-from yid_ocp.integrator.statics import Rest, Statics
+from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
+from yid_ocp.integrator.statics import Equilibrium, EquilibriumSolver
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 
 Array = NDArray[np.float64]
 
-DAMPINGS = ("damping", "twist_damping")
+_DAMPING_PARAMETERS = ("damping", "twist_damping")
 
 
 @dataclass(frozen=True)
-class Frequencies:
+class NaturalFrequencies:
     """Natural frequencies of one step map about an equilibrium, its robot held still.
 
     Attributes
     ----------
-    hertz : ndarray, shape (k,)
+    frequencies_hz : ndarray, shape (k,)
         Undamped, ascending [Hz].
-    growing : int
+    n_unstable_modes : int
         Number of damped modes that still grow from step to step: the equilibrium is unstable, or the time step is too
         long for the tension that the grasps put on the object.
     message : str
         Why there are no frequencies, empty otherwise.
     """
 
-    hertz: Array
-    growing: int = 0
+    frequencies_hz: Array
+    n_unstable_modes: int = 0
     message: str = ""
 
 
-def held_still(system: System) -> System:
+def _with_prescribed_joints(system: System) -> System:
     """The system with its driven joints prescribed."""
     return replace(system, driven=(), servos={}, prescribed=(*system.driven, *system.prescribed))
 
@@ -53,9 +53,9 @@ def natural_frequencies(
     theta: Array,
     time_step: float,
     force_split: ForceSplit = "symmetric",
-    constraint_force: ConstraintForce = "midpoint",
+    constraint_force: ConstraintForcePlacement = "midpoint",
     guess: Array | None = None,
-) -> Frequencies:
+) -> NaturalFrequencies:
     """Natural frequencies of a system's step map about an equilibrium, from the eigenvalues of A_k without damping.
 
     Parameters
@@ -72,27 +72,27 @@ def natural_frequencies(
     guess : ndarray, shape (n,), optional
         Configuration from which rest is sought.
     """
-    still = held_still(system)
+    still = _with_prescribed_joints(system)
     if not still.free_indices:
-        return Frequencies(np.zeros(0), message="every coordinate is prescribed, nothing can swing")
+        return NaturalFrequencies(np.zeros(0), message="every coordinate is prescribed, nothing can swing")
     step = compile_step(still, time_step, force_split, constraint_force, use_compiler=False)
     known = np.array([posture[name] for name in still.prescribed])
-    rest = Statics(step).solve(known, theta, guess=guess)
-    if not rest.converged:
-        return Frequencies(np.zeros(0), message=rest.message)
+    rest = EquilibriumSolver(step).solve(known, theta, guess=guess)
+    if not rest.is_converged:
+        return NaturalFrequencies(np.zeros(0), message=rest.message)
     undamped = theta.copy()
     for i, name in enumerate(system.parameters.names):
-        if name.rpartition(".")[2] in DAMPINGS:
+        if name.rpartition(".")[2] in _DAMPING_PARAMETERS:
             undamped[i] = 0.0
     angles = np.sort(np.angle(_eigenvalues(step, rest, known, undamped)))
     turning = angles[(angles > 1e-7) & (angles < math.pi - 1e-7)]
     growing = int(np.sum(np.abs(_eigenvalues(step, rest, known, theta)) > 1 + 1e-6))
-    return Frequencies(turning / (2 * math.pi * time_step), growing)
+    return NaturalFrequencies(turning / (2 * math.pi * time_step), growing)
 
 
-def _eigenvalues(step: Step, rest: Rest, known: Array, theta: Array) -> Array:
+def _eigenvalues(step: Step, rest: Equilibrium, known: Array, theta: Array) -> Array:
     """Eigenvalues of A at rest that belong to motion, not to what the constraints take away."""
-    n = step.system.size
+    n = step.system.n_coordinates
     q, p, z = rest.state[:n], rest.state[n : 2 * n], rest.state[2 * n :]
     a, _, _ = step.jacobians(q, p, np.zeros(0), theta, (known, known), z, names=())
     free = np.array(step.system.free_indices)
@@ -101,7 +101,7 @@ def _eigenvalues(step: Step, rest: Rest, known: Array, theta: Array) -> Array:
     return values[np.abs(values) > 0.2]
 
 
-def grasp_gaps(system: System, posture: Mapping[str, float], theta: Array) -> dict[str, float]:
+def min_grasp_gaps(system: System, posture: Mapping[str, float], theta: Array) -> dict[str, float]:
     """Smallest remaining gap of each grasp [m], by name: the robot's joints are fixed, the object may bend.
 
     Parameters
@@ -114,15 +114,15 @@ def grasp_gaps(system: System, posture: Mapping[str, float], theta: Array) -> di
     """
     if not system.grasps:
         return {}
-    q = ca.SX.sym("q", system.size)
+    q = ca.SX.sym("q", system.n_coordinates)
     kinematics = forward_kinematics(system.mechanism, q)
-    symbols = ca.vertcat(system.parameters.symbols, *system.internal.values())
-    numbers = np.concatenate([theta, np.zeros(len(system.internal))])
-    ends = [grasp.residual(kinematics)[:3] for grasp in system.grasps]
+    symbols = ca.vertcat(system.parameters.symbols, *system.internal_coordinates.values())
+    numbers = np.concatenate([theta, np.zeros(len(system.internal_coordinates))])
+    ends = [grasp.constraint_residual(kinematics)[:3] for grasp in system.grasps]
     phi = ca.substitute(ca.vertcat(*ends), symbols, ca.SX(ca.DM(numbers)))
     known = [system.mechanism.joint_index(name) for name in posture]
-    free = [i for i in range(system.size) if i not in known]
-    full = np.zeros(system.size)
+    free = [i for i in range(system.n_coordinates) if i not in known]
+    full = np.zeros(system.n_coordinates)
     full[known] = list(posture.values())
     function = ca.Function("phi", [q], [phi, ca.jacobian(phi, q)[:, free]])
 

@@ -11,42 +11,42 @@ import numpy as np
 import threadpoolctl
 from numpy.typing import ArrayLike, NDArray
 
-from yid_ocp.analysis.combinations import Component, combination_words, listed_names, sparse_basis
-from yid_ocp.analysis.profile import Profile, best_fit, profile_likelihood, sure_of_small
+from yid_ocp.analysis.parameter_combinations import DirectionComponent, describe_combination, join_names, sparse_basis
+from yid_ocp.analysis.profile import ParameterProfile, check_small_estimate, nearby_optimum, profile_likelihood
+from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.effects import make_effect
-from yid_ocp.errors import ConfigError, SolverError, nearest
+from yid_ocp.errors import ConfigError, SolverError, nearest_name_hint
 from yid_ocp.model.system import System
-from yid_ocp.parallel import map_in_step
+from yid_ocp.parallel import map_with_batched_calls
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.null_test import USUAL, GapLimits
-from yid_ocp.progress import SILENT, Parts, Progress
-from yid_ocp.shown import Shown, Summary, counted
+from yid_ocp.problem.null_test import DEFAULT_GAP_CRITERIA, GapCriteria
+from yid_ocp.progress import NULL_PROGRESS, ParallelProgress, Progress
 from yid_ocp.solvers.base import Solution
-from yid_ocp.solvers.judgement import (
-    IDENTIFIABLE,
-    UNINFORMED,
-    WEAK,
-    Estimate,
-    by_profile,
+from yid_ocp.solvers.fit_messages import VERDICT_WORDS, finite_or_none, parameter_text, percent_text
+from yid_ocp.solvers.uncertainty import (
+    MAX_IDENTIFIABLE_RELATIVE_STD,
+    MAX_WEAK_RELATIVE_STD,
+    MIN_UNINFORMED_RELATIVE_STD,
+    ParameterEstimate,
+    assess_goodness_of_fit,
+    covariance_and_chi2,
     covariance_of_fit,
-    estimates,
-    judge_fit,
-    parameter_names,
-    typical_sizes,
-    uncertainty,
-    verdict,
+    parameter_estimates,
+    parameter_unknown_names,
+    parameter_verdict,
+    typical_parameter_sizes,
+    with_profile_interval,
 )
-from yid_ocp.solvers.words import VERDICT_WORDS, finite, parameter_words, percent_words
 
 Array = NDArray[np.float64]
-StartKnowledge = Literal["assumed", "known", "unknown"]
+InitialStateKnowledge = Literal["assumed", "known", "unknown"]
 
-GRASP_EFFECT = "grasp_offset"
-GRASP_NUISANCE = f"{GRASP_EFFECT}@"
-GRASP_STD = 0.01  # prior of where a grasp sits [m]
+_GRASP_OFFSET_KIND = "grasp_offset"
+_GRASP_OFFSET_PREFIX = f"{_GRASP_OFFSET_KIND}@"
+GRASP_OFFSET_PRIOR_STD = 0.01  # prior of where a grasp sits [m]
 # A column this much smaller than the largest counts as zero where nuisances are eliminated.
-RANK_TOLERANCE = 1e-10
+_RANK_RTOL = 1e-10
 
 
 @dataclass(frozen=True)
@@ -65,8 +65,8 @@ class ParameterInformation:
     std_alone : float
         Relative standard deviation if all other unknowns were known.
     verdict : str
-        That of a solution at the same point (`solvers.judgement.verdict`), made consistent with a requested interval
-        (`solvers.judgement.by_profile`).
+        That of a solution at the same point (`solvers.judgement.parameter_verdict`), made consistent with a requested interval
+        (`solvers.judgement.with_profile_interval`).
     interval : (float or None, float or None), or None
         95 % interval by profile likelihood about the best fit of all unknowns, None for an open end; None as a whole
         where not requested.
@@ -82,7 +82,7 @@ class ParameterInformation:
 
 
 @dataclass(frozen=True)
-class Direction:
+class ParameterDirection:
     """A direction of relative parameter changes and its uncertainty.
 
     Attributes
@@ -107,21 +107,21 @@ class Direction:
 
 
 @dataclass(frozen=True, repr=False)
-class Identifiability(Shown):
+class IdentifiabilityResult(ReprMixin):
     """Identifiability of the free parameters from a set of recordings.
 
     Attributes
     ----------
     parameters : mapping of str to ParameterInformation
-    names : tuple of str, length p
+    parameter_names : tuple of str, length p
         In the order of the matrices.
     correlations : ndarray, shape (p, p)
         NaN in rows of parameters that nothing informs.
-    information : ndarray, shape (p, p)
+    fisher_information : ndarray, shape (p, p)
         Fisher information of relative changes, nuisances eliminated.
     directions : tuple of Direction
         Least observable first.
-    nuisances : tuple of str
+    nuisance_names : tuple of str
         Names of further unknowns, estimated together with the parameters.
     chi2_per_dof : float
         At the evaluated point; at a fit, standard deviations are scaled by its square root where it exceeds one.
@@ -129,29 +129,37 @@ class Identifiability(Shown):
     """
 
     parameters: Mapping[str, ParameterInformation]
-    names: tuple[str, ...]
+    parameter_names: tuple[str, ...]
     correlations: Array
-    information: Array
-    directions: tuple[Direction, ...]
-    nuisances: tuple[str, ...]
+    fisher_information: Array
+    directions: tuple[ParameterDirection, ...]
+    nuisance_names: tuple[str, ...]
     chi2_per_dof: float
-    profiles: Mapping[str, Profile] = field(default_factory=dict)
+    profiles: Mapping[str, ParameterProfile] = field(default_factory=dict)
 
-    def _summary(self) -> Summary:
+    def _summary(self) -> ReprSummary:
         rows = [("parameter", "value", "unit", "")]
         rows += [
-            (name, parameter_words(entry.value, finite(entry.std), None), entry.unit, VERDICT_WORDS[entry.verdict])
+            (
+                name,
+                parameter_text(entry.value, finite_or_none(entry.std), None),
+                entry.unit,
+                VERDICT_WORDS[entry.verdict],
+            )
             for name, entry in self.parameters.items()
         ]
-        return Summary(f"{len(self.identifiable)} of {counted(len(self.names), 'parameter')} found", rows)
+        return ReprSummary(
+            f"{len(self.identifiable_parameters)} of {count_with_noun(len(self.parameter_names), 'parameter')} found",
+            rows,
+        )
 
     @property
-    def identifiable(self) -> tuple[str, ...]:
-        """Names of parameters whose verdict is `identifiable`."""
+    def identifiable_parameters(self) -> tuple[str, ...]:
+        """Names of parameters whose verdict is `identifiable_parameters`."""
         return tuple(name for name, entry in self.parameters.items() if entry.verdict == "identifiable")
 
     @property
-    def unseen(self) -> tuple[Direction, ...]:
+    def unidentifiable_directions(self) -> tuple[ParameterDirection, ...]:
         """Directions whose verdict is `not_identifiable`."""
         return tuple(entry for entry in self.directions if entry.verdict == "not_identifiable")
 
@@ -160,12 +168,12 @@ def identifiability(
     problem: EstimationProblem,
     solution: Solution | ArrayLike | None = None,
     *,
-    start: StartKnowledge = "assumed",
+    start: InitialStateKnowledge = "assumed",
     grasp_std: float | None = None,
     intervals: Iterable[str] | Literal["all"] = (),
-    limits: GapLimits = USUAL,
-    progress: Progress = SILENT,
-) -> Identifiability:
+    limits: GapCriteria = DEFAULT_GAP_CRITERIA,
+    progress: Progress = NULL_PROGRESS,
+) -> IdentifiabilityResult:
     """Fisher-information analysis of which free parameters the problem's recordings determine.
 
     The Fisher information of independent Gaussian noise is I = J' J, J = d r/d x the whitened sensitivities; the
@@ -181,7 +189,7 @@ def identifiability(
         along, with the problem's prior about what it assumes; or none.
     grasp_std : float, optional
         Prior standard deviation of the fixed `grasp_offset@...` parameters of a system that has any (see
-        `with_grasp_offsets`), which are estimated along [m]; None for grasps that are known.
+        `with_grasp_offset_effects`), which are estimated along [m]; None for grasps that are known.
     intervals : iterable of str, or "all"
         Parameters whose interval by profile likelihood is wanted.
     limits : GapLimits, optional
@@ -213,81 +221,89 @@ def identifiability(
 def _information(
     problem: EstimationProblem,
     solution: Solution | ArrayLike | None,
-    start: StartKnowledge,
+    start: InitialStateKnowledge,
     grasp_std: float | None,
     intervals: Iterable[str] | Literal["all"],
-    limits: GapLimits,
+    limits: GapCriteria,
     progress: Progress,
-) -> Identifiability:
-    names = parameter_names(problem)
+) -> IdentifiabilityResult:
+    names = parameter_unknown_names(problem)
     wanted = names if intervals == "all" else tuple(intervals)
     for name in wanted:
         if name not in names:
-            raise ConfigError(f"'{name}' is not a free parameter", hint=nearest(name, names), where="intervals")
-    given = unknown_vector(problem, solution)
-    wide = with_nuisances(problem, given, start, grasp_std)
-    x = carried(given, problem.names, wide)
-    as_solved, wide = wide is problem, wide.weighted_at(x, rounds=2)
+            raise ConfigError(
+                f"'{name}' is not a free parameter", hint=nearest_name_hint(name, names), where="intervals"
+            )
+    given = unknowns_from_solution(problem, solution)
+    wide = with_nuisance_unknowns(problem, given, start, grasp_std)
+    x = transfer_unknowns(given, problem.unknown_names, wide)
+    as_solved, wide = wide is problem, wide.whitened_at(x, rounds=2)
     evaluation = wide.evaluate(x)
     if not evaluation.ok or evaluation.jacobian is None:
         raise SolverError(
             f"the model cannot be rolled out where its information is asked for: {evaluation.message}",
             hint="solve first, or choose other initial values",
         )
-    covariance, chi2 = uncertainty(wide, evaluation)
+    covariance, chi2 = covariance_and_chi2(wide, evaluation)
     inflation = math.sqrt(max(1.0, chi2))
     fit = None
     if solution is None:
         # far from the data chi2 says nothing of the noise
         covariance, inflation = covariance / inflation**2, 1.0
     else:
-        own = wide if as_solved else problem.weighted_at(given, rounds=2)
-        fit = judge_fit(own, evaluation if as_solved else own.evaluate(given), limits)
+        own = wide if as_solved else problem.whitened_at(given, rounds=2)
+        fit = assess_goodness_of_fit(own, evaluation if as_solved else own.evaluate(given), limits)
         covariance = covariance_of_fit(wide, evaluation, fit)
-    chosen = np.array([wide.names.index(name) for name in names], int)
-    scale = np.where(x[chosen] != 0, np.abs(x[chosen]), wide.scales[chosen])
-    view = _Sensitivities(wide, x, evaluation, names, chosen, split_rows(wide, evaluation, chosen), scale, inflation)
-    judged = estimates(wide, x, evaluation, covariance, fit)
+    chosen = np.array([wide.unknown_names.index(name) for name in names], int)
+    scale = np.where(x[chosen] != 0, np.abs(x[chosen]), wide.unknown_scales[chosen])
+    view = _Sensitivities(
+        wide, x, evaluation, names, chosen, _split_sensitivities(wide, evaluation, chosen), scale, inflation
+    )
+    judged = parameter_estimates(wide, x, evaluation, covariance, fit)
     std = np.array([judged[name].std for name in names])
     plain = np.sqrt(np.diag(covariance)[chosen])
-    informed = np.where(plain < UNINFORMED * np.maximum(scale, wide.scales[chosen]), plain, np.inf)
+    informed = np.where(
+        plain < MIN_UNINFORMED_RELATIVE_STD * np.maximum(scale, wide.unknown_scales[chosen]), plain, np.inf
+    )
     profiles, judged = _profiles(view, std, wanted, judged, progress)
-    return Identifiability(
+    return IdentifiabilityResult(
         _parameters(view, judged),
         names,
         _correlations(covariance[np.ix_(chosen, chosen)], informed),
         view.relative.T @ view.relative,
         _directions(view, std / scale),
-        tuple(name for name in wide.names if name not in names),
+        tuple(name for name in wide.unknown_names if name not in names),
         chi2,
         profiles,
     )
 
 
 def _profiles(
-    view: _Sensitivities, std: Array, wanted: Sequence[str], judged: Mapping[str, Estimate], progress: Progress
-) -> tuple[dict[str, Profile], dict[str, Estimate]]:
+    view: _Sensitivities, std: Array, wanted: Sequence[str], judged: Mapping[str, ParameterEstimate], progress: Progress
+) -> tuple[dict[str, ParameterProfile], dict[str, ParameterEstimate]]:
     """Profile likelihoods of the wanted parameters about the best fit of all unknowns, and what they leave to say."""
     if not wanted:
         return {}, dict(judged)
-    problem, (best, there) = view.problem, best_fit(view.problem, view.x)
-    sizes = typical_sizes(problem, view.x)
-    progress.stage(f"intervals of {len(wanted)} parameters by profile likelihood")
-    parts = Parts(progress, len(wanted), wanted[0])
+    problem, (best, there) = view.problem, nearby_optimum(view.problem, view.x)
+    sizes = typical_parameter_sizes(problem, view.x)
+    progress.begin_stage(f"intervals of {len(wanted)} parameters by profile likelihood")
+    parts = ParallelProgress(progress, len(wanted), wanted[0])
 
-    def one(name: str) -> tuple[Profile, Estimate]:
-        index, size = problem.names.index(name), sizes[name.split("[")[0]]
+    def one(name: str) -> tuple[ParameterProfile, ParameterEstimate]:
+        index, size = problem.unknown_names.index(name), sizes[name.split("[")[0]]
         found = profile_likelihood(problem, best, index, float(std[view.names.index(name)]), there)
-        said = sure_of_small(problem, best, index, judged[name], size, there)
-        parts.done(name)
-        return found, by_profile(judged[name], found.interval, size) if said.verdict == judged[name].verdict else said
+        said = check_small_estimate(problem, best, index, judged[name], size, there)
+        parts.count_done(name)
+        return found, with_profile_interval(judged[name], found.interval, size) if said.verdict == judged[
+            name
+        ].verdict else said
 
-    pairs = dict(zip(wanted, map_in_step(one, wanted), strict=True))
+    pairs = dict(zip(wanted, map_with_batched_calls(one, wanted), strict=True))
     profiles = {name: profile for name, (profile, _) in pairs.items()}
     return profiles, {**judged, **{name: said for name, (_, said) in pairs.items()}}
 
 
-def _parameters(view: _Sensitivities, judged: Mapping[str, Estimate]) -> dict[str, ParameterInformation]:
+def _parameters(view: _Sensitivities, judged: Mapping[str, ParameterEstimate]) -> dict[str, ParameterInformation]:
     """What is known of each parameter, from standard deviations with all others free and from its interval."""
     found = {}
     for i, name in enumerate(view.names):
@@ -316,36 +332,38 @@ def _correlations(covariance: Array, std: Array) -> Array:
 # -- nuisances --------------------------------------------------------------------------------------------------------
 
 
-def with_grasp_offsets(system: System) -> System:
+def with_grasp_offset_effects(system: System) -> System:
     """The system with a `grasp_offset` effect, at its neutral value, on every grasp that has none."""
-    there = {effect.location for effect in system.effects if effect.kind == GRASP_EFFECT}
+    there = {effect.location for effect in system.effects if effect.kind == _GRASP_OFFSET_KIND}
     places = [grasp.name for grasp in system.grasps if grasp.name not in there]
-    return system.with_effects([make_effect(GRASP_EFFECT, place, system) for place in places])
+    return system.with_effects([make_effect(_GRASP_OFFSET_KIND, place, system) for place in places])
 
 
-def unknown_vector(problem: EstimationProblem, solution: Solution | ArrayLike | None) -> Array:
+def unknowns_from_solution(problem: EstimationProblem, solution: Solution | ArrayLike | None) -> Array:
     """A problem's unknown vector from a solution, an array or, when absent, its initial values.
 
     Raises `SolverError` for a wrong shape or a value that is not finite.
     """
     if solution is None:
-        return problem.start
+        return problem.initial_unknowns
     if isinstance(solution, Solution):
-        x = problem.start
-        for name, value in zip(solution.names, solution.x, strict=True):
-            if name in problem.names:
-                x[problem.names.index(name)] = value
+        x = problem.initial_unknowns
+        for name, value in zip(solution.unknown_names, solution.x, strict=True):
+            if name in problem.unknown_names:
+                x[problem.unknown_names.index(name)] = value
         return x
     x = np.array(solution, float)
-    if x.shape != (len(problem.names),):
-        raise SolverError(f"the point has shape {x.shape}", allowed=f"({len(problem.names)},), as problem.names")
+    if x.shape != (len(problem.unknown_names),):
+        raise SolverError(
+            f"the point has shape {x.shape}", allowed=f"({len(problem.unknown_names)},), as problem.names"
+        )
     if not np.all(np.isfinite(x)):
-        raise SolverError(f"{problem.names[int(np.argmin(np.isfinite(x)))]} is not finite at the point")
+        raise SolverError(f"{problem.unknown_names[int(np.argmin(np.isfinite(x)))]} is not finite at the point")
     return x
 
 
-def with_nuisances(
-    problem: EstimationProblem, x: Array, start: StartKnowledge, grasp_std: float | None
+def with_nuisance_unknowns(
+    problem: EstimationProblem, x: Array, start: InitialStateKnowledge, grasp_std: float | None
 ) -> EstimationProblem:
     """The problem with initial state and grasp offsets among its unknowns, or with a fixed initial state.
 
@@ -361,41 +379,43 @@ def with_nuisances(
     if start == "assumed" and grasp_std is None:
         return problem
     options = problem.options
-    initial, known = options.initial_state, dict(options.known_start)
-    values = {name: dict(entry) for name, entry in options.recording_values.items()}
+    initial, known = options.initial_state, dict(options.known_initial_states)
+    values = {name: dict(entry) for name, entry in options.parameters_by_recording.items()}
     if initial == "fitted_to_points" and start != "assumed":
         # the fit's start stays where it is, and becomes the centre of a prior where it is unknown
         for episode in problem.episodes:
-            if episode.name not in known and episode.start is not None:
-                known[episode.name] = episode.start.state
-                values.setdefault(episode.name, {}).update(episode.start.values)
+            if episode.name not in known and episode.fixed_initial_state is not None:
+                known[episode.name] = episode.fixed_initial_state.state
+                values.setdefault(episode.name, {}).update(episode.fixed_initial_state.fitted_parameters)
     elif start == "known" and initial == "estimated":
         for i, episode in enumerate(problem.episodes):
-            begin = problem.start_state(episode, *problem.split(x, i))
-            if begin.message:
-                raise SolverError(f"there is no start to be known: {begin.message}", where=episode.name)
+            begin = problem.initial_state(episode, *problem.split(x, i))
+            if begin.failure_message:
+                raise SolverError(f"there is no start to be known: {begin.failure_message}", where=episode.name)
             known[episode.name] = begin.state
     if start != "assumed":
         initial = "estimated" if start == "unknown" else "equilibrium" if initial == "estimated" else initial
     grasps = [
         entry.name
         for entry in problem.system.parameters
-        if grasp_std is not None and entry.name.startswith(GRASP_NUISANCE) and entry.name not in problem.free
+        if grasp_std is not None and entry.name.startswith(_GRASP_OFFSET_PREFIX) and entry.name not in problem.free
     ]
     if initial == options.initial_state and not grasps:
         return problem
-    priors = dict(options.priors) | {name: float(grasp_std) for name in grasps if grasp_std is not None}
-    changed = replace(options, initial_state=initial, known_start=known, recording_values=values, priors=priors)
+    priors = dict(options.prior_stds) | {name: float(grasp_std) for name in grasps if grasp_std is not None}
+    changed = replace(
+        options, initial_state=initial, known_initial_states=known, parameters_by_recording=values, prior_stds=priors
+    )
     nominal = dict(zip(problem.system.parameters.names, problem.theta, strict=True))
     recordings = [episode.recording for episode in problem.episodes]
     return EstimationProblem(problem.step, recordings, (*problem.free, *grasps), changed, nominal)
 
 
-def carried(x: Array, names: Sequence[str], other: EstimationProblem) -> Array:
+def transfer_unknowns(x: Array, names: Sequence[str], other: EstimationProblem) -> Array:
     """Unknown vector of another problem: values of the same names, its own initial values for the rest."""
-    result = other.start
+    result = other.initial_unknowns
     place = {name: i for i, name in enumerate(names)}
-    for i, name in enumerate(other.names):
+    for i, name in enumerate(other.unknown_names):
         if name in place:
             result[i] = x[place[name]]
     return result
@@ -405,7 +425,7 @@ def carried(x: Array, names: Sequence[str], other: EstimationProblem) -> Array:
 
 
 @dataclass(frozen=True)
-class SplitRows:
+class _SensitivitySplit:
     """Whitened sensitivities of the parameters of interest.
 
     Attributes
@@ -423,23 +443,25 @@ class SplitRows:
     nuisance: Array
 
 
-def split_rows(problem: EstimationProblem, evaluation: Evaluation, chosen: NDArray[np.int64]) -> SplitRows:
+def _split_sensitivities(
+    problem: EstimationProblem, evaluation: Evaluation, chosen: NDArray[np.int64]
+) -> _SensitivitySplit:
     """Sensitivities of chosen unknowns with all others, and their priors, projected out."""
-    _, jacobian = problem.informing(evaluation)
+    _, jacobian = problem.residual_without_weak_priors(evaluation)
     jacobian = jacobian.copy()
     others = np.setdiff1d(np.arange(jacobian.shape[1]), chosen)
     # what is known beforehand of the parameters themselves is not something that a sensor sees
-    jacobian[problem.rows.stated_priors, chosen] = 0.0
-    alone, nuisance = jacobian[:, chosen], jacobian[:, others] * problem.scales[others]
-    return SplitRows(alone, without(alone, nuisance), nuisance)
+    jacobian[problem.residual_rows.stated_priors, chosen] = 0.0
+    alone, nuisance = jacobian[:, chosen], jacobian[:, others] * problem.unknown_scales[others]
+    return _SensitivitySplit(alone, _orthogonal_part(alone, nuisance), nuisance)
 
 
-def without(columns: Array, explained: Array) -> Array:
+def _orthogonal_part(columns: Array, explained: Array) -> Array:
     """The part of columns that is orthogonal to the columns `explained`."""
     if explained.shape[1] == 0:
         return columns
     vectors, singular, _ = np.linalg.svd(explained, full_matrices=False)
-    basis = vectors[:, singular > RANK_TOLERANCE * max(float(singular.max(initial=0.0)), 1e-300)]
+    basis = vectors[:, singular > _RANK_RTOL * max(float(singular.max(initial=0.0)), 1e-300)]
     return np.asarray(columns - basis @ (basis.T @ columns))
 
 
@@ -473,7 +495,7 @@ class _Sensitivities:
     evaluation: Evaluation
     names: tuple[str, ...]
     chosen: NDArray[np.int64]
-    split: SplitRows
+    split: _SensitivitySplit
     scale: Array
     inflation: float
 
@@ -492,14 +514,14 @@ class _Sensitivities:
         return self.problem.system.parameters[name.split("[")[0]].unit
 
 
-def _directions(view: _Sensitivities, std: Array) -> tuple[Direction, ...]:
+def _directions(view: _Sensitivities, std: Array) -> tuple[ParameterDirection, ...]:
     """Unseen parameters, plain unseen combinations, and what is seen; least seen first.
 
     `std`: relative standard deviations of the parameters, which count a misfit in time where directions count its size.
     """
     relative, alone, count = view.relative, view.alone, len(view.names)
-    found: list[Direction] = []
-    hidden = [i for i in range(count) if alone[i] * WEAK < 1.0]
+    found: list[ParameterDirection] = []
+    hidden = [i for i in range(count) if alone[i] * MAX_WEAK_RELATIVE_STD < 1.0]
     for i in hidden:
         size = float(np.linalg.norm(relative[:, i]))
         found.append(_direction(view, size, np.eye(count)[i], f"{view.names[i]} is not seen by any sensor"))
@@ -510,7 +532,7 @@ def _directions(view: _Sensitivities, std: Array) -> tuple[Direction, ...]:
         wide[: len(vectors), rest] = vectors
         sizes = np.zeros(len(rest))
         sizes[: len(singular)] = singular
-        blind = sizes * WEAK < 1.0
+        blind = sizes * MAX_WEAK_RELATIVE_STD < 1.0
         if np.any(blind):
             for vector in sparse_basis(_completed(wide, rest, blind)):
                 size = float(np.linalg.norm(relative @ vector))
@@ -522,17 +544,17 @@ def _directions(view: _Sensitivities, std: Array) -> tuple[Direction, ...]:
     return tuple(sorted(found, key=lambda entry: entry.singular_value))
 
 
-def _direction(view: _Sensitivities, size: float, vector: Array, words: str) -> Direction:
+def _direction(view: _Sensitivities, size: float, vector: Array, words: str) -> ParameterDirection:
     vector = vector * np.sign(vector[np.argmax(np.abs(vector))])
     std = 1.0 / size if size > 0 else math.inf
     components = {name: float(part) for name, part in zip(view.names, vector, strict=True)}
-    return Direction(size, std, components, verdict(1.0, std), words)
+    return ParameterDirection(size, std, components, parameter_verdict(1.0, std), words)
 
 
-def _components(view: _Sensitivities, vector: Array) -> list[Component]:
+def _components(view: _Sensitivities, vector: Array) -> list[DirectionComponent]:
     """The parameters that make up a direction."""
     return [
-        Component(name, float(part), float(view.x[index]), view.unit(name))
+        DirectionComponent(name, float(part), float(view.x[index]), view.unit(name))
         for name, part, index in zip(view.names, vector, view.chosen, strict=True)
         if abs(part) > 0.05 * np.max(np.abs(vector))
     ]
@@ -542,20 +564,20 @@ def _unseen_words(view: _Sensitivities, vector: Array) -> str:
     """Why a direction is not seen."""
     parts = _components(view, vector)
     seen_alone = float(np.linalg.norm(view.split.alone @ (view.scale * vector)))
-    if seen_alone / view.inflation * WEAK >= 1.0:
-        what = parts[0].name if len(parts) == 1 else "this: " + combination_words(parts, None)
+    if seen_alone / view.inflation * MAX_WEAK_RELATIVE_STD >= 1.0:
+        what = parts[0].name if len(parts) == 1 else "this: " + describe_combination(parts, None)
         return f"{what} cannot be told apart from {_hiding_nuisances(view, vector)}"
-    return combination_words(parts, lambda changes: _moved(view, changes))
+    return describe_combination(parts, lambda changes: _moved(view, changes))
 
 
 def _hiding_nuisances(view: _Sensitivities, vector: Array) -> str:
     """Which nuisances hide a direction."""
-    others = [name for i, name in enumerate(view.problem.names) if i not in set(view.chosen)]
+    others = [name for i, name in enumerate(view.problem.unknown_names) if i not in set(view.chosen)]
     column = (view.split.alone @ (view.scale * vector))[:, None] / view.inflation
-    groups = {"the unknown start": "start.", "where the grasp sits": GRASP_NUISANCE}
+    groups = {"the unknown start": "start.", "where the grasp sits": _GRASP_OFFSET_PREFIX}
     for words, prefix in groups.items():
         at = [i for i, name in enumerate(others) if name.startswith(prefix)]
-        if at and np.linalg.norm(without(column, view.split.nuisance[:, at])) * WEAK < 1.0:
+        if at and np.linalg.norm(_orthogonal_part(column, view.split.nuisance[:, at])) * MAX_WEAK_RELATIVE_STD < 1.0:
             return words
     return "the unknown start and where the grasp sits"
 
@@ -564,24 +586,24 @@ def _moved(view: _Sensitivities, changes: Mapping[str, float]) -> float:
     """How far the data move when parameters take other values, beyond what nuisances explain [standard deviations]."""
     problem, x = view.problem, view.x.copy()
     for name, value in changes.items():
-        x[problem.names.index(name)] = value
-    evaluation = problem.evaluate(x, False, view.evaluation.warm)
+        x[problem.unknown_names.index(name)] = value
+    evaluation = problem.evaluate(x, False, view.evaluation.equilibrium_guesses)
     if not evaluation.ok:
         return math.inf
-    rows = problem.rows.data
+    rows = problem.residual_rows.data
     change = np.zeros((len(view.split.alone), 1))
-    change[rows, 0] = (evaluation.residual[rows] - view.evaluation.residual[rows]) / problem.noise
-    return float(np.linalg.norm(without(change, view.split.nuisance))) / view.inflation
+    change[rows, 0] = (evaluation.residual[rows] - view.evaluation.residual[rows]) / problem.data_noise_unit
+    return float(np.linalg.norm(_orthogonal_part(change, view.split.nuisance))) / view.inflation
 
 
 def _seen_words(view: _Sensitivities, size: float, vector: Array, std: Array) -> str:
     """How well a direction is seen; of one parameter alone as its own standard deviation says."""
-    parts = sorted(_components(view, vector), key=lambda part: -abs(part.part))
+    parts = sorted(_components(view, vector), key=lambda part: -abs(part.coefficient))
     own = float(std[view.names.index(parts[0].name)])
     spread = own if len(parts) == 1 and math.isfinite(own) else 1.0 / size
-    how = "is seen" if spread <= IDENTIFIABLE else "is seen only weakly"
+    how = "is seen" if spread <= MAX_IDENTIFIABLE_RELATIVE_STD else "is seen only weakly"
     joint = "a joint change of " if len(parts) > 1 else ""
-    return f"{joint}{listed_names([part.name for part in parts])} {how} (± {percent_words(spread)} %)"
+    return f"{joint}{join_names([part.name for part in parts])} {how} (± {percent_text(spread)} %)"
 
 
 def _completed(wide: Array, rest: Sequence[int], blind: NDArray[np.bool_]) -> Array:

@@ -9,47 +9,52 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.parallel import map_in_step
+from yid_ocp.parallel import map_with_batched_calls
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.progress import SILENT, Parts, Progress
+from yid_ocp.progress import NULL_PROGRESS, ParallelProgress, Progress
 from yid_ocp.solvers import Solution
 from yid_ocp.solvers.gauss_newton import GaussNewton
-from yid_ocp.solvers.judgement import (
-    Estimate,
-    Interval,
-    by_profile,
-    parameter_names,
-    stands_by_itself,
-    typical_sizes,
-    uncertainty,
+from yid_ocp.solvers.linear_model import bounded_least_squares_step
+from yid_ocp.solvers.uncertainty import (
+    ConfidenceInterval,
+    ParameterEstimate,
+    covariance_and_chi2,
+    is_std_sufficient,
+    parameter_unknown_names,
+    typical_parameter_sizes,
+    with_profile_interval,
 )
-from yid_ocp.solvers.linear_model import bounded_step
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
-LEVEL = 3.841458820694124
+CHI2_QUANTILE_95 = 3.841458820694124
 """Quantile 0.95 of chi2 with one degree of freedom."""
 
-RULED_OUT = 10.827566170662733
+_CHI2_QUANTILE_999 = 10.827566170662733
 """Quantile 0.999."""
-SMALL = 0.3
+_SMALL_VALUE_FRACTION = 0.3
 """A value below this part of its typical size is small."""
 
-REACH = math.log(1e3)  # how far a positive unknown is followed, up and down, before its interval counts as open
-ANCHOR = math.log(1e3)  # standard deviation that keeps other positive unknowns in place that nothing informs
-REFIT_TOLERANCE = 1e-3  # chi2 that a refit may leave on the table
-ROOT_TOLERANCE = 0.01  # of the root of delta chi2 against its level's
-REFITS, ATTEMPTS = 30, 12
-MOST_INTERVALS, MOST_UNKNOWNS = 12, 300  # beyond, profiles take long and are worked out only where asked for
-POLISH = 20  # iterations that bring all unknowns, nuisances among them, to their best fit
-CLIFF, EDGE = 10.0, 1e-3  # height that is no parabola's, of the level's; distance of two sides, of that from the fit
-WIDENING, OVERSHOOT = 3.0, 1.3
+_MAX_LOG_DISTANCE = math.log(
+    1e3
+)  # how far a positive unknown is followed, up and down, before its interval counts as open
+_LOG_PRIOR_STD = math.log(1e3)  # standard deviation that keeps other positive unknowns in place that nothing informs
+_REFIT_CHI2_ATOL = 1e-3  # chi2 that a refit may leave on the table
+_ROOT_RTOL = 0.01  # of the root of delta chi2 against its level's
+_MAX_REFIT_ITERATIONS, _MAX_PROFILE_POINTS = 30, 12
+_MAX_AUTOMATIC_INTERVALS, _MAX_UNKNOWNS = 12, 300  # beyond, profiles take long and are worked out only where asked for
+_OPTIMUM_ITERATIONS = 20  # iterations that bring all unknowns, nuisances among them, to their best fit
+_CLIFF_HEIGHT_RATIO, _CLIFF_WIDTH_RTOL = (
+    10.0,
+    1e-3,
+)  # height that is no parabola's, of the level's; distance of two sides, of that from the fit
+_MAX_STEP_GROWTH, _STEP_OVERSHOOT = 3.0, 1.3
 
 
 @dataclass(frozen=True)
-class Profile:
+class ParameterProfile:
     """Profile likelihood of one unknown.
 
     Attributes
@@ -75,7 +80,7 @@ class Profile:
     notes: tuple[str, ...] = ()
 
     @property
-    def interval(self) -> Interval:
+    def interval(self) -> ConfidenceInterval:
         """Lower and upper end of the 95 % interval; None for an open end."""
         return self.lower, self.upper
 
@@ -86,8 +91,8 @@ def profile_likelihood(
     index: int,
     std: float,
     evaluation: Evaluation | None = None,
-    level: float = LEVEL,
-) -> Profile:
+    level: float = CHI2_QUANTILE_95,
+) -> ParameterProfile:
     """Profile-likelihood interval of one unknown: min over all others of chi2(x) - chi2(best) = level.
 
     Each value is reached from the last one, the others first moved along the tangent and then by Gauss-Newton.
@@ -120,7 +125,7 @@ def profile_likelihood(
     best = problem.evaluate(x) if evaluation is None else evaluation
     walk = _Walk(problem, x, index, best, level)
     size = std / abs(x[index]) if walk.logarithmic else std
-    size = min(size, 0.5) if walk.logarithmic else min(size, 10 * float(problem.scales[index]))
+    size = min(size, 0.5) if walk.logarithmic else min(size, 10 * float(problem.unknown_scales[index]))
     lower = walk.end(-1, size)
     upper = walk.end(1, size)
     order = np.argsort([point.value for point in walk.points])
@@ -129,14 +134,16 @@ def profile_likelihood(
     notes = walk.notes
     if walk.base < -0.1 * level:
         notes = [*notes, f"a fit better by {-walk.base:.2g} in chi2 was met; the point was not the best one"]
-    return Profile(problem.names[index], float(x[index]), lower, upper, values, deltas, tuple(notes))
+    return ParameterProfile(problem.unknown_names[index], float(x[index]), lower, upper, values, deltas, tuple(notes))
 
 
-def with_intervals(problem: EstimationProblem, solution: Solution, progress: Progress = SILENT) -> Solution:
+def with_profile_intervals(
+    problem: EstimationProblem, solution: Solution, progress: Progress = NULL_PROGRESS
+) -> Solution:
     """The solution with profile-likelihood intervals, and the verdicts they allow, for weakly determined parameters.
 
     There the cost is not a parabola; nor is it for stiffnesses that are small compared with their typical size
-    (`sure_of_small`). The solution is unchanged where the problem is not `small`, as profiles then take long.
+    (`check_small_estimate`). The solution is unchanged where the problem is not `is_small_problem`, as profiles then take long.
 
     Parameters
     ----------
@@ -146,36 +153,38 @@ def with_intervals(problem: EstimationProblem, solution: Solution, progress: Pro
     progress : Progress, optional
     """
     usable = solution.evaluation is not None and problem.options.weighting != "paper"
-    if not usable or not small(problem):
+    if not usable or not is_small_problem(problem):
         return solution
-    sizes = typical_sizes(problem, solution.x)
+    sizes = typical_parameter_sizes(problem, solution.x)
     asked = {
         name: sizes[name.split("[")[0]]
         for name, entry in solution.parameters.items()
         if entry.verdict in ("identifiable", "weak")
-        and (not stands_by_itself(entry) or entry.value < SMALL * sizes[name.split("[")[0]])
+        and (not is_std_sufficient(entry) or entry.value < _SMALL_VALUE_FRACTION * sizes[name.split("[")[0]])
     }
     if not asked:
         return solution
-    progress.stage(f"intervals of {', '.join(asked)} by profile likelihood")
-    best, there = best_fit(problem, solution.x)
-    parts = Parts(progress, len(asked), next(iter(asked)))
+    progress.begin_stage(f"intervals of {', '.join(asked)} by profile likelihood")
+    best, there = nearby_optimum(problem, solution.x)
+    parts = ParallelProgress(progress, len(asked), next(iter(asked)))
 
-    def judged(name: str) -> Estimate:
-        index, size = problem.names.index(name), asked[name]
-        entry = sure_of_small(problem, best, index, solution.parameters[name], size, there)
-        if entry.verdict != "not_identifiable" and not stands_by_itself(entry):
-            entry = by_profile(entry, profile_likelihood(problem, best, index, entry.std, there).interval, size)
-        parts.done(name)
+    def judged(name: str) -> ParameterEstimate:
+        index, size = problem.unknown_names.index(name), asked[name]
+        entry = check_small_estimate(problem, best, index, solution.parameters[name], size, there)
+        if entry.verdict != "not_identifiable" and not is_std_sufficient(entry):
+            entry = with_profile_interval(
+                entry, profile_likelihood(problem, best, index, entry.std, there).interval, size
+            )
+        parts.count_done(name)
         return entry
 
-    found = dict(zip(asked, map_in_step(judged, asked), strict=True))
+    found = dict(zip(asked, map_with_batched_calls(judged, asked), strict=True))
     return replace(solution, parameters={**solution.parameters, **found})
 
 
-def sure_of_small(
-    problem: EstimationProblem, x: Array, index: int, entry: Estimate, size: float, evaluation: Evaluation
-) -> Estimate:
+def check_small_estimate(
+    problem: EstimationProblem, x: Array, index: int, entry: ParameterEstimate, size: float, evaluation: Evaluation
+) -> ParameterEstimate:
     """The estimate, or `not_identifiable` where it is small and the data do not rule out its typical size at 99.9 %.
 
     A branch's twist that no sensor sees swings only where its stiffness is near zero. There it follows the noise: the
@@ -191,26 +200,31 @@ def sure_of_small(
     entry : Estimate
         Of this unknown.
     size : float
-        Its typical size, as in `solvers.judgement.typical_sizes`.
+        Its typical size, as in `solvers.judgement.typical_parameter_sizes`.
     evaluation : Evaluation
         At `x`, with the Jacobian.
     """
-    if entry.verdict not in ("identifiable", "weak") or not 0 <= entry.value < SMALL * size:
+    if entry.verdict not in ("identifiable", "weak") or not 0 <= entry.value < _SMALL_VALUE_FRACTION * size:
         return entry
-    walk = _Walk(problem, x, index, evaluation, RULED_OUT)
+    walk = _Walk(problem, x, index, evaluation, _CHI2_QUANTILE_999)
     rise = walk.rise(size)
-    log.info("%s = %.3g: chi2 rises by %.3g up to %.3g", problem.names[index], entry.value, rise, size)
-    return entry if rise > RULED_OUT else replace(entry, verdict="not_identifiable", std=math.inf, interval=None)
+    log.info("%s = %.3g: chi2 rises by %.3g up to %.3g", problem.unknown_names[index], entry.value, rise, size)
+    return (
+        entry if rise > _CHI2_QUANTILE_999 else replace(entry, verdict="not_identifiable", std=math.inf, interval=None)
+    )
 
 
-def small(problem: EstimationProblem) -> bool:
+def is_small_problem(problem: EstimationProblem) -> bool:
     """Whether a problem is small enough for its profile intervals to be computed by default."""
-    return len(parameter_names(problem)) <= MOST_INTERVALS and len(problem.names) <= MOST_UNKNOWNS
+    return (
+        len(parameter_unknown_names(problem)) <= _MAX_AUTOMATIC_INTERVALS
+        and len(problem.unknown_names) <= _MAX_UNKNOWNS
+    )
 
 
-def best_fit(problem: EstimationProblem, x: Array) -> tuple[Array, Evaluation]:
+def nearby_optimum(problem: EstimationProblem, x: Array) -> tuple[Array, Evaluation]:
     """Unknowns of the problem's optimum near a point, and the evaluation there with its Jacobian."""
-    outcome = GaussNewton(iterations=POLISH).run(problem, x, None)
+    outcome = GaussNewton(max_iterations=_OPTIMUM_ITERATIONS).minimize_cost(problem, x, None)
     return outcome.x, problem.evaluate(outcome.x)
 
 
@@ -231,7 +245,7 @@ class _Walk:
     def __init__(self, problem: EstimationProblem, x: Array, index: int, best: Evaluation, level: float) -> None:
         self.problem, self.index, self.level = problem, index, level
         lower, upper = problem.bounds
-        self.positive = problem.positive & (x > 0)
+        self.positive = problem.is_positive & (x > 0)
         self.logarithmic = bool(self.positive[index])
         # infinite bounds and bounds at zero become infinite ones of the coordinates
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -240,8 +254,8 @@ class _Walk:
         self.others = np.array([i for i in range(len(x)) if i != index], int)
         self.anchored = np.array([i for i in self.others if self.positive[i]], int)
         self.centre = self.coordinates(x)
-        self.noise = problem.noise
-        self.scale = max(1.0, uncertainty(problem, best)[1])
+        self.noise = problem.data_noise_unit
+        self.scale = max(1.0, covariance_and_chi2(problem, best)[1])
         self.first = self._chi2(best)
         self.base = 0.0
         self.notes: list[str] = []
@@ -265,7 +279,7 @@ class _Walk:
         outside: _Point | None = None
         barrier: float | None = None
         step = target * size
-        for _ in range(ATTEMPTS):
+        for _ in range(_MAX_PROFILE_POINTS):
             reach = limit if barrier is None else barrier
             trial = s + sign * step
             trial = min(trial, reach) if sign > 0 else max(trial, reach)
@@ -282,7 +296,7 @@ class _Walk:
             self.points.append(point)
             self.base = min(self.base, point.chi2)
             height = self._height(point)
-            if abs(height - target) < ROOT_TOLERANCE * target:
+            if abs(height - target) < _ROOT_RTOL * target:
                 return point.value
             if height > target:
                 outside = point
@@ -292,11 +306,11 @@ class _Walk:
                 return None
             # the root of a parabola is a line, whose slope from the start tells how far the level still is
             gone = abs(trial - self.centre[self.index])
-            ahead = gone * (target / height - 1.0) * OVERSHOOT if height > 0.05 * target else math.inf
-            step = min(max(ahead, 0.2 * gone), WIDENING * gone) if barrier is None else 0.5 * abs(barrier - s)
+            ahead = gone * (target / height - 1.0) * _STEP_OVERSHOOT if height > 0.05 * target else math.inf
+            step = min(max(ahead, 0.2 * gone), _MAX_STEP_GROWTH * gone) if barrier is None else 0.5 * abs(barrier - s)
         if outside is None:
             if barrier is None:
-                self.notes.append(f"no end was met {'above' if sign > 0 else 'below'} in {ATTEMPTS} refits")
+                self.notes.append(f"no end was met {'above' if sign > 0 else 'below'} in {_MAX_PROFILE_POINTS} refits")
             else:
                 value = self.unknowns(np.full(len(self.centre), barrier))[self.index]
                 self.notes.append(f"the model cannot be rolled out {'above' if sign > 0 else 'below'} {value:.4g}")
@@ -313,9 +327,9 @@ class _Walk:
     def _limit(self, sign: int) -> float:
         bound = float((self.upper if sign > 0 else self.lower)[self.index])
         if not self.logarithmic:
-            reach = self.centre[self.index] + sign * 1e3 * float(self.problem.scales[self.index])
+            reach = self.centre[self.index] + sign * 1e3 * float(self.problem.unknown_scales[self.index])
         else:
-            reach = self.centre[self.index] + sign * REACH
+            reach = self.centre[self.index] + sign * _MAX_LOG_DISTANCE
         return min(bound, reach) if sign > 0 else max(bound, reach)
 
     def _height(self, point: _Point) -> float:
@@ -326,14 +340,14 @@ class _Walk:
         a, b = inside, outside
         heights = [self._height(a) - target, self._height(b) - target]
         share = 1.0  # of the older side's height that counts, halved each time that side is kept
-        for attempt in range(2 * ATTEMPTS + 1):
+        for attempt in range(2 * _MAX_PROFILE_POINTS + 1):
             at = [float(point.x[self.index]) for point in (a, b)]
             older = share * heights[0]
-            cliff = max(heights) > CLIFF * target
+            cliff = max(heights) > _CLIFF_HEIGHT_RATIO * target
             s = 0.5 * (at[0] + at[1]) if cliff else at[1] - heights[1] * (at[1] - at[0]) / (heights[1] - older)
             # a cliff's edge is known well enough when its two sides are near each other
-            near = abs(at[1] - at[0]) < EDGE * abs(at[1] - self.centre[self.index])
-            if min(map(abs, heights)) < ROOT_TOLERANCE * target or near or attempt == 2 * ATTEMPTS:
+            near = abs(at[1] - at[0]) < _CLIFF_WIDTH_RTOL * abs(at[1] - self.centre[self.index])
+            if min(map(abs, heights)) < _ROOT_RTOL * target or near or attempt == 2 * _MAX_PROFILE_POINTS:
                 s = at[int(abs(heights[1]) < abs(heights[0]))]
                 break
             # beyond the end the others may sit where nothing moves them any more
@@ -360,7 +374,7 @@ class _Walk:
         tangent = -near.jacobian[:, self.index] * change
         if len(others):
             low, high = self.lower[others] - now[others], self.upper[others] - now[others]
-            now[others] += bounded_step(near.jacobian[:, others], -tangent, 0.0, low, high)
+            now[others] += bounded_least_squares_step(near.jacobian[:, others], -tangent, 0.0, low, high)
         now[self.index] = s
         found = self._at(now)
         if found is None:
@@ -369,16 +383,16 @@ class _Walk:
             now[self.index] = s
             found = self._at(now)
         damping, rejected = 1e-8, 0
-        for _ in range(REFITS):
+        for _ in range(_MAX_REFIT_ITERATIONS):
             if found is None or not len(others):
                 break
             jacobian = found.jacobian[:, others]
             low, high = self.lower[others] - now[others], self.upper[others] - now[others]
-            step = bounded_step(jacobian, found.rows, damping, low, high)
+            step = bounded_least_squares_step(jacobian, found.rows, damping, low, high)
             largest = float(np.max(np.abs(step[self.positive[others]]), initial=0.0))
             step *= min(1.0, 1.5 / max(largest, 1e-300))
             promised = -2.0 * float(found.rows @ (jacobian @ step)) - float(np.sum((jacobian @ step) ** 2))
-            if promised / self.scale < REFIT_TOLERANCE:
+            if promised / self.scale < _REFIT_CHI2_ATOL:
                 break
             trial = now.copy()
             trial[others] += step
@@ -405,15 +419,15 @@ class _Walk:
         """Twice the cost without the weak priors, in units of the noise."""
         stated, weak = (
             float(np.sum(evaluation.residual[rows] ** 2))
-            for rows in (self.problem.rows.stated_priors, self.problem.rows.weak_priors)
+            for rows in (self.problem.residual_rows.stated_priors, self.problem.residual_rows.weak_priors)
         )
         return (2.0 * evaluation.cost - weak - stated) / self.noise**2 + stated
 
     def _rows(self, evaluation: Evaluation, s: Array) -> tuple[Array, Array]:
         """Residual and Jacobian by the coordinates, with the anchors in place of the weak priors."""
-        residual, jacobian = self.problem.informing(evaluation)
+        residual, jacobian = self.problem.residual_without_weak_priors(evaluation)
         slope = np.where(self.positive, self.unknowns(s), 1.0)
         anchors = np.zeros((len(self.anchored), len(s)))
-        anchors[np.arange(len(self.anchored)), self.anchored] = 1.0 / ANCHOR
-        held = (s - self.centre)[self.anchored] / ANCHOR
+        anchors[np.arange(len(self.anchored)), self.anchored] = 1.0 / _LOG_PRIOR_STD
+        held = (s - self.centre)[self.anchored] / _LOG_PRIOR_STD
         return np.concatenate([residual, held]), np.vstack([jacobian * slope, anchors])

@@ -21,21 +21,31 @@ from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent, ScalarEvent
 
-from yid_ocp.config import keys
-from yid_ocp.config.keys import Sections, sections_of, unknown_key
-from yid_ocp.config.settings import Run
-from yid_ocp.errors import ConfigError, nearest
-from yid_ocp.options import About, entries_of, members, options_of, stripped, values_of, words
+from yid_ocp.config import setting_keys
+from yid_ocp.config.setting_keys import SectionVariants, section_variants, unknown_key_error
+from yid_ocp.config.settings import RunSettings
+from yid_ocp.errors import ConfigError, nearest_name_hint
+from yid_ocp.options import (
+    OptionInfo,
+    dataclass_options,
+    describe_type,
+    mapping_value_type,
+    sequence_entry_type,
+    split_annotated,
+    union_members,
+)
 
-KeyPath = tuple[str | int, ...]
-DEFAULT = "dual_arm_vision.yaml"
-DIAGNOSIS_DEFAULT = "diagnosis.yaml"
+_KeyPath = tuple[str | int, ...]
+DEFAULT_CONFIG = "dual_arm_vision.yaml"
+DEFAULT_DIAGNOSIS_CONFIG = "diagnosis.yaml"
 
-DEPTH, LARGEST = 40, 100_000
+_MAX_DEPTH, _MAX_ENTRIES = 40, 100_000
 """Levels and entries of a configuration, far beyond what any needs."""
 
 
-def load_config(path: str | Path | None = None, overrides: Sequence[str] = (), default: str = DEFAULT) -> Run:
+def load_config(
+    path: str | Path | None = None, overrides: Sequence[str] = (), default: str = DEFAULT_CONFIG
+) -> RunSettings:
     """Read and check a configuration file.
 
     Parameters
@@ -68,11 +78,11 @@ def load_config(path: str | Path | None = None, overrides: Sequence[str] = (), d
     data, places = _parse(text, origin)
     for override in overrides:
         _override(data, places, override)
-    run = _Reader(places, origin, base).build(Run, data, ())
-    return dataclasses.replace(run, name=name, file=file, places=places)
+    run = _Reader(places, origin, base).build(RunSettings, data, ())
+    return dataclasses.replace(run, name=name, config_file=file, key_locations=places)
 
 
-def settable(prefix: str, path: str | Path | None = None) -> list[str]:
+def settable_keys(prefix: str, path: str | Path | None = None) -> list[str]:
     """Dotted keys that `overrides` may set and that begin with a prefix, with the names used in a given file.
 
     Raises
@@ -81,7 +91,7 @@ def settable(prefix: str, path: str | Path | None = None) -> list[str]:
         The file cannot be read.
     """
     data = {} if path is None else _parse(_read(Path(path)), str(path))[0]
-    return list(keys.settable(Run, prefix, data))
+    return list(setting_keys.iter_settable_keys(RunSettings, prefix, data))
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------
@@ -93,7 +103,7 @@ def _read(path: Path) -> str:
     except FileNotFoundError as error:
         hint = "check the path"
         if path.parent.is_dir():
-            hint = nearest(path.name, (entry.name for entry in path.parent.glob("*.yaml")))
+            hint = nearest_name_hint(path.name, (entry.name for entry in path.parent.glob("*.yaml")))
         raise ConfigError("there is no such configuration file", where=str(path), hint=hint) from error
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
@@ -102,13 +112,13 @@ def _read(path: Path) -> str:
         ) from error
 
 
-def _parse(text: str, origin: str) -> tuple[dict[str, Any], dict[KeyPath, str]]:
+def _parse(text: str, origin: str) -> tuple[dict[str, Any], dict[_KeyPath, str]]:
     data = _loaded(text, origin)
     if data is None:
         data = CommentedMap()
     if not isinstance(data, CommentedMap):
         raise ConfigError("the file does not hold keys and values", where=origin, allowed="sections such as `model:`")
-    places: dict[KeyPath, str] = {}
+    places: dict[_KeyPath, str] = {}
     return _unwrap(data, (), places, origin), places
 
 
@@ -118,8 +128,8 @@ def _loaded(text: str, origin: str) -> Any:
         depth = 0
         for event in YAML(typ="rt").parse(io.StringIO(text)):
             depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
-            if depth > DEPTH:
-                raise _odd(f"more than {DEPTH} levels stand in one another", origin, event)
+            if depth > _MAX_DEPTH:
+                raise _odd(f"more than {_MAX_DEPTH} levels stand in one another", origin, event)
             if isinstance(event, (ScalarEvent, CollectionStartEvent)) and event.tag is not None:
                 raise _odd(f"the tag '{event.tag}' asks for a type", origin, event)
         return YAML(typ="rt").load(text)
@@ -147,10 +157,10 @@ def _odd(what: str, origin: str, event: Any) -> ConfigError:
     )
 
 
-def _unwrap(node: Any, path: KeyPath, places: dict[KeyPath, str], origin: str) -> Any:
+def _unwrap(node: Any, path: _KeyPath, places: dict[_KeyPath, str], origin: str) -> Any:
     """Plain Python values in place of the YAML reader's own; their lines go into `places`."""
-    if len(places) > LARGEST or len(path) > DEPTH:
-        what = f"aliases make more than {LARGEST} entries, or stand for themselves"
+    if len(places) > _MAX_ENTRIES or len(path) > _MAX_DEPTH:
+        what = f"aliases make more than {_MAX_ENTRIES} entries, or stand for themselves"
         raise ConfigError(what, where=origin, hint="write what the aliases stand for")
     if isinstance(node, CommentedMap):
         result: dict[str, Any] = {}
@@ -181,14 +191,14 @@ def _line(node: CommentedMap | CommentedSeq, key: Any) -> int:
         return int(node.lc.line) + 1
 
 
-def _override(data: dict[str, Any], places: dict[KeyPath, str], text: str) -> None:
+def _override(data: dict[str, Any], places: dict[_KeyPath, str], text: str) -> None:
     key, equals, value_text = text.partition("=")
     origin = f"--set {key.strip()}"
     if not equals or not key.strip():
         raise ConfigError(
             f"'{text}' does not set anything", where="--set", allowed="KEY=VALUE, for example problem.time_step=0.005"
         )
-    path, hint = _key_path(Run, key.strip().split("."), origin, data)
+    path, hint = _key_path(RunSettings, key.strip().split("."), origin, data)
     try:
         value = _loaded(value_text, origin) if value_text.strip() else None
     except ConfigError as error:
@@ -204,12 +214,12 @@ def _override(data: dict[str, Any], places: dict[KeyPath, str], text: str) -> No
             entry = parent[part] = {}
             places[path[: i + 1]] = origin
         parent = entry
-    own: dict[KeyPath, str] = {path: origin}
+    own: dict[_KeyPath, str] = {path: origin}
     parent[path[-1]] = _merged(hint, parent.get(path[-1]), _unwrap(value, path, own, origin), path, places)
     places |= own
 
 
-def _merged(hint: Any, before: Any, value: Any, path: KeyPath, places: dict[KeyPath, str]) -> Any:
+def _merged(hint: Any, before: Any, value: Any, path: _KeyPath, places: dict[_KeyPath, str]) -> Any:
     """What stands at a key once a value is set there: sections of one kind merge, all else is replaced.
 
     An empty section replaces too: nothing else would make room for other names than those that stand there.
@@ -218,41 +228,45 @@ def _merged(hint: Any, before: Any, value: Any, path: KeyPath, places: dict[KeyP
         for known in [known for known in places if known[: len(path)] == path]:
             del places[known]
         return value
-    sections = sections_of(hint)
-    keys = {} if sections is None else sections.keys(sections.word({**before, **value}))
+    sections = section_variants(hint)
+    keys = {} if sections is None else sections.variant_options(sections.selected_variant({**before, **value}))
     for name, entry in value.items():
-        kind = keys[name].hint if name in keys else values_of(hint)
+        kind = keys[name].type_hint if name in keys else mapping_value_type(hint)
         before[name] = _merged(kind, before.get(name), entry, (*path, name), places)
     return before
 
 
 def _another(hint: Any, before: dict[str, Any], value: dict[str, Any]) -> bool:
     """Whether a section chooses another kind or method, with other keys, than the one that stands there."""
-    sections = sections_of(hint)
-    return sections is not None and sections.key in value and sections.word(value) != sections.word(before)
+    sections = section_variants(hint)
+    return (
+        sections is not None
+        and sections.selector_key in value
+        and sections.selected_variant(value) != sections.selected_variant(before)
+    )
 
 
 def _key_path(hint: Any, parts: list[str], origin: str, raw: Any) -> tuple[tuple[str, ...], Any]:
     """Split a dotted key by the settings' types, and say which type stands there; names such as T1.bend keep dots."""
     if not parts:
         return (), hint
-    sections = sections_of(hint)
+    sections = section_variants(hint)
     if sections is not None:
-        known = sections.keys(sections.word(raw))
+        known = sections.variant_options(sections.selected_variant(raw))
         if parts[0] not in known:
-            raise unknown_key(Run, parts[0], known, origin)
-        return _below(parts[0], _key_path(known[parts[0]].hint, parts[1:], origin, _inner(raw, parts[0])))
-    values = values_of(hint)
+            raise unknown_key_error(RunSettings, parts[0], known, origin)
+        return _below(parts[0], _key_path(known[parts[0]].type_hint, parts[1:], origin, _inner(raw, parts[0])))
+    values = mapping_value_type(hint)
     if values is None:
         raise ConfigError(f"there are no keys below '{parts[0]}'", where=origin, hint="shorten the key")
-    inner = sections_of(values)
-    if inner is not None and inner.key == "name":
-        inner = inner.of(parts[0], origin)
+    inner = section_variants(values)
+    if inner is not None and inner.selector_key == "name":
+        inner = inner.for_name(parts[0], origin)
         return _below(parts[0], _key_path(next(iter(inner.classes.values())), parts[1:], origin, None))
-    known = {} if inner is None else inner.keys()
+    known = {} if inner is None else inner.variant_options()
     cut = next((i for i in range(len(parts) - 1, 0, -1) if parts[i] in known), len(parts))
     if isinstance(raw, dict) and ".".join(parts[:-1]) in raw and cut == len(parts) and known:
-        raise unknown_key(Run, parts[-1], known, origin)
+        raise unknown_key_error(RunSettings, parts[-1], known, origin)
     name = ".".join(parts[:cut])
     return _below(name, _key_path(values, parts[cut:], origin, _inner(raw, name)))
 
@@ -272,11 +286,11 @@ def _inner(raw: Any, name: str) -> Any:
 class _Reader:
     """Builds settings from plain data and says where something is wrong."""
 
-    places: Mapping[KeyPath, str]
+    places: Mapping[_KeyPath, str]
     origin: str
     base: Path
 
-    def where(self, path: KeyPath) -> str:
+    def where(self, path: _KeyPath) -> str:
         key = ".".join(map(str, path))
         for count in range(len(path), 0, -1):
             if path[:count] in self.places:
@@ -284,51 +298,55 @@ class _Reader:
                 return place if place == f"--set {key}" else f"{place}: {key}"
         return f"{self.origin}: {key}" if key else self.origin
 
-    def build(self, hint: Any, raw: Any, path: KeyPath) -> Any:
+    def build(self, hint: Any, raw: Any, path: _KeyPath) -> Any:
         """A value of the given type."""
-        sections, entries, values = sections_of(hint), entries_of(hint), values_of(hint)
+        sections, entries, values = section_variants(hint), sequence_entry_type(hint), mapping_value_type(hint)
         if sections is not None:
-            return None if raw is None and sections.nullable else self._section(sections, raw, path)
-        if entries is not None and sections_of(entries) is not None:
+            return None if raw is None and sections.is_nullable else self._section(sections, raw, path)
+        if entries is not None and section_variants(entries) is not None:
             if not isinstance(raw, list):
                 raise self._wrong(raw, hint, path)
             return tuple(self.build(entries, value, (*path, i)) for i, value in enumerate(raw))
-        inner = sections_of(values)
+        inner = section_variants(values)
         if inner is not None:
             if raw is not None and not isinstance(raw, dict):
                 raise self._wrong(raw, hint, path)
             return {
-                name: self._section(inner.of(name, self.where((*path, name))), value, (*path, name))
+                name: self._section(inner.for_name(name, self.where((*path, name))), value, (*path, name))
                 for name, value in (raw or {}).items()
             }
         return self._leaf(hint, raw, path)
 
-    def _section(self, sections: Sections, raw: Any, path: KeyPath) -> Any:
+    def _section(self, sections: SectionVariants, raw: Any, path: _KeyPath) -> Any:
         raw = {} if raw is None else raw
         if not isinstance(raw, dict):
-            keys = list(sections.keys(sections.default))
+            keys = list(sections.variant_options(sections.default_variant))
             raise ConfigError(
                 f"{self._name(path)} = {_shown(raw)} is not a section",
                 where=self.where(path),
                 allowed="keys: " + ", ".join(keys),
                 hint=_key_meant(self._name(path), keys),
             )
-        word = sections.word(raw)
+        word = sections.selected_variant(raw)
         if not isinstance(word, str) or word not in sections.classes:
-            raise sections.unknown(word, self.where((*path, sections.key) if sections.key in raw else path))
-        known, kind = sections.keys(word), sections.classes[word]
+            raise sections.unknown_variant_error(
+                word, self.where((*path, sections.selector_key) if sections.selector_key in raw else path)
+            )
+        known, kind = sections.variant_options(word), sections.classes[word]
         for name in raw:
             if name not in known:
-                raise unknown_key(Run, name, known, self.where((*path, name)), ".".join(map(str, path)))
+                raise unknown_key_error(RunSettings, name, known, self.where((*path, name)), ".".join(map(str, path)))
         values: dict[str, Any] = {}
-        for name, option in options_of(kind).items():
+        for name, option in dataclass_options(kind).items():
             if name in raw:
-                values[option.field] = self.build(option.hint, raw[name], (*path, name))
-            elif option.default is MISSING:
-                raise ConfigError(f"the key '{name}' is missing", where=self.where(path), allowed=words(option.hint))
+                values[option.field_name] = self.build(option.type_hint, raw[name], (*path, name))
+            elif option.default_value is MISSING:
+                raise ConfigError(
+                    f"the key '{name}' is missing", where=self.where(path), allowed=describe_type(option.type_hint)
+                )
         return kind(**values)
 
-    def _leaf(self, hint: Any, raw: Any, path: KeyPath) -> Any:
+    def _leaf(self, hint: Any, raw: Any, path: _KeyPath) -> Any:
         try:
             text = json.dumps(raw)
             value = _adapter(hint).validate_json(text, strict=True)
@@ -338,8 +356,8 @@ class _Reader:
             raise self._wrong(raw, hint, path)
         return _absolute(value, hint, self.base)
 
-    def _wrong(self, raw: Any, hint: Any, path: KeyPath) -> ConfigError:
-        unit = next((m.unit for m in stripped(hint)[1] if isinstance(m, About) and m.unit), "")
+    def _wrong(self, raw: Any, hint: Any, path: _KeyPath) -> ConfigError:
+        unit = next((m.unit for m in split_annotated(hint)[1] if isinstance(m, OptionInfo) and m.unit), "")
         hint_text = ""
         if isinstance(raw, str) and (match := re.fullmatch(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*([^\d\s].*)", raw)):
             hint_text = f"write the number alone, in {unit}" if unit else "write the number alone"
@@ -348,12 +366,12 @@ class _Reader:
         return ConfigError(
             f"{self._name(path)} = {_shown(raw)} is not allowed",
             where=self.where(path),
-            allowed=words(hint),
+            allowed=describe_type(hint),
             hint=hint_text,
         )
 
     @staticmethod
-    def _name(path: KeyPath) -> str:
+    def _name(path: _KeyPath) -> str:
         return ".".join(map(str, path)) or "the configuration"
 
 
@@ -380,10 +398,10 @@ def _has_nan(raw: Any) -> bool:
 def _absolute(value: Any, hint: Any, base: Path) -> Any:
     """Paths within a value, relative to the configuration no longer."""
     if isinstance(value, tuple):
-        entries = entries_of(hint)
+        entries = sequence_entry_type(hint)
         return value if entries is None else tuple(_absolute(entry, entries, base) for entry in value)
-    markers = [marker for part in (hint, *members(hint)) for marker in stripped(part)[1]]
-    is_path = any(isinstance(marker, About) and marker.path for marker in markers)
+    markers = [marker for part in (hint, *union_members(hint)) for marker in split_annotated(part)[1]]
+    is_path = any(isinstance(marker, OptionInfo) and marker.is_path for marker in markers)
     if not isinstance(value, str) or not is_path or value.startswith(("package:", "default:")):
         return value
     return str((base / Path(value).expanduser()).resolve())

@@ -16,47 +16,49 @@ from annotated_types import Ge, Gt, Le, Len, Lt
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedSeq
 
-from yid_ocp.data.recording import Clock
+from yid_ocp.data.recording import ClockKind
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import ConfigError
-from yid_ocp.integrator.discrete import ConstraintForce, ForceSplit
+from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
 from yid_ocp.model.cable import CableOptions
-from yid_ocp.model.drives import Commands
-from yid_ocp.options import About, Among, options_of, stripped
+from yid_ocp.model.servos_and_springs import CommandInterpolation
+from yid_ocp.options import OptionInfo, RegistryChoice, dataclass_options, split_annotated
 from yid_ocp.planning.options import PlanOptions
-from yid_ocp.problem.null_test import GapLimits
+from yid_ocp.problem.null_test import GapCriteria
 from yid_ocp.problem.options import ProblemOptions, SensorOptions
 from yid_ocp.solvers import SOLVERS, GaussNewton, Lifted, MultipleShooting, SingleShooting, SteepestDescent
 from yid_ocp.solvers.base import Solver
-from yid_ocp.vision.meshes import ExtraMesh
 from yid_ocp.vision.options import TrackOptions
+from yid_ocp.vision.surface_meshes import ExtraMesh
 
-Triple = tuple[float, float, float]
-Quadruple = tuple[float, float, float, float]
-Interval = tuple[float, float]
-FilePath = Annotated[str, About("a file, relative to the configuration", path=True)]
-RecordingPath = Annotated[str, About("a recording, relative to the configuration, or default:NAME.h5", path=True)]
-ArmMode = Literal["driven", "prescribed", "servo", "passive"]
-GraspName = Literal["point", "axis", "weld"]
+_Vector3 = tuple[float, float, float]
+_Vector4 = tuple[float, float, float, float]
+_Bounds = tuple[float, float]
+_FilePath = Annotated[str, OptionInfo("a file, relative to the configuration", is_path=True)]
+_RecordingPath = Annotated[
+    str, OptionInfo("a recording, relative to the configuration, or default:NAME.h5", is_path=True)
+]
+_ArmMode = Literal["driven", "prescribed", "servo", "passive"]
+_GraspKind = Literal["point", "axis", "weld"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class MountSettings:
     """Pose of an object's root in a parent frame."""
 
-    frame: Annotated[str | None, About("frame or clamp that carries it; the world when absent")] = None
-    xyz: Annotated[Triple, About("position in that frame", "m")] = (0.0, 0.0, 0.0)
-    rpy: Annotated[Triple, About("roll, pitch, yaw in that frame", "rad")] = (0.0, 0.0, 0.0)
+    parent_frame: Annotated[str | None, OptionInfo("frame or clamp that carries it; the world when absent")] = None
+    xyz: Annotated[_Vector3, OptionInfo("position in that frame", "m")] = (0.0, 0.0, 0.0)
+    rpy: Annotated[_Vector3, OptionInfo("roll, pitch, yaw in that frame", "rad")] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class FrameSettings(MountSettings):
     """An additional named frame on the robot, the object or in the world, such as a tool tip or a marker."""
 
-    straight: Annotated[
+    marker_reference_pose: Annotated[
         bool,
-        About(
-            "whether each recording's `straight` says where the point of this name sits, in place of xyz, for markers "
+        OptionInfo(
+            "whether each recording's `marker_reference_pose` says where the point of this name sits, in place of xyz, for markers "
             "on an object that stands in the world"
         ),
     ] = False
@@ -66,110 +68,126 @@ class FrameSettings(MountSettings):
 class ClampSettings:
     """A massless clamp frame whose prescribed motion follows two recorded points."""
 
-    origin: Annotated[str, About("point at which the clamp's origin sits")]
-    towards: Annotated[str, About("point to which its z axis looks, never along the world's x axis")]
-    roll: Annotated[
+    origin_point: Annotated[str, OptionInfo("point at which the clamp's origin sits")]
+    z_axis_point: Annotated[str, OptionInfo("point to which its z axis looks, never along the world's x axis")]
+    roll_convention: Annotated[
         Literal["level", "transported"],
-        About("what two points do not tell: x axis across the world's y, or no turn about z from the start on"),
+        OptionInfo("what two points do not tell: x axis across the world's y, or no turn about z from the start on"),
     ] = "level"
 
 
 @dataclass(frozen=True, kw_only=True)
-class YObject:
+class FoamYSettings:
     """The paper's foam letter Y."""
 
-    kind: Annotated[Literal["y"], About("what the object is")] = "y"
-    links: Annotated[int, Ge(1), Le(64), About("rigid links of every tube")] = 4
-    gravity_fraction: Annotated[float, Ge(0), Le(1), About("part of its weight that it has; its inertia is whole")] = (
-        1.0
-    )
-    mount: Annotated[MountSettings | None, About("the trunk's foot; the paper's when absent")] = None
+    kind: Annotated[Literal["foam_y"], OptionInfo("what the object is")] = "foam_y"
+    links: Annotated[int, Ge(1), Le(64), OptionInfo("rigid links of every tube")] = 4
+    gravity_fraction: Annotated[
+        float, Ge(0), Le(1), OptionInfo("part of its weight that it has; its inertia is whole")
+    ] = 1.0
+    mount: Annotated[MountSettings | None, OptionInfo("the trunk's foot; the paper's when absent")] = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class SegmentSettings:
     """One segment (tube, branch or beam) as a chain of rigid links; its stiffness and damping are in `parameters`."""
 
-    length: Annotated[float | None, Gt(0), Le(50), About("length; not needed beside link_lengths", "m")] = None
-    mass: Annotated[float, Gt(0), About("mass of the whole segment", "kg")]
-    radius: Annotated[float | None, Gt(0), Le(5), About("radius of the solid cylinder; or give a section", "m")] = None
-    section: Annotated[
-        tuple[Annotated[float, Gt(0)], Annotated[float, Gt(0)]] | None,
-        About("extents of a rectangular cross section along the links' x and y axes", "m"),
+    length: Annotated[float | None, Gt(0), Le(50), OptionInfo("length; not needed beside link_lengths", "m")] = None
+    mass: Annotated[float, Gt(0), OptionInfo("mass of the whole segment", "kg")]
+    radius: Annotated[
+        float | None, Gt(0), Le(5), OptionInfo("radius of the solid cylinder; or give a section", "m")
     ] = None
-    links: Annotated[int, Ge(1), Le(64), About("number of equal links")] = 4
-    link_lengths: Annotated[tuple[Annotated[float, Gt(0)], ...] | None, About("unequal links, base to tip", "m")] = None
-    parent: Annotated[str | None, About("segment on which it grows; the mount when absent")] = None
-    at_link: Annotated[int | None, Ge(0), About("it leaves at the tip of this link of the parent; the last")] = None
-    rpy: Annotated[Triple, About("turn of its first link at rest against what carries it", "rad")] = (0.0, 0.0, 0.0)
-    twist_damping: Annotated[bool, About("whether twists have a damping parameter of their own")] = False
-    rigidity: Annotated[bool, About("whether stiffness and damping are per curvature")] = False
-    clamped: Annotated[bool, About("whether it starts at a rigid wall or gripper")] = False
-    joint_order: Annotated[str, About("axes of the turns at a joint, base to tip; rigid about the others")] = "xyz"
-    link_length_parameters: Annotated[bool, About("whether every link has a length parameter of its own")] = False
+    cross_section: Annotated[
+        tuple[Annotated[float, Gt(0)], Annotated[float, Gt(0)]] | None,
+        OptionInfo("extents of a rectangular cross section along the links' x and y axes", "m"),
+    ] = None
+    links: Annotated[int, Ge(1), Le(64), OptionInfo("number of equal links")] = 4
+    link_lengths: Annotated[
+        tuple[Annotated[float, Gt(0)], ...] | None, OptionInfo("unequal links, base to tip", "m")
+    ] = None
+    parent: Annotated[str | None, OptionInfo("segment on which it grows; the mount when absent")] = None
+    parent_link_index: Annotated[
+        int | None, Ge(0), OptionInfo("it leaves at the tip of this link of the parent; the last")
+    ] = None
+    rpy: Annotated[_Vector3, OptionInfo("turn of its first link at rest against what carries it", "rad")] = (
+        0.0,
+        0.0,
+        0.0,
+    )
+    separate_twist_damping: Annotated[bool, OptionInfo("whether twists have a damping parameter of their own")] = False
+    stiffness_per_curvature: Annotated[bool, OptionInfo("whether stiffness and damping are per curvature")] = False
+    clamped_at_base: Annotated[bool, OptionInfo("whether it starts at a rigid wall or gripper")] = False
+    joint_axes: Annotated[str, OptionInfo("axes of the turns at a joint, base to tip; rigid about the others")] = "xyz"
+    link_length_parameters: Annotated[bool, OptionInfo("whether every link has a length parameter of its own")] = False
 
 
 @dataclass(frozen=True, kw_only=True)
-class SegmentedObject:
+class SegmentedObjectSettings:
     """A flexible object built from segments, such as a beam or a tube with branches."""
 
-    kind: Annotated[Literal["segments"], About("what the object is")] = "segments"
-    segments: Annotated[Mapping[str, SegmentSettings], About("by name, parents first")] = field(default_factory=dict)
-    gravity_fraction: Annotated[float, Ge(0), Le(1), About("part of its weight that it has; its inertia is whole")] = (
-        1.0
+    kind: Annotated[Literal["segments"], OptionInfo("what the object is")] = "segments"
+    segments: Annotated[Mapping[str, SegmentSettings], OptionInfo("by name, parents first")] = field(
+        default_factory=dict
     )
-    mount: Annotated[MountSettings, About("where its root sits")] = field(default_factory=MountSettings)
+    gravity_fraction: Annotated[
+        float, Ge(0), Le(1), OptionInfo("part of its weight that it has; its inertia is whole")
+    ] = 1.0
+    mount: Annotated[MountSettings, OptionInfo("where its root sits")] = field(default_factory=MountSettings)
 
 
 @dataclass(frozen=True, kw_only=True)
-class CableObject(CableOptions):
+class CableSettings(CableOptions):
     """A branched cable held at both ends by clamps that follow measured points; lengths come from recordings."""
 
-    kind: Annotated[Literal["cable"], About("what the object is")] = "cable"
-    parent: Annotated[tuple[str, ...], Len(5), About("points from clamp to clamp, two held at each end")]
-    children: Annotated[
-        Mapping[str, tuple[str, ...]], About("points of every branch, the first one the parent's at which it leaves")
+    kind: Annotated[Literal["cable"], OptionInfo("what the object is")] = "cable"
+    parent_vertices: Annotated[tuple[str, ...], Len(5), OptionInfo("points from clamp to clamp, two held at each end")]
+    child_vertices: Annotated[
+        Mapping[str, tuple[str, ...]],
+        OptionInfo("points of every branch, the first one the parent's at which it leaves"),
     ] = field(default_factory=dict)
-    undeformed: Annotated[FilePath, About("CSV table with the columns point, x, y, z [m]")]
+    undeformed_shape_file: Annotated[_FilePath, OptionInfo("CSV table with the columns point, x, y, z [m]")]
 
 
 @dataclass(frozen=True, kw_only=True)
 class GraspSettings:
     """A grasp: a constraint between a frame of the robot and a frame of the object."""
 
-    holder: Annotated[str, About("frame of the robot, or a clamp")]
-    held: Annotated[str, About("frame of the object, or a point along a segment such as T1:40%")]
-    kind: Annotated[GraspName, About("3, 5 or 6 equations")] = "point"
-    rpy: Annotated[Triple, About("orientation of held in holder, for axis and weld", "rad")] = (0.0, 0.0, 0.0)
+    holder_frame: Annotated[str, OptionInfo("frame of the robot, or a clamp")]
+    held_frame: Annotated[str, OptionInfo("frame of the object, or a point along a segment such as T1:40%")]
+    kind: Annotated[_GraspKind, OptionInfo("3, 5 or 6 equations")] = "point"
+    rpy: Annotated[_Vector3, OptionInfo("orientation of held in holder, for axis and weld", "rad")] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
-class SpringSettings:
+class JointSpringSettings:
     """A spring and damper on one joint of the robot."""
 
-    stiffness: Annotated[float, Ge(0), About("stiffness", "N m/rad or N/m")]
-    rest: Annotated[float, About("coordinate at which it is relaxed", "rad or m")] = 0.0
-    damping: Annotated[float | None, Ge(0), About("viscous; model.damping when absent", "N m s/rad or N s/m")] = None
+    stiffness: Annotated[float, Ge(0), OptionInfo("stiffness", "N m/rad or N/m")]
+    rest_position: Annotated[float, OptionInfo("coordinate at which it is relaxed", "rad or m")] = 0.0
+    damping: Annotated[float | None, Ge(0), OptionInfo("viscous; model.damping when absent", "N m s/rad or N s/m")] = (
+        None
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class EffectSettings:
     """An effect beyond the nominal model; its parameters are named kind@location.quantity."""
 
-    kind: Annotated[str, About("kelvin_voigt, joint_coulomb, ...")]
-    location: Annotated[str, About("a segment, point, joint, grasp, arm, base, object, world, camera or clock")]
-    values: Annotated[Mapping[str, float], About("quantities that are not neutral")] = field(default_factory=dict)
+    kind: Annotated[str, OptionInfo("kelvin_voigt, joint_coulomb, ...")]
+    location: Annotated[str, OptionInfo("a segment, point, joint, grasp, arm, base, object, world, camera or clock")]
+    values: Annotated[Mapping[str, float], OptionInfo("quantities that are not neutral")] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ServoSettings:
     """How position servos process commands; gains and limits are parameters such as JOINT.servo_gain."""
 
-    commands: Annotated[
-        Commands, About("what a servo follows between two commands: the last one held, or straight lines")
+    command_interpolation: Annotated[
+        CommandInterpolation,
+        OptionInfo("what a servo follows between two commands: the last one held, or straight lines"),
     ] = "held"
-    gravity_compensation: Annotated[
-        bool, About("whether the controller carries the robot's own weight, so that the servos need not")
+    has_gravity_compensation: Annotated[
+        bool, OptionInfo("whether the controller carries the robot's own weight, so that the servos need not")
     ] = False
 
 
@@ -177,22 +195,25 @@ class ServoSettings:
 class ArmSettings:
     """Moving joints of the robot and how each is driven."""
 
-    joints: Annotated[tuple[str, ...] | None, About("in configuration order; all movable ones when absent")] = None
+    joints: Annotated[tuple[str, ...] | None, OptionInfo("in configuration order; all movable ones when absent")] = None
     mode: Annotated[
-        ArmMode,
-        About(
+        _ArmMode,
+        OptionInfo(
             "driven by measured effort, prescribed (moved as measured), servo (moved by position servos that follow "
             "recorded commands) or passive; with a grasp and recorded torques, prescribed arms are states that their "
             "encoders correct"
         ),
     ] = "driven"
-    servo: Annotated[ServoSettings, About("of the mode servo")] = field(default_factory=ServoSettings)
-    passive: Annotated[tuple[str, ...], About("joints among them that nothing drives, whatever the mode")] = ()
-    locked: Annotated[Mapping[str, float], About("value of joints that do not move", "rad or m")] = field(
+    servo: Annotated[ServoSettings, OptionInfo("of the mode servo")] = field(default_factory=ServoSettings)
+    passive_joints: Annotated[
+        tuple[str, ...], OptionInfo("joints among them that nothing drives, whatever the mode")
+    ] = ()
+    locked_joints: Annotated[Mapping[str, float], OptionInfo("value of joints that do not move", "rad or m")] = field(
         default_factory=dict
     )
     exclude_links: Annotated[
-        tuple[str, ...], About("links of the URDF left out with all that hangs on them, such as a hand not mounted")
+        tuple[str, ...],
+        OptionInfo("links of the URDF left out with all that hangs on them, such as a hand not mounted"),
     ] = ()
 
 
@@ -201,57 +222,63 @@ class ModelSettings:
     """Mechanical model: robot, flexible object, grasps, clamps, frames and effects."""
 
     robot: Annotated[
-        FilePath | None,
-        About(
+        _FilePath | None,
+        OptionInfo(
             "URDF file, package:NAME of example-robot-data, or default:NAME.urdf of this package; null for an object "
             "held by the world or by clamps"
         ),
     ] = None
     clamps: Annotated[
         Mapping[str, ClampSettings],
-        About("what moves an object without a robot, by name; a cable has its own at both ends"),
+        OptionInfo("what moves an object without a robot, by name; a cable has its own at both ends"),
     ] = field(default_factory=dict)
-    arms: Annotated[ArmSettings, About("the robot's joints")] = field(default_factory=ArmSettings)
+    arms: Annotated[ArmSettings, OptionInfo("the robot's joints")] = field(default_factory=ArmSettings)
     frames: Annotated[
         Mapping[str, FrameSettings],
-        About(
+        OptionInfo(
             "more frames, by name, on robot, object or world: a tool's tip, the middle of what a hand holds, a marker"
         ),
     ] = field(default_factory=dict)
-    object: Annotated[YObject | SegmentedObject | CableObject | None, About("the flexible object")] = None
-    grasp: Annotated[Mapping[str, GraspSettings], About("by name: left, right, gripper")] = field(default_factory=dict)
-    springs: Annotated[Mapping[str, SpringSettings], About("by joint of the robot")] = field(default_factory=dict)
+    object: Annotated[
+        FoamYSettings | SegmentedObjectSettings | CableSettings | None, OptionInfo("the flexible object")
+    ] = None
+    grasp: Annotated[Mapping[str, GraspSettings], OptionInfo("by name: left, right, gripper")] = field(
+        default_factory=dict
+    )
+    springs: Annotated[Mapping[str, JointSpringSettings], OptionInfo("by joint of the robot")] = field(
+        default_factory=dict
+    )
     damping: Annotated[
         Annotated[float, Ge(0)] | Mapping[str, Annotated[float, Ge(0)]],
-        About(
+        OptionInfo(
             "viscous damping of every coordinate; or by joint of the robot (0.05 for those not named) and by the name "
             "`object`",
             "N m s/rad",
         ),
     ] = 0.05
-    gravity: Annotated[Triple, About("acceleration of free fall in the world", "m/s^2")] = (0.0, 0.0, -9.81)
+    gravity: Annotated[_Vector3, OptionInfo("acceleration of free fall in the world", "m/s^2")] = (0.0, 0.0, -9.81)
     points: Annotated[
-        tuple[str, ...] | None, About("frames that sensors may see, such as T1:40%; the segments' tips")
+        tuple[str, ...] | None, OptionInfo("frames that sensors may see, such as T1:40%; the segments' tips")
     ] = None
     extra_meshes: Annotated[
         tuple[ExtraMesh, ...],
-        About("what a camera sees and the URDF does not have: a gripper's body, a table; `track` leaves it out"),
+        OptionInfo("what a camera sees and the URDF does not have: a gripper's body, a table; `track` leaves it out"),
     ] = ()
-    effects: Annotated[tuple[EffectSettings, ...], About("added to the nominal model, in this order")] = ()
+    effects: Annotated[tuple[EffectSettings, ...], OptionInfo("added to the nominal model, in this order")] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingSettings:
     """Recordings for estimation, for held-out prediction and for reference."""
 
-    estimate: Annotated[tuple[RecordingPath, ...], About("to estimate on")] = ()
-    held_out: Annotated[tuple[RecordingPath, ...], About("only predicted, never touched by the fit")] = ()
-    without: Annotated[
-        tuple[RecordingPath, ...],
-        About("made without what a diagnosis finds, which it then predicts; those of its baseline when absent"),
+    estimate: Annotated[tuple[_RecordingPath, ...], OptionInfo("to estimate on")] = ()
+    held_out: Annotated[tuple[_RecordingPath, ...], OptionInfo("only predicted, never touched by the fit")] = ()
+    reference_recordings: Annotated[
+        tuple[_RecordingPath, ...],
+        OptionInfo("made without what a diagnosis finds, which it then predicts; those of its baseline when absent"),
     ] = ()
     strict: Annotated[
-        bool, About("whether any doubt about a recording stops the run; --strict on the command line")
+        bool, OptionInfo("whether any doubt about a recording stops the run; --strict on the command line")
     ] = False
 
 
@@ -260,69 +287,78 @@ class ImportSettings:
     """How `import` converts a file of another tool; a command-line flag overrides its key here."""
 
     joint_topics: Annotated[
-        tuple[str, ...] | None, About("of a bag: topics of joint states, put on one clock; all when absent")
+        tuple[str, ...] | None, OptionInfo("of a bag: topics of joint states, put on one clock; all when absent")
     ] = None
     command_topic: Annotated[
-        str | None, About("of a bag: topic of joint states whose positions were asked for, not measured")
+        str | None, OptionInfo("of a bag: topic of joint states whose positions were asked for, not measured")
     ] = None
     joints: Annotated[
-        tuple[str, ...] | None, About("joints to keep, NAME or RECORDED=NAME, in this order; all when absent")
+        tuple[str, ...] | None, OptionInfo("joints to keep, NAME or RECORDED=NAME, in this order; all when absent")
     ] = None
     points: Annotated[
         Mapping[str, str] | None,
-        About("topic, TOPIC:FRAME of /tf, marker or stem of columns, and the point that it is, such as cable:40%"),
+        OptionInfo("topic, TOPIC:FRAME of /tf, marker or stem of columns, and the point that it is, such as cable:40%"),
     ] = None
     pose_axes: Annotated[
-        float | None, Gt(0), Le(10), About("how far along a pose's axes points NAME_x, NAME_y, NAME_z are made", "m")
+        float | None,
+        Gt(0),
+        Le(10),
+        OptionInfo("how far along a pose's axes points NAME_x, NAME_y, NAME_z are made", "m"),
     ] = None
     columns: Annotated[
         Mapping[str, str] | None,
-        About("of a table: column, or pattern such as *_pos, and t, CHANNEL:JOINT, AXIS:POINT or skip"),
+        OptionInfo("of a table: column, or pattern such as *_pos, and t, CHANNEL:JOINT, AXIS:POINT or skip"),
     ] = None
-    header: Annotated[bool | None, About("of a table: whether its first row has names, else 1, 2 and so on")] = None
-    skip_bad_lines: Annotated[bool | None, About("of a table: whether lines that are no numbers are left out")] = None
-    delimiter: Annotated[str | None, About("of a table: one character between cells; a comma when absent")] = None
+    header: Annotated[bool | None, OptionInfo("of a table: whether its first row has names, else 1, 2 and so on")] = (
+        None
+    )
+    skip_bad_lines: Annotated[bool | None, OptionInfo("of a table: whether lines that are no numbers are left out")] = (
+        None
+    )
+    delimiter: Annotated[str | None, OptionInfo("of a table: one character between cells; a comma when absent")] = None
     units: Annotated[
         Mapping[str, str] | None,
-        About(
+        OptionInfo(
             "of t (s, ms, us, ns), position (rad, deg, rev), velocity (rad/s, deg/s, rpm), effort (N m, N mm, A, mA), "
             "points (m, cm, mm) and so on, where they are not SI"
         ),
     ] = None
     torque_constants: Annotated[
-        Mapping[str, float] | None, About("by joint or pattern, where effort is a motor's current", "N m/A")
+        Mapping[str, float] | None, OptionInfo("by joint or pattern, where effort is a motor's current", "N m/A")
     ] = None
     gears: Annotated[
         Mapping[str, float] | None,
-        About("turns of the motor per turn of the joint, by joint or pattern; 1 when absent"),
+        OptionInfo("turns of the motor per turn of the joint, by joint or pattern; 1 when absent"),
     ] = None
-    episode: Annotated[int | None, Ge(0), About("of a LeRobot dataset: which one; the first when absent")] = None
-    clock: Annotated[Clock | None, About("of a table: whether its times were measured")] = None
-    sensor: Annotated[str | None, About("what saw the points, in words")] = None
-    frame: Annotated[str | None, About("frame of reference of the points, of a table or C3D file")] = None
+    episode: Annotated[int | None, Ge(0), OptionInfo("of a LeRobot dataset: which one; the first when absent")] = None
+    clock: Annotated[ClockKind | None, OptionInfo("of a table: whether its times were measured")] = None
+    sensor: Annotated[str | None, OptionInfo("what saw the points, in words")] = None
+    frame: Annotated[str | None, OptionInfo("frame of reference of the points, of a table or C3D file")] = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class ParameterSettings:
     """Initial value, bounds and prior of one parameter, or of all that match a pattern such as T*.bend."""
 
-    initial: Annotated[float | None, About("value, or where the search starts", "that of the parameter")] = None
-    bounds: Annotated[Interval | None, About("lower and upper bound", "that of the parameter")] = None
-    free: Annotated[bool | None, About("whether it is estimated")] = None
-    prior: Annotated[float | None, Gt(0), About("standard deviation of a Gaussian prior", "that of the parameter")] = (
-        None
-    )
-    local: Annotated[bool | None, About("whether it has a value of its own in every recording")] = None
+    initial: Annotated[float | None, OptionInfo("value, or where the search starts", "that of the parameter")] = None
+    bounds: Annotated[_Bounds | None, OptionInfo("lower and upper bound", "that of the parameter")] = None
+    free: Annotated[bool | None, OptionInfo("whether it is estimated")] = None
+    prior_std: Annotated[
+        float | None, Gt(0), OptionInfo("standard deviation of a Gaussian prior", "that of the parameter")
+    ] = None
+    per_recording: Annotated[bool | None, OptionInfo("whether it has a value of its own in every recording")] = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProblemSettings(ProblemOptions):
     """Estimation problem: residuals, initial state and time discretisation."""
 
-    time_step: Annotated[float, Gt(0), Le(0.1), About("of the integrator", "s")] = 0.01
-    force_split: Annotated[ForceSplit, About("rule for forces; left is the paper's")] = "symmetric"
-    constraint_force: Annotated[ConstraintForce, About("where grasps pull; node is the paper's")] = "midpoint"
-    compiler: Annotated[bool, About("whether to compile the step where a C compiler is found")] = True
+    time_step: Annotated[float, Gt(0), Le(0.1), OptionInfo("of the integrator", "s")] = 0.01
+    force_split: Annotated[ForceSplit, OptionInfo("rule for forces; left is the paper's")] = "symmetric"
+    constraint_force: Annotated[ConstraintForcePlacement, OptionInfo("where grasps pull; node is the paper's")] = (
+        "midpoint"
+    )
+    use_compiler: Annotated[bool, OptionInfo("whether to compile the step where a C compiler is found")] = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -330,30 +366,34 @@ class DiagnosisSettings(Thresholds):
     """Candidates and thresholds of the diagnosis of the sim-to-real gap."""
 
     candidates: Annotated[
-        Literal["all"] | tuple[str, ...], About("effects to try: all, or a list of kind or kind@location")
+        Literal["all"] | tuple[str, ...], OptionInfo("effects to try: all, or a list of kind or kind@location")
     ] = "all"
-    leave_out: Annotated[tuple[str, ...], About("candidates not to try, by kind or kind@location")] = ()
+    exclude: Annotated[tuple[str, ...], OptionInfo("candidates not to try, by kind or kind@location")] = ()
     noise_fraction: Annotated[
         float,
         Gt(0),
         Le(1),
-        About("part of all stated std, torques' included, that is noise, where the rest stands for the model's error"),
+        OptionInfo(
+            "part of all stated std, torques' included, that is noise, where the rest stands for the model's error"
+        ),
     ] = 1.0
 
     baseline: Annotated[
-        tuple[FilePath, ...],
-        About("run folders of `solve` or `diagnose`, of the same model: what differs since is asked"),
+        tuple[_FilePath, ...],
+        OptionInfo("run folders of `solve` or `diagnose`, of the same model: what differs since is asked"),
     ] = ()
 
     @property
-    def of_a_fit(self) -> GapLimits:
+    def fit_gap_limits(self) -> GapCriteria:
         """Limits of the null test for a fit's residual, in the sensors' stated standard deviations."""
-        return replace(self.gap, noise_fraction=self.noise_fraction)
+        return replace(self.gap_limits, noise_fraction=self.noise_fraction)
 
 
 def _compared() -> dict[str, Solver]:
     return {
-        "steepest_descent": SteepestDescent(trial="spectral", memory=10, iterations=800, gradient_tolerance=1e-4),
+        "steepest_descent": SteepestDescent(
+            first_trial_step="spectral", nonmonotone_memory=10, max_iterations=800, gradient_tolerance=1e-4
+        ),
         "single_shooting": SingleShooting(),
         "gauss_newton": GaussNewton(),
         "multiple_shooting": MultipleShooting(),
@@ -365,59 +405,67 @@ def _compared() -> dict[str, Solver]:
 class CompareSettings:
     """Solvers to compare, each with its own settings."""
 
-    methods: Annotated[Mapping[str, Annotated[Solver, Among(SOLVERS)]], About("settings of each method, by name")] = (
-        field(default_factory=_compared)
+    methods: Annotated[
+        Mapping[str, Annotated[Solver, RegistryChoice(SOLVERS)]], OptionInfo("settings of each method, by name")
+    ] = field(default_factory=_compared)
+    paper_experiment: Annotated[str | None, OptionInfo("experiment of the source paper whose answer stands beside")] = (
+        None
     )
-    published: Annotated[str | None, About("experiment of the source paper whose answer stands beside")] = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class VirtualFramesSettings:
     """A MuJoCo experiment and its virtual depth camera, used when no recorded frames are given."""
 
-    seed: Annotated[int, Ge(0), About("of motion, noise and camera")] = 0
-    duration: Annotated[float, Gt(0), Le(600), About("of the experiment", "s")] = 5.0
-    travel: Annotated[float, Gt(0), Le(1), About("largest distance of a gripper from its start", "m")] = 0.11
-    offsets: Annotated[
-        Mapping[str, Triple], About("by grasp: where it starts beside the end of the undeformed object", "m")
+    seed: Annotated[int, Ge(0), OptionInfo("of motion, noise and camera")] = 0
+    duration: Annotated[float, Gt(0), Le(600), OptionInfo("of the experiment", "s")] = 5.0
+    max_gripper_travel: Annotated[
+        float, Gt(0), Le(1), OptionInfo("largest distance of a gripper from its start", "m")
+    ] = 0.11
+    grasp_start_offsets: Annotated[
+        Mapping[str, _Vector3], OptionInfo("by grasp: where it starts beside the end of the undeformed object", "m")
     ] = field(default_factory=dict)
-    eye: Annotated[Triple, About("where the camera stands", "m")] = (2.6, 0.0, 0.45)
-    target: Annotated[Triple, About("where it looks", "m")] = (0.85, 0.0, -0.1)
-    rate: Annotated[float, Gt(0), Le(60), About("mean rate of frames", "Hz")] = 3.0
-    dropped: Annotated[float, Ge(0), Lt(1), About("fraction of frames that are lost")] = 0.0
-    latency: Annotated[float, About("stamp minus time of the picture", "s")] = 0.0
-    latency_std: Annotated[float, Ge(0), About("standard deviation of the latency", "s")] = 0.0
-    outliers: Annotated[float, Ge(0), Lt(1), About("fraction of pixels with a wrong depth")] = 0.0
+    camera_position: Annotated[_Vector3, OptionInfo("where the camera stands", "m")] = (2.6, 0.0, 0.45)
+    camera_target: Annotated[_Vector3, OptionInfo("where it looks", "m")] = (0.85, 0.0, -0.1)
+    frame_rate: Annotated[float, Gt(0), Le(60), OptionInfo("mean rate of frames", "Hz")] = 3.0
+    dropped_fraction: Annotated[float, Ge(0), Lt(1), OptionInfo("fraction of frames that are lost")] = 0.0
+    latency: Annotated[float, OptionInfo("stamp minus time of the picture", "s")] = 0.0
+    latency_std: Annotated[float, Ge(0), OptionInfo("standard deviation of the latency", "s")] = 0.0
+    outlier_fraction: Annotated[float, Ge(0), Lt(1), OptionInfo("fraction of pixels with a wrong depth")] = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrackSettings:
     """How points are tracked in the frames of a depth camera."""
 
-    frames: Annotated[
-        FilePath | None,
-        About("folder of clouds or depth images, bag, MCAP or RealSense file; a virtual frame sequence when absent"),
+    frames_path: Annotated[
+        _FilePath | None,
+        OptionInfo(
+            "folder of clouds or depth images, bag, MCAP or RealSense file; a virtual frame sequence when absent"
+        ),
     ] = None
-    topic: Annotated[str | None, About("of the clouds or depth images in a bag, where it has several")] = None
-    pose: Annotated[
-        tuple[Quadruple, Quadruple, Quadruple, Quadruple] | None,
-        About("camera (x right, y down, z ahead) in the world, row by row, instead of the folder's", "m"),
+    frame_topic: Annotated[str | None, OptionInfo("of the clouds or depth images in a bag, where it has several")] = (
+        None
+    )
+    camera_pose: Annotated[
+        tuple[_Vector4, _Vector4, _Vector4, _Vector4] | None,
+        OptionInfo("camera (x right, y down, z ahead) in the world, row by row, instead of the folder's", "m"),
     ] = None
-    unit: Annotated[Literal["m", "mm"] | None, About("of the clouds, instead of the folder's")] = None
-    background: Annotated[
-        FilePath | None,
-        About(
+    length_unit: Annotated[Literal["m", "mm"] | None, OptionInfo("of the clouds, instead of the folder's")] = None
+    background_frames: Annotated[
+        _FilePath | None,
+        OptionInfo(
             "frames of the scene without robot and object, by the same camera in the same place: left out of the others"
         ),
     ] = None
-    virtual: Annotated[VirtualFramesSettings, About("what is filmed without frames")] = field(
+    virtual_frames: Annotated[VirtualFramesSettings, OptionInfo("what is filmed without frames")] = field(
         default_factory=VirtualFramesSettings
     )
-    keep_frames: Annotated[bool, About("whether a virtual frame sequence's frames are written to the run folder")] = (
-        False
-    )
-    pictures: Annotated[int, Ge(0), Le(1000), About("frames of which every stage is drawn")] = 2
-    options: Annotated[TrackOptions, About("filters, skeleton, fit, clock and what counts as good")] = field(
+    keep_frames: Annotated[
+        bool, OptionInfo("whether a virtual frame sequence's frames are written to the run folder")
+    ] = False
+    n_drawn_frames: Annotated[int, Ge(0), Le(1000), OptionInfo("frames of which every stage is drawn")] = 2
+    options: Annotated[TrackOptions, OptionInfo("filters, skeleton, fit, clock and what counts as good")] = field(
         default_factory=TrackOptions
     )
 
@@ -426,9 +474,9 @@ class TrackSettings:
 class PlanSettings(PlanOptions):
     """Goal of a planned motion and the run that supplies the parameters."""
 
-    run: Annotated[
-        FilePath | None,
-        About(
+    parameter_run: Annotated[
+        _FilePath | None,
+        OptionInfo(
             "run folder of `solve` with parameters and covariance, for information of `diagnose` as well; the initial "
             "values when absent"
         ),
@@ -439,11 +487,13 @@ class PlanSettings(PlanOptions):
 class OutputSettings:
     """Output: run folders, the report and the discretisation check."""
 
-    folder: Annotated[FilePath | None, About("in which run folders are made; `runs` in the working folder")] = None
-    report: Annotated[bool, About("whether report.html is written")] = True
-    discretisation: Annotated[
+    runs_folder: Annotated[
+        _FilePath | None, OptionInfo("in which run folders are made; `runs` in the working folder")
+    ] = None
+    write_report: Annotated[bool, OptionInfo("whether report.html is written")] = True
+    discretisation_check: Annotated[
         Literal["none", "time_step", "both"] | None,
-        About(
+        OptionInfo(
             "what `solve` refines to see how far estimates move: the time step, the links as well; both for an object "
             "of segments and the time step for any other when absent"
         ),
@@ -451,59 +501,69 @@ class OutputSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Run:
+class RunSettings:
     """Resolved settings of one run: all sections of its configuration file.
 
     Attributes
     ----------
     name : str
         Stem of the configuration file.
-    file : str
+    config_file : str
         Path of the configuration file, empty for none.
-    places : mapping of key path to text
+    key_locations : mapping of key path to text
         File and line of every key, for error messages.
     """
 
-    description: Annotated[str, About("one sentence for the report")] = ""
-    plugins: Annotated[tuple[FilePath, ...], About("Python files that register effects or sensors; they are run")] = ()
-    model: Annotated[ModelSettings, About("what the world is made of")] = field(default_factory=ModelSettings)
-    recordings: Annotated[RecordingSettings, About("the data")] = field(default_factory=RecordingSettings)
-    import_: Annotated[ImportSettings, About("how files of other tools become recordings")] = field(
+    description: Annotated[str, OptionInfo("one sentence for the report")] = ""
+    plugins: Annotated[
+        tuple[_FilePath, ...], OptionInfo("Python files that register effects or sensors; they are run")
+    ] = ()
+    model: Annotated[ModelSettings, OptionInfo("what the world is made of")] = field(default_factory=ModelSettings)
+    recordings: Annotated[RecordingSettings, OptionInfo("the data")] = field(default_factory=RecordingSettings)
+    import_: Annotated[ImportSettings, OptionInfo("how files of other tools become recordings")] = field(
         default_factory=ImportSettings
     )
-    sensors: Annotated[Mapping[str, SensorOptions], About("by group of the recordings: points, joints.effort")] = field(
+    sensors: Annotated[Mapping[str, SensorOptions], OptionInfo("by group of the recordings: points, joints.effort")] = (
+        field(default_factory=dict)
+    )
+    parameters: Annotated[Mapping[str, ParameterSettings], OptionInfo("by name or pattern")] = field(
         default_factory=dict
     )
-    parameters: Annotated[Mapping[str, ParameterSettings], About("by name or pattern")] = field(default_factory=dict)
-    problem: Annotated[ProblemSettings, About("what is compared with the recordings and how")] = field(
+    problem: Annotated[ProblemSettings, OptionInfo("what is compared with the recordings and how")] = field(
         default_factory=ProblemSettings
     )
-    solver: Annotated[Solver, Among(SOLVERS, "gauss_newton"), About("how the cost is lowered")] = field(
+    solver: Annotated[Solver, RegistryChoice(SOLVERS, "gauss_newton"), OptionInfo("how the cost is lowered")] = field(
         default_factory=GaussNewton
     )
-    compare: Annotated[CompareSettings, About("which methods are compared")] = field(default_factory=CompareSettings)
-    diagnosis: Annotated[DiagnosisSettings, About("how a gap is diagnosed")] = field(default_factory=DiagnosisSettings)
-    track: Annotated[TrackSettings, About("how a camera's frames are tracked")] = field(default_factory=TrackSettings)
-    plan: Annotated[PlanSettings, About("which motion is planned")] = field(default_factory=PlanSettings)
-    output: Annotated[OutputSettings, About("where results go")] = field(default_factory=OutputSettings)
+    compare: Annotated[CompareSettings, OptionInfo("which methods are compared")] = field(
+        default_factory=CompareSettings
+    )
+    diagnosis: Annotated[DiagnosisSettings, OptionInfo("how a gap is diagnosed")] = field(
+        default_factory=DiagnosisSettings
+    )
+    track: Annotated[TrackSettings, OptionInfo("how a camera's frames are tracked")] = field(
+        default_factory=TrackSettings
+    )
+    plan: Annotated[PlanSettings, OptionInfo("which motion is planned")] = field(default_factory=PlanSettings)
+    output: Annotated[OutputSettings, OptionInfo("where results go")] = field(default_factory=OutputSettings)
     name: str = "run"
-    file: str = field(default="", compare=False)
-    places: Mapping[tuple[str | int, ...], str] = field(default_factory=dict, compare=False, repr=False)
+    config_file: str = field(default="", compare=False)
+    key_locations: Mapping[tuple[str | int, ...], str] = field(default_factory=dict, compare=False, repr=False)
 
-    def where(self, *path: str | int) -> str:
-        """Text with file, line and key of a setting, for the `where` of an error."""
+    def describe_location(self, *path: str | int) -> str:
+        """Text with file, line and key of a setting, for the `describe_location` of an error."""
         key = ".".join(str(part) for part in path)
         for count in range(len(path), 0, -1):
-            if path[:count] in self.places:
-                return f"{self.places[path[:count]]}: {key}"
-        return f"{self.file}: {key}" if self.file else key
+            if path[:count] in self.key_locations:
+                return f"{self.key_locations[path[:count]]}: {key}"
+        return f"{self.config_file}: {key}" if self.config_file else key
 
-    def refuse(self, what: str, *path: str | int, allowed: str = "", hint: str = "") -> ConfigError:
+    def config_error(self, what: str, *path: str | int, allowed: str = "", hint: str = "") -> ConfigError:
         """A `ConfigError` (not raised here) that names file, line and key of a setting."""
-        return ConfigError(what, where=self.where(*path), allowed=allowed, hint=hint)
+        return ConfigError(what, where=self.describe_location(*path), allowed=allowed, hint=hint)
 
 
-def dump_config(run: Run) -> str:
+def dump_config(run: RunSettings) -> str:
     """YAML text of a run's settings, with every default, that `load_config` reads back to the same run."""
     stream = io.StringIO()
     yaml = YAML()
@@ -515,10 +575,10 @@ def dump_config(run: Run) -> str:
 def _plain(value: Any) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         result: dict[str, Any] = {}
-        for name, option in options_of(type(value)).items():
-            item = getattr(value, option.field)
-            if item is not None or option.default is not None:
-                chosen = any(isinstance(marker, Among) for marker in stripped(option.hint)[1])
+        for name, option in dataclass_options(type(value)).items():
+            item = getattr(value, option.field_name)
+            if item is not None or option.default_value is not None:
+                chosen = any(isinstance(marker, RegistryChoice) for marker in split_annotated(option.type_hint)[1])
                 result[name] = {"name": item.name, **_plain(item)} if chosen else _plain(item)
         return result
     if isinstance(value, Mapping):

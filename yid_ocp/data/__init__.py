@@ -1,17 +1,17 @@
 """Recordings in memory and on disk; a new file format is one file in `readers/` and touches nothing else."""
 
-from yid_ocp.data.hdf5 import read_recording as read_recording
-from yid_ocp.data.hdf5 import write_recording as write_recording
 from yid_ocp.data.readers import READERS as READERS
-from yid_ocp.data.readers import preview as preview
+from yid_ocp.data.readers import preview_file as preview_file
 from yid_ocp.data.readers import read_any as read_any
 from yid_ocp.data.readers.bags import read_bag as read_bag
 from yid_ocp.data.readers.c3d import read_c3d as read_c3d
 from yid_ocp.data.readers.csv import read_csv as read_csv
 from yid_ocp.data.readers.lerobot import read_lerobot as read_lerobot
-from yid_ocp.data.recording import JOINT_CHANNELS as JOINT_CHANNELS
+from yid_ocp.data.recording import JOINT_CHANNEL_UNITS as JOINT_CHANNEL_UNITS
 from yid_ocp.data.recording import JointGroup as JointGroup
 from yid_ocp.data.recording import PointGroup as PointGroup
 from yid_ocp.data.recording import Recording as Recording
-from yid_ocp.data.recording import check_names as check_names
-from yid_ocp.data.recording import validate as validate
+from yid_ocp.data.recording import check_recorded_names as check_recorded_names
+from yid_ocp.data.recording import validate_recording as validate_recording
+from yid_ocp.data.recording_hdf5 import read_recording as read_recording
+from yid_ocp.data.recording_hdf5 import write_recording as write_recording

@@ -12,24 +12,30 @@ from dataclasses import replace
 import numpy as np
 import scipy.signal
 
-from yid_ocp.data.channels import overstated, saturated, steps_and_noise, stuck, white
-from yid_ocp.data.doubt import (
-    CLOCK_UNITS,
-    DEGREE,
-    EPOCH,
-    LIMITS,
-    MOST,
+from yid_ocp.data.channel_checks import (
+    excess_noise_issues,
+    overstated_noise_issues,
+    saturated_effort_issues,
+    stuck_channel_issues,
+    white_noise_std,
+)
+from yid_ocp.data.issues import (
+    DEGREES_PER_RADIAN,
+    MAX_LIMIT_RATIO,
+    MIN_EPOCH_SECONDS,
+    QUALITY_LIMITS,
+    SECONDS_PER_CLOCK_UNIT,
     Array,
-    Choices,
-    Doubt,
-    Group,
+    Issue,
+    SampleGroup,
+    SensorChoiceLookup,
     group_name,
-    period,
+    median_sample_period,
 )
 from yid_ocp.data.recording import PointGroup, Recording
 
 
-def check_recording(recording: Recording, choice: Choices, driving: bool = True) -> list[Doubt]:
+def check_recording(recording: Recording, choice: SensorChoiceLookup, driving: bool = True) -> list[Issue]:
     """All issues of one recording that need no model.
 
     Parameters
@@ -45,7 +51,7 @@ def check_recording(recording: Recording, choice: Choices, driving: bool = True)
     -------
     list of Doubt
     """
-    recording = recording.with_effort_kind(choice("joints.effort").kind)
+    recording = recording.with_effort_kind(choice("joints.effort").effort_kind)
     units = [replace(doubt, recording=recording.name) for doubt in _units_of_time(recording)]
     if units:
         return units  # nothing else can be said in times that are not seconds
@@ -55,10 +61,10 @@ def check_recording(recording: Recording, choice: Choices, driving: bool = True)
             _common_clock(recording),
             _dropped(recording, driving),
             _velocities(recording),
-            stuck(recording),
-            steps_and_noise(recording, choice),
-            overstated(recording, choice),
-            saturated(recording),
+            stuck_channel_issues(recording),
+            excess_noise_issues(recording, choice),
+            overstated_noise_issues(recording, choice),
+            saturated_effort_issues(recording),
             _standstill(recording),
         )
         for doubt in found
@@ -68,30 +74,32 @@ def check_recording(recording: Recording, choice: Choices, driving: bool = True)
 # -- clocks -----------------------------------------------------------------------------------------------------------
 
 
-def _units_of_time(recording: Recording) -> Iterator[Doubt]:
+def _units_of_time(recording: Recording) -> Iterator[Issue]:
     for group in recording.groups:
-        step, slowest = period(group.t), LIMITS.slowest_joints
+        step, slowest = median_sample_period(group.t), QUALITY_LIMITS.max_joint_period
         if isinstance(group, PointGroup):
-            slowest = LIMITS.slowest_points
+            slowest = QUALITY_LIMITS.max_point_period
         if step <= slowest:
             continue
-        fitting = [name for name, size in CLOCK_UNITS.items() if 2e-4 <= step * size <= 2 * slowest]
+        fitting = [name for name, size in SECONDS_PER_CLOCK_UNIT.items() if 2e-4 <= step * size <= 2 * slowest]
         rate = f"a sample every {step:.4g} s"
         unit = fitting[0] if fitting else ""
-        guess = f": in {unit} it would be {1 / (step * CLOCK_UNITS[unit]):.4g} Hz" if unit else ""
-        yield Doubt(
+        guess = f": in {unit} it would be {1 / (step * SECONDS_PER_CLOCK_UNIT[unit]):.4g} Hz" if unit else ""
+        yield Issue(
             "time_unit",
             f"{group_name(group)}/t has {rate}{guess}",
             "refused",
             step / slowest,
-            f"write times in seconds (divide by {1 / CLOCK_UNITS[unit]:.0e})" if unit else "write times in seconds",
+            f"write times in seconds (divide by {1 / SECONDS_PER_CLOCK_UNIT[unit]:.0e})"
+            if unit
+            else "write times in seconds",
             "",
             group_name(group),
             "t",
         )
 
 
-def _common_clock(recording: Recording) -> Iterator[Doubt]:
+def _common_clock(recording: Recording) -> Iterator[Issue]:
     joints = recording.joints
     if joints is None:
         return
@@ -100,25 +108,25 @@ def _common_clock(recording: Recording) -> Iterator[Doubt]:
         begin, end = group.t[0], group.t[-1]
         if end < first or begin > last:
             far = min(abs(begin - last), abs(first - end))
-            epoch = (abs(begin) > EPOCH) != (abs(first) > EPOCH)
+            epoch = (abs(begin) > MIN_EPOCH_SECONDS) != (abs(first) > MIN_EPOCH_SECONDS)
             since = "one of them counts from 1970: " if epoch else ""
-            yield Doubt(
+            yield Issue(
                 "clock_base",
                 f"{since}joints were recorded from {first:.10g} to {last:.10g} s, {group.name} from {begin:.10g} to "
                 f"{end:.10g} s",
                 "refused",
-                MOST if epoch else 1 + far / max(last - first, 1e-9),
+                MAX_LIMIT_RATIO if epoch else 1 + far / max(last - first, 1e-9),
                 "write the times of all groups on one clock",
                 "",
                 group.name,
                 "t",
             )
             continue
-        slack = max(LIMITS.clock_off * (last - first), 5 * period(group.t))
+        slack = max(QUALITY_LIMITS.max_clock_mismatch_fraction * (last - first), 5 * median_sample_period(group.t))
         late, over = begin - first, end - last
         shift = min(late, over) if late > 0 else max(late, over)
         if late * over > 0 and abs(shift) > slack:
-            yield Doubt(
+            yield Issue(
                 "clock_offset",
                 f"{group.name} begins {late:+.3g} s from the joints and ends {over:+.3g} s from them",
                 "not_trusted",
@@ -130,7 +138,7 @@ def _common_clock(recording: Recording) -> Iterator[Doubt]:
             )
 
 
-def _dropped(recording: Recording, driving: bool) -> Iterator[Doubt]:
+def _dropped(recording: Recording, driving: bool) -> Iterator[Issue]:
     """Samples missing from an otherwise even clock of what drives the model."""
     joints = recording.joints
     if joints is None or not driving or len(joints.t) < 20:
@@ -143,12 +151,12 @@ def _dropped(recording: Recording, driving: bool) -> Iterator[Doubt]:
     even = float(np.mean(np.abs(steps / base - count) < 0.1 * count))
     small = count[count < 50]  # what is longer is a gap
     missing = float(np.sum(small - 1) / np.sum(small))
-    if even > 0.9 and missing > LIMITS.dropped:
-        yield Doubt(
+    if even > 0.9 and missing > QUALITY_LIMITS.max_missing_fraction:
+        yield Issue(
             "dropped_samples",
             f"{100 * missing:.2g} % of the samples of a clock of {1 / base:.4g} Hz are missing",
             "warning",
-            missing / LIMITS.dropped,
+            missing / QUALITY_LIMITS.max_missing_fraction,
             "find what lost them; between those that are left the recorded torques are interpolated",
             "",
             "joints",
@@ -159,7 +167,7 @@ def _dropped(recording: Recording, driving: bool) -> Iterator[Doubt]:
 # -- motion -----------------------------------------------------------------------------------------------------------
 
 
-def smooth_rate(t: Array, values: Array, rates: Array) -> tuple[Array, Array]:
+def _windowed_rates(t: Array, values: Array, rates: Array) -> tuple[Array, Array]:
     """Rates of change from values and from recorded rates, averaged over windows that suppress noise.
 
     Parameters
@@ -174,7 +182,7 @@ def smooth_rate(t: Array, values: Array, rates: Array) -> tuple[Array, Array]:
     ndarray, shape (M, k)
         What the rates say of the same windows, by the trapezoidal rule.
     """
-    width = max(3, round(0.2 / max(period(t), 1e-9)))
+    width = max(3, round(0.2 / max(median_sample_period(t), 1e-9)))
     starts = np.arange(0, max(len(t) - width, 1), max(1, width // 2))
     ends = np.minimum(starts + width, len(t) - 1)
     length = (t[ends] - t[starts])[:, None]
@@ -184,34 +192,34 @@ def smooth_rate(t: Array, values: Array, rates: Array) -> tuple[Array, Array]:
     return by_value, by_rate
 
 
-def _velocities(recording: Recording) -> Iterator[Doubt]:
+def _velocities(recording: Recording) -> Iterator[Issue]:
     """Angles differentiated beside recorded velocities."""
     joints = recording.joints
     if joints is None or joints.velocity is None or len(joints.t) < 50:
         return
-    by_angle, by_velocity = smooth_rate(joints.t, joints.position, joints.velocity)
+    by_angle, by_velocity = _windowed_rates(joints.t, joints.position, joints.velocity)
     names = joints.names
     ratio, fit = np.full(len(names), np.nan), np.zeros(len(names))
     for j in range(len(names)):
         x, y = by_velocity[:, j], by_angle[:, j]
-        floor = max(0.02, 2 * white(joints.t, joints.velocity[:, j]))
+        floor = max(0.02, 2 * white_noise_std(joints.t, joints.velocity[:, j]))
         if np.std(x) > floor and np.std(y) > 0:
             ratio[j] = np.sign(x @ y) * math.sqrt(float(y @ y) / float(x @ x))
             fit[j] = float(np.corrcoef(x, y)[0, 1])
     known = [j for j in range(len(names)) if math.isfinite(ratio[j]) and abs(fit[j]) > 0.8]
-    wrong = [j for j in known if not 1 / LIMITS.rate <= ratio[j] <= LIMITS.rate]
+    wrong = [j for j in known if not 1 / QUALITY_LIMITS.max_rate_ratio <= ratio[j] <= QUALITY_LIMITS.max_rate_ratio]
     if not wrong:
         yield from _exchanged(names, by_angle, by_velocity, fit, ratio)
         return
     typical = float(np.median(ratio[known]))
     alike = bool(len(wrong) == len(known) and np.all(np.abs(ratio[known] / typical - 1) < 0.2))
     if alike and typical > 0 and len(known) >= min(2, len(names)):
-        degrees = abs(typical / DEGREE - 1) < 0.1
-        yield Doubt(
+        degrees = abs(typical / DEGREES_PER_RADIAN - 1) < 0.1
+        yield Issue(
             "degrees" if degrees else "time_scale",
             f"all angles turn {typical:.3g} times as fast as the recorded velocities say",
             "not_trusted",
-            max(typical, 1 / typical) / LIMITS.rate,
+            max(typical, 1 / typical) / QUALITY_LIMITS.max_rate_ratio,
             "convert angles to radians"
             if degrees
             else f"multiply times by {typical:.3g}, or find what is wrong with velocities",
@@ -221,13 +229,17 @@ def _velocities(recording: Recording) -> Iterator[Doubt]:
         )
         return
     for j in wrong:
-        cause = "angle_sign" if ratio[j] < 0 and abs(abs(ratio[j]) - 1) < LIMITS.rate - 1 else "angle_scale"
+        cause = (
+            "angle_sign"
+            if ratio[j] < 0 and abs(abs(ratio[j]) - 1) < QUALITY_LIMITS.max_rate_ratio - 1
+            else "angle_scale"
+        )
         size = abs(ratio[j])
-        yield Doubt(
+        yield Issue(
             cause,
             f"the angle of {names[j]} turns {ratio[j]:.3g} times as fast as its recorded velocity says",
             "not_trusted",
-            MOST if cause == "angle_sign" else max(size, 1 / size) / LIMITS.rate,
+            MAX_LIMIT_RATIO if cause == "angle_sign" else max(size, 1 / size) / QUALITY_LIMITS.max_rate_ratio,
             f"divide the angle of {names[j]} by {ratio[j]:.3g}",
             "",
             "joints",
@@ -235,14 +247,14 @@ def _velocities(recording: Recording) -> Iterator[Doubt]:
         )
 
 
-def _exchanged(names: Sequence[str], by_angle: Array, by_velocity: Array, fit: Array, ratio: Array) -> Iterator[Doubt]:
+def _exchanged(names: Sequence[str], by_angle: Array, by_velocity: Array, fit: Array, ratio: Array) -> Iterator[Issue]:
     """Two angles that turn as each other's velocity says."""
     off = [j for j in range(len(names)) if math.isfinite(ratio[j]) and abs(fit[j]) < 0.5]
     for place, i in enumerate(off):
         for j in off[place + 1 :]:
             across = [float(np.corrcoef(by_angle[:, a], by_velocity[:, b])[0, 1]) for a, b in ((i, j), (j, i))]
             if min(across) > 0.9:
-                yield Doubt(
+                yield Issue(
                     "swapped_joints",
                     f"the angle of {names[i]} turns as the velocity of {names[j]} says, and the other way round",
                     "not_trusted",
@@ -254,21 +266,21 @@ def _exchanged(names: Sequence[str], by_angle: Array, by_velocity: Array, fit: A
                 )
 
 
-def _standstill(recording: Recording) -> Iterator[Doubt]:
+def _standstill(recording: Recording) -> Iterator[Issue]:
     joints, moved = recording.joints, []
     if joints is not None:
         size = float(np.max(np.ptp(_smoothed(joints.position), axis=0)))
-        moved.append(size / LIMITS.motion)
+        moved.append(size / QUALITY_LIMITS.min_joint_motion)
     for group in recording.points:
         seen = group.position[:, np.isfinite(group.position).any(axis=(0, 2))]
         size = float(np.max(np.nanmax(seen, axis=0) - np.nanmin(seen, axis=0), initial=0.0))
         known = np.zeros(0) if group.std is None else group.std[np.isfinite(group.std)]
         noise = 6 * float(np.median(known)) if len(known) else 0.0
-        moved.append(size / max(LIMITS.travel, noise))
+        moved.append(size / max(QUALITY_LIMITS.min_point_travel, noise))
     if max(moved, default=2.0) < 1.0:
-        yield Doubt(
+        yield Issue(
             "standstill",
-            f"no joint turns by {LIMITS.motion:g} rad and no point moves by more than its noise",
+            f"no joint turns by {QUALITY_LIMITS.min_joint_motion:g} rad and no point moves by more than its noise",
             "warning",
             1 / max(*moved, 1e-3),
             "record a motion; what a posture at rest says is all that can be found",
@@ -286,7 +298,7 @@ def _smoothed(values: Array) -> Array:
 # -- several recordings -----------------------------------------------------------------------------------------------
 
 
-def shared_samples(one: Recording, other: Recording) -> int:
+def _shared_sample_count(one: Recording, other: Recording) -> int:
     """Number of bit-identical motion samples that two recordings share."""
     if one.joints is not None and other.joints is not None:
         return _common(_rows(one.joints), _rows(other.joints))
@@ -294,7 +306,7 @@ def shared_samples(one: Recording, other: Recording) -> int:
     return max((_common(_rows(g), _rows(others[g.name])) for g in one.points if g.name in others), default=0)
 
 
-def _rows(group: Group) -> Array:
+def _rows(group: SampleGroup) -> Array:
     if isinstance(group, PointGroup):
         return np.nan_to_num(group.position.reshape(len(group.t), -1))
     return group.position if group.effort is None else np.hstack([group.position, np.nan_to_num(group.effort)])
@@ -307,17 +319,17 @@ def _common(one: Array, other: Array) -> int:
     return len(set.intersection(*pairs))
 
 
-def same_data(one: Recording, other: Recording) -> Doubt | None:
+def duplicate_data_issue(one: Recording, other: Recording) -> Issue | None:
     """Issue naming the second recording if both hold the same measurement at least in part, else None."""
-    count = shared_samples(one, other)
+    count = _shared_sample_count(one, other)
     few = min(len(group.t) for recording in (one, other) for group in recording.groups[:1])
-    if count < min(LIMITS.shared, 0.5 * few):
+    if count < min(QUALITY_LIMITS.min_shared_samples, 0.5 * few):
         return None
-    return Doubt(
+    return Issue(
         "same_data",
         f"{count} samples of {other.name} are those of {one.name} to the last digit",
         "warning",
-        MOST,
+        MAX_LIMIT_RATIO,
         "list every measurement once",
         other.name,
     )

@@ -11,14 +11,14 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from yid_ocp.errors import DataError, choices
+from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
+from yid_ocp.errors import DataError, unknown_name_details
 from yid_ocp.sensors.base import EffortKind
-from yid_ocp.shown import Shown, Summary, counted
 
 Array = NDArray[np.float64]
-Clock = Literal["recorded", "nominal"]
+ClockKind = Literal["recorded", "nominal"]
 
-JOINT_CHANNELS: Mapping[str, str] = {
+JOINT_CHANNEL_UNITS: Mapping[str, str] = {
     "position": "rad",
     "velocity": "rad/s",
     "effort": "N m",
@@ -28,9 +28,9 @@ JOINT_CHANNELS: Mapping[str, str] = {
 }
 """Channels of a joint group and their units."""
 
-JOINT_STD = ("position_std", "velocity_std", "effort_std", "effort_bias_std")
+JOINT_STD_FIELDS = ("position_std", "velocity_std", "effort_std", "effort_bias_std")
 """Standard deviations that a joint group may have, in the units of their channels."""
-POINT_GROUP_NAME = re.compile(r"points(_[^/]+)?")
+POINT_GROUP_NAME_PATTERN = re.compile(r"points(_[^/]+)?")
 """Pattern of allowed names of point groups."""
 
 _LARGEST = {"rad": 50.0, "rad/s": 1e6, "N m": 1e9}
@@ -41,7 +41,7 @@ _TIME_TOLERANCE = 1e-9  # a nominal clock is a sum of rounded periods, so its en
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class JointGroup(Shown):
+class JointGroup(ReprMixin):
     """Joint measurements of a robot: N samples of nj joints on one clock.
 
     Arrays are copied, made float64 and read-only.
@@ -84,31 +84,33 @@ class JointGroup(Shown):
     effort_std: float | Array | None = None
     effort_bias_std: float | Array | None = None
     effort_kind: EffortKind | None = None
-    clock: Clock = "recorded"
+    clock: ClockKind = "recorded"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
-        for name in ("t", *JOINT_CHANNELS):
+        for name in ("t", *JOINT_CHANNEL_UNITS):
             if getattr(self, name) is not None:
-                object.__setattr__(self, name, read_only(getattr(self, name), f"joints/{name}"))
-        for name in JOINT_STD:
+                object.__setattr__(self, name, read_only_array(getattr(self, name), f"joints/{name}"))
+        for name in JOINT_STD_FIELDS:
             if getattr(self, name) is not None:
-                std = read_only(getattr(self, name), f"joints, attribute {name}")
+                std = read_only_array(getattr(self, name), f"joints, attribute {name}")
                 object.__setattr__(self, name, float(std) if std.ndim == 0 else std)
 
     @property
     def channels(self) -> dict[str, Array]:
-        """The channels that were recorded: name to array, shape (N, nj), units in `JOINT_CHANNELS`."""
-        return {name: getattr(self, name) for name in JOINT_CHANNELS if getattr(self, name) is not None}
+        """The channels that were recorded: name to array, shape (N, nj), units in `JOINT_CHANNEL_UNITS`."""
+        return {name: getattr(self, name) for name in JOINT_CHANNEL_UNITS if getattr(self, name) is not None}
 
     @property
-    def effort_taken_as(self) -> EffortKind:
+    def effort_kind_or_default(self) -> EffortKind:
         """`effort_kind`, or `sample` if it is not stated, which is what robot drivers publish."""
         return self.effort_kind or "sample"
 
-    def _summary(self) -> Summary:
+    def _summary(self) -> ReprSummary:
         rows = [("joint",), *((name,) for name in self.names)]
-        return Summary(f"{counted(len(self.names), 'joint')}, {_sampled(self.t)}: {', '.join(self.channels)}", rows)
+        return ReprSummary(
+            f"{count_with_noun(len(self.names), 'joint')}, {_sampled(self.t)}: {', '.join(self.channels)}", rows
+        )
 
     def _rows(self, rows: NDArray[np.bool_]) -> JointGroup:
         changes: dict[str, Any] = {name: value[rows] for name, value in self.channels.items()}
@@ -116,7 +118,7 @@ class JointGroup(Shown):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class PointGroup(Shown):
+class PointGroup(ReprMixin):
     """Positions of np named points over M frames of one sensor, on its own clock.
 
     Arrays are copied, made float64 and read-only.
@@ -151,22 +153,24 @@ class PointGroup(Shown):
     sensor: str = "unknown"
     frame: str = "world"
     pose: Array | None = None
-    clock: Clock = "recorded"
+    clock: ClockKind = "recorded"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
         for name in ("t", "position", "std", "pose"):
             if getattr(self, name) is not None:
-                object.__setattr__(self, name, read_only(getattr(self, name), f"{self.name}/{name}"))
+                object.__setattr__(self, name, read_only_array(getattr(self, name), f"{self.name}/{name}"))
         if self.std is not None and self.std.ndim == 0:
             object.__setattr__(
-                self, "std", read_only(np.full(self.position.shape, float(self.std)), f"{self.name}/std")
+                self, "std", read_only_array(np.full(self.position.shape, float(self.std)), f"{self.name}/std")
             )
 
-    def _summary(self) -> Summary:
+    def _summary(self) -> ReprSummary:
         seen = np.isfinite(self.position).all(axis=2).sum(axis=0)
         rows = [("point", "seen"), *((name, str(count)) for name, count in zip(self.names, seen, strict=True))]
-        return Summary(f"{self.name}, {counted(len(self.names), 'point')}, {_sampled(self.t)}, in {self.frame}", rows)
+        return ReprSummary(
+            f"{self.name}, {count_with_noun(len(self.names), 'point')}, {_sampled(self.t)}, in {self.frame}", rows
+        )
 
     def _rows(self, rows: NDArray[np.bool_]) -> PointGroup:
         std = None if self.std is None else self.std[rows]
@@ -179,10 +183,10 @@ class PointGroup(Shown):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Recording(Shown):
+class Recording(ReprMixin):
     """One recording of a robot or of a virtual experiment, in SI units.
 
-    The constructor only stores; `validate(Recording(...))` checks as well.
+    The constructor only stores; `validate_recording(Recording(...))` checks as well.
 
     Attributes
     ----------
@@ -195,10 +199,10 @@ class Recording(Shown):
     name : str
         Short name, the stem of the file.
     sha256 : str or None
-        Hash of the file read; kept by `slice` and `select_points`.
-    truth : mapping of str to float
+        Hash of the file read; kept by `time_slice` and `select_points`.
+    true_parameters : mapping of str to float
         The parameter values of a virtual experiment, in the parameters' own units; empty for a real one.
-    straight : ndarray, shape (np, 3), or None
+    marker_reference_pose : ndarray, shape (np, 3), or None
         Positions of the points of the first group while the object was held straight, in that group's frame [m].
     notes : tuple of str
         What an import left out or changed, in words.
@@ -210,26 +214,29 @@ class Recording(Shown):
     source: str = ""
     name: str = "recording"
     sha256: str | None = None
-    truth: Mapping[str, float] = field(default_factory=dict)
-    straight: Array | None = None
+    true_parameters: Mapping[str, float] = field(default_factory=dict)
+    marker_reference_pose: Array | None = None
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", tuple(self.points))
-        object.__setattr__(self, "truth", dict(self.truth))
+        object.__setattr__(self, "truth", dict(self.true_parameters))
         object.__setattr__(self, "notes", tuple(self.notes))
-        if self.straight is not None:
-            object.__setattr__(self, "straight", read_only(self.straight, "straight"))
+        if self.marker_reference_pose is not None:
+            object.__setattr__(self, "straight", read_only_array(self.marker_reference_pose, "straight"))
 
-    def _summary(self) -> Summary:
-        joints, points = counted(len(self.joint_names), "joint"), counted(len(self.point_names), "point")
+    def _summary(self) -> ReprSummary:
+        joints, points = (
+            count_with_noun(len(self.joint_names), "joint"),
+            count_with_noun(len(self.point_names), "point"),
+        )
         rows = [("group", "names", "samples", "channels")]
         if self.joints is not None:
             own = self.joints
             rows.append(("joints", ", ".join(own.names), _sampled(own.t), ", ".join(own.channels)))
         rows += [(g.name, ", ".join(g.names), _sampled(g.t), "position") for g in self.points]
         span = f", {self.duration:.4g} s" if self.groups else ""
-        return Summary(f"'{self.name}', {joints} and {points}{span}", rows)
+        return ReprSummary(f"'{self.name}', {joints} and {points}{span}", rows)
 
     @property
     def groups(self) -> tuple[JointGroup | PointGroup, ...]:
@@ -257,7 +264,7 @@ class Recording(Shown):
             return self
         return replace(self, joints=replace(self.joints, effort_kind=kind))
 
-    def slice(self, start: float, stop: float) -> Recording:
+    def time_slice(self, start: float, stop: float) -> Recording:
         """Cut out the samples with  start <= t <= stop.
 
         Times are kept as they are, each group's on its own clock; a group without a sample in between is left out.
@@ -281,11 +288,13 @@ class Recording(Shown):
         kept = [group._rows(mask) for group, mask in zip(self.groups, masks, strict=True) if mask.any()]
         first, last = min(g.t[0] for g in self.groups), max(g.t[-1] for g in self.groups)
         what, allowed = f"nothing was recorded from {start:g} s to {stop:g} s", f"within {first:g} s to {last:g} s"
-        require(start < stop and bool(kept), what, f"recording '{self.name}'", f"start < stop, {allowed}")
+        require_data(start < stop and bool(kept), what, f"recording '{self.name}'", f"start < stop, {allowed}")
         joints = next((group for group in kept if isinstance(group, JointGroup)), None)
         points = tuple(group for group in kept if isinstance(group, PointGroup))
         first_kept = bool(points) and points[0].name == self.points[0].name
-        return replace(self, joints=joints, points=points, straight=self.straight if first_kept else None)
+        return replace(
+            self, joints=joints, points=points, marker_reference_pose=self.marker_reference_pose if first_kept else None
+        )
 
     def select_points(self, names: Iterable[str]) -> Recording:
         """Keep only the named points, in the order given, in every group that has them.
@@ -306,18 +315,20 @@ class Recording(Shown):
             If a point was not recorded, or nothing is left.
         """
         wanted = tuple(dict.fromkeys(names))
-        check_names(self, (), wanted)
+        check_recorded_names(self, (), wanted)
         present = [(group, [name for name in wanted if name in group.names]) for group in self.points]
         points = tuple(group._select(kept) for group, kept in present if kept)
         what = "no point was selected and the recording has no joints"
-        require(bool(points) or self.joints is not None, what, f"recording '{self.name}'", ", ".join(self.point_names))
+        require_data(
+            bool(points) or self.joints is not None, what, f"recording '{self.name}'", ", ".join(self.point_names)
+        )
         straight = None
-        if self.straight is not None and points and points[0].name == self.points[0].name:
-            straight = self.straight[[self.points[0].names.index(name) for name in points[0].names]]
-        return replace(self, points=points, straight=straight)
+        if self.marker_reference_pose is not None and points and points[0].name == self.points[0].name:
+            straight = self.marker_reference_pose[[self.points[0].names.index(name) for name in points[0].names]]
+        return replace(self, points=points, marker_reference_pose=straight)
 
 
-def validate(recording: Recording, *, allow_nan_effort: bool = False, where: str = "") -> Recording:
+def validate_recording(recording: Recording, *, allow_nan_effort: bool = False, where: str = "") -> Recording:
     """Check shapes, clocks, names, values and units of a recording.
 
     Parameters
@@ -344,25 +355,25 @@ def validate(recording: Recording, *, allow_nan_effort: bool = False, where: str
         machine; `straight` does not match the first group of points.
     """
     origin = where or f"recording '{recording.name}'"
-    require(bool(recording.groups), "the recording has no group", origin, "joints, points, points_<name>")
+    require_data(bool(recording.groups), "the recording has no group", origin, "joints, points, points_<name>")
     _check_text(origin, recording.description, recording.source, *recording.notes)
-    for key, value in recording.truth.items():
+    for key, value in recording.true_parameters.items():
         good = isinstance(value, numbers.Real) and not isinstance(value, bool) and bool(np.isfinite(value))
-        require(good, f"the true value of '{key}' is {value!r}", f"{origin}: truth", "finite numbers")
+        require_data(good, f"the true value of '{key}' is {value!r}", f"{origin}: truth", "finite numbers")
     if recording.joints is not None:
         _validate_joints(recording.joints, f"{origin}: joints", allow_nan_effort)
     names = [group.name for group in recording.points]
     for group in recording.points:
-        legal = POINT_GROUP_NAME.fullmatch(group.name) is not None
-        require(legal, f"a group of points is called '{group.name}'", origin, "points, points_<name>")
-        require(names.count(group.name) == 1, f"two groups of points are called '{group.name}'", origin)
+        legal = POINT_GROUP_NAME_PATTERN.fullmatch(group.name) is not None
+        require_data(legal, f"a group of points is called '{group.name}'", origin, "points, points_<name>")
+        require_data(names.count(group.name) == 1, f"two groups of points are called '{group.name}'", origin)
         _validate_points(group, f"{origin}: {group.name}")
-    if recording.straight is not None:
-        _validate_straight(recording.straight, recording.points, f"{origin}: straight")
+    if recording.marker_reference_pose is not None:
+        _validate_straight(recording.marker_reference_pose, recording.points, f"{origin}: straight")
     return recording
 
 
-def check_names(recording: Recording, joints: Iterable[str], points: Iterable[str]) -> None:
+def check_recorded_names(recording: Recording, joints: Iterable[str], points: Iterable[str]) -> None:
     """Check that a recording has the given joints and points.
 
     Parameters
@@ -381,7 +392,7 @@ def check_names(recording: Recording, joints: Iterable[str], points: Iterable[st
         missing = [name for name in dict.fromkeys(wanted) if name not in known]
         if missing:
             listed = ", ".join(f"'{name}'" for name in missing)
-            said = [(name, choices(name, known)) for name in missing]
+            said = [(name, unknown_name_details(name, known)) for name in missing]
             raise DataError(
                 f"the recording has no {noun}{'s' if len(missing) > 1 else ''} {listed}",
                 where=f"recording '{recording.name}'",
@@ -393,16 +404,16 @@ def check_names(recording: Recording, joints: Iterable[str], points: Iterable[st
 def _sampled(t: Array) -> str:
     """How many samples there are, and how fast they come."""
     rate = (len(t) - 1) / (t[-1] - t[0]) if len(t) > 1 else 0.0
-    return f"{counted(len(t), 'sample')} at {rate:.4g} Hz" if rate else counted(len(t), "sample")
+    return f"{count_with_noun(len(t), 'sample')} at {rate:.4g} Hz" if rate else count_with_noun(len(t), "sample")
 
 
-def require(ok: bool, what: str, where: str, allowed: str = "", hint: str = "") -> None:
+def require_data(ok: bool, what: str, where: str, allowed: str = "", hint: str = "") -> None:
     """Raise a `DataError` unless a condition holds."""
     if not ok:
         raise DataError(what, where=where, allowed=allowed, hint=hint)
 
 
-def read_only(value: ArrayLike, where: str) -> Array:
+def read_only_array(value: ArrayLike, where: str) -> Array:
     """A read-only copy as float64; `DataError` where that is not possible."""
     try:
         array = np.array(value, dtype=np.float64)
@@ -429,27 +440,27 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
                 hint="cut the recording or leave the channel out"
                 + (", or read with allow_nan_effort=True" if is_effort else ""),
             )
-        unit = JOINT_CHANNELS[channel]
+        unit = JOINT_CHANNEL_UNITS[channel]
         largest = float(np.nanmax(np.abs(value), initial=0.0))
         degrees = f"these look like degrees: convert them to radians, or read a CSV with units={{'{channel}': 'deg'}}"
-        require(
+        require_data(
             largest <= _LARGEST[unit],
             f"channel '{channel}' reaches {largest:g} {unit}",
             place,
             f"at most {_LARGEST[unit]:g} {unit}",
             degrees if unit == "rad" else "convert it again from what was recorded: no machine does that",
         )
-    for name in JOINT_STD:
+    for name in JOINT_STD_FIELDS:
         std, place = getattr(joints, name), f"{where}, attribute {name}"
         if std is not None:
             if np.ndim(std) > 0:
                 _check_shape(std, (len(joints.names),), place, "one number or (nj,)")
             good = bool(np.all((np.asarray(std) >= 0) & (np.asarray(std) <= _LARGEST_SPREAD)))
-            require(good, f"{name} is {std}", place, f"not negative, and at most {_LARGEST_SPREAD:g}")
+            require_data(good, f"{name} is {std}", place, f"not negative, and at most {_LARGEST_SPREAD:g}")
     if joints.effort_kind is not None:
         place, kinds = f"{where}, attribute effort_kind", get_args(EffortKind)
         hint = "leave the attribute out where it is not known"
-        require(joints.effort_kind in kinds, f"the kind is '{joints.effort_kind}'", place, ", ".join(kinds), hint)
+        require_data(joints.effort_kind in kinds, f"the kind is '{joints.effort_kind}'", place, ", ".join(kinds), hint)
 
 
 def _validate_points(group: PointGroup, where: str) -> None:
@@ -466,7 +477,7 @@ def _validate_points(group: PointGroup, where: str) -> None:
             allowed="three finite coordinates, or three NaN where the point was not seen",
         )
     largest = float(np.abs(group.position[~unseen]).max(initial=0.0))
-    require(
+    require_data(
         largest <= _LARGEST_DISTANCE,
         f"a coordinate reaches {largest:g} m",
         f"{where}/position",
@@ -478,31 +489,35 @@ def _validate_points(group: PointGroup, where: str) -> None:
         seen = group.std[~unseen]
         wrong = seen[~((seen >= 0) & (seen <= _LARGEST_SPREAD))]
         what = f"the standard deviation of a point that was seen is {wrong[:1]}"
-        require(wrong.size == 0, what, f"{where}/std", f"not negative, and at most {_LARGEST_SPREAD:g} m")
+        require_data(wrong.size == 0, what, f"{where}/std", f"not negative, and at most {_LARGEST_SPREAD:g} m")
     if group.pose is not None:
         _check_pose(group.pose, f"{where}, attribute pose")
 
 
 def _validate_straight(straight: Array, groups: Sequence[PointGroup], where: str) -> None:
-    require(bool(groups), "the positions of a straight object belong to no points", where, "a group of points")
+    require_data(bool(groups), "the positions of a straight object belong to no points", where, "a group of points")
     _check_shape(straight, (len(groups[0].names), 3), where, "(np, 3), for the first group of points")
-    require(bool(np.isfinite(straight).all()), "a position is not finite", where, "finite coordinates of every point")
+    require_data(
+        bool(np.isfinite(straight).all()), "a position is not finite", where, "finite coordinates of every point"
+    )
     largest = float(np.abs(straight).max())
     what, allowed = f"a coordinate reaches {largest:g} m", f"at most {_LARGEST_DISTANCE:g} m"
-    require(largest <= _LARGEST_DISTANCE, what, where, allowed, "these look like millimetres: convert them to metres")
+    require_data(
+        largest <= _LARGEST_DISTANCE, what, where, allowed, "these look like millimetres: convert them to metres"
+    )
     # a file lists its groups by name, so only that order survives it
     first = min(groups, key=lambda group: group.name.encode())
     what = f"the positions belong to '{groups[0].name}', but a file would list '{first.name}' first"
-    require(first is groups[0], what, where, "groups of points sorted by name")
+    require_data(first is groups[0], what, where, "groups of points sorted by name")
 
 
 def _check_pose(pose: Array, where: str) -> None:
     _check_shape(pose, (4, 4), where, "(4, 4)")
     rotation, allowed = pose[:3, :3], "a rotation, a translation [m] and the last row 0 0 0 1"
-    require(bool(np.isfinite(pose).all()), "the pose has a value that is not finite", where, allowed)
-    require(_close(pose[3], np.eye(4)[3]), f"the last row of the pose is {pose[3]}", where, allowed)
-    require(_close(rotation.T @ rotation, np.eye(3)), "the axes of the pose are not orthonormal", where, allowed)
-    require(bool(np.linalg.det(rotation) > 0), "the pose is a reflection", where, allowed)
+    require_data(bool(np.isfinite(pose).all()), "the pose has a value that is not finite", where, allowed)
+    require_data(_close(pose[3], np.eye(4)[3]), f"the last row of the pose is {pose[3]}", where, allowed)
+    require_data(_close(rotation.T @ rotation, np.eye(3)), "the axes of the pose are not orthonormal", where, allowed)
+    require_data(bool(np.linalg.det(rotation) > 0), "the pose is a reflection", where, allowed)
 
 
 def _close(array: Array, expected: Array) -> bool:
@@ -510,18 +525,20 @@ def _close(array: Array, expected: Array) -> bool:
 
 
 def _check_names_and_clock(group: JointGroup | PointGroup, where: str) -> None:
-    require(bool(group.names), "the group has no names", where)
-    require(group.t.size > 0, "the group has no samples", where)
+    require_data(bool(group.names), "the group has no names", where)
+    require_data(group.t.size > 0, "the group has no samples", where)
     for name in group.names:
         place = f"{where}, names"
-        require(isinstance(name, str) and bool(name), f"the name {name!r} cannot be used", place, "text, not empty")
+        require_data(
+            isinstance(name, str) and bool(name), f"the name {name!r} cannot be used", place, "text, not empty"
+        )
         _check_text(place, name)
-        require(group.names.count(name) == 1, f"the name '{name}' occurs {group.names.count(name)} times", place)
-    clocks = get_args(Clock)
-    require(group.clock in clocks, f"the clock is '{group.clock}'", f"{where}, attribute clock", ", ".join(clocks))
+        require_data(group.names.count(name) == 1, f"the name '{name}' occurs {group.names.count(name)} times", place)
+    clocks = get_args(ClockKind)
+    require_data(group.clock in clocks, f"the clock is '{group.clock}'", f"{where}, attribute clock", ", ".join(clocks))
     _check_shape(group.t, (group.t.size,), f"{where}/t", "one-dimensional")
     bad = np.flatnonzero(~np.isfinite(group.t))
-    require(bad.size == 0, f"the time at index {bad[:1]} is not finite", f"{where}/t", "finite seconds")
+    require_data(bad.size == 0, f"the time at index {bad[:1]} is not finite", f"{where}/t", "finite seconds")
     backward = np.flatnonzero(np.diff(group.t) <= 0)
     if backward.size:
         index = int(backward[0])
@@ -535,11 +552,11 @@ def _check_names_and_clock(group: JointGroup | PointGroup, where: str) -> None:
 
 
 def _check_shape(array: Array, shape: tuple[int, ...], where: str, letters: str) -> None:
-    require(array.shape == shape, f"the array has shape {array.shape}", where, f"{shape}, that is {letters}")
+    require_data(array.shape == shape, f"the array has shape {array.shape}", where, f"{shape}, that is {letters}")
 
 
 def _check_text(where: str, *texts: str) -> None:
     for text in texts:
         # HDF5 ends text at the first null character and stores it as UTF-8
         storable = "\0" not in text and not any("\ud800" <= letter <= "\udfff" for letter in text)
-        require(storable, f"the text {text!r} cannot be stored", where, "Unicode text without null characters")
+        require_data(storable, f"the text {text!r} cannot be stored", where, "Unicode text without null characters")

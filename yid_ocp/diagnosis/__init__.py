@@ -1,18 +1,18 @@
 """Diagnosis of the sim-to-real gap: is there one, where, which unmodelled effect makes it, how far it closes."""
 
 from yid_ocp.diagnosis.diagnose import diagnose as diagnose
-from yid_ocp.diagnosis.finding import Finding as Finding
-from yid_ocp.diagnosis.hypotheses import CandidateProblem as CandidateProblem
-from yid_ocp.diagnosis.localise import Place as Place
-from yid_ocp.diagnosis.localise import localise as localise
-from yid_ocp.diagnosis.refit import Refitted as Refitted
-from yid_ocp.diagnosis.refit import refit as refit
-from yid_ocp.diagnosis.screening import confusability as confusability
-from yid_ocp.diagnosis.screening import linearise as linearise
-from yid_ocp.diagnosis.screening import scores as scores
-from yid_ocp.diagnosis.screening import together as together
-from yid_ocp.diagnosis.screening import visibility as visibility
-from yid_ocp.diagnosis.select import closure as closure
-from yid_ocp.diagnosis.smoother import Smoothed as Smoothed
-from yid_ocp.diagnosis.smoother import smooth as smooth
+from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult as DiagnosisResult
+from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem as AllCandidatesProblem
+from yid_ocp.diagnosis.localise import GapLocation as GapLocation
+from yid_ocp.diagnosis.localise import localise_gap as localise_gap
+from yid_ocp.diagnosis.refit import StoredFit as StoredFit
+from yid_ocp.diagnosis.refit import refit_with_effects as refit_with_effects
+from yid_ocp.diagnosis.screening import candidate_detectability as candidate_detectability
+from yid_ocp.diagnosis.screening import confusability_matrix as confusability_matrix
+from yid_ocp.diagnosis.screening import linearize_candidates as linearize_candidates
+from yid_ocp.diagnosis.screening import score_candidates as score_candidates
+from yid_ocp.diagnosis.screening import score_jointly as score_jointly
+from yid_ocp.diagnosis.select import gap_closure as gap_closure
+from yid_ocp.diagnosis.smoother import SmootherResult as SmootherResult
+from yid_ocp.diagnosis.smoother import run_smoother as run_smoother
 from yid_ocp.diagnosis.thresholds import Thresholds as Thresholds

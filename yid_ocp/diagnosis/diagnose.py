@@ -11,51 +11,81 @@ from dataclasses import dataclass, replace
 import numpy as np
 import threadpoolctl
 
-from yid_ocp.analysis.history import Estimates
+from yid_ocp.analysis.estimate_history import RunEstimates
 from yid_ocp.data.recording import Recording
-from yid_ocp.diagnosis.baseline import with_baseline
-from yid_ocp.diagnosis.carry_over import carried_over, counting_both
-from yid_ocp.diagnosis.earlier import UNTOLD, Earlier
-from yid_ocp.diagnosis.events import NOTHING, Events, find_events, without_events
-from yid_ocp.diagnosis.finding import Finding, absorption
-from yid_ocp.diagnosis.hypotheses import MARGINS, CandidateProblem, Choice, Cut, chosen_effects, left_out
-from yid_ocp.diagnosis.localise import Place, attributed, localise, main_places, merged
-from yid_ocp.diagnosis.refit import Fit, Search, Store, recalled, refit
-from yid_ocp.diagnosis.screening import Screened, screen
-from yid_ocp.diagnosis.select import Added, Closure, closure, compose
-from yid_ocp.diagnosis.smoother import Smoothed, smooth
-from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
-from yid_ocp.diagnosis.verdict import decide, explained_part, has_gap, shapeless, why_unknown
-from yid_ocp.diagnosis.words import cut_short, next_experiment, sentences, shortage
+from yid_ocp.diagnosis.baseline_comparison import with_baseline_prior
+from yid_ocp.diagnosis.baseline_data import NO_BASELINE, BaselineData
+from yid_ocp.diagnosis.diagnosis_messages import (
+    diagnosis_summary_text,
+    insufficient_data_message,
+    next_experiment_text,
+    truncation_message,
+)
+from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult, nominal_parameter_changes
+from yid_ocp.diagnosis.events import NO_EVENTS, EventSet, find_events, problem_without_events
+from yid_ocp.diagnosis.hypotheses import (
+    TRUNCATION_FRACTIONS,
+    AllCandidatesProblem,
+    CandidateChoice,
+    TruncatedRecording,
+    exclude_candidates,
+    make_candidate_effects,
+)
+from yid_ocp.diagnosis.localise import (
+    GapLocation,
+    attribute_gap_to_effects,
+    localise_gap,
+    main_gap_locations,
+    merge_intervals,
+)
+from yid_ocp.diagnosis.refit import RefitContext, RefitModel, RefitStore, load_stored_refit, refit_with_effects
+from yid_ocp.diagnosis.screening import ScreeningResult, screen_candidates
+from yid_ocp.diagnosis.select import GapClosure, SelectedEffect, gap_closure, select_effects
+from yid_ocp.diagnosis.smoother import SmootherResult, run_smoother
+from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
+from yid_ocp.diagnosis.transfer_check import check_transfer, inflate_std_by_disagreement
+from yid_ocp.diagnosis.verdict import (
+    compute_explained_fraction,
+    decide_verdict,
+    find_unknown_reason,
+    has_gap,
+    is_chance_excess,
+)
 from yid_ocp.errors import DataError, SolverError
-from yid_ocp.parallel import map_in_step
+from yid_ocp.parallel import map_with_batched_calls
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.constant_errors import without_constants
-from yid_ocp.problem.null_test import NullTest, noise_floor, null_test, residual_series, whitened_beside
-from yid_ocp.progress import Logged, Progress
+from yid_ocp.problem.constant_sensor_errors import subtract_estimated_biases
+from yid_ocp.problem.null_test import (
+    NullTestResult,
+    channel_noise_levels,
+    residual_channels,
+    run_null_test,
+    whiten_with_extra_errors,
+)
+from yid_ocp.progress import LoggingProgress, Progress
 from yid_ocp.solvers import GaussNewton, Solution, solve
-from yid_ocp.solvers.base import RESTARTS
-from yid_ocp.solvers.judgement import spread_by_noise
+from yid_ocp.solvers.base import RESTART_FACTORS
+from yid_ocp.solvers.uncertainty import noise_covariance_factor
 
 log = logging.getLogger(__name__)
 
-ROUNDS = 3
+_MAX_EVENT_ROUNDS = 3
 """Maximum number of refits of the nominal model, each without the events found before it."""
 
 
 def diagnose(
     problem: EstimationProblem,
-    candidates: Choice = "all",
+    candidates: CandidateChoice = "all",
     held_out: Sequence[Recording] = (),
     *,
     thresholds: Thresholds | None = None,
     solution: Solution | None = None,
     progress: Progress | None = None,
-    store: Store | None = None,
-    baseline: Estimates | Sequence[Estimates] = (),
-    without: Sequence[Recording] = (),
-    leave_out: Sequence[str] = (),
-) -> Finding:
+    store: RefitStore | None = None,
+    baseline: RunEstimates | Sequence[RunEstimates] = (),
+    reference_recordings: Sequence[Recording] = (),
+    exclude: Sequence[str] = (),
+) -> DiagnosisResult:
     """Diagnose the gap between model and recordings: whether it exists, where, its cause, and how far it closes.
 
     Parameters
@@ -75,10 +105,10 @@ def diagnose(
         Of refits that an earlier run of the same diagnosis finished; told of every further one.
     baseline : Estimates or sequence of Estimates, optional
         What earlier runs of the same model say of its parameters (`read_estimates`): priors, so that the question is
-        what differs now. A problem that has them already (`with_baseline`) is taken as it is.
-    without : sequence of Recording, optional
+        what differs now. A problem that has them already (`with_baseline_prior`) is taken as it is.
+    reference_recordings : sequence of Recording, optional
         Made without what is looked for: what the effects found are taken out for (`counterfactual`).
-    leave_out : sequence of str, optional
+    exclude : sequence of str, optional
         Candidates that are not tried, `kind` or `kind@location`.
 
     Returns
@@ -96,177 +126,200 @@ def diagnose(
     """
     # the matrices are small: threads of the linear algebra library cost more than they give
     with threadpoolctl.threadpool_limits(1):
-        clock, told = _Clock(), progress or Logged(log)
-        runs = (baseline,) if isinstance(baseline, Estimates) else tuple(baseline)
-        earlier = Earlier.of(runs, tuple(without))
-        if earlier.known is not None and not problem.options.joint_prior.names:
-            problem = with_baseline(problem, earlier.known)
-        composed = _composed(problem, candidates, leave_out, held_out, told)
+        clock, told = _Clock(), progress or LoggingProgress(log)
+        runs = (baseline,) if isinstance(baseline, RunEstimates) else tuple(baseline)
+        earlier = BaselineData.from_runs(runs, tuple(reference_recordings))
+        if earlier.combined_estimates is not None and not problem.options.multivariate_prior.parameter_names:
+            problem = with_baseline_prior(problem, earlier.combined_estimates)
+        composed = _composed(problem, candidates, exclude, held_out, told)
         clock.lap("compose")
-        search = Search(composed, thresholds or DEFAULTS, told, store)
+        search = RefitContext(composed, thresholds or DEFAULT_THRESHOLDS, told, store)
         return _diagnosed(problem, search, solution, clock, earlier)
 
 
 def _diagnosed(
-    problem: EstimationProblem, search: Search, solution: Solution | None, clock: _Clock, earlier: Earlier = UNTOLD
-) -> Finding:
-    limits, progress = search.limits, search.progress
-    progress.stage("fitting the nominal model")
-    nominal = nominal_fit(problem, search.problem, solution, search.store, limits)
+    problem: EstimationProblem,
+    search: RefitContext,
+    solution: Solution | None,
+    clock: _Clock,
+    earlier: BaselineData = NO_BASELINE,
+) -> DiagnosisResult:
+    limits, progress = search.thresholds, search.progress
+    progress.begin_stage("fitting the nominal model")
+    nominal = fit_nominal_model(problem, search.problem, solution, search.store, limits)
     search, nominal, cuts = _followed(search, nominal)
     clock.lap("nominal")
-    progress.stage("looking for events")
+    progress.begin_stage("looking for events")
     whole = _undivided(search.problem, problem)
     search, nominal, happened = _without_events(search, nominal, whole)
     events, about = happened.events, nominal
     clock.lap("events")
     search, before, held, screened = _tested(search, nominal)
     clock.lap("screening")
-    enough = before.degrees >= limits.samples_per_unknown * len(nominal.values)
+    enough = before.degrees_of_freedom >= limits.min_samples_per_unknown * len(nominal.values)
     offsets = _offsets_stated(nominal.problem)
-    smoothed, trusted, gap = None, None, has_gap(before, held, limits, screened.scores, offsets)
-    other = elsewhere(search, nominal) if gap and enough and before.chi2_per_dof < limits.poor else None
+    smoothed, trusted, gap = None, None, has_gap(before, held, limits, screened.candidate_scores, offsets)
+    other = (
+        _better_nominal_fit(search, nominal) if gap and enough and before.chi2_per_dof < limits.restart_chi2 else None
+    )
     if other is not None:
         search, nominal, cuts = _followed(search, other, cuts)
         search, before, held, screened = _tested(search, nominal)
-        gap = has_gap(before, held, limits, screened.scores, offsets)
-    changed = earlier.changed(nominal, limits)
+        gap = has_gap(before, held, limits, screened.candidate_scores, offsets)
+    changed = earlier.changed_parameters(nominal, limits)
     clock.lap("other_starts")
     moved = bool(changed) and not gap
     gap = gap or moved
     if gap and enough:
-        progress.stage("locating the gap")
+        progress.begin_stage("locating the gap")
         # where nothing happened it was run on all that was fitted already
-        known = happened.smoothed if nominal is about and not search.problem.blocks else None
-        smoothed = smooth_fit(nominal, limits) if known is None else known
+        known = happened.smoothed if nominal is about and not search.problem.is_split_in_blocks else None
+        smoothed = _smooth_about_model(nominal, limits) if known is None else known
         # it knows noise of torques by its spectrum only: too little for a verdict to rest on what it explains
-        trusted = None if nominal.problem.disturbed else smoothed
-        gap = not shapeless(trusted, screened.scores, before, held, limits)
+        trusted = None if nominal.problem.has_process_noise else smoothed
+        gap = not is_chance_excess(trusted, screened.candidate_scores, before, held, limits)
     clock.lap("localisation")
-    fits: tuple[Fit, ...] = ()
-    added: tuple[Added, ...] = ()
-    if gap and enough and screened.scores:
-        there = () if smoothed is None else main_places(localise(smoothed, limits.sure))
-        fits, added = compose(search, nominal, screened, [place.location for place in there], bool(changed))
+    fits: tuple[RefitModel, ...] = ()
+    added: tuple[SelectedEffect, ...] = ()
+    if gap and enough and screened.candidate_scores:
+        there = () if smoothed is None else main_gap_locations(localise_gap(smoothed, limits.location_z))
+        fits, added = select_effects(search, nominal, screened, [place.location for place in there], bool(changed))
     clock.lap("refits")
-    carried = carried_over(search, added[-1].fit) if added else ()
+    carried = check_transfer(search, added[-1].refitted_model) if added else ()
     if carried:
-        added = (*added[:-1], replace(added[-1], fit=counting_both(added[-1].fit, carried)))
+        added = (
+            *added[:-1],
+            replace(added[-1], refitted_model=inflate_std_by_disagreement(added[-1].refitted_model, carried)),
+        )
     clock.lap("carry_over")
-    total = closure(nominal.loss, added[-1].fit.loss, limits=limits) if added else Closure(np.nan, np.nan, np.nan)
-    explained = explained_part(nominal, added, trusted)
+    total = (
+        gap_closure(nominal.held_out_loss, added[-1].refitted_model.held_out_loss, limits=limits)
+        if added
+        else GapClosure(np.nan, np.nan, np.nan)
+    )
+    explained = compute_explained_fraction(nominal, added, trusted)
     gap = gap and (bool(added) or not moved)  # what parameters explain by moving is no gap
-    same = all(entry.agrees for entry in carried)
-    verdict = decide(gap, screened.visible, added, total, limits, enough, explained, same)
+    same = all(entry.is_consistent for entry in carried)
+    verdict = decide_verdict(gap, screened.detectability, added, total, limits, enough, explained, same)
     accepted = added if verdict in ("effect", "confusable") else ()
     remaining, where, rest_where = _after(nominal, accepted, smoothed, before, held, limits)
     if accepted:
         # what a better model explains was no event
-        events = _happened(whole, accepted[-1].fit, limits).events
+        events = _happened(whole, accepted[-1].refitted_model, limits).events
     clock.lap("remaining")
-    finding = Finding(
+    finding = DiagnosisResult(
         verdict=verdict,
-        floor=noise_floor(nominal.problem),
-        before=before,
-        held_out_before=held,
-        visibility=screened.visible,
-        confusability=screened.alike,
-        scores=screened.scores,
-        smoothed=smoothed,
-        where=where,
-        nominal=nominal,
-        fits=fits,
-        added=added,
-        closure=total,
-        remaining=remaining,
-        remaining_where=rest_where,
-        absorbed=absorption(nominal, accepted[-1].fit if accepted else nominal),
-        next_experiment=next_experiment(verdict, accepted, where, screened.unseen),
-        held_out=tuple(episode.name for episode in nominal.problem.held_out),
-        in_blocks=search.problem.blocks,
-        message=shortage(verdict, before, len(nominal.values), screened.visible, limits),
-        limits=limits,
-        cuts=cuts,
-        reason=why_unknown(added, total, limits, explained, same) if verdict == "unknown" else "",
-        explained=explained,
-        carried=carried,
-        seconds=clock.laps,
+        noise_floor=channel_noise_levels(nominal.problem),
+        nominal_test=before,
+        nominal_held_out_test=held,
+        detectability=screened.detectability,
+        confusability=screened.confusability,
+        candidate_scores=screened.candidate_scores,
+        smoother_result=smoothed,
+        gap_locations=where,
+        nominal_model=nominal,
+        single_effect_models=fits,
+        selected_effects=added,
+        gap_closure=total,
+        remaining_test=remaining,
+        remaining_gap_locations=rest_where,
+        nominal_changes=nominal_parameter_changes(nominal, accepted[-1].refitted_model if accepted else nominal),
+        next_experiment=next_experiment_text(verdict, accepted, where, screened.undetectable_labels),
+        held_out_names=tuple(episode.name for episode in nominal.problem.held_out),
+        is_split_in_blocks=search.problem.is_split_in_blocks,
+        message=insufficient_data_message(verdict, before, len(nominal.values), screened.detectability, limits),
+        thresholds=limits,
+        truncated_recordings=cuts,
+        unknown_reason=find_unknown_reason(added, total, limits, explained, same) if verdict == "unknown" else "",
+        explained_fraction=explained,
+        transfer_checks=carried,
+        stage_seconds=clock.laps,
         events=events,
-        since=earlier.since(accepted[-1].fit if accepted else nominal, limits),
-        counterfactual=earlier.counterfactual(nominal, accepted, progress),
+        baseline_comparison=earlier.compare_with_baseline(accepted[-1].refitted_model if accepted else nominal, limits),
+        counterfactual=earlier.predict_reference_recordings(nominal, accepted, progress),
     )
-    return replace(finding, summary=sentences(finding))
+    return replace(finding, summary=diagnosis_summary_text(finding))
 
 
-def _undivided(composed: CandidateProblem, problem: EstimationProblem) -> EstimationProblem:
+def _undivided(composed: AllCandidatesProblem, problem: EstimationProblem) -> EstimationProblem:
     """The composed problem with all samples, although a diagnosis divides a single recording in blocks."""
     pairs = zip(composed.problem.episodes, problem.episodes, strict=True)
-    episodes = [replace(episode, samples=own.samples) for episode, own in pairs]
-    return composed.problem.on(episodes, () if composed.blocks else composed.problem.held_out)
+    episodes = [replace(episode, measurements=own.measurements) for episode, own in pairs]
+    return composed.problem.with_episodes(episodes, () if composed.is_split_in_blocks else composed.problem.held_out)
 
 
 @dataclass(frozen=True)
 class _Happened:
     """Events about a fit, and what the smoother says about it where it was asked."""
 
-    events: Events = NOTHING
-    smoothed: Smoothed | None = None
+    events: EventSet = NO_EVENTS
+    smoothed: SmootherResult | None = None
 
 
-def _happened(whole: EstimationProblem, fit: Fit, limits: Thresholds) -> _Happened:
+def _happened(whole: EstimationProblem, fit: RefitModel, limits: Thresholds) -> _Happened:
     """Events about a fit in all that was recorded; nothing where that cannot be predicted.
 
     Forces that take little of the gap with them are the largest errors of a model that errs everywhere.
     """
-    own, x = fit.problem.on(whole.episodes, whole.held_out), fit.problem.vector(fit.values)
+    own, x = fit.problem.with_episodes(whole.episodes, whole.held_out), fit.problem.vector(fit.values)
     smoothed = None
     if own.system.free_indices:
-        judged = own.weighted_at(x, fit.evaluation.warm) if own.disturbed else own
-        residual = judged.evaluate(x, False, fit.evaluation.warm)
+        judged = own.whitened_at(x, fit.evaluation.equilibrium_guesses) if own.has_process_noise else own
+        residual = judged.evaluate(x, False, fit.evaluation.equilibrium_guesses)
         if not residual.ok:
             return _Happened()
-        test = null_test(residual_series(judged), residual.residual, len(fit.values), limits.level, limits.window)
-        if any(window.flagged for window in test.windows):
-            evaluation = own.evaluate(x, warm=fit.evaluation.warm)
-            smoothed = smooth_fit(replace(fit, problem=own, evaluation=evaluation), limits)
+        test = run_null_test(
+            residual_channels(judged),
+            residual.residual,
+            len(fit.values),
+            limits.significance_level,
+            limits.residual_window,
+        )
+        if any(window.is_flagged for window in test.windows):
+            evaluation = own.evaluate(x, equilibrium_guesses=fit.evaluation.equilibrium_guesses)
+            smoothed = _smooth_about_model(replace(fit, problem=own, evaluation=evaluation), limits)
     if smoothed is None:
-        evaluation = own.evaluate(x, False, fit.evaluation.warm)
+        evaluation = own.evaluate(x, False, fit.evaluation.equilibrium_guesses)
     if not evaluation.ok:
         return _Happened()
     found = find_events(own, x, evaluation, smoothed, limits)
-    pushed = found.forces_alone
-    if pushed and _excess(fit, without_events(own, pushed)) > (1 - limits.event_share) * _excess(fit, own):
-        found = found.without_forces
+    pushed = found.only_force_events
+    if pushed and _excess(fit, problem_without_events(own, pushed)) > (1 - limits.min_event_chi2_fraction) * _excess(
+        fit, own
+    ):
+        found = found.without_force_events
     return _Happened(found, smoothed)
 
 
-def _excess(fit: Fit, problem: EstimationProblem) -> float:
+def _excess(fit: RefitModel, problem: EstimationProblem) -> float:
     """r'r of a fit beyond the number of samples that count, in all of a problem's recordings that can be predicted."""
-    x, warm = problem.vector(fit.values), fit.evaluation.warm
-    judged = problem.weighted_at(x, warm) if problem.disturbed else problem
+    x, warm = problem.vector(fit.values), fit.evaluation.equilibrium_guesses
+    judged = problem.whitened_at(x, warm) if problem.has_process_noise else problem
     evaluation = judged.evaluate(x, False, warm)
     if not evaluation.ok:
         return math.inf
-    rows = [evaluation.residual[judged.rows.data]]
-    for i, (episode, result) in enumerate(judged.validate(x)):
+    rows = [evaluation.residual[judged.residual_rows.data]]
+    for i, (episode, result) in enumerate(judged.predict_held_out(x)):
         if not isinstance(result, str):
-            rows.append(judged.held_out_rows(i, episode, result).residual)
+            rows.append(judged.held_out_residual(i, episode, result).residual)
     counted = np.concatenate(rows)
     return float(counted @ counted) - np.count_nonzero(counted)
 
 
-def _without_events(search: Search, nominal: Fit, whole: EstimationProblem) -> tuple[Search, Fit, _Happened]:
+def _without_events(
+    search: RefitContext, nominal: RefitModel, whole: EstimationProblem
+) -> tuple[RefitContext, RefitModel, _Happened]:
     """All that follows without what events explain, the nominal model fitted to that, and the events about it.
 
     Pushes pull a fit towards them: about a fit without those that were found, others may show.
     """
-    composed, limits = search.problem, search.limits
+    composed, limits = search.problem, search.thresholds
     happened = _happened(whole, nominal, limits)
-    for round_ in range(ROUNDS):
+    for round_ in range(_MAX_EVENT_ROUNDS):
         if not happened.events:
             return search, nominal, happened
-        cleaned = replace(composed, problem=without_events(composed.problem, happened.events))
-        search.progress.stage(f"fitting the nominal model without {len(happened.events.found)} events")
+        cleaned = replace(composed, problem=problem_without_events(composed.problem, happened.events))
+        search.progress.begin_stage(f"fitting the nominal model without {len(happened.events.disturbances)} events")
         name = f"the nominal model without events, round {round_ + 1}"
         again = _settled(cleaned, nominal.values, search.store, name, limits)
         if again is None:
@@ -274,64 +327,74 @@ def _without_events(search: Search, nominal: Fit, whole: EstimationProblem) -> t
         search, nominal, before = replace(search, problem=cleaned), again, happened.events
         # what the smoother says is of all recordings, events not taken out
         happened = replace(_happened(whole, nominal, limits), smoothed=None)
-        if happened.events.like(before):
+        if happened.events.overlaps_with(before):
             break
     return search, nominal, happened
 
 
-def _tested(search: Search, nominal: Fit) -> tuple[Search, NullTest, NullTest, Screened]:
+def _tested(
+    search: RefitContext, nominal: RefitModel
+) -> tuple[RefitContext, NullTestResult, NullTestResult, ScreeningResult]:
     """Null tests and screening at a nominal fit, at which the weights of all hypotheses are frozen."""
-    angles, limits = largest_angles(nominal), search.limits
-    effects = tuple(effect.expected(angles) for effect in search.problem.effects)
-    composed = replace(search.problem, problem=nominal.problem, effects=effects)
-    before, held = fitted_test(nominal, limits), held_out_test(nominal, limits)
-    search.progress.stage(f"screening {len(composed.effects)} candidates")
-    screened = screen(composed, (), nominal.values, limits)
+    angles, limits = _largest_joint_angles(nominal), search.thresholds
+    effects = tuple(effect.with_expected_ranges(angles) for effect in search.problem.candidate_effects)
+    composed = replace(search.problem, problem=nominal.problem, candidate_effects=effects)
+    before, held = _estimation_null_test(nominal, limits), _held_out_null_test(nominal, limits)
+    search.progress.begin_stage(f"screening {len(composed.candidate_effects)} candidates")
+    screened = screen_candidates(composed, (), nominal.values, limits)
     return replace(search, problem=composed), before, held, screened
 
 
-def _followed(search: Search, nominal: Fit, before: tuple[Cut, ...] = ()) -> tuple[Search, Fit, tuple[Cut, ...]]:
+def _followed(
+    search: RefitContext, nominal: RefitModel, before: tuple[TruncatedRecording, ...] = ()
+) -> tuple[RefitContext, RefitModel, tuple[TruncatedRecording, ...]]:
     """The nominal model beside held-out recordings as far as it can follow them, fitted again where they were cut."""
     found = before
-    for margin in MARGINS:
-        if np.isfinite(nominal.loss.mean):
+    for margin in TRUNCATION_FRACTIONS:
+        if np.isfinite(nominal.held_out_loss.chi2_per_sample):
             break
-        composed, cuts = replace(search.problem, problem=nominal.problem).followed(nominal.values, margin)
+        composed, cuts = replace(search.problem, problem=nominal.problem).truncate_held_out(nominal.values, margin)
         for cut in cuts:
-            search.progress.stage(cut_short(cut))
+            search.progress.begin_stage(truncation_message(cut))
         names = {cut.recording for cut in cuts}
         found = (*(cut for cut in found if cut.recording not in names), *cuts)
         name = f"the nominal model beside what it can follow ({margin:g})"
-        again = _settled(composed, nominal.values, search.store, name, search.limits)
+        again = _settled(composed, nominal.values, search.store, name, search.thresholds)
         if again is not None:
             search, nominal = replace(search, problem=composed), again
     return search, nominal, found
 
 
 def _offsets_stated(problem: EstimationProblem) -> bool:
-    driving = (e.errors is not None and bool(np.any(e.errors.bias_std > 0)) for e in problem.episodes)
-    return any(driving) or any(e.has_constant_errors for e in problem.episodes)
+    driving = (
+        e.input_errors is not None and bool(np.any(e.input_errors.torque_bias_std > 0)) for e in problem.episodes
+    )
+    return any(driving) or any(e.has_constant_sensor_errors for e in problem.episodes)
 
 
-def elsewhere(search: Search, nominal: Fit) -> Fit | None:
+def _better_nominal_fit(search: RefitContext, nominal: RefitModel) -> RefitModel | None:
     """Return the nominal model refitted from a start that ends far likelier; None if no start does.
 
     A parameter that few samples tell of has several valleys, and a wrong one of them costs too little to be noticed in
     chi2: what candidates gain there, they gain from the parameter's error.
     """
-    search.progress.stage("fitting the nominal model from other starts")
-    problem, limits = search.problem.problem, search.limits
+    search.progress.begin_stage("fitting the nominal model from other starts")
+    problem, limits = search.problem.problem, search.thresholds
 
-    def begun(factor: float) -> Fit | None:
-        start = problem.named(
-            np.where(problem.positive, np.clip(factor * problem.start, *problem.bounds), problem.start)
+    def begun(factor: float) -> RefitModel | None:
+        start = problem.named_values(
+            np.where(
+                problem.is_positive,
+                np.clip(factor * problem.initial_unknowns, *problem.bounds),
+                problem.initial_unknowns,
+            )
         )
         name = f"the nominal model from {factor:g} times its start"
-        return refit(search.problem, (), start, search.store, name, limits)
+        return refit_with_effects(search.problem, (), start, search.store, name, limits)
 
     best = nominal
-    for found in map_in_step(begun, RESTARTS):
-        if found is not None and found.cost < best.cost - limits.worth:
+    for found in map_with_batched_calls(begun, RESTART_FACTORS):
+        if found is not None and found.cost < best.cost - limits.min_log_bayes_factor:
             best = found
     if best is nominal:
         return None
@@ -339,31 +402,31 @@ def elsewhere(search: Search, nominal: Fit) -> Fit | None:
 
 
 def _settled(
-    composed: CandidateProblem, start: Mapping[str, float], store: Store | None, name: str, limits: Thresholds
-) -> Fit | None:
+    composed: AllCandidatesProblem, start: Mapping[str, float], store: RefitStore | None, name: str, limits: Thresholds
+) -> RefitModel | None:
     """The nominal model fitted from a start, under weights that were frozen near its end."""
-    if composed.problem.disturbed:
+    if composed.problem.has_process_noise:
         composed, start = _nearer(composed, start, limits)
-        composed = composed.weighted_at(start)
-    return refit(composed, (), start, store, name, limits)
+        composed = composed.whitened_at(start)
+    return refit_with_effects(composed, (), start, store, name, limits)
 
 
 def _nearer(
-    composed: CandidateProblem, start: Mapping[str, float], limits: Thresholds
-) -> tuple[CandidateProblem, Mapping[str, float]]:
+    composed: AllCandidatesProblem, start: Mapping[str, float], limits: Thresholds
+) -> tuple[AllCandidatesProblem, Mapping[str, float]]:
     """The problem weighted at a start, and the nominal fit under these weights."""
-    weighted = composed.weighted_at(start)
-    first = refit(weighted, (), start, limits=limits)
+    weighted = composed.whitened_at(start)
+    first = refit_with_effects(weighted, (), start, limits=limits)
     return weighted, start if first is None else first.values
 
 
 def _composed(
     problem: EstimationProblem,
-    candidates: Choice,
+    candidates: CandidateChoice,
     leave_out: Sequence[str],
     held_out: Sequence[Recording],
     progress: Progress,
-) -> CandidateProblem:
+) -> AllCandidatesProblem:
     """The problem with all candidates; see `diagnose` for what is refused."""
     if problem.options.weighting != "whitened":
         raise SolverError(
@@ -372,31 +435,31 @@ def _composed(
             allowed="whitened",
             hint="set problem.weighting: whitened and the noise levels under `sensors`",
         )
-    effects = chosen_effects(problem.system, [episode.recording for episode in problem.episodes], candidates)
-    left_out(effects, leave_out)  # refused before anything is compiled
-    progress.stage(f"composing {len(effects)} candidates into one step")
-    composed = CandidateProblem.of(problem, effects, held_out)
-    return replace(composed, effects=tuple(left_out(composed.effects, leave_out)))
+    effects = make_candidate_effects(problem.system, [episode.recording for episode in problem.episodes], candidates)
+    exclude_candidates(effects, leave_out)  # refused before anything is compiled
+    progress.begin_stage(f"composing {len(effects)} candidates into one step")
+    composed = AllCandidatesProblem.from_problem(problem, effects, held_out)
+    return replace(composed, candidate_effects=tuple(exclude_candidates(composed.candidate_effects, leave_out)))
 
 
 def _after(
-    nominal: Fit,
-    accepted: Sequence[Added],
-    smoothed: Smoothed | None,
-    before: NullTest,
-    held: NullTest,
+    nominal: RefitModel,
+    accepted: Sequence[SelectedEffect],
+    smoothed: SmootherResult | None,
+    before: NullTestResult,
+    held: NullTestResult,
     limits: Thresholds,
-) -> tuple[NullTest, tuple[Place, ...], tuple[Place, ...]]:
+) -> tuple[NullTestResult, tuple[GapLocation, ...], tuple[GapLocation, ...]]:
     """The held-out null test with the effects, the places of the gap, and those of what is left of it."""
-    where = () if smoothed is None else localise(smoothed, limits.sure)
+    where = () if smoothed is None else localise_gap(smoothed, limits.location_z)
     if not accepted:
         return held, where, where
-    last = accepted[-1].fit
-    remaining = held_out_test(last, limits)
-    left = has_gap(fitted_test(last, limits), remaining, limits)
-    rest = localise(smooth_fit(last, limits), limits.sure) if left else ()
-    windows = merged([(w.begin, w.end) for w in before.windows if w.flagged])
-    return remaining, attributed(where, _closed(accepted), rest, windows), rest
+    last = accepted[-1].refitted_model
+    remaining = _held_out_null_test(last, limits)
+    left = has_gap(_estimation_null_test(last, limits), remaining, limits)
+    rest = localise_gap(_smooth_about_model(last, limits), limits.location_z) if left else ()
+    windows = merge_intervals([(w.start_time, w.end_time) for w in before.windows if w.is_flagged])
+    return remaining, attribute_gap_to_effects(where, _closed(accepted), rest, windows), rest
 
 
 class _Clock:
@@ -410,13 +473,13 @@ class _Clock:
         self._last = now
 
 
-def nominal_fit(
+def fit_nominal_model(
     problem: EstimationProblem,
-    composed: CandidateProblem,
+    composed: AllCandidatesProblem,
     solution: Solution | None = None,
-    store: Store | None = None,
-    limits: Thresholds = DEFAULTS,
-) -> Fit:
+    store: RefitStore | None = None,
+    limits: Thresholds = DEFAULT_THRESHOLDS,
+) -> RefitModel:
     """Return the fit of the nominal model within the problem with all candidates.
 
     Raises
@@ -424,9 +487,9 @@ def nominal_fit(
     SolverError
         The nominal model cannot be rolled out.
     """
-    known = recalled(composed, (), store)
-    if known is not None and composed.problem.disturbed:
-        known = recalled(composed.weighted_at(known.values), (), store)
+    known = load_stored_refit(composed, (), store)
+    if known is not None and composed.problem.has_process_noise:
+        known = load_stored_refit(composed.whitened_at(known.values), (), store)
     if known is not None:
         return known
     start = _nominal_start(problem, composed, solution)
@@ -440,38 +503,46 @@ def nominal_fit(
 
 
 def _nominal_start(
-    problem: EstimationProblem, composed: CandidateProblem, solution: Solution | None
+    problem: EstimationProblem, composed: AllCandidatesProblem, solution: Solution | None
 ) -> Mapping[str, float]:
     """Unknowns of the nominal model's solution; nothing where a single recording is both fitted and held out."""
-    found = solution if solution is not None or composed.blocks else solve(problem, GaussNewton(iterations=30))
+    found = (
+        solution
+        if solution is not None or composed.is_split_in_blocks
+        else solve(problem, GaussNewton(max_iterations=30))
+    )
     if found is None:
         return {}
     if found.evaluation is None:
         raise SolverError(f"the nominal model cannot be fitted: {found.message}", where="diagnosis")
-    return dict(zip(found.names, map(float, found.x), strict=True))
+    return dict(zip(found.unknown_names, map(float, found.x), strict=True))
 
 
-def largest_angles(fit: Fit) -> dict[str, float]:
+def _largest_joint_angles(fit: RefitModel) -> dict[str, float]:
     """Return the largest joint angle of each segment in the estimation recordings [rad]."""
     system = fit.problem.system
     found = {}
-    for segment in system.segments:
-        index = [system.mechanism.joint_index(joint) for link in segment.links for joint in link]
-        found[segment.name] = max(float(np.abs(r.rollout.state[:, index]).max()) for r in fit.evaluation.episodes)
+    for segment in system.segment_layouts:
+        index = [system.mechanism.joint_index(joint) for link in segment.link_joints for joint in link]
+        found[segment.name] = max(
+            float(np.abs(r.rollout.state[:, index]).max()) for r in fit.evaluation.episode_predictions
+        )
     return found
 
 
-def fitted_test(fit: Fit, limits: Thresholds = DEFAULTS) -> NullTest:
+def _estimation_null_test(fit: RefitModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> NullTestResult:
     """Return the null test of a model on the estimation recordings."""
-    series = residual_series(fit.problem)
-    return null_test(series, fit.evaluation.residual, len(fit.values), limits.level, limits.window)
+    series = residual_channels(fit.problem)
+    return run_null_test(
+        series, fit.evaluation.residual, len(fit.values), limits.significance_level, limits.residual_window
+    )
 
 
-def held_out_test(fit: Fit, limits: Thresholds = DEFAULTS) -> NullTest:
+def _held_out_null_test(fit: RefitModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> NullTestResult:
     """Return the null test of a model on the held-out recordings.
 
     What is held out is predicted by parameters that noise has moved: without a gap the residual has the covariance
-    I + J F F' J', where F F' is that of the parameters (`spread_by_noise`). It is tested in units of that.
+    I + J F F' J', where F F' is that of the parameters (`noise_covariance_factor`). It is tested in units of that.
 
     Raises
     ------
@@ -480,45 +551,50 @@ def held_out_test(fit: Fit, limits: Thresholds = DEFAULTS) -> NullTest:
     """
     problem = fit.problem
     residuals, slopes = [], []
-    for i, (episode, result) in enumerate(problem.validate(problem.vector(fit.values), True)):
+    for i, (episode, result) in enumerate(problem.predict_held_out(problem.vector(fit.values), True)):
         if isinstance(result, str):
             raise DataError(
                 f"the held-out recording cannot be predicted: {result}",
                 where=episode.name,
                 hint="hold out a recording that the nominal model can follow",
             )
-        rows = problem.held_out_rows(i, episode, result)
+        rows = problem.held_out_residual(i, episode, result)
         assert rows.jacobian is not None
         residuals.append(rows.residual)
-        slopes.append(rows.jacobian[:, : len(problem.shared)])
-    series = residual_series(problem.on(problem.held_out, ()))
-    spread = np.vstack(slopes) @ spread_by_noise(problem, fit.evaluation)[: len(problem.shared)]
-    residual = whitened_beside(np.concatenate(residuals), spread)
-    return null_test(series, residual, 0, limits.level, limits.window)
+        slopes.append(rows.jacobian[:, : len(problem.shared_parameters)])
+    series = residual_channels(problem.with_episodes(problem.held_out, ()))
+    spread = np.vstack(slopes) @ noise_covariance_factor(problem, fit.evaluation)[: len(problem.shared_parameters)]
+    residual = whiten_with_extra_errors(np.concatenate(residuals), spread)
+    return run_null_test(series, residual, 0, limits.significance_level, limits.residual_window)
 
 
-def smooth_fit(fit: Fit, limits: Thresholds = DEFAULTS) -> Smoothed:
+def _smooth_about_model(fit: RefitModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> SmootherResult:
     """Run the weak-constraint smoother about a fitted model, with torque noise among its unknowns.
 
     Estimated constant sensor errors are subtracted first.
     """
     problem, evaluation, x = fit.problem, fit.evaluation, fit.problem.vector(fit.values)
-    if problem.disturbed:
-        problem = problem.weighted_by_sensors()
-        evaluation = problem.evaluate(x, warm=fit.evaluation.warm)
-    if any(episode.has_constant_errors for episode in problem.episodes):
-        pairs = zip(problem.episodes, evaluation.episodes, strict=True)
-        less = [replace(e, samples=without_constants(e.samples, result.predicted)) for e, result in pairs]
-        problem = problem.on(less, ())
-        evaluation = problem.evaluate(x, warm=evaluation.warm)
-    return smooth(problem, x, evaluation, limits)
+    if problem.has_process_noise:
+        problem = problem.whitened_by_sensor_noise()
+        evaluation = problem.evaluate(x, equilibrium_guesses=fit.evaluation.equilibrium_guesses)
+    if any(episode.has_constant_sensor_errors for episode in problem.episodes):
+        pairs = zip(problem.episodes, evaluation.episode_predictions, strict=True)
+        less = [
+            replace(e, measurements=subtract_estimated_biases(e.measurements, result.predicted_outputs))
+            for e, result in pairs
+        ]
+        problem = problem.with_episodes(less, ())
+        evaluation = problem.evaluate(x, equilibrium_guesses=evaluation.equilibrium_guesses)
+    return run_smoother(problem, x, evaluation, limits)
 
 
-def _closed(added: Sequence[Added]) -> dict[str, float]:
+def _closed(added: Sequence[SelectedEffect]) -> dict[str, float]:
     """What the effects at every location close, of the whole gap, each by what it adds to those before it."""
     closed: dict[str, float] = {}
     before = 0.0
     for entry in added:
-        closed[entry.effect.location] = closed.get(entry.effect.location, 0.0) + max(entry.closure.value - before, 0.0)
-        before = max(entry.closure.value, before)
+        closed[entry.effect.location] = closed.get(entry.effect.location, 0.0) + max(
+            entry.cumulative_closure.fraction - before, 0.0
+        )
+        before = max(entry.cumulative_closure.fraction, before)
     return closed

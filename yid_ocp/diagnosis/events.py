@@ -2,7 +2,7 @@
 
 A gap that lives in short windows is no effect of the model. Along prescribed joints whose efforts are compared the
 unknown force is measured minus needed torque, sample by sample; elsewhere it is what the smoother's linear model says
-of the force at one coordinate, everything else as the smoother has it. In both cases `pulses` looks for what rises and
+of the force at one coordinate, everything else as the smoother has it. In both cases `detect_pulses` looks for what rises and
 falls beside a rest that follows the load. What a sensor says for one to three samples alone is an event of that sensor.
 
 What events explain is taken out before anything else is judged: torques act beside the recorded ones, and samples that
@@ -20,50 +20,50 @@ import numpy as np
 import threadpoolctl
 from numpy.typing import NDArray
 
-from yid_ocp.data.channels import quantum
-from yid_ocp.diagnosis.pulses import RARE, History, Pulse, pulses
-from yid_ocp.diagnosis.smoother import Smoothed, history_of_force
-from yid_ocp.diagnosis.smoother_model import Linear, linear_model, seen_by
-from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
-from yid_ocp.diagnosis.torque_terms import TorqueModel
+from yid_ocp.data.channel_checks import quantization_step
+from yid_ocp.diagnosis.inverse_dynamics_terms import InverseDynamicsModel
+from yid_ocp.diagnosis.pulse_detection import MAX_EVENT_TIME_FRACTION, DetectedPulse, ForceEstimate, detect_pulses
+from yid_ocp.diagnosis.smoother import SmootherResult, force_likelihood_terms
+from yid_ocp.diagnosis.smoother_model import LinearResidualModel, linear_residual_models, sensor_bias_location
+from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects.base import robot_joints
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.constant_errors import without_constants
+from yid_ocp.problem.constant_sensor_errors import subtract_estimated_biases
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.low_pass import effort_filter
+from yid_ocp.problem.low_pass_filter import effort_filter
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.null_test import discoveries, sample_times
+from yid_ocp.problem.null_test import benjamini_hochberg_mask, sample_times
 from yid_ocp.problem.options import SensorOptions
-from yid_ocp.problem.outcome import EpisodeResult
-from yid_ocp.sensors.joints import by_joint
+from yid_ocp.problem.prediction_result import EpisodePrediction
+from yid_ocp.sensors.joints import values_by_joint
 
 Array = NDArray[np.float64]
-Run = tuple[Episode, EpisodeResult, Array]
+_RecordingRollout = tuple[Episode, EpisodePrediction, Array]
 """A recording, its prediction and the parameters theta of that."""
 
-INTERVAL = 0.05
+_FORCE_INTERVAL = 0.05
 """Time over which an unknown force is constant where events are sought [s]."""
-POINTS = 250
+_MAX_SPAN_POINTS = 250
 """Maximum number of points of a force history processed together."""
-LONGEST_RUN = 3
+_MAX_WRONG_SAMPLES = 3
 """Wrong samples in a row; more of them are a gap or a stuck channel."""
-STENCILS = (4, 7, 10)
+_STENCIL_STEPS = (4, 7, 10)
 """Distances of the samples through which a smooth course is laid beside a wrong one."""
-NEIGHBOURS = 20
+_NEIGHBOUR_COUNT = 20
 """Samples on either side with which one is compared."""
-ALONE = 3.0
+_MIN_NEIGHBOUR_RATIO = 3.0
 """Times the largest deviation among its neighbours by which a wrong sample stands out."""
-SAME = 0.5
+_MIN_RECURRENCE_OVERLAP = 0.5
 """Part of the longer of two windows by which they overlap where they are the same time."""
-MANY = 0.5
+_MAX_RECURRING_FRACTION = 0.5
 """Part of all forces that recur from which those that do are the motion's, which a model has to have."""
-SURE = 8.0
+_WRONG_SAMPLE_Z = 8.0
 """Standard deviations of noise, and robust ones of its neighbours, by which it does."""
 
 
 @dataclass(frozen=True)
-class Event:
+class DisturbanceEvent:
     """A brief local disturbance: an external force on one coordinate, or wrong samples of one channel.
 
     Attributes
@@ -72,17 +72,17 @@ class Event:
     channel : str
         Coordinate on which a force acted, or channel that was wrong.
     kind : "force" or "sample"
-    begin, end : float
+    start_time, end_time : float
         Since the start of the recording [s].
-    peak : float
+    peak_value : float
         Largest value with its sign, in `unit`: a force beside what the model and the recording have, or measured less
         true.
     impulse : float
         Integral over time [unit x s].
-    std : float
+    impulse_std : float
         Standard deviation of the impulse, counting what the model is allowed to be wrong by.
     unit : str
-    pulse : Pulse or None
+    detected_pulse : Pulse or None
         Shape of a force.
     """
 
@@ -90,13 +90,13 @@ class Event:
     location: str
     channel: str
     kind: str
-    begin: float
-    end: float
-    peak: float
+    start_time: float
+    end_time: float
+    peak_value: float
     impulse: float
-    std: float
+    impulse_std: float
     unit: str
-    pulse: Pulse | None = None
+    detected_pulse: DetectedPulse | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """As in result.json."""
@@ -105,32 +105,32 @@ class Event:
             "location": self.location,
             "channel": self.channel,
             "kind": self.kind,
-            "from": self.begin,
-            "to": self.end,
+            "from": self.start_time,
+            "to": self.end_time,
             "impulse": self.impulse,
-            "peak": self.peak,
+            "peak": self.peak_value,
             "unit": self.unit,
-            "std": self.std,
+            "std": self.impulse_std,
         }
 
 
 @dataclass(frozen=True)
-class Fall:
-    """Time after which a recording is ignored because a joint moves faster than `Thresholds.fall`."""
+class Overspeed:
+    """Time after which a recording is ignored because a joint moves faster than `Thresholds.max_joint_speed`."""
 
     recording: str
     joint: str
-    time: float
+    start_time: float
 
 
 @dataclass(frozen=True)
-class Force:
+class EventForceSeries:
     """Time series of the unknown force at a coordinate with an event, for plots.
 
     Attributes
     ----------
     recording, channel, unit : str
-    t, value, allowed : ndarray, shape (M,)
+    t, force, allowed_model_error : ndarray, shape (M,)
         Since the start of the recording [s]; the force beside what the model and the recording have, each point for
         itself, and what the model may be wrong by, in `unit`.
     """
@@ -139,54 +139,56 @@ class Force:
     channel: str
     unit: str
     t: Array
-    value: Array
-    allowed: Array
+    force: Array
+    allowed_model_error: Array
 
 
 @dataclass(frozen=True)
-class Events:
+class EventSet:
     """All events of a diagnosis by recording and time, the force time series, and overspeeds."""
 
-    found: tuple[Event, ...] = ()
-    falls: tuple[Fall, ...] = ()
-    forces: tuple[Force, ...] = ()
+    disturbances: tuple[DisturbanceEvent, ...] = ()
+    overspeeds: tuple[Overspeed, ...] = ()
+    force_series: tuple[EventForceSeries, ...] = ()
 
     def __bool__(self) -> bool:
-        return bool(self.found or self.falls)
+        return bool(self.disturbances or self.overspeeds)
 
-    def like(self, other: Events) -> bool:
+    def overlaps_with(self, other: EventSet) -> bool:
         """Whether both hold events of the same channels at overlapping times."""
-        pairs = zip(self.found, other.found, strict=False)
-        return len(self.found) == len(other.found) and all(
-            (a.recording, a.channel) == (b.recording, b.channel) and a.begin < b.end and b.begin < a.end
+        pairs = zip(self.disturbances, other.disturbances, strict=False)
+        return len(self.disturbances) == len(other.disturbances) and all(
+            (a.recording, a.channel) == (b.recording, b.channel)
+            and a.start_time < b.end_time
+            and b.start_time < a.end_time
             for a, b in pairs
         )
 
     @property
-    def forces_alone(self) -> Events:
+    def only_force_events(self) -> EventSet:
         """Only the force events."""
-        return Events(tuple(event for event in self.found if event.kind == "force"))
+        return EventSet(tuple(event for event in self.disturbances if event.kind == "force"))
 
     @property
-    def without_forces(self) -> Events:
+    def without_force_events(self) -> EventSet:
         """The events that are not forces, and the overspeeds."""
-        return Events(tuple(event for event in self.found if event.kind != "force"), self.falls)
+        return EventSet(tuple(event for event in self.disturbances if event.kind != "force"), self.overspeeds)
 
-    def of(self, recording: str) -> tuple[Event, ...]:
+    def for_recording(self, recording: str) -> tuple[DisturbanceEvent, ...]:
         """Return the events of one recording."""
-        return tuple(event for event in self.found if event.recording == recording)
+        return tuple(event for event in self.disturbances if event.recording == recording)
 
 
-NOTHING = Events()
+NO_EVENTS = EventSet()
 
 
 def find_events(
     problem: EstimationProblem,
     x: Array,
     evaluation: Evaluation,
-    smoothed: Smoothed | None,
-    limits: Thresholds = DEFAULTS,
-) -> Events:
+    smoothed: SmootherResult | None,
+    limits: Thresholds = DEFAULT_THRESHOLDS,
+) -> EventSet:
     """Find events in all recordings of a problem, estimation and held-out.
 
     Parameters
@@ -207,53 +209,57 @@ def find_events(
     Events
         Those that are more than chance among all windows of all recordings, by the false-discovery rate `level`.
     """
-    runs: list[Run] = []
-    for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episodes, strict=True)):
-        runs.append((episode, result, problem.predictor.own_theta(episode, problem.split(x, i)[0])))
+    runs: list[_RecordingRollout] = []
+    for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episode_predictions, strict=True)):
+        runs.append((episode, result, problem.predictor.episode_theta(episode, problem.split(x, i)[0])))
     shared = problem.split(x, 0)[0]
-    for episode, outcome in problem.validate(x):
+    for episode, outcome in problem.predict_held_out(x):
         if not isinstance(outcome, str):
-            runs.append((episode, outcome, problem.predictor.own_theta(episode, shared)))
+            runs.append((episode, outcome, problem.predictor.episode_theta(episode, shared)))
     falls = tuple(fall for run in runs for fall in _falls(problem, run, limits))
-    until = {fall.recording: fall.time for fall in falls}
+    until = {fall.recording: fall.start_time for fall in falls}
     wrong = [
         event
         for run in runs
         for event in _wrong_samples(problem, run)
-        if event.end < until.get(event.recording, math.inf)
+        if event.end_time < until.get(event.recording, math.inf)
     ]
-    torques = TorqueModel(problem.step)
+    torques = InverseDynamicsModel(problem.step)
     histories = [history for run in runs for history in _read_forces(problem, run, torques, limits)]
     if smoothed is not None:
         histories += _driving_forces(problem, x, evaluation, runs, smoothed, torques, limits)
     cut = [entry for entry in (_before_fall(history, falls, limits) for history in histories) if entry is not None]
-    found: list[tuple[History, Pulse]] = []
+    found: list[tuple[ForceEstimate, DetectedPulse]] = []
     tries = 0.0
     for history in cut:
-        own, looked = pulses(history, limits)
+        own, looked = detect_pulses(history, limits)
         tries += looked
         found += [(history, pulse) for pulse in own]
-    real = discoveries([pulse.p_value for _, pulse in found], tries, limits.level)
+    real = benjamini_hochberg_mask([pulse.p_value for _, pulse in found], tries, limits.significance_level)
     forces = _one_each([entry for entry, sure in zip(found, real, strict=True) if sure], problem)
-    times = {(e.recording, 0.5 * (e.begin + e.end)) for e in wrong}
-    forces = [f for f in forces if not any(f.recording == name and f.begin <= t <= f.end for name, t in times)]
+    times = {(e.recording, 0.5 * (e.start_time + e.end_time)) for e in wrong}
+    forces = [
+        f for f in forces if not any(f.recording == name and f.start_time <= t <= f.end_time for name, t in times)
+    ]
     single = [f for f in forces if not any(_recurs(f, other) for other in forces)]
-    if len(single) < MANY * len(forces):
+    if len(single) < _MAX_RECURRING_FRACTION * len(forces):
         forces = single
-    everything = sorted([*forces, *wrong], key=lambda event: (event.recording, event.begin, event.location))
+    everything = sorted([*forces, *wrong], key=lambda event: (event.recording, event.start_time, event.location))
     there = {(event.recording, event.channel) for event in forces}
     shown = [
-        Force(h.recording, h.unknown, h.unit, h.t, h.values, np.hypot(h.error, h.held))
+        EventForceSeries(
+            h.recording, h.coordinate, h.unit, h.t, h.force_values, np.hypot(h.model_error_std, h.friction_limit)
+        )
         for h in cut
-        if (h.recording, h.unknown) in there
+        if (h.recording, h.coordinate) in there
     ]
-    return Events(tuple(everything), falls, tuple(shown))
+    return EventSet(tuple(everything), falls, tuple(shown))
 
 
 # -- forces -----------------------------------------------------------------------------------------------------------
 
 
-def _falls(problem: EstimationProblem, run: Run, limits: Thresholds) -> Iterator[Fall]:
+def _falls(problem: EstimationProblem, run: _RecordingRollout, limits: Thresholds) -> Iterator[Overspeed]:
     """When a joint of the robot first moves faster than `fall`."""
     episode, result, _ = run
     names = problem.system.mechanism.joint_names
@@ -262,50 +268,58 @@ def _falls(problem: EstimationProblem, run: Run, limits: Thresholds) -> Iterator
     if not places:
         return
     speed = np.abs(np.gradient(result.rollout.state[:, places], h, axis=0))
-    fast = np.flatnonzero(np.any(speed > limits.fall, axis=1))
+    fast = np.flatnonzero(np.any(speed > limits.max_joint_speed, axis=1))
     if len(fast):
-        yield Fall(episode.name, names[places[int(speed[fast[0]].argmax())]], float(fast[0] * h))
+        yield Overspeed(episode.name, names[places[int(speed[fast[0]].argmax())]], float(fast[0] * h))
 
 
-def _before_fall(history: History, falls: Sequence[Fall], limits: Thresholds) -> History | None:
+def _before_fall(history: ForceEstimate, falls: Sequence[Overspeed], limits: Thresholds) -> ForceEstimate | None:
     """A history up to where its recording's motion gets too fast, less what a filter smears; None where too short."""
-    until = min((fall.time for fall in falls if fall.recording == history.recording), default=math.inf)
-    keep = np.flatnonzero(history.t <= until - effort_filter(history.cutoff).settling)
+    until = min((fall.start_time for fall in falls if fall.recording == history.recording), default=math.inf)
+    keep = np.flatnonzero(history.t <= until - effort_filter(history.filter_cutoff).settling_time)
     if len(keep) < 10:
         return None
-    return history.at(keep)
+    return history.subset_at(keep)
 
 
-def _allowed(torques: TorqueModel, run: Run, nodes: NDArray[np.int64], limits: Thresholds) -> tuple[Array, Array]:
+def _allowed(
+    torques: InverseDynamicsModel, run: _RecordingRollout, nodes: NDArray[np.int64], limits: Thresholds
+) -> tuple[Array, Array]:
     """What the model of every coordinate's torque may be wrong by, and what friction may hold, shape (M, n)."""
     episode, result, theta = run
-    terms = torques.terms(theta, result.rollout, nodes)
+    terms = torques.evaluate_term_sizes(theta, result.rollout, nodes)
     joints = episode.recording.joints
     # a torque is known at no better time than that of a sample
     late = 0.0 if joints is None else float(np.median(np.diff(joints.t)))
-    return np.hypot(limits.term_error * terms.size, late * terms.rate), terms.held
+    return np.hypot(
+        limits.inverse_dynamics_rtol * terms.rss_torque, late * terms.torque_rate
+    ), terms.static_friction_limit
 
 
-def _read_forces(problem: EstimationProblem, run: Run, torques: TorqueModel, limits: Thresholds) -> Iterator[History]:
+def _read_forces(
+    problem: EstimationProblem, run: _RecordingRollout, torques: InverseDynamicsModel, limits: Thresholds
+) -> Iterator[ForceEstimate]:
     """Histories of prescribed joints whose efforts are compared: needed less measured torque."""
     episode, result, _ = run
     tree = problem.system.mechanism
-    for samples, predicted in zip(without_constants(episode.samples, result.predicted), result.predicted, strict=True):
-        if not samples.sensor.efforts or samples.node.ndim > 1 or len(samples.node) < 10:
+    for samples, predicted in zip(
+        subtract_estimated_biases(episode.measurements, result.predicted_outputs), result.predicted_outputs, strict=True
+    ):
+        if not samples.sensor.effort_joints or samples.node.ndim > 1 or len(samples.node) < 10:
             continue
         error, held = _allowed(torques, run, samples.node, limits)
-        weight = np.where(samples.seen, samples.weight, 0.0)
-        value = np.where(samples.seen, predicted - samples.value, 0.0)
+        weight = np.where(samples.is_used, samples.weight, 0.0)
+        value = np.where(samples.is_used, predicted - samples.value, 0.0)
         times = sample_times(episode, samples)
         # what lies closer together than an interval counts together
-        bins = np.unique(np.floor((times - times[0]) / INTERVAL + 1e-6), return_inverse=True)[1]
+        bins = np.unique(np.floor((times - times[0]) / _FORCE_INTERVAL + 1e-6), return_inverse=True)[1]
         together = np.zeros((int(bins.max()) + 1, len(times)))
         together[bins, np.arange(len(times))] = 1.0
         mean = together / together.sum(axis=1, keepdims=True)
-        for column, joint in enumerate(samples.sensor.efforts):
+        for column, joint in enumerate(samples.sensor.effort_joints):
             at, square = tree.joint_index(joint), weight[:, column] ** 2
             unit = "N" if tree.joints[at].kind == "prismatic" else "N m"
-            whole = History(
+            whole = ForceEstimate(
                 episode.name,
                 joint,
                 joint,
@@ -320,73 +334,75 @@ def _read_forces(problem: EstimationProblem, run: Run, torques: TorqueModel, lim
             yield from _spans(whole, limits)
 
 
-def _spans(whole: History, limits: Thresholds) -> Iterator[History]:
+def _spans(whole: ForceEstimate, limits: Thresholds) -> Iterator[ForceEstimate]:
     """A long history in parts that overlap by twice the longest pulse: the work grows with the cube of their points."""
-    overlap = math.ceil(2 * limits.pulse / whole.spacing)
-    length = max(POINTS, 3 * overlap)
+    overlap = math.ceil(2 * limits.max_event_duration / whole.sample_spacing)
+    length = max(_MAX_SPAN_POINTS, 3 * overlap)
     for begin in range(0, max(len(whole.t) - overlap, 1), length - overlap):
         keep = np.arange(begin, min(begin + length, len(whole.t)))
-        yield whole.at(keep)
+        yield whole.subset_at(keep)
 
 
 def _driving_forces(
     problem: EstimationProblem,
     x: Array,
     evaluation: Evaluation,
-    runs: Sequence[Run],
-    smoothed: Smoothed,
-    torques: TorqueModel,
+    runs: Sequence[_RecordingRollout],
+    smoothed: SmootherResult,
+    torques: InverseDynamicsModel,
     limits: Thresholds,
-) -> list[History]:
+) -> list[ForceEstimate]:
     """Histories of coordinates that move under unknown forces, where the smoother found some for part of the time."""
-    sought = {trace.recording: _short(smoothed, i, limits) for i, trace in enumerate(smoothed.traces)}
+    sought = {trace.recording: _short(smoothed, i, limits) for i, trace in enumerate(smoothed.smoothed_unknowns)}
     if not any(sought.values()):
         return []
     found = []
     with threadpoolctl.threadpool_limits(1):
-        for model, run in zip(linear_model(problem, x, evaluation, limits, INTERVAL), runs, strict=False):
+        for model, run in zip(
+            linear_residual_models(problem, x, evaluation, limits, _FORCE_INTERVAL), runs, strict=False
+        ):
             if not sought[model.recording]:
                 continue
-            middle = (model.edges[:-1] + model.edges[1:]) / 2
+            middle = (model.interval_edges[:-1] + model.interval_edges[1:]) / 2
             allowed = _allowed(torques, run, np.rint(middle / run[0].grid.time_step).astype(np.int64), limits)
             for unknown in sought[model.recording]:
-                index = model.unknowns.index(unknown)
+                index = model.unknown_names.index(unknown)
                 found.append(_driving_force(problem, model, index, smoothed, middle, allowed))
     return found
 
 
-def _short(smoothed: Smoothed, recording: int, limits: Thresholds) -> list[str]:
+def _short(smoothed: SmootherResult, recording: int, limits: Thresholds) -> list[str]:
     """Unknown forces that are surely there, but for a small part of the time only."""
-    trace, names = smoothed.traces[recording], []
-    for i, source in enumerate(trace.sources):
-        if source.kind != "force" or source.read or not smoothed.variance[source]:
+    trace, names = smoothed.smoothed_unknowns[recording], []
+    for i, source in enumerate(trace.unknown_groups):
+        if source.kind != "force" or source.is_confounded_with_bias or not smoothed.group_variance[source]:
             continue
-        sure = np.abs(trace.mean[:, i]) > limits.sure * np.maximum(trace.std[:, i], 1e-12)
-        if np.any(sure) and np.mean(sure) <= RARE:
-            names.append(trace.unknowns[i])
+        sure = np.abs(trace.posterior_mean[:, i]) > limits.location_z * np.maximum(trace.posterior_std[:, i], 1e-12)
+        if np.any(sure) and np.mean(sure) <= MAX_EVENT_TIME_FRACTION:
+            names.append(trace.unknown_names[i])
     return names
 
 
 def _driving_force(
     problem: EstimationProblem,
-    model: Linear,
+    model: LinearResidualModel,
     unknown: int,
-    smoothed: Smoothed,
+    smoothed: SmootherResult,
     middle: Array,
     allowed: tuple[Array, Array],
-) -> History:
-    source, tree = model.sources[unknown], problem.system.mechanism
-    at = tree.joint_index(model.unknowns[unknown])
-    score, information = history_of_force(model, smoothed.variance | {source: 0.0}, unknown)
+) -> ForceEstimate:
+    source, tree = model.unknown_groups[unknown], problem.system.mechanism
+    at = tree.joint_index(model.unknown_names[unknown])
+    score, information = force_likelihood_terms(model, smoothed.group_variance | {source: 0.0}, unknown)
     error, held = allowed
     unit = "N" if tree.joints[at].kind == "prismatic" else "N m"
-    size = model.reference[unknown]
+    size = model.reference_std[unknown]
     # the last interval is shorter than the others
     full = slice(0, len(middle) - 1) if len(middle) > 1 else slice(None)
-    return History(
+    return ForceEstimate(
         model.recording,
         source.location,
-        model.unknowns[unknown],
+        model.unknown_names[unknown],
         unit,
         middle[full],
         score[full] / size,
@@ -396,27 +412,31 @@ def _driving_force(
     )
 
 
-def _one_each(found: Sequence[tuple[History, Pulse]], problem: EstimationProblem) -> list[Event]:
+def _one_each(
+    found: Sequence[tuple[ForceEstimate, DetectedPulse]], problem: EstimationProblem
+) -> list[DisturbanceEvent]:
     """Events of forces; where one push moves the model, it is named at the coordinate that explains most of it."""
     prescribed = set(problem.system.prescribed)
-    kept: list[tuple[History, Pulse]] = []
+    kept: list[tuple[ForceEstimate, DetectedPulse]] = []
     for history, pulse in sorted(found, key=lambda entry: entry[1].p_value):
         same = [
-            p for h, p in kept if h.recording == history.recording and not {h.unknown, history.unknown} <= prescribed
+            p
+            for h, p in kept
+            if h.recording == history.recording and not {h.coordinate, history.coordinate} <= prescribed
         ]
-        if all(pulse.end <= other.begin or pulse.begin >= other.end for other in same):
+        if all(pulse.end_time <= other.start_time or pulse.start_time >= other.end_time for other in same):
             kept.append((history, pulse))
     return [
-        Event(
+        DisturbanceEvent(
             history.recording,
             history.location,
-            history.unknown,
+            history.coordinate,
             "force",
-            pulse.begin,
-            pulse.end,
-            pulse.size,
+            pulse.start_time,
+            pulse.end_time,
+            pulse.peak_value,
             pulse.impulse,
-            pulse.std * pulse.area,
+            pulse.peak_std * pulse.unit_impulse,
             history.unit,
             pulse,
         )
@@ -424,30 +444,34 @@ def _one_each(found: Sequence[tuple[History, Pulse]], problem: EstimationProblem
     ]
 
 
-def _recurs(one: Event, other: Event) -> bool:
+def _recurs(one: DisturbanceEvent, other: DisturbanceEvent) -> bool:
     """Whether the same force is there at the same time of another recording."""
-    if one.recording == other.recording or one.channel != other.channel or one.peak * other.peak < 0:
+    if one.recording == other.recording or one.channel != other.channel or one.peak_value * other.peak_value < 0:
         return False
-    both = min(one.end, other.end) - max(one.begin, other.begin)
-    return both > SAME * max(one.end - one.begin, other.end - other.begin)
+    both = min(one.end_time, other.end_time) - max(one.start_time, other.start_time)
+    return both > _MIN_RECURRENCE_OVERLAP * max(one.end_time - one.start_time, other.end_time - other.start_time)
 
 
 # -- wrong samples ----------------------------------------------------------------------------------------------------
 
 
-def _wrong_samples(problem: EstimationProblem, run: Run) -> Iterator[Event]:
+def _wrong_samples(problem: EstimationProblem, run: _RecordingRollout) -> Iterator[DisturbanceEvent]:
     """Samples that their neighbours contradict: of sensors beside their prediction, of joints as they were recorded."""
     episode, result, _ = run
-    for samples, predicted in zip(episode.samples, result.predicted, strict=True):
-        if samples.sensor.efforts or samples.node.ndim > 1:
+    for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
+        if samples.sensor.effort_joints or samples.node.ndim > 1:
             continue
         t = sample_times(episode, samples)
         for column, channel in enumerate(samples.channel_of_column):
-            seen = samples.seen[:, column]
-            axis = f".{'xyz'[column % 3]}" if samples.sensor.width == 3 else ""
-            frame = samples.sensor.frames[column // samples.sensor.width] if samples.sensor.frames else ""
-            location = seen_by(problem.system, samples.sensor, frame)
-            if samples.sensor.width == 1:
+            seen = samples.is_used[:, column]
+            axis = f".{'xyz'[column % 3]}" if samples.sensor.outputs_per_channel == 3 else ""
+            frame = (
+                samples.sensor.frame_names[column // samples.sensor.outputs_per_channel]
+                if samples.sensor.frame_names
+                else ""
+            )
+            location = sensor_bias_location(problem.system, samples.sensor, frame)
+            if samples.sensor.outputs_per_channel == 1:
                 location = channel.rpartition(".")[2]
             values = (samples.value - predicted)[seen, column]
             about = (episode.name, location, f"{channel}{axis}", samples.sensor.unit)
@@ -460,9 +484,9 @@ def _wrong_samples(problem: EstimationProblem, run: Run) -> Iterator[Event]:
         for column, (joint, channel) in enumerate(zip(joints.names, channels, strict=True)):
             floor = _floor(problem, episode, joint, quantity)
             if values is not None and floor is not None:
-                noise = np.full(len(joints.t), max(floor, quantum(values[:, column])))
+                noise = np.full(len(joints.t), max(floor, quantization_step(values[:, column])))
                 about = (episode.name, joint, channel, unit)
-                yield from _alone(joints.t - episode.grid.start, values[:, column], noise, about)
+                yield from _alone(joints.t - episode.grid.start_time, values[:, column], noise, about)
 
 
 def _floor(problem: EstimationProblem, episode: Episode, joint: str, quantity: str) -> float | None:
@@ -480,7 +504,7 @@ def _floor(problem: EstimationProblem, episode: Episode, joint: str, quantity: s
     choice = options.sensors.get(group, SensorOptions())
     recorded = joints.position_std if quantity == "position" else joints.effort_std
     given = choice.std if choice.std is not None else recorded
-    std = 0.0 if given is None else float(by_joint(given, joints.names, (joint,), f"sensors.{group}.std")[0])
+    std = 0.0 if given is None else float(values_by_joint(given, joints.names, (joint,), f"sensors.{group}.std")[0])
     if quantity == "effort" and joint in system.prescribed and math.isfinite(options.path_cutoff):
         # of one sample that much is left: its share of the filter's time
         share = 2 * options.path_cutoff * float(np.median(np.diff(joints.t)))
@@ -488,32 +512,36 @@ def _floor(problem: EstimationProblem, episode: Episode, joint: str, quantity: s
     return std
 
 
-def _alone(t: Array, values: Array, noise: Array, about: tuple[str, str, str, str]) -> Iterator[Event]:
-    """Runs of at most `LONGEST_RUN` samples far from where what is around them leads, as none of these is."""
+def _alone(t: Array, values: Array, noise: Array, about: tuple[str, str, str, str]) -> Iterator[DisturbanceEvent]:
+    """Runs of at most `_MAX_WRONG_SAMPLES` samples far from where what is around them leads, as none of these is."""
     count = len(values)
-    if count < 2 * NEIGHBOURS:
+    if count < 2 * _NEIGHBOUR_COUNT:
         return
     off = _beside_neighbours(t, values)
     size = np.abs(off)
-    wide = np.lib.stride_tricks.sliding_window_view(np.pad(size, NEIGHBOURS, mode="reflect"), 2 * NEIGHBOURS + 1)
+    wide = np.lib.stride_tricks.sliding_window_view(
+        np.pad(size, _NEIGHBOUR_COUNT, mode="reflect"), 2 * _NEIGHBOUR_COUNT + 1
+    )
     spread = 1.4826 * np.median(wide, axis=1)
-    odd = size > SURE * np.maximum(np.maximum(noise, spread), 1e-12)
+    odd = size > _WRONG_SAMPLE_Z * np.maximum(np.maximum(noise, spread), 1e-12)
     for begin in np.flatnonzero(odd & ~np.roll(odd, 1)):
         end = begin
         while end + 1 < count and odd[end + 1]:
             end += 1
-        if end - begin >= LONGEST_RUN:
+        if end - begin >= _MAX_WRONG_SAMPLES:
             continue
-        near = np.r_[max(begin - NEIGHBOURS, 0) : begin, end + 1 : min(end + 1 + NEIGHBOURS, count)]
+        near = np.r_[max(begin - _NEIGHBOUR_COUNT, 0) : begin, end + 1 : min(end + 1 + _NEIGHBOUR_COUNT, count)]
         # a stamp that is late by an interval moves a value by what changes from sample to sample
         steps = np.abs(np.diff(values))[[k for k in near[:-1] if k + 1 != begin and k < count - 1]]
-        if size[begin : end + 1].min() < ALONE * max(size[near].max(initial=0.0), steps.max(initial=0.0)):
+        if size[begin : end + 1].min() < _MIN_NEIGHBOUR_RATIO * max(
+            size[near].max(initial=0.0), steps.max(initial=0.0)
+        ):
             continue
-        period = float(np.median(np.diff(t[max(begin - NEIGHBOURS, 0) : end + NEIGHBOURS])))
+        period = float(np.median(np.diff(t[max(begin - _NEIGHBOUR_COUNT, 0) : end + _NEIGHBOUR_COUNT])))
         peak = float(off[begin + int(size[begin : end + 1].argmax())])
         spread_here = max(float(spread[begin]), float(noise[begin]))
         recording, location, channel, unit = about
-        yield Event(
+        yield DisturbanceEvent(
             recording,
             location,
             channel,
@@ -533,8 +561,8 @@ def _beside_neighbours(t: Array, values: Array) -> Array:
     No two of the stencils share a sample within a run, so that a wrong sample spoils at most one of its neighbours'
     three; where they differ in sign, and at both ends, nothing is said.
     """
-    found = np.zeros((len(STENCILS), len(values)))
-    for one, step in zip(found, STENCILS, strict=True):
+    found = np.zeros((len(_STENCIL_STEPS), len(values)))
+    for one, step in zip(found, _STENCIL_STEPS, strict=True):
         middle = np.arange(2 * step, len(values) - 2 * step)
         at = [middle + shift * step for shift in (-2, -1, 1, 2)]
         cubic = np.zeros(len(middle))
@@ -550,7 +578,7 @@ def _beside_neighbours(t: Array, values: Array) -> Array:
 # -- the recordings without them --------------------------------------------------------------------------------------
 
 
-def without_events(problem: EstimationProblem, events: Events) -> EstimationProblem:
+def problem_without_events(problem: EstimationProblem, events: EventSet) -> EstimationProblem:
     """Return the problem with force events compensated and affected samples excluded.
 
     Forces at joints that recorded torques drive act beside these. Samples of prescribed joints' efforts in the window
@@ -559,41 +587,45 @@ def without_events(problem: EstimationProblem, events: Events) -> EstimationProb
     """
 
     def cleaned(episode: Episode) -> Episode:
-        own = events.of(episode.name)
-        fall = min((f.time for f in events.falls if f.recording == episode.name), default=math.inf)
+        own = events.for_recording(episode.name)
+        fall = min((f.start_time for f in events.overspeeds if f.recording == episode.name), default=math.inf)
         if not own and not math.isfinite(fall):
             return episode
         torque = episode.torque.copy()
-        times = episode.grid.times[:-1] - episode.grid.start + episode.grid.time_step / 2
+        times = episode.grid.node_times[:-1] - episode.grid.start_time + episode.grid.time_step / 2
         for event in own:
-            if event.pulse is not None and event.channel in set(problem.system.driven) - set(problem.system.servos):
-                torque[:, problem.system.driven.index(event.channel)] += event.pulse.values(times)
-        parts = [_counting(episode, s, own, fall, problem.options.path_cutoff) for s in episode.samples]
-        return replace(episode, torque=torque, samples=tuple(parts))
+            if event.detected_pulse is not None and event.channel in set(problem.system.driven) - set(
+                problem.system.servos
+            ):
+                torque[:, problem.system.driven.index(event.channel)] += event.detected_pulse.evaluate_at(times)
+        parts = [_counting(episode, s, own, fall, problem.options.path_cutoff) for s in episode.measurements]
+        return replace(episode, torque=torque, measurements=tuple(parts))
 
-    return problem.on([cleaned(e) for e in problem.episodes], [cleaned(e) for e in problem.held_out])
+    return problem.with_episodes([cleaned(e) for e in problem.episodes], [cleaned(e) for e in problem.held_out])
 
 
-def _counting(episode: Episode, samples: Measurements, own: Sequence[Event], end: float, cutoff: float) -> Measurements:
+def _counting(
+    episode: Episode, samples: Measurements, own: Sequence[DisturbanceEvent], end: float, cutoff: float
+) -> Measurements:
     """Samples without those that an event spoils."""
     smear = 1 / cutoff
     hidden = np.zeros(samples.value.shape, bool)
     t = sample_times(episode, samples)
     t = t if t.ndim > 1 else np.broadcast_to(t[:, None], hidden.shape)
-    if math.isfinite(end) and samples.sensor.efforts:
-        hidden |= t > end - effort_filter(cutoff).settling
+    if math.isfinite(end) and samples.sensor.effort_joints:
+        hidden |= t > end - effort_filter(cutoff).settling_time
     for event in own:
         for column, channel in enumerate(samples.channel_of_column):
-            if samples.sensor.efforts:
+            if samples.sensor.effort_joints:
                 # a wrong angle is smeared over what all joints need
                 spoilt = event.channel == channel.rpartition(".")[2] or event.kind == "sample"
-                inside = (t[:, column] > event.begin - smear) & (t[:, column] < event.end + smear)
+                inside = (t[:, column] > event.start_time - smear) & (t[:, column] < event.end_time + smear)
             else:
-                axis = f".{'xyz'[column % 3]}" if samples.sensor.width == 3 else ""
+                axis = f".{'xyz'[column % 3]}" if samples.sensor.outputs_per_channel == 3 else ""
                 spoilt = event.channel == f"{channel}{axis}"
-                inside = (t[:, column] > event.begin) & (t[:, column] < event.end)
+                inside = (t[:, column] > event.start_time) & (t[:, column] < event.end_time)
             if spoilt:
                 hidden[:, column] |= inside
-    if not np.any(hidden & samples.seen):
+    if not np.any(hidden & samples.is_used):
         return samples
     return replace(samples, value=np.where(hidden, np.nan, samples.value), weight=np.where(hidden, 0.0, samples.weight))

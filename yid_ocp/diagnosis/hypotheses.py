@@ -11,27 +11,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.data.recording import Recording
-from yid_ocp.effects import EFFECTS, EffectBase, candidates, make_effect
+from yid_ocp.effects import EFFECTS, EffectBase, candidate_effects, make_effect
 from yid_ocp.errors import ConfigError, DataError
-from yid_ocp.integrator.step import Step, compile_alike
+from yid_ocp.integrator.step import Step, compile_step_like
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import Episode, beginning
-from yid_ocp.problem.inputs import sensors_present
+from yid_ocp.problem.episodes import Episode, truncate_episode
+from yid_ocp.problem.recorded_inputs import recorded_sensors
 
 Array = NDArray[np.float64]
-Choice = Literal["all"] | Sequence[str]
+CandidateChoice = Literal["all"] | Sequence[str]
 
-BLOCK = 1.0
+_BLOCK_DURATION = 1.0
 """Length of the blocks in which a single recording is split [s]."""
-FOLLOWED = 1.0
+_MIN_PREDICTED_DURATION = 1.0
 """Shortest beginning of a held-out recording that is worth predicting [s]."""
-MARGINS = (0.9, 0.5, 0.0)
+TRUNCATION_FRACTIONS = (0.9, 0.5, 0.0)
 """Parts of what a model can be rolled out on that are kept, one after the other while it still fails: near its end a
 model is lost already, and a fit on less of the recording may fail earlier."""
 
 
-def chosen_effects(system: System, recordings: Sequence[Recording], choice: Choice) -> list[EffectBase]:
+def make_candidate_effects(
+    system: System, recordings: Sequence[Recording], choice: CandidateChoice
+) -> list[EffectBase]:
     """Return the candidate effects, excluding those of the nominal model.
 
     Parameters
@@ -52,7 +54,7 @@ def chosen_effects(system: System, recordings: Sequence[Recording], choice: Choi
     present = {f"{effect.kind}@{effect.location}" for effect in system.effects}
     possible = [
         (kind, place)
-        for kind, place in candidates(system, sensors_present(recordings))
+        for kind, place in candidate_effects(system, recorded_sensors(recordings))
         if f"{kind}@{place}" not in present
     ]
     if isinstance(choice, str):
@@ -69,7 +71,7 @@ def chosen_effects(system: System, recordings: Sequence[Recording], choice: Choi
             raise ConfigError(f"{text} is part of the model", where="diagnosis.candidates", hint="leave it out")
         found = [(kind, place)] if place else [pair for pair in possible if pair[0] == kind]
         if not found:
-            missing = ", ".join(sorted(cls.needs - sensors_present(recordings)))
+            missing = ", ".join(sorted(cls.required_sensors - recorded_sensors(recordings)))
             raise ConfigError(
                 f"{kind} does not fit this system or these recordings",
                 where="diagnosis.candidates",
@@ -84,7 +86,7 @@ def chosen_effects(system: System, recordings: Sequence[Recording], choice: Choi
     return [make_effect(kind, place, system) for kind, place in pairs]
 
 
-def left_out(effects: Sequence[EffectBase], names: Sequence[str]) -> list[EffectBase]:
+def exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> list[EffectBase]:
     """Return the candidates without those named.
 
     Excluded candidates stay in the compiled step at their neutral values, so that no recompilation is needed.
@@ -100,7 +102,7 @@ def left_out(effects: Sequence[EffectBase], names: Sequence[str]) -> list[Effect
     ConfigError
         A name that is no candidate, or none is left.
     """
-    where = "diagnosis.leave_out"
+    where = "diagnosis.exclude"
     known = {name for effect in effects for name in (effect.kind, effect.label)}
     for name in names:
         if name not in known:
@@ -113,25 +115,25 @@ def left_out(effects: Sequence[EffectBase], names: Sequence[str]) -> list[Effect
 
 
 @dataclass(frozen=True)
-class Cut:
+class TruncatedRecording:
     """A held-out recording truncated where the nominal model stops following it.
 
     Attributes
     ----------
     recording : str
-    kept : float
+    kept_duration : float
         How much of it is compared [s]; 0 where nothing is.
-    whole : float
+    full_duration : float
         Its length [s].
     """
 
     recording: str
-    kept: float
-    whole: float
+    kept_duration: float
+    full_duration: float
 
 
 @dataclass(frozen=True)
-class CandidateProblem:
+class AllCandidatesProblem:
     """Estimation problem of a system with all candidates, any of which can be freed without recompiling.
 
     Sensors, statics and corrections are differentiated by everything once, recordings are placed on the nodes once, and
@@ -141,20 +143,20 @@ class CandidateProblem:
     ----------
     problem : EstimationProblem
         Of the system with all candidates at their neutral values; frees the nominal parameters.
-    effects : tuple of EffectBase
+    candidate_effects : tuple of EffectBase
         The candidates that are tried: all of the system's that are neutral, but for those left out.
-    blocks : bool
+    is_split_in_blocks : bool
         Whether a single recording is both estimated on and held out, in alternate blocks.
     """
 
     problem: EstimationProblem
-    effects: tuple[EffectBase, ...]
-    blocks: bool
+    candidate_effects: tuple[EffectBase, ...]
+    is_split_in_blocks: bool
 
     @staticmethod
-    def of(
+    def from_problem(
         problem: EstimationProblem, effects: Sequence[EffectBase], held_out: Sequence[Recording] = ()
-    ) -> CandidateProblem:
+    ) -> AllCandidatesProblem:
         """Build from a problem and its candidates, all at neutral values.
 
         Raises
@@ -171,27 +173,29 @@ class CandidateProblem:
         made = EstimationProblem(joint, estimate, problem.free, problem.options, values, held, extra)
         if not held:
             made = _in_blocks(made)
-        return CandidateProblem(made, effects, not held)
+        return AllCandidatesProblem(made, effects, not held)
 
     @property
-    def nominal(self) -> tuple[str, ...]:
+    def nominal_parameters(self) -> tuple[str, ...]:
         """Parameters that the nominal problem frees."""
         return self.problem.free
 
-    def weighted_at(self, values: Mapping[str, float]) -> CandidateProblem:
+    def whitened_at(self, values: Mapping[str, float]) -> AllCandidatesProblem:
         """Return the problem whitened by sensor noise and torque noise, linearised at these unknowns.
 
         Twice in a row, so that what is frozen is about the offsets that the torques have there.
         """
         x = self.problem.vector(values)
-        return replace(self, problem=self.problem.weighted_at(x, rounds=2).held_out_weighted_at(x))
+        return replace(self, problem=self.problem.whitened_at(x, rounds=2).held_out_whitened_at(x))
 
-    def followed(self, values: Mapping[str, float], margin: float) -> tuple[CandidateProblem, tuple[Cut, ...]]:
+    def truncate_held_out(
+        self, values: Mapping[str, float], margin: float
+    ) -> tuple[AllCandidatesProblem, tuple[TruncatedRecording, ...]]:
         """Truncate held-out recordings where the rollout fails; return the problem and the truncated recordings.
 
         A gap may be so large that the nominal model cannot follow a recording at all; what it says until then is
         compared all the same. Where nothing worth predicting is left, those to estimate on are split in blocks. Weights
-        are those of the sensors' noise; see `weighted_at`. `margin` is the part that is kept of what it follows.
+        are those of the sensors' noise; see `whitened_at`. `margin` is the part that is kept of what it follows.
         """
         problem, x = self.problem, self.problem.vector(values)
         kept, cuts = [], []
@@ -201,40 +205,42 @@ class CandidateProblem:
             if steps < whole:
                 steps = round(margin * steps)
             h = episode.grid.time_step
-            usable = steps * h >= FOLLOWED
+            usable = steps * h >= _MIN_PREDICTED_DURATION
             if steps < whole:
-                cuts.append(Cut(episode.name, steps * h if usable else 0.0, whole * h))
+                cuts.append(TruncatedRecording(episode.name, steps * h if usable else 0.0, whole * h))
             if usable or steps == whole:
-                kept.append(episode if steps == whole else beginning(episode, steps))
+                kept.append(episode if steps == whole else truncate_episode(episode, steps))
         if not cuts:
             return self, ()
         if kept:
-            return replace(self, problem=problem.on(problem.episodes, kept)), tuple(cuts)
-        return replace(self, problem=_in_blocks(problem), blocks=True), tuple(cuts)
+            return replace(self, problem=problem.with_episodes(problem.episodes, kept)), tuple(cuts)
+        return replace(self, problem=_in_blocks(problem), is_split_in_blocks=True), tuple(cuts)
 
-    def freeing(self, effects: Sequence[EffectBase]) -> EstimationProblem:
+    def with_free_effects(self, effects: Sequence[EffectBase]) -> EstimationProblem:
         """Return the problem with the nominal parameters and those of some effects free."""
-        return self.problem.freeing((*self.nominal, *(name for effect in effects for name in effect.parameters.names)))
+        return self.problem.with_free_subset(
+            (*self.nominal_parameters, *(name for effect in effects for name in effect.parameters.names))
+        )
 
-    def placed(self, effects: Sequence[EffectBase], at: Mapping[str, float]) -> EstimationProblem:
+    def relinearized_with_effects(self, effects: Sequence[EffectBase], at: Mapping[str, float]) -> EstimationProblem:
         """Return the problem with some effects free, relinearised about the torque errors that remain with them.
 
         Torque offsets that the nominal model sees are too large by what an effect does. Filters of held-out recordings
-        are left as they are: see `held_out_placed`.
+        are left as they are: see `held_out_relinearized`.
         """
-        own = self.freeing(effects)
-        return own.about_torques_at(*_beside(own, effects, at)) if own.disturbed else own
+        own = self.with_free_effects(effects)
+        return own.relinearized_at_torque_bias(*_beside(own, effects, at)) if own.has_process_noise else own
 
-    def held_out_placed(
+    def held_out_relinearized(
         self, own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]
     ) -> EstimationProblem:
-        """Return a `placed` problem with the held-out recordings relinearised too, once at the end of a fit."""
-        return own.held_out_about_torques_at(*_beside(own, effects, at)) if own.disturbed else own
+        """Return a `relinearized_with_effects` problem with the held-out recordings relinearised too, once at the end of a fit."""
+        return own.held_out_relinearized_at_torque_bias(*_beside(own, effects, at)) if own.has_process_noise else own
 
 
 def _beside(own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]) -> tuple[Array, Array]:
     """Unknowns at some values, and with neutral effects, where filters are about the right torques."""
-    neutral = {name: value for effect in effects for name, value in effect.neutral.items()}
+    neutral = {name: value for effect in effects for name, value in effect.neutral_values.items()}
     return own.vector(at), own.vector({**at, **neutral})
 
 
@@ -246,12 +252,12 @@ def _joint(step: Step, effects: tuple[EffectBase, ...]) -> tuple[Step, tuple[Eff
     """A step with candidates composed, and the candidates whose symbols it has."""
     known = _JOINT.get(step)
     if known is None or list(map(_told, known[1])) != list(map(_told, effects)):
-        known = _JOINT[step] = compile_alike(step, step.system.with_effects(effects)), effects
+        known = _JOINT[step] = compile_step_like(step, step.system.with_effects(effects)), effects
     return known
 
 
 def _told(effect: EffectBase) -> tuple[object, ...]:
-    return effect.label, effect.quantities, tuple(effect.parameters.vector())
+    return effect.label, effect.definitions, tuple(effect.parameters.vector())
 
 
 def _check_apart(estimate: Sequence[Recording], held: Sequence[Recording]) -> None:
@@ -279,15 +285,15 @@ def _same(a: Recording, b: Recording) -> bool:
 
 def _in_blocks(problem: EstimationProblem) -> EstimationProblem:
     """The problem with every other block of its recordings held out."""
-    others = [replace(_masked(e, 1), shares_start_of=i) for i, e in enumerate(problem.episodes)]
-    return problem.on([_masked(episode, 0) for episode in problem.episodes], others)
+    others = [replace(_masked(e, 1), initial_state_shared_with=i) for i, e in enumerate(problem.episodes)]
+    return problem.with_episodes([_masked(episode, 0) for episode in problem.episodes], others)
 
 
 def _steps_followed(problem: EstimationProblem, episode: Episode, x: Array) -> int:
     """Steps of a held-out recording that can be rolled out at some unknowns, to a sixty-fourth of its length."""
 
     def runs(steps: int) -> bool:
-        [(_, result)] = problem.on(problem.episodes, [beginning(episode, steps)]).validate(x)
+        [(_, result)] = problem.with_episodes(problem.episodes, [truncate_episode(episode, steps)]).predict_held_out(x)
         return not isinstance(result, str)
 
     low, high = 0, episode.grid.steps
@@ -302,14 +308,14 @@ def _steps_followed(problem: EstimationProblem, episode: Episode, x: Array) -> i
 def _masked(episode: Episode, parity: int) -> Episode:
     """The episode with the measurements of every other block only; it is rolled out from its start all the same."""
     samples = []
-    for entry in episode.samples:
+    for entry in episode.measurements:
         t = (entry.node + entry.fraction) * episode.grid.time_step
-        hidden = (np.floor(t / BLOCK).astype(int) % 2 != parity)[:, None] & np.ones(entry.value.shape, bool)
+        hidden = (np.floor(t / _BLOCK_DURATION).astype(int) % 2 != parity)[:, None] & np.ones(entry.value.shape, bool)
         value, weight = np.where(hidden, np.nan, entry.value), np.where(hidden, 0.0, entry.weight)
         samples.append(replace(entry, value=value, weight=weight))
-    return replace(episode, samples=tuple(samples))
+    return replace(episode, measurements=tuple(samples))
 
 
-def describe(effects: Sequence[Any]) -> str:
+def join_effect_labels(effects: Sequence[Any]) -> str:
     """Join the labels `kind@location` of several effects by "and"; "the nominal model" for none."""
     return " and ".join(effect.label for effect in effects) if effects else "the nominal model"

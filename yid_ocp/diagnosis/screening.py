@@ -24,116 +24,116 @@ import scipy.signal
 import scipy.stats
 from numpy.typing import NDArray
 
-from yid_ocp.diagnosis.hypotheses import CandidateProblem
-from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
+from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
+from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
-from yid_ocp.problem.null_test import Series, residual_series
+from yid_ocp.problem.null_test import ResidualChannel, residual_channels
 
 Array = NDArray[np.float64]
 
-EQUAL = 1e-6
+_DECREASE_RTOL = 1e-6
 """Relative difference of promised decreases that rounding can make."""
 
 
 @dataclass(frozen=True)
-class Signature:
+class EffectSignature:
     """First-order change of the residual by the amplitudes of a candidate.
 
     Attributes
     ----------
     effect : EffectBase
-    shape : dict of str to float
+    shape_values : dict of str to float
         Values of its shape parameters.
-    columns : ndarray, shape (nr, p)
+    projected_sensitivity : ndarray, shape (nr, p)
         P J_j, by its amplitudes.
-    noise : ndarray, shape (p, p)
+    score_noise_covariance : ndarray, shape (p, p)
         Covariance of `columns'` r under the noise's own colour.
     """
 
     effect: EffectBase
-    shape: dict[str, float]
-    columns: Array
-    noise: Array
+    shape_values: dict[str, float]
+    projected_sensitivity: Array
+    score_noise_covariance: Array
 
 
 @dataclass(frozen=True)
-class Linearisation:
+class CandidateLinearization:
     """Residual and signatures of all candidates, linearised at one point.
 
     Attributes
     ----------
-    residual : ndarray, shape (nr,)
+    projected_residual : ndarray, shape (nr,)
         P r.
     signatures : tuple of Signature
         One for each candidate and grid value.
-    values : dict of str to float
+    parameter_values : dict of str to float
         Where it was taken.
     """
 
-    residual: Array
-    signatures: tuple[Signature, ...]
-    values: dict[str, float]
+    projected_residual: Array
+    signatures: tuple[EffectSignature, ...]
+    parameter_values: dict[str, float]
 
 
 @dataclass(frozen=True)
-class Visibility:
+class CandidateDetectability:
     """Smallest detectable amplitudes of a candidate, from sensitivity and noise alone.
 
     Attributes
     ----------
     effect : EffectBase
-    detectable : dict of amplitude to float
+    detectable_amplitudes : dict of amplitude to float
         Smallest value that would be noticed, in the parameter's unit.
-    visible : bool
+    is_detectable : bool
         Whether one of them lies within the range that an engineer would expect.
     """
 
     effect: EffectBase
-    detectable: dict[str, float]
-    visible: bool
+    detectable_amplitudes: dict[str, float]
+    is_detectable: bool
 
 
 @dataclass(frozen=True)
-class Score:
+class CandidateScore:
     """Score test (Lagrange multiplier) of a candidate on the residual.
 
     Attributes
     ----------
     effect : EffectBase
-    step : dict of str to float
+    predicted_values : dict of str to float
         Amplitudes to which the linear model would go, and the shape values.
-    decrease : float
+    predicted_chi2_decrease : float
         Promised decrease of r'r.
-    statistic : float
+    lm_statistic : float
         LM with robust covariance.
     p_value : float
     """
 
     effect: EffectBase
-    step: dict[str, float]
-    decrease: float
-    statistic: float
+    predicted_values: dict[str, float]
+    predicted_chi2_decrease: float
+    lm_statistic: float
     p_value: float
 
 
-def shape_grid(effect: EffectBase, count: int = DEFAULTS.shape_values) -> list[dict[str, float]]:
+def _shape_grid(effect: EffectBase, count: int = DEFAULT_THRESHOLDS.shape_grid_size) -> list[dict[str, float]]:
     """Return grid values of a candidate's shape parameters, uniform or log-uniform over the prior range."""
-    if not effect.shapes:
+    if not effect.shape_names:
         return [{}]
     axes = []
-    for name in effect.shapes:
-        low, high = effect.prior_range[name]
+    for name in effect.shape_names:
+        low, high = effect.prior_ranges[name]
         axes.append(np.geomspace(low, high, count) if low > 0 else np.linspace(low, high, count))
-    return [{name: float(axis[i]) for name, axis in zip(effect.shapes, axes, strict=True)} for i in range(count)]
+    return [{name: float(axis[i]) for name, axis in zip(effect.shape_names, axes, strict=True)} for i in range(count)]
 
 
-def linearise(
-    problem: CandidateProblem,
+def linearize_candidates(
+    problem: AllCandidatesProblem,
     base: Sequence[EffectBase],
     values: Mapping[str, float],
-    grid: int = DEFAULTS.shape_values,
-) -> Linearisation:
+    grid: int = DEFAULT_THRESHOLDS.shape_grid_size,
+) -> CandidateLinearization:
     """Return the residual and the signatures of all candidates that are not yet in the model.
 
     Parameters
@@ -152,25 +152,25 @@ def linearise(
         The model cannot be rolled out there.
     """
     labels = {effect.label for effect in base}
-    others = [effect for effect in problem.effects if effect.label not in labels]
-    grids = {effect.label: shape_grid(effect, grid) for effect in others}
+    others = [effect for effect in problem.candidate_effects if effect.label not in labels]
+    grids = {effect.label: _shape_grid(effect, grid) for effect in others}
     own = [name for effect in base for name in effect.parameters.names]
     residual, basis = np.zeros(0), np.zeros((0, 0))
-    placed, series = problem.placed(base, values), residual_series(problem.problem)
+    placed, series = problem.relinearized_with_effects(base, values), residual_channels(problem.problem)
     warm = None
-    signatures: list[Signature] = []
+    signatures: list[EffectSignature] = []
     for k in range(max((len(g) for g in grids.values()), default=0)):
         chosen = [effect for effect in others if k < len(grids[effect.label])]
         shape = {name: value for effect in chosen for name, value in grids[effect.label][k].items()}
-        amplitudes = [name for effect in chosen for name in effect.amplitudes]
-        trial = placed.freeing((*problem.nominal, *own, *amplitudes)).at(shape)
-        evaluation = trial.evaluate(trial.vector(values), warm=warm)
+        amplitudes = [name for effect in chosen for name in effect.amplitude_names]
+        trial = placed.with_free_subset((*problem.nominal_parameters, *own, *amplitudes)).with_parameter_values(shape)
+        evaluation = trial.evaluate(trial.vector(values), equilibrium_guesses=warm)
         if not evaluation.ok or evaluation.jacobian is None:
             raise SolverError(f"the model cannot be linearised: {evaluation.message}", where="diagnosis")
-        names, warm = list(trial.names), evaluation.warm
+        names, warm = list(trial.unknown_names), evaluation.equilibrium_guesses
         places = [names.index(name) for name in amplitudes]
         rest = np.setdiff1d(np.arange(len(names)), places)
-        data, jacobian = trial.informing(evaluation)
+        data, jacobian = trial.residual_without_weak_priors(evaluation)
         if k == 0:
             basis = _basis(jacobian[:, rest])
             residual = data - basis @ (basis.T @ data)
@@ -178,11 +178,11 @@ def linearise(
         moved = moved - basis @ (basis.T @ moved)
         at = 0
         for effect in chosen:
-            width = len(effect.amplitudes)
+            width = len(effect.amplitude_names)
             columns = np.ascontiguousarray(moved[:, at : at + width])
-            signatures.append(Signature(effect, grids[effect.label][k], columns, _coloured(columns, series)))
+            signatures.append(EffectSignature(effect, grids[effect.label][k], columns, _coloured(columns, series)))
             at += width
-    return Linearisation(residual, tuple(signatures), dict(values))
+    return CandidateLinearization(residual, tuple(signatures), dict(values))
 
 
 def _basis(matrix: Array) -> Array:
@@ -193,53 +193,64 @@ def _basis(matrix: Array) -> Array:
     return np.asarray(u[:, singular > 1e-7 * max(singular.max(initial=0.0), 1e-300)])
 
 
-def visibility(point: Linearisation, detection: float = DEFAULTS.detection) -> tuple[Visibility, ...]:
-    """Return the detectability of every candidate: amplitudes of `detection` standard deviations, from J and noise."""
-    found: dict[str, Visibility] = {}
+def candidate_detectability(
+    point: CandidateLinearization, detection_z: float = DEFAULT_THRESHOLDS.detection_z
+) -> tuple[CandidateDetectability, ...]:
+    """Return the detectability of every candidate: amplitudes of `detection_z` standard deviations, from J and noise."""
+    found: dict[str, CandidateDetectability] = {}
     for signature in point.signatures:
         effect = signature.effect
-        information = signature.columns.T @ signature.columns
-        noise = signature.noise
+        information = signature.projected_sensitivity.T @ signature.projected_sensitivity
+        noise = signature.score_noise_covariance
         inverse = np.linalg.pinv(information, rcond=1e-10, hermitian=True)
         covariance = inverse @ noise @ inverse
         detectable = {}
         visible = False
-        for i, name in enumerate(effect.amplitudes):
+        for i, name in enumerate(effect.amplitude_names):
             informed = information[i, i] > 1e-16
-            size = detection * float(np.sqrt(max(covariance[i, i], 0.0))) if informed else float("inf")
+            size = detection_z * float(np.sqrt(max(covariance[i, i], 0.0))) if informed else float("inf")
             detectable[name] = size
-            quantity = next(q for q in effect.quantities if name.endswith(f".{q.name}"))
-            visible |= size < max(abs(bound - quantity.neutral) for bound in effect.prior_range[name])
+            quantity = next(q for q in effect.definitions if name.endswith(f".{q.name}"))
+            visible |= size < max(abs(bound - quantity.neutral_value) for bound in effect.prior_ranges[name])
         best = found.get(effect.label)
-        if best is None or (visible and not best.visible) or min(detectable.values()) < min(best.detectable.values()):
-            found[effect.label] = Visibility(effect, detectable, visible or (best is not None and best.visible))
+        if (
+            best is None
+            or (visible and not best.is_detectable)
+            or min(detectable.values()) < min(best.detectable_amplitudes.values())
+        ):
+            found[effect.label] = CandidateDetectability(
+                effect, detectable, visible or (best is not None and best.is_detectable)
+            )
     return tuple(found.values())
 
 
-def _coloured(columns: Array, series: Sequence[Series]) -> Array:
+def _coloured(columns: Array, series: Sequence[ResidualChannel]) -> Array:
     """X' Omega X under the noise's known colour."""
     total = np.zeros((columns.shape[1], columns.shape[1]))
     size = float(np.max(np.abs(columns), initial=0.0))
     for s in series:
-        x = columns[s.rows]
+        x = columns[s.residual_indices]
         if not np.any(np.abs(x) > 1e-6 * size):
             continue
-        if len(s.colour) > 1:
-            both = np.concatenate([s.colour[:0:-1], s.colour])[:, None]
-            total += x.T @ scipy.signal.oaconvolve(x, both, mode="full", axes=0)[len(s.colour) - 1 :][: len(x)]
+        if len(s.noise_autocorrelation) > 1:
+            both = np.concatenate([s.noise_autocorrelation[:0:-1], s.noise_autocorrelation])[:, None]
+            total += (
+                x.T
+                @ scipy.signal.oaconvolve(x, both, mode="full", axes=0)[len(s.noise_autocorrelation) - 1 :][: len(x)]
+            )
         else:
             total += x.T @ x
     return (total + total.T) / 2
 
 
-def robust(columns: Array, residual: Array, series: Sequence[Series]) -> Array:
+def _newey_west_covariance(columns: Array, residual: Array, series: Sequence[ResidualChannel]) -> Array:
     """Return the Newey-West covariance of X' r for a residual of unknown autocorrelation, shape (p, p).
 
     Bartlett's weights of L = sqrt(M) lags are the mean square of the sums over all windows of that length.
     """
     total = np.zeros((columns.shape[1], columns.shape[1]))
     for s in series:
-        u = columns[s.rows] * residual[s.rows, None]
+        u = columns[s.residual_indices] * residual[s.residual_indices, None]
         length = int(np.sqrt(len(u))) + 1
         cumulative = np.vstack([np.zeros((length, u.shape[1])), np.cumsum(u, axis=0)])
         cumulative = np.vstack([cumulative, np.tile(cumulative[-1], (length - 1, 1))])
@@ -248,37 +259,43 @@ def robust(columns: Array, residual: Array, series: Sequence[Series]) -> Array:
     return total
 
 
-def scores(point: Linearisation, series: Sequence[Series], visible: Sequence[Visibility]) -> tuple[Score, ...]:
+def score_candidates(
+    point: CandidateLinearization, series: Sequence[ResidualChannel], visible: Sequence[CandidateDetectability]
+) -> tuple[CandidateScore, ...]:
     """Return the score of every detectable candidate, largest predicted decrease of r'r first."""
-    seen = {entry.effect.label for entry in visible if entry.visible}
-    best: dict[str, Score] = {}
+    seen = {entry.effect.label for entry in visible if entry.is_detectable}
+    best: dict[str, CandidateScore] = {}
     tries: dict[str, int] = {}
     for signature in point.signatures:
         label = signature.effect.label
         if label not in seen:
             continue
         tries[label] = tries.get(label, 0) + 1
-        score = _score(signature, point.residual, series)
+        score = _score(signature, point.projected_residual, series)
         # shape values that make no difference are told apart by nothing but rounding: the first one stays
-        if label not in best or score.decrease > best[label].decrease * (1 + EQUAL):
+        if label not in best or score.predicted_chi2_decrease > best[label].predicted_chi2_decrease * (
+            1 + _DECREASE_RTOL
+        ):
             best[label] = score
     final = [
-        Score(s.effect, s.step, s.decrease, s.statistic, min(1.0, s.p_value * tries[label]))
+        CandidateScore(
+            s.effect, s.predicted_values, s.predicted_chi2_decrease, s.lm_statistic, min(1.0, s.p_value * tries[label])
+        )
         for label, s in best.items()
     ]
-    return tuple(sorted(final, key=lambda s: -s.decrease))
+    return tuple(sorted(final, key=lambda s: -s.predicted_chi2_decrease))
 
 
-def best_of(ranked: Sequence[Score]) -> float:
+def bonferroni_min_p_value(ranked: Sequence[CandidateScore]) -> float:
     """Return the Bonferroni-corrected smallest p-value of the candidates; 1 if there are none."""
     return min((score.p_value for score in ranked), default=1.0) * max(len(ranked), 1)
 
 
 def _room(effect: EffectBase) -> tuple[Array, Array]:
     """How far amplitudes may go from neutral, to either side."""
-    quantities = {f"{effect.label}.{q.name}": q for q in effect.quantities}
-    own = [quantities[name] for name in effect.amplitudes]
-    return np.array([q.lower - q.neutral for q in own]), np.array([q.upper - q.neutral for q in own])
+    quantities = {f"{effect.label}.{q.name}": q for q in effect.definitions}
+    own = [quantities[name] for name in effect.amplitude_names]
+    return np.array([q.lower - q.neutral_value for q in own]), np.array([q.upper - q.neutral_value for q in own])
 
 
 def _promised(information: Array, slope: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
@@ -288,14 +305,14 @@ def _promised(information: Array, slope: Array, lower: Array, upper: Array) -> t
     return step, np.sum((2 * slope - (information @ step[..., None])[..., 0]) * step, axis=-1)
 
 
-def _score(signature: Signature, residual: Array, series: Sequence[Series]) -> Score:
-    effect, x = signature.effect, signature.columns
+def _score(signature: EffectSignature, residual: Array, series: Sequence[ResidualChannel]) -> CandidateScore:
+    effect, x = signature.effect, signature.projected_sensitivity
     slope = -(x.T @ residual)
     lower, upper = _room(effect)
     step, decrease = _promised(x.T @ x, slope, lower, upper)
     # the candidate's own share of the residual would hide it: what would be left is what its score scatters with
-    covariance = robust(x, residual + x @ step, series)
-    floor = signature.noise
+    covariance = _newey_west_covariance(x, residual + x @ step, series)
+    floor = signature.score_noise_covariance
     # a residual below the noise must not make a score look sure
     covariance = covariance if np.trace(covariance) > np.trace(floor) else floor
     statistic = float(slope @ np.linalg.pinv(covariance, rcond=1e-10, hermitian=True) @ slope)
@@ -304,82 +321,84 @@ def _score(signature: Signature, residual: Array, series: Sequence[Series]) -> S
         if step[0] <= 0:
             statistic, p_value = 0.0, 1.0
         p_value = p_value / 2 if statistic > 0 else 1.0
-    return Score(effect, _values(effect, step) | signature.shape, max(float(decrease), 0.0), statistic, p_value)
+    return CandidateScore(
+        effect, _values(effect, step) | signature.shape_values, max(float(decrease), 0.0), statistic, p_value
+    )
 
 
 def _values(effect: EffectBase, step: Array) -> dict[str, float]:
     """Amplitudes a step from neutral."""
-    neutral = effect.neutral
-    return {name: neutral[name] + float(moved) for name, moved in zip(effect.amplitudes, step, strict=True)}
+    neutral = effect.neutral_values
+    return {name: neutral[name] + float(moved) for name, moved in zip(effect.amplitude_names, step, strict=True)}
 
 
 @dataclass(frozen=True)
-class Confusability:
+class ConfusabilityMatrix:
     """Fractions of each candidate's signature that the others explain.
 
     Attributes
     ----------
     labels : tuple of str
-    matrix : ndarray, shape (nj, nj)
+    overlap_fractions : ndarray, shape (nj, nj)
         Fraction of row j's signature that column i's can explain, beyond what the nominal parameters can.
     """
 
     labels: tuple[str, ...]
-    matrix: Array
+    overlap_fractions: Array
 
-    def like(self, label: str, limit: float) -> tuple[str, ...]:
+    def confusable_with(self, label: str, limit: float) -> tuple[str, ...]:
         """Return the candidates that explain at least the fraction `limit` of one candidate's signature."""
-        row = self.matrix[self.labels.index(label)]
+        row = self.overlap_fractions[self.labels.index(label)]
         return tuple(n for n, f in zip(self.labels, row, strict=True) if f >= limit and n != label)
 
 
 @dataclass(frozen=True)
-class Pair:
+class CandidatePair:
     """First-order decrease of the residual by two candidates together.
 
     Attributes
     ----------
     effects : tuple of EffectBase
-    step : dict of str to float
+    predicted_values : dict of str to float
         Amplitudes to which the linear model would go, and the shape values.
-    decrease : float
+    predicted_chi2_decrease : float
         Promised decrease of r'r.
-    worth : float
+    penalized_chi2_decrease : float
         The decrease beyond what chance alone brings by so many amplitudes.
     """
 
     effects: tuple[EffectBase, EffectBase]
-    step: dict[str, float]
-    decrease: float
-    worth: float
+    predicted_values: dict[str, float]
+    predicted_chi2_decrease: float
+    penalized_chi2_decrease: float
 
 
 @dataclass(frozen=True)
-class Together:
+class JointScores:
     """Joint linear model of the residual in the amplitudes of all candidates, each at one shape value.
 
     Attributes
     ----------
     effects : tuple of EffectBase
-    shapes : tuple of dict of str to float
+    shape_values : tuple of dict of str to float
     information : ndarray, shape (n, n)
         X'X of all signatures side by side.
-    slope : ndarray, shape (n,)
+    score_vector : ndarray, shape (n,)
         -X'r.
     """
 
     effects: tuple[EffectBase, ...]
-    shapes: tuple[dict[str, float], ...]
+    shape_values: tuple[dict[str, float], ...]
     information: Array
-    slope: Array
+    score_vector: Array
 
     @property
-    def blocks(self) -> list[slice]:
+    def effect_columns(self) -> list[slice]:
         """Columns of every candidate."""
-        edges = np.cumsum([0, *(len(effect.amplitudes) for effect in self.effects)])
+        edges = np.cumsum([0, *(len(effect.amplitude_names) for effect in self.effects)])
         return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
 
-    def pairs(self, among: Sequence[str]) -> Iterator[Pair]:
+    def ranked_pairs(self, among: Sequence[str]) -> Iterator[CandidatePair]:
         """Yield all pairs of some candidates, largest penalised decrease first.
 
         What two effects do together neither need do alone: one of them may hide in what the other leaves.
@@ -391,7 +410,7 @@ class Together:
         """
         bounds = [_room(effect) for effect in self.effects]
         lower, upper = (np.concatenate([np.zeros(0), *(entry[k] for entry in bounds)]) for k in (0, 1))
-        columns = [np.arange(block.start, block.stop) for block in self.blocks]
+        columns = [np.arange(block.start, block.stop) for block in self.effect_columns]
         wanted = set(among)
         by_size: dict[tuple[int, int], list[tuple[int, int]]] = {}
         for i, j in itertools.combinations([i for i, e in enumerate(self.effects) if e.label in wanted], 2):
@@ -399,37 +418,39 @@ class Together:
         found: list[tuple[float, float, int, int, Array]] = []
         for members in by_size.values():
             at = np.array([[*columns[i], *columns[j]] for i, j in members])
-            information, slope = self.information[at[:, :, None], at[:, None, :]], self.slope[at]
+            information, slope = self.information[at[:, :, None], at[:, None, :]], self.score_vector[at]
             steps, decrease = _promised(information, slope, lower[at], upper[at])
             worth = decrease - at.shape[1]
             found += [(w, d, *both, s) for w, d, both, s in zip(worth, decrease, members, steps, strict=True)]
         for worth, promised, i, j, step in sorted(found, key=lambda entry: -entry[0]):
             (one, other), width = (self.effects[i], self.effects[j]), len(columns[i])
             values = _values(one, step[:width]) | _values(other, step[width:])
-            yield Pair((one, other), values | self.shapes[i] | self.shapes[j], float(promised), float(worth))
+            yield CandidatePair(
+                (one, other), values | self.shape_values[i] | self.shape_values[j], float(promised), float(worth)
+            )
 
 
-def together(point: Linearisation, chosen: Sequence[Score] = ()) -> Together:
+def score_jointly(point: CandidateLinearization, chosen: Sequence[CandidateScore] = ()) -> JointScores:
     """Return the joint linear model of all candidates, at the scores' shape values or the middle of the grid."""
-    shape = {s.effect.label: {k: v for k, v in s.step.items() if k in s.effect.shapes} for s in chosen}
-    groups: dict[str, list[Signature]] = {}
+    shape = {s.effect.label: {k: v for k, v in s.predicted_values.items() if k in s.effect.shape_names} for s in chosen}
+    groups: dict[str, list[EffectSignature]] = {}
     for signature in point.signatures:
         groups.setdefault(signature.effect.label, []).append(signature)
     kept = []
     for label, group in groups.items():
         wanted = shape.get(label)
-        kept.append(next((s for s in group if s.shape == wanted), group[len(group) // 2]))
-    every = np.hstack([s.columns for s in kept]) if kept else np.zeros((len(point.residual), 0))
-    effects, shapes = tuple(s.effect for s in kept), tuple(s.shape for s in kept)
-    return Together(effects, shapes, every.T @ every, -(every.T @ point.residual))
+        kept.append(next((s for s in group if s.shape_values == wanted), group[len(group) // 2]))
+    every = np.hstack([s.projected_sensitivity for s in kept]) if kept else np.zeros((len(point.projected_residual), 0))
+    effects, shapes = tuple(s.effect for s in kept), tuple(s.shape_values for s in kept)
+    return JointScores(effects, shapes, every.T @ every, -(every.T @ point.projected_residual))
 
 
-def confusability(everything: Together) -> Confusability:
+def confusability_matrix(everything: JointScores) -> ConfusabilityMatrix:
     """Return the matrix of signature fractions that candidates explain, amplitudes scaled by prior range."""
-    ranges = [effect.prior_range[name] for effect in everything.effects for name in effect.amplitudes]
+    ranges = [effect.prior_ranges[name] for effect in everything.effects for name in effect.amplitude_names]
     scale = np.array([(high - low) / 2 for low, high in ranges])
     gram = everything.information * scale[:, None] * scale
-    blocks = everything.blocks
+    blocks = everything.effect_columns
     matrix = np.zeros((len(blocks), len(blocks)))
     inverses = [np.linalg.pinv(gram[b, b], rcond=1e-8, hermitian=True) for b in blocks]
     for j, row in enumerate(blocks):
@@ -437,39 +458,42 @@ def confusability(everything: Together) -> Confusability:
         for i, column in enumerate(blocks):
             cross = gram[row, column]
             matrix[j, i] = float(np.trace(cross @ inverses[i] @ cross.T)) / size if size > 0 else 0.0
-    return Confusability(tuple(effect.label for effect in everything.effects), np.clip(matrix, 0.0, 1.0))
+    return ConfusabilityMatrix(tuple(effect.label for effect in everything.effects), np.clip(matrix, 0.0, 1.0))
 
 
 @dataclass(frozen=True)
-class Screened:
+class ScreeningResult:
     """Detectability, scores and confusability of all candidates at one point.
 
     Attributes
     ----------
-    visible : tuple of Visibility
-    scores : tuple of Score
+    detectability : tuple of Visibility
+    candidate_scores : tuple of Score
         Best first.
-    alike : Confusability
-    together : Together
+    confusability : Confusability
+    joint_scores : Together
     """
 
-    visible: tuple[Visibility, ...]
-    scores: tuple[Score, ...]
-    alike: Confusability
-    together: Together
+    detectability: tuple[CandidateDetectability, ...]
+    candidate_scores: tuple[CandidateScore, ...]
+    confusability: ConfusabilityMatrix
+    joint_scores: JointScores
 
     @property
-    def unseen(self) -> list[str]:
+    def undetectable_labels(self) -> list[str]:
         """Labels of candidates that these data cannot detect."""
-        return [entry.effect.label for entry in self.visible if not entry.visible]
+        return [entry.effect.label for entry in self.detectability if not entry.is_detectable]
 
 
-def screen(
-    problem: CandidateProblem, base: Sequence[EffectBase], values: Mapping[str, float], limits: Thresholds = DEFAULTS
-) -> Screened:
+def screen_candidates(
+    problem: AllCandidatesProblem,
+    base: Sequence[EffectBase],
+    values: Mapping[str, float],
+    limits: Thresholds = DEFAULT_THRESHOLDS,
+) -> ScreeningResult:
     """Screen all candidates except those of `base`: detectability, score and confusability."""
-    point = linearise(problem, base, values, limits.shape_values)
-    visible = visibility(point, limits.detection)
-    ranked = scores(point, residual_series(problem.problem), visible)
-    everything = together(point, ranked)
-    return Screened(visible, ranked, confusability(everything), everything)
+    point = linearize_candidates(problem, base, values, limits.shape_grid_size)
+    visible = candidate_detectability(point, limits.detection_z)
+    ranked = score_candidates(point, residual_channels(problem.problem), visible)
+    everything = score_jointly(point, ranked)
+    return ScreeningResult(visible, ranked, confusability_matrix(everything), everything)

@@ -12,229 +12,274 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from yid_ocp.diagnosis.hypotheses import describe
-from yid_ocp.diagnosis.refit import Fit, Loss, Search, refit, refit_all, refit_pairs
-from yid_ocp.diagnosis.screening import Confusability, Pair, Score, Screened, best_of, screen
-from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
+from yid_ocp.diagnosis.hypotheses import join_effect_labels
+from yid_ocp.diagnosis.refit import (
+    HeldOutLoss,
+    RefitContext,
+    RefitModel,
+    refit_each_candidate,
+    refit_each_pair,
+    refit_with_effects,
+)
+from yid_ocp.diagnosis.screening import (
+    CandidatePair,
+    CandidateScore,
+    ConfusabilityMatrix,
+    ScreeningResult,
+    bonferroni_min_p_value,
+    screen_candidates,
+)
+from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
-from yid_ocp.solvers.judgement import TWO_SIDED
+from yid_ocp.solvers.uncertainty import CHI2_95_TWO_SIDED
 
-RESAMPLES = 1000
+_N_BOOTSTRAP = 1000
 """Draws of held-out blocks for the interval of a closure."""
 
 
 @dataclass(frozen=True)
-class Closure:
+class GapClosure:
     """Fraction of the held-out gap that a model closes, with its 95 % interval; NaN if there was no gap.
 
-    `sure`: whether the likelihood ratio favours the model decisively, however small the gap; see `far_likelier`.
+    `is_decisive`: whether the likelihood ratio favours the model decisively, however small the gap; see `_lr_decisive`.
     """
 
-    value: float
-    low: float
-    high: float
-    sure: bool = False
+    fraction: float
+    ci_low: float
+    ci_high: float
+    is_decisive: bool = False
 
 
 @dataclass(frozen=True)
-class Added:
+class SelectedEffect:
     """An effect added by the selection, with the refitted model of its round.
 
     Attributes
     ----------
     effect : EffectBase
-    fit : Fit
+    refitted_model : Fit
         With all effects up to this one.
-    closure : Closure
+    cumulative_closure : Closure
         Of the whole gap by all effects up to this one.
-    rivals : tuple of EffectBase
+    equivalent_effects : tuple of EffectBase
         Effects that the data cannot tell from this one, the chosen one first.
     """
 
     effect: EffectBase
-    fit: Fit
-    closure: Closure
-    rivals: tuple[EffectBase, ...]
+    refitted_model: RefitModel
+    cumulative_closure: GapClosure
+    equivalent_effects: tuple[EffectBase, ...]
 
 
-def closure(before: Loss, after: Loss, seed: int = 0, limits: Thresholds = DEFAULTS) -> Closure:
+def gap_closure(
+    before: HeldOutLoss, after: HeldOutLoss, seed: int = 0, limits: Thresholds = DEFAULT_THRESHOLDS
+) -> GapClosure:
     """Return the fraction of the held-out gap closed from `before` to `after`, with a block-bootstrap interval."""
-    sure = far_likelier(before, after, limits)
-    if before.gap <= 0 or not np.isfinite(after.mean):
-        return Closure(float("nan"), float("nan"), float("nan"), sure)
+    sure = _lr_decisive(before, after, limits)
+    if before.excess_chi2 <= 0 or not np.isfinite(after.chi2_per_sample):
+        return GapClosure(float("nan"), float("nan"), float("nan"), sure)
     rng = np.random.default_rng(seed)
-    draws = rng.integers(0, len(before.counts), (RESAMPLES, len(before.counts)))
-    n = before.counts[draws].sum(axis=1)
-    g0 = np.maximum((before.squares[draws].sum(axis=1) + before.known) / n - 1.0, 0.0)
-    g1 = np.maximum((after.squares[draws].sum(axis=1) + after.known) / n - 1.0, 0.0)
+    draws = rng.integers(0, len(before.block_sample_counts), (_N_BOOTSTRAP, len(before.block_sample_counts)))
+    n = before.block_sample_counts[draws].sum(axis=1)
+    g0 = np.maximum((before.block_chi2[draws].sum(axis=1) + before.baseline_chi2) / n - 1.0, 0.0)
+    g1 = np.maximum((after.block_chi2[draws].sum(axis=1) + after.baseline_chi2) / n - 1.0, 0.0)
     ratio = 1 - g1[g0 > 0] / g0[g0 > 0]
     low, high = np.quantile(ratio, [0.025, 0.975]) if len(ratio) else (float("nan"), float("nan"))
-    return Closure(1 - after.gap / before.gap, float(low), float(high), sure)
+    return GapClosure(1 - after.excess_chi2 / before.excess_chi2, float(low), float(high), sure)
 
 
-def far_likelier(before: Loss, after: Loss, limits: Thresholds = DEFAULTS) -> bool:
+def _lr_decisive(before: HeldOutLoss, after: HeldOutLoss, limits: Thresholds = DEFAULT_THRESHOLDS) -> bool:
     """Whether the held-out log likelihood ratio favours `after` by more than `worth`, if both models leave only noise.
 
     Innovations that are noise are independent, and half the fall of their squares is a log likelihood ratio. What shows
     in a few of them only, as a constant error of a torque does at the start, differs too much from block to block for
-    `gain` to be sure, and hardly moves chi2/n.
+    `held_out_improvement` to be sure, and hardly moves chi2/n.
     """
-    return _noise_is_left(limits, before, after) and _squares(before) - _squares(after) > 2 * limits.worth
+    return (
+        _noise_is_left(limits, before, after) and _squares(before) - _squares(after) > 2 * limits.min_log_bayes_factor
+    )
 
 
-def _noise_is_left(limits: Thresholds, *losses: Loss) -> bool:
+def _noise_is_left(limits: Thresholds, *losses: HeldOutLoss) -> bool:
     """Whether all of some models leave little but noise."""
-    return max(loss.mean for loss in losses) < 1 + limits.smallest_gap
+    return max(loss.chi2_per_sample for loss in losses) < 1 + limits.min_excess_chi2
 
 
-def _squares(loss: Loss) -> float:
-    return float(np.sum(loss.squares)) + loss.known
+def _squares(loss: HeldOutLoss) -> float:
+    return float(np.sum(loss.block_chi2)) + loss.baseline_chi2
 
 
-def gain(before: Loss, after: Loss) -> tuple[float, float]:
+def held_out_improvement(before: HeldOutLoss, after: HeldOutLoss) -> tuple[float, float]:
     """Return the decrease of held-out chi2/n from `before` to `after`, and its standard error over blocks."""
-    total = float(before.counts.sum())
-    difference = before.squares - after.squares
+    total = float(before.block_sample_counts.sum())
+    difference = before.block_chi2 - after.block_chi2
     if not np.all(np.isfinite(difference)):
-        return (-np.inf if np.isfinite(before.mean) else np.inf), 0.0
+        return (-np.inf if np.isfinite(before.chi2_per_sample) else np.inf), 0.0
     count = len(difference)
     error = np.sqrt(count) * float(np.std(difference, ddof=1)) if count > 1 else np.inf
-    return float(difference.sum() + before.known - after.known) / total, float(error) / total
+    return float(difference.sum() + before.baseline_chi2 - after.baseline_chi2) / total, float(error) / total
 
 
-def within_reach(fits: Sequence[Fit], limits: Thresholds = DEFAULTS) -> list[Fit]:
+def _near_best_models(fits: Sequence[RefitModel], limits: Thresholds = DEFAULT_THRESHOLDS) -> list[RefitModel]:
     """Models that predict the held-out recordings as well as the best one, the simplest first.
 
     Their loss is within one standard error of the best one's, or within `tie` of it, or all recordings together are as
-    likely with them (`as_likely`): about 16 % of equally good models trail the best by more than one standard error.
-    Models far less likely than the best are dropped (`less_likely`). Where model error dominates, simpler models are
-    also accepted by BIC; see `outweighs`. An effect whose shape is far from what
-    an engineer would expect (`out_of_shape`) counts only where no other comes near it: a solid that relaxes in a tenth
+    likely with them (`_lr_equivalent`): about 16 % of equally good models trail the best by more than one standard error.
+    Models far less likely than the best are dropped (`_lr_rejects`). Where model error dominates, simpler models are
+    also accepted by BIC; see `_bic_prefers`. An effect whose shape is far from what
+    an engineer would expect (`_is_shape_outside_prior`) counts only where no other comes near it: a solid that relaxes in a tenth
     of the shortest time expected is a damper. So does one that is not sure to be there. One whose amplitude is out of
-    its range (`oversized`) comes last.
+    its range (`_is_amplitude_outside_prior`) comes last.
     """
-    best = min(fits, key=lambda fit: fit.loss.mean)
+    best = min(fits, key=lambda fit: fit.held_out_loss.chi2_per_sample)
     likely = [fit for fit in fits if not fit.effects or _likely(fit.effects[-1], fit, limits)]
-    if likely and min(fit.loss.mean for fit in likely) <= (1 + limits.stand_in) * best.loss.mean:
+    if (
+        likely
+        and min(fit.held_out_loss.chi2_per_sample for fit in likely)
+        <= (1 + limits.implausible_shape_margin) * best.held_out_loss.chi2_per_sample
+    ):
         fits = likely
-        best = min(fits, key=lambda fit: fit.loss.mean)
+        best = min(fits, key=lambda fit: fit.held_out_loss.chi2_per_sample)
     near = []
     for fit in fits:
-        lost, error = gain(fit.loss, best.loss)
-        close = fit is best or lost <= max(error, limits.tie * best.loss.mean)
-        if close or as_likely(fit, best, limits) or outweighs(fit, best, limits):
+        lost, error = held_out_improvement(fit.held_out_loss, best.held_out_loss)
+        close = fit is best or lost <= max(error, limits.chi2_equivalence * best.held_out_loss.chi2_per_sample)
+        if close or _lr_equivalent(fit, best, limits) or _bic_prefers(fit, best, limits):
             near.append(fit)
-    likeliest = min(near, key=lambda fit: behind(fit, best))
-    near = [fit for fit in near if not less_likely(fit, likeliest, limits)]
+    likeliest = min(near, key=lambda fit: penalized_chi2_difference(fit, best))
+    near = [fit for fit in near if not _lr_rejects(fit, likeliest, limits)]
 
-    def order(fit: Fit) -> tuple[bool, int, float]:
-        return bool(fit.effects) and oversized(fit.effects[-1], fit.values, limits), fit.size, behind(fit, likeliest)
+    def order(fit: RefitModel) -> tuple[bool, int, float]:
+        return (
+            bool(fit.effects) and _is_amplitude_outside_prior(fit.effects[-1], fit.values, limits),
+            fit.effect_parameter_count,
+            penalized_chi2_difference(fit, likeliest),
+        )
 
     return sorted(near, key=order)
 
 
-def as_likely(fit: Fit, other: Fit, limits: Thresholds = DEFAULTS) -> bool:
+def _lr_equivalent(fit: RefitModel, other: RefitModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> bool:
     """Whether the likelihood ratio of two models over all recordings is within its 95 % bound.
 
     Where more than noise is left, squares count errors of the model, and their differences say little.
     """
-    return _noise_is_left(limits, fit.loss, other.loss) and behind(fit, other) <= TWO_SIDED
+    return (
+        _noise_is_left(limits, fit.held_out_loss, other.held_out_loss)
+        and penalized_chi2_difference(fit, other) <= CHI2_95_TWO_SIDED
+    )
 
 
-def less_likely(fit: Fit, other: Fit, limits: Thresholds = DEFAULTS) -> bool:
+def _lr_rejects(fit: RefitModel, other: RefitModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> bool:
     """Whether the log likelihood ratio over all recordings rejects `fit` against `other` by more than `worth`."""
-    return _noise_is_left(limits, fit.loss, other.loss) and behind(fit, other) > 2 * limits.worth
+    return (
+        _noise_is_left(limits, fit.held_out_loss, other.held_out_loss)
+        and penalized_chi2_difference(fit, other) > 2 * limits.min_log_bayes_factor
+    )
 
 
-def behind(fit: Fit, other: Fit) -> float:
+def penalized_chi2_difference(fit: RefitModel, other: RefitModel) -> float:
     """Return r'r of `fit` minus that of `other` over all recordings, fitted and held out, with parameter penalty.
 
     Every parameter counts as the one by which chance alone lowers r'r.
     """
-    held = _squares(fit.loss) - _squares(other.loss)
-    return held + 2 * (fit.cost - other.cost) + fit.size - other.size
+    held = _squares(fit.held_out_loss) - _squares(other.held_out_loss)
+    return held + 2 * (fit.cost - other.cost) + fit.effect_parameter_count - other.effect_parameter_count
 
 
-def _likely(effect: EffectBase, fit: Fit, limits: Thresholds) -> bool:
-    return stands_out(effect, fit, limits) and not out_of_shape(effect, fit.values, limits, fit.std)
+def _likely(effect: EffectBase, fit: RefitModel, limits: Thresholds) -> bool:
+    return _is_significant(effect, fit, limits) and not _is_shape_outside_prior(effect, fit.values, limits, fit.std)
 
 
-def outweighs(fit: Fit, best: Fit, limits: Thresholds = DEFAULTS) -> bool:
+def _bic_prefers(fit: RefitModel, best: RefitModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> bool:
     """Whether BIC prefers `fit` with fewer parameters over `best` when model error dominates.
 
     Residuals are then errors of the model, of unknown size and alike for the length of a block: blocks times the
     logarithm of the losses' ratio against parameters times that of the blocks (BIC, Schwarz 1978,
     doi:10.1214/aos/1176344136).
     """
-    if best.loss.mean < limits.everywhere or not np.isfinite(fit.loss.mean):
+    if best.held_out_loss.chi2_per_sample < limits.model_error_chi2 or not np.isfinite(
+        fit.held_out_loss.chi2_per_sample
+    ):
         return False
-    blocks, fewer = len(best.loss.counts), best.size - fit.size
-    return fewer > 0 and blocks * math.log(fit.loss.mean / best.loss.mean) <= fewer * math.log(blocks)
+    blocks, fewer = (
+        len(best.held_out_loss.block_sample_counts),
+        best.effect_parameter_count - fit.effect_parameter_count,
+    )
+    return fewer > 0 and blocks * math.log(
+        fit.held_out_loss.chi2_per_sample / best.held_out_loss.chi2_per_sample
+    ) <= fewer * math.log(blocks)
 
 
-def out_of_shape(
+def _is_shape_outside_prior(
     effect: EffectBase,
     values: Mapping[str, float],
-    limits: Thresholds = DEFAULTS,
+    limits: Thresholds = DEFAULT_THRESHOLDS,
     std: Mapping[str, float] | None = None,
 ) -> bool:
-    """Whether a shape parameter lies outside its prior range by more than `shape_factor` or `range_widths` widths.
+    """Whether a shape parameter lies outside its prior range by more than `shape_range_factor` or `prior_range_margin` widths.
 
     One that may as well lie within, by `away` standard deviations, does not.
     """
-    for name in effect.shapes:
-        low, high = effect.prior_range[name]
-        room = limits.range_widths * (high - low)
-        factor = limits.shape_factor
+    for name in effect.shape_names:
+        low, high = effect.prior_ranges[name]
+        room = limits.prior_range_margin * (high - low)
+        factor = limits.shape_range_factor
         near, far = (low / factor, high * factor) if low > 0 else (low - room, high + room)
-        unsure = limits.away * (std or {}).get(name, 0.0)
+        unsure = limits.min_z * (std or {}).get(name, 0.0)
         if not near - unsure <= values[name] <= far + unsure:
             return True
     return False
 
 
-def oversized(effect: EffectBase, values: Mapping[str, float], limits: Thresholds = DEFAULTS) -> bool:
-    """Whether an amplitude lies outside its prior range by more than `range_widths` widths of that range."""
-    for name in effect.amplitudes:
-        low, high = effect.prior_range[name]
-        room = limits.range_widths * (high - low)
+def _is_amplitude_outside_prior(
+    effect: EffectBase, values: Mapping[str, float], limits: Thresholds = DEFAULT_THRESHOLDS
+) -> bool:
+    """Whether an amplitude lies outside its prior range by more than `prior_range_margin` widths of that range."""
+    for name in effect.amplitude_names:
+        low, high = effect.prior_ranges[name]
+        room = limits.prior_range_margin * (high - low)
         if not low - room <= values[name] <= high + room:
             return True
     return False
 
 
-def stands_out(effect: EffectBase, fit: Fit, limits: Thresholds = DEFAULTS) -> bool:
+def _is_significant(effect: EffectBase, fit: RefitModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> bool:
     """Whether any amplitude is at least `away` standard deviations from neutral.
 
     The standard deviations hold the shape fixed; see `amplitude_std`.
     """
-    neutral, std = effect.neutral, fit.amplitude_std
-    return any(abs(fit.values[n] - neutral[n]) >= limits.away * std.get(n, 0.0) for n in effect.amplitudes)
+    neutral, std = effect.neutral_values, fit.amplitude_std
+    return any(abs(fit.values[n] - neutral[n]) >= limits.min_z * std.get(n, 0.0) for n in effect.amplitude_names)
 
 
-def relevant(before: Loss, after: Loss, limits: Thresholds = DEFAULTS) -> bool:
-    """Whether the held-out error, of all channels or of any one, is reduced by at least the fraction `relevance`.
+def _is_rmse_reduced(before: HeldOutLoss, after: HeldOutLoss, limits: Thresholds = DEFAULT_THRESHOLDS) -> bool:
+    """Whether the held-out error, of all channels or of any one, is reduced by at least the fraction `min_rmse_reduction`.
 
     Held-out recordings that are far likelier need not show it: what tells of a constant error shows in few samples.
     """
-    if far_likelier(before, after, limits) or not np.isfinite(before.mean):
+    if _lr_decisive(before, after, limits) or not np.isfinite(before.chi2_per_sample):
         return True
-    return fall(before, after) >= limits.relevance
+    return rmse_reduction(before, after) >= limits.min_rmse_reduction
 
 
-def fall(before: Loss, after: Loss) -> float:
+def rmse_reduction(before: HeldOutLoss, after: HeldOutLoss) -> float:
     """Return the relative reduction of the held-out RMSE: the larger of all channels together and the best channel."""
-    pairs = [(np.sqrt(before.mean), np.sqrt(after.mean))]
-    pairs += [(rmse, after.channels[name][0]) for name, (rmse, _) in before.channels.items() if name in after.channels]
+    pairs = [(np.sqrt(before.chi2_per_sample), np.sqrt(after.chi2_per_sample))]
+    pairs += [
+        (rmse, after.channel_rmse[name][0])
+        for name, (rmse, _) in before.channel_rmse.items()
+        if name in after.channel_rmse
+    ]
     return float(max(1.0 - later / earlier if earlier > 0 else 0.0 for earlier, later in pairs))
 
 
 # -- several effects --------------------------------------------------------------------------------------------------
 
 
-def shortlist(
-    scores: Sequence[Score], alike: Confusability, limits: Thresholds, places: Sequence[str] = ()
+def _refit_shortlist(
+    scores: Sequence[CandidateScore], alike: ConfusabilityMatrix, limits: Thresholds, places: Sequence[str] = ()
 ) -> list[tuple[EffectBase, Mapping[str, float]]]:
     """Choose the candidates to refit, with their start values.
 
@@ -243,38 +288,38 @@ def shortlist(
     where the gap lies is refitted whether significant or not: in a valley far from its end the linear model of a
     candidate may say nothing.
     """
-    ranked = [score for score in scores if score.p_value < limits.level]
+    ranked = [score for score in scores if score.p_value < limits.significance_level]
     if not ranked:
         return []
-    best = list(ranked[: limits.refits])
-    extra: list[Score] = []
+    best = list(ranked[: limits.n_refit_per_round])
+    extra: list[CandidateScore] = []
     for score in best:
-        names = alike.like(score.effect.label, limits.alike)
+        names = alike.confusable_with(score.effect.label, limits.signature_overlap)
         extra += [s for s in ranked if s.effect.label in names and s not in best and s not in extra]
-    extra.sort(key=lambda s: -s.decrease)
-    chosen = [*best, *extra[: limits.refits]]
-    surest = sorted(ranked, key=lambda s: (s.p_value, -s.statistic))[: limits.surest]
+    extra.sort(key=lambda s: -s.predicted_chi2_decrease)
+    chosen = [*best, *extra[: limits.n_refit_per_round]]
+    surest = sorted(ranked, key=lambda s: (s.p_value, -s.lm_statistic))[: limits.n_refit_lowest_p]
     there = [next((s for s in scores if s.effect.location == place), None) for place in places]
     for other in (*surest, *there):
         if other is not None and other not in chosen:
             chosen.append(other)
-    return [(s.effect, s.step) for s in chosen]
+    return [(s.effect, s.predicted_values) for s in chosen]
 
 
-def _from_before(search: Search) -> list[Fit]:
+def _from_before(search: RefitContext) -> list[RefitModel]:
     """Candidates refitted from the earlier run's parameters: the nominal fit's stand in for what is missing."""
     try:
-        screened = screen(search.problem, (), {}, search.limits)
+        screened = screen_candidates(search.problem, (), {}, search.thresholds)
     except SolverError:
         return []
-    search.progress.stage("trying candidates from the earlier run's parameters")
-    chosen = shortlist(screened.scores, screened.alike, search.limits)
-    return refit_all(search, (), chosen, {}, "from the earlier run's parameters")
+    search.progress.begin_stage("trying candidates from the earlier run's parameters")
+    chosen = _refit_shortlist(screened.candidate_scores, screened.confusability, search.thresholds)
+    return refit_each_candidate(search, (), chosen, {}, "from the earlier run's parameters")
 
 
-def _likelier(fits: Sequence[Fit], others: Sequence[Fit]) -> list[Fit]:
+def _likelier(fits: Sequence[RefitModel], others: Sequence[RefitModel]) -> list[RefitModel]:
     """Of every effect the fit of least cost."""
-    best: dict[str, Fit] = {}
+    best: dict[str, RefitModel] = {}
     for fit in (*fits, *others):
         label = fit.effects[-1].label
         if label not in best or fit.cost < best[label].cost:
@@ -282,9 +327,13 @@ def _likelier(fits: Sequence[Fit], others: Sequence[Fit]) -> list[Fit]:
     return list(best.values())
 
 
-def compose(
-    search: Search, nominal: Fit, screened: Screened, places: Sequence[str] = (), moved: bool = False
-) -> tuple[tuple[Fit, ...], tuple[Added, ...]]:
+def select_effects(
+    search: RefitContext,
+    nominal: RefitModel,
+    screened: ScreeningResult,
+    places: Sequence[str] = (),
+    moved: bool = False,
+) -> tuple[tuple[RefitModel, ...], tuple[SelectedEffect, ...]]:
     """Select effects by forward selection on the held-out gap, then try replacing and removing each.
 
     Parameters
@@ -306,59 +355,73 @@ def compose(
         its last fit first.
     added : tuple of Added
     """
-    limits, alone = search.limits, screened
+    limits, alone = search.thresholds, screened
     current = nominal
-    first: tuple[Fit, ...] = ()
-    added: tuple[Added, ...] = ()
+    first: tuple[RefitModel, ...] = ()
+    added: tuple[SelectedEffect, ...] = ()
     paired = False
-    while len(added) < limits.effects:
+    while len(added) < limits.max_effects:
         base = tuple(entry.effect for entry in added)
         if added:
-            search.progress.stage(f"scoring what is left beside {', '.join(e.label for e in base)}")
-            screened = screen(search.problem, base, current.values, limits)
+            search.progress.begin_stage(f"scoring what is left beside {', '.join(e.label for e in base)}")
+            screened = screen_candidates(search.problem, base, current.values, limits)
             # a rest that the residual as a whole does not show may show along a candidate, as a gap does
-            if _little_is_left(current, limits) and best_of(screened.scores) >= limits.candidate_level:
+            if (
+                _little_is_left(current, limits)
+                and bonferroni_min_p_value(screened.candidate_scores) >= limits.candidate_significance_level
+            ):
                 break
         # where the gap lay before anything was added asks for no more than the significant afterwards
-        scores = [score for score in screened.scores if not added or score.p_value < limits.level]
-        fits = refit_all(search, base, shortlist(scores, screened.alike, limits, places), current.values)
+        scores = [
+            score for score in screened.candidate_scores if not added or score.p_value < limits.significance_level
+        ]
+        fits = refit_each_candidate(
+            search, base, _refit_shortlist(scores, screened.confusability, limits, places), current.values
+        )
         if moved and not added:
             fits = _likelier(fits, _from_before(search))
         if len(added) == 1:
-            pairs = likely_pairs(alone, limits, base[0])
-            fits += [fit for fit in refit_pairs(search, pairs, nominal.values) if _firmly(fit.effects[0], fit, limits)]
+            pairs = _pairs_to_refit(alone, limits, base[0])
+            fits += [
+                fit for fit in refit_each_pair(search, pairs, nominal.values) if _firmly(fit.effects[0], fit, limits)
+            ]
         if added:
             fits = _of_a_size(fits, limits)
         if not fits:
             break
-        near = within_reach(fits, limits)
+        near = _near_best_models(fits, limits)
         if not added:
-            first = (near[0], *sorted((fit for fit in fits if fit is not near[0]), key=lambda fit: fit.loss.mean))
+            first = (
+                near[0],
+                *sorted((fit for fit in fits if fit is not near[0]), key=lambda fit: fit.held_out_loss.chi2_per_sample),
+            )
         chosen = next((fit for fit in near if _worth_adding(current, fit, limits)), None)
         if chosen is None:
             break
         paired = chosen.effects[:-1] != base
-        total = closure(nominal.loss, chosen.loss, limits=limits)
-        said = "" if np.isnan(total.value) else f": {100 * total.value:.3g} % of the held-out gap closed"
+        total = gap_closure(nominal.held_out_loss, chosen.held_out_loss, limits=limits)
+        said = "" if np.isnan(total.fraction) else f": {100 * total.fraction:.3g} % of the held-out gap closed"
         if paired:
-            search.progress.stage(f"put {describe(chosen.effects)} in the place of {describe(base)}{said}")
-            both = [Added(effect, chosen, total, (effect,)) for effect in chosen.effects]
+            search.progress.begin_stage(
+                f"put {join_effect_labels(chosen.effects)} in the place of {join_effect_labels(base)}{said}"
+            )
+            both = [SelectedEffect(effect, chosen, total, (effect,)) for effect in chosen.effects]
             added = _rebuilt(search, nominal, both, chosen)
         else:
-            search.progress.stage(f"added {chosen.effects[-1].label}{said}")
+            search.progress.begin_stage(f"added {chosen.effects[-1].label}{said}")
             beside = [fit.effects[-1] for fit in near if fit is not chosen and fit.effects[:-1] == base]
-            added = (*added, Added(chosen.effects[-1], chosen, total, (chosen.effects[-1], *beside)))
+            added = (*added, SelectedEffect(chosen.effects[-1], chosen, total, (chosen.effects[-1], *beside)))
         current = chosen
     kept = _reconsidered(search, nominal, added, paired)
     if len(kept) == 1:
         # it may have ended elsewhere than where it was tried first
         [own] = kept
-        first = (own.fit, *(fit for fit in first if fit.effects[0].label != own.effect.label))
+        first = (own.refitted_model, *(fit for fit in first if fit.effects[0].label != own.effect.label))
     return first, kept
 
 
-def likely_pairs(
-    screened: Screened, limits: Thresholds, without: EffectBase
+def _pairs_to_refit(
+    screened: ScreeningResult, limits: Thresholds, without: EffectBase
 ) -> list[tuple[tuple[EffectBase, EffectBase], Mapping[str, float]]]:
     """Choose the pairs of candidates to refit: best penalized decrease first, without confusable duplicates.
 
@@ -375,54 +438,58 @@ def likely_pairs(
     list of (pair of EffectBase, mapping of parameter to float)
         With the values at which both begin.
     """
-    alike = screened.alike
+    alike = screened.confusability
 
     def same(one: EffectBase, other: EffectBase) -> bool:
-        return one.label == other.label or other.label in alike.like(one.label, limits.alike)
+        return one.label == other.label or other.label in alike.confusable_with(one.label, limits.signature_overlap)
 
-    def covered(pair: Pair, by: Pair) -> bool:
+    def covered(pair: CandidatePair, by: CandidatePair) -> bool:
         (a, b), (c, d) = pair.effects, by.effects
         return (same(a, c) and same(b, d)) or (same(a, d) and same(b, c))
 
-    labels = [score.effect.label for score in screened.scores if score.effect.label != without.label]
-    chosen: list[Pair] = []
-    for pair in screened.together.pairs(labels):
-        if len(chosen) == limits.pairs:
+    labels = [score.effect.label for score in screened.candidate_scores if score.effect.label != without.label]
+    chosen: list[CandidatePair] = []
+    for pair in screened.joint_scores.ranked_pairs(labels):
+        if len(chosen) == limits.n_refit_pairs:
             break
         if not any(covered(pair, before) for before in chosen):
             chosen.append(pair)
-    return [(pair.effects, pair.step) for pair in chosen]
+    return [(pair.effects, pair.predicted_values) for pair in chosen]
 
 
-def _firmly(effect: EffectBase, fit: Fit, limits: Thresholds) -> bool:
+def _firmly(effect: EffectBase, fit: RefitModel, limits: Thresholds) -> bool:
     """Whether an effect of a fit is there, with a shape and an amplitude to be expected."""
-    return _likely(effect, fit, limits) and not oversized(effect, fit.values, limits)
+    return _likely(effect, fit, limits) and not _is_amplitude_outside_prior(effect, fit.values, limits)
 
 
-def _of_a_size(fits: Sequence[Fit], limits: Thresholds) -> list[Fit]:
+def _of_a_size(fits: Sequence[RefitModel], limits: Thresholds) -> list[RefitModel]:
     """Fits whose last effect is of a size to be expected: beyond it, it mends what those before it do wrong."""
-    return [fit for fit in fits if not oversized(fit.effects[-1], fit.values, limits)]
+    return [fit for fit in fits if not _is_amplitude_outside_prior(fit.effects[-1], fit.values, limits)]
 
 
-def _little_is_left(fit: Fit, limits: Thresholds) -> bool:
+def _little_is_left(fit: RefitModel, limits: Thresholds) -> bool:
     """Whether the effects of a fit leave little but noise; a gap that is as little is one without any."""
-    return bool(fit.effects) and _noise_is_left(limits, fit.loss)
+    return bool(fit.effects) and _noise_is_left(limits, fit.held_out_loss)
 
 
-def _worth_adding(current: Fit, chosen: Fit, limits: Thresholds) -> bool:
+def _worth_adding(current: RefitModel, chosen: RefitModel, limits: Thresholds) -> bool:
     """Whether the last effect of a fit closes a sure and relevant part of the gap, and is there at all.
 
     Where little but noise is left, only odds convince: a part of next to nothing is soon closed.
     """
-    gained, error = gain(current.loss, chosen.loss)
-    part = gained >= limits.closure * current.loss.gap and current.loss.gap > 0
+    gained, error = held_out_improvement(current.held_out_loss, chosen.held_out_loss)
+    part = gained >= limits.min_gap_closed * current.held_out_loss.excess_chi2 and current.held_out_loss.excess_chi2 > 0
     closes = not _little_is_left(current, limits) and gained > error and part
-    if not closes and not far_likelier(current.loss, chosen.loss, limits):
+    if not closes and not _lr_decisive(current.held_out_loss, chosen.held_out_loss, limits):
         return False
-    return stands_out(chosen.effects[-1], chosen, limits) and relevant(current.loss, chosen.loss, limits)
+    return _is_significant(chosen.effects[-1], chosen, limits) and _is_rmse_reduced(
+        current.held_out_loss, chosen.held_out_loss, limits
+    )
 
 
-def _reconsidered(search: Search, nominal: Fit, added: Sequence[Added], paired: bool) -> tuple[Added, ...]:
+def _reconsidered(
+    search: RefitContext, nominal: RefitModel, added: Sequence[SelectedEffect], paired: bool
+) -> tuple[SelectedEffect, ...]:
     """Every effect tried for its place again beside the others: without it, and others instead of it.
 
     What was added first was chosen while the others were missing, and may be there in their stead. The last one, unless
@@ -445,57 +512,71 @@ def _reconsidered(search: Search, nominal: Fit, added: Sequence[Added], paired: 
     return kept
 
 
-def _labels(added: Sequence[Added]) -> frozenset[str]:
+def _labels(added: Sequence[SelectedEffect]) -> frozenset[str]:
     return frozenset(entry.effect.label for entry in added)
 
 
-def _revised(search: Search, nominal: Fit, kept: tuple[Added, ...], position: int) -> tuple[Added, ...]:
+def _revised(
+    search: RefitContext, nominal: RefitModel, kept: tuple[SelectedEffect, ...], position: int
+) -> tuple[SelectedEffect, ...]:
     """The effects without one of them, with another in its place, or as they are with what would do as well."""
-    limits, full, entry = search.limits, kept[-1].fit, kept[position]
+    limits, full, entry = search.thresholds, kept[-1].refitted_model, kept[position]
     rest = [other.effect for other in kept if other is not entry]
     # it begins elsewhere than a refit of the same effects in an earlier round
-    without = _again(search, rest, full, f"{describe(full.effects)} without {entry.effect.label}")
+    without = _again(search, rest, full, f"{join_effect_labels(full.effects)} without {entry.effect.label}")
     if without is None:
         return kept
     if not _needed(without, full, entry.effect, limits):
-        search.progress.stage(f"left {entry.effect.label} out again: the others do as well")
+        search.progress.begin_stage(f"left {entry.effect.label} out again: the others do as well")
         return _rebuilt(search, nominal, [other for other in kept if other is not entry], without)
-    search.progress.stage(f"looking for others in the place of {entry.effect.label}")
-    screened = screen(search.problem, rest, without.values, limits)
-    tried = shortlist(screened.scores, screened.alike, limits)[: limits.refits]
+    search.progress.begin_stage(f"looking for others in the place of {entry.effect.label}")
+    screened = screen_candidates(search.problem, rest, without.values, limits)
+    tried = _refit_shortlist(screened.candidate_scores, screened.confusability, limits)[: limits.n_refit_per_round]
     tried = [pair for pair in tried if pair[0].label != entry.effect.label]
     own = replace(full, effects=(*rest, entry.effect))
-    others = refit_all(search, rest, tried, without.values)
-    if not oversized(entry.effect, own.values, limits):
+    others = refit_each_candidate(search, rest, tried, without.values)
+    if not _is_amplitude_outside_prior(entry.effect, own.values, limits):
         others = _of_a_size(others, limits)
-    near = within_reach([own, *others], limits)
+    near = _near_best_models([own, *others], limits)
     chosen = next((fit for fit in near if _needed(without, fit, fit.effects[-1], limits)), own)
     rivals = (chosen.effects[-1], *(fit.effects[-1] for fit in near if fit is not chosen))
-    placed = [replace(e, effect=chosen.effects[-1], rivals=rivals) if e is entry else e for e in kept]
+    placed = [replace(e, effect=chosen.effects[-1], equivalent_effects=rivals) if e is entry else e for e in kept]
     if chosen is own:
         return tuple(placed)
-    search.progress.stage(f"put {chosen.effects[-1].label} in the place of {entry.effect.label}")
+    search.progress.begin_stage(f"put {chosen.effects[-1].label} in the place of {entry.effect.label}")
     return _rebuilt(search, nominal, placed, replace(chosen, effects=tuple(e.effect for e in placed)))
 
 
-def _needed(without: Fit, full: Fit, effect: EffectBase, limits: Thresholds) -> bool:
+def _needed(without: RefitModel, full: RefitModel, effect: EffectBase, limits: Thresholds) -> bool:
     """Whether held-out recordings are surely predicted worse without an effect, and it is there at all."""
-    gained, error = gain(without.loss, full.loss)
-    sure = gained > error or far_likelier(without.loss, full.loss, limits)
-    return sure and stands_out(effect, full, limits) and relevant(without.loss, full.loss, limits)
+    gained, error = held_out_improvement(without.held_out_loss, full.held_out_loss)
+    sure = gained > error or _lr_decisive(without.held_out_loss, full.held_out_loss, limits)
+    return (
+        sure
+        and _is_significant(effect, full, limits)
+        and _is_rmse_reduced(without.held_out_loss, full.held_out_loss, limits)
+    )
 
 
-def _rebuilt(search: Search, nominal: Fit, entries: Sequence[Added], last: Fit) -> tuple[Added, ...]:
+def _rebuilt(
+    search: RefitContext, nominal: RefitModel, entries: Sequence[SelectedEffect], last: RefitModel
+) -> tuple[SelectedEffect, ...]:
     """Effects in their order, each with the fit of all up to it, or of all where that cannot be made."""
     found = []
     for i, entry in enumerate(entries):
         effects = [other.effect for other in entries[: i + 1]]
-        part = None if i == len(entries) - 1 else _again(search, effects, last, f"{describe(effects)} again")
+        part = None if i == len(entries) - 1 else _again(search, effects, last, f"{join_effect_labels(effects)} again")
         fit = last if part is None else part
-        found.append(replace(entry, fit=fit, closure=closure(nominal.loss, fit.loss, limits=search.limits)))
+        found.append(
+            replace(
+                entry,
+                refitted_model=fit,
+                cumulative_closure=gap_closure(nominal.held_out_loss, fit.held_out_loss, limits=search.thresholds),
+            )
+        )
     return tuple(found)
 
 
-def _again(search: Search, effects: Sequence[EffectBase], near: Fit, name: str) -> Fit | None:
+def _again(search: RefitContext, effects: Sequence[EffectBase], near: RefitModel, name: str) -> RefitModel | None:
     """A refit that begins where another one ended."""
-    return refit(search.problem, effects, near.values, search.store, name, search.limits)
+    return refit_with_effects(search.problem, effects, near.values, search.store, name, search.thresholds)

@@ -24,105 +24,105 @@ import scipy.optimize
 import threadpoolctl
 from numpy.typing import NDArray
 
-from yid_ocp.diagnosis.smoother_model import Linear, Source, linear_model
-from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
-from yid_ocp.parallel import map_threads
+from yid_ocp.diagnosis.smoother_model import LinearResidualModel, UnknownGroup, linear_residual_models
+from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
+from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 
 Array = NDArray[np.float64]
 
-ITERATIONS = 12
+_MAX_ITERATIONS = 12
 """Fixed-point iterations on the standard deviations."""
-VARIANCES = (1e-6, 1e7)
+_VARIANCE_BOUNDS = (1e-6, 1e7)
 """Range of the variances, in units of the squared reference."""
-LATER = 6
+_LATER_GROUP_TRIALS = 6
 """Groups tried after the first round, the most promising ones by their scores."""
 
 
 @dataclass(frozen=True)
-class Trace:
+class SmoothedUnknowns:
     """Smoothed unknowns of one recording over its intervals: posterior mean and standard deviation.
 
     Attributes
     ----------
     recording : str
-    edges : ndarray, shape (J + 1,)
+    interval_edges : ndarray, shape (J + 1,)
         [s]
-    unknowns : tuple of str
-    sources : tuple of Source
-    reference : ndarray, shape (nd,)
+    unknown_names : tuple of str
+    unknown_groups : tuple of Source
+    reference_std : ndarray, shape (nd,)
         [N m, N or m]
-    mean, std : ndarray, shape (J, nd)
+    posterior_mean, posterior_std : ndarray, shape (J, nd)
         In units of the reference.
     """
 
     recording: str
-    edges: Array
-    unknowns: tuple[str, ...]
-    sources: tuple[Source, ...]
-    reference: Array
-    mean: Array
-    std: Array
+    interval_edges: Array
+    unknown_names: tuple[str, ...]
+    unknown_groups: tuple[UnknownGroup, ...]
+    reference_std: Array
+    posterior_mean: Array
+    posterior_std: Array
 
 
 @dataclass(frozen=True)
-class Smoothed:
+class SmootherResult:
     """Result of the weak-constraint smoother: smoothed unknowns and the evidence of every group.
 
     Attributes
     ----------
-    traces : tuple of Trace
-    variance : dict of Source to float
+    smoothed_unknowns : tuple of Trace
+    group_variance : dict of Source to float
         Of every group, in units of its squared reference, at the largest evidence.
-    weight : dict of Source to float
+    log_evidence_drop : dict of Source to float
         Fall of the log evidence when the group is left out.
-    detectable : dict of Source to float
+    detectable_std : dict of Source to float
         Smallest standard deviation of every group's unknowns that would be noticed, in units of the reference, from the
         model alone.
-    before, after : float
+    chi2_before, chi2_after : float
         r'r, after the free parameters' refit, without and with the unknowns.
-    degrees_before, degrees_after : float
+    dof_before, dof_after : float
         Measurements less what the parameters, and the unknowns, take of the noise.
-    evidence : dict of str to float
+    log_evidence : dict of str to float
         Log evidence of unknown forces and offsets alone ("plant"), of biases alone ("sensor"), of both, above that of
         neither ("none" is 0).
-    worth : float
+    min_log_bayes_factor : float
         Rise of the log evidence that is more than chance.
-    instead : dict of Source to tuple of Source
+    alternative_groups : dict of Source to tuple of Source
         Groups that would do nearly as well in the place of each group at work.
     """
 
-    traces: tuple[Trace, ...]
-    variance: dict[Source, float]
-    weight: dict[Source, float]
-    detectable: dict[Source, float]
-    before: float
-    after: float
-    degrees_before: float
-    degrees_after: float
-    evidence: dict[str, float]
-    worth: float = DEFAULTS.worth
-    instead: Mapping[Source, tuple[Source, ...]] = field(default_factory=dict)
+    smoothed_unknowns: tuple[SmoothedUnknowns, ...]
+    group_variance: dict[UnknownGroup, float]
+    log_evidence_drop: dict[UnknownGroup, float]
+    detectable_std: dict[UnknownGroup, float]
+    chi2_before: float
+    chi2_after: float
+    dof_before: float
+    dof_after: float
+    log_evidence: dict[str, float]
+    min_log_bayes_factor: float = DEFAULT_THRESHOLDS.min_log_bayes_factor
+    alternative_groups: Mapping[UnknownGroup, tuple[UnknownGroup, ...]] = field(default_factory=dict)
 
     @property
-    def explainable(self) -> float:
+    def explainable_fraction(self) -> float:
         """Fraction of the gap G = max(0, chi2/n - 1) that unknown forces, offsets and biases can explain."""
-        gap = self.before / self.degrees_before - 1
-        rest = max(self.after / self.degrees_after - 1, 0.0)
+        gap = self.chi2_before / self.dof_before - 1
+        rest = max(self.chi2_after / self.dof_after - 1, 0.0)
         return float(np.clip(1 - rest / gap, 0.0, 1.0)) if gap > 0 else 0.0
 
     @property
-    def side(self) -> str:
+    def gap_origin(self) -> str:
         """Origin of the gap by evidence: "none", "plant", "sensor", "both", or "either" if they are confounded."""
-        if max(self.evidence.values()) <= 0:
+        if max(self.log_evidence.values()) <= 0:
             return "none"
-        heaviest = max(self.weight, key=lambda source: self.weight[source])
-        if heaviest.read:
+        heaviest = max(self.log_evidence_drop, key=lambda source: self.log_evidence_drop[source])
+        if heaviest.is_confounded_with_bias:
             return "either"
         # both must beat either alone by more than chance
-        alone = max(("plant", "sensor"), key=lambda name: self.evidence[name])
-        return "both" if self.evidence["both"] - self.evidence[alone] > self.worth else alone
+        alone = max(("plant", "sensor"), key=lambda name: self.log_evidence[name])
+        return "both" if self.log_evidence["both"] - self.log_evidence[alone] > self.min_log_bayes_factor else alone
 
 
 # -- filter and smoother ----------------------------------------------------------------------------------------------
@@ -164,7 +164,7 @@ class _Update:
     move: Array
 
 
-def _filter(model: Linear, variance: Array, smooth: bool) -> _Pass:
+def _filter(model: LinearResidualModel, variance: Array, smooth: bool) -> _Pass:
     """Run through one recording with given variances of the unknowns, shape (nd,)."""
     updates: list[_Update] = []
     products, log_determinant, begin = _forwards(model, variance, updates if smooth else None)
@@ -174,7 +174,7 @@ def _filter(model: Linear, variance: Array, smooth: bool) -> _Pass:
     return _Pass(products, log_determinant, *_backwards(model, begin, updates))
 
 
-def _forwards(model: Linear, variance: Array, updates: list[_Update] | None) -> tuple[Array, float, Array]:
+def _forwards(model: LinearResidualModel, variance: Array, updates: list[_Update] | None) -> tuple[Array, float, Array]:
     """`products` and `log_determinant` of `_Pass`, and `begin` of `_backwards`; keeps its updates where they are asked.
 
     The determinant is infinite where variances are so large that rounding shows: they are never the best.
@@ -182,20 +182,20 @@ def _forwards(model: Linear, variance: Array, updates: list[_Update] | None) -> 
     # nobody asks for the scores of unknowns that are known to be zero
     used = np.flatnonzero(variance > 0) if updates is None else np.arange(len(variance))
     variance = variance[used]
-    ns, nd = len(model.loose), len(variance)
-    size, columns = ns + nd, model.intervals[0].observed.shape[1]
+    ns, nd = len(model.initial_state_std), len(variance)
+    size, columns = ns + nd, model.intervals[0].negative_residual_jacobian.shape[1]
     fresh = np.zeros((size, size))
-    fresh[ns:, ns:] = (1 - model.decay**2) * np.diag(variance)
-    begin = np.vstack([model.at_rest[:, used], np.eye(nd)])
+    fresh[ns:, ns:] = (1 - model.interval_correlation**2) * np.diag(variance)
+    begin = np.vstack([model.initial_state_jacobian[:, used], np.eye(nd)])
     p = (begin * variance) @ begin.T
-    p[np.arange(ns), np.arange(ns)] += model.loose**2
+    p[np.arange(ns), np.arange(ns)] += model.initial_state_std**2
     mean = np.zeros((size, columns))
     products, log_determinant = np.zeros((columns, columns)), 0.0
     for interval in model.intervals:
-        design = np.hstack([interval.by_state, interval.by_unknown[:, used]])
-        products += interval.rest
+        design = np.hstack([interval.state_jacobian, interval.unknown_jacobian[:, used]])
+        products += interval.unreachable_products
         cross = p @ design.T
-        innovation = interval.observed - design @ mean
+        innovation = interval.negative_residual_jacobian - design @ mean
         factor, failed = scipy.linalg.lapack.dpotrf(design @ cross + np.eye(len(design)), lower=1)
         if failed:
             return products, math.inf, begin
@@ -204,8 +204,8 @@ def _forwards(model: Linear, variance: Array, updates: list[_Update] | None) -> 
         products += white.T @ white
         log_determinant += 2 * float(np.sum(np.log(np.diag(factor))))
         move = np.zeros((size, size))
-        move[:ns, :ns], move[:ns, ns:] = interval.transition, interval.drive[:, used]
-        move[ns:, ns:] = model.decay * np.eye(nd)
+        move[:ns, :ns], move[:ns, ns:] = interval.state_transition, interval.unknown_input_matrix[:, used]
+        move[ns:, ns:] = model.interval_correlation * np.eye(nd)
         half = shaped @ p
         if updates is not None:
             updates.append(_Update(mean, p, factor, white, shaped, half, move))
@@ -216,13 +216,13 @@ def _forwards(model: Linear, variance: Array, updates: list[_Update] | None) -> 
 
 
 def _backwards(
-    model: Linear, begin: Array, updates: Sequence[_Update]
+    model: LinearResidualModel, begin: Array, updates: Sequence[_Update]
 ) -> tuple[Array, Array, Array, Array, tuple[Array, ...]]:
     """Scores, their variances, smoothed unknowns, their variances and smoothed residuals; see `_Pass`.
 
     `begin` (ns + nd, nd) says how state and unknowns of the first interval follow the first disturbances.
     """
-    ns, gain = len(model.loose), math.sqrt(1 - model.decay**2)
+    ns, gain = len(model.initial_state_std), math.sqrt(1 - model.interval_correlation**2)
     count, (size, columns) = len(updates), updates[0].mean.shape
     score, information = np.zeros((count, size - ns, columns)), np.zeros((count, size - ns))
     smoothed, covariance = np.zeros((count, size - ns, columns)), np.zeros((count, size - ns))
@@ -263,13 +263,15 @@ class _State:
     evidence: float
 
 
-def _run(models: Sequence[Linear], variance: Mapping[Source, float], smooth: bool = True) -> _State:
+def _run(models: Sequence[LinearResidualModel], variance: Mapping[UnknownGroup, float], smooth: bool = True) -> _State:
     """All recordings at given variances: the parameters' step, its covariance, and the log evidence."""
 
-    def passed(model: Linear) -> _Pass:
-        return _filter(model, np.array([variance[s] for s in model.sources]) + model.known, smooth)
+    def passed(model: LinearResidualModel) -> _Pass:
+        return _filter(
+            model, np.array([variance[s] for s in model.unknown_groups]) + model.torque_noise_variance, smooth
+        )
 
-    passes = tuple(map_threads(passed, models))
+    passes = tuple(map_in_threads(passed, models))
     products = np.sum([p.products for p in passes], axis=0)
     evidence, shift, information = _judged(products, sum(p.log_determinant for p in passes))
     return _State(passes, shift, scipy.linalg.cho_solve(information, np.eye(len(shift))), evidence)
@@ -286,27 +288,31 @@ def _judged(products: Array, log_determinant: float) -> tuple[float, Array, tupl
     return -0.5 * (quadratic + log_determinant + determinant), shift, factor
 
 
-def _scores(models: Sequence[Linear], state: _State) -> dict[Source, tuple[float, float]]:
+def _scores(models: Sequence[LinearResidualModel], state: _State) -> dict[UnknownGroup, tuple[float, float]]:
     """|score|^2 of every group's unknowns and its expectation, whatever their variance is."""
-    up: dict[Source, float] = {}
-    down: dict[Source, float] = {}
+    up: dict[UnknownGroup, float] = {}
+    down: dict[UnknownGroup, float] = {}
     for model, done in zip(models, state.passes, strict=True):
         by_theta = done.score[:, :, 1:]
         score = done.score[:, :, 0] - by_theta @ state.shift
         information = np.maximum(done.information - np.sum((by_theta @ state.spread) * by_theta, axis=2), 0.0)
-        for i, source in enumerate(model.sources):
+        for i, source in enumerate(model.unknown_groups):
             up[source] = up.get(source, 0.0) + float(np.sum(score[:, i] ** 2))
             down[source] = down.get(source, 0.0) + float(np.sum(information[:, i]))
     return {source: (up[source], down[source]) for source in up}
 
 
-def _refined(models: Sequence[Linear], variance: dict[Source, float]) -> tuple[dict[Source, float], _State]:
+def _refined(
+    models: Sequence[LinearResidualModel], variance: dict[UnknownGroup, float]
+) -> tuple[dict[UnknownGroup, float], _State]:
     """Variances of the groups at work by MacKay's fixed point: s^2 <- s^2 |score|^2 / its expectation."""
     state = _run(models, variance)
-    for _ in range(ITERATIONS):
+    for _ in range(_MAX_ITERATIONS):
         found = _scores(models, state)
         trial = {
-            s: float(np.clip(v * np.clip(found[s][0] / max(found[s][1], 1e-300), 0.05, 20.0), *VARIANCES)) if v else 0.0
+            s: float(np.clip(v * np.clip(found[s][0] / max(found[s][1], 1e-300), 0.05, 20.0), *_VARIANCE_BOUNDS))
+            if v
+            else 0.0
             for s, v in variance.items()
         }
         after = _run(models, trial)
@@ -317,30 +323,30 @@ def _refined(models: Sequence[Linear], variance: dict[Source, float]) -> tuple[d
 
 
 def _selected(
-    models: Sequence[Linear],
-    sources: Sequence[Source],
-    variance: dict[Source, float],
+    models: Sequence[LinearResidualModel],
+    sources: Sequence[UnknownGroup],
+    variance: dict[UnknownGroup, float],
     state: _State,
     limits: Thresholds,
-) -> tuple[dict[Source, float], _State]:
+) -> tuple[dict[UnknownGroup, float], _State]:
     """Add group after group, that which raises the evidence most, while it rises by more than chance."""
-    while sum(v > 0 for v in variance.values()) < limits.places:
+    while sum(v > 0 for v in variance.values()) < limits.max_unknown_groups:
         found = _scores(models, state)
         promising = [s for s in sources if not variance[s] and found[s][0] > found[s][1]]
         promising.sort(key=lambda s: -found[s][0] / max(found[s][1], 1e-300))
         if any(variance.values()):
-            promising = promising[:LATER]
+            promising = promising[:_LATER_GROUP_TRIALS]
 
         bases = _bases(models, variance) if promising else ()
 
-        def tried(source: Source, bases: Sequence[_Base] = bases) -> tuple[float, float]:
+        def tried(source: UnknownGroup, bases: Sequence[_Base] = bases) -> tuple[float, float]:
             return _largest_evidence(bases, source)
 
-        outcomes = map_threads(tried, promising)
+        outcomes = map_in_threads(tried, promising)
         if not outcomes:
             return variance, state
         (evidence, size), source = max(zip(outcomes, promising, strict=True), key=lambda pair: pair[0][0])
-        if not evidence > state.evidence + limits.worth:
+        if not evidence > state.evidence + limits.min_log_bayes_factor:
             return variance, state
         variance, state = _refined(models, variance | {source: size})
     return variance, state
@@ -350,22 +356,22 @@ def _selected(
 class _Base:
     """The filter of one recording at variances to which one group's is to be added."""
 
-    model: Linear
+    model: LinearResidualModel
     products: Array
     log_determinant: float
     updates: Sequence[_Update]
 
 
-def _bases(models: Sequence[Linear], variance: Mapping[Source, float]) -> tuple[_Base, ...]:
+def _bases(models: Sequence[LinearResidualModel], variance: Mapping[UnknownGroup, float]) -> tuple[_Base, ...]:
     """All recordings at given variances."""
 
-    def passed(model: Linear) -> _Base:
+    def passed(model: LinearResidualModel) -> _Base:
         updates: list[_Update] = []
-        own = np.array([variance[s] for s in model.sources]) + model.known
+        own = np.array([variance[s] for s in model.unknown_groups]) + model.torque_noise_variance
         products, log_determinant, _ = _forwards(model, own, updates)
         return _Base(model, products, log_determinant, updates)
 
-    return tuple(map_threads(passed, models))
+    return tuple(map_in_threads(passed, models))
 
 
 def _responses(base: _Base, chosen: NDArray[np.int64]) -> Array:
@@ -374,15 +380,15 @@ def _responses(base: _Base, chosen: NDArray[np.int64]) -> Array:
     The filter follows a disturbance as far as its own unknowns let it; those without variance stay at zero.
     """
     model, updates = base.model, base.updates
-    ns, count, u = len(model.loose), len(updates), len(chosen)
+    ns, count, u = len(model.initial_state_std), len(updates), len(chosen)
     kept = np.concatenate([np.arange(ns), ns + np.flatnonzero(np.diag(updates[0].p)[ns:] > 0)])
     # what the filter has not followed yet, and the disturbed unknowns themselves, by the interval of the disturbance
     behind, unknown = np.zeros((len(kept), u, count)), np.zeros((u, count))
-    behind[:ns, :, 0] = model.at_rest[:, chosen]
+    behind[:ns, :, 0] = model.initial_state_jacobian[:, chosen]
     found = []
     for k, update in enumerate(updates):
-        unknown[:, :k] *= model.decay
-        unknown[:, k] = math.sqrt(1 - model.decay**2) if k else 1.0
+        unknown[:, :k] *= model.interval_correlation
+        unknown[:, k] = math.sqrt(1 - model.interval_correlation**2) if k else 1.0
         left = behind.reshape(len(kept), u * count)
         rows = update.shaped[:, kept] @ left
         rows += (update.shaped[:, ns + chosen][:, :, None] * unknown).reshape(rows.shape)
@@ -393,7 +399,7 @@ def _responses(base: _Base, chosen: NDArray[np.int64]) -> Array:
     return np.vstack(found)
 
 
-def _largest_evidence(bases: Sequence[_Base], source: Source) -> tuple[float, float]:
+def _largest_evidence(bases: Sequence[_Base], source: UnknownGroup) -> tuple[float, float]:
     """The largest log evidence over the variance that one group gets on top, and that variance.
 
     With W the innovations by its disturbances, those of the base have the covariance I + s^2 W W', whose inverse and
@@ -401,10 +407,10 @@ def _largest_evidence(bases: Sequence[_Base], source: Source) -> tuple[float, fl
     """
     products, log_determinant = np.sum([b.products for b in bases], axis=0), sum(b.log_determinant for b in bases)
     if math.isinf(log_determinant):
-        return -math.inf, VARIANCES[0]
+        return -math.inf, _VARIANCE_BOUNDS[0]
     values, pulls = [], []
     for base in bases:
-        chosen = np.flatnonzero([own == source for own in base.model.sources])
+        chosen = np.flatnonzero([own == source for own in base.model.unknown_groups])
         rows = _responses(base, chosen)
         value, vectors = np.linalg.eigh(rows.T @ rows)
         values.append(np.maximum(value, 0.0))
@@ -416,12 +422,14 @@ def _largest_evidence(bases: Sequence[_Base], source: Source) -> tuple[float, fl
         closed = pull.T @ ((variance / (1 + variance * value))[:, None] * pull)
         return -_judged(products - closed, log_determinant + float(np.sum(np.log1p(variance * value))))[0]
 
-    low, high = np.log10(VARIANCES)
+    low, high = np.log10(_VARIANCE_BOUNDS)
     outcome = scipy.optimize.minimize_scalar(cost, bounds=(low, high), method="bounded", options={"xatol": 0.4})
     return -float(outcome.fun), 10.0 ** float(outcome.x)
 
 
-def smooth(problem: EstimationProblem, x: Array, evaluation: Evaluation, limits: Thresholds = DEFAULTS) -> Smoothed:
+def run_smoother(
+    problem: EstimationProblem, x: Array, evaluation: Evaluation, limits: Thresholds = DEFAULT_THRESHOLDS
+) -> SmootherResult:
     """Run the smoother: choose the groups of unknowns with the largest evidence and estimate them.
 
     Parameters
@@ -440,8 +448,8 @@ def smooth(problem: EstimationProblem, x: Array, evaluation: Evaluation, limits:
     """
     # matrices of this size are multiplied faster by one thread
     with threadpoolctl.threadpool_limits(1):
-        models = linear_model(problem, x, evaluation, limits)
-        sources = tuple(dict.fromkeys(source for model in models for source in model.sources))
+        models = linear_residual_models(problem, x, evaluation, limits)
+        sources = tuple(dict.fromkeys(source for model in models for source in model.unknown_groups))
         none = dict.fromkeys(sources, 0.0)
         nothing = _run(models, none)
         sides = {
@@ -449,7 +457,7 @@ def smooth(problem: EstimationProblem, x: Array, evaluation: Evaluation, limits:
             "plant": tuple(s for s in sources if s.kind != "bias"),
             "sensor": tuple(s for s in sources if s.kind == "bias"),
         }
-        found: dict[str, tuple[dict[Source, float], _State]] = {}
+        found: dict[str, tuple[dict[UnknownGroup, float], _State]] = {}
         for side, own in sides.items():
             done = [entry for entry in found.values() if {s for s, v in entry[0].items() if v} <= set(own)]
             found[side] = done[0] if done else _selected(models, own, none, nothing, limits)
@@ -459,23 +467,25 @@ def smooth(problem: EstimationProblem, x: Array, evaluation: Evaluation, limits:
         before, after, taken, samples = _explained(models, variance, nothing, state)
         degrees = max(float(samples) - len(nothing.shift), 1.0)
         weight = _weights(models, variance, state)
-        return Smoothed(
+        return SmootherResult(
             tuple(_trace(model, done, state) for model, done in zip(models, state.passes, strict=True)),
             variance,
             weight,
             # what unknowns of the reference size add to r'r on average is the variance of their scores
-            {s: math.sqrt(limits.noticed / max(v, 1e-300)) for s, (_, v) in _scores(models, nothing).items()},
+            {s: math.sqrt(limits.detectable_chi2 / max(v, 1e-300)) for s, (_, v) in _scores(models, nothing).items()},
             before,
             after,
             degrees,
             max(degrees - taken, 1.0),
             evidence,
-            limits.worth,
+            limits.min_log_bayes_factor,
             _instead(models, variance, state.evidence, weight, limits),
         )
 
 
-def history_of_force(model: Linear, variance: Mapping[Source, float], unknown: int) -> tuple[Array, Array]:
+def force_likelihood_terms(
+    model: LinearResidualModel, variance: Mapping[UnknownGroup, float], unknown: int
+) -> tuple[Array, Array]:
     """Return g and L of the log likelihood g'f - f'L f / 2 of one unknown f over the intervals of a recording.
 
     Parameters
@@ -493,17 +503,23 @@ def history_of_force(model: Linear, variance: Mapping[Source, float], unknown: i
     information : ndarray, shape (J, J)
         L; free parameters, states and all other unknowns are integrated out.
     """
-    count, parameters = len(model.intervals), model.intervals[0].observed.shape[1] - 1
-    moved = np.zeros((len(model.loose), count))
+    count, parameters = len(model.intervals), model.intervals[0].negative_residual_jacobian.shape[1] - 1
+    moved = np.zeros((len(model.initial_state_std), count))
     intervals = []
     for j, interval in enumerate(model.intervals):
-        seen = interval.by_state @ moved
-        seen[:, j] += interval.by_unknown[:, unknown]
-        moved = interval.transition @ moved
-        moved[:, j] += interval.drive[:, unknown]
-        rest = np.pad(interval.rest, (0, count))
-        intervals.append(replace(interval, observed=np.hstack([interval.observed, seen]), rest=rest))
-    own = np.array([variance[source] for source in model.sources]) + model.known
+        seen = interval.state_jacobian @ moved
+        seen[:, j] += interval.unknown_jacobian[:, unknown]
+        moved = interval.state_transition @ moved
+        moved[:, j] += interval.unknown_input_matrix[:, unknown]
+        rest = np.pad(interval.unreachable_products, (0, count))
+        intervals.append(
+            replace(
+                interval,
+                negative_residual_jacobian=np.hstack([interval.negative_residual_jacobian, seen]),
+                unreachable_products=rest,
+            )
+        )
+    own = np.array([variance[source] for source in model.unknown_groups]) + model.torque_noise_variance
     products = _filter(replace(model, intervals=tuple(intervals)), own, False).products
     split = 1 + parameters
     free = products[1:split, 1:split] + np.eye(parameters) / 9.0
@@ -515,34 +531,44 @@ def history_of_force(model: Linear, variance: Mapping[Source, float], unknown: i
 # -- what it says -----------------------------------------------------------------------------------------------------
 
 
-def _trace(model: Linear, done: _Pass, state: _State) -> Trace:
+def _trace(model: LinearResidualModel, done: _Pass, state: _State) -> SmoothedUnknowns:
     """The unknowns of one recording, with the free parameters' own uncertainty."""
     by_theta = done.mean[:, :, 1:]
     smoothed = done.mean[:, :, 0] - by_theta @ state.shift
     spread = done.covariance + np.sum((by_theta @ state.spread) * by_theta, axis=2)
     std = np.sqrt(np.maximum(spread, 0.0))
-    return Trace(model.recording, model.edges, model.unknowns, model.sources, model.reference, smoothed, std)
+    return SmoothedUnknowns(
+        model.recording,
+        model.interval_edges,
+        model.unknown_names,
+        model.unknown_groups,
+        model.reference_std,
+        smoothed,
+        std,
+    )
 
 
 def _explained(
-    models: Sequence[Linear], variance: Mapping[Source, float], plain: _State, state: _State
+    models: Sequence[LinearResidualModel], variance: Mapping[UnknownGroup, float], plain: _State, state: _State
 ) -> tuple[float, float, float, int]:
     """r'r without and with the unknowns, degrees of freedom that they take, and the number of samples."""
     before = after = taken = 0.0
     samples = 0
     bare, full = np.append(1.0, -plain.shift), np.append(1.0, -state.shift)
     for model, done in zip(models, state.passes, strict=True):
-        own = np.array([variance[s] for s in model.sources])
+        own = np.array([variance[s] for s in model.unknown_groups])
         taken += float(np.sum((own * done.information)[:, own > 0]))
         for interval, smoothed in zip(model.intervals, done.left, strict=True):
-            first, left = interval.observed @ bare, smoothed @ full
-            before += float(first @ first + bare @ interval.rest @ bare)
-            after += float(left @ left + full @ interval.rest @ full)
-            samples += interval.samples
+            first, left = interval.negative_residual_jacobian @ bare, smoothed @ full
+            before += float(first @ first + bare @ interval.unreachable_products @ bare)
+            after += float(left @ left + full @ interval.unreachable_products @ full)
+            samples += interval.sample_count
     return before, after, taken, samples
 
 
-def _weights(models: Sequence[Linear], variance: dict[Source, float], state: _State) -> dict[Source, float]:
+def _weights(
+    models: Sequence[LinearResidualModel], variance: dict[UnknownGroup, float], state: _State
+) -> dict[UnknownGroup, float]:
     """Fall of the log evidence without each group."""
     weight = dict.fromkeys(variance, 0.0)
     for source in [s for s, v in variance.items() if v]:
@@ -552,14 +578,14 @@ def _weights(models: Sequence[Linear], variance: dict[Source, float], state: _St
 
 
 def _instead(
-    models: Sequence[Linear],
-    variance: dict[Source, float],
+    models: Sequence[LinearResidualModel],
+    variance: dict[UnknownGroup, float],
     evidence: float,
-    weight: Mapping[Source, float],
+    weight: Mapping[UnknownGroup, float],
     limits: Thresholds,
-) -> dict[Source, tuple[Source, ...]]:
+) -> dict[UnknownGroup, tuple[UnknownGroup, ...]]:
     """Groups that would keep most of what each group at work raises the evidence by, or all but what is chance."""
-    found: dict[Source, tuple[Source, ...]] = {}
+    found: dict[UnknownGroup, tuple[UnknownGroup, ...]] = {}
     for source in [s for s, v in variance.items() if v]:
         less = variance | {source: 0.0}
         scores = _scores(models, _run(models, less))
@@ -567,10 +593,10 @@ def _instead(
         asked = [s for s, v in variance.items() if not v and scores[s][0] > scores[s][1]]
         bases = _bases(models, less) if asked else ()
 
-        def tried(other: Source, bases: Sequence[_Base] = bases) -> float:
+        def tried(other: UnknownGroup, bases: Sequence[_Base] = bases) -> float:
             return _largest_evidence(bases, other)[0]
 
-        lost = max(limits.worth, (1 - limits.as_well) * weight[source])
-        reached = zip(asked, map_threads(tried, asked), strict=True)
+        lost = max(limits.min_log_bayes_factor, (1 - limits.location_tie) * weight[source])
+        reached = zip(asked, map_in_threads(tried, asked), strict=True)
         found[source] = tuple(other for other, reach in reached if reach >= evidence - lost)
     return found

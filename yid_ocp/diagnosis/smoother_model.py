@@ -24,121 +24,121 @@ import scipy.linalg
 import scipy.sparse
 from numpy.typing import NDArray
 
-from yid_ocp.diagnosis.pushes import forces_of_pushes, weights_of_segments
-from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
+from yid_ocp.diagnosis.segment_forces import generalized_forces_per_newton, segment_weights
+from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects.base import grasp_names, robot_joints
-from yid_ocp.integrator.linear import Loads, linear_steps, live_states
-from yid_ocp.integrator.rollout import applied_torque
+from yid_ocp.integrator.linearized_steps import AdditionalLoads, active_state_mask, linearized_steps
+from yid_ocp.integrator.rollout import applied_joint_torque
 from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import Episode, apparent_inertia
+from yid_ocp.problem.episodes import Episode, mass_matrix_diagonal
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.outcome import EpisodeResult
+from yid_ocp.problem.prediction_result import EpisodePrediction
 from yid_ocp.sensors import Sensor
 
 Array = NDArray[np.float64]
-Kind = Literal["force", "push", "offset", "bias"]
+_UnknownKind = Literal["force", "push", "offset", "bias"]
 
-MEMORY = 0.5
+_CORRELATION_TIME = 0.5
 """Correlation time of the unknowns [s]."""
-INTERVAL = 0.1
+_MIN_INTERVAL = 0.1
 """Shortest time over which unknowns are constant [s]."""
-INTERVALS = 150
+_MAX_INTERVAL_COUNT = 150
 """Number of intervals of a long recording, beyond which they become longer."""
 
 
 @dataclass(frozen=True)
-class Source:
+class UnknownGroup:
     """Group of unknowns that share a location and a standard deviation.
 
     Attributes
     ----------
     location : str
     kind : "force", "push", "offset" or "bias"
-    read : bool
+    is_confounded_with_bias : bool
         Whether a bias of an effort sensor would be the same: a force at a prescribed joint whose effort is measured.
     """
 
     location: str
-    kind: Kind
-    read: bool = False
+    kind: _UnknownKind
+    is_confounded_with_bias: bool = False
 
 
 @dataclass(frozen=True)
-class Interval:
+class IntervalModel:
     """Linear model of one interval: residual, state transition and input of the unknowns.
 
     Attributes
     ----------
-    observed : ndarray, shape (r, 1 + ntheta)
+    negative_residual_jacobian : ndarray, shape (r, 1 + ntheta)
         Whitened residual with the opposite sign, then its derivative by the free parameters, with that sign too.
-    by_state : ndarray, shape (r, ns)
+    state_jacobian : ndarray, shape (r, ns)
         Its derivative by the state at the interval's beginning.
-    by_unknown : ndarray, shape (r, nd)
-    transition : ndarray, shape (ns, ns)
+    unknown_jacobian : ndarray, shape (r, nd)
+    state_transition : ndarray, shape (ns, ns)
         State at the end by that at the beginning.
-    drive : ndarray, shape (ns, nd)
-    rest : ndarray, shape (1 + ntheta, 1 + ntheta)
+    unknown_input_matrix : ndarray, shape (ns, nd)
+    unreachable_products : ndarray, shape (1 + ntheta, 1 + ntheta)
         Products of what no state or unknown can reach.
-    samples : int
+    sample_count : int
         Before rows were compressed.
     """
 
-    observed: Array
-    by_state: Array
-    by_unknown: Array
-    transition: Array
-    drive: Array
-    rest: Array
-    samples: int
+    negative_residual_jacobian: Array
+    state_jacobian: Array
+    unknown_jacobian: Array
+    state_transition: Array
+    unknown_input_matrix: Array
+    unreachable_products: Array
+    sample_count: int
 
 
 @dataclass(frozen=True)
-class Linear:
+class LinearResidualModel:
     """Linear state-space model of the residual of one recording, interval by interval.
 
     Attributes
     ----------
     recording : str
     intervals : tuple of Interval
-    edges : ndarray, shape (J + 1,)
+    interval_edges : ndarray, shape (J + 1,)
         Beginnings of the intervals and the end [s].
-    unknowns : tuple of str
+    unknown_names : tuple of str
         Coordinate, grasp or channel of each of the nd unknowns.
-    sources : tuple of Source
+    unknown_groups : tuple of Source
         That each of the nd unknowns belongs to.
-    reference : ndarray, shape (nd,)
+    reference_std : ndarray, shape (nd,)
         Reference standard deviation of each; the matrices are by unknowns in this unit.
-    at_rest : ndarray, shape (ns, nd)
+    initial_state_jacobian : ndarray, shape (ns, nd)
         How the first state follows the first unknowns.
-    loose : ndarray, shape (ns,)
+    initial_state_std : ndarray, shape (ns,)
         Standard deviation of the first state beside that.
-    decay : float
+    interval_correlation : float
         Correlation of an unknown with itself one interval later.
-    known : ndarray, shape (nd,)
+    torque_noise_variance : ndarray, shape (nd,)
         Variance that each has whatever its group's is: noise of recorded torques [squared reference].
     """
 
     recording: str
-    intervals: tuple[Interval, ...]
-    edges: Array
-    unknowns: tuple[str, ...]
-    sources: tuple[Source, ...]
-    reference: Array
-    at_rest: Array
-    loose: Array
-    decay: float
-    known: Array
+    intervals: tuple[IntervalModel, ...]
+    interval_edges: Array
+    unknown_names: tuple[str, ...]
+    unknown_groups: tuple[UnknownGroup, ...]
+    reference_std: Array
+    initial_state_jacobian: Array
+    initial_state_std: Array
+    interval_correlation: float
+    torque_noise_variance: Array
 
 
-def linear_model(
+def linear_residual_models(
     problem: EstimationProblem,
     x: Array,
     evaluation: Evaluation,
-    limits: Thresholds = DEFAULTS,
-    interval: float = INTERVAL,
-) -> tuple[Linear, ...]:
+    limits: Thresholds = DEFAULT_THRESHOLDS,
+    interval: float = _MIN_INTERVAL,
+) -> tuple[LinearResidualModel, ...]:
     """Return the linear model of every recording about its rollout at `x`, with unknown forces, offsets and biases.
 
     Parameters
@@ -153,17 +153,17 @@ def linear_model(
         Shortest time over which unknowns are constant [s].
     """
     assert evaluation.jacobian is not None
-    columns = -np.column_stack([evaluation.residual, evaluation.jacobian * problem.scales])
+    columns = -np.column_stack([evaluation.residual, evaluation.jacobian * problem.unknown_scales])
     found = []
-    for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episodes, strict=True)):
-        theta = problem.predictor.own_theta(episode, problem.split(x, i)[0])
-        groups = problem.rows.measurements[i]
+    for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episode_predictions, strict=True)):
+        theta = problem.predictor.episode_theta(episode, problem.split(x, i)[0])
+        groups = problem.residual_rows.measurements[i]
         observed = columns[groups[0].start : groups[-1].stop]
         found.append(_recording(_Course(problem, episode, theta, result), observed, limits, interval))
-    prior = columns[problem.rows.stated_priors]
+    prior = columns[problem.residual_rows.stated_priors]
     # stated priors of the free parameters are observations that no unknown reaches
     first, *later = found[0].intervals
-    first = replace(first, rest=first.rest + prior.T @ prior)
+    first = replace(first, unreachable_products=first.unreachable_products + prior.T @ prior)
     return (replace(found[0], intervals=(first, *later)), *found[1:])
 
 
@@ -182,7 +182,7 @@ class _Course:
     problem: EstimationProblem
     episode: Episode
     theta: Array
-    result: EpisodeResult
+    result: EpisodePrediction
 
     @property
     def system(self) -> System:
@@ -227,7 +227,7 @@ class _Unknowns:
     """
 
     names: tuple[str, ...]
-    sources: tuple[Source, ...]
+    sources: tuple[UnknownGroup, ...]
     reference: Array
     forced: NDArray[np.int64]
     grasped: NDArray[np.int64]
@@ -246,46 +246,48 @@ class _Unknowns:
 
 
 def _unknowns(course: _Course, limits: Thresholds) -> _Unknowns:
-    names, sources, reference, forced = _unknown_forces(course, limits.force)
+    names, sources, reference, forced = _unknown_forces(course, limits.force_prior_std)
     grasped, row = [], 0
     for grasp, name in zip(course.system.grasps, grasp_names(course.system), strict=True):
         grasped += [row, row + 1, row + 2]
         names += [f"{name}.{axis}" for axis in "xyz"]
-        sources += [Source(name, "offset")] * 3
-        reference += [limits.offset] * 3
-        row += grasp.equations
+        sources += [UnknownGroup(name, "offset")] * 3
+        reference += [limits.grasp_offset_prior_std] * 3
+        row += grasp.n_equations
     pushed = []
-    for segment, weight in weights_of_segments(course.system, course.theta).items():
+    for segment, weight in segment_weights(course.system, course.theta).items():
         pushed.append(segment)
         names += [f"{segment}.push_{axis}" for axis in "xyz"]
-        sources += [Source(segment, "push")] * 3
-        reference += [limits.force * weight] * 3
+        sources += [UnknownGroup(segment, "push")] * 3
+        reference += [limits.force_prior_std * weight] * 3
     biased = []
-    for k, samples in enumerate(course.episode.samples):
+    for k, samples in enumerate(course.episode.measurements):
         sensor = samples.sensor
-        if sensor.efforts:
+        if sensor.effort_joints:
             continue  # at a prescribed joint a bias and a force are the same
         for column, channel in enumerate(samples.channel_of_column):
-            if not np.any(samples.seen[:, column]):
+            if not np.any(samples.is_used[:, column]):
                 continue
-            axis = f".{'xyz'[column % 3]}" if sensor.width == 3 else ""
-            frame = sensor.frames[column // sensor.width] if sensor.frames else ""
+            axis = f".{'xyz'[column % 3]}" if sensor.outputs_per_channel == 3 else ""
+            frame = sensor.frame_names[column // sensor.outputs_per_channel] if sensor.frame_names else ""
             biased.append((k, column))
             names.append(f"{channel}{axis}")
-            sources.append(Source(seen_by(course.system, sensor, frame), "bias"))
-            reference.append(limits.bias * float(np.nanmedian(samples.std[:, column])))
+            sources.append(UnknownGroup(sensor_bias_location(course.system, sensor, frame), "bias"))
+            reference.append(limits.bias_prior_std * float(np.nanmedian(samples.std[:, column])))
     held = np.array(grasped, int)
     return _Unknowns(tuple(names), tuple(sources), np.array(reference), forced, held, tuple(pushed), tuple(biased))
 
 
-def _unknown_forces(course: _Course, part: float) -> tuple[list[str], list[Source], list[float], NDArray[np.int64]]:
+def _unknown_forces(
+    course: _Course, part: float
+) -> tuple[list[str], list[UnknownGroup], list[float], NDArray[np.int64]]:
     """Names, sources, reference sizes and coordinates of the unknown forces."""
     system, joint_names = course.system, course.system.mechanism.joint_names
-    place = {joint: s.name for s in system.segments for link in s.links for joint in link}
+    place = {joint: s.name for s in system.segment_layouts for link in s.link_joints for joint in link}
     place |= {joint: joint for joint in robot_joints(system)}
-    measured = {joint for samples in course.episode.samples for joint in samples.sensor.efforts}
+    measured = {joint for samples in course.episode.measurements for joint in samples.sensor.effort_joints}
     silent = {joint_names[i] for i in course.fixed} - measured
-    names = [n for n in joint_names if n in place and n not in silent and n not in system.compliant]
+    names = [n for n in joint_names if n in place and n not in silent and n not in system.joint_compliances]
     forced = np.array([joint_names.index(name) for name in names], int)
     load = _loads(course)
     of_place: dict[str, list[float]] = {}
@@ -293,32 +295,32 @@ def _unknown_forces(course: _Course, part: float) -> tuple[list[str], list[Sourc
         of_place.setdefault(place[name], []).append(load[index])
     largest = max((max(v) for v in of_place.values()), default=1.0)
     size = {p: part * max(float(np.sqrt(np.mean(np.square(v)))), 1e-2 * largest) for p, v in of_place.items()}
-    sources = [Source(place[name], "force", name in measured) for name in names]
+    sources = [UnknownGroup(place[name], "force", name in measured) for name in names]
     return names, sources, [size[place[name]] for name in names], forced
 
 
-def seen_by(system: System, sensor: Sensor, frame: str) -> str:
+def sensor_bias_location(system: System, sensor: Sensor, frame: str) -> str:
     """Return the location of a sensor's bias: the camera, the arm that holds the frame, else the sensor's group."""
-    if sensor.camera is not None:
+    if sensor.camera_pose is not None:
         return "camera"
     for grasp in system.grasps:
-        if frame in (grasp.held, grasp.holder):
+        if frame in (grasp.held_frame, grasp.holder_frame):
             return grasp.name
-    return sensor.group
+    return sensor.group_name
 
 
 def _loads(course: _Course) -> Array:
     """Typical load of every coordinate: of its spring, its motor or its prescription, shape (n,) [N m or N]."""
     system, rollout = course.system, course.rollout
-    load = np.zeros(system.size)
-    q = rollout.state[:, : system.size]
-    springs = [(system.mechanism.joint_index(s.joint), s) for s in system.elastic]
+    load = np.zeros(system.n_coordinates)
+    q = rollout.state[:, : system.n_coordinates]
+    springs = [(system.mechanism.joint_index(s.joint_name), s) for s in system.elastic_joints]
     if springs:
-        symbols = ca.vertcat(*(ca.vertcat(s.stiffness, s.rest) for _, s in springs))
+        symbols = ca.vertcat(*(ca.vertcat(s.stiffness, s.rest_angle) for _, s in springs))
         values = np.array(ca.Function("springs", [system.parameters.symbols], [symbols])(course.theta)).ravel()
         for (index, _), stiffness, rest in zip(springs, values[::2], values[1::2], strict=True):
             load[index] = stiffness * float(np.sqrt(np.mean((q[:, index] - rest) ** 2)))
-    torque = applied_torque(course.problem.step, course.theta, rollout)
+    torque = applied_joint_torque(course.problem.step, course.theta, rollout)
     for indices, force in ((system.driven_indices, torque), (system.prescribed_indices, rollout.effort)):
         if len(indices):
             load[list(indices)] = np.sqrt(np.mean(force**2, axis=0))
@@ -328,7 +330,7 @@ def _loads(course: _Course) -> Array:
 # -- the slopes of single steps ---------------------------------------------------------------------------------------
 
 
-def _loads_of(course: _Course, unknowns: _Unknowns) -> Loads:
+def _loads_of(course: _Course, unknowns: _Unknowns) -> AdditionalLoads:
     """What unknown forces and grasp offsets of their reference size add to every step."""
     step = course.problem.step
     n, nz, m = (step.sizes[key] for key in ("n", "nz", "m"))
@@ -340,31 +342,38 @@ def _loads_of(course: _Course, unknowns: _Unknowns) -> Loads:
     rows[unknowns.forced, np.arange(forces)] = first_share * impulse
     momentum[unknowns.forced, np.arange(forces)] = (1 - first_share) * impulse
     rows[n + nz + unknowns.grasped, np.arange(forces, loading)] = unknowns.reference[forces:loading]
-    return Loads(rows, momentum)
+    return AdditionalLoads(rows, momentum)
 
 
 def _steps(
-    course: _Course, loads: Loads, pushes: Array, moving: NDArray[np.int64], first: int, last: int
+    course: _Course, loads: AdditionalLoads, pushes: Array, moving: NDArray[np.int64], first: int, last: int
 ) -> tuple[Array, Array, Array]:
     """A_k (steps, ns, ns), E_k (steps, ns, nd') and the effort's slopes (steps, nc, ns + nd') of some steps.
 
-    `pushes` (N + 1, forces, np) says what forces pushes amount to.
+    `force_pulses` (N + 1, forces, np) says what forces pushes amount to.
     """
     a, e, effort = [], [], []
-    feedback = course.episode.feedback
-    followed = np.zeros((0, 0)) if feedback is None else np.vstack([0 * loads.momentum, loads.momentum])[feedback.index]
-    found = linear_steps(course.problem.step, course.theta, course.rollout, loads, slice(first, last))
+    feedback = course.episode.tracking_feedback
+    followed = (
+        np.zeros((0, 0))
+        if feedback is None
+        else np.vstack([0 * loads.next_momentum, loads.next_momentum])[feedback.state_indices]
+    )
+    found = linearized_steps(course.problem.step, course.theta, course.rollout, loads, slice(first, last))
     for k, one in enumerate(found, first):
-        by_state, effort_by_state = one.by_state, one.effort_by_state
-        by_load, effort_by_load = one.by_load, one.effort_by_load
+        by_state, effort_by_state = one.state_by_state, one.effort_by_state
+        by_load, effort_by_load = one.state_by_load, one.effort_by_load
         if feedback is not None:
             by_state, effort_by_state = by_state.copy(), effort_by_state.copy()
-            by_state[:, feedback.index] -= one.by_torque @ feedback.gain[k]
-            effort_by_state[:, feedback.index] -= one.effort_by_torque @ feedback.gain[k]
+            by_state[:, feedback.state_indices] -= one.state_by_torque @ feedback.gain[k]
+            effort_by_state[:, feedback.state_indices] -= one.effort_by_torque @ feedback.gain[k]
             # the momentum of the motion that was measured has half the impulse of an unknown force in it (of the step
             # before; this step's stands for it)
             unknown = feedback.gain[k] @ followed
-            by_load, effort_by_load = by_load + one.by_torque @ unknown, effort_by_load + one.effort_by_torque @ unknown
+            by_load, effort_by_load = (
+                by_load + one.state_by_torque @ unknown,
+                effort_by_load + one.effort_by_torque @ unknown,
+            )
         forces = pushes.shape[1]
         a.append(by_state[np.ix_(moving, moving)])
         e.append(np.hstack([by_load[moving], by_load[moving, :forces] @ pushes[k]]))
@@ -376,19 +385,19 @@ def _steps(
 # -- from steps to intervals ------------------------------------------------------------------------------------------
 
 
-def _recording(course: _Course, observed: Array, limits: Thresholds, shortest: float) -> Linear:
+def _recording(course: _Course, observed: Array, limits: Thresholds, shortest: float) -> LinearResidualModel:
     """The linear model of one recording from its whitened residuals and their slopes."""
     h, steps = course.problem.step.time_step, course.episode.grid.steps
-    length = int(max(round(shortest / h), math.ceil(steps * INTERVAL / (INTERVALS * shortest)), 1))
+    length = int(max(round(shortest / h), math.ceil(steps * _MIN_INTERVAL / (_MAX_INTERVAL_COUNT * shortest)), 1))
     edges = np.unique(np.append(np.arange(0, steps, length), steps))
     unknowns = _unknowns(course, limits)
     loads, forces = _loads_of(course, unknowns), len(unknowns.forced)
-    nodes = course.rollout.state[:, : course.system.size]
-    pushes = forces_of_pushes(course.system, course.theta, nodes, unknowns.pushed)[:, unknowns.forced]
+    nodes = course.rollout.state[:, : course.system.n_coordinates]
+    pushes = generalized_forces_per_newton(course.system, course.theta, nodes, unknowns.pushed)[:, unknowns.forced]
     pushes *= unknowns.reference[unknowns.loading : unknowns.driving] / unknowns.reference[:forces, None]
-    linear = partial(linear_steps, course.problem.step, course.theta, course.rollout, loads)
+    linear = partial(linearized_steps, course.problem.step, course.theta, course.rollout, loads)
     ends = [*linear(slice(0, 1)), *linear(slice(steps - 1, steps))]
-    moving = np.flatnonzero(live_states(course.problem.step, ends))
+    moving = np.flatnonzero(active_state_mask(course.problem.step, ends))
     reading = _reading(course, moving, edges)
     rests = course.problem.options.initial_state != "fitted_to_points"
     ns, driving = len(moving), unknowns.driving
@@ -401,8 +410,8 @@ def _recording(course: _Course, observed: Array, limits: Thresholds, shortest: f
             at_rest[:, :driving] = np.linalg.lstsq(np.eye(ns) - slopes[0][0], slopes[1][0], rcond=1e-6)[0]
         intervals.append(_interval(slopes, unknowns, reading, j, observed))
     span = h * float(np.median(np.diff(edges)))
-    decay = math.exp(-span / MEMORY)
-    return Linear(
+    decay = math.exp(-span / _CORRELATION_TIME)
+    return LinearResidualModel(
         course.episode.name,
         tuple(intervals),
         h * edges,
@@ -422,16 +431,16 @@ def _torque_noise(course: _Course, unknowns: _Unknowns, span: float, decay: floa
     White noise counts by its spectral density at low frequencies, which an unknown force of memory `decay` from
     interval to interval must have as well.
     """
-    errors, driven = course.episode.errors, course.system.driven
+    errors, driven = course.episode.input_errors, course.system.driven
     known = np.zeros(len(unknowns.names))
     if errors is None:
         return known
-    held = course.problem.step.time_step * len(errors.sample) / len(np.unique(errors.sample))
+    held = course.problem.step.time_step * len(errors.sample_of_step) / len(np.unique(errors.sample_of_step))
     white = errors.torque_std**2 * (held / span) * (1 - decay) / (1 + decay)
     for i, name in enumerate(unknowns.names[: len(unknowns.forced)]):
         if name in driven:
             at = driven.index(name)
-            known[i] = (white[at] + errors.bias_std[at] ** 2) / unknowns.reference[i] ** 2
+            known[i] = (white[at] + errors.torque_bias_std[at] ** 2) / unknowns.reference[i] ** 2
     return known
 
 
@@ -439,16 +448,16 @@ def _loose_start(course: _Course) -> Array:
     """Standard deviation of a start that was fitted to points, shape (nx,)."""
     problem, free = course.problem, course.free
     options, joints = problem.options, course.system.mechanism.joint_names
-    inertia = apparent_inertia(problem.step, course.theta, tuple(joints[i] for i in free))
+    inertia = mass_matrix_diagonal(problem.step, course.theta, tuple(joints[i] for i in free))
     loose = np.zeros(problem.step.sizes["nx"])
-    loose[free] = options.configuration_std
-    loose[course.system.size + free] = options.velocity_std * np.abs(inertia)
+    loose[free] = options.start_configuration_std
+    loose[course.system.n_coordinates + free] = options.start_velocity_std * np.abs(inertia)
     return loose
 
 
 def _interval(
     slopes: tuple[Array, Array, Array], unknowns: _Unknowns, reading: _Reading, j: int, observed: Array
-) -> Interval:
+) -> IntervalModel:
     """Interval `j` from the slopes of its steps (A_k, E_k, effort's), states inside it eliminated."""
     a, e, by_effort = slopes
     steps, ns, driving, count = len(a), a.shape[1], unknowns.driving, len(unknowns.names)
@@ -469,7 +478,7 @@ def _interval(
     return _compressed(observed[rows], moved[:, :ns], by_unknown, node[-1][:, :ns], drive)
 
 
-def _compressed(observed: Array, by_state: Array, by_unknown: Array, transition: Array, drive: Array) -> Interval:
+def _compressed(observed: Array, by_state: Array, by_unknown: Array, transition: Array, drive: Array) -> IntervalModel:
     """An interval with no more rows than columns: what is orthogonal to all columns only adds to the products."""
     joined, count = np.hstack([by_state, by_unknown]), len(observed)
     rest = np.zeros((observed.shape[1], observed.shape[1]))
@@ -479,7 +488,7 @@ def _compressed(observed: Array, by_state: Array, by_unknown: Array, transition:
         rest = observed.T @ observed - turned.T @ turned
         observed, joined = turned, r
     ns = by_state.shape[1]
-    return Interval(observed, joined[:, :ns], joined[:, ns:], transition, drive, rest, count)
+    return IntervalModel(observed, joined[:, :ns], joined[:, ns:], transition, drive, rest, count)
 
 
 @dataclass(frozen=True)
@@ -557,31 +566,31 @@ class _Reading:
 
 
 def _reading(course: _Course, moving: NDArray[np.int64], edges: NDArray[np.int64]) -> _Reading:
-    problem, theta, n = course.problem, course.theta, course.system.size
+    problem, theta, n = course.problem, course.theta, course.system.n_coordinates
     predictor, threshold = problem.predictor, problem.options.huber_threshold
-    state, efforts = course.rollout.state, predictor.efforts(course.rollout)
+    state, efforts = course.rollout.state, predictor.joint_efforts(course.rollout)
     group: list[NDArray[np.int64]] = []
     column, node, fraction, weight, factor, slope, load = [], [], [], [], [], [], []
-    for samples, predicted in zip(course.episode.samples, course.result.predicted, strict=True):
-        placed = predictor.placed(samples, theta)
-        shape, keep = samples.weight.shape, samples.seen
+    for samples, predicted in zip(course.episode.measurements, course.result.predicted_outputs, strict=True):
+        placed = predictor.measurements_at_true_times(samples, theta)
+        shape, keep = samples.weight.shape, samples.is_used
         where = placed.node if placed.node.ndim > 1 else np.broadcast_to(placed.node[:, None], shape)
         beyond = placed.fraction if placed.node.ndim > 1 else np.broadcast_to(placed.fraction[:, None], shape)
-        read = problem.functions.sensor(samples.sensor, ())
+        read = problem.model_functions.compiled_sensor(samples.sensor, ())
         _, by_q, by_z, by_e, _ = read(state[:, :n], state[:, 2 * n :], efforts, theta)
-        group.append(np.full(samples.count, len(group)))
+        group.append(np.full(samples.n_residuals, len(group)))
         column.append(np.broadcast_to(np.arange(shape[1]), shape)[keep])
         node.append(where[keep])
         fraction.append(beyond[keep])
         weight.append(samples.weight[keep])
-        factor.append(samples.rows(predicted, threshold=threshold).factor)
+        factor.append(samples.residual_block(predicted, threshold=threshold).robust_factor)
         slope.append(np.concatenate([by_q, np.zeros((*by_q.shape[:2], n)), by_z], axis=2)[:, :, moving])
         load.append(by_e[:, :, course.fixed])
     nodes = np.concatenate(node)
     interval = np.clip(np.searchsorted(edges, nodes, side="right") - 1, 0, len(edges) - 2)
     mixing = None
-    if any(samples.mixing is not None for samples in course.episode.samples):
-        own = [s.independent(scipy.sparse.eye_array(s.count, format="csr")) for s in course.episode.samples]
+    if any(samples.decorrelation_matrix is not None for samples in course.episode.measurements):
+        own = [s.decorrelate(scipy.sparse.eye_array(s.n_residuals, format="csr")) for s in course.episode.measurements]
         mixing = scipy.sparse.csr_array(scipy.sparse.block_diag(own))
     return _Reading(
         edges,

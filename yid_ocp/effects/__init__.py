@@ -12,12 +12,12 @@ from pkgutil import iter_modules
 from yid_ocp.effects import base
 from yid_ocp.effects.base import EFFECTS as EFFECTS
 from yid_ocp.effects.base import EffectBase as EffectBase
-from yid_ocp.effects.base import Quantity as Quantity
-from yid_ocp.effects.base import Reported as Reported
-from yid_ocp.errors import Choices, ModelError, choices
+from yid_ocp.effects.base import ParameterDefinition as ParameterDefinition
+from yid_ocp.effects.base import ReportedParameter as ReportedParameter
+from yid_ocp.errors import ModelError, UnknownNameDetails, unknown_name_details
 from yid_ocp.model.system import System
 
-SENSORS = ("joints.position", "joints.effort", "camera", "nominal_clock")
+SENSOR_KINDS = ("joints.position", "joints.effort", "camera", "nominal_clock")
 """Kinds of recorded signals on which candidates depend; `nominal_clock` is a sample index times a nominal period."""
 
 # every file of this folder registers its kinds when it is imported
@@ -52,25 +52,25 @@ def make_effect(kind: str, location: str, system: System, values: Mapping[str, f
         The system has no such place for it.
     """
     cls = EFFECTS[kind]
-    places = cls.locations(system)
+    places = cls.possible_locations(system)
     if location not in places:
         if not places:
-            said = Choices(allowed="nothing in this system", hint="leave it out")
+            said = UnknownNameDetails(allowed="nothing in this system", hint="leave it out")
         else:
-            said = choices(location, places)
+            said = unknown_name_details(location, places)
         raise ModelError(f"{kind} does not fit '{location}'", where=f"{kind}@{location}", **said)
-    return base.build(kind, location, system, values)
+    return base.build_effect(kind, location, system, values)
 
 
-def candidates(system: System, sensors_present: Collection[str]) -> list[tuple[str, str]]:
+def candidate_effects(system: System, recorded_sensors: Collection[str]) -> list[tuple[str, str]]:
     """Every (kind, location) that is possible in a system and visible in a recording.
 
     Parameters
     ----------
     system : System
         Without the effects in question.
-    sensors_present : collection of str
-        What was recorded, among `SENSORS`.
+    recorded_sensors : collection of str
+        What was recorded, among `SENSOR_KINDS`.
 
     Returns
     -------
@@ -81,20 +81,20 @@ def candidates(system: System, sensors_present: Collection[str]) -> list[tuple[s
     Raises
     ------
     ModelError
-        An entry that is not in `SENSORS`.
+        An entry that is not in `SENSOR_KINDS`.
     """
-    present = set(sensors_present)
-    for name in sorted(present - set(SENSORS)):
-        raise ModelError(f"there is no kind of sensor '{name}'", **choices(name, SENSORS))
+    present = set(recorded_sensors)
+    for name in sorted(present - set(SENSOR_KINDS)):
+        raise ModelError(f"there is no kind of sensor '{name}'", **unknown_name_details(name, SENSOR_KINDS))
     unseen = set() if "joints.effort" in present else set(system.prescribed)
     found = []
     for kind in EFFECTS:
         cls = EFFECTS[kind]
-        if cls.needs <= present:
-            found += [(kind, place) for place in cls.likely(system) if place not in unseen]
+        if cls.required_sensors <= present:
+            found += [(kind, place) for place in cls.candidate_locations(system) if place not in unseen]
     return found
 
 
-def vocabulary() -> list[tuple[str, str, str]]:
+def effect_overview() -> list[tuple[str, str, str]]:
     """Every kind with its equation and the sensors that it requires."""
-    return [(kind, EFFECTS[kind].equation, ", ".join(sorted(EFFECTS[kind].needs))) for kind in EFFECTS]
+    return [(kind, EFFECTS[kind].equation, ", ".join(sorted(EFFECTS[kind].required_sensors))) for kind in EFFECTS]

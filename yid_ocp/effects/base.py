@@ -11,18 +11,18 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
-from yid_ocp.errors import ConfigError, nearest
-from yid_ocp.model.drives import NO_LIMIT
+from yid_ocp.errors import ConfigError, nearest_name_hint
 from yid_ocp.model.flexible import ElasticJoint
 from yid_ocp.model.kinematics import forward_kinematics
-from yid_ocp.model.mechanism import Inertia, Mechanism, Placement, merged
+from yid_ocp.model.mechanism import Inertia, Mechanism, Placement, merge_bodies
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.model.system import Grasp, MidpointState, NodeState, System, Terms
+from yid_ocp.model.servos_and_springs import UNLIMITED_EFFORT
+from yid_ocp.model.system import Grasp, MidpointState, NodeState, StepTerms, System
 from yid_ocp.registry import Registry
 
-SMOOTHING = 0.02
+SIGN_SMOOTHING_SPEED = 0.02
 """Smoothing speed v_s in sgn(v) = tanh(v/v_s) [rad/s]."""
-ASPECTS = (
+EXCITATIONS = (
     "how fast it moves",
     "how long it is held",
     "how hard it accelerates",
@@ -34,66 +34,66 @@ ASPECTS = (
     "how long it is",
 )
 """What a motion has to vary to excite an effect of the library, in the order in which messages list it."""
-BAXTER_LIMIT = 50.0
+_BAXTER_EFFORT_LIMIT = 50.0
 """Effort limit of Baxter's joints [N m], on which the ranges of arm effects are based; they scale with the limit."""
-SAME_PLACE = 1e-6
+_SAME_POINT_DISTANCE = 1e-6
 """Points of arms that stay nearer to each other than this in all configurations count as one point [m]."""
 
 
 @dataclass(frozen=True)
-class Quantity:
+class ParameterDefinition:
     """The definition of one parameter of an effect: unit, neutral value, bounds, expected range.
 
     Attributes
     ----------
     name : str
     unit : str
-    neutral : float
-        Value at which the effect is absent; for a `shape`, any value, from which a search may start.
+    neutral_value : float
+        Value at which the effect is absent; for a `is_shape_parameter`, any value, from which a search may start.
     lower, upper : float
         Physical bounds.
     prior_range : (float, float)
         Range that an engineer would expect.
     description : str
-    shape : bool
+    is_shape_parameter : bool
         Whether it has no influence while the others are neutral (a relaxation time, a yield angle).
-    reciprocal : str
+    reported_reciprocal : str
         `name unit` under which 1/value is reported, for a stiffness whose neutral value is infinite, or a factor that
         goes through infinity when it changes its sign.
-    power : int
+    reciprocal_power : int
         p in value = reported value^-p.
     """
 
     name: str
     unit: str
-    neutral: float
+    neutral_value: float
     lower: float
     upper: float
     prior_range: tuple[float, float]
     description: str
-    shape: bool = False
-    reciprocal: str = ""
-    power: int = 1
+    is_shape_parameter: bool = False
+    reported_reciprocal: str = ""
+    reciprocal_power: int = 1
 
     @property
-    def reported(self) -> tuple[str, str]:
+    def reported_name_and_unit(self) -> tuple[str, str]:
         """Name and unit under which the parameter is reported."""
-        name, _, unit = self.reciprocal.partition(" ")
-        return (name, unit) if self.reciprocal else (self.name, self.unit)
+        name, _, unit = self.reported_reciprocal.partition(" ")
+        return (name, unit) if self.reported_reciprocal else (self.name, self.unit)
 
-    def turned(self, value: float) -> float:
+    def to_reported(self, value: float) -> float:
         """The reported value for a nonzero internal value; the internal value itself where there is no reciprocal."""
-        if not self.reciprocal:
+        if not self.reported_reciprocal:
             return value
-        return 1 / value if self.power == 1 else value ** (-1 / self.power)
+        return 1 / value if self.reciprocal_power == 1 else value ** (-1 / self.reciprocal_power)
 
-    def kept(self, value: float) -> float:
+    def to_internal(self, value: float) -> float:
         """The internal value for a nonzero reported value; the reported value itself where there is no reciprocal."""
-        return value**-self.power if self.reciprocal else value
+        return value**-self.reciprocal_power if self.reported_reciprocal else value
 
 
 @dataclass(frozen=True)
-class Reported:
+class ReportedParameter:
     """A parameter as reported to users: value, standard deviation and unit."""
 
     value: float
@@ -108,68 +108,68 @@ class EffectBase(ABC):
     Attributes
     ----------
     kind, location : str
-    quantities : tuple of Quantity
+    definitions : tuple of Quantity
         Definitions at this location, in the order of `parameters`.
     parameters : Parameters
         Named `kind@location.quantity`.
-    internal : mapping of str to casadi.SX
+    internal_coordinates : mapping of str to casadi.SX
         Internal coordinates, named `kind@location.joint`.
-    joints : tuple of str
+    arm_joints : tuple of str
         Names of the arm's joints where `location` is an arm.
     equation : str
         Equation that the kind adds, as text.
-    depends_on : str
-        What a motion has to vary to distinguish the kind from others: one of `ASPECTS`, or words that continue
+    required_excitation : str
+        What a motion has to vary to distinguish the kind from others: one of `EXCITATIONS`, or words that continue
         "vary ...".
-    needs : frozenset of str
+    required_sensors : frozenset of str
         Sensors without which the effect is not observable.
-    alone : bool
+    is_local : bool
         Whether its presence at one location says nothing about others, as for a mass; not so for friction.
     """
 
     kind: str
     location: str
-    quantities: tuple[Quantity, ...]
+    definitions: tuple[ParameterDefinition, ...]
     parameters: Parameters
-    internal: Mapping[str, ca.SX] = field(default_factory=dict)
-    joints: tuple[str, ...] = ()
+    internal_coordinates: Mapping[str, ca.SX] = field(default_factory=dict)
+    arm_joints: tuple[str, ...] = ()
 
     equation: ClassVar[str] = ""
-    depends_on: ClassVar[str] = ""
-    needs: ClassVar[frozenset[str]] = frozenset()
-    alone: ClassVar[bool] = False
+    required_excitation: ClassVar[str] = ""
+    required_sensors: ClassVar[frozenset[str]] = frozenset()
+    is_local: ClassVar[bool] = False
 
     @classmethod
     @abstractmethod
-    def locations(cls, system: System) -> tuple[str, ...]:
+    def possible_locations(cls, system: System) -> tuple[str, ...]:
         """Names of all places in the system where the effect can act."""
 
     @classmethod
-    def likely(cls, system: System) -> tuple[str, ...]:
-        """Names of the places that a diagnosis tries; by default all of `locations`."""
-        return cls.locations(system)
+    def candidate_locations(cls, system: System) -> tuple[str, ...]:
+        """Names of the places that a diagnosis tries; by default all of `possible_locations`."""
+        return cls.possible_locations(system)
 
     @classmethod
     @abstractmethod
-    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
         """Definitions of the effect's parameters; bounds and ranges may depend on the location."""
 
     @classmethod
-    def internal_names(cls, location: str, system: System) -> tuple[str, ...]:
+    def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
         """Names of the effect's internal coordinates, such as the joint that each belongs to; none by default."""
         return ()
 
     @classmethod
-    def joints_at(cls, location: str, system: System) -> tuple[str, ...]:
+    def arm_joints_at_location(cls, location: str, system: System) -> tuple[str, ...]:
         """Names of the joints that an arm's location stands for, where the effect needs them; none by default."""
         return ()
 
     @property
-    def unknown_at_start(self) -> Mapping[str, float]:
+    def unknown_initial_state_bounds(self) -> Mapping[str, float]:
         """Internal coordinates with unknown initial value, which is estimated: name to largest absolute value."""
         return {}
 
-    def elsewhere(self, start: Mapping[str, float]) -> Mapping[str, float] | None:
+    def alternative_start(self, start: Mapping[str, float]) -> Mapping[str, float] | None:
         """Values of a second starting point for a search that starts at `start`; None where one start is enough."""
         return None
 
@@ -182,28 +182,28 @@ class EffectBase(ABC):
         return f"{self.kind}@{self.location}"
 
     @property
-    def neutral(self) -> dict[str, float]:
+    def neutral_values(self) -> dict[str, float]:
         """Parameter values at which the effect is absent, by parameter name."""
-        return {f"{self.label}.{q.name}": q.neutral for q in self.quantities}
+        return {f"{self.label}.{q.name}": q.neutral_value for q in self.definitions}
 
     @property
-    def amplitudes(self) -> tuple[str, ...]:
+    def amplitude_names(self) -> tuple[str, ...]:
         """Names of the parameters whose neutral values alone make the effect vanish."""
-        return tuple(f"{self.label}.{q.name}" for q in self.quantities if not q.shape)
+        return tuple(f"{self.label}.{q.name}" for q in self.definitions if not q.is_shape_parameter)
 
     @property
-    def shapes(self) -> tuple[str, ...]:
+    def shape_names(self) -> tuple[str, ...]:
         """Names of the parameters without influence while the amplitudes are neutral, such as a relaxation time."""
-        return tuple(f"{self.label}.{q.name}" for q in self.quantities if q.shape)
+        return tuple(f"{self.label}.{q.name}" for q in self.definitions if q.is_shape_parameter)
 
     @property
-    def prior_range(self) -> dict[str, tuple[float, float]]:
+    def prior_ranges(self) -> dict[str, tuple[float, float]]:
         """Expected range (low, high) of every parameter, in the parameter's unit."""
-        return {f"{self.label}.{q.name}": q.prior_range for q in self.quantities}
+        return {f"{self.label}.{q.name}": q.prior_range for q in self.definitions}
 
-    def reported(
+    def reported_parameters(
         self, values: Mapping[str, float] | None = None, stds: Mapping[str, float] | None = None
-    ) -> dict[str, Reported]:
+    ) -> dict[str, ReportedParameter]:
         """The parameters as reported to users; a compliance is reported as stiffness.
 
         The standard deviation of C^(-1/p) is C^(-1/p) std(C)/(p C) (delta method).
@@ -220,42 +220,42 @@ class EffectBase(ABC):
         dict of quantity name to Reported
         """
         result = {}
-        for quantity, entry in zip(self.quantities, self.parameters, strict=True):
+        for quantity, entry in zip(self.definitions, self.parameters, strict=True):
             value = float((values or {}).get(entry.name, entry.value))
             std = float((stds or {}).get(entry.name, math.nan))
-            name, unit = quantity.reported
-            if quantity.reciprocal:
+            name, unit = quantity.reported_name_and_unit
+            if quantity.reported_reciprocal:
                 known = bool(value)
-                turned = quantity.turned(value) if known else math.inf
-                value, std = turned, abs(turned * std / (quantity.power * value)) if known else math.nan
-            result[name] = Reported(value, std, unit)
+                turned = quantity.to_reported(value) if known else math.inf
+                value, std = turned, abs(turned * std / (quantity.reciprocal_power * value)) if known else math.nan
+            result[name] = ReportedParameter(value, std, unit)
         return result
 
-    def expected(self, largest: Mapping[str, float]) -> EffectBase:
+    def with_expected_ranges(self, largest: Mapping[str, float]) -> EffectBase:
         """The effect with expected ranges that fit the segments' largest joint angles in the data [rad]."""
         return self
 
-    def modify(self, system: System) -> System:
+    def apply_to_system(self, system: System) -> System:
         """The system with the effect's changes of masses, lengths, springs, grasps, gravity or joints."""
         return system
 
-    def terms(self, state: MidpointState) -> Terms:
+    def step_terms(self, state: MidpointState) -> StepTerms:
         """Energy, forces and internal equations that the effect adds to one step."""
-        return Terms()
+        return StepTerms()
 
-    def measure(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
+    def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
         """What the sensor reads where it would read `output` without the effect."""
         return output
 
-    def correct(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
+    def corrected_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
         """The true value for a recorded input value."""
         return reading
 
-    def delay(self, channel: str, camera: bool) -> ca.SX:
+    def added_delay(self, channel: str, camera: bool) -> ca.SX:
         """How long before its recorded time a sample was true [s]; for a driving torque, how much later it acts."""
         return ca.SX(0)
 
-    def lag(self, channel: str) -> ca.SX:
+    def lag_time_constant(self, channel: str) -> ca.SX:
         """Time constant with which a torque follows its command, or a recorded effort the true one [s]."""
         return ca.SX(0)
 
@@ -263,30 +263,34 @@ class EffectBase(ABC):
 EFFECTS: Registry[type[EffectBase]] = Registry("effect")
 
 
-def build(kind: str, location: str, system: System, values: Mapping[str, float] | None = None) -> EffectBase:
+def build_effect(kind: str, location: str, system: System, values: Mapping[str, float] | None = None) -> EffectBase:
     """An effect of a registered kind at a valid location; `make_effect` also checks the location."""
     cls = EFFECTS[kind]
     label = f"{kind}@{location}"
-    quantities = cls.quantities_at(location, system)
-    names = {q.name: q for q in quantities} | {q.reported[0]: q for q in quantities}
+    quantities = cls.parameter_definitions(location, system)
+    names = {q.name: q for q in quantities} | {q.reported_name_and_unit[0]: q for q in quantities}
     given: dict[str, float] = {}
     for name, value in (values or {}).items():
         if name not in names:
-            raise ConfigError(f"{kind} has no quantity '{name}'", where=label, hint=nearest(name, names))
+            raise ConfigError(f"{kind} has no quantity '{name}'", where=label, hint=nearest_name_hint(name, names))
         quantity = names[name]
         if name != quantity.name:
             signed = quantity.lower < 0
             if not (value > 0 or (signed and value < 0)):
                 kind_of = "a number other than zero" if signed else "a positive number"
-                raise ConfigError(f"{name} = {value}", where=label, allowed=f"{kind_of} {quantity.reported[1]}")
-            value = quantity.kept(value)
+                raise ConfigError(
+                    f"{name} = {value}", where=label, allowed=f"{kind_of} {quantity.reported_name_and_unit[1]}"
+                )
+            value = quantity.to_internal(value)
         given[quantity.name] = float(value)
     entries = (
-        Parameter(f"{label}.{q.name}", given.get(q.name, q.neutral), q.unit, q.lower, q.upper, q.description)
+        Parameter(f"{label}.{q.name}", given.get(q.name, q.neutral_value), q.unit, q.lower, q.upper, q.description)
         for q in quantities
     )
-    internal = {f"{label}.{name}": ca.SX.sym(f"{label}.{name}") for name in cls.internal_names(location, system)}
-    return cls(kind, location, quantities, Parameters(entries), internal, cls.joints_at(location, system))
+    internal = {
+        f"{label}.{name}": ca.SX.sym(f"{label}.{name}") for name in cls.internal_coordinate_names(location, system)
+    }
+    return cls(kind, location, quantities, Parameters(entries), internal, cls.arm_joints_at_location(location, system))
 
 
 # -- where effects can sit --------------------------------------------------------------------------------------------
@@ -294,15 +298,15 @@ def build(kind: str, location: str, system: System, values: Mapping[str, float] 
 
 def segment_names(system: System) -> tuple[str, ...]:
     """Names of the object's segments."""
-    return tuple(segment.name for segment in system.segments)
+    return tuple(segment.name for segment in system.segment_layouts)
 
 
 def object_joints(system: System) -> tuple[str, ...]:
     """Names of the joints of the object's segments."""
-    return tuple(joint for segment in system.segments for link in segment.links for joint in link)
+    return tuple(joint for segment in system.segment_layouts for link in segment.link_joints for joint in link)
 
 
-def clamp_names(system: System) -> tuple[str, ...]:
+def _clamp_names(system: System) -> tuple[str, ...]:
     """Names of floating clamps, each with six joints NAME_x ... NAME_rz."""
     names = set(system.mechanism.joint_names)
     found = [name.removesuffix("_rz") for name in system.mechanism.joint_names if name.endswith("_rz")]
@@ -311,8 +315,8 @@ def clamp_names(system: System) -> tuple[str, ...]:
 
 def robot_joints(system: System) -> tuple[str, ...]:
     """Names of the arms' joints: all but those of the object, of clamps and of compliant mounts."""
-    other = set(object_joints(system)) | set(system.compliant)
-    for clamp in clamp_names(system):
+    other = set(object_joints(system)) | set(system.joint_compliances)
+    for clamp in _clamp_names(system):
         other |= {f"{clamp}_{part}" for part in ("x", "y", "z", "rx", "ry", "rz")}
     return tuple(name for name in system.mechanism.joint_names if name not in other)
 
@@ -322,13 +326,13 @@ def grasp_names(system: System) -> tuple[str, ...]:
     return tuple(grasp.name for grasp in system.grasps)
 
 
-def arms(system: System) -> dict[str, tuple[str, ...]]:
+def joints_by_arm(system: System) -> dict[str, tuple[str, ...]]:
     """Joint names of every arm, by the arm's name: its grasp, else the prefix left or right, else `gripper`."""
     joints = robot_joints(system)
     tree = system.mechanism
     found: dict[str, tuple[str, ...]] = {}
     for grasp in system.grasps:
-        chain = {tree.joints[i].name for i in tree.ancestors(tree.frame(grasp.holder).joint)}
+        chain = {tree.joints[i].name for i in tree.ancestor_joints(tree.frame(grasp.holder_frame).joint_index)}
         held = tuple(name for name in joints if name in chain)
         if held:
             found[grasp.name] = held
@@ -343,58 +347,58 @@ def arms(system: System) -> dict[str, tuple[str, ...]]:
     return found
 
 
-def arm_tips(system: System) -> tuple[str, ...]:
+def _arm_tip_frames(system: System) -> tuple[str, ...]:
     """Names of one frame at the end of every arm without a grasp, a gripper's or hand's where there is one."""
     tree = system.mechanism
     tips = []
-    for name, joints in arms(system).items():
+    for name, joints in joints_by_arm(system).items():
         if name in grasp_names(system):
             continue
         last = max(tree.joint_index(joint) for joint in joints)
-        frames = [frame for frame, entry in tree.frames.items() if entry.joint == last]
+        frames = [frame for frame, entry in tree.frames.items() if entry.joint_index == last]
         named = [f for word in ("gripper", "tcp", "hand", "tool") for f in frames if f.endswith(word)]
         tips += (named or frames[-1:])[:1]
     return tuple(tips)
 
 
-def strength(system: System, joint: str) -> float:
+def relative_effort_limit(system: System, joint: str) -> float:
     """A joint's effort limit over Baxter's; 1 for a smaller limit and for none."""
     limit = system.mechanism.joints[system.mechanism.joint_index(joint)].effort_limit
-    return max(1.0, limit / BAXTER_LIMIT) if limit < NO_LIMIT else 1.0
+    return max(1.0, limit / _BAXTER_EFFORT_LIMIT) if limit < UNLIMITED_EFFORT else 1.0
 
 
 @dataclass(frozen=True)
-class Carried:
+class CarriedBody:
     """Nominal mass, centre of mass and second moment of a joint's child bodies, in the joint's frame.
 
     Attributes
     ----------
     mass : float
         [kg]
-    com : ndarray, shape (3,)
+    center_of_mass : ndarray, shape (3,)
         Centre of mass [m]; the joint's origin where it carries none.
-    spread : ndarray, shape (3, 3)
+    second_moment : ndarray, shape (3, 3)
         Second moment of mass, the integral of r r' dm about the centre of mass [kg m^2].
     """
 
     mass: float
-    com: np.ndarray
-    spread: np.ndarray
+    center_of_mass: np.ndarray
+    second_moment: np.ndarray
 
 
-def carried(system: System, joint: int) -> Carried:
+def carried_body(system: System, joint: int) -> CarriedBody:
     """Nominal mass properties of one joint's child bodies, up to the next joints."""
     bodies = [replace(body, gravity_fraction=None) for body in system.mechanism.joints[joint].bodies]
-    whole = merged(bodies)
+    whole = merge_bodies(bodies)
     if whole is None:
-        return Carried(0.0, np.zeros(3), np.zeros((3, 3)))
+        return CarriedBody(0.0, np.zeros(3), np.zeros((3, 3)))
     parameters = system.parameters
-    function = ca.Function("carried", [parameters.symbols], [whole.mass, whole.com, whole.about_com])
+    function = ca.Function("carried", [parameters.symbols], [whole.mass, whole.center_of_mass, whole.inertia_about_com])
     mass, com, tensor = (np.array(ca.densify(x)) for x in function(parameters.vector()))
-    return Carried(float(mass[0, 0]), com.ravel(), np.trace(tensor) / 2 * np.eye(3) - tensor)
+    return CarriedBody(float(mass[0, 0]), com.ravel(), np.trace(tensor) / 2 * np.eye(3) - tensor)
 
 
-def link_ends(system: System) -> tuple[str, ...]:
+def link_end_frames(system: System) -> tuple[str, ...]:
     """Names of frames at the ends of the arms' links: at the next joint or at the tip, each point once.
 
     A point on an axis that no other joint moves is left out.
@@ -406,17 +410,17 @@ def link_ends(system: System) -> tuple[str, ...]:
     # a link's own frame is where the link before it ends
     first: dict[int, str] = {}
     for name, frame in tree.frames.items():
-        if frame.joint in own:
-            first.setdefault(frame.joint, name)
-    names = (*arm_tips(system), *(first[joint] for joint in sorted(first)))
-    held = [end for grasp in system.grasps for end in (grasp.holder, grasp.held)]
+        if frame.joint_index in own:
+            first.setdefault(frame.joint_index, name)
+    names = (*_arm_tip_frames(system), *(first[joint] for joint in sorted(first)))
+    held = [end for grasp in system.grasps for end in (grasp.holder_frame, grasp.held_frame)]
     paths = _paths(system, tree, (*names, *held))
     known = [path for name, path in paths.items() if name in held]
     found = []
     for name in dict.fromkeys(names):
         path = paths[name]
-        moves = np.ptp(path, axis=0).max() > SAME_PLACE
-        if moves and not any(np.abs(path - other).max() < SAME_PLACE for other in known):
+        moves = np.ptp(path, axis=0).max() > _SAME_POINT_DISTANCE
+        if moves and not any(np.abs(path - other).max() < _SAME_POINT_DISTANCE for other in known):
             found.append(name)
             known.append(path)
     return tuple(found)
@@ -428,13 +432,15 @@ def link_frames(system: System) -> tuple[str, ...]:
     What slides on a link and carries nothing else, a finger for example, counts as part of that link.
     """
     tree = system.mechanism
-    preferred = [*(grasp.holder for grasp in system.grasps), *arm_tips(system)]
-    parents = {joint.parent for joint in tree.joints}
+    preferred = [*(grasp.holder_frame for grasp in system.grasps), *_arm_tip_frames(system)]
+    parents = {joint.parent_index for joint in tree.joints}
     found = []
     for name in robot_joints(system):
         index = tree.joint_index(name)
-        finger = tree.joints[index].kind == "prismatic" and index not in parents and tree.joints[index].parent >= 0
-        frames = [frame for frame, entry in tree.frames.items() if entry.joint == index]
+        finger = (
+            tree.joints[index].kind == "prismatic" and index not in parents and tree.joints[index].parent_index >= 0
+        )
+        frames = [frame for frame, entry in tree.frames.items() if entry.joint_index == index]
         if not finger and frames and tree.joints[index].bodies:
             found.append(next((frame for frame in preferred if frame in frames), frames[0]))
     return tuple(found)
@@ -446,48 +452,52 @@ def _paths(system: System, tree: Mechanism, names: Sequence[str]) -> dict[str, n
         return {}
     q = ca.SX.sym("q", len(tree.joints))
     kinematics = forward_kinematics(tree, q)
-    places = ca.horzcat(*(kinematics.position(name) for name in names))
+    places = ca.horzcat(*(kinematics.frame_position(name) for name in names))
     function = ca.Function("places", [q, system.parameters.symbols], [places])
     rng, theta = np.random.default_rng(0), system.parameters.vector()
     at = [np.array(ca.densify(function(rng.uniform(-1.0, 1.0, len(tree.joints)), theta))) for _ in range(3)]
     return {name: np.stack([place[:, i] for place in at]) for i, name in enumerate(names)}
 
 
-def roots(system: System) -> dict[str, tuple[str, ...]]:
+def root_joints_by_base(system: System) -> dict[str, tuple[str, ...]]:
     """First joints of all segments without a parent, by what carries them: a clamp's name, else `base`."""
-    tree, clamps = system.mechanism, clamp_names(system)
+    tree, clamps = system.mechanism, _clamp_names(system)
     found: dict[str, tuple[str, ...]] = {}
-    for segment in system.segments:
-        if segment.parent is not None:
+    for segment in system.segment_layouts:
+        if segment.parent_segment is not None:
             continue
-        first = segment.links[0][0]
-        below = {tree.joints[i].name for i in tree.ancestors(tree.joints[tree.joint_index(first)].parent)}
+        first = segment.link_joints[0][0]
+        below = {tree.joints[i].name for i in tree.ancestor_joints(tree.joints[tree.joint_index(first)].parent_index)}
         place = next((clamp for clamp in clamps if f"{clamp}_rz" in below), "base")
         found[place] = (*found.get(place, ()), first)
     return found
 
 
-def junctions(system: System) -> dict[str, tuple[str, ...]]:
+def branch_joints_by_junction(system: System) -> dict[str, tuple[str, ...]]:
     """First joints of the branches at every junction: `w_PARENT` at a parent's tip, else `junction_BRANCH`."""
     tree = system.mechanism
     found: dict[str, tuple[str, ...]] = {}
-    for segment in system.segments:
-        if segment.parent is None:
+    for segment in system.segment_layouts:
+        if segment.parent_segment is None:
             continue
-        first = segment.links[0][0]
-        tip = tree.frame(f"w_{segment.parent}").joint
-        place = f"w_{segment.parent}" if tip in tree.ancestors(tree.joint_index(first)) else f"junction_{segment.name}"
+        first = segment.link_joints[0][0]
+        tip = tree.frame(f"w_{segment.parent_segment}").joint_index
+        place = (
+            f"w_{segment.parent_segment}"
+            if tip in tree.ancestor_joints(tree.joint_index(first))
+            else f"junction_{segment.name}"
+        )
         found[place] = (*found.get(place, ()), first)
     return found
 
 
 def segment_of_frame(system: System, frame: str) -> str | None:
     """Name of the segment whose link carries a frame; None for other frames."""
-    index = system.mechanism.frame(frame).joint
+    index = system.mechanism.frame(frame).joint_index
     if index < 0:
         return None
     name = system.mechanism.joints[index].name
-    return next((s.name for s in system.segments if any(name in link for link in s.links)), None)
+    return next((s.name for s in system.segment_layouts if any(name in link for link in s.link_joints)), None)
 
 
 # -- helpers for the kinds --------------------------------------------------------------------------------------------
@@ -495,18 +505,20 @@ def segment_of_frame(system: System, frame: str) -> str | None:
 
 def segment_springs(system: System, segment: str) -> tuple[ElasticJoint, ...]:
     """Elastic joints of a segment."""
-    return tuple(spring for spring in system.elastic if spring.segment == segment)
+    return tuple(spring for spring in system.elastic_joints if spring.segment_name == segment)
 
 
-def with_springs(system: System, changed: Mapping[str, ElasticJoint]) -> System:
+def with_elastic_joints(system: System, changed: Mapping[str, ElasticJoint]) -> System:
     """The system with some elastic joints replaced, by joint name."""
-    return replace(system, elastic=tuple(changed.get(spring.joint, spring) for spring in system.elastic))
+    return replace(
+        system, elastic_joints=tuple(changed.get(spring.joint_name, spring) for spring in system.elastic_joints)
+    )
 
 
-def typical_stiffness(system: System, segment: str) -> float:
+def mean_bending_stiffness(system: System, segment: str) -> float:
     """Mean nominal bending stiffness of a segment's joints, at least 1e-6 [N m/rad]."""
     springs = segment_springs(system, segment)
-    chosen = [s.stiffness for s in springs if s.kind == "bend"] or [s.stiffness for s in springs]
+    chosen = [s.stiffness for s in springs if s.deformation == "bend"] or [s.stiffness for s in springs]
     if not chosen:
         return 1.0
     parameters = system.parameters
@@ -514,9 +526,9 @@ def typical_stiffness(system: System, segment: str) -> float:
     return max(float(np.mean(np.array(function(parameters.vector())))), 1e-6)
 
 
-def on_joint(system: System, joint: str, value: ca.SX) -> ca.SX:
+def force_on_joint(system: System, joint: str, value: ca.SX) -> ca.SX:
     """Generalized force with one nonzero entry, at a joint, shape (n, 1)."""
-    force = ca.SX(system.size, 1)
+    force = ca.SX(system.n_coordinates, 1)
     force[system.mechanism.joint_index(joint)] = value
     return force
 
@@ -533,13 +545,13 @@ def with_grasp(system: System, changed: Grasp) -> System:
     return replace(system, grasps=tuple(changed if g.name == changed.name else g for g in system.grasps))
 
 
-def substituted(system: System, old: Collection[ca.SX], new: Collection[ca.SX]) -> System:
+def substitute_symbols(system: System, old: Collection[ca.SX], new: Collection[ca.SX]) -> System:
     """The system with symbols substituted in all its expressions."""
     before, after = ca.vertcat(*old), ca.vertcat(*new)
-    return system.mapped(lambda expression: ca.substitute(expression, before, after))
+    return system.map_expressions(lambda expression: ca.substitute(expression, before, after))
 
 
-def inverse(placement: Placement) -> Placement:
+def inverse_placement(placement: Placement) -> Placement:
     """The inverse of a rigid transform."""
     back = placement.rotation.T
     return Placement(back, -(back @ placement.translation))

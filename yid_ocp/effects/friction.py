@@ -6,12 +6,20 @@ from collections.abc import Callable, Mapping
 
 import casadi as ca
 
-from yid_ocp.effects.base import EFFECTS, SMOOTHING, EffectBase, Quantity, on_joint, robot_joints, strength
-from yid_ocp.model.system import MidpointState, System, Terms
+from yid_ocp.effects.base import (
+    EFFECTS,
+    SIGN_SMOOTHING_SPEED,
+    EffectBase,
+    ParameterDefinition,
+    force_on_joint,
+    relative_effort_limit,
+    robot_joints,
+)
+from yid_ocp.model.system import MidpointState, StepTerms, System
 
-STILL = 1e-7
+_ABS_SMOOTHING_ANGLE = 1e-7
 """Angle turned in a step below which |d| in Dahl's law is smoothed [rad]."""
-NEAR = 1e-2
+_SERIES_MAX_ANGLE_RATIO = 1e-2
 """Ratio of step angle to yield angle below which a power series replaces the exponential, which loses digits there."""
 
 
@@ -20,72 +28,83 @@ class JointViscous(EffectBase):
     """Viscous friction F = -b v in addition to the model's damping."""
 
     equation = "F = -b v"
-    depends_on = "how fast it moves"
+    required_excitation = "how fast it moves"
 
     @classmethod
-    def locations(cls, system: System) -> tuple[str, ...]:
+    def possible_locations(cls, system: System) -> tuple[str, ...]:
         """Names of the arms' joints."""
         return robot_joints(system)
 
     @classmethod
-    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
         """Definition of b [N m s/rad]."""
-        size = strength(system, location)
-        return (Quantity("b", "N m s/rad", 0.0, 0.0, 10.0 * size, (0.0, 2.0 * size), "viscous friction"),)
+        size = relative_effort_limit(system, location)
+        return (ParameterDefinition("b", "N m s/rad", 0.0, 0.0, 10.0 * size, (0.0, 2.0 * size), "viscous friction"),)
 
-    def terms(self, state: MidpointState) -> Terms:
+    def step_terms(self, state: MidpointState) -> StepTerms:
         """The viscous friction of the joint."""
         return _friction(self, state, lambda v: self["b"] * v)
 
 
 @EFFECTS.register("joint_coulomb")
 class JointCoulomb(EffectBase):
-    """Coulomb friction F = -tau_c tanh(v/v_s), v_s = `SMOOTHING`."""
+    """Coulomb friction F = -tau_c tanh(v/v_s), v_s = `SIGN_SMOOTHING_SPEED`."""
 
     equation = "F = -tau_c tanh(v/v_s)"
-    depends_on = "how fast it moves"
+    required_excitation = "how fast it moves"
 
     @classmethod
-    def locations(cls, system: System) -> tuple[str, ...]:
+    def possible_locations(cls, system: System) -> tuple[str, ...]:
         """Names of the arms' joints."""
         return robot_joints(system)
 
     @classmethod
-    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
         """Definition of tau_c [N m], expected up to a fifth of the joint's effort limit."""
-        size = strength(system, location)
-        return (Quantity("tau_c", "N m", 0.0, 0.0, 10.0 * size, (0.0, 2.0 * size), "sliding friction"),)
+        size = relative_effort_limit(system, location)
+        return (ParameterDefinition("tau_c", "N m", 0.0, 0.0, 10.0 * size, (0.0, 2.0 * size), "sliding friction"),)
 
-    def terms(self, state: MidpointState) -> Terms:
+    def step_terms(self, state: MidpointState) -> StepTerms:
         """The Coulomb friction of the joint."""
-        return _friction(self, state, lambda v: self["tau_c"] * ca.tanh(v / SMOOTHING))
+        return _friction(self, state, lambda v: self["tau_c"] * ca.tanh(v / SIGN_SMOOTHING_SPEED))
 
 
 @EFFECTS.register("joint_stribeck")
 class JointStribeck(EffectBase):
-    """Stribeck friction F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s), v_s = `SMOOTHING`, beside Coulomb friction."""
+    """Stribeck friction F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s), v_s = `SIGN_SMOOTHING_SPEED`, beside Coulomb friction."""
 
     equation = "F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s)"
-    depends_on = "how fast it moves"
+    required_excitation = "how fast it moves"
 
     @classmethod
-    def locations(cls, system: System) -> tuple[str, ...]:
+    def possible_locations(cls, system: System) -> tuple[str, ...]:
         """Names of the arms' joints."""
         return robot_joints(system)
 
     @classmethod
-    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
         """Definitions of tau_s [N m] and v_stribeck [rad/s]."""
-        size, text = strength(system, location), "friction at low speed beside sliding friction"
+        size, text = relative_effort_limit(system, location), "friction at low speed beside sliding friction"
         return (
-            Quantity("tau_s", "N m", 0.0, 0.0, 10.0 * size, (0.0, 2.0 * size), text),
-            Quantity("v_stribeck", "rad/s", 0.1, 5e-3, 2.0, (0.01, 0.3), "speed beyond which it is gone", shape=True),
+            ParameterDefinition("tau_s", "N m", 0.0, 0.0, 10.0 * size, (0.0, 2.0 * size), text),
+            ParameterDefinition(
+                "v_stribeck",
+                "rad/s",
+                0.1,
+                5e-3,
+                2.0,
+                (0.01, 0.3),
+                "speed beyond which it is gone",
+                is_shape_parameter=True,
+            ),
         )
 
-    def terms(self, state: MidpointState) -> Terms:
+    def step_terms(self, state: MidpointState) -> StepTerms:
         """The Stribeck friction of the joint."""
         width = self["v_stribeck"]
-        return _friction(self, state, lambda v: self["tau_s"] * ca.exp(-((v / width) ** 2)) * ca.tanh(v / SMOOTHING))
+        return _friction(
+            self, state, lambda v: self["tau_s"] * ca.exp(-((v / width) ** 2)) * ca.tanh(v / SIGN_SMOOTHING_SPEED)
+        )
 
 
 @EFFECTS.register("joint_presliding")
@@ -98,7 +117,7 @@ class JointPresliding(EffectBase):
 
     at x = |d|/yield_angle is its solution and its mean for a motion that does not turn round within the step. It stays
     within -1 and 1 and takes energy out whatever the step is, where a midpoint rule would ring at steps longer than the
-    yield angle. The |d| beside s_k is rounded off below `STILL`. A loaded joint whose arm rings on the friction's own
+    yield angle. The |d| beside s_k is rounded off below `_ABS_SMOOTHING_ANGLE`. A loaded joint whose arm rings on the friction's own
     stiffness, tau_c/yield_angle, faster than the steps follow creeps a little instead of resting, as Dahl's law has it
     of anything that is shaken: shorter steps hold it. What s was before a recording begins is not known: it
     is estimated with every recording.
@@ -109,54 +128,70 @@ class JointPresliding(EffectBase):
     """
 
     equation = "F = -tau_c s, ds/dt = (v - |v| s) / yield_angle"
-    depends_on = "how fast it moves"
+    required_excitation = "how fast it moves"
 
     @classmethod
-    def locations(cls, system: System) -> tuple[str, ...]:
+    def possible_locations(cls, system: System) -> tuple[str, ...]:
         """Names of the arms' joints."""
         return robot_joints(system)
 
     @classmethod
-    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
         """Definitions of tau_c [N m], expected up to a fifth of the effort limit, and yield_angle [rad]."""
-        size = strength(system, location)
+        size = relative_effort_limit(system, location)
         return (
-            Quantity("tau_c", "N m", 0.0, 0.0, 10.0 * size, (0.0, 2.0 * size), "friction that holds and slides"),
-            Quantity("yield_angle", "rad", 5e-3, 1e-5, 0.5, (1e-4, 0.05), "angle over which it yields", shape=True),
+            ParameterDefinition(
+                "tau_c", "N m", 0.0, 0.0, 10.0 * size, (0.0, 2.0 * size), "friction that holds and slides"
+            ),
+            ParameterDefinition(
+                "yield_angle",
+                "rad",
+                5e-3,
+                1e-5,
+                0.5,
+                (1e-4, 0.05),
+                "angle over which it yields",
+                is_shape_parameter=True,
+            ),
         )
 
     @classmethod
-    def internal_names(cls, location: str, system: System) -> tuple[str, ...]:
+    def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
         """`s`, the acting fraction of tau_c, from -1 to 1."""
         return ("s",)
 
     @property
-    def unknown_at_start(self) -> Mapping[str, float]:
+    def unknown_initial_state_bounds(self) -> Mapping[str, float]:
         """`s` with the bound 1: its value at the start of a recording is estimated."""
-        return dict.fromkeys(self.internal, 1.0)
+        return dict.fromkeys(self.internal_coordinates, 1.0)
 
-    def terms(self, state: MidpointState) -> Terms:
+    def step_terms(self, state: MidpointState) -> StepTerms:
         """The friction force and the update equation of s."""
-        [name] = self.internal
-        row, index = state.internal[name], state.system.mechanism.joint_index(self.location)
+        [name] = self.internal_coordinates
+        row, index = state.internal_rows[name], state.system.mechanism.joint_index(self.location)
         s, rate, width = state.z[row], state.z_rate[row], self["yield_angle"]
         turned = state.h * state.v[index]
         before = s - state.h / 2 * rate
-        x, rounded = ca.fabs(turned) / width, (ca.sqrt(turned**2 + STILL**2) - STILL) / width
+        x, rounded = (
+            ca.fabs(turned) / width,
+            (ca.sqrt(turned**2 + _ABS_SMOOTHING_ANGLE**2) - _ABS_SMOOTHING_ANGLE) / width,
+        )
         # e^-x by what is left over x^2, so that nothing is lost next to zero, where an arm that rests stays
         change = turned / width * (1 - x * _left(x)) - before * rounded * (1 - rounded * _left(rounded))
         mean = turned / width * _left(x) + before * (1 - rounded * _left(rounded))
-        force = on_joint(state.system, self.location, -self["tau_c"] * mean)
-        return Terms(force=force, internal={name: state.h * rate - change}, at_rest={name: s})
+        force = force_on_joint(state.system, self.location, -self["tau_c"] * mean)
+        return StepTerms(
+            generalized_force=force, internal_equations={name: state.h * rate - change}, static_equations={name: s}
+        )
 
 
 def _left(x: ca.SX) -> ca.SX:
     """(exp(-x) - 1 + x)/x^2 for x >= 0."""
-    far = ca.fmax(x, NEAR)
+    far = ca.fmax(x, _SERIES_MAX_ANGLE_RATIO)
     series = 1 / 2 - x / 6 + x**2 / 24 - x**3 / 120
-    return ca.if_else(x < NEAR, series, (ca.exp(-far) - 1 + far) / far**2)
+    return ca.if_else(x < _SERIES_MAX_ANGLE_RATIO, series, (ca.exp(-far) - 1 + far) / far**2)
 
 
-def _friction(effect: EffectBase, state: MidpointState, law: Callable[[ca.SX], ca.SX]) -> Terms:
+def _friction(effect: EffectBase, state: MidpointState, law: Callable[[ca.SX], ca.SX]) -> StepTerms:
     v = state.v[state.system.mechanism.joint_index(effect.location)]
-    return Terms(viscous=on_joint(state.system, effect.location, -law(v)))
+    return StepTerms(dissipative_force=force_on_joint(state.system, effect.location, -law(v)))

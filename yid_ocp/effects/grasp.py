@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import casadi as ca
 
-from yid_ocp.effects.base import EFFECTS, EffectBase, Quantity, grasp_names, with_grasp
-from yid_ocp.model.system import Grasp, MidpointState, System, Terms
+from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, grasp_names, with_grasp
+from yid_ocp.model.system import Grasp, MidpointState, StepTerms, System
 
 
 @EFFECTS.register("grasp_offset")
@@ -15,26 +15,26 @@ class GraspOffset(EffectBase):
     """The grasped point displaced by (dx, dy, dz) from its nominal position, in the gripper's frame."""
 
     equation = "phi = (holder + R (dx, dy, dz)) - held"
-    depends_on = "how hard it pulls at its ends"
+    required_excitation = "how hard it pulls at its ends"
 
     @classmethod
-    def locations(cls, system: System) -> tuple[str, ...]:
+    def possible_locations(cls, system: System) -> tuple[str, ...]:
         """Names of the grasps."""
         return grasp_names(system)
 
     @classmethod
-    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
         """Definitions of dx, dy and dz [m]."""
         return tuple(
-            Quantity(f"d{axis}", "m", 0.0, -0.1, 0.1, (-0.02, 0.02), f"shift along the gripper's {axis}")
+            ParameterDefinition(f"d{axis}", "m", 0.0, -0.1, 0.1, (-0.02, 0.02), f"shift along the gripper's {axis}")
             for axis in "xyz"
         )
 
-    def modify(self, system: System) -> System:
+    def apply_to_system(self, system: System) -> System:
         """The system with the displaced grasp."""
         grasp = _grasp(system, self.location)
         shift = ca.vertcat(*(self[f"d{axis}"] for axis in "xyz"))
-        return with_grasp(system, replace(grasp, offset=grasp.offset + shift))
+        return with_grasp(system, replace(grasp, holder_offset=grasp.holder_offset + shift))
 
 
 @EFFECTS.register("grasp_compliance")
@@ -47,74 +47,83 @@ class GraspCompliance(EffectBase):
     """
 
     equation = "phi + C damping dphi/dt = C force"
-    depends_on = "how hard it pulls at its ends"
+    required_excitation = "how hard it pulls at its ends"
 
     @classmethod
-    def locations(cls, system: System) -> tuple[str, ...]:
+    def possible_locations(cls, system: System) -> tuple[str, ...]:
         """Names of the grasps."""
         return grasp_names(system)
 
     @classmethod
-    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
         """Definitions of compliance [m/N], reported as stiffness [N/m], and damping [N s/m]."""
         text = "compliance of the grasp"
         return (
-            Quantity("compliance", "m/N", 0.0, 0.0, 0.1, (1e-4, 1e-2), text, reciprocal="stiffness N/m"),
-            Quantity("damping", "N s/m", 0.0, 0.0, 100.0, (0.1, 20.0), "damping of the grasp", shape=True),
+            ParameterDefinition(
+                "compliance", "m/N", 0.0, 0.0, 0.1, (1e-4, 1e-2), text, reported_reciprocal="stiffness N/m"
+            ),
+            ParameterDefinition(
+                "damping", "N s/m", 0.0, 0.0, 100.0, (0.1, 20.0), "damping of the grasp", is_shape_parameter=True
+            ),
         )
 
-    def modify(self, system: System) -> System:
+    def apply_to_system(self, system: System) -> System:
         """The system with the compliant grasp."""
         grasp = _grasp(system, self.location)
         compliance = grasp.compliance + self["compliance"]
         own = self["compliance"] * self["damping"]
-        relaxation = own if grasp.relaxation is None else grasp.relaxation + own
-        return with_grasp(system, replace(grasp, compliance=compliance, relaxation=relaxation))
+        relaxation = own if grasp.relaxation_time is None else grasp.relaxation_time + own
+        return with_grasp(system, replace(grasp, compliance=compliance, relaxation_time=relaxation))
 
 
 @EFFECTS.register("grasp_slip")
 class GraspSlip(EffectBase):
     """The grasped point creeps along the tube in the direction in which the gripper pulls.
 
-    d(offset)/dt = slip_per_load x axial load, both along the object's z axis; `Grasp.slip` counts the other way. At the
+    d(offset)/dt = slip_per_load x axial load, both along the object's z axis; `Grasp.axial_slip` counts the other way. At the
     start of a recording nothing has slipped.
     """
 
     equation = "d(offset)/dt = slip_per_load x axial load"
-    depends_on = "how long it is held"
+    required_excitation = "how long it is held"
 
     @classmethod
-    def locations(cls, system: System) -> tuple[str, ...]:
+    def possible_locations(cls, system: System) -> tuple[str, ...]:
         """Names of the grasps."""
         return grasp_names(system)
 
     @classmethod
-    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
         """Definition of slip_per_load [m/(N s)]."""
         text = "creep rate per axial load"
-        return (Quantity("slip_per_load", "m/(N s)", 0.0, 0.0, 0.1, (0.0, 0.01), text),)
+        return (ParameterDefinition("slip_per_load", "m/(N s)", 0.0, 0.0, 0.1, (0.0, 0.01), text),)
 
     @classmethod
-    def internal_names(cls, location: str, system: System) -> tuple[str, ...]:
+    def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
         """`offset`, the slipped distance along the tube."""
         return ("offset",)
 
-    def modify(self, system: System) -> System:
+    def apply_to_system(self, system: System) -> System:
         """The system with the slipped distance as the grasp's slip."""
         grasp = _grasp(system, self.location)
-        return with_grasp(system, replace(grasp, slip=grasp.slip - self.internal[f"{self.label}.offset"]))
+        return with_grasp(
+            system, replace(grasp, axial_slip=grasp.axial_slip - self.internal_coordinates[f"{self.label}.offset"])
+        )
 
-    def terms(self, state: MidpointState) -> Terms:
+    def step_terms(self, state: MidpointState) -> StepTerms:
         """The creep equation of the slipped distance."""
         name = f"{self.label}.offset"
-        row, at = state.internal[name], 0
+        row, at = state.internal_rows[name], 0
         for grasp in state.system.grasps:
             if grasp.name == self.location:
                 break
-            at += grasp.equations
-        axis = state.kinematics.pose(grasp.held).rotation[:, 2]
+            at += grasp.n_equations
+        axis = state.kinematics.frame_pose(grasp.held_frame).rotation[:, 2]
         load = ca.dot(axis, state.constraint_force[at : at + 3])
-        return Terms(internal={name: state.z_rate[row] - self["slip_per_load"] * load}, at_rest={name: state.z[row]})
+        return StepTerms(
+            internal_equations={name: state.z_rate[row] - self["slip_per_load"] * load},
+            static_equations={name: state.z[row]},
+        )
 
 
 def _grasp(system: System, name: str) -> Grasp:

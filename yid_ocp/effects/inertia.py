@@ -11,37 +11,37 @@ import numpy as np
 
 from yid_ocp.effects.base import (
     EFFECTS,
-    Carried,
+    CarriedBody,
     EffectBase,
-    Quantity,
-    Reported,
-    carried,
-    link_ends,
+    ParameterDefinition,
+    ReportedParameter,
+    carried_body,
+    link_end_frames,
     link_frames,
     object_joints,
+    relative_effort_limit,
     robot_joints,
     segment_names,
     segment_of_frame,
-    strength,
-    substituted,
+    substitute_symbols,
     with_bodies,
 )
 from yid_ocp.model.mechanism import Inertia
-from yid_ocp.model.system import MidpointState, System, Terms
+from yid_ocp.model.system import MidpointState, StepTerms, System
 
-REACH = 0.5
+_MAX_PAYLOAD_DISTANCE = 0.5
 """Largest distance of a payload's mass from its frame [m]."""
-SHIFT = 0.05
+_MAX_COM_SHIFT = 0.05
 """Largest shift of a link's centre of mass without added mass [m]."""
-REMOVABLE = 0.9
+_MAX_REMOVED_MASS_FRACTION = 0.9
 """Largest fraction of a link's mass that a negative payload may remove."""
-FAR = 2.0
+_POINT_INERTIA_DISTANCE = 2.0
 """Distance beyond which a payload's own inertia is no longer that of a point [m]."""
-LIGHT = 1e-2
+_POINT_INERTIA_MIN_MASS = 1e-2
 """Mass below which a payload has no inertia of its own [kg]."""
-FREE = 0.95
+_UNLIMITED_MOMENT_FRACTION = 0.95
 """Reported fraction of a payload's moments above which the limit of its position is negligible."""
-THIN = 1e-3
+_MIN_LINK_EXTENT = 1e-3
 """Smallest root mean square extent of a link [m]."""
 
 
@@ -50,21 +50,25 @@ class Density(EffectBase):
     """All masses and inertias of a segment multiplied by a factor."""
 
     equation = "masses and inertias times scale"
-    depends_on = "how hard it accelerates"
+    required_excitation = "how hard it accelerates"
 
     @classmethod
-    def locations(cls, system: System) -> tuple[str, ...]:
+    def possible_locations(cls, system: System) -> tuple[str, ...]:
         """Names of the object's segments."""
         return segment_names(system)
 
     @classmethod
-    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
         """Definition of scale, the factor on masses and inertias [1]."""
-        return (Quantity("scale", "1", 1.0, 0.2, 3.0, (0.7, 1.3), "factor on masses and inertias"),)
+        return (ParameterDefinition("scale", "1", 1.0, 0.2, 3.0, (0.7, 1.3), "factor on masses and inertias"),)
 
-    def modify(self, system: System) -> System:
+    def apply_to_system(self, system: System) -> System:
         """The system with the segment's scaled bodies."""
-        return _scaled(system, [joint for link in system.segment(self.location).links for joint in link], self["scale"])
+        return _scaled(
+            system,
+            [joint for link in system.segment_layout(self.location).link_joints for joint in link],
+            self["scale"],
+        )
 
 
 @EFFECTS.register("link_mass")
@@ -72,21 +76,21 @@ class LinkMass(EffectBase):
     """Mass and inertia of an arm joint's child link multiplied by a factor."""
 
     equation = "mass and inertia of the child link times scale"
-    depends_on = "how hard it accelerates"
-    alone: ClassVar[bool] = True
+    required_excitation = "how hard it accelerates"
+    is_local: ClassVar[bool] = True
 
     @classmethod
-    def locations(cls, system: System) -> tuple[str, ...]:
+    def possible_locations(cls, system: System) -> tuple[str, ...]:
         """Names of arm joints whose child link has mass."""
         tree = system.mechanism
         return tuple(name for name in robot_joints(system) if tree.joints[tree.joint_index(name)].bodies)
 
     @classmethod
-    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
         """Definition of scale, the factor on mass and inertia [1]."""
-        return (Quantity("scale", "1", 1.0, 0.2, 3.0, (0.8, 1.2), "factor on mass and inertia"),)
+        return (ParameterDefinition("scale", "1", 1.0, 0.2, 3.0, (0.8, 1.2), "factor on mass and inertia"),)
 
-    def modify(self, system: System) -> System:
+    def apply_to_system(self, system: System) -> System:
         """The system with the scaled link."""
         return _scaled(system, [self.location], self["scale"])
 
@@ -96,31 +100,31 @@ class PointMass(EffectBase):
     """A point mass fixed to a frame: T += 1/2 mass |v|^2, V += -mass g.x."""
 
     equation = "T += 1/2 mass |v|^2, V -= mass g.x"
-    depends_on = "how hard it accelerates"
-    alone: ClassVar[bool] = True
+    required_excitation = "how hard it accelerates"
+    is_local: ClassVar[bool] = True
 
     @classmethod
-    def locations(cls, system: System) -> tuple[str, ...]:
+    def possible_locations(cls, system: System) -> tuple[str, ...]:
         """Names of all moving frames."""
-        return tuple(name for name, frame in system.mechanism.frames.items() if frame.joint >= 0)
+        return tuple(name for name, frame in system.mechanism.frames.items() if frame.joint_index >= 0)
 
     @classmethod
-    def likely(cls, system: System) -> tuple[str, ...]:
+    def candidate_locations(cls, system: System) -> tuple[str, ...]:
         """Names of segment tips, junctions and ends of arm links."""
         tree = system.mechanism
-        ends = (f"{prefix}_{s.name}" for s in system.segments for prefix in ("w", "junction"))
-        return (*(name for name in ends if name in tree.frames), *link_ends(system))
+        ends = (f"{prefix}_{s.name}" for s in system.segment_layouts for prefix in ("w", "junction"))
+        return (*(name for name in ends if name in tree.frames), *link_end_frames(system))
 
     @classmethod
-    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
         """Definition of mass [kg], up to the object's mass on the object and up to the arm's payload on an arm."""
         upper, expected = _bearable(system, location)
-        return (Quantity("mass", "kg", 0.0, 0.0, upper, (0.0, expected), "mass of the point"),)
+        return (ParameterDefinition("mass", "kg", 0.0, 0.0, upper, (0.0, expected), "mass of the point"),)
 
-    def modify(self, system: System) -> System:
+    def apply_to_system(self, system: System) -> System:
         """The system with the added point mass."""
         frame = system.mechanism.frame(self.location)
-        joint = system.mechanism.joints[frame.joint]
+        joint = system.mechanism.joints[frame.joint_index]
         point = Inertia(self["mass"], frame.placement.translation, ca.SX(ca.DM.zeros(3, 3)))
         return with_bodies(system, {joint.name: (*joint.bodies, point)})
 
@@ -129,80 +133,87 @@ class PointMass(EffectBase):
 class Payload(EffectBase):
     """A mass at (mx, my, mz)/mass in a frame, moving with it; a negative mass removes excess mass of the model.
 
-    The place is within `REACH` of the frame: moments beyond L = sqrt((`REACH` mass)^2 + (`SHIFT` M)^2) do not grow any
+    The place is within `_MAX_PAYLOAD_DISTANCE` of the frame: moments beyond L = sqrt((`_MAX_PAYLOAD_DISTANCE` mass)^2 + (`_MAX_COM_SHIFT` M)^2) do not grow any
     more, s = (mx, my, mz) (1 + (|(mx, my, mz)|/L)^8)^(-1/8), and s is what is reported. M, C and Sigma are mass, centre
     and integral of r r' dm about the centre of what the joint carries (M at least 1 kg in L). With
     e = s + mass (frame - C) the link gets `mass`, the first moment e about C, and the second moment
 
-        K = e e' (1/(M + mass) + c h),  c = w(mass) M/(M + mass),  w(mass) = mass^3/(mass^4 + (|e|/`FAR`)^4 + `LIGHT`^4)
+        K = e e' (1/(M + mass) + c h),  c = w(mass) M/(M + mass),  w(mass) = mass^3/(mass^4 + (|e|/`_POINT_INERTIA_DISTANCE`)^4 + `_POINT_INERTIA_MIN_MASS`^4)
 
-    about C. w is 1/mass, and K = e e'/mass that of a point, but for a place further off than `FAR` and next to neutral,
+    about C. w is 1/mass, and K = e e'/mass that of a point, but for a place further off than `_POINT_INERTIA_DISTANCE` and next to neutral,
     where all goes smoothly to nothing. About its own centre the link then has Sigma + c h e e', where h is 1 for a mass
     that is added and (1 + a^4)^(-1/4), a = c e' Sigma^-1 e, for one that is taken away: almost 1 while what is taken
     away was there, and never so large that the link would be left without inertia.
     """
 
     equation = "a mass at (mx, my, mz)/mass, moving with the frame"
-    depends_on = "how it stands against gravity"
-    alone: ClassVar[bool] = True
+    required_excitation = "how it stands against gravity"
+    is_local: ClassVar[bool] = True
 
     @classmethod
-    def locations(cls, system: System) -> tuple[str, ...]:
+    def possible_locations(cls, system: System) -> tuple[str, ...]:
         """Names of all moving frames."""
-        return tuple(name for name, frame in system.mechanism.frames.items() if frame.joint >= 0)
+        return tuple(name for name, frame in system.mechanism.frames.items() if frame.joint_index >= 0)
 
     @classmethod
-    def likely(cls, system: System) -> tuple[str, ...]:
+    def candidate_locations(cls, system: System) -> tuple[str, ...]:
         """One frame per arm link: payloads at two frames of one link are equivalent."""
         return link_frames(system)
 
     @classmethod
-    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Definitions of mass [kg], from -`REMOVABLE` times the link's, and of first moments mx, my, mz [kg m]."""
+    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
+        """Definitions of mass [kg], from -`_MAX_REMOVED_MASS_FRACTION` times the link's, and of first moments mx, my, mz [kg m]."""
         upper, expected = _bearable(system, location)
-        lower = -REMOVABLE * carried(system, system.mechanism.frame(location).joint).mass
+        lower = -_MAX_REMOVED_MASS_FRACTION * carried_body(system, system.mechanism.frame(location).joint_index).mass
         moments = (
-            Quantity(
+            ParameterDefinition(
                 f"m{axis}",
                 "kg m",
                 0.0,
-                -REACH * upper,
-                REACH * upper,
-                (-REACH * expected, REACH * expected),
+                -_MAX_PAYLOAD_DISTANCE * upper,
+                _MAX_PAYLOAD_DISTANCE * upper,
+                (-_MAX_PAYLOAD_DISTANCE * expected, _MAX_PAYLOAD_DISTANCE * expected),
                 f"mass times its place along {axis}",
             )
             for axis in "xyz"
         )
-        return (Quantity("mass", "kg", 0.0, lower, upper, (lower, expected), "mass added to the link"), *moments)
+        return (
+            ParameterDefinition("mass", "kg", 0.0, lower, upper, (lower, expected), "mass added to the link"),
+            *moments,
+        )
 
-    def elsewhere(self, start: Mapping[str, float]) -> Mapping[str, float] | None:
-        """A start with the opposite sign of mass, at the distance `REACH`; None where the mass is zero.
+    def alternative_start(self, start: Mapping[str, float]) -> Mapping[str, float] | None:
+        """A start with the opposite sign of mass, at the distance `_MAX_PAYLOAD_DISTANCE`; None where the mass is zero.
 
         Near zero mass no second moment distinguishes the two signs.
         """
-        mass, *moments = (start.get(f"{self.label}.{quantity.name}", 0.0) for quantity in self.quantities)
-        own = self.quantities[0]
-        other = float(np.clip(-math.copysign(np.linalg.norm(moments) / REACH, mass), own.lower, own.upper))
+        mass, *moments = (start.get(f"{self.label}.{quantity.name}", 0.0) for quantity in self.definitions)
+        own = self.definitions[0]
+        other = float(
+            np.clip(-math.copysign(np.linalg.norm(moments) / _MAX_PAYLOAD_DISTANCE, mass), own.lower, own.upper)
+        )
         return {f"{self.label}.mass": other} if other * mass < 0 else None
 
-    def reported(
+    def reported_parameters(
         self, values: Mapping[str, float] | None = None, stds: Mapping[str, float] | None = None
-    ) -> dict[str, Reported]:
+    ) -> dict[str, ReportedParameter]:
         """Mass and acting first moments; the moments have no standard deviation where the position limit is active."""
-        found = super().reported(values, stds)
-        mass, *moments = (found[quantity.name].value for quantity in self.quantities)
-        own = -self.quantities[0].lower / REMOVABLE
+        found = super().reported_parameters(values, stds)
+        mass, *moments = (found[quantity.name].value for quantity in self.definitions)
+        own = -self.definitions[0].lower / _MAX_REMOVED_MASS_FRACTION
         kept = float(_kept(ca.SX(mass), ca.SX(ca.DM(moments)), own))
         for name in ("mx", "my", "mz"):
             said = found[name]
-            found[name] = Reported(kept * said.value, said.std if kept > FREE else math.nan, said.unit)
+            found[name] = ReportedParameter(
+                kept * said.value, said.std if kept > _UNLIMITED_MOMENT_FRACTION else math.nan, said.unit
+            )
         return found
 
-    def modify(self, system: System) -> System:
+    def apply_to_system(self, system: System) -> System:
         """The system with the payload's mass, first and second moments added to its link."""
         frame = system.mechanism.frame(self.location)
-        joint, link = system.mechanism.joints[frame.joint], carried(system, frame.joint)
-        mass, centre = self["mass"], ca.SX(ca.DM(link.com))
+        joint, link = system.mechanism.joints[frame.joint_index], carried_body(system, frame.joint_index)
+        mass, centre = self["mass"], ca.SX(ca.DM(link.center_of_mass))
         moment = ca.vertcat(*(self[f"m{axis}"] for axis in "xyz"))
         first = frame.placement.rotation @ (moment * _kept(mass, moment, link.mass)) + mass * (
             frame.placement.translation - centre
@@ -219,20 +230,20 @@ class Payload(EffectBase):
 
 def _kept(mass: ca.SX, moment: ca.SX, own: float) -> ca.SX:
     """Fraction of the first moments that acts; see `Payload`."""
-    most = (REACH * mass) ** 2 + (SHIFT * max(own, 1.0)) ** 2
+    most = (_MAX_PAYLOAD_DISTANCE * mass) ** 2 + (_MAX_COM_SHIFT * max(own, 1.0)) ** 2
     return (1 + (ca.dot(moment, moment) / most) ** 4) ** (-1 / 8)
 
 
-def _spread(mass: ca.SX, first: ca.SX, link: Carried) -> ca.SX:
+def _spread(mass: ca.SX, first: ca.SX, link: CarriedBody) -> ca.SX:
     """The factor of e e' in K, 1/mass for a point; see `Payload`."""
-    far = ca.dot(first, first) / FAR**2
-    inverse = mass**3 / (mass**4 + far**2 + LIGHT**4)
+    far = ca.dot(first, first) / _POINT_INERTIA_DISTANCE**2
+    inverse = mass**3 / (mass**4 + far**2 + _POINT_INERTIA_MIN_MASS**4)
     if link.mass == 0:
         return inverse
     whole = link.mass + mass
     beyond = inverse * link.mass / whole
-    size, axes = np.linalg.eigh(link.spread)
-    stretch = ca.SX(ca.DM(axes / np.sqrt(np.maximum(size, link.mass * THIN**2)))).T @ first
+    size, axes = np.linalg.eigh(link.second_moment)
+    stretch = ca.SX(ca.DM(axes / np.sqrt(np.maximum(size, link.mass * _MIN_LINK_EXTENT**2)))).T @ first
     taken = ca.fmin(beyond, 0) * ca.dot(stretch, stretch)
     return 1 / whole + beyond / ca.sqrt(ca.sqrt(1 + taken**4))
 
@@ -240,12 +251,12 @@ def _spread(mass: ca.SX, first: ca.SX, link: Carried) -> ca.SX:
 def _bearable(system: System, frame: str) -> tuple[float, float]:
     """Upper bound and expected maximum of a mass at a frame [kg]."""
     tree = system.mechanism
-    joint = tree.frame(frame).joint
+    joint = tree.frame(frame).joint_index
     if segment_of_frame(system, frame) is not None:
-        whole = sum(carried(system, tree.joint_index(name)).mass for name in object_joints(system))
+        whole = sum(carried_body(system, tree.joint_index(name)).mass for name in object_joints(system))
         return max(0.5, whole), max(0.05, whole)
-    moving = set(robot_joints(system)) & {tree.joints[i].name for i in tree.ancestors(joint)}
-    size = max((strength(system, name) for name in moving), default=1.0)
+    moving = set(robot_joints(system)) & {tree.joints[i].name for i in tree.ancestor_joints(joint)}
+    size = max((relative_effort_limit(system, name) for name in moving), default=1.0)
     return 10.0 * size, 3.0 * size
 
 
@@ -254,22 +265,22 @@ class LengthScale(EffectBase):
     """Link lengths of a segment multiplied by a factor; its mass is unchanged."""
 
     equation = "link lengths times scale"
-    depends_on = "how long it is"
+    required_excitation = "how long it is"
 
     @classmethod
-    def locations(cls, system: System) -> tuple[str, ...]:
+    def possible_locations(cls, system: System) -> tuple[str, ...]:
         """Names of segments whose length is a parameter."""
         return tuple(name for name in segment_names(system) if _lengths(system, name))
 
     @classmethod
-    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
         """Definition of scale, the factor on link lengths [1]."""
-        return (Quantity("scale", "1", 1.0, 0.8, 1.2, (0.97, 1.03), "factor on link lengths"),)
+        return (ParameterDefinition("scale", "1", 1.0, 0.8, 1.2, (0.97, 1.03), "factor on link lengths"),)
 
-    def modify(self, system: System) -> System:
+    def apply_to_system(self, system: System) -> System:
         """The system with scaled link lengths."""
         old = [system.parameters[name].symbol for name in _lengths(system, self.location)]
-        return substituted(system, old, [symbol * self["scale"] for symbol in old])
+        return substitute_symbols(system, old, [symbol * self["scale"] for symbol in old])
 
 
 @EFFECTS.register("rotor_inertia")
@@ -277,29 +288,29 @@ class RotorInertia(EffectBase):
     """Inertia of a motor's rotor, reflected to its joint: T += 1/2 armature v^2."""
 
     equation = "T += 1/2 armature v^2"
-    depends_on = "how hard it accelerates"
+    required_excitation = "how hard it accelerates"
 
     @classmethod
-    def locations(cls, system: System) -> tuple[str, ...]:
+    def possible_locations(cls, system: System) -> tuple[str, ...]:
         """Names of the arms' joints."""
         return robot_joints(system)
 
     @classmethod
-    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
         """Definition of armature [kg m^2]."""
-        size, text = strength(system, location), "inertia of the rotor at the joint"
-        return (Quantity("armature", "kg m^2", 0.0, 0.0, 5.0 * size, (0.0, size), text),)
+        size, text = relative_effort_limit(system, location), "inertia of the rotor at the joint"
+        return (ParameterDefinition("armature", "kg m^2", 0.0, 0.0, 5.0 * size, (0.0, size), text),)
 
-    def terms(self, state: MidpointState) -> Terms:
+    def step_terms(self, state: MidpointState) -> StepTerms:
         """The kinetic energy of the rotor."""
         v = state.v[state.system.mechanism.joint_index(self.location)]
-        return Terms(lagrangian=self["armature"] / 2 * v**2)
+        return StepTerms(lagrangian=self["armature"] / 2 * v**2)
 
 
 def _scaled(system: System, joints: list[str], factor: ca.SX) -> System:
     tree = system.mechanism
     bodies = {name: tree.joints[tree.joint_index(name)].bodies for name in joints}
-    return with_bodies(system, {name: [body.scaled(factor) for body in entry] for name, entry in bodies.items()})
+    return with_bodies(system, {name: [body.scaled_by(factor) for body in entry] for name, entry in bodies.items()})
 
 
 def _lengths(system: System, segment: str) -> list[str]:

@@ -14,21 +14,21 @@ from numpy.typing import NDArray
 
 from yid_ocp.data import JointGroup, Recording
 from yid_ocp.errors import OutputError
-from yid_ocp.files import new_file, reason
+from yid_ocp.files import atomic_write, os_error_reason
 
 Array = NDArray[np.float64]
-Kind = Literal["joints", "point", "vector", "wrench"]
-TYPES: Mapping[Kind, str] = {
+_SignalKind = Literal["joints", "point", "vector", "wrench"]
+_MESSAGE_TYPES: Mapping[_SignalKind, str] = {
     "joints": "sensor_msgs/msg/JointState",
     "point": "geometry_msgs/msg/PointStamped",
     "vector": "geometry_msgs/msg/Vector3Stamped",
     "wrench": "geometry_msgs/msg/WrenchStamped",
 }
-WORLD = "world"
+_WORLD_FRAME = "world"
 
 
 @dataclass(frozen=True)
-class Signal:
+class TopicSignal:
     """Time series of one ROS topic.
 
     Attributes
@@ -47,14 +47,14 @@ class Signal:
     """
 
     topic: str
-    kind: Kind
+    kind: _SignalKind
     t: Array
     values: Mapping[str, Array]
     names: Sequence[str] = field(default=())
-    frame: str = WORLD
+    frame: str = _WORLD_FRAME
 
 
-def export_mcap(signals: Sequence[Signal], path: str | os.PathLike[str]) -> float:
+def export_mcap(signals: Sequence[TopicSignal], path: str | os.PathLike[str]) -> float:
     """Write signals into one MCAP file, with the definitions of their messages, in the order of time.
 
     Parameters
@@ -95,20 +95,20 @@ def export_mcap(signals: Sequence[Signal], path: str | os.PathLike[str]) -> floa
         with tempfile.TemporaryDirectory(dir=path.parent) as folder:
             bag = Path(folder) / "bag"
             with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-                told = [writer.add_connection(s.topic, TYPES[s.kind], typestore=store) for s in signals]
+                told = [writer.add_connection(s.topic, _MESSAGE_TYPES[s.kind], typestore=store) for s in signals]
                 for stamp, k, message in made:
-                    writer.write(told[k], stamp, store.serialize_cdr(message, TYPES[signals[k].kind]))
+                    writer.write(told[k], stamp, store.serialize_cdr(message, _MESSAGE_TYPES[signals[k].kind]))
             [file] = bag.glob("*.mcap")
-            with new_file(path) as temporary:
+            with atomic_write(path) as temporary:
                 os.replace(file, temporary)
     except OSError as error:
-        raise OutputError(f"the file cannot be written: {reason(error)}", where=str(path)) from error
+        raise OutputError(f"the file cannot be written: {os_error_reason(error)}", where=str(path)) from error
     return shift
 
 
-def recorded_signals(recording: Recording) -> list[Signal]:
+def signals_from_recording(recording: Recording) -> list[TopicSignal]:
     """The signals of a recording: `/joint_states`, `/joint_commands`, `/external_efforts` and `/points/GROUP/POINT`."""
-    found: list[Signal] = []
+    found: list[TopicSignal] = []
     for group in recording.groups:
         if isinstance(group, JointGroup):
             own = group.channels
@@ -119,24 +119,30 @@ def recorded_signals(recording: Recording) -> list[Signal]:
                 },
                 "/external_efforts": {"effort": own["external_effort"]} if "external_effort" in own else {},
             }
-            found += [Signal(topic, "joints", group.t, v, group.names) for topic, v in parts.items() if v]
+            found += [TopicSignal(topic, "joints", group.t, v, group.names) for topic, v in parts.items() if v]
             continue
         for i, name in enumerate(group.names):
             place = {"xyz": group.position[:, i]}
-            found.append(Signal(f"/points/{group.name}/{name}", "point", group.t, place, frame=group.frame or WORLD))
+            found.append(
+                TopicSignal(f"/points/{group.name}/{name}", "point", group.t, place, frame=group.frame or _WORLD_FRAME)
+            )
     return found
 
 
-def _messages(signal: Signal, shift: float, store: Any) -> Iterator[tuple[int, Any]]:
+def _messages(signal: TopicSignal, shift: float, store: Any) -> Iterator[tuple[int, Any]]:
     """Stamp [ns] and message of every time at which there is a number."""
     types = store.types
-    make: Mapping[Kind, Callable[[Any, int], Any]] = {
-        "joints": lambda header, i: types[TYPES["joints"]](
+    make: Mapping[_SignalKind, Callable[[Any, int], Any]] = {
+        "joints": lambda header, i: types[_MESSAGE_TYPES["joints"]](
             header, list(signal.names), *(_row(signal, name, i) for name in ("position", "velocity", "effort"))
         ),
-        "point": lambda header, i: types[TYPES["point"]](header, _vector(types, "Point", signal.values["xyz"][i])),
-        "vector": lambda header, i: types[TYPES["vector"]](header, _vector(types, "Vector3", signal.values["xyz"][i])),
-        "wrench": lambda header, i: types[TYPES["wrench"]](
+        "point": lambda header, i: types[_MESSAGE_TYPES["point"]](
+            header, _vector(types, "Point", signal.values["xyz"][i])
+        ),
+        "vector": lambda header, i: types[_MESSAGE_TYPES["vector"]](
+            header, _vector(types, "Vector3", signal.values["xyz"][i])
+        ),
+        "wrench": lambda header, i: types[_MESSAGE_TYPES["wrench"]](
             header,
             types["geometry_msgs/msg/Wrench"](
                 _vector(types, "Vector3", signal.values["xyz"][i]), _vector(types, "Vector3", np.zeros(3))
@@ -150,7 +156,7 @@ def _messages(signal: Signal, shift: float, store: Any) -> Iterator[tuple[int, A
         yield stamp, make[signal.kind](types["std_msgs/msg/Header"](time, signal.frame), int(i))
 
 
-def _row(signal: Signal, name: str, i: int) -> Array:
+def _row(signal: TopicSignal, name: str, i: int) -> Array:
     """Values of all joints at one time; none at all of what is not known."""
     return np.ascontiguousarray(signal.values[name][i], float) if name in signal.values else np.zeros(0)
 

@@ -16,30 +16,30 @@ from yid_ocp.errors import ModelError
 from yid_ocp.files import file_sha256
 from yid_ocp.integrator import codegen, compiler
 from yid_ocp.integrator.step_model import (
-    ITERATION_LIMIT,
-    REST_ITERATION_LIMIT,
-    Directions,
-    Feedback,
-    Gradient,
-    Member,
+    EQUILIBRIUM_ITERATION_LIMIT,
+    NEWTON_ITERATION_LIMIT,
+    CostGradient,
+    NewtonStatus,
     Rollout,
-    StepCode,
+    RolloutInputs,
+    SensitivityDirections,
     StepLinearization,
     StepModel,
-    empty_linearization,
-    empty_rollout,
-    ended,
-    out_of_memory,
+    TrackingFeedback,
+    allocate_linearization,
+    allocate_rollout,
+    out_of_memory_error,
+    rollout_with_status,
 )
-from yid_ocp.parallel import Once, ask_together, map_threads
+from yid_ocp.parallel import LockedCache, batched_call, map_in_threads
 
 Array = NDArray[np.float64]
 
-BATCH, BATCH_PER_COLUMN = 1.7, 0.11
+_BATCH_COST, _BATCH_COST_PER_COLUMN = 1.7, 0.11
 """Cost of a batch in rollouts of one member, whatever its size, and the extra cost per sensitivity column."""
-GAIN = 1.5
+_MIN_BATCH_SPEEDUP = 1.5
 """Minimum speed-up of a batch over single rollouts; above 2 it is also faster than two threads."""
-WORTH = 50_000
+MIN_STEPS_TO_COMPILE_BATCH = 50_000
 """Number of steps that could have been batched after which the batched kernel is compiled."""
 
 
@@ -105,11 +105,20 @@ class _Gradient(_Struct):
 
 
 # In the order of the struct.
-MATRICES = ("rows_new", "rows_old", "rows_input", "p1_new", "p1_old", "p1_input", "rows_theta", "p1_theta")
+_LINEARIZATION_MATRICES = (
+    "residual_by_new",
+    "residual_by_old",
+    "residual_by_input",
+    "p1_by_new",
+    "p1_by_old",
+    "p1_by_input",
+    "residual_by_theta",
+    "p1_by_theta",
+)
 
 
 class _Linearization(_Struct):
-    _fields_ = tuple((name, ctypes.c_void_p) for name in ("rows", "p1", *MATRICES))
+    _fields_ = tuple((name, ctypes.c_void_p) for name in ("residual", "p1", *_LINEARIZATION_MATRICES))
 
 
 class _Outcome(_Struct):
@@ -123,10 +132,10 @@ class _Outcome(_Struct):
     )
 
 
-Kind = TypeVar("Kind", bound=_Struct)
+_StructType = TypeVar("_StructType", bound=_Struct)
 
 
-def _filled(kind: type[Kind], *values: object) -> Kind:
+def _filled(kind: type[_StructType], *values: object) -> _StructType:
     """A struct from numbers and from the addresses of arrays and other structs; None becomes a null pointer."""
     entries: list[object] = []
     for value in values:
@@ -160,12 +169,14 @@ class CompiledKernel:
         self._model = model
         self._library = library
         self._wished = 0  # steps for which a batch would have been the better way
-        self._batched: Once[None, tuple[ctypes.CDLL, int] | None] = Once(lambda _: _batched_library(model))
-        self._theta_columns: Once[tuple[str, ...], _ThetaColumns] = Once(
+        self._batched: LockedCache[None, tuple[ctypes.CDLL, int] | None] = LockedCache(
+            lambda _: _batched_library(model)
+        )
+        self._theta_columns: LockedCache[tuple[str, ...], _ThetaColumns] = LockedCache(
             lambda names: _theta_columns(model, library, names)
         )
 
-    def of(self, model: StepModel) -> CompiledKernel:
+    def with_model(self, model: StepModel) -> CompiledKernel:
         """A compiled kernel of the same library with another step model."""
         other = CompiledKernel(model, self._library)
         other._theta_columns, other._batched = self._theta_columns, self._batched
@@ -177,17 +188,17 @@ class CompiledKernel:
         start: Array,
         torque: Array,
         path: Array,
-        feedback: Feedback | None,
-        wanted: Directions | None,
+        feedback: TrackingFeedback | None,
+        wanted: SensitivityDirections | None,
     ) -> Rollout:
         """Simulate one rollout in C."""
-        return self._rolled_out(self._library, [Member(theta, start, torque, path, feedback, wanted)])[0]
+        return self._rolled_out(self._library, [RolloutInputs(theta, start, torque, path, feedback, wanted)])[0]
 
-    def rollouts(self, members: Sequence[Member]) -> list[Rollout]:
+    def rollout_batch(self, members: Sequence[RolloutInputs]) -> list[Rollout]:
         """Simulate all members in C, in SIMD batches where that is faster."""
-        return ask_together(self._rollouts, list(members))
+        return batched_call(self._rollouts, list(members))
 
-    def _rollouts(self, members: Sequence[Member]) -> list[Rollout]:
+    def _rollouts(self, members: Sequence[RolloutInputs]) -> list[Rollout]:
         alike: dict[Hashable, list[int]] = {}
         for i, member in enumerate(members):
             alike.setdefault(_sort(member), []).append(i)
@@ -200,51 +211,59 @@ class CompiledKernel:
             return self._together([members[i] for i in batch])
 
         found: dict[int, Rollout] = {}
-        for batch, rollouts in zip(batches, map_threads(one, batches), strict=True):
+        for batch, rollouts in zip(batches, map_in_threads(one, batches), strict=True):
             found |= zip(batch, rollouts, strict=True)
         return [found[i] for i in range(len(members))]
 
-    def _split(self, group: Sequence[int], members: Sequence[Member]) -> list[Sequence[int]]:
+    def _split(self, group: Sequence[int], members: Sequence[RolloutInputs]) -> list[Sequence[int]]:
         """Batches of members that are alike, and single ones where a batch would have too few.
 
         As results differ by rounding, the same members are split in the same way whatever threads there are.
         """
         batches: list[Sequence[int]] = []
         left = list(group)
-        fewest = max(GAIN * (BATCH + BATCH_PER_COLUMN * _width(members[left[0]])), 2.0)
+        fewest = max(_MIN_BATCH_SPEEDUP * (_BATCH_COST + _BATCH_COST_PER_COLUMN * _width(members[left[0]])), 2.0)
         if len(left) >= fewest:
             self._wished += sum(len(members[i].torque) for i in left)
-        known = self._batched(None) if len(left) >= fewest and self._wished > WORTH else None
+        known = self._batched(None) if len(left) >= fewest and self._wished > MIN_STEPS_TO_COMPILE_BATCH else None
         while known is not None and min(len(left), known[1]) >= fewest:
             batches.append(left[: known[1]])
             left = left[known[1] :]
         return [*batches, *([i] for i in left)]
 
-    def _together(self, members: Sequence[Member]) -> list[Rollout]:
+    def _together(self, members: Sequence[RolloutInputs]) -> list[Rollout]:
         known = self._batched(None) if len(members) > 1 else None
         if known is None:
             return [self._rolled_out(self._library, [member])[0] for member in members]
         found = self._rolled_out(known[0], members)
         # a batch knows simplified Newton only; what needs more, and what fails, is told by the kernel of one member
         return [
-            rollout if rollout.status.ok else self._rolled_out(self._library, [member])[0]
+            rollout if rollout.status.is_converged else self._rolled_out(self._library, [member])[0]
             for rollout, member in zip(found, members, strict=True)
         ]
 
-    def _rolled_out(self, library: ctypes.CDLL, members: Sequence[Member]) -> list[Rollout]:
+    def _rolled_out(self, library: ctypes.CDLL, members: Sequence[RolloutInputs]) -> list[Rollout]:
         """Rollouts by one call of the kernel of one member, or of a batch."""
         sizes = self._model.sizes
         outs, motions, trajectories, sensitivities = [], [], [], []
         for m in members:
-            out = empty_rollout(sizes, len(m.torque), None if m.wanted is None else m.wanted.count)
-            out.state[0] = m.start
+            out = allocate_rollout(sizes, len(m.torque), None if m.directions is None else m.directions.count)
+            out.state[0] = m.initial_state
             directions = None
-            if m.wanted is not None and out.by_state is not None:
-                out.by_state[0] = m.wanted.start
-                given = _doubles(m.wanted.torque), _doubles(m.wanted.path)
-                sensitivities.append(_filled(_Sensitivities, out.by_state, out.by_multipliers, out.by_effort, *given))
-                directions = self._directions(m.wanted.names, m.wanted.count)
-            motions.append(self._motion(len(m.torque), m.theta, m.torque, m.path, m.feedback, directions))
+            if m.directions is not None and out.state_sensitivity is not None:
+                out.state_sensitivity[0] = m.directions.initial_state_tangents
+                given = _doubles(m.directions.torque_tangents), _doubles(m.directions.prescribed_tangents)
+                sensitivities.append(
+                    _filled(
+                        _Sensitivities,
+                        out.state_sensitivity,
+                        out.multipliers_sensitivity,
+                        out.effort_sensitivity,
+                        *given,
+                    )
+                )
+                directions = self._directions(m.directions.parameter_names, m.directions.count)
+            motions.append(self._motion(len(m.torque), m.theta, m.torque, m.prescribed_path, m.feedback, directions))
             trajectories.append(_filled(_Trajectory, out.state, out.multipliers, out.effort, out.torque))
             outs.append(out)
         outcomes = (_Outcome * len(members))()
@@ -257,24 +276,24 @@ class CompiledKernel:
         )
         self._check(code, outcomes[0])
         return [
-            ended(out, sizes, o.status, o.step, o.error, (o.iterations, o.factorisations))
+            rollout_with_status(out, sizes, o.status, o.step, o.error, (o.iterations, o.factorisations))
             for out, o in zip(outs, outcomes, strict=True)
         ]
 
-    def adjoint(
+    def adjoint_gradient(
         self,
         theta: Array,
         rollout: Rollout,
-        feedback: Feedback | None,
+        feedback: TrackingFeedback | None,
         names: tuple[str, ...],
         by_state: Array,
         by_multipliers: Array | None,
         by_effort: Array | None,
-    ) -> Gradient:
+    ) -> CostGradient:
         """Gradient of a cost along a rollout, computed backwards in C."""
         sizes, steps = self._model.sizes, len(rollout.multipliers)
         shapes = (len(names),), (sizes["nx"],), (steps, sizes["nu"]), (steps + 1, sizes["nc"])
-        gradient = Gradient(*(np.zeros(shape) for shape in shapes))
+        gradient = CostGradient(*(np.zeros(shape) for shape in shapes))
         along = [_doubles(a) for a in (rollout.state, rollout.multipliers, None, rollout.torque)]
         partials = [_doubles(a) for a in (by_state, by_multipliers, by_effort)]
         outcome = _Outcome()
@@ -287,7 +306,7 @@ class CompiledKernel:
             ctypes.byref(outcome),
         )
         self._check(code, outcome)
-        if code != StepCode.OK:
+        if code != NewtonStatus.OK:
             for array in vars(gradient).values():
                 array[:] = np.nan
         return gradient
@@ -302,21 +321,21 @@ class CompiledKernel:
         derivatives: bool,
     ) -> StepLinearization:
         """Residuals and Jacobians of many steps, evaluated in C."""
-        out = empty_linearization(self._model.sizes, len(torque), len(names), derivatives)
+        out = allocate_linearization(self._model.sizes, len(torque), len(names), derivatives)
         along = [_doubles(a) for a in (state, multipliers, None, torque)]
-        matrices = [getattr(out, name) if derivatives else None for name in MATRICES]
+        matrices = [getattr(out, name) if derivatives else None for name in _LINEARIZATION_MATRICES]
         outcome = _Outcome()
         directions = self._directions(names, len(names)) if derivatives else None
         code = self._library.yid_linearize(
             ctypes.byref(self._motion(len(torque), theta, None, None, None, directions)),
             ctypes.byref(_filled(_Trajectory, *along)),
-            ctypes.byref(_filled(_Linearization, out.rows, out.p1, *matrices)),
+            ctypes.byref(_filled(_Linearization, out.residual, out.p1, *matrices)),
             ctypes.byref(outcome),
         )
         self._check(code, outcome)
         return out
 
-    def slopes(
+    def step_jacobians(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, load_rows: Array, load_momentum: Array
     ) -> tuple[Array, Array]:
         """Jacobians of single steps, solved in C."""
@@ -334,22 +353,22 @@ class CompiledKernel:
             ctypes.byref(outcome),
         )
         self._check(code, outcome)
-        if code != StepCode.OK:
+        if code != NewtonStatus.OK:
             raise np.linalg.LinAlgError(f"the equations of step {outcome.step} are singular")
         return after, effort
 
-    def rest(
+    def find_equilibrium(
         self, theta: Array, unknowns: Array, given: Array, held: Array, stiffness: float, tolerance: float
     ) -> tuple[Array, float, bool]:
         """Static equilibrium by Newton's iteration in C."""
         nu, driven = len(held), np.array(self._model.system.driven_indices, np.int32)
         hold = _filled(_Feedback, nu, driven, stiffness * np.eye(nu), _doubles(given[:nu])) if nu else None
         inputs = (_doubles(theta), _doubles(held), _doubles(given[nu:]))
-        motion = _filled(_Motion, 1, REST_ITERATION_LIMIT, self._model.time_step, tolerance, *inputs, hold, None)
+        motion = _filled(_Motion, 1, EQUILIBRIUM_ITERATION_LIMIT, self._model.time_step, tolerance, *inputs, hold, None)
         w, outcome = np.array(unknowns, float), _Outcome()
         code = self._library.yid_rest(ctypes.byref(motion), ctypes.c_void_p(w.ctypes.data), ctypes.byref(outcome))
         self._check(code, outcome)
-        return w, outcome.error, code == StepCode.OK
+        return w, outcome.error, code == NewtonStatus.OK
 
     def _motion(
         self,
@@ -357,15 +376,15 @@ class CompiledKernel:
         theta: Array,
         torque: Array | None,
         path: Array | None,
-        feedback: Feedback | None,
+        feedback: TrackingFeedback | None,
         directions: _Directions | None,
     ) -> _Motion:
         loop = None
         if feedback is not None:
-            index = np.ascontiguousarray(feedback.index, np.int32)
+            index = np.ascontiguousarray(feedback.state_indices, np.int32)
             loop = _filled(_Feedback, len(index), index, _doubles(feedback.gain), _doubles(feedback.reference))
         inputs = (_doubles(theta), _doubles(torque), _doubles(path))
-        numbers = (steps, ITERATION_LIMIT, self._model.time_step, self._model.tolerance)
+        numbers = (steps, NEWTON_ITERATION_LIMIT, self._model.time_step, self._model.tolerance)
         return _filled(_Motion, *numbers, *inputs, loop, directions)
 
     def _directions(self, names: tuple[str, ...], count: int) -> _Directions:
@@ -377,24 +396,24 @@ class CompiledKernel:
         return _filled(_Directions, count, len(names), columns.address, *columns.patterns, *values, w, iw)
 
     def _check(self, code: int, outcome: _Outcome) -> None:
-        if code == StepCode.OUT_OF_MEMORY:
-            raise out_of_memory("the work on one step", outcome.memory)
+        if code == NewtonStatus.OUT_OF_MEMORY:
+            raise out_of_memory_error("the work on one step", outcome.memory)
 
 
-def _sort(member: Member) -> Hashable:
+def _sort(member: RolloutInputs) -> Hashable:
     """What members of one batch have in common."""
-    feedback, wanted = member.feedback, member.wanted
-    return None if feedback is None else tuple(np.asarray(feedback.index).tolist()), wanted is None
+    feedback, wanted = member.feedback, member.directions
+    return None if feedback is None else tuple(np.asarray(feedback.state_indices).tolist()), wanted is None
 
 
-def _width(member: Member) -> int:
+def _width(member: RolloutInputs) -> int:
     """Columns of derivatives."""
-    return 0 if member.wanted is None else member.wanted.count
+    return 0 if member.directions is None else member.directions.count
 
 
 def _batched_library(model: StepModel) -> tuple[ctypes.CDLL, int] | None:
     """The kernel of a batch and how many members it takes; None where compiler or machine have no vectors for it."""
-    source = codegen.kernel_source(model.functions, model.structure, batched=True)
+    source = codegen.kernel_source(model.functions, model.index_tables, batched=True)
     library = None if source is None else compiler.compile_library(source)
     count = 0 if library is None else int(library.yid_lanes())
     return None if library is None or not count else (library, count)
@@ -408,8 +427,8 @@ def _theta_columns(model: StepModel, kernel: ctypes.CDLL, names: tuple[str, ...]
     """
 
     def source() -> str:
-        function = codegen.theta_function(model.equations, names)
-        return codegen.functions_source(function.name(), (function,))
+        function = codegen.parameter_jacobian_function(model.equations, names)
+        return codegen.casadi_c_source(function.name(), (function,))
 
     places = [str(model.system.parameters.index(name)) for name in names]
     told = "\0".join([file_sha256(Path(codegen.__file__)), Path(kernel._name).name, *places])

@@ -24,27 +24,27 @@ from yid_ocp.files import file_sha256
 
 log = logging.getLogger(__name__)
 
-FLAGS = ("-ftree-vectorize", "-ffp-contract=fast", "-fopenmp-simd", "-fPIC", "-shared")
-NATIVE = ("-march=native",)
+_COMMON_FLAGS = ("-ftree-vectorize", "-ffp-contract=fast", "-fopenmp-simd", "-fPIC", "-shared")
+_NATIVE_FLAGS = ("-march=native",)
 # Straight lines of arithmetic have no branch to thread and few constants left to fold; looking for them is a third of
 # GCC's time on a step of 50 variables, and what it makes runs as fast without. Other compilers refuse these words.
-GCC = ("-fno-tree-dominator-opts", "-fno-tree-ccp", "-fno-tree-bit-ccp")
+_GCC_FLAGS = ("-fno-tree-dominator-opts", "-fno-tree-ccp", "-fno-tree-bit-ccp")
 
 # -O2 takes 1.7 times as long on a step of 43 variables, for a gain of 2 to 4 %, and minutes on single functions of tens
 # of thousands of lines.
-LEVEL = "-O1"
+_OPTIMIZATION_FLAG = "-O1"
 # What runs for seconds in all and is new for every model is worth no more: -O1 takes a minute on 70 000 lines, this
 # three seconds, for code that is still two or three times as fast as CasADi's own machine.
-QUICK = "-O0"
+_NO_OPTIMIZATION_FLAG = "-O0"
 
 
 # Ten times what the longest of our functions takes; a compiler that hangs would hang the run.
-PATIENCE, VERSION_PATIENCE = 900.0, 30.0  # [s]
-MARK = "yid_compiled"
+_COMPILE_TIMEOUT, _VERSION_TIMEOUT = 900.0, 30.0  # [s]
+_MARKER_SYMBOL = "yid_compiled"
 
 
 @functools.cache
-def compiler() -> str | None:
+def _compiler_path() -> str | None:
     """Path of the C compiler, or None with one log message; the environment variable CC selects it, `none` disables.
 
     Raises
@@ -67,7 +67,7 @@ def compiler() -> str | None:
     return path
 
 
-def cache_folder() -> Path:
+def _cache_folder() -> Path:
     """Path of the private folder of compiled code, created if absent; YID_OCP_CACHE overrides it.
 
     Raises
@@ -97,12 +97,12 @@ def cache_folder() -> Path:
 
 @functools.cache
 def _version(path: str) -> str:
-    return _said([path, "--version"], VERSION_PATIENCE)[1]
+    return _said([path, "--version"], _VERSION_TIMEOUT)[1]
 
 
 def _flags(path: str) -> tuple[str, ...]:
     """What a compiler is told wherever its code runs."""
-    return (*FLAGS, *GCC) if "Free Software Foundation" in _version(path) else FLAGS
+    return (*_COMMON_FLAGS, *_GCC_FLAGS) if "Free Software Foundation" in _version(path) else _COMMON_FLAGS
 
 
 @functools.cache
@@ -114,7 +114,7 @@ def _machine() -> str:
         processor += "".join(
             sorted({line for line in info.read_text(errors="replace").splitlines() if line.startswith(wanted)})
         )
-    version = _version(compiler() or "none")
+    version = _version(_compiler_path() or "none")
     return f"{version}|{platform.system()}|{processor}"
 
 
@@ -129,7 +129,7 @@ def compile_library(source: str, make: Callable[[], str] | None = None) -> ctype
     make : callable, optional
         Returns the C text if `source` is not the C text; called only if the library is not in the cache.
     """
-    target = _library_file(source, LEVEL, make)
+    target = _library_file(source, _OPTIMIZATION_FLAG, make)
     if target is None:
         return None
     try:
@@ -149,7 +149,7 @@ def compiled_function(function: ca.Function) -> ca.Function:
     """
     generator = ca.CodeGenerator(function.name(), {"with_header": False, "indent": 0})
     generator.add(function)
-    target = _library_file(generator.dump(), QUICK)
+    target = _library_file(generator.dump(), _NO_OPTIMIZATION_FLAG)
     if target is None:
         return function
     try:
@@ -161,14 +161,14 @@ def compiled_function(function: ca.Function) -> ca.Function:
 
 def _library_file(source: str, level: str, make: Callable[[], str] | None = None) -> Path | None:
     """The library in the cache, compiled if it is not there yet; None where nothing can compile it."""
-    path = compiler()
+    path = _compiler_path()
     if path is None:
         return None
     flags = _flags(path)
     key = hashlib.sha256(
-        "\0".join([source, level, *flags, *NATIVE, _machine(), ca.CasadiMeta.version()]).encode()
+        "\0".join([source, level, *flags, *_NATIVE_FLAGS, _machine(), ca.CasadiMeta.version()]).encode()
     ).hexdigest()[:32]
-    folder = cache_folder()
+    folder = _cache_folder()
     kept = _kept(folder, key)
     if kept is not None:
         return kept
@@ -177,10 +177,10 @@ def _library_file(source: str, level: str, make: Callable[[], str] | None = None
         with tempfile.TemporaryDirectory(dir=folder) as work:
             text, built = Path(work) / "source.c", Path(work) / "library.so"
             text.write_text(
-                f"{source if make is None else make()}\nint {MARK}(void) {{ return 1; }}\n", encoding="utf-8"
+                f"{source if make is None else make()}\nint {_MARKER_SYMBOL}(void) {{ return 1; }}\n", encoding="utf-8"
             )
-            for told in ((*flags, *NATIVE), flags):
-                good, said = _said([path, level, *told, str(text), "-o", str(built), "-lm"], PATIENCE)
+            for told in ((*flags, *_NATIVE_FLAGS), flags):
+                good, said = _said([path, level, *told, str(text), "-o", str(built), "-lm"], _COMPILE_TIMEOUT)
                 if good and _is_ours(built):
                     target = folder / f"{key}-{file_sha256(built)[:32]}.so"
                     os.replace(built, target)
@@ -229,6 +229,6 @@ def _said(command: list[str], patience: float) -> tuple[bool, str]:
 def _is_ours(built: Path) -> bool:
     """Whether what a compiler left is a library with our symbols."""
     try:
-        return bool(getattr(ctypes.CDLL(str(built)), MARK)() == 1)
+        return bool(getattr(ctypes.CDLL(str(built)), _MARKER_SYMBOL)() == 1)
     except (OSError, AttributeError):
         return False

@@ -26,48 +26,54 @@ from typing import Literal, get_args
 import casadi as ca
 
 from yid_ocp.errors import ModelError
-from yid_ocp.model.kinematics import Kinematics, RigidBody, cross, forward_kinematics, rigid_body
+from yid_ocp.model.kinematics import (
+    Kinematics,
+    RigidBodyDerivatives,
+    cross_product,
+    forward_kinematics,
+    rigid_body_derivatives,
+)
 from yid_ocp.model.mechanism import Frame, Placement
-from yid_ocp.model.system import ClosedForce, Grasp, MidpointState, System
+from yid_ocp.model.system import ForceWithDerivatives, Grasp, MidpointState, System
 
 ForceSplit = Literal["symmetric", "left"]
-ConstraintForce = Literal["node", "midpoint"]
+ConstraintForcePlacement = Literal["node", "midpoint"]
 
 
 @dataclass(frozen=True)
-class ConstraintPulls:
+class ConstraintImpulses:
     """Constraint Jacobians that give the constraint impulses of a step, with closed-form derivatives by q.
 
     The balance loses (share_0 Dphi(q_k) + share_m Dphi(q_m))' lam, p1 loses share_m (Dphi(q_m) - Dphi(q_{k+1}))' lam.
 
     Attributes
     ----------
-    share_0, share_m : float
+    start_share, midpoint_share : float
         Their sum is one.
-    before, middle, after : casadi.SX, shape (m, n)
+    before_jacobian, middle_jacobian, after_jacobian : casadi.SX, shape (m, n)
         Dphi at q_k, q_m and q_{k+1}, all of one sparsity.
-    before_by_q, middle_by_q, after_by_q : casadi.SX, shape (n, n)
+    before_force_by_q, middle_force_by_q, after_force_by_q : casadi.SX, shape (n, n)
         d(Dphi(q)' lam)/dq there.
     """
 
-    share_0: float
-    share_m: float
-    before: ca.SX
-    middle: ca.SX
-    after: ca.SX
-    before_by_q: ca.SX
-    middle_by_q: ca.SX
-    after_by_q: ca.SX
+    start_share: float
+    midpoint_share: float
+    before_jacobian: ca.SX
+    middle_jacobian: ca.SX
+    after_jacobian: ca.SX
+    before_force_by_q: ca.SX
+    middle_force_by_q: ca.SX
+    after_force_by_q: ca.SX
 
     @property
-    def left(self) -> ca.SX:
+    def left_jacobian(self) -> ca.SX:
         """Jacobian whose transpose times lam is subtracted in the momentum balance, shape (m, n)."""
-        return self.share_0 * self.before + self.share_m * self.middle
+        return self.start_share * self.before_jacobian + self.midpoint_share * self.middle_jacobian
 
     @property
-    def right(self) -> ca.SX:
+    def right_jacobian(self) -> ca.SX:
         """Jacobian whose transpose times lam is subtracted in p1, shape (m, n)."""
-        return self.share_m * (self.middle - self.after)
+        return self.midpoint_share * (self.middle_jacobian - self.after_jacobian)
 
 
 @dataclass(frozen=True)
@@ -92,29 +98,29 @@ class DiscreteEquations:
         Motor torques held over the step [N m], or what servos are commanded [rad or m].
     theta : casadi.SX, shape (ntheta, 1)
     time_step : casadi.SX
-        Recorded step [s]; the step in the equations is this times `System.time_scale`.
+        Recorded step [s]; the step in the equations is this times `System.recorded_time_scale`.
     momentum_balance : casadi.SX, shape (n, 1)
         Left side of the DEL equation.
-    internal : casadi.SX, shape (nz, 1)
+    internal_residual : casadi.SX, shape (nz, 1)
         Midpoint equations of the internal coordinates.
-    internal_at_rest : casadi.SX, shape (nz, 1)
+    internal_residual_at_rest : casadi.SX, shape (nz, 1)
         Equations of the internal coordinates in a static equilibrium.
-    constraint : casadi.SX, shape (m, 1)
+    constraint_residual : casadi.SX, shape (m, 1)
         phi(q_{k+1}) - C lam / h.
-    constraint_gain : casadi.SX or None, shape (m, 1)
-        Where a grasp relaxes: 1 + T/h, the factor on phi(q_{k+1}) in `constraint`; phi(q_k) then has 1 minus it.
+    constraint_relaxation_gain : casadi.SX or None, shape (m, 1)
+        Where a grasp relaxes: 1 + T/h, the factor on phi(q_{k+1}) in `constraint_residual`; phi(q_k) then has 1 minus it.
     p1 : casadi.SX, shape (n, 1)
         p_{k+1}.
-    rigid : RigidBody
+    rigid_body_terms : RigidBody
         Closed-form derivatives of the bodies' Lagrangian at the midpoint.
-    balance_rest, p1_rest : casadi.SX, shape (n, 1)
+    balance_remainder, p1_remainder : casadi.SX, shape (n, 1)
         `momentum_balance` and `p1` without the bodies' Lagrangian, p_k, the constraint impulses and the closed force;
         this gives the Jacobians without differentiating the tree.
-    closed : ClosedForce or None
+    closed_form_force : ClosedForce or None
         Sum of the forces that effects give with their slopes, at the midpoint.
-    closed_shares : (float, float)
+    closed_form_force_shares : (float, float)
         Parts of its impulse h F in `momentum_balance` and in `p1`.
-    pulls : ConstraintPulls
+    constraint_impulses : ConstraintPulls
         The constraints' part of `momentum_balance` and of `p1`, before `row_scale`.
     row_scale : casadi.SX, shape (n, 1)
         Factor on each row of the bodies' part, in the balance and in p1 (1, or the compliance of a compliant one).
@@ -122,7 +128,7 @@ class DiscreteEquations:
 
     system: System
     force_split: ForceSplit
-    constraint_force: ConstraintForce
+    constraint_force: ConstraintForcePlacement
     q0: ca.SX
     q1: ca.SX
     z0: ca.SX
@@ -134,17 +140,17 @@ class DiscreteEquations:
     time_step: ca.SX
     h: ca.SX
     momentum_balance: ca.SX
-    internal: ca.SX
-    internal_at_rest: ca.SX
-    constraint: ca.SX
-    constraint_gain: ca.SX | None
+    internal_residual: ca.SX
+    internal_residual_at_rest: ca.SX
+    constraint_residual: ca.SX
+    constraint_relaxation_gain: ca.SX | None
     p1: ca.SX
-    rigid: RigidBody
-    balance_rest: ca.SX
-    p1_rest: ca.SX
-    closed: ClosedForce | None
-    closed_shares: tuple[float, float]
-    pulls: ConstraintPulls
+    rigid_body_terms: RigidBodyDerivatives
+    balance_remainder: ca.SX
+    p1_remainder: ca.SX
+    closed_form_force: ForceWithDerivatives | None
+    closed_form_force_shares: tuple[float, float]
+    constraint_impulses: ConstraintImpulses
     row_scale: ca.SX
 
     @property
@@ -155,22 +161,26 @@ class DiscreteEquations:
     @property
     def residual(self) -> ca.SX:
         """Residual of the step's unknowns: free rows of the balance, internal and constraint equations."""
-        return ca.vertcat(self.momentum_balance[list(self.system.free_indices), 0], self.internal, self.constraint)
+        return ca.vertcat(
+            self.momentum_balance[list(self.system.free_indices), 0], self.internal_residual, self.constraint_residual
+        )
 
     @property
-    def closed_impulses(self) -> tuple[ca.SX, ca.SX] | None:
+    def closed_form_impulses(self) -> tuple[ca.SX, ca.SX] | None:
         """Impulse of the closed force in `momentum_balance` and in `p1`, shape (n, 1) [N m s]; None without one."""
-        if self.closed is None:
+        if self.closed_form_force is None:
             return None
-        first, second = (part * self.h * self.row_scale * self.closed.force for part in self.closed_shares)
+        first, second = (
+            part * self.h * self.row_scale * self.closed_form_force.force for part in self.closed_form_force_shares
+        )
         return first, second
 
     @property
-    def closure(self) -> ca.SX:
+    def constraint_violation(self) -> ca.SX:
         """Constraint violation phi(q) - C lam / h at (q1, z1), without relaxation, shape (m, 1)."""
-        if self.constraint_gain is None:
-            return self.constraint
-        return ca.substitute(self.constraint, ca.vertcat(self.q0, self.z0), ca.vertcat(self.q1, self.z1))
+        if self.constraint_relaxation_gain is None:
+            return self.constraint_residual
+        return ca.substitute(self.constraint_residual, ca.vertcat(self.q0, self.z0), ca.vertcat(self.q1, self.z1))
 
     @property
     def unknowns(self) -> ca.SX:
@@ -179,7 +189,7 @@ class DiscreteEquations:
 
 
 def discrete_equations(
-    system: System, force_split: ForceSplit = "symmetric", constraint_force: ConstraintForce = "midpoint"
+    system: System, force_split: ForceSplit = "symmetric", constraint_force: ConstraintForcePlacement = "midpoint"
 ) -> DiscreteEquations:
     """Build the DEL equations of one step.
 
@@ -207,12 +217,14 @@ def discrete_equations(
     """
     if force_split not in get_args(ForceSplit):
         raise ModelError(f"force_split = '{force_split}'", allowed=", ".join(get_args(ForceSplit)))
-    if constraint_force not in get_args(ConstraintForce):
-        raise ModelError(f"constraint_force = '{constraint_force}'", allowed=", ".join(get_args(ConstraintForce)))
+    if constraint_force not in get_args(ConstraintForcePlacement):
+        raise ModelError(
+            f"constraint_force = '{constraint_force}'", allowed=", ".join(get_args(ConstraintForcePlacement))
+        )
     at = _Symbols.of(system)
     q0, q1, z0, z1, lam, h, qm, vm = at.q0, at.q1, at.z0, at.z1, at.lam, at.h, at.qm, at.vm
     kinematics = forward_kinematics(system.mechanism, qm)
-    rigid = rigid_body(kinematics, vm, system.gravity)
+    rigid = rigid_body_derivatives(kinematics, vm, system.gravity)
     terms = _summed_terms(system, at, kinematics)
     extra_q, extra_v = ca.gradient(terms.lagrangian, qm), ca.gradient(terms.lagrangian, vm)
 
@@ -223,15 +235,19 @@ def discrete_equations(
     constraint, gain = _constraint(system, at)
     balance_rest = scale * (h / 2 * extra_q - extra_v + share * push) - spring
     p1_rest = scale * (h / 2 * extra_q + extra_v + (1 - share) * push) - spring
-    balance = at.p0 + scale * (h / 2 * rigid.by_q - rigid.by_v - pulls.left.T @ lam) + balance_rest
-    p1 = scale * (h / 2 * rigid.by_q + rigid.by_v - pulls.right.T @ lam) + p1_rest
+    balance = (
+        at.p0
+        + scale * (h / 2 * rigid.lagrangian_by_q - rigid.lagrangian_by_v - pulls.left_jacobian.T @ lam)
+        + balance_rest
+    )
+    p1 = scale * (h / 2 * rigid.lagrangian_by_q + rigid.lagrangian_by_v - pulls.right_jacobian.T @ lam) + p1_rest
     if terms.closed is not None:
         balance += share * h * scale * terms.closed.force
         p1 += (1 - share) * h * scale * terms.closed.force
-    fields = ("by_q", "by_v", "kinetic", "potential", "S", "D", "F", "B", "G")
+    fields = ("lagrangian_by_q", "lagrangian_by_v", "kinetic_energy", "potential_energy", "S", "D", "F", "B", "G")
     closed = terms.closed
     if closed is not None:
-        closed = ClosedForce(at.placed(closed.force), at.placed(closed.A), at.placed(closed.T))
+        closed = ForceWithDerivatives(at.placed(closed.force), at.placed(closed.A), at.placed(closed.T))
     return DiscreteEquations(
         system=system,
         force_split=force_split,
@@ -247,17 +263,17 @@ def discrete_equations(
         time_step=at.time_step,
         h=h,
         momentum_balance=at.placed(balance),
-        internal=at.placed(terms.internal),
-        internal_at_rest=at.placed(terms.internal_at_rest),
-        constraint=constraint,
-        constraint_gain=gain,
+        internal_residual=at.placed(terms.internal),
+        internal_residual_at_rest=at.placed(terms.internal_at_rest),
+        constraint_residual=constraint,
+        constraint_relaxation_gain=gain,
         p1=at.placed(p1),
-        rigid=RigidBody(**{name: at.placed(getattr(rigid, name)) for name in fields}),
-        balance_rest=at.placed(balance_rest),
-        p1_rest=at.placed(p1_rest),
-        closed=closed,
-        closed_shares=(share, 1 - share),
-        pulls=pulls,
+        rigid_body_terms=RigidBodyDerivatives(**{name: at.placed(getattr(rigid, name)) for name in fields}),
+        balance_remainder=at.placed(balance_rest),
+        p1_remainder=at.placed(p1_rest),
+        closed_form_force=closed,
+        closed_form_force_shares=(share, 1 - share),
+        constraint_impulses=pulls,
         row_scale=ca.densify(scale),
     )
 
@@ -284,12 +300,12 @@ class _Symbols:
 
     @staticmethod
     def of(system: System) -> _Symbols:
-        n, m, internal = system.size, system.constraint_count, system.internal
+        n, m, internal = system.n_coordinates, system.n_constraints, system.internal_coordinates
         sizes = {"q0": n, "q1": n, "p0": n, "z0": len(internal), "z1": len(internal), "lam": m, "u": len(system.driven)}
         sizes |= {"time_step": 1, "qm": n, "vm": n, "zm": len(internal), "z_rate": len(internal), "pull_rate": m}
         symbols = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
         own = ca.vertcat(*internal.values()) if internal else ca.SX(0, 1)
-        return _Symbols(**symbols, h=symbols["time_step"] * system.time_scale, internal=own)
+        return _Symbols(**symbols, h=symbols["time_step"] * system.recorded_time_scale, internal=own)
 
     def placed(self, expression: ca.SX, dense: bool = True) -> ca.SX:
         """An expression of the midpoint as one of the two nodes."""
@@ -310,26 +326,26 @@ class _SummedTerms:
     viscous: ca.SX
     internal: ca.SX
     internal_at_rest: ca.SX
-    closed: ClosedForce | None
+    closed: ForceWithDerivatives | None
 
 
 def _summed_terms(system: System, at: _Symbols, kinematics: Kinematics) -> _SummedTerms:
-    names = tuple(system.internal)
+    names = tuple(system.internal_coordinates)
     rows = {name: i for i, name in enumerate(names)}
     state = MidpointState(system, kinematics, at.qm, at.vm, at.zm, at.z_rate, at.u, at.pull_rate, rows, at.h)
     energy = -system.elastic_energy(at.qm)
     force, viscous = system.input_force(at.u, at.qm, at.vm), system.viscous_force(at.vm)
     equations: dict[str, ca.SX] = {}
     at_rest: dict[str, ca.SX] = {}
-    closed: list[ClosedForce] = []
+    closed: list[ForceWithDerivatives] = []
     for effect in system.effects:
-        terms = effect.terms(state)
+        terms = effect.step_terms(state)
         energy += terms.lagrangian
-        force = force if terms.force is None else force + terms.force
-        viscous = viscous if terms.viscous is None else viscous + terms.viscous
-        equations.update(terms.internal)
-        at_rest.update(terms.at_rest)
-        closed += [] if terms.closed is None else [terms.closed]
+        force = force if terms.generalized_force is None else force + terms.generalized_force
+        viscous = viscous if terms.dissipative_force is None else viscous + terms.dissipative_force
+        equations.update(terms.internal_equations)
+        at_rest.update(terms.static_equations)
+        closed += [] if terms.force_with_derivatives is None else [terms.force_with_derivatives]
     missing = [name for name in names if name not in equations]
     if missing:
         raise ModelError(f"internal coordinate '{missing[0]}' has no equation")
@@ -340,45 +356,46 @@ def _summed_terms(system: System, at: _Symbols, kinematics: Kinematics) -> _Summ
         viscous,
         ca.vertcat(*(equations[name] for name in names)) if names else ca.SX(0, 1),
         ca.vertcat(*(at_rest.get(name, equations[name]) for name in names)) if names else ca.SX(0, 1),
-        ClosedForce(*(sum(rest, first) for first, *rest in parts)) if closed else None,
+        ForceWithDerivatives(*(sum(rest, first) for first, *rest in parts)) if closed else None,
     )
 
 
 def _row_scale(system: System, at: _Symbols) -> tuple[ca.SX, ca.SX]:
     """Factor on every row, and what the spring of a compliant coordinate takes off it, both shape (n, 1)."""
-    scale, held = [ca.SX(1)] * system.size, [ca.SX(0)] * system.size
-    for joint, compliance in system.compliant.items():
+    scale, held = [ca.SX(1)] * system.n_coordinates, [ca.SX(0)] * system.n_coordinates
+    for joint, compliance in system.joint_compliances.items():
         index = system.mechanism.joint_index(joint)
         q, v = at.qm[index], at.vm[index]
-        relaxed = q + system.relaxing[joint] * v if joint in system.relaxing else q
+        relaxed = q + system.joint_relaxation_times[joint] * v if joint in system.joint_relaxation_times else q
         scale[index], held[index] = compliance, at.h / 2 * relaxed
     return ca.vertcat(*scale), ca.vertcat(*held)
 
 
 def _constraint(system: System, at: _Symbols) -> tuple[ca.SX, ca.SX | None]:
-    """`constraint` and `constraint_gain` of `DiscreteEquations`."""
+    """`constraint_residual` and `constraint_relaxation_gain` of `DiscreteEquations`."""
 
     def phi(q: ca.SX, z: ca.SX) -> ca.SX:
-        return ca.substitute(system.constraints(forward_kinematics(system.mechanism, q)), at.internal, z)
+        return ca.substitute(system.constraint_residual(forward_kinematics(system.mechanism, q)), at.internal, z)
 
     closure, gain = phi(at.q1, at.z1), None
-    relaxation = system.constraint_relaxation()
+    relaxation = system.constraint_relaxation_times()
     if relaxation is not None:
         gain = 1 + relaxation / at.h
         closure = gain * closure + (1 - gain) * phi(at.q0, at.z0)
     return ca.densify(closure - system.constraint_compliance() * at.lam / at.h), gain
 
 
-def _constraint_pulls(system: System, at: _Symbols, middle: Kinematics, share_m: float) -> ConstraintPulls:
+def _constraint_pulls(system: System, at: _Symbols, middle: Kinematics, share_m: float) -> ConstraintImpulses:
     parts: dict[str, ca.SX] = {}
     for name, q, z in (("before", at.q0, at.z0), ("after", at.q1, at.z1)):
         found = _constraint_derivatives(system, forward_kinematics(system.mechanism, q), q, at.lam)
-        parts[name], parts[f"{name}_by_q"] = (ca.substitute(expression, at.internal, z) for expression in found)
+        parts[f"{name}_jacobian"], parts[f"{name}_force_by_q"] = (ca.substitute(expression, at.internal, z) for expression in found)
     found = _constraint_derivatives(system, middle, at.qm, at.lam)
-    parts["middle"], parts["middle_by_q"] = (at.placed(expression, dense=False) for expression in found)
-    shared = parts["before"].sparsity() + parts["middle"].sparsity() + parts["after"].sparsity()
-    parts |= {name: ca.project(parts[name], shared) for name in ("before", "middle", "after")}
-    return ConstraintPulls(1.0 - share_m, share_m, **parts)
+    parts["middle_jacobian"], parts["middle_force_by_q"] = (at.placed(expression, dense=False) for expression in found)
+    jacobians = ("before_jacobian", "middle_jacobian", "after_jacobian")
+    before, middle_sparsity, after = (parts[name].sparsity() for name in jacobians)
+    parts |= {name: ca.project(parts[name], before + middle_sparsity + after) for name in jacobians}
+    return ConstraintImpulses(1.0 - share_m, share_m, **parts)
 
 
 def _constraint_derivatives(system: System, kinematics: Kinematics, q: ca.SX, lam: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -386,7 +403,7 @@ def _constraint_derivatives(system: System, kinematics: Kinematics, q: ca.SX, la
 
     A point moves with d2x/dq_i dq_j = w_i x dx/dq_j, a direction with d2v/dq_i dq_j = w_i x (w_j x v), for i above j.
     """
-    n = system.size
+    n = system.n_coordinates
     blocks, hessian, row = [ca.SX(0, n)], ca.SX(n, n), 0
 
     def add(i: int, j: int, entry: ca.SX) -> None:
@@ -395,18 +412,18 @@ def _constraint_derivatives(system: System, kinematics: Kinematics, q: ca.SX, la
             hessian[j, i] += entry
 
     for grasp in system.grasps:
-        part = lam[row : row + grasp.equations]
-        row += grasp.equations
+        part = lam[row : row + grasp.n_equations]
+        row += grasp.n_equations
         holder, held = _grasped(system, grasp, "holder"), _grasped(system, grasp, "held")
         block = ca.SX(3, n)
         for frame, sign in ((holder, 1.0), (held, -1.0)):
-            jacobian = kinematics.point_jacobian(frame)
+            jacobian = kinematics.position_jacobian(frame)
             block += sign * jacobian
-            chain = system.mechanism.ancestors(frame.joint)
+            chain = system.mechanism.ancestor_joints(frame.joint_index)
             for above, i in enumerate(chain):
                 if system.mechanism.joints[i].kind == "prismatic":
                     continue
-                turned = cross(part[:3], kinematics.screws[i][:3])
+                turned = cross_product(part[:3], kinematics.joint_screws[i][:3])
                 for j in chain[above:]:
                     add(i, j, sign * ca.dot(jacobian[:, j], turned))
         blocks.append(block)
@@ -414,14 +431,14 @@ def _constraint_derivatives(system: System, kinematics: Kinematics, q: ca.SX, la
         if not rows:
             continue
         relative = kinematics.angular_jacobian(holder) - kinematics.angular_jacobian(held)
-        blocks += [sum((cross(a, b).T @ relative for a, b in pairs), ca.SX(1, n)) for pairs in rows]
+        blocks += [sum((cross_product(a, b).T @ relative for a, b in pairs), ca.SX(1, n)) for pairs in rows]
         for a, b in [(part[3 + k] * a, b) for k, pairs in enumerate(rows) for a, b in pairs]:
             turns: list[dict[int, ca.SX]] = []
             for frame, vector, other in ((holder, a, b), (held, b, a)):
                 chain = _turning(system, frame)
-                turns.append({j: cross(kinematics.screws[j][:3], vector) for j in chain})
+                turns.append({j: cross_product(kinematics.joint_screws[j][:3], vector) for j in chain})
                 for above, i in enumerate(chain):
-                    turned = cross(other, kinematics.screws[i][:3])
+                    turned = cross_product(other, kinematics.joint_screws[i][:3])
                     for j in chain[above:]:
                         add(i, j, ca.dot(turns[-1][j], turned))
             for i, by_i in turns[0].items():
@@ -434,8 +451,8 @@ def _direction_products(grasp: Grasp, kinematics: Kinematics) -> list[list[tuple
     """Each orientation row of a grasp as a sum of products of a vector on the holder with one on the held frame."""
     if grasp.kind == "point":
         return []
-    a = ca.horzsplit(kinematics.pose(grasp.holder).rotation @ grasp.rotation)
-    b = ca.horzsplit(kinematics.pose(grasp.held).rotation)
+    a = ca.horzsplit(kinematics.frame_pose(grasp.holder_frame).rotation @ grasp.held_orientation)
+    b = ca.horzsplit(kinematics.frame_pose(grasp.held_frame).rotation)
     if grasp.kind == "axis":
         return [[(a[0], b[2])], [(a[1], b[2])]]
     return [[(0.5 * a[i], b[j]), (-0.5 * a[j], b[i])] for i, j in ((2, 1), (0, 2), (1, 0))]
@@ -443,21 +460,21 @@ def _direction_products(grasp: Grasp, kinematics: Kinematics) -> list[list[tuple
 
 def _turning(system: System, frame: Frame) -> tuple[int, ...]:
     joints = system.mechanism.joints
-    return tuple(j for j in system.mechanism.ancestors(frame.joint) if joints[j].kind != "prismatic")
+    return tuple(j for j in system.mechanism.ancestor_joints(frame.joint_index) if joints[j].kind != "prismatic")
 
 
 def _grasped(system: System, grasp: Grasp, side: str) -> Frame:
     """The frame whose origin is the grasped point, on one side of a grasp."""
     if side == "holder":
-        frame = system.mechanism.frame(grasp.holder)
-        return Frame(frame.joint, frame.placement @ Placement(grasp.rotation, grasp.offset))
-    frame = system.mechanism.frame(grasp.held)
-    back = Placement(ca.SX(ca.DM.eye(3)), ca.vertcat(0, 0, -grasp.slip))
-    return Frame(frame.joint, frame.placement @ back)
+        frame = system.mechanism.frame(grasp.holder_frame)
+        return Frame(frame.joint_index, frame.placement @ Placement(grasp.held_orientation, grasp.holder_offset))
+    frame = system.mechanism.frame(grasp.held_frame)
+    back = Placement(ca.SX(ca.DM.eye(3)), ca.vertcat(0, 0, -grasp.axial_slip))
+    return Frame(frame.joint_index, frame.placement @ back)
 
 
 @dataclass(frozen=True)
-class RestEquations:
+class EquilibriumEquations:
     """Equations of static equilibrium: driven joints held by torques and springs, prescribed joints given.
 
     Attributes
@@ -476,22 +493,22 @@ class RestEquations:
     state: ca.SX
 
 
-def rest_equations(e: DiscreteEquations) -> RestEquations:
+def equilibrium_equations(e: DiscreteEquations) -> EquilibriumEquations:
     """The static equilibrium equations: a step from a configuration to itself with unchanged momentum."""
     system, h, nu = e.system, e.h, e.u.numel()
     free, fixed, driven = (list(i) for i in (system.free_indices, system.prescribed_indices, system.driven_indices))
     given, sought = ca.SX.sym("given", nu + len(fixed)), ca.SX.sym("sought", len(free))
     z, force = ca.SX.sym("z", e.z0.numel()), ca.SX.sym("force", e.lam.numel())
     held, stiffness = ca.SX.sym("held", nu), ca.SX.sym("stiffness")
-    q = ca.SX(ca.DM.zeros(system.size))
+    q = ca.SX(ca.DM.zeros(system.n_coordinates))
     for indices, values in ((fixed, given[nu:]), (free, sought)):
         for row, index in enumerate(indices):
             q[index] = values[row]
     u = held + stiffness * (given[:nu] - q[driven]) if nu else held
     old, now = [e.q0, e.q1, e.z0, e.z1, e.lam, e.u], [q, q, z, z, h * force, u]
-    rows = ca.substitute([e.p1, e.momentum_balance, e.internal_at_rest, e.constraint], old, now)
+    rows = ca.substitute([e.p1, e.momentum_balance, e.internal_residual_at_rest, e.constraint_residual], old, now)
     p, balance, internal, constraint = (ca.densify(x) for x in rows)
     balance = ca.substitute(balance, e.p0, p) / h
     inputs = [ca.vertcat(sought, z, force), given, held, stiffness, e.theta, e.time_step]
     residual = ca.vertcat(balance[free, 0], internal, constraint)
-    return RestEquations(inputs, residual, ca.densify(ca.vertcat(q, p, z)))
+    return EquilibriumEquations(inputs, residual, ca.densify(ca.vertcat(q, p, z)))

@@ -14,26 +14,26 @@ import numpy as np
 import scipy.linalg.lapack
 from numpy.typing import NDArray
 
-from yid_ocp.integrator.discrete import rest_equations
+from yid_ocp.integrator.discrete import equilibrium_equations
 from yid_ocp.integrator.step_model import (
-    ITERATION_LIMIT,
-    REST_ITERATION_LIMIT,
-    Directions,
-    Feedback,
-    Gradient,
-    Member,
+    EQUILIBRIUM_ITERATION_LIMIT,
+    NEWTON_ITERATION_LIMIT,
+    CostGradient,
+    NewtonStatus,
     Rollout,
-    StepCode,
+    RolloutInputs,
+    SensitivityDirections,
     StepLinearization,
     StepModel,
-    empty_linearization,
-    empty_rollout,
-    ended,
+    TrackingFeedback,
+    allocate_linearization,
+    allocate_rollout,
+    rollout_with_status,
 )
-from yid_ocp.parallel import Once
+from yid_ocp.parallel import LockedCache
 
 Array = NDArray[np.float64]
-Evaluator = Callable[[Array], Array]
+_PointEvaluator = Callable[[Array], Array]
 
 
 class InterpretedKernel:
@@ -45,8 +45,8 @@ class InterpretedKernel:
 
     def __init__(self, model: StepModel) -> None:
         self._model = model
-        self._functions: Once[None, list[ca.Function]] = Once(self._made)
-        self._rest: Once[None, ca.Function] = Once(self._rest_made)
+        self._functions: LockedCache[None, list[ca.Function]] = LockedCache(self._made)
+        self._rest: LockedCache[None, ca.Function] = LockedCache(self._rest_made)
         system, sizes = model.system, model.sizes
         names = ("q0", "q1", "p0", "z0", "z1", "lam", "u", "theta", "time_step")
         ends = np.cumsum([0, *(argument.numel() for argument in model.equations.arguments)])
@@ -58,26 +58,26 @@ class InterpretedKernel:
         self._residual = np.concatenate([free, np.arange(sizes["n"], self._rows)])
         self._p1, self._effort = slice(self._rows, self._rows + sizes["n"]), slice(self._rows + sizes["n"], None)
 
-    def of(self, model: StepModel) -> InterpretedKernel:
+    def with_model(self, model: StepModel) -> InterpretedKernel:
         """An interpreted kernel of the same functions with another step model."""
         other = InterpretedKernel(model)
         other._functions, other._rest = self._functions, self._rest
         return other
 
-    def _evaluators(self) -> list[Evaluator]:
+    def _evaluators(self) -> list[_PointEvaluator]:
         """Outputs at a point, the slope of the residual by the unknowns, and that of the outputs by the point."""
         return [_evaluator(function) for function in self._functions(None)]
 
     def _made(self, _: None) -> list[ca.Function]:
         e, point = self._model.equations, ca.vertcat(*self._model.equations.arguments)
         effort = -e.momentum_balance[list(self._model.system.prescribed_indices), 0] / e.h
-        outputs = ca.cse(ca.vertcat(e.momentum_balance, e.internal, e.constraint, e.p1, effort))
+        outputs = ca.cse(ca.vertcat(e.momentum_balance, e.internal_residual, e.constraint_residual, e.p1, effort))
         slope = ca.jacobian(outputs[self._residual.tolist()], e.unknowns)
         wanted = (outputs, slope, ca.jacobian(outputs, point))
         return [ca.Function("f", [point], [ca.densify(x)]) for x in wanted]
 
     def _rest_made(self, _: None) -> ca.Function:
-        e = rest_equations(self._model.equations)
+        e = equilibrium_equations(self._model.equations)
         return ca.Function("rest", e.inputs, [e.residual, ca.jacobian(e.residual, e.inputs[0])])
 
     def _point(self, theta: Array, before: Array, after: Array, lam: Array, u: Array) -> Array:
@@ -89,24 +89,24 @@ class InterpretedKernel:
         """Where parameters stand in a point."""
         return self._at["theta"][[self._model.system.parameters.index(name) for name in names]]
 
-    def _newton(self, value: Evaluator, slope: Evaluator, point: Array) -> tuple[StepCode, float, int]:
+    def _newton(self, value: _PointEvaluator, slope: _PointEvaluator, point: Array) -> tuple[NewtonStatus, float, int]:
         """Solve for the unknowns in the point, with the natural monotonicity test (Deuflhard 2011, section 3.3)."""
 
         def largest(change: Array) -> float:
             return float(np.max(np.abs(change[: self._coordinates]), initial=0.0))
 
         tolerance, error = self._model.tolerance, 0.0
-        for iteration in range(1, ITERATION_LIMIT + 1):
+        for iteration in range(1, NEWTON_ITERATION_LIMIT + 1):
             residual = value(point)[self._residual, 0]
             if not np.all(np.isfinite(residual)):
-                return StepCode.NOT_FINITE, error, iteration
+                return NewtonStatus.NOT_FINITE, error, iteration
             factors = _factorised(slope(point))
             if factors is None:
-                return StepCode.SINGULAR, error, iteration
+                return NewtonStatus.SINGULAR, error, iteration
             change = -_solved(factors, residual)
             error = largest(change)
             if not math.isfinite(error):
-                return StepCode.NOT_FINITE, error, iteration
+                return NewtonStatus.NOT_FINITE, error, iteration
             noise, factor = error <= tolerance, min(1.0, 0.5 / error) if error else 1.0
             while not noise:
                 trial = point.copy()
@@ -115,17 +115,17 @@ class InterpretedKernel:
                 if largest(further) <= (1 - 0.25 * factor) * error:
                     break
                 if factor < 1e-4:
-                    return StepCode.NOT_CONVERGED, error, iteration
+                    return NewtonStatus.NOT_CONVERGED, error, iteration
                 # near the tolerance a correction that no step makes smaller is rounding
                 noise, factor = error < 1e3 * tolerance, 0.5 * factor
             if noise:
                 point[self._at["lam"]] += change[self._coordinates :]
-                return StepCode.OK, error, iteration
+                return NewtonStatus.OK, error, iteration
             point[:] = trial
             if factor == 1.0 and largest(further) <= tolerance:
                 point[self._at["lam"]] -= further[self._coordinates :]
-                return StepCode.OK, largest(further), iteration
-        return StepCode.NOT_CONVERGED, error, ITERATION_LIMIT
+                return NewtonStatus.OK, largest(further), iteration
+        return NewtonStatus.NOT_CONVERGED, error, NEWTON_ITERATION_LIMIT
 
     def rollout(
         self,
@@ -133,21 +133,21 @@ class InterpretedKernel:
         start: Array,
         torque: Array,
         path: Array,
-        feedback: Feedback | None,
-        wanted: Directions | None,
+        feedback: TrackingFeedback | None,
+        wanted: SensitivityDirections | None,
     ) -> Rollout:
         """Simulate one rollout step by step."""
         (value, slope, slopes), n, lam = self._evaluators(), self._model.sizes["n"], np.zeros(self._model.sizes["m"])
-        out = empty_rollout(self._model.sizes, len(torque), None if wanted is None else wanted.count)
-        state, by = out.state, [getattr(out, f"by_{name}") for name in ("state", "multipliers", "effort")]
+        out = allocate_rollout(self._model.sizes, len(torque), None if wanted is None else wanted.count)
+        state, by = out.state, [getattr(out, f"{name}_sensitivity") for name in ("state", "multipliers", "effort")]
         state[0] = start
         if wanted is not None:
-            by[0][0] = wanted.start
-        code, error, total, done = StepCode.OK, 0.0, 0, 0
+            by[0][0] = wanted.initial_state_tangents
+        code, error, total, done = NewtonStatus.OK, 0.0, 0, 0
         for k, u in enumerate(torque):
             x = state[k]
             if feedback is not None:
-                u = u - feedback.gain[k] @ (x[feedback.index] - feedback.reference[k])
+                u = u - feedback.gain[k] @ (x[feedback.state_indices] - feedback.reference[k])
             guess = x if k == 0 else 2 * x - state[k - 1]
             if k > 1:
                 guess[:n] += x[:n] - 2 * state[k - 1, :n] + state[k - 2, :n]
@@ -156,36 +156,36 @@ class InterpretedKernel:
                 point[self._fixed] = path[k + 1]
                 code, error, spent = self._newton(value, slope, point)
                 total += spent
-                if code == StepCode.OK:
+                if code == NewtonStatus.OK:
                     break
             outputs, lam = value(point)[:, 0], point[self._at["lam"]]
             state[k + 1] = np.concatenate([point[self._at["q1"]], outputs[self._p1], point[self._at["z1"]]])
-            if code != StepCode.OK:
+            if code != NewtonStatus.OK:
                 break
             out.torque[k], out.multipliers[k], out.effort[k] = u, lam, outputs[self._effort]
             if wanted is not None:
                 moved = self._moved(slopes(point), wanted, feedback, by[0][k], k)
                 if moved is None:
-                    code = StepCode.SINGULAR
+                    code = NewtonStatus.SINGULAR
                     break
                 by[0][k + 1], by[1][k], by[2][k] = moved
             done = k + 1
-        return ended(out, self._model.sizes, code, done, error, (total, total))
+        return rollout_with_status(out, self._model.sizes, code, done, error, (total, total))
 
     def _moved(
-        self, slopes: Array, wanted: Directions, feedback: Feedback | None, before: Array, k: int
+        self, slopes: Array, wanted: SensitivityDirections, feedback: TrackingFeedback | None, before: Array, k: int
     ) -> tuple[Array, Array, Array] | None:
         """Derivatives of state, multipliers and effort after step k by the implicit function theorem."""
-        n, at, names = self._model.sizes["n"], self._at, wanted.names
+        n, at, names = self._model.sizes["n"], self._at, wanted.parameter_names
         moved = np.zeros((slopes.shape[1], wanted.count))
         moved[at["q0"]], moved[at["p0"]], moved[at["z0"]] = before[:n], before[n : 2 * n], before[2 * n :]
         moved[self._columns(names), np.arange(len(names))] = 1.0
-        if wanted.torque is not None:
-            moved[at["u"]] = wanted.torque[k]
+        if wanted.torque_tangents is not None:
+            moved[at["u"]] = wanted.torque_tangents[k]
         if feedback is not None:
-            moved[at["u"]] -= feedback.gain[k] @ before[feedback.index]
-        if wanted.path is not None:
-            moved[self._fixed] = wanted.path[k + 1]
+            moved[at["u"]] -= feedback.gain[k] @ before[feedback.state_indices]
+        if wanted.prescribed_tangents is not None:
+            moved[self._fixed] = wanted.prescribed_tangents[k + 1]
         change = slopes @ moved
         try:
             solution = np.linalg.solve(slopes[np.ix_(self._residual, self._unknown)], change[self._residual])
@@ -196,20 +196,23 @@ class InterpretedKernel:
         after = np.concatenate([moved[at["q1"]], change[self._p1], moved[at["z1"]]])
         return after, moved[at["lam"]], change[self._effort]
 
-    def rollouts(self, members: Sequence[Member]) -> list[Rollout]:
+    def rollout_batch(self, members: Sequence[RolloutInputs]) -> list[Rollout]:
         """Simulate all members, one after another."""
-        return [self.rollout(m.theta, m.start, m.torque, m.path, m.feedback, m.wanted) for m in members]
+        return [
+            self.rollout(m.theta, m.initial_state, m.torque, m.prescribed_path, m.feedback, m.directions)
+            for m in members
+        ]
 
-    def adjoint(
+    def adjoint_gradient(
         self,
         theta: Array,
         rollout: Rollout,
-        feedback: Feedback | None,
+        feedback: TrackingFeedback | None,
         names: tuple[str, ...],
         by_state: Array,
         by_multipliers: Array | None,
         by_effort: Array | None,
-    ) -> Gradient:
+    ) -> CostGradient:
         """Gradient of a cost along a rollout by the backward recursion of the costate."""
         sizes, at, steps = self._model.sizes, self._at, len(rollout.torque)
         slopes, n = self._evaluators()[-1], sizes["n"]
@@ -229,41 +232,41 @@ class InterpretedKernel:
             try:
                 by_point -= jacobian[self._residual].T @ np.linalg.solve(square.T, by_point[self._unknown])
             except np.linalg.LinAlgError:
-                return Gradient(*(np.full_like(a, np.nan) for a in (by_theta, costate, by_torque, by_path)))
+                return CostGradient(*(np.full_like(a, np.nan) for a in (by_theta, costate, by_torque, by_path)))
             by_theta += by_point[self._columns(names)]
             by_torque[k], by_path[k + 1] = by_point[at["u"]], by_point[self._fixed]
             costate = np.concatenate([by_point[at[name]] for name in ("q0", "p0", "z0")]) + by_state[k]
             if feedback is not None:
-                np.subtract.at(costate, feedback.index, feedback.gain[k].T @ by_torque[k])
+                np.subtract.at(costate, feedback.state_indices, feedback.gain[k].T @ by_torque[k])
         by_path[0] = costate[list(self._model.system.prescribed_indices)]
-        return Gradient(by_theta, costate, by_torque, by_path)
+        return CostGradient(by_theta, costate, by_torque, by_path)
 
     def linearize(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, names: tuple[str, ...], derivatives: bool
     ) -> StepLinearization:
         """Residuals and Jacobians of many steps, evaluated one after another."""
         (value, _, slopes), at = self._evaluators(), self._at
-        out = empty_linearization(self._model.sizes, len(torque), len(names), derivatives)
+        out = allocate_linearization(self._model.sizes, len(torque), len(names), derivatives)
         new, old = np.concatenate([at["q1"], at["z1"], at["lam"]]), np.concatenate([at["q0"], at["z0"]])
         columns = {"new": new, "old": old, "input": at["u"], "theta": self._columns(names)}
         for k, u in enumerate(torque):
             point = self._point(theta, state[k], state[k + 1], multipliers[k], u)
             outputs = value(point)[:, 0]
-            out.rows[k], out.p1[k] = outputs[: self._rows], outputs[self._p1]
+            out.residual[k], out.p1[k] = outputs[: self._rows], outputs[self._p1]
             if derivatives:
                 jacobian = slopes(point)
                 for key, index in columns.items():
-                    getattr(out, f"rows_{key}")[k] = jacobian[: self._rows, index]
-                    getattr(out, f"p1_{key}")[k] = jacobian[self._p1, index]
+                    getattr(out, f"residual_by_{key}")[k] = jacobian[: self._rows, index]
+                    getattr(out, f"p1_by_{key}")[k] = jacobian[self._p1, index]
         return out
 
-    def slopes(
+    def step_jacobians(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, load_rows: Array, load_momentum: Array
     ) -> tuple[Array, Array]:
         """Jacobians of single steps from the linearized equations."""
         sizes = self._model.sizes
         point = self._point(theta, state[0], state[1], multipliers[0], torque[0])
-        h = float(self._model.functions.scales(*(point[index] for index in self._at.values()))[1])
+        h = float(self._model.functions.row_scale_and_time_step(*(point[index] for index in self._at.values()))[1])
         n, nz, nx, nu, count = sizes["n"], sizes["nz"], sizes["nx"], sizes["nu"], len(torque)
         system = self._model.system
         free, fixed = (np.array(index, int) for index in (system.free_indices, system.prescribed_indices))
@@ -271,21 +274,21 @@ class InterpretedKernel:
         width = nx + nu + load_rows.shape[1]
         top, bottom = np.zeros((count, self._rows, width)), np.zeros((count, n, width))
         for target, old, push, load in (
-            (top, found.rows_old, found.rows_input, load_rows),
-            (bottom, found.p1_old, found.p1_input, load_momentum),
+            (top, found.residual_by_old, found.residual_by_input, load_rows),
+            (bottom, found.p1_by_old, found.p1_by_input, load_momentum),
         ):
             target[:, :, :n], target[:, :, 2 * n : nx] = old[:, :, :n], old[:, :, n:]
             target[:, :, nx : nx + nu], target[:, :, nx + nu :] = push, load
         top[:, np.arange(n), n + np.arange(n)] += 1.0
         solved = self._residual
-        moved = -np.linalg.solve(found.rows_new[:, solved[:, None], solved], top[:, solved])
+        moved = -np.linalg.solve(found.residual_by_new[:, solved[:, None], solved], top[:, solved])
         after = np.zeros((count, nx, width))
         after[:, free] = moved[:, : len(free)]
-        after[:, n : 2 * n] = bottom + found.p1_new[:, :, solved] @ moved
+        after[:, n : 2 * n] = bottom + found.p1_by_new[:, :, solved] @ moved
         after[:, 2 * n :] = moved[:, len(free) : len(free) + nz]
-        return after, -(top[:, fixed] + found.rows_new[:, fixed[:, None], solved] @ moved) / h
+        return after, -(top[:, fixed] + found.residual_by_new[:, fixed[:, None], solved] @ moved) / h
 
-    def rest(
+    def find_equilibrium(
         self, theta: Array, unknowns: Array, given: Array, held: Array, stiffness: float, tolerance: float
     ) -> tuple[Array, float, bool]:
         """Static equilibrium by `damped_newton`."""
@@ -324,7 +327,7 @@ def damped_newton(
 
     residual, jacobian = evaluate(w)
     error = float(np.max(np.abs(residual)))
-    for _ in range(REST_ITERATION_LIMIT):
+    for _ in range(EQUILIBRIUM_ITERATION_LIMIT):
         if error <= tolerance or not math.isfinite(error):
             return w, error, error <= tolerance
         factors = _factorised(jacobian)
@@ -351,7 +354,7 @@ def damped_newton(
     return w, error, False
 
 
-def _evaluator(function: Any) -> Evaluator:
+def _evaluator(function: Any) -> _PointEvaluator:
     """A function of one column with a dense output, without CasADi's conversions; for one thread."""
     buffer, run = function.buffer()
     point, result = np.zeros(function.numel_in(0)), np.zeros(function.size_out(0)[::-1])

@@ -8,7 +8,7 @@
  *   NT = N + NZ + M rows, NY = NF + NZ + M unknowns of a step, NX = 2 N + NZ state (q, p, z).
  * All matrices are row-major. compiled.py declares the structs of the entry points at the end once more.
  *
- * Everything is compiled for one member, and once more for a batch of `LANES` members that march together, see lanes.c.
+ * Everything is compiled for one member, and once more for a batch of `LANES` members that march together, see simd.c.
  * What only one member can do (damped steps, adjoint, equilibria) is left out of a batch.
  */
 #define NX (2 * N + NZ)

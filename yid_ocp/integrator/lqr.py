@@ -10,14 +10,14 @@ import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import ModelError
-from yid_ocp.integrator.step import Step, compile_alike
-from yid_ocp.integrator.step_model import ITERATION_LIMIT, Feedback
+from yid_ocp.integrator.step import Step, compile_step_like
+from yid_ocp.integrator.step_model import NEWTON_ITERATION_LIMIT, TrackingFeedback
 from yid_ocp.model.system import System
 
 Array = NDArray[np.float64]
 
 
-def proportional_filter(step: Step, measured: ArrayLike, gains: ArrayLike) -> Feedback:
+def proportional_feedback(step: Step, measured: ArrayLike, gains: ArrayLike) -> TrackingFeedback:
     """Feedback u_k = ubar_k - K (q_k - qbar_k) with a constant diagonal K on the driven joints.
 
     Parameters
@@ -43,10 +43,10 @@ def proportional_filter(step: Step, measured: ArrayLike, gains: ArrayLike) -> Fe
         raise ModelError(f"a tracking gain is negative: {values.min():g} N m/rad", allowed="0 or more")
     steps = len(reference) - 1
     gain = np.broadcast_to(np.diag(values), (steps, nu, nu)).copy()
-    return Feedback(np.array(step.system.driven_indices, np.int32), gain, reference[:-1])
+    return TrackingFeedback(np.array(step.system.driven_indices, np.int32), gain, reference[:-1])
 
 
-def lqr_filter(
+def lqr_feedback(
     step: Step,
     measured: ArrayLike,
     torque: ArrayLike,
@@ -55,7 +55,7 @@ def lqr_filter(
     rate_std: float = 0.3,
     torque_std: ArrayLike = 1.0,
     arms: Step | None = None,
-) -> Feedback:
+) -> TrackingFeedback:
     """Feedback of a finite-horizon LQR of the driven arms, linearised about their measured motion.
 
     Minimises the sum of |dq|^2/angle_std^2 + |M^-1 dp|^2/rate_std^2 + |du|^2/torque_std^2 over the recording for the
@@ -73,7 +73,7 @@ def lqr_filter(
     angle_std, rate_std, torque_std : float or array_like
         Standard deviations that weigh the same [rad], [rad/s], [N m].
     arms : Step, optional
-        From `arms_alone`; made when absent.
+        From `arms_only_step`; made when absent.
 
     References
     ----------
@@ -81,7 +81,7 @@ def lqr_filter(
     """
     reference, torques = np.asarray(measured, float), np.asarray(torque, float)
     system = step.system
-    arm_step = arms_alone(step) if arms is None else arms
+    arm_step = arms_only_step(step) if arms is None else arms
     values = dict(zip(system.parameters.names, np.asarray(theta, float), strict=True))
     parameters = arm_step.system.parameters
     arm_theta = parameters.vector({name: values[name] for name in parameters.names})
@@ -105,12 +105,12 @@ def lqr_filter(
         closed = a - b @ gain[k]
         cost = stage + closed.T @ cost @ closed + gain[k].T @ weight_u @ gain[k]
         cost = 0.5 * (cost + cost.T)
-    n = system.size
+    n = system.n_coordinates
     index = np.concatenate([np.array(system.driven_indices), n + np.array(system.driven_indices)])
-    return Feedback(index.astype(np.int32), gain, np.hstack([reference[:-1], momenta[:-1]]))
+    return TrackingFeedback(index.astype(np.int32), gain, np.hstack([reference[:-1], momenta[:-1]]))
 
 
-def arms_alone(step: Step) -> Step:
+def arms_only_step(step: Step) -> Step:
     """The step of a system of the driven joints only, without the object and everything else.
 
     Raises
@@ -118,7 +118,7 @@ def arms_alone(step: Step) -> Step:
     ModelError
         The driven joints do not come first in the configuration.
     """
-    return compile_alike(step, _arms_only(step.system))
+    return compile_step_like(step, _arms_only(step.system))
 
 
 def _arms_only(system: System) -> System:
@@ -130,20 +130,20 @@ def _arms_only(system: System) -> System:
             where=", ".join(system.driven),
             hint="use proportional gains instead",
         )
-    frames = {name: frame for name, frame in mechanism.frames.items() if frame.joint < len(keep)}
-    arms = replace(mechanism, joints=mechanism.joints[: len(keep)], frames=frames, lines={})
+    frames = {name: frame for name, frame in mechanism.frames.items() if frame.joint_index < len(keep)}
+    arms = replace(mechanism, joints=mechanism.joints[: len(keep)], frames=frames, link_chains={})
     wanted: Sequence[str] = system.driven
     return replace(
         system,
         mechanism=arms,
-        elastic=(),
+        elastic_joints=(),
         grasps=(),
         prescribed=(),
-        compliant={},
-        segments=(),
-        points=(),
+        joint_compliances={},
+        segment_layouts=(),
+        point_frames=(),
         effects=(),
-        damping={name: value for name, value in system.damping.items() if name in wanted},
+        joint_damping={name: value for name, value in system.joint_damping.items() if name in wanted},
     )
 
 
@@ -166,9 +166,9 @@ def _one_step_each(arm_step: Step, start: Array, torque: Array, guess: Array, th
     state[1::2, :nu] = guess
     none, own = np.zeros((2 * count - 1, 0)), slice(None, None, 2)
     try:
-        for _ in range(ITERATION_LIMIT):
+        for _ in range(NEWTON_ITERATION_LIMIT):
             found = arm_step.kernel.linearize(theta, state, none, torques, (), True)
-            change = np.linalg.solve(found.rows_new[own], found.rows[own, :, None])[:, :, 0]
+            change = np.linalg.solve(found.residual_by_new[own], found.residual[own, :, None])[:, :, 0]
             if not np.max(np.abs(change), initial=0.0) > arm_step.model.tolerance:
                 break
             state[1::2, :nu] -= change
@@ -176,10 +176,11 @@ def _one_step_each(arm_step: Step, start: Array, torque: Array, guess: Array, th
             raise np.linalg.LinAlgError
         known = np.broadcast_to(np.eye(nu), (count, nu, nu))
         moved = -np.linalg.solve(
-            found.rows_new[own], np.concatenate([found.rows_old[own], known, found.rows_input[own]], axis=2)
+            found.residual_by_new[own],
+            np.concatenate([found.residual_by_old[own], known, found.residual_by_input[own]], axis=2),
         )
     except np.linalg.LinAlgError:
         return np.full((count, 2 * nu, 2 * nu), np.nan), np.full((count, 2 * nu, nu), np.nan)
-    momenta = np.concatenate([found.p1_old[own], 0 * known, found.p1_input[own]], axis=2)
-    after = np.concatenate([moved, found.p1_new[own] @ moved + momenta], axis=1)
+    momenta = np.concatenate([found.p1_by_old[own], 0 * known, found.p1_by_input[own]], axis=2)
+    after = np.concatenate([moved, found.p1_by_new[own] @ moved + momenta], axis=1)
     return after[:, :, : 2 * nu], after[:, :, 2 * nu :]

@@ -11,70 +11,70 @@ import numpy as np
 import scipy.linalg.lapack
 from numpy.typing import ArrayLike, NDArray
 
-from yid_ocp.integrator.codegen import triplet
-from yid_ocp.integrator.discrete import RestEquations, rest_equations
+from yid_ocp.integrator.codegen import nonzero_indices
+from yid_ocp.integrator.discrete import EquilibriumEquations, equilibrium_equations
 from yid_ocp.integrator.interpreted import damped_newton
-from yid_ocp.integrator.step import Step, check_shape
+from yid_ocp.integrator.step import Step, float_array_of_shape
 from yid_ocp.model.system import System
-from yid_ocp.parallel import SYMBOLIC, Once
+from yid_ocp.parallel import CASADI_LOCK, LockedCache
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Rest:
+class Equilibrium:
     """A static equilibrium with its derivatives.
 
     Attributes
     ----------
     state : ndarray, shape (nx,)
         (q, p, z); p is half a step's pull of the constraints, so that the next step stays at rest.
-    torque : ndarray, shape (nu,)
+    holding_torque : ndarray, shape (nu,)
         Motor torque that holds the posture [N m], or command of its servos [rad or m].
-    constraint_force : ndarray, shape (m,)
+    constraint_reactions : ndarray, shape (m,)
         [N or N m]
-    by_theta : ndarray, shape (nx, len(names))
+    state_by_theta : ndarray, shape (nx, len(names))
         Derivative of `state` by the parameters asked for.
-    by_posture : ndarray, shape (nx, nk)
+    state_by_known_coordinates : ndarray, shape (nx, nk)
         Derivative by the known coordinates (driven, then prescribed).
-    by_torque : ndarray, shape (nx, nu)
+    state_by_torque : ndarray, shape (nx, nu)
         Derivative by the measured torque.
-    converged : bool
-    error : float
+    is_converged : bool
+    max_imbalance : float
         Largest remaining imbalance [N m] or constraint violation [m].
     message : str
     """
 
     state: Array
-    torque: Array
-    constraint_force: Array
-    by_theta: Array
-    by_posture: Array
-    by_torque: Array
-    converged: bool
-    error: float
+    holding_torque: Array
+    constraint_reactions: Array
+    state_by_theta: Array
+    state_by_known_coordinates: Array
+    state_by_torque: Array
+    is_converged: bool
+    max_imbalance: float
     message: str
 
 
 # Driven joints are held at their measured posture by a spring [N m/rad], so that an equilibrium exists also where
 # encoder noise stretches the object by a hair beyond its reach. With a measured torque the spring is as soft as the
 # ratio of torque error to encoder error; without one it is stiff enough to give less than an encoder's noise.
-HOLD_STIFFNESS = 1e5
-HOLD_STIFFNESS_WITH_TORQUE = 1e3
+_HOLD_STIFFNESS = 1e5
+_HOLD_STIFFNESS_WITH_TORQUE = 1e3
 
 # A servo holds its joint itself, and what it is commanded is known: nothing is left to make up for. Not zero, so that
 # derivatives by the command are those by the posture over it.
-HOLD_STIFFNESS_WITH_COMMAND = 1e-9
+_HOLD_STIFFNESS_WITH_COMMAND = 1e-9
 
-MOST_ITERATIONS = 300  # of the search for the lowest energy
+_ENERGY_ITERATION_LIMIT = 300  # of the search for the lowest energy
 
-SINGULAR = 1e-14  # reciprocal of the condition beyond which equations have no solution of their own
+_MIN_RECIPROCAL_CONDITION = 1e-14  # reciprocal of the condition beyond which equations have no solution of their own
 
 # A holding spring that gives by more than this means that the posture does not fit the grasp [rad].
-HOLD_LIMIT = 0.02
+_MAX_HOLD_DEFLECTION = 0.02
 
 
-class Statics:
+class EquilibriumSolver:
     """Solver for the static equilibrium of a system with driven joints held and prescribed joints given.
 
     Parameters
@@ -83,24 +83,24 @@ class Statics:
 
     Attributes
     ----------
-    known, unknown : tuple of int
+    known_coordinates, free_coordinates : tuple of int
         Indices of given coordinates (driven, then prescribed) and of the coordinates to solve for.
     """
 
     def __init__(self, step: Step) -> None:
         self.step = step
         system, e = step.system, step.equations
-        self.known = (*system.driven_indices, *system.prescribed_indices)
-        self.unknown = system.free_indices
-        self._equations: Once[None, RestEquations] = Once(lambda _: rest_equations(e))
-        self._inner_slopes: Once[None, ca.Function] = Once(
-            lambda _: ca.Function("inner", e.arguments, [ca.jacobian(e.internal_at_rest, e.theta)])
+        self.known_coordinates = (*system.driven_indices, *system.prescribed_indices)
+        self.free_coordinates = system.free_indices
+        self._equations: LockedCache[None, EquilibriumEquations] = LockedCache(lambda _: equilibrium_equations(e))
+        self._inner_slopes: LockedCache[None, ca.Function] = LockedCache(
+            lambda _: ca.Function("inner", e.arguments, [ca.jacobian(e.internal_residual_at_rest, e.theta)])
         )
-        potential = system.elastic_energy(e.q0) + e.rigid.potential + _servo_energy(system, e.u, e.q0)
+        potential = system.elastic_energy(e.q0) + e.rigid_body_terms.potential_energy + _servo_energy(system, e.u, e.q0)
         self._potential = ca.Function("potential", [e.q0, e.q1, e.z0, e.z1, e.u, e.theta], [potential])
 
     @property
-    def equations(self) -> RestEquations:
+    def equations(self) -> EquilibriumEquations:
         """Symbolic equilibrium equations."""
         return self._equations(None)
 
@@ -112,7 +112,7 @@ class Statics:
         guess: ArrayLike | None = None,
         names: Sequence[str] = (),
         tolerance: float = 1e-10,
-    ) -> Rest:
+    ) -> Equilibrium:
         """Find the equilibrium for given driven and prescribed coordinates.
 
         Parameters
@@ -136,15 +136,19 @@ class Statics:
             `converged` is False, with the best point found, where Newton's iteration does not succeed.
         """
         step, system = self.step, self.step.system
-        given = check_shape("posture", posture, (len(self.known),))
-        theta = check_shape("theta", theta, (len(system.parameters),))
-        stiffness = hold_stiffness(system, torque is not None)
-        held = np.zeros(step.sizes["nu"]) if torque is None else check_shape("torque", torque, (step.sizes["nu"],))
+        given = float_array_of_shape("posture", posture, (len(self.known_coordinates),))
+        theta = float_array_of_shape("theta", theta, (len(system.parameters),))
+        stiffness = holding_spring_stiffness(system, torque is not None)
+        held = (
+            np.zeros(step.sizes["nu"])
+            if torque is None
+            else float_array_of_shape("torque", torque, (step.sizes["nu"],))
+        )
         hold = _Hold(given, held, stiffness)
         best: tuple[bool, float, float, Array] | None = None
         for start in self._guesses(given, guess):
-            w, error, converged = step.kernel.rest(theta, start, given, held, stiffness, tolerance)
-            inner = w[len(self.unknown) : len(self.unknown) + step.sizes["nz"]]
+            w, error, converged = step.kernel.find_equilibrium(theta, start, given, held, stiffness, tolerance)
+            inner = w[len(self.free_coordinates) : len(self.free_coordinates) + step.sizes["nz"]]
             energy = float(self._energy(ca.DM(self._configuration(w, given)), inner, hold, theta))
             found = (not converged, energy if converged else error, error, w)
             if best is None or found[:2] < best[:2]:
@@ -162,7 +166,7 @@ class Statics:
         state, by_theta, by_posture = self._differentiate(w, q, theta, hold, tuple(names))
         message = self._explain(state, theta, error) if failed else "at rest"
         by_itself = bool(system.servos) and torque is not None
-        if not failed and not by_itself and np.max(np.abs(give), initial=0.0) > HOLD_LIMIT:
+        if not failed and not by_itself and np.max(np.abs(give), initial=0.0) > _MAX_HOLD_DEFLECTION:
             joint = int(np.argmax(np.abs(give)))
             failed = True
             # with a torque given, any of the three may be wrong
@@ -170,10 +174,10 @@ class Statics:
             message = (
                 f"the measured {parts} at rest: {system.driven[joint]} would have to move by {abs(give[joint]):.3g} rad"
             )
-        count = len(self.unknown) + step.sizes["nz"]
+        count = len(self.free_coordinates) + step.sizes["nz"]
         # torque and posture enter together, as the torque plus the holding spring's stiffness times the posture
         by_torque = by_posture[:, : step.sizes["nu"]] / stiffness
-        return Rest(
+        return Equilibrium(
             state, held + stiffness * give, w[count:], by_theta, by_posture, by_torque, not failed, error, message
         )
 
@@ -183,16 +187,20 @@ class Statics:
         A straight chain at full stretch is a singular point of the grasp constraints, from which Newton cannot leave.
         """
         system = self.step.system
-        size = len(self.unknown) + self.step.sizes["nz"] + self.step.sizes["m"]
+        size = len(self.free_coordinates) + self.step.sizes["nz"] + self.step.sizes["m"]
         first = np.zeros(size)
-        q = np.zeros(system.size)
-        q[list(self.known)] = given
+        q = np.zeros(system.n_coordinates)
+        q[list(self.known_coordinates)] = given
         if guess is not None:
             q[:] = np.asarray(guess, float)
-        first[: len(self.unknown)] = q[list(self.unknown)]
+        first[: len(self.free_coordinates)] = q[list(self.free_coordinates)]
         starts = [first]
-        elastic = {system.mechanism.joint_index(spring.joint) for spring in system.elastic if spring.kind == "bend"}
-        bendable = [row for row, index in enumerate(self.unknown) if index in elastic]
+        elastic = {
+            system.mechanism.joint_index(spring.joint_name)
+            for spring in system.elastic_joints
+            if spring.deformation == "bend"
+        }
+        bendable = [row for row, index in enumerate(self.free_coordinates) if index in elastic]
         for seed in range(4 if bendable and system.grasps else 0):
             bent = first.copy()
             bent[bendable] += np.random.default_rng(seed).normal(scale=0.05, size=len(bendable))
@@ -201,9 +209,9 @@ class Statics:
 
     def _configuration(self, w: Array, given: Array) -> Array:
         """All coordinates, shape (n,); driven ones are where the holding spring lets them be."""
-        q = np.zeros(self.step.system.size)
-        q[list(self.known)] = given
-        q[list(self.unknown)] = w[: len(self.unknown)]
+        q = np.zeros(self.step.system.n_coordinates)
+        q[list(self.known_coordinates)] = given
+        q[list(self.free_coordinates)] = w[: len(self.free_coordinates)]
         return q
 
     def _energy(self, q: Any, z: Array, hold: _Hold, theta: Array) -> Any:
@@ -223,18 +231,18 @@ class Statics:
         ----------
         Waechter and Biegler (2006), Math. Programming 106:25, doi:10.1007/s10107-004-0559-y.
         """
-        size, m, given = len(self.unknown), self.step.sizes["m"], hold.given
+        size, m, given = len(self.free_coordinates), self.step.sizes["m"], hold.given
         if not size or not m:
             return None
-        with SYMBOLIC:
+        with CASADI_LOCK:
             function = ca.Function("rest", self.equations.inputs, [self.equations.residual])
             known = (given, hold.held, hold.stiffness, theta, self.step.time_step)
             x = ca.SX.sym("x", size)
             residual = function(ca.vertcat(x, ca.SX(self.step.sizes["nz"] + m, 1)), *known)
             q = ca.SX(ca.DM(self._configuration(np.zeros(size), given)))
-            q[list(self.unknown)] = x
+            q[list(self.free_coordinates)] = x
             scale = 1.0 / max(float(ca.norm_inf(function(0, *known))), 1e-6)
-            search = {"print_level": 0, "sb": "yes", "max_iter": MOST_ITERATIONS, "tol": 1e-8}
+            search = {"print_level": 0, "sb": "yes", "max_iter": _ENERGY_ITERATION_LIMIT, "tol": 1e-8}
             options: dict[str, Any] = {"print_time": False, "error_on_fail": False, "ipopt": search}
             program = {
                 "x": x,
@@ -257,10 +265,14 @@ class Statics:
         """
         step = self.step
         n, nz, m, nu = (step.sizes[key] for key in ("n", "nz", "m", "nu"))
-        free, driven, fixed = len(self.unknown), list(step.system.driven_indices), list(step.system.prescribed_indices)
+        free, driven, fixed = (
+            len(self.free_coordinates),
+            list(step.system.driven_indices),
+            list(step.system.prescribed_indices),
+        )
         z, u = w[free : free + nz], hold.held + hold.stiffness * hold.give(q, step.system)
         none = np.zeros(n)
-        h = float(step.functions.scales(q, q, none, z, z, np.zeros(m), u, theta, step.time_step)[1])
+        h = float(step.functions.row_scale_and_time_step(q, q, none, z, z, np.zeros(m), u, theta, step.time_step)[1])
         lam = h * w[free + nz :]
         before = np.concatenate([q, none, z])
         found = step.kernel.linearize(theta, np.stack([before, before]), lam[None], u[None], names, True)
@@ -272,10 +284,10 @@ class Statics:
             whole[:, driven] -= hold.stiffness * push[0]
             return whole
 
-        rows = by_point(found.rows_new, found.rows_old, found.rows_input)
-        p = by_point(found.p1_new, found.p1_old, found.p1_input)
-        push, push_p = found.rows_input[0].copy(), found.p1_input[0]
-        others, others_p = found.rows_theta[0].copy(), found.p1_theta[0]
+        rows = by_point(found.residual_by_new, found.residual_by_old, found.residual_by_input)
+        p = by_point(found.p1_by_new, found.p1_by_old, found.p1_by_input)
+        push, push_p = found.residual_by_input[0].copy(), found.p1_by_input[0]
+        others, others_p = found.residual_by_theta[0].copy(), found.p1_by_theta[0]
         rows[:n] += p
         push[:n] += push_p
         others[:n] += others_p
@@ -283,8 +295,8 @@ class Statics:
             inner = slice(n, n + nz)
             at = (q, q, none, z, z, lam, u, theta, step.time_step)
             slopes = np.zeros((nz, n + nz + m + nu))
-            row, column = triplet(step.functions.patterns["resting"])
-            slopes[row, column] = np.array(step.functions.resting(*at)[1]).ravel()
+            row, column = nonzero_indices(step.functions.sparsity_patterns["resting"])
+            slopes[row, column] = np.array(step.functions.internal_residual_at_rest(*at)[1]).ravel()
             rows[inner], push[inner] = slopes[:, : n + nz + m], slopes[:, n + nz + m :]
             rows[inner, driven] -= hold.stiffness * push[inner]
             chosen = [step.system.parameters.index(name) for name in names]
@@ -294,12 +306,12 @@ class Statics:
         others[:n] /= h
         rows[:, n + nz :] *= h
         p[:, n + nz :] *= h
-        sought = [*self.unknown, *range(n, n + nz + m)]
+        sought = [*self.free_coordinates, *range(n, n + nz + m)]
         by_other = np.hstack([others, hold.stiffness * push, rows[:, fixed]])[sought]
         change = -_solved(rows[np.ix_(sought, sought)], by_other)
         state = np.concatenate([q, found.p1[0], z])
         total = np.zeros((len(state), by_other.shape[1]))
-        total[list(self.unknown)] = change[:free]
+        total[list(self.free_coordinates)] = change[:free]
         total[fixed, len(names) + nu + np.arange(len(fixed))] = 1.0
         total[n : 2 * n] = p[:, sought] @ change + np.hstack([others_p, hold.stiffness * push_p, p[:, fixed]])
         total[2 * n :] = change[free : free + nz]
@@ -308,16 +320,16 @@ class Statics:
     def _explain(self, state: Array, theta: Array, error: float) -> str:
         system, step = self.step.system, self.step
         text = f"no equilibrium found (remaining imbalance {error:.2g})"
-        e, n = step.equations, system.size
+        e, n = step.equations, system.n_coordinates
         if not system.grasps or not np.all(np.isfinite(state)):
             return text
-        with SYMBOLIC:
-            phi = ca.Function("phi", [e.q1, e.z1, e.lam, e.theta, e.time_step], [e.closure])
+        with CASADI_LOCK:
+            phi = ca.Function("phi", [e.q1, e.z1, e.lam, e.theta, e.time_step], [e.constraint_violation])
         gap = np.array(phi(state[:n], state[2 * n :], 0, theta, step.time_step)).ravel()
         row = 0
         for grasp in system.grasps:
             distance = float(np.linalg.norm(gap[row : row + 3]))
-            row += grasp.equations
+            row += grasp.n_equations
             if distance > 1e-4:
                 text += f"; grasp '{grasp.name}' is out of reach by {1e3 * distance:.3g} mm"
         return text
@@ -330,11 +342,11 @@ def _servo_energy(system: System, u: ca.SX, q: ca.SX) -> ca.SX:
     return sum((0.5 * system.servos[name].gain * (part - q[i]) ** 2 for name, i, part in at), ca.SX(0))
 
 
-def hold_stiffness(system: System, known: bool) -> float:
+def holding_spring_stiffness(system: System, known: bool) -> float:
     """Stiffness of the springs that hold driven joints at measured angles, inputs known or not [N m/rad, or 1]."""
     if not known:
-        return HOLD_STIFFNESS
-    return HOLD_STIFFNESS_WITH_COMMAND if system.servos else HOLD_STIFFNESS_WITH_TORQUE
+        return _HOLD_STIFFNESS
+    return _HOLD_STIFFNESS_WITH_COMMAND if system.servos else _HOLD_STIFFNESS_WITH_TORQUE
 
 
 @dataclass(frozen=True)
@@ -356,22 +368,22 @@ def _solved(matrix: Array, right: Array) -> Array:
         return np.zeros((matrix.shape[1], right.shape[1]))
     factors, pivots, info = scipy.linalg.lapack.dgetrf(matrix)
     norm = float(np.max(np.sum(np.abs(matrix), axis=0)))
-    if info == 0 and scipy.linalg.lapack.dgecon(factors, norm)[0] > SINGULAR:
+    if info == 0 and scipy.linalg.lapack.dgecon(factors, norm)[0] > _MIN_RECIPROCAL_CONDITION:
         return np.asarray(scipy.linalg.lapack.dgetrs(factors, pivots, right)[0])
     return np.asarray(np.linalg.lstsq(matrix, right, rcond=None)[0])
 
 
-def relaxed(step: Step, q: ArrayLike, theta: ArrayLike) -> Array:
+def relaxed_internal_coordinates(step: Step, q: ArrayLike, theta: ArrayLike) -> Array:
     """Fully relaxed internal coordinates of an object held at a configuration, shape (nz,)."""
     e = step.equations
     nz = e.z0.numel()
     if nz == 0:
         return np.zeros(0)
-    with SYMBOLIC:
+    with CASADI_LOCK:
         z, at = ca.SX.sym("z", nz), ca.SX.sym("q", e.q0.numel())
         old = ca.vertcat(e.q0, e.q1, e.z0, e.z1, e.p0, e.lam, e.u)
         still = ca.vertcat(at, at, z, z, ca.SX(ca.DM.zeros(e.p0.numel() + e.lam.numel() + e.u.numel())))
-        residual = ca.substitute(e.internal_at_rest, old, still)
+        residual = ca.substitute(e.internal_residual_at_rest, old, still)
         function = ca.Function("relaxed", [z, at, e.theta, e.time_step], [residual, ca.jacobian(residual, z)])
     arguments = (np.asarray(q, float), np.asarray(theta, float), step.time_step)
     return damped_newton(lambda x: function(x, *arguments), np.zeros(nz), 1e-12)[0]

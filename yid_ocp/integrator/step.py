@@ -9,23 +9,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from yid_ocp.display import ReprMixin, ReprSummary
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator import codegen, compiler
 from yid_ocp.integrator.compiled import CompiledKernel
-from yid_ocp.integrator.discrete import ConstraintForce, DiscreteEquations, ForceSplit
+from yid_ocp.integrator.discrete import ConstraintForcePlacement, DiscreteEquations, ForceSplit
 from yid_ocp.integrator.interpreted import InterpretedKernel
-from yid_ocp.integrator.step_model import Directions as Directions
-from yid_ocp.integrator.step_model import Feedback as Feedback
-from yid_ocp.integrator.step_model import Kernel, StepModel, StepStatus, newton_tolerance, step_model
 from yid_ocp.integrator.step_model import Rollout as Rollout
+from yid_ocp.integrator.step_model import SensitivityDirections as SensitivityDirections
+from yid_ocp.integrator.step_model import StepKernel, StepModel, StepStatus, build_step_model, newton_tolerance
+from yid_ocp.integrator.step_model import TrackingFeedback as TrackingFeedback
 from yid_ocp.model.system import System
-from yid_ocp.shown import Shown, Summary
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Step(Shown):
+class Step(ReprMixin):
     """Step map of a system over one time step; made by `compile_step`.
 
     Attributes
@@ -33,17 +33,17 @@ class Step(Shown):
     model : StepModel
         Its equations, functions, sizes, time step and tolerance.
     kernel : Kernel
-    compiled : bool
+    is_compiled : bool
         Whether generated C code is used.
     """
 
     model: StepModel
-    kernel: Kernel
-    compiled: bool
+    kernel: StepKernel
+    is_compiled: bool
 
-    def _summary(self) -> Summary:
-        how = "compiled" if self.compiled else "interpreted"
-        return Summary(f"{self.time_step:g} s, {self.force_split}, {how}, of {self.system._summary().line}")
+    def _summary(self) -> ReprSummary:
+        how = "compiled" if self.is_compiled else "interpreted"
+        return ReprSummary(f"{self.time_step:g} s, {self.force_split}, {how}, of {self.system._summary().one_line}")
 
     @property
     def system(self) -> System:
@@ -61,7 +61,7 @@ class Step(Shown):
         return self.model.equations.force_split
 
     @property
-    def constraint_force(self) -> ConstraintForce:
+    def constraint_force(self) -> ConstraintForcePlacement:
         """Configuration at which the constraint forces act, `node` or `midpoint`."""
         return self.model.equations.constraint_force
 
@@ -110,7 +110,7 @@ class Step(Shown):
         status : StepStatus
         """
         rollout = self._single(q0, p0, u, theta, prescribed, internal, None)
-        n = self.system.size
+        n = self.system.n_coordinates
         after = rollout.state[1]
         return after[:n], after[n : 2 * n], rollout.multipliers[0], rollout.status
 
@@ -145,9 +145,9 @@ class Step(Shown):
         start[:, nt : nt + nx] = np.eye(nx)
         torque = np.zeros((1, nu, nt + nx + nu))
         torque[0, :, nt + nx :] = np.eye(nu)
-        rollout = self._single(q0, p0, u, theta, prescribed, internal, Directions(chosen, start, torque))
-        assert rollout.by_state is not None
-        after = rollout.by_state[1]
+        rollout = self._single(q0, p0, u, theta, prescribed, internal, SensitivityDirections(chosen, start, torque))
+        assert rollout.state_sensitivity is not None
+        after = rollout.state_sensitivity[1]
         return after[:, nt : nt + nx].copy(), after[:, nt + nx :].copy(), after[:, :nt].copy()
 
     def _single(
@@ -158,11 +158,13 @@ class Step(Shown):
         theta: ArrayLike,
         prescribed: tuple[ArrayLike, ArrayLike] | None,
         internal: ArrayLike | None,
-        wanted: Directions | None,
+        wanted: SensitivityDirections | None,
     ) -> Rollout:
         sizes = self.sizes
-        z0 = np.zeros(sizes["nz"]) if internal is None else check_shape("internal", internal, (sizes["nz"],))
-        start = np.concatenate([check_shape("q0", q0, (sizes["n"],)), check_shape("p0", p0, (sizes["n"],)), z0])
+        z0 = np.zeros(sizes["nz"]) if internal is None else float_array_of_shape("internal", internal, (sizes["nz"],))
+        start = np.concatenate(
+            [float_array_of_shape("q0", q0, (sizes["n"],)), float_array_of_shape("p0", p0, (sizes["n"],)), z0]
+        )
         if prescribed is None:
             if sizes["nc"]:
                 raise ModelError(
@@ -172,17 +174,19 @@ class Step(Shown):
         else:
             if len(prescribed) != 2:
                 raise ModelError(f"prescribed has {len(prescribed)} entries", allowed="the pair (s0, s1)")
-            path = np.stack([check_shape("prescribed", s, (sizes["nc"],)) for s in prescribed])
+            path = np.stack([float_array_of_shape("prescribed", s, (sizes["nc"],)) for s in prescribed])
         start[list(self.system.prescribed_indices)] = path[0]
-        torque = check_shape("u", u, (sizes["nu"],))[None, :]
-        return self.kernel.rollout(check_shape("theta", theta, (sizes["ntheta"],)), start, torque, path, None, wanted)
+        torque = float_array_of_shape("u", u, (sizes["nu"],))[None, :]
+        return self.kernel.rollout(
+            float_array_of_shape("theta", theta, (sizes["ntheta"],)), start, torque, path, None, wanted
+        )
 
 
 def compile_step(
     system: System,
     time_step: float,
     force_split: ForceSplit = "symmetric",
-    constraint_force: ConstraintForce = "midpoint",
+    constraint_force: ConstraintForcePlacement = "midpoint",
     *,
     use_compiler: bool = True,
     tolerance: float | None = None,
@@ -213,15 +217,15 @@ def compile_step(
     ModelError
         Time step not positive, unknown force split or constraint force.
     """
-    model = step_model(system, _positive(time_step), force_split, constraint_force, tolerance)
-    source = codegen.kernel_source(model.functions, model.structure) if use_compiler else None
+    model = build_step_model(system, _positive(time_step), force_split, constraint_force, tolerance)
+    source = codegen.kernel_source(model.functions, model.index_tables) if use_compiler else None
     library = None if source is None else compiler.compile_library(source)
     if library is None:
-        return Step(model, InterpretedKernel(model), compiled=False)
-    return Step(model, CompiledKernel(model, library), compiled=True)
+        return Step(model, InterpretedKernel(model), is_compiled=False)
+    return Step(model, CompiledKernel(model, library), is_compiled=True)
 
 
-def at_time_step(step: Step, time_step: float) -> Step:
+def with_time_step(step: Step, time_step: float) -> Step:
     """A copy of a step with another time step [s], from the same equations and compiled code.
 
     Raises
@@ -230,12 +234,12 @@ def at_time_step(step: Step, time_step: float) -> Step:
         Time step not positive.
     """
     model = replace(step.model, time_step=_positive(time_step), tolerance=newton_tolerance(time_step))
-    return Step(model, step.kernel.of(model), step.compiled)
+    return Step(model, step.kernel.with_model(model), step.is_compiled)
 
 
-def compile_alike(step: Step, system: System, *, use_compiler: bool | None = None) -> Step:
+def compile_step_like(step: Step, system: System, *, use_compiler: bool | None = None) -> Step:
     """The step of another system with the time step, integration rules and, by default, kernel type of `step`."""
-    compiled = step.compiled if use_compiler is None else use_compiler
+    compiled = step.is_compiled if use_compiler is None else use_compiler
     return compile_step(system, step.time_step, step.force_split, step.constraint_force, use_compiler=compiled)
 
 
@@ -245,7 +249,7 @@ def _positive(time_step: float) -> float:
     return time_step
 
 
-def check_shape(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
+def float_array_of_shape(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
     """The values as a contiguous float array; `ModelError` with `name` if its shape is not `shape`."""
     array = np.ascontiguousarray(values, dtype=float)
     if array.size == 0 and 0 in shape:

@@ -13,20 +13,20 @@ from numpy.typing import NDArray
 
 from yid_ocp.errors import ModelError, ResourceError
 from yid_ocp.integrator import codegen
-from yid_ocp.integrator.discrete import ConstraintForce, DiscreteEquations, ForceSplit, discrete_equations
+from yid_ocp.integrator.discrete import ConstraintForcePlacement, DiscreteEquations, ForceSplit, discrete_equations
 from yid_ocp.model.system import System
 
 Array = NDArray[np.float64]
 
 # Newton iterations of one step before it is given up.
-ITERATION_LIMIT = 60
+NEWTON_ITERATION_LIMIT = 60
 
 # The same of an equilibrium, which is looked for from far away.
-REST_ITERATION_LIMIT = 100
+EQUILIBRIUM_ITERATION_LIMIT = 100
 
 # Newton stops when a correction of the coordinates is below TOLERANCE [rad or m], with short time steps below
 # RATE_TOLERANCE times the step: what is left undone is momentum lost in every step, mass times correction over step.
-TOLERANCE, RATE_TOLERANCE, ROUNDING = 1e-12, 1e-10, 1e-15
+_COORDINATE_TOLERANCE, _VELOCITY_TOLERANCE, _ROUNDING_FLOOR = 1e-12, 1e-10, 1e-15
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class StepModel:
     system : System
     equations : DiscreteEquations
     functions : StepFunctions
-    structure : Structure
+    index_tables : Structure
     sizes : dict of str to int
         n, nz, m, nu, nc, nx and ntheta.
     time_step : float
@@ -50,23 +50,23 @@ class StepModel:
     system: System
     equations: DiscreteEquations
     functions: codegen.StepFunctions
-    structure: codegen.Structure
+    index_tables: codegen.StepIndexTables
     sizes: dict[str, int]
     time_step: float
     tolerance: float
 
 
-def step_model(
+def build_step_model(
     system: System,
     time_step: float,
     force_split: ForceSplit,
-    constraint_force: ConstraintForce,
+    constraint_force: ConstraintForcePlacement,
     tolerance: float | None = None,
 ) -> StepModel:
     """The `StepModel` of a system; arguments as in `compile_step`."""
     e = discrete_equations(system, force_split, constraint_force)
     functions = codegen.step_functions(e)
-    n, nz = system.size, e.z0.numel()
+    n, nz = system.n_coordinates, e.z0.numel()
     sizes = {
         "n": n,
         "nz": nz,
@@ -78,15 +78,15 @@ def step_model(
     }
     if tolerance is None:
         tolerance = newton_tolerance(time_step)
-    return StepModel(system, e, functions, codegen.structure(functions), sizes, float(time_step), tolerance)
+    return StepModel(system, e, functions, codegen.step_index_tables(functions), sizes, float(time_step), tolerance)
 
 
 def newton_tolerance(time_step: float) -> float:
     """Newton's tolerance on the coordinates [rad or m] for a time step [s]."""
-    return max(ROUNDING, min(TOLERANCE, RATE_TOLERANCE * time_step))
+    return max(_ROUNDING_FLOOR, min(_COORDINATE_TOLERANCE, _VELOCITY_TOLERANCE * time_step))
 
 
-class StepCode(IntEnum):
+class NewtonStatus(IntEnum):
     """Termination status of Newton's iteration of one step, as the C kernel numbers it."""
 
     OK = 0
@@ -96,18 +96,18 @@ class StepCode(IntEnum):
     OUT_OF_MEMORY = 4
 
 
-MESSAGES = {
-    StepCode.OK: "converged",
-    StepCode.NOT_CONVERGED: "Newton did not converge; try a smaller time step, more damping, or a fitting start",
-    StepCode.SINGULAR: "the step's equations are singular; look for redundant grasps or a coordinate without inertia",
-    StepCode.NOT_FINITE: "the state is no longer finite; the motion is unstable open loop: add feedback or damping",
-    StepCode.OUT_OF_MEMORY: "there is not enough memory",
+_STATUS_MESSAGES = {
+    NewtonStatus.OK: "converged",
+    NewtonStatus.NOT_CONVERGED: "Newton did not converge; try a smaller time step, more damping, or a fitting start",
+    NewtonStatus.SINGULAR: "the step's equations are singular; look for redundant grasps or a coordinate without inertia",
+    NewtonStatus.NOT_FINITE: "the state is no longer finite; the motion is unstable open loop: add feedback or damping",
+    NewtonStatus.OUT_OF_MEMORY: "there is not enough memory",
 }
 
 
-LONG = 100
+_LONG_ROLLOUT_STEPS = 100
 """Number of steps after which a failure is attributed to the integration method, not to the initial state."""
-LIMIT = (
+_INSTABILITY_HINT = (
     "the midpoint rule damps nothing by itself: without damping in the model the fastest modes grow over some hundred "
     "steps until a step of this length cannot follow them"
 )
@@ -120,79 +120,86 @@ class StepStatus:
     Attributes
     ----------
     code : StepCode
-    step : int
+    completed_steps : int
         Steps completed.
-    error : float
+    last_correction : float
         Last Newton correction [rad or m].
-    iterations, factorisations : int
+    newton_iterations, factorisations : int
         Totals over all steps.
-    effort : ndarray, shape (nc,)
+    prescribed_effort : ndarray, shape (nc,)
         Effort that the prescribed coordinates needed at the first node of the last step [N m].
-    internal : ndarray, shape (nz,)
+    internal_coordinates : ndarray, shape (nz,)
         Internal coordinates after the last step.
     """
 
-    code: StepCode
-    step: int
-    error: float
-    iterations: int
+    code: NewtonStatus
+    completed_steps: int
+    last_correction: float
+    newton_iterations: int
     factorisations: int
-    effort: Array = field(default_factory=lambda: np.zeros(0), repr=False)
-    internal: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+    prescribed_effort: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+    internal_coordinates: Array = field(default_factory=lambda: np.zeros(0), repr=False)
 
     @property
-    def ok(self) -> bool:
+    def is_converged(self) -> bool:
         """Whether every step converged."""
-        return self.code == StepCode.OK
+        return self.code == NewtonStatus.OK
 
     @property
     def message(self) -> str:
         """The status as a sentence with the step, the last correction and a remedy."""
-        if self.ok:
-            return MESSAGES[self.code]
-        said = f"step {self.step}: {MESSAGES[self.code]} (last correction {self.error:.2g})"
-        late = self.code in (StepCode.NOT_CONVERGED, StepCode.NOT_FINITE) and self.step >= LONG
-        return f"{said}; {LIMIT}" if late else said
+        if self.is_converged:
+            return _STATUS_MESSAGES[self.code]
+        said = (
+            f"step {self.completed_steps}: {_STATUS_MESSAGES[self.code]} (last correction {self.last_correction:.2g})"
+        )
+        late = (
+            self.code in (NewtonStatus.NOT_CONVERGED, NewtonStatus.NOT_FINITE)
+            and self.completed_steps >= _LONG_ROLLOUT_STEPS
+        )
+        return f"{said}; {_INSTABILITY_HINT}" if late else said
 
 
 @dataclass(frozen=True)
-class Directions:
+class SensitivityDirections:
     """Directions of the forward sensitivities of a rollout: d columns, the first ones the named parameters.
 
     Attributes
     ----------
-    names : tuple of str
+    parameter_names : tuple of str
         Parameters of theta.
-    start : ndarray, shape (nx, d)
+    initial_state_tangents : ndarray, shape (nx, d)
         Derivative of the initial state (q, p, z).
-    torque : ndarray, optional, shape (N, nu, d)
+    torque_tangents : ndarray, optional, shape (N, nu, d)
         Derivative of the nominal torque.
-    path : ndarray, optional, shape (N + 1, nc, d)
+    prescribed_tangents : ndarray, optional, shape (N + 1, nc, d)
         Derivative of the prescribed coordinates.
     """
 
-    names: tuple[str, ...]
-    start: Array
-    torque: Array | None = None
-    path: Array | None = None
+    parameter_names: tuple[str, ...]
+    initial_state_tangents: Array
+    torque_tangents: Array | None = None
+    prescribed_tangents: Array | None = None
 
     def __post_init__(self) -> None:
-        if self.count < len(self.names):
-            raise ModelError(f"{self.count} directions for {len(self.names)} parameters", allowed="one or more each")
+        if self.count < len(self.parameter_names):
+            raise ModelError(
+                f"{self.count} directions for {len(self.parameter_names)} parameters", allowed="one or more each"
+            )
 
     @property
     def count(self) -> int:
         """d, the number of directions."""
-        return self.start.shape[1]
+        return self.initial_state_tangents.shape[1]
 
 
 @dataclass(frozen=True)
-class Feedback:
+class TrackingFeedback:
     """Time-varying feedback of the tracking filter, u_k = ubar_k - K_k (x_k[index] - xbar_k).
 
     Attributes
     ----------
-    index : ndarray of int, shape (nb,)
+    state_indices : ndarray of int, shape (nb,)
         Rows of the state (q, p, z) that are fed back.
     gain : ndarray, shape (N, nu, nb)
         K_k [N m/rad for a coordinate, 1/s for a momentum].
@@ -200,34 +207,34 @@ class Feedback:
         Measured values of these rows.
     """
 
-    index: NDArray[np.int32]
+    state_indices: NDArray[np.int32]
     gain: Array
     reference: Array
 
 
 @dataclass(frozen=True)
-class Member:
+class RolloutInputs:
     """Inputs of one rollout.
 
     Attributes
     ----------
     theta : ndarray, shape (ntheta,)
-    start : ndarray, shape (nx,)
+    initial_state : ndarray, shape (nx,)
         Initial (q, p, z).
     torque : ndarray, shape (N, nu)
         Nominal motor torque of every step [N m].
-    path : ndarray, shape (N + 1, nc)
+    prescribed_path : ndarray, shape (N + 1, nc)
         Prescribed coordinates at every node.
     feedback : Feedback, optional
-    wanted : Directions, optional
+    directions : Directions, optional
     """
 
     theta: Array
-    start: Array
+    initial_state: Array
     torque: Array
-    path: Array
-    feedback: Feedback | None = None
-    wanted: Directions | None = None
+    prescribed_path: Array
+    feedback: TrackingFeedback | None = None
+    directions: SensitivityDirections | None = None
 
 
 @dataclass(frozen=True)
@@ -245,7 +252,7 @@ class Rollout:
         (`Rest` gives such a p_0); after p_0 = dL/dv it holds only half a step's impulse, half the effort.
     torque : ndarray, shape (N, nu)
         Applied torque [N m].
-    by_state, by_multipliers, by_effort : ndarray, shape (..., d), or None
+    state_sensitivity, multipliers_sensitivity, effort_sensitivity : ndarray, shape (..., d), or None
         Derivatives of state, multipliers and effort by the directions; NaN after a failed step, like all arrays.
     status : StepStatus
     """
@@ -254,33 +261,33 @@ class Rollout:
     multipliers: Array
     effort: Array
     torque: Array
-    by_state: Array | None
-    by_multipliers: Array | None
-    by_effort: Array | None
+    state_sensitivity: Array | None
+    multipliers_sensitivity: Array | None
+    effort_sensitivity: Array | None
     status: StepStatus
 
 
 @dataclass(frozen=True)
-class Gradient:
+class CostGradient:
     """Gradient of a scalar cost along a rollout, from the adjoint.
 
     Attributes
     ----------
     by_theta : ndarray, shape (len(names),)
-    by_start : ndarray, shape (nx,)
+    by_initial_state : ndarray, shape (nx,)
         By the initial state.
     by_torque : ndarray, shape (N, nu)
         By the nominal torque.
-    by_path : ndarray, shape (N + 1, nc)
-        By the prescribed coordinates at every node, those at node 0 as in `by_start`.
+    by_prescribed_path : ndarray, shape (N + 1, nc)
+        By the prescribed coordinates at every node, those at node 0 as in `by_initial_state`.
 
     All NaN where a step's equations turned out singular.
     """
 
     by_theta: Array
-    by_start: Array
+    by_initial_state: Array
     by_torque: Array
-    by_path: Array
+    by_prescribed_path: Array
 
 
 @dataclass(frozen=True)
@@ -289,36 +296,36 @@ class StepLinearization:
 
     Attributes
     ----------
-    rows : ndarray, shape (N, nt)
+    residual : ndarray, shape (N, nt)
         Residual of every step: momentum balance (n), internal (nz) and constraint (m) equations.
     p1 : ndarray, shape (N, n)
         p_{k+1} that follows from the other values.
-    rows_new, p1_new : ndarray, shape (N, nt, nt) and (N, n, nt)
+    residual_by_new, p1_by_new : ndarray, shape (N, nt, nt) and (N, n, nt)
         Derivatives by (q_{k+1}, z_{k+1}, lam_k).
-    rows_old, p1_old : ndarray, shape (N, nt, n + nz) and (N, n, n + nz)
+    residual_by_old, p1_by_old : ndarray, shape (N, nt, n + nz) and (N, n, n + nz)
         Derivatives by (q_k, z_k); that of the balance by p_k is the identity.
-    rows_input, p1_input : ndarray, shape (N, nt, nu) and (N, n, nu)
+    residual_by_input, p1_by_input : ndarray, shape (N, nt, nu) and (N, n, nu)
         Derivatives by the torque.
-    rows_theta, p1_theta : ndarray, shape (N, nt, ntheta) and (N, n, ntheta)
+    residual_by_theta, p1_by_theta : ndarray, shape (N, nt, ntheta) and (N, n, ntheta)
         Derivatives by the chosen parameters.
     """
 
-    rows: Array
+    residual: Array
     p1: Array
-    rows_new: Array
-    rows_old: Array
-    rows_input: Array
-    p1_new: Array
-    p1_old: Array
-    p1_input: Array
-    rows_theta: Array
-    p1_theta: Array
+    residual_by_new: Array
+    residual_by_old: Array
+    residual_by_input: Array
+    p1_by_new: Array
+    p1_by_old: Array
+    p1_by_input: Array
+    residual_by_theta: Array
+    p1_by_theta: Array
 
 
-class Kernel(Protocol):
+class StepKernel(Protocol):
     """Interface of the compiled and the interpreted implementation of a step."""
 
-    def of(self, model: StepModel) -> Kernel:
+    def with_model(self, model: StepModel) -> StepKernel:
         """A kernel of the same equations with another step model, which differs in the time step."""
         ...
 
@@ -328,26 +335,26 @@ class Kernel(Protocol):
         start: Array,
         torque: Array,
         path: Array,
-        feedback: Feedback | None,
-        wanted: Directions | None,
+        feedback: TrackingFeedback | None,
+        wanted: SensitivityDirections | None,
     ) -> Rollout:
         """Simulate len(torque) steps from the state `start`."""
         ...
 
-    def rollouts(self, members: Sequence[Member]) -> list[Rollout]:
+    def rollout_batch(self, members: Sequence[RolloutInputs]) -> list[Rollout]:
         """Simulate all members, in batches where that is faster; equal to `rollout` of each but for rounding."""
         ...
 
-    def adjoint(
+    def adjoint_gradient(
         self,
         theta: Array,
         rollout: Rollout,
-        feedback: Feedback | None,
+        feedback: TrackingFeedback | None,
         names: tuple[str, ...],
         by_state: Array,
         by_multipliers: Array | None,
         by_effort: Array | None,
-    ) -> Gradient:
+    ) -> CostGradient:
         """Gradient of a cost whose partial derivatives along the rollout are given."""
         ...
 
@@ -363,7 +370,7 @@ class Kernel(Protocol):
         """Residuals of len(torque) steps along a trajectory and, with `derivatives`, their Jacobians."""
         ...
 
-    def slopes(
+    def step_jacobians(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, load_rows: Array, load_momentum: Array
     ) -> tuple[Array, Array]:
         """Jacobians of the single steps of a finished rollout by the implicit function theorem.
@@ -389,10 +396,10 @@ class Kernel(Protocol):
         """
         ...
 
-    def rest(
+    def find_equilibrium(
         self, theta: Array, unknowns: Array, given: Array, held: Array, stiffness: float, tolerance: float
     ) -> tuple[Array, float, bool]:
-        """Solve `RestEquations` for a static equilibrium by Newton's iteration.
+        """Solve `EquilibriumEquations` for a static equilibrium by Newton's iteration.
 
         Parameters
         ----------
@@ -416,7 +423,7 @@ class Kernel(Protocol):
         ...
 
 
-def empty_rollout(sizes: dict[str, int], steps: int, count: int | None) -> Rollout:
+def allocate_rollout(sizes: dict[str, int], steps: int, count: int | None) -> Rollout:
     """A rollout filled with NaN, with `count` directions or none, for a kernel to write into."""
     shapes: dict[str, tuple[int, ...]] = {
         "state": (steps + 1, sizes["nx"]),
@@ -428,17 +435,23 @@ def empty_rollout(sizes: dict[str, int], steps: int, count: int | None) -> Rollo
         shapes |= {f"by_{name}": (*shapes[name], count) for name in ("state", "multipliers", "effort")}
     arrays = _arrays(f"a rollout of {steps} steps with {count or 0} derivatives", shapes, math.nan)
     by_state, by_multipliers, by_effort = (arrays.pop(f"by_{name}", None) for name in list(shapes)[:3])
-    status = StepStatus(StepCode.OK, 0, 0.0, 0, 0)
-    return Rollout(**arrays, by_state=by_state, by_multipliers=by_multipliers, by_effort=by_effort, status=status)
+    status = StepStatus(NewtonStatus.OK, 0, 0.0, 0, 0)
+    return Rollout(
+        **arrays,
+        state_sensitivity=by_state,
+        multipliers_sensitivity=by_multipliers,
+        effort_sensitivity=by_effort,
+        status=status,
+    )
 
 
-def empty_linearization(sizes: dict[str, int], count: int, width: int, derivatives: bool) -> StepLinearization:
+def allocate_linearization(sizes: dict[str, int], count: int, width: int, derivatives: bool) -> StepLinearization:
     """A linearization of `count` steps and `width` parameters filled with zeros; no Jacobians without `derivatives`."""
     n, nz, m, nu = sizes["n"], sizes["nz"], sizes["m"], sizes["nu"]
     nt, steps = n + nz + m, count if derivatives else 0
-    shapes: dict[str, tuple[int, ...]] = {"rows": (count, nt), "p1": (count, n)}
+    shapes: dict[str, tuple[int, ...]] = {"residual": (count, nt), "p1": (count, n)}
     for name, columns in {"new": nt, "old": n + nz, "input": nu, "theta": width}.items():
-        shapes |= {f"rows_{name}": (steps, nt, columns), f"p1_{name}": (steps, n, columns)}
+        shapes |= {f"residual_by_{name}": (steps, nt, columns), f"p1_by_{name}": (steps, n, columns)}
     return StepLinearization(**_arrays(f"the derivatives of {count} steps", shapes, 0.0))
 
 
@@ -446,22 +459,22 @@ def _arrays(what: str, shapes: Mapping[str, tuple[int, ...]], value: float) -> d
     try:
         return {name: np.full(shape, value) if value else np.zeros(shape) for name, shape in shapes.items()}
     except MemoryError as error:
-        raise out_of_memory(what, 8 * sum(math.prod(shape) for shape in shapes.values())) from error
+        raise out_of_memory_error(what, 8 * sum(math.prod(shape) for shape in shapes.values())) from error
 
 
-def out_of_memory(what: str, size: int) -> ResourceError:
+def out_of_memory_error(what: str, size: int) -> ResourceError:
     """The `ResourceError` to raise when `size` bytes for `what` cannot be allocated."""
     amount = f"{size / 1e9:.3g} GB" if size >= 1e9 else f"{size / 1e6:.3g} MB"
     return ResourceError(
-        f"{MESSAGES[StepCode.OUT_OF_MEMORY]} for {what}: it takes {amount}",
+        f"{_STATUS_MESSAGES[NewtonStatus.OUT_OF_MEMORY]} for {what}: it takes {amount}",
         hint="estimate fewer parameters at once, use a shorter part of the recording, or close other programs",
     )
 
 
-def ended(
+def rollout_with_status(
     rollout: Rollout, sizes: dict[str, int], code: int, step: int, error: float, counts: tuple[int, int]
 ) -> Rollout:
-    """A copy of the rollout with its `StepStatus`; `counts` are Newton iterations and factorisations."""
+    """A copy of the rollout with its `StepStatus`; `block_sample_counts` are Newton iterations and factorisations."""
     last = rollout.effort[step - 1] if step else np.zeros(sizes["nc"])
     inner = rollout.state[step, 2 * sizes["n"] :]
-    return replace(rollout, status=StepStatus(StepCode(code), step, error, *counts, last, inner))
+    return replace(rollout, status=StepStatus(NewtonStatus(code), step, error, *counts, last, inner))

@@ -15,5 +15,5 @@ from yid_ocp.model.system import Effect as Effect
 from yid_ocp.model.system import Grasp as Grasp
 from yid_ocp.model.system import MidpointState as MidpointState
 from yid_ocp.model.system import NodeState as NodeState
+from yid_ocp.model.system import StepTerms as StepTerms
 from yid_ocp.model.system import System as System
-from yid_ocp.model.system import Terms as Terms

@@ -27,29 +27,29 @@ import numpy as np
 from annotated_types import Ge, Gt, Le
 from numpy.typing import ArrayLike, NDArray
 
-from yid_ocp.errors import DataError, ModelError, nearest
+from yid_ocp.errors import DataError, ModelError, nearest_name_hint
 from yid_ocp.model import Grasp, Mechanism, System, flexible_object
-from yid_ocp.model.flexible import AXES, FlexibleObject, Segment, polyline_rotations
-from yid_ocp.model.mechanism import Frame, Line, Placement
+from yid_ocp.model.flexible import UNIT_AXES, FlexibleObject, Segment, polyline_rotations
+from yid_ocp.model.mechanism import Frame, LinkChain, Placement
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.model.rotations import about_axis
+from yid_ocp.model.rotations import symbolic_axis_rotation
 from yid_ocp.model.system import floating_clamp
-from yid_ocp.options import About
+from yid_ocp.options import OptionInfo
 
 Array = NDArray[np.float64]
-START, END = "clamp_start", "clamp_end"
-START_ROLL, END_ROLL = f"{START}.roll", f"{END}.roll"
-REST = ".rest"
-SPEED_SCALE = "start.speed_scale"
+_START_CLAMP, _END_CLAMP = "clamp_start", "clamp_end"
+_START_ROLL_PARAMETER, _END_ROLL_PARAMETER = f"{_START_CLAMP}.roll", f"{_END_CLAMP}.roll"
+_REST_ANGLE_SUFFIX = ".rest"
+START_SPEED_SCALE_PARAMETER = "start.speed_scale"
 # Keeps load/stiffness finite where a stiffness is zero [N m/rad].
-LEAST_STIFFNESS = 1e-9
-START_EDGE, LAST_EDGE = f"{START}_edge", "last_edge"
+_MIN_STIFFNESS = 1e-9
+_START_EDGE_FRAME, _LAST_EDGE_FRAME = f"{_START_CLAMP}_edge", "last_edge"
 
 
 # Parameters of a joint whose rest angle is told from the start: its angle there [rad] and the torque it bears [N m].
-PRESET = ("start", "load")
+START_SHAPE_SUFFIXES = ("start", "load")
 # Parameter that is told the root mean square speed of the measured points at the start [m/s].
-START_SPEED = "start.speed"
+START_SPEED_PARAMETER = "start.speed"
 
 
 @dataclass(frozen=True)
@@ -58,59 +58,61 @@ class ClampPath:
 
     Attributes
     ----------
-    clamp : str
+    clamp_name : str
         Name of the clamp.
-    origin : str
+    origin_point : str
         Point at which its origin sits.
-    towards : str
+    z_axis_point : str
         Point to which its z axis looks.
-    roll : "level" or "transported"
+    roll_convention : "level" or "transported"
         What the points do not tell, the turn about z: with `level` the third angle stays zero (x axis across world y);
         with `transported` the clamp never turns about its own z axis, from `level` at the first node on.
     """
 
-    clamp: str
-    origin: str
-    towards: str
-    roll: Literal["level", "transported"] = "level"
+    clamp_name: str
+    origin_point: str
+    z_axis_point: str
+    roll_convention: Literal["level", "transported"] = "level"
 
 
 @dataclass(frozen=True)
-class Cable:
+class CableTopology:
     """Vertices and branches of a cable with their undeformed positions.
 
     Attributes
     ----------
-    parent : tuple of str
+    parent_vertices : tuple of str
         Vertices of the parent from one clamp to the other; the first two and the last two are held.
-    children : mapping of str to tuple of str
+    child_vertices : mapping of str to tuple of str
         Name of each child to its vertices, the first one that of the parent at which it leaves.
-    undeformed : mapping of str to array_like, shape (3,)
+    undeformed_positions : mapping of str to array_like, shape (3,)
         Every vertex of the cable at rest without load [m], in any frame.
-    parent_name : str
+    parent_segment : str
         Segment name of the parent.
     """
 
-    parent: tuple[str, ...]
-    children: Mapping[str, tuple[str, ...]]
-    undeformed: Mapping[str, ArrayLike]
-    parent_name: str = "parent"
+    parent_vertices: tuple[str, ...]
+    child_vertices: Mapping[str, tuple[str, ...]]
+    undeformed_positions: Mapping[str, ArrayLike]
+    parent_segment: str = "parent"
 
     def __post_init__(self) -> None:
-        if len(self.parent) < 5:
+        if len(self.parent_vertices) < 5:
             raise ModelError(
-                f"the parent has {len(self.parent)} vertices", where="cable", allowed="5 or more: two held at each end"
+                f"the parent has {len(self.parent_vertices)} vertices",
+                where="cable",
+                allowed="5 or more: two held at each end",
             )
-        for name, vertices in self.children.items():
-            if len(vertices) < 2 or vertices[0] not in self.parent[2:-2]:
+        for name, vertices in self.child_vertices.items():
+            if len(vertices) < 2 or vertices[0] not in self.parent_vertices[2:-2]:
                 raise ModelError(
                     f"child '{name}' does not leave the parent at one of its free vertices",
                     where="cable",
-                    allowed=", ".join(self.parent[2:-2]),
+                    allowed=", ".join(self.parent_vertices[2:-2]),
                 )
         for vertex in self.vertices:
-            if vertex not in self.undeformed:
-                hint = nearest(vertex, self.undeformed)
+            if vertex not in self.undeformed_positions:
+                hint = nearest_name_hint(vertex, self.undeformed_positions)
                 raise ModelError(f"vertex '{vertex}' has no undeformed position", where="cable", hint=hint)
         if len(set(self.vertices)) != len(self.vertices):
             raise ModelError("a vertex belongs to two branches", where="cable")
@@ -118,101 +120,109 @@ class Cable:
     @property
     def vertices(self) -> tuple[str, ...]:
         """Names of all vertices, the parent's first."""
-        return (*self.parent, *(vertex for chain in self.children.values() for vertex in chain[1:]))
+        return (*self.parent_vertices, *(vertex for chain in self.child_vertices.values() for vertex in chain[1:]))
 
     @property
-    def held(self) -> tuple[str, ...]:
+    def clamped_vertices(self) -> tuple[str, ...]:
         """Names of the four vertices held by the clamps."""
-        return (*self.parent[:2], *self.parent[-2:])
+        return (*self.parent_vertices[:2], *self.parent_vertices[-2:])
 
     @property
-    def free(self) -> tuple[str, ...]:
+    def free_vertices(self) -> tuple[str, ...]:
         """Names of the vertices that no clamp holds, on which predictions are evaluated."""
-        return tuple(vertex for vertex in self.vertices if vertex not in self.held)
+        return tuple(vertex for vertex in self.vertices if vertex not in self.clamped_vertices)
 
     @property
-    def chains(self) -> dict[str, tuple[str, ...]]:
+    def branch_vertices(self) -> dict[str, tuple[str, ...]]:
         """Names of the vertices of every branch, by segment, the parent first."""
-        return {self.parent_name: self.parent, **self.children}
+        return {self.parent_segment: self.parent_vertices, **self.child_vertices}
 
     @property
     def edges(self) -> tuple[tuple[str, str], ...]:
         """Pairs of neighbouring vertices, branch by branch."""
-        return tuple(pair for chain in self.chains.values() for pair in pairwise(chain))
+        return tuple(pair for chain in self.branch_vertices.values() for pair in pairwise(chain))
 
     @property
-    def clamps(self) -> tuple[ClampPath, ClampPath]:
+    def clamp_paths(self) -> tuple[ClampPath, ClampPath]:
         """Paths of the two clamps, start and end."""
-        p = self.parent
-        return ClampPath(START, p[0], p[1], "transported"), ClampPath(END, p[-2], p[-1], "transported")
+        p = self.parent_vertices
+        return ClampPath(_START_CLAMP, p[0], p[1], "transported"), ClampPath(_END_CLAMP, p[-2], p[-1], "transported")
 
-    def shape(self, chain: Sequence[str]) -> Array:
+    def undeformed_polyline(self, chain: Sequence[str]) -> Array:
         """Undeformed positions of some vertices, shape (len(chain), 3) [m]."""
-        return np.array([np.asarray(self.undeformed[vertex], float) for vertex in chain])
+        return np.array([np.asarray(self.undeformed_positions[vertex], float) for vertex in chain])
 
 
 @dataclass(frozen=True)
-class BranchOptions:
+class CableBranchOptions:
     """Nominal properties of one branch of a cable.
 
     Attributes
     ----------
-    bend, twist : float
+    bend_rigidity, twist_rigidity : float
         Rigidity [N m^2]; in a configuration under `parameters`.
-    damping : float
+    bend_damping : float
         Viscous damping per curvature rate [N m^2 s]; in a configuration under `parameters`.
     """
 
-    bend: float = 1.5e-3
-    twist: float = 1.0e-3
-    damping: float = 5e-5
-    twist_damping: Annotated[bool, About("whether twists have a damping parameter of their own")] = False
-    density: Annotated[float, Gt(0), About("mass per length; results are per unit of it", "kg/m")] = 0.05
+    bend_rigidity: float = 1.5e-3
+    twist_rigidity: float = 1.0e-3
+    bend_damping: float = 5e-5
+    separate_twist_damping: Annotated[bool, OptionInfo("whether twists have a damping parameter of their own")] = False
+    linear_density: Annotated[float, Gt(0), OptionInfo("mass per length; results are per unit of it", "kg/m")] = 0.05
 
 
 @dataclass(frozen=True)
 class CableOptions:
     """Options of a cable's model.
 
-    With a `memory` each joint rests at (1 - memory) x undeformed + memory x (start angle - load/stiffness), the load
+    With a `shape_memory` each joint rests at (1 - memory) x undeformed + memory x (start angle - load/stiffness), the load
     being what the joint bears at the recording's start if the cable is at rest there. It becomes the parameter
     `SEGMENT.memory` and counts less for a recording that starts in motion, by the factor
     1/(1 + (start speed/`start.speed_scale`)^2).
 
     Attributes
     ----------
-    default : BranchOptions
+    default_branch : BranchOptions
         Of branches that are not named.
     gravity : tuple of float
         [m/s^2]
     """
 
-    branches: Annotated[Mapping[str, BranchOptions], About("by name, parent and children")] = field(
+    branches: Annotated[Mapping[str, CableBranchOptions], OptionInfo("by name, parent and children")] = field(
         default_factory=dict
     )
-    default: BranchOptions = field(default_factory=BranchOptions)
-    radius: Annotated[float, Gt(0), Le(1), About("of the solid cylinders that give the links' inertia", "m")] = 0.005
-    end: Annotated[
+    default_branch: CableBranchOptions = field(default_factory=CableBranchOptions)
+    radius: Annotated[float, Gt(0), Le(1), OptionInfo("of the solid cylinders that give the links' inertia", "m")] = (
+        0.005
+    )
+    end_clamp: Annotated[
         Literal["axis", "weld"],
-        About("whether the end clamp leaves the roll free or holds it at the parameter clamp_end.roll"),
+        OptionInfo("whether the end clamp leaves the roll free or holds it at the parameter clamp_end.roll"),
     ] = "axis"
-    rest_shape: Annotated[bool, About("whether branches rest in their undeformed shape, or straight")] = True
-    rigid_clamp: Annotated[
-        bool, About("whether the first edge is rigid up to its second point, so that half of the next one bends alone")
+    undeformed_rest_shape: Annotated[
+        bool, OptionInfo("whether branches rest in their undeformed shape, or straight")
+    ] = True
+    rigid_first_edge: Annotated[
+        bool,
+        OptionInfo("whether the first edge is rigid up to its second point, so that half of the next one bends alone"),
     ] = False
     lengths_per_recording: Annotated[
-        bool, About("whether every recording has edge lengths of its own; every edge then has a length parameter")
+        bool, OptionInfo("whether every recording has edge lengths of its own; every edge then has a length parameter")
     ] = True
-    memory: Annotated[
-        float | None, Ge(0), Le(1), About("how far the rest shape is that of the recording's start; none when absent")
+    shape_memory: Annotated[
+        float | None,
+        Ge(0),
+        Le(1),
+        OptionInfo("how far the rest shape is that of the recording's start; none when absent"),
     ] = None
-    rest_angles: Annotated[
-        bool, About("whether every bend has a parameter JOINT.rest, its rest angle beside the undeformed shape's")
+    has_rest_angle_parameters: Annotated[
+        bool, OptionInfo("whether every bend has a parameter JOINT.rest, its rest angle beside the undeformed shape's")
     ] = False
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
 
 
-def read_vertices(path: str | Path) -> dict[str, Array]:
+def read_vertex_positions(path: str | Path) -> dict[str, Array]:
     """Vertex positions [m] by name, from a CSV table with the columns point, x, y, z [m].
 
     Raises
@@ -231,36 +241,38 @@ def read_vertices(path: str | Path) -> dict[str, Array]:
         raise DataError("the table of vertices is malformed", where=str(path), allowed=allowed) from error
 
 
-def length_values(cable: Cable, lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
+def edge_length_parameters(cable: CableTopology, lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
     """Values of the edge length parameters by name, from the edges' lengths [m]."""
-    values = {f"{START}.length": lengths[cable.parent[0], cable.parent[1]]}
-    for name, chain in cable.chains.items():
-        first = 1 if name == cable.parent_name else 0
+    values = {f"{_START_CLAMP}.length": lengths[cable.parent_vertices[0], cable.parent_vertices[1]]}
+    for name, chain in cable.branch_vertices.items():
+        first = 1 if name == cable.parent_segment else 0
         for i, edge in enumerate(pairwise(chain[first:])):
             values[f"{name}.length_{i}"] = lengths[edge]
     return values
 
 
-def free_parameters(cable: Cable, options: CableOptions | None = None) -> tuple[str, ...]:
+def estimable_parameters(cable: CableTopology, options: CableOptions | None = None) -> tuple[str, ...]:
     """Names of the parameters that a cable's motion alone can identify: stiffness, damping and rest shape, no mass."""
     options = options or CableOptions()
     names: list[str] = []
-    for name in cable.chains:
+    for name in cable.branch_vertices:
         names += [f"{name}.bend", f"{name}.twist", f"{name}.damping"]
-        if options.branches.get(name, options.default).twist_damping:
+        if options.branches.get(name, options.default_branch).separate_twist_damping:
             names.append(f"{name}.twist_damping")
-        if options.memory is not None:
+        if options.shape_memory is not None:
             names.append(f"{name}.memory")
-    if options.memory is not None:
-        names.append(SPEED_SCALE)
-    if options.rest_angles:
-        for name, chain in cable.chains.items():
-            links = len(chain) - (2 if name == cable.parent_name else 1)
-            names += [f"{name}_{i}_{axis}{REST}" for i in range(links) for axis in "xy"]
+    if options.shape_memory is not None:
+        names.append(START_SPEED_SCALE_PARAMETER)
+    if options.has_rest_angle_parameters:
+        for name, chain in cable.branch_vertices.items():
+            links = len(chain) - (2 if name == cable.parent_segment else 1)
+            names += [f"{name}_{i}_{axis}{_REST_ANGLE_SUFFIX}" for i in range(links) for axis in "xy"]
     return tuple(names)
 
 
-def cable_system(lengths: Mapping[tuple[str, str], float], cable: Cable, options: CableOptions | None = None) -> System:
+def cable_system(
+    lengths: Mapping[tuple[str, str], float], cable: CableTopology, options: CableOptions | None = None
+) -> System:
     """The system of a cable held by two clamps.
 
     Parameters
@@ -284,125 +296,159 @@ def cable_system(lengths: Mapping[tuple[str, str], float], cable: Cable, options
     """
     options = options or CableOptions()
     item = flexible_object(_segments(cable, lengths, options), name="cable")
-    if options.rest_angles:
+    if options.has_rest_angle_parameters:
         item = _with_rest_angles(item)
-    if options.memory is not None:
-        item = _with_memory(item, options.memory)
-    clamps = _start_clamp(lengths[cable.parent[0], cable.parent[1]], cable).joined(floating_clamp(END))
-    end_roll = Parameter(END_ROLL, 0.0, "rad", -np.pi, np.pi, "roll of the end clamp about the last edge")
-    if options.end == "weld":
-        clamps = replace(clamps, parameters=clamps.parameters.joined([end_roll]))
-    rotation = about_axis(AXES["z"], end_roll.symbol) if options.end == "weld" else ca.SX(ca.DM.eye(3))
+    if options.shape_memory is not None:
+        item = _with_memory(item, options.shape_memory)
+    clamps = _start_clamp(lengths[cable.parent_vertices[0], cable.parent_vertices[1]], cable).with_mechanism(
+        floating_clamp(_END_CLAMP)
+    )
+    end_roll = Parameter(_END_ROLL_PARAMETER, 0.0, "rad", -np.pi, np.pi, "roll of the end clamp about the last edge")
+    if options.end_clamp == "weld":
+        clamps = replace(clamps, parameters=clamps.parameters.with_added([end_roll]))
+    rotation = (
+        symbolic_axis_rotation(UNIT_AXES["z"], end_roll.symbol) if options.end_clamp == "weld" else ca.SX(ca.DM.eye(3))
+    )
     return System.build(
         clamps,
-        objects=((_with_vertices(item, cable, lengths), START_EDGE, None),),
-        grasps=(Grasp(END, END, LAST_EDGE, options.end, rotation),),
-        prescribed=tuple(f"{clamp}_{prefix}{axis}" for clamp in (START, END) for prefix in ("", "r") for axis in "xyz"),
+        objects=((_with_vertices(item, cable, lengths), _START_EDGE_FRAME, None),),
+        grasps=(Grasp(_END_CLAMP, _END_CLAMP, _LAST_EDGE_FRAME, options.end_clamp, rotation),),
+        prescribed=tuple(
+            f"{clamp}_{prefix}{axis}" for clamp in (_START_CLAMP, _END_CLAMP) for prefix in ("", "r") for axis in "xyz"
+        ),
         damping={},
         gravity=options.gravity,
-        points=cable.vertices,
+        point_frames=cable.vertices,
     )
 
 
 def _with_rest_angles(item: FlexibleObject) -> FlexibleObject:
     entries = [
-        Parameter(f"{spring.joint}{REST}", 0.0, "rad", -np.pi, np.pi, "rest angle beside the undeformed shape's")
-        for spring in item.elastic
-        if spring.kind == "bend"
+        Parameter(
+            f"{spring.joint_name}{_REST_ANGLE_SUFFIX}",
+            0.0,
+            "rad",
+            -np.pi,
+            np.pi,
+            "rest angle beside the undeformed shape's",
+        )
+        for spring in item.elastic_joints
+        if spring.deformation == "bend"
     ]
     rest = {entry.name: entry.symbol for entry in entries}
-    elastic = (replace(s, rest=s.rest + rest.get(f"{s.joint}{REST}", 0)) for s in item.elastic)
-    tree = replace(item.mechanism, parameters=item.mechanism.parameters.joined(entries))
-    return replace(item, mechanism=tree, elastic=tuple(elastic))
+    elastic = (
+        replace(s, rest_angle=s.rest_angle + rest.get(f"{s.joint_name}{_REST_ANGLE_SUFFIX}", 0))
+        for s in item.elastic_joints
+    )
+    tree = replace(item.mechanism, parameters=item.mechanism.parameters.with_added(entries))
+    return replace(item, mechanism=tree, elastic_joints=tuple(elastic))
 
 
 def _with_memory(item: FlexibleObject, memory: float) -> FlexibleObject:
     shares = {
         s.name: Parameter(f"{s.name}.memory", memory, "1", 0.0, 1.0, "share of the start's shape in the rest shape")
-        for s in item.segments
+        for s in item.segment_layouts
     }
-    speed = Parameter(START_SPEED, 0.0, "m/s", 0.0, np.inf, "speed of the vertices at the recording's start")
-    scale = Parameter(SPEED_SCALE, 0.3, "m/s", 1e-3, np.inf, "start speed at which the memory counts half")
+    speed = Parameter(START_SPEED_PARAMETER, 0.0, "m/s", 0.0, np.inf, "speed of the vertices at the recording's start")
+    scale = Parameter(
+        START_SPEED_SCALE_PARAMETER, 0.3, "m/s", 1e-3, np.inf, "start speed at which the memory counts half"
+    )
     trust = 1 / (1 + (speed.symbol / scale.symbol) ** 2)
     entries, elastic = [*shares.values(), speed, scale], []
-    for spring in item.elastic:
-        angle = Parameter(f"{spring.joint}.{PRESET[0]}", 0.0, "rad", description="angle at the recording's start")
-        load = Parameter(f"{spring.joint}.{PRESET[1]}", 0.0, "N m", description="torque borne at the recording's start")
+    for spring in item.elastic_joints:
+        angle = Parameter(
+            f"{spring.joint_name}.{START_SHAPE_SUFFIXES[0]}", 0.0, "rad", description="angle at the recording's start"
+        )
+        load = Parameter(
+            f"{spring.joint_name}.{START_SHAPE_SUFFIXES[1]}",
+            0.0,
+            "N m",
+            description="torque borne at the recording's start",
+        )
         entries += [angle, load]
-        shift = angle.symbol - load.symbol / (spring.stiffness + LEAST_STIFFNESS)
-        share = trust * shares[spring.segment].symbol
-        elastic.append(replace(spring, rest=spring.rest + share * (shift - spring.rest)))
-    tree = replace(item.mechanism, parameters=item.mechanism.parameters.joined(entries))
-    return replace(item, mechanism=tree, elastic=tuple(elastic))
+        shift = angle.symbol - load.symbol / (spring.stiffness + _MIN_STIFFNESS)
+        share = trust * shares[spring.segment_name].symbol
+        elastic.append(replace(spring, rest_angle=spring.rest_angle + share * (shift - spring.rest_angle)))
+    tree = replace(item.mechanism, parameters=item.mechanism.parameters.with_added(entries))
+    return replace(item, mechanism=tree, elastic_joints=tuple(elastic))
 
 
-def _with_vertices(item: FlexibleObject, cable: Cable, lengths: Mapping[tuple[str, str], float]) -> FlexibleObject:
+def _with_vertices(
+    item: FlexibleObject, cable: CableTopology, lengths: Mapping[tuple[str, str], float]
+) -> FlexibleObject:
     """The object with its vertices as frames, the parent's arc length measured from clamp to clamp."""
     tree = item.mechanism
     frames = dict(tree.frames)
-    for name, chain in cable.chains.items():
-        first = 2 if name == cable.parent_name else 1
+    for name, chain in cable.branch_vertices.items():
+        first = 2 if name == cable.parent_segment else 1
         frames |= {vertex: frames[f"{name}_{i}_tip"] for i, vertex in enumerate(chain[first:])}
-        if name != cable.parent_name:
+        if name != cable.parent_segment:
             frames[f"junction_{name}"] = frames[chain[0]]
-    last = tree.joint_index(item.segment(cable.parent_name).links[-1][-1])
-    frames[LAST_EDGE] = Frame(last, Placement.identity())
-    parent = tree.lines[cable.parent_name]
-    edges = np.array([lengths[edge] for edge in pairwise(cable.parent)])
-    whole = Line((cable.parent[1], *parent.tips), tuple(map(float, edges / edges.sum())))
-    lines = {**tree.lines, cable.parent_name: whole}
-    return replace(item, mechanism=replace(tree, frames=frames, lines=lines))
+    last = tree.joint_index(item.segment_layout(cable.parent_segment).link_joints[-1][-1])
+    frames[_LAST_EDGE_FRAME] = Frame(last, Placement.identity())
+    parent = tree.link_chains[cable.parent_segment]
+    edges = np.array([lengths[edge] for edge in pairwise(cable.parent_vertices)])
+    whole = LinkChain((cable.parent_vertices[1], *parent.tip_frames), tuple(map(float, edges / edges.sum())))
+    lines = {**tree.link_chains, cable.parent_segment: whole}
+    return replace(item, mechanism=replace(tree, frames=frames, link_chains=lines))
 
 
-def _start_clamp(length: float, cable: Cable) -> Mechanism:
-    clamp = floating_clamp(START)
-    roll = Parameter(START_ROLL, 0.0, "rad", -np.pi, np.pi, "roll of the start clamp about the first edge")
-    edge = Parameter(f"{START}.length", length, "m", 1e-9, np.inf, "length of the first edge")
-    carrier = clamp.frame(START)
-    tip = Frame(carrier.joint, Placement(about_axis(AXES["z"], roll.symbol), ca.vertcat(0, 0, edge.symbol)))
-    frames = {**clamp.frames, cable.parent[0]: carrier, cable.parent[1]: tip, START_EDGE: tip}
-    return Mechanism(START, clamp.joints, frames, Parameters([roll, edge]))
+def _start_clamp(length: float, cable: CableTopology) -> Mechanism:
+    clamp = floating_clamp(_START_CLAMP)
+    roll = Parameter(_START_ROLL_PARAMETER, 0.0, "rad", -np.pi, np.pi, "roll of the start clamp about the first edge")
+    edge = Parameter(f"{_START_CLAMP}.length", length, "m", 1e-9, np.inf, "length of the first edge")
+    carrier = clamp.frame(_START_CLAMP)
+    tip = Frame(
+        carrier.joint_index,
+        Placement(symbolic_axis_rotation(UNIT_AXES["z"], roll.symbol), ca.vertcat(0, 0, edge.symbol)),
+    )
+    frames = {**clamp.frames, cable.parent_vertices[0]: carrier, cable.parent_vertices[1]: tip, _START_EDGE_FRAME: tip}
+    return Mechanism(_START_CLAMP, clamp.joints, frames, Parameters([roll, edge]))
 
 
-def _segments(cable: Cable, lengths: Mapping[tuple[str, str], float], options: CableOptions) -> list[Segment]:
+def _segments(cable: CableTopology, lengths: Mapping[tuple[str, str], float], options: CableOptions) -> list[Segment]:
     def of(chain: Sequence[str]) -> list[float]:
         return [lengths[edge] for edge in pairwise(chain)]
 
-    parent = cable.parent
-    turns = polyline_rotations(cable.shape(parent))
+    parent = cable.parent_vertices
+    turns = polyline_rotations(cable.undeformed_polyline(parent))
     # rest frame of every parent edge, from which children's directions are measured
     carried = [turns[0]]
     for turn in turns[1:]:
         carried.append(carried[-1] @ turn)
     segments = []
-    for name, chain in cable.chains.items():
-        branch = options.branches.get(name, options.default)
-        if name == cable.parent_name:
+    for name, chain in cable.branch_vertices.items():
+        branch = options.branches.get(name, options.default_branch)
+        if name == cable.parent_segment:
             chain, at, own, before = chain[1:], None, turns[1:], lengths[parent[0], parent[1]]
         else:
             junction = parent.index(chain[0])
-            own, before = polyline_rotations(cable.shape(chain), carried[junction - 1]), None
+            own, before = polyline_rotations(cable.undeformed_polyline(chain), carried[junction - 1]), None
             at = junction - 2
-        rest = own if options.rest_shape else [own[0] if at is not None else np.eye(3), *[np.eye(3)] * (len(own) - 1)]
+        rest = (
+            own
+            if options.undeformed_rest_shape
+            else [own[0] if at is not None else np.eye(3), *[np.eye(3)] * (len(own) - 1)]
+        )
         edges = of(chain)
         segments.append(
             Segment(
                 name,
                 sum(edges),
-                branch.density * sum(edges),
+                branch.linear_density * sum(edges),
                 options.radius,
                 link_lengths=edges,
-                parent=None if at is None else cable.parent_name,
-                at_link=at,
-                rotation=rest[0],
-                link_rotations=rest[1:],
-                bend=branch.bend,
-                twist=branch.twist,
-                damping=branch.damping,
-                twist_damping=branch.damping if branch.twist_damping else None,
-                rigidity=True,
-                clamped=options.rigid_clamp and at is None,
-                length_before=before,
+                parent=None if at is None else cable.parent_segment,
+                parent_link_index=at,
+                rest_rotation=rest[0],
+                link_rest_rotations=rest[1:],
+                bend=branch.bend_rigidity,
+                twist=branch.twist_rigidity,
+                damping=branch.bend_damping,
+                twist_damping=branch.bend_damping if branch.separate_twist_damping else None,
+                stiffness_per_curvature=True,
+                clamped_at_base=options.rigid_first_edge and at is None,
+                clamped_edge_length=before,
                 link_length_parameters=options.lengths_per_recording,
             )
         )

@@ -11,13 +11,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from yid_ocp.errors import ModelError, nearest
-from yid_ocp.model.mechanism import Frame, Inertia, Joint, Line, Mechanism, Placement
+from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
+from yid_ocp.errors import ModelError, nearest_name_hint
+from yid_ocp.model.mechanism import Frame, Inertia, Joint, LinkChain, Mechanism, Placement
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.model.rotations import snapped, turn
-from yid_ocp.shown import Shown, Summary, counted
+from yid_ocp.model.rotations import axis_angle_rotation, snap_to_unit_entries
 
-AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+UNIT_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 @dataclass(frozen=True)
@@ -32,40 +32,40 @@ class Segment:
     mass : float
         Of the whole segment, spread along its length [kg].
     radius : float, optional
-        [m]; of the solid cylinder that gives each link's inertia. None where `section` is given.
+        [m]; of the solid cylinder that gives each link's inertia. None where `cross_section` is given.
     links : int
         Number of equal links.
     link_lengths : sequence of float, optional
         Unequal links [m], base to tip.
     parent : str, optional
         Segment on which it grows; None for the root.
-    at_link : int, optional
+    parent_link_index : int, optional
         It leaves at the tip of this link of the parent (0-based); the last one when absent.
-    rotation : (3, 3) array_like, optional
+    rest_rotation : (3, 3) array_like, optional
         Of its first link at rest in the frame of the parent's link (of the root's frame for the root).
-    link_rotations : sequence of (3, 3) array_like, optional
+    link_rest_rotations : sequence of (3, 3) array_like, optional
         Rest rotation of every later link in the frame of the one before (a measured undeformed shape).
     bend, twist : float
-        Nominal stiffness of every joint [N m/rad], or rigidity [N m^2] when `rigidity` is set.
+        Nominal stiffness of every joint [N m/rad], or rigidity [N m^2] when `stiffness_per_curvature` is set.
     damping : float
-        Viscous damping of every coordinate [N m s/rad] ([N m^2 s] when `rigidity` is set).
+        Viscous damping of every coordinate [N m s/rad] ([N m^2 s] when `stiffness_per_curvature` is set).
     twist_damping : float, optional
         Damping of the twists where it differs from that of the bends.
-    rigidity : bool
+    stiffness_per_curvature : bool
         Whether bend, twist and damping are per curvature: a joint between links of length a and b then has
         2/(a + b) times the value, and the first joint of a clamped segment 2/a.
-    clamped : bool
-        Whether the first joint turns about the tip of a rigid wall or clamp (only matters with `rigidity`); otherwise
+    clamped_at_base : bool
+        Whether the first joint turns about the tip of a rigid wall or clamp (only matters with `stiffness_per_curvature`); otherwise
         it sits between the parent's link and the first one.
-    joint_order : str
+    joint_axes : str
         Axes of the turns at each joint, base to tip; about those left out the segment is rigid.
-    section : (float, float), optional
+    cross_section : (float, float), optional
         Extents of a rectangular cross section along the links' x and y axes [m], in place of `radius`.
     link_length_parameters : bool
         Whether every link has a length parameter of its own (`SEGMENT.length_0`, ...) in place of `SEGMENT.length`,
         for markers that sit elsewhere in every recording; masses do not follow them.
-    length_before : float, optional
-        Length of a flexible edge that a clamp keeps straight before a root segment; with `rigidity` its first joint
+    clamped_edge_length : float, optional
+        Length of a flexible edge that a clamp keeps straight before a root segment; with `stiffness_per_curvature` its first joint
         then counts half of it [m].
     """
 
@@ -76,32 +76,32 @@ class Segment:
     links: int = 4
     link_lengths: Sequence[float] | None = None
     parent: str | None = None
-    at_link: int | None = None
-    rotation: ArrayLike | None = None
-    link_rotations: Sequence[ArrayLike] | None = None
+    parent_link_index: int | None = None
+    rest_rotation: ArrayLike | None = None
+    link_rest_rotations: Sequence[ArrayLike] | None = None
     bend: float = 3.0
     twist: float = 3.0
     damping: float = 0.05
     twist_damping: float | None = None
-    rigidity: bool = False
-    clamped: bool = False
-    joint_order: str = "xyz"
-    section: tuple[float, float] | None = None
+    stiffness_per_curvature: bool = False
+    clamped_at_base: bool = False
+    joint_axes: str = "xyz"
+    cross_section: tuple[float, float] | None = None
     link_length_parameters: bool = False
-    length_before: float | None = None
+    clamped_edge_length: float | None = None
 
 
 @dataclass(frozen=True)
 class ElasticJoint:
     """A spring 1/2 stiffness (q - rest)^2 and a damper -damping v on one joint; the values may be symbolic."""
 
-    joint: str
-    segment: str
-    kind: Literal["bend", "twist"]
+    joint_name: str
+    segment_name: str
+    deformation: Literal["bend", "twist"]
     axis: str
     stiffness: ca.SX
     damping: ca.SX
-    rest: ca.SX
+    rest_angle: ca.SX
 
 
 @dataclass(frozen=True)
@@ -112,15 +112,15 @@ class SegmentLayout:
     """
 
     name: str
-    links: tuple[tuple[str, ...], ...]
-    lengths: tuple[ca.SX, ...]
+    link_joints: tuple[tuple[str, ...], ...]
+    link_lengths: tuple[ca.SX, ...]
     radius: ca.SX
     mass: ca.SX
-    parent: str | None
+    parent_segment: str | None
 
 
 @dataclass(frozen=True, repr=False)
-class FlexibleObject(Shown):
+class FlexibleObject(ReprMixin):
     """A generated flexible object: its mechanism, elastic joints and segments.
 
     Frames: `SEGMENT` tip as `w_SEGMENT`, tip of link i as `SEGMENT_i_tip`, the root frame `object_root`, and points by
@@ -128,24 +128,28 @@ class FlexibleObject(Shown):
     """
 
     mechanism: Mechanism
-    elastic: tuple[ElasticJoint, ...]
-    segments: tuple[SegmentLayout, ...]
+    elastic_joints: tuple[ElasticJoint, ...]
+    segment_layouts: tuple[SegmentLayout, ...]
 
-    def _summary(self) -> Summary:
-        names, tree = ", ".join(segment.name for segment in self.segments), self.mechanism
-        return Summary(f"{names}, {counted(len(tree.joints), 'joint')}", tree.parameters._summary().rows)
+    def _summary(self) -> ReprSummary:
+        names, tree = ", ".join(segment.name for segment in self.segment_layouts), self.mechanism
+        return ReprSummary(
+            f"{names}, {count_with_noun(len(tree.joints), 'joint')}", tree.parameters._summary().table_rows
+        )
 
-    def segment(self, name: str) -> SegmentLayout:
+    def segment_layout(self, name: str) -> SegmentLayout:
         """Layout of a segment by name; `ModelError` where there is none."""
-        for entry in self.segments:
+        for entry in self.segment_layouts:
             if entry.name == name:
                 return entry
-        raise ModelError(f"there is no segment '{name}'", hint=nearest(name, [s.name for s in self.segments]))
+        raise ModelError(
+            f"there is no segment '{name}'", hint=nearest_name_hint(name, [s.name for s in self.segment_layouts])
+        )
 
 
 def flexible_object(
     segments: Sequence[Segment],
-    foot: ArrayLike | None = None,
+    root_placement: ArrayLike | None = None,
     name: str = "object",
     gravity_fraction: float = 1.0,
 ) -> FlexibleObject:
@@ -155,7 +159,7 @@ def flexible_object(
     ----------
     segments : sequence of Segment
         Parents first.
-    foot : array_like, shape (4, 4), optional
+    root_placement : array_like, shape (4, 4), optional
         Placement of the root; the origin when absent.
     name : str
         Name of the mechanism.
@@ -173,7 +177,7 @@ def flexible_object(
     ModelError
         Unknown parent, parent after child, non-positive length, mass or radius, links that do not fit.
     """
-    root = Placement.identity() if foot is None else Placement.of(foot)
+    root = Placement.identity() if root_placement is None else Placement.from_matrix(root_placement)
     parts = _Parts(frames={"object_root": Frame(-1, root)})
     fraction = None if gravity_fraction == 1 else ca.SX(gravity_fraction)
     for segment in segments:
@@ -206,18 +210,22 @@ def _add_segment(parts: _Parts, segment: Segment, root: Placement, gravity_fract
     else:
         lengths = tuple(own["length"].symbol * float(share) for share in shares)
     later: Sequence[ArrayLike | None] = (
-        [None] * (len(shares) - 1) if segment.link_rotations is None else segment.link_rotations
+        [None] * (len(shares) - 1) if segment.link_rest_rotations is None else segment.link_rest_rotations
     )
-    rotations = [_rotation(entry) for entry in (segment.rotation, *later)]
+    rotations = [_rotation(entry) for entry in (segment.rest_rotation, *later)]
     before: ca.SX | None
     if segment.parent is None:
         carrier = Frame(-1, root)
-        before = None if segment.length_before is None or segment.clamped else ca.SX(segment.length_before)
+        before = (
+            None
+            if segment.clamped_edge_length is None or segment.clamped_at_base
+            else ca.SX(segment.clamped_edge_length)
+        )
     else:
         above = parts.layouts[segment.parent]
-        at = len(above.links) - 1 if segment.at_link is None else segment.at_link
+        at = len(above.link_joints) - 1 if segment.parent_link_index is None else segment.parent_link_index
         carrier = parts.frames[f"{segment.parent}_{at}_tip"]
-        before = None if segment.clamped else above.lengths[at]
+        before = None if segment.clamped_at_base else above.link_lengths[at]
     links: list[tuple[str, ...]] = []
     for i, length in enumerate(lengths):
         along = ca.vertcat(0, 0, length)
@@ -226,8 +234,8 @@ def _add_segment(parts: _Parts, segment: Segment, root: Placement, gravity_fract
         share = mass * float(shares[i])
         body = Inertia(share, along / 2, ca.diag(squares) * share, gravity_fraction)
         turned = carrier.placement @ Placement(ca.SX(ca.DM(rotations[i])), ca.SX(ca.DM.zeros(3)))
-        names = tuple(f"{segment.name}_{i}_{axis}" for axis in segment.joint_order)
-        _add_link(parts, segment, names, Frame(carrier.joint, turned), body)
+        names = tuple(f"{segment.name}_{i}_{axis}" for axis in segment.joint_axes)
+        _add_link(parts, segment, names, Frame(carrier.joint_index, turned), body)
         parts.elastic.extend(_springs(segment, names, own, _per_joint(segment, length, before)))
         links.append(names)
         carrier = Frame(len(parts.joints) - 1, Placement(ca.SX(ca.DM.eye(3)), along))
@@ -240,10 +248,10 @@ def _add_segment(parts: _Parts, segment: Segment, root: Placement, gravity_fract
 
 def _add_link(parts: _Parts, segment: Segment, names: Sequence[str], at: Frame, body: Inertia) -> None:
     """Append the joints before a link, the last of which carries its body."""
-    parent, placement = at.joint, at.placement
-    for name, axis in zip(names, segment.joint_order, strict=True):
+    parent, placement = at.joint_index, at.placement
+    for name, axis in zip(names, segment.joint_axes, strict=True):
         bodies = (body,) if name == names[-1] else ()
-        parts.joints.append(Joint(name, "revolute", parent, placement, AXES[axis], bodies))
+        parts.joints.append(Joint(name, "revolute", parent, placement, UNIT_AXES[axis], bodies))
         parent, placement = len(parts.joints) - 1, Placement.identity()
 
 
@@ -251,26 +259,26 @@ def _springs(
     segment: Segment, names: Sequence[str], own: Mapping[str, Parameter], factor: ca.SX
 ) -> Iterator[ElasticJoint]:
     """Springs and dampers of the joints before a link; `factor` converts rigidities to stiffnesses."""
-    for name, axis in zip(names, segment.joint_order, strict=True):
+    for name, axis in zip(names, segment.joint_axes, strict=True):
         kind: Literal["bend", "twist"] = "twist" if axis == "z" else "bend"
         damping = own.get("twist_damping", own["damping"]) if kind == "twist" else own["damping"]
         yield ElasticJoint(name, segment.name, kind, axis, own[kind].symbol * factor, damping.symbol * factor, ca.SX(0))
 
 
-def polyline_rotations(vertices: ArrayLike, start: ArrayLike | None = None) -> list[NDArray[np.float64]]:
+def polyline_rotations(vertices: ArrayLike, initial_frame: ArrayLike | None = None) -> list[NDArray[np.float64]]:
     """Rotation from each edge's frame to the next one's by the smallest angle (no twist).
 
     Parameters
     ----------
     vertices : array_like, shape (k, 3)
         Undeformed centre line [m].
-    start : array_like, shape (3, 3), optional
+    initial_frame : array_like, shape (3, 3), optional
         Frame before the first edge, whose z axis is the direction it continues; the world's when absent.
 
     Returns
     -------
     list of ndarray, shape (3, 3)
-        One for every edge, to be used as `Segment.rotation` and `Segment.link_rotations`.
+        One for every edge, to be used as `Segment.rest_rotation` and `Segment.link_rest_rotations`.
 
     Raises
     ------
@@ -283,7 +291,7 @@ def polyline_rotations(vertices: ArrayLike, start: ArrayLike | None = None) -> l
     edges = np.diff(points, axis=0)
     if not np.all(np.linalg.norm(edges, axis=1) > 0):
         raise ModelError("two neighbouring vertices coincide or are not finite", where="polyline")
-    frame = np.eye(3) if start is None else np.asarray(start, float)
+    frame = np.eye(3) if initial_frame is None else np.asarray(initial_frame, float)
     rotations = []
     for edge in edges:
         local = frame.T @ (edge / np.linalg.norm(edge))
@@ -297,11 +305,11 @@ def _shortest_turn(direction: NDArray[np.float64]) -> NDArray[np.float64]:
     sine, cosine = float(np.linalg.norm(axis)), float(direction[2])
     if sine < 1e-12:
         return np.eye(3) if cosine > 0 else np.diag([1.0, -1.0, -1.0])
-    return turn(axis / sine, sine, cosine)
+    return axis_angle_rotation(axis / sine, sine, cosine)
 
 
 def _rotation(matrix: ArrayLike | None) -> NDArray[np.float64]:
-    return np.eye(3) if matrix is None else snapped(np.asarray(matrix, float))
+    return np.eye(3) if matrix is None else snap_to_unit_entries(np.asarray(matrix, float))
 
 
 def _shares(segment: Segment) -> NDArray[np.float64]:
@@ -311,16 +319,16 @@ def _shares(segment: Segment) -> NDArray[np.float64]:
     return lengths / lengths.sum()
 
 
-def _line(segment: Segment) -> Line:
+def _line(segment: Segment) -> LinkChain:
     parts = tuple(map(float, _shares(segment)))
-    return Line(tuple(f"{segment.name}_{i}_tip" for i in range(len(parts))), parts)
+    return LinkChain(tuple(f"{segment.name}_{i}_tip" for i in range(len(parts))), parts)
 
 
 def _per_joint(segment: Segment, length: ca.SX, before: ca.SX | None) -> ca.SX:
-    if not segment.rigidity:
+    if not segment.stiffness_per_curvature:
         return ca.SX(1)
     if before is None:
-        return 2 / length if segment.clamped else 1 / length
+        return 2 / length if segment.clamped_at_base else 1 / length
     return 2 / (length + before)
 
 
@@ -342,7 +350,7 @@ def _cross_section(own: Mapping[str, Parameter]) -> _CrossSection:
 
 
 def _segment_parameters(segment: Segment) -> dict[str, Parameter]:
-    per, rate = ("N m^2", "N m^2 s") if segment.rigidity else ("N m/rad", "N m s/rad")
+    per, rate = ("N m^2", "N m^2 s") if segment.stiffness_per_curvature else ("N m/rad", "N m s/rad")
     length = float(np.sum(segment.link_lengths)) if segment.link_lengths is not None else segment.length
     small = 1e-9
     entries = {
@@ -360,7 +368,7 @@ def _segment_parameters(segment: Segment) -> dict[str, Parameter]:
             if segment.radius is not None
             else {
                 f"size_{axis}": (size, "m", small, f"extent of the section along {axis}")
-                for axis, size in zip("xy", segment.section or (), strict=True)
+                for axis, size in zip("xy", segment.cross_section or (), strict=True)
             }
         ),
         "bend": (segment.bend, per, 0.0, "bending stiffness of every joint, about x and y"),
@@ -383,9 +391,9 @@ def _check(segment: Segment, known: dict[str, SegmentLayout]) -> None:
         raise ModelError(
             f"parent '{segment.parent}' of segment '{segment.name}' does not come before it",
             where=where,
-            hint=nearest(segment.parent, known),
+            hint=nearest_name_hint(segment.parent, known),
         )
-    if (segment.radius is None) == (segment.section is None):
+    if (segment.radius is None) == (segment.cross_section is None):
         raise ModelError(
             "a segment needs a radius or a section",
             where=where,
@@ -396,7 +404,7 @@ def _check(segment: Segment, known: dict[str, SegmentLayout]) -> None:
     if segment.link_lengths is None:
         sizes["length"] = segment.length
     sizes |= {"radius": segment.radius} if segment.radius is not None else {}
-    sizes |= {f"section[{i}]": size for i, size in enumerate(segment.section or ())}
+    sizes |= {f"section[{i}]": size for i, size in enumerate(segment.cross_section or ())}
     for quantity, value in sizes.items():
         if not (math.isfinite(value) and value > 0):
             raise ModelError(f"{quantity} = {value}", where=where, allowed="a positive number in SI units")
@@ -405,14 +413,14 @@ def _check(segment: Segment, known: dict[str, SegmentLayout]) -> None:
     if segment.link_lengths is not None and not min(segment.link_lengths, default=0.0) > 0:
         raise ModelError("a link has no length", where=where, allowed="positive lengths [m]")
     count = len(segment.link_lengths) if segment.link_lengths is not None else segment.links
-    if segment.link_rotations is not None and len(segment.link_rotations) != count - 1:
+    if segment.link_rest_rotations is not None and len(segment.link_rest_rotations) != count - 1:
         raise ModelError(
-            f"{len(segment.link_rotations)} link rotations for {count} links", where=where, allowed=f"{count - 1}"
+            f"{len(segment.link_rest_rotations)} link rotations for {count} links", where=where, allowed=f"{count - 1}"
         )
-    if segment.at_link is not None and segment.parent is not None:
-        links = len(known[segment.parent].links)
-        if not 0 <= segment.at_link < links:
-            raise ModelError(f"at_link = {segment.at_link}", where=where, allowed=f"0 to {links - 1}")
-    axes = segment.joint_order
-    if not axes or len(set(axes)) < len(axes) or not set(axes) <= set(AXES):
+    if segment.parent_link_index is not None and segment.parent is not None:
+        links = len(known[segment.parent].link_joints)
+        if not 0 <= segment.parent_link_index < links:
+            raise ModelError(f"at_link = {segment.parent_link_index}", where=where, allowed=f"0 to {links - 1}")
+    axes = segment.joint_axes
+    if not axes or len(set(axes)) < len(axes) or not set(axes) <= set(UNIT_AXES):
         raise ModelError(f"joint_order = '{axes}'", where=where, allowed="letters of x, y, z, each at most once")

@@ -2,7 +2,7 @@
 
 A spatial velocity is (angular, linear of the body point now at the world origin), a wrench (moment about the world
 origin, force); with both in one fixed frame the derivatives of the Lagrangian take the closed forms given at
-`RigidBody`, which is what makes the compiled step cheap.
+`RigidBodyDerivatives`, which is what makes the compiled step cheap.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import casadi as ca
 
 from yid_ocp.model.mechanism import Frame, Inertia, Mechanism, Placement
-from yid_ocp.model.rotations import about_axis
+from yid_ocp.model.rotations import symbolic_axis_rotation
 
 
 @dataclass(frozen=True)
@@ -23,50 +23,52 @@ class Kinematics:
     Attributes
     ----------
     mechanism : Mechanism
-    rotations : tuple of casadi.SX, each (3, 3)
+    joint_rotations : tuple of casadi.SX, each (3, 3)
         Of each joint's moving frame, to the world.
-    origins : tuple of casadi.SX, each (3, 1)
+    joint_origins : tuple of casadi.SX, each (3, 1)
         [m]
-    screws : tuple of casadi.SX, each (6, 1)
+    joint_screws : tuple of casadi.SX, each (6, 1)
         S_j, the spatial velocity per unit rate of joint j.
     """
 
     mechanism: Mechanism
-    rotations: tuple[ca.SX, ...]
-    origins: tuple[ca.SX, ...]
-    screws: tuple[ca.SX, ...]
+    joint_rotations: tuple[ca.SX, ...]
+    joint_origins: tuple[ca.SX, ...]
+    joint_screws: tuple[ca.SX, ...]
 
-    def pose(self, frame: str | Frame) -> Placement:
+    def frame_pose(self, frame: str | Frame) -> Placement:
         """Pose of a frame in the world."""
         entry = self.mechanism.frame(frame) if isinstance(frame, str) else frame
-        if entry.joint < 0:
+        if entry.joint_index < 0:
             return entry.placement
-        return Placement(self.rotations[entry.joint], self.origins[entry.joint]) @ entry.placement
+        return (
+            Placement(self.joint_rotations[entry.joint_index], self.joint_origins[entry.joint_index]) @ entry.placement
+        )
 
-    def position(self, frame: str | Frame) -> ca.SX:
+    def frame_position(self, frame: str | Frame) -> ca.SX:
         """Position of a frame's origin in the world, shape (3, 1) [m]."""
-        return self.pose(frame).translation
+        return self.frame_pose(frame).translation
 
-    def point_jacobian(self, frame: str | Frame) -> ca.SX:
+    def position_jacobian(self, frame: str | Frame) -> ca.SX:
         """Derivative of a frame's position by the configuration, shape (3, n)."""
         entry = self.mechanism.frame(frame) if isinstance(frame, str) else frame
-        point = self.position(entry)
-        columns = [ca.SX(3, 1)] * len(self.screws)
-        for j in self.mechanism.ancestors(entry.joint):
-            columns[j] = self.screws[j][3:] + cross(self.screws[j][:3], point)
+        point = self.frame_position(entry)
+        columns = [ca.SX(3, 1)] * len(self.joint_screws)
+        for j in self.mechanism.ancestor_joints(entry.joint_index):
+            columns[j] = self.joint_screws[j][3:] + cross_product(self.joint_screws[j][:3], point)
         return ca.horzcat(*columns) if columns else ca.SX(3, 0)
 
     def angular_jacobian(self, frame: str | Frame) -> ca.SX:
         """Angular velocity of a frame per configuration rate, in the world, shape (3, n)."""
         entry = self.mechanism.frame(frame) if isinstance(frame, str) else frame
-        columns = [ca.SX(3, 1)] * len(self.screws)
-        for j in self.mechanism.ancestors(entry.joint):
-            columns[j] = self.screws[j][:3]
+        columns = [ca.SX(3, 1)] * len(self.joint_screws)
+        for j in self.mechanism.ancestor_joints(entry.joint_index):
+            columns[j] = self.joint_screws[j][:3]
         return ca.horzcat(*columns) if columns else ca.SX(3, 0)
 
 
 @dataclass(frozen=True)
-class RigidBody:
+class RigidBodyDerivatives:
     """First derivatives of the rigid-body Lagrangian at (q, v), and the vectors of its second derivatives.
 
     With S_j the screw of joint j, D_j = V_parent(j) x S_j, Ic_j and H_j the inertia and momentum of all that j moves:
@@ -81,18 +83,18 @@ class RigidBody:
 
     Attributes
     ----------
-    by_q, by_v : casadi.SX, shape (n, 1)
+    lagrangian_by_q, lagrangian_by_v : casadi.SX, shape (n, 1)
         dL/dq and dL/dv.
-    kinetic, potential : casadi.SX
+    kinetic_energy, potential_energy : casadi.SX
         [J]
     S, D, F, B : casadi.SX, shape (6, n)
     G : casadi.SX, shape (3, n)
     """
 
-    by_q: ca.SX
-    by_v: ca.SX
-    kinetic: ca.SX
-    potential: ca.SX
+    lagrangian_by_q: ca.SX
+    lagrangian_by_v: ca.SX
+    kinetic_energy: ca.SX
+    potential_energy: ca.SX
     S: ca.SX
     D: ca.SX
     F: ca.SX
@@ -100,19 +102,19 @@ class RigidBody:
     G: ca.SX
 
 
-def cross(a: ca.SX, b: ca.SX) -> ca.SX:
+def cross_product(a: ca.SX, b: ca.SX) -> ca.SX:
     """Cross product of two (3, 1) expressions."""
     return ca.cross(a, b)
 
 
-def motion_cross(a: ca.SX, b: ca.SX) -> ca.SX:
+def motion_cross_motion_product(a: ca.SX, b: ca.SX) -> ca.SX:
     """Spatial cross product a x b of two motions (twists), shape (6, 1)."""
-    return ca.vertcat(cross(a[:3], b[:3]), cross(a[:3], b[3:]) + cross(a[3:], b[:3]))
+    return ca.vertcat(cross_product(a[:3], b[:3]), cross_product(a[:3], b[3:]) + cross_product(a[3:], b[:3]))
 
 
-def force_cross(a: ca.SX, f: ca.SX) -> ca.SX:
+def motion_cross_force_product(a: ca.SX, f: ca.SX) -> ca.SX:
     """Spatial cross product a x* f of a motion and a wrench, shape (6, 1)."""
-    return ca.vertcat(cross(a[:3], f[:3]) + cross(a[3:], f[3:]), cross(a[:3], f[3:]))
+    return ca.vertcat(cross_product(a[:3], f[:3]) + cross_product(a[3:], f[3:]), cross_product(a[:3], f[3:]))
 
 
 def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
@@ -129,13 +131,13 @@ def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
     screws: list[ca.SX] = []
     for j, joint in enumerate(mechanism.joints):
         rotation, origin = joint.placement.rotation, joint.placement.translation
-        if joint.parent >= 0:
-            origin = rotations[joint.parent] @ origin + origins[joint.parent]
-            rotation = rotations[joint.parent] @ rotation
+        if joint.parent_index >= 0:
+            origin = rotations[joint.parent_index] @ origin + origins[joint.parent_index]
+            rotation = rotations[joint.parent_index] @ rotation
         axis = rotation @ ca.SX(ca.DM(joint.axis))
         if joint.kind == "revolute":
-            rotations.append(rotation @ about_axis(joint.axis, q[j]))
-            screws.append(ca.vertcat(axis, cross(origin, axis)))
+            rotations.append(rotation @ symbolic_axis_rotation(joint.axis, q[j]))
+            screws.append(ca.vertcat(axis, cross_product(origin, axis)))
         else:
             origin = origin + axis * q[j]
             rotations.append(rotation)
@@ -144,7 +146,7 @@ def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
     return Kinematics(mechanism, tuple(rotations), tuple(origins), tuple(screws))
 
 
-def rigid_body(kinematics: Kinematics, v: ca.SX, gravity: ca.SX) -> RigidBody:
+def rigid_body_derivatives(kinematics: Kinematics, v: ca.SX, gravity: ca.SX) -> RigidBodyDerivatives:
     """Energies and first derivatives of the Lagrangian of a mechanism's bodies.
 
     Parameters
@@ -155,28 +157,32 @@ def rigid_body(kinematics: Kinematics, v: ca.SX, gravity: ca.SX) -> RigidBody:
     gravity : casadi.SX, shape (3, 1)
         Acceleration of free fall in the world frame [m/s^2].
     """
-    joints, S = kinematics.mechanism.joints, kinematics.screws
+    joints, S = kinematics.mechanism.joints, kinematics.joint_screws
     velocity: list[ca.SX] = []
     D: list[ca.SX] = []
     for j, joint in enumerate(joints):
-        above = velocity[joint.parent] if joint.parent >= 0 else ca.SX(ca.DM.zeros(6))
-        D.append(motion_cross(above, S[j]) if joint.parent >= 0 else above)
+        above = velocity[joint.parent_index] if joint.parent_index >= 0 else ca.SX(ca.DM.zeros(6))
+        D.append(motion_cross_motion_product(above, S[j]) if joint.parent_index >= 0 else above)
         velocity.append(above + S[j] * v[j])
     moved, kinetic, potential = _moved(kinematics, velocity, gravity)
     by_q, by_v, F, B, G = [], [], [], [], []
     for j, part in enumerate(moved):
-        moment, weight = cross(part.heavy_first, gravity), part.heavy * gravity
+        moment, weight = cross_product(part.heavy_first, gravity), part.heavy * gravity
         axis, linear = S[j][:3], S[j][3:]
         by_v.append(ca.dot(S[j], part.momentum))
         by_q.append(ca.dot(D[j], part.momentum) + ca.dot(axis, moment) + ca.dot(linear, weight))
         F.append(part.inertia_times(S[j]))
-        B.append(part.inertia_times(D[j]) + force_cross(S[j], part.momentum))
-        G.append(cross(axis, moment) + cross(linear, weight) + cross(part.heavy_first, cross(gravity, axis)))
+        B.append(part.inertia_times(D[j]) + motion_cross_force_product(S[j], part.momentum))
+        G.append(
+            cross_product(axis, moment)
+            + cross_product(linear, weight)
+            + cross_product(part.heavy_first, cross_product(gravity, axis))
+        )
 
     def columns(entries: Sequence[ca.SX], rows: int) -> ca.SX:
         return ca.densify(ca.horzcat(ca.SX(rows, 0), *entries))
 
-    return RigidBody(
+    return RigidBodyDerivatives(
         ca.densify(ca.vertcat(*by_q)) if joints else ca.SX(0, 1),
         ca.densify(ca.vertcat(*by_v)) if joints else ca.SX(0, 1),
         kinetic,
@@ -208,8 +214,8 @@ class _Moved:
             setattr(self, name, getattr(self, name) + getattr(other, name))
 
     def inertia_times(self, motion: ca.SX) -> ca.SX:
-        force = self.mass * motion[3:] + cross(motion[:3], self.first)
-        return ca.vertcat(self.second @ motion[:3] + cross(self.first, motion[3:]), force)
+        force = self.mass * motion[3:] + cross_product(motion[:3], self.first)
+        return ca.vertcat(self.second @ motion[:3] + cross_product(self.first, motion[3:]), force)
 
 
 def _moved(kinematics: Kinematics, velocity: Sequence[ca.SX], gravity: ca.SX) -> tuple[list[_Moved], ca.SX, ca.SX]:
@@ -221,33 +227,33 @@ def _moved(kinematics: Kinematics, velocity: Sequence[ca.SX], gravity: ca.SX) ->
     apart = any(body.gravity_fraction is not None for joint in joints for body in joint.bodies)
     for j, joint in enumerate(joints):
         for body in joint.bodies:
-            com = kinematics.rotations[j] @ body.com + kinematics.origins[j]
-            about_com = _rotated_tensor(body, kinematics.rotations[j])
-            angular, linear = velocity[j][:3], velocity[j][3:] + cross(velocity[j][:3], com)
+            com = kinematics.joint_rotations[j] @ body.center_of_mass + kinematics.joint_origins[j]
+            about_com = _rotated_tensor(body, kinematics.joint_rotations[j])
+            angular, linear = velocity[j][:3], velocity[j][3:] + cross_product(velocity[j][:3], com)
             impulse = body.mass * linear
             spin = about_com @ angular
             kinetic += 0.5 * (ca.dot(impulse, linear) + ca.dot(spin, angular))
             heavy = body.mass if body.gravity_fraction is None else body.mass * body.gravity_fraction
             potential -= heavy * ca.dot(gravity, com)
             second = about_com + body.mass * (ca.dot(com, com) * ca.SX.eye(3) - com @ com.T)
-            momentum = ca.vertcat(spin + cross(com, impulse), impulse)
+            momentum = ca.vertcat(spin + cross_product(com, impulse), impulse)
             moved[j].add(_Moved(body.mass, body.mass * com, second, momentum, heavy, heavy * com))
     for j in reversed(range(len(joints))):
-        if joints[j].parent >= 0:
-            moved[joints[j].parent].add(moved[j])
+        if joints[j].parent_index >= 0:
+            moved[joints[j].parent_index].add(moved[j])
     if not apart:
         for part in moved:
             part.heavy, part.heavy_first = part.mass, part.first
     return moved, kinetic, potential
 
 
-def mass_matrix(rigid: RigidBody, mechanism: Mechanism) -> ca.SX:
-    """M = L_vv of the bodies, shape (n, n), from the closed form of `RigidBody`."""
+def mass_matrix(rigid: RigidBodyDerivatives, mechanism: Mechanism) -> ca.SX:
+    """M = L_vv of the bodies, shape (n, n), from the closed form of `RigidBodyDerivatives`."""
     return _from_pairs(mechanism, lambda i, j: (_dot(rigid.S, i, rigid.F, j), _dot(rigid.S, i, rigid.F, j)))
 
 
-def second_derivatives(rigid: RigidBody, mechanism: Mechanism) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """(L_qq, L_qv, L_vv) of the bodies, each (n, n), from the closed form of `RigidBody`; L_qv[row q, column v]."""
+def lagrangian_second_derivatives(rigid: RigidBodyDerivatives, mechanism: Mechanism) -> tuple[ca.SX, ca.SX, ca.SX]:
+    """(L_qq, L_qv, L_vv) of the bodies, each (n, n), from the closed form of `RigidBodyDerivatives`; L_qv[row q, column v]."""
 
     def by_qq(i: int, j: int) -> tuple[ca.SX, ca.SX]:
         entry = _dot(rigid.D, i, rigid.B, j) + ca.dot(rigid.S[:3, i], rigid.G[:, j])
@@ -267,7 +273,7 @@ def _from_pairs(mechanism: Mechanism, entry: Callable[[int, int], tuple[ca.SX, c
     n = len(mechanism.joints)
     matrix = ca.SX(n, n)
     for j in range(n):
-        for i in mechanism.ancestors(j):
+        for i in mechanism.ancestor_joints(j):
             upper, lower = entry(i, j)
             matrix[j, i] = lower
             matrix[i, j] = upper
@@ -275,7 +281,7 @@ def _from_pairs(mechanism: Mechanism, entry: Callable[[int, int], tuple[ca.SX, c
 
 
 def _rotated_tensor(body: Inertia, rotation: ca.SX) -> ca.SX:
-    tensor = ca.densify(body.about_com)
+    tensor = ca.densify(body.inertia_about_com)
     off = [(0, 1), (0, 2), (1, 2)]
     diagonal = all(tensor[i, j].is_zero() and tensor[j, i].is_zero() for i, j in off)
     if diagonal and ca.is_equal(tensor[0, 0], tensor[1, 1], 8):

@@ -12,10 +12,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from yid_ocp.errors import ModelError, nearest
+from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
+from yid_ocp.errors import ModelError, nearest_name_hint
 from yid_ocp.model.parameters import Parameters
-from yid_ocp.model.rotations import snapped
-from yid_ocp.shown import Shown, Summary, counted
+from yid_ocp.model.rotations import snap_to_unit_entries
 
 
 @dataclass(frozen=True)
@@ -33,24 +33,24 @@ class Placement:
     translation: ca.SX
 
     @staticmethod
-    def of(matrix: ArrayLike) -> Placement:
+    def from_matrix(matrix: ArrayLike) -> Placement:
         """Placement from a numeric 4x4 homogeneous matrix."""
-        array = snapped(np.asarray(matrix, dtype=float))
+        array = snap_to_unit_entries(np.asarray(matrix, dtype=float))
         return Placement(ca.SX(ca.DM(array[:3, :3])), ca.SX(ca.DM(array[:3, 3])))
 
     @staticmethod
     def identity() -> Placement:
         """The identity transform."""
-        return Placement.of(np.eye(4))
+        return Placement.from_matrix(np.eye(4))
 
     def __matmul__(self, other: Placement) -> Placement:
         return Placement(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
 
-    def mapped(self, change: Callable[[ca.SX], ca.SX]) -> Placement:
+    def map_expressions(self, change: Callable[[ca.SX], ca.SX]) -> Placement:
         """The transform with `change` applied to both expressions."""
         return Placement(change(self.rotation), change(self.translation))
 
-    def matrix(self) -> ca.SX:
+    def homogeneous_matrix(self) -> ca.SX:
         """The 4x4 homogeneous matrix."""
         return ca.vertcat(ca.horzcat(self.rotation, self.translation), ca.SX(ca.DM([[0.0, 0.0, 0.0, 1.0]])))
 
@@ -63,29 +63,29 @@ class Inertia:
     """
 
     mass: ca.SX
-    com: ca.SX
-    about_com: ca.SX
+    center_of_mass: ca.SX
+    inertia_about_com: ca.SX
     gravity_fraction: ca.SX | None = None
 
     @staticmethod
-    def of(mass: float, com: ArrayLike, about_com: ArrayLike) -> Inertia:
+    def from_values(mass: float, com: ArrayLike, about_com: ArrayLike) -> Inertia:
         """Inertia from numbers."""
         return Inertia(ca.SX(mass), ca.SX(ca.DM(np.asarray(com, float))), ca.SX(ca.DM(np.asarray(about_com, float))))
 
-    def scaled(self, factor: ca.SX) -> Inertia:
+    def scaled_by(self, factor: ca.SX) -> Inertia:
         """The inertia with mass and tensor multiplied by `factor`; the centre of mass is unchanged."""
-        return replace(self, mass=self.mass * factor, about_com=self.about_com * factor)
+        return replace(self, mass=self.mass * factor, inertia_about_com=self.inertia_about_com * factor)
 
-    def moved(self, placement: Placement) -> Inertia:
+    def transformed_by(self, placement: Placement) -> Inertia:
         """The inertia in another frame, in which its present frame has `placement`."""
         rotation = placement.rotation
-        com = rotation @ self.com + placement.translation
-        return replace(self, com=com, about_com=rotation @ self.about_com @ rotation.T)
+        com = rotation @ self.center_of_mass + placement.translation
+        return replace(self, center_of_mass=com, inertia_about_com=rotation @ self.inertia_about_com @ rotation.T)
 
-    def mapped(self, change: Callable[[ca.SX], ca.SX]) -> Inertia:
+    def map_expressions(self, change: Callable[[ca.SX], ca.SX]) -> Inertia:
         """The inertia with `change` applied to every expression."""
         fraction = None if self.gravity_fraction is None else change(self.gravity_fraction)
-        return Inertia(change(self.mass), change(self.com), change(self.about_com), fraction)
+        return Inertia(change(self.mass), change(self.center_of_mass), change(self.inertia_about_com), fraction)
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class Joint:
     ----------
     name : str
     kind : "revolute" or "prismatic"
-    parent : int
+    parent_index : int
         Index of the parent joint, -1 for the world.
     placement : Placement
         From the parent's joint frame to this joint's frame at zero.
@@ -104,7 +104,7 @@ class Joint:
         Unit vector in the joint frame.
     bodies : tuple of Inertia
         Everything rigidly attached to the moving side.
-    lower, upper : float
+    lower_limit, upper_limit : float
         Range [rad or m].
     effort_limit, velocity_limit : float
         [N m or N], [rad/s or m/s]
@@ -112,57 +112,57 @@ class Joint:
 
     name: str
     kind: Literal["revolute", "prismatic"]
-    parent: int
+    parent_index: int
     placement: Placement
     axis: tuple[float, float, float]
     bodies: tuple[Inertia, ...] = ()
-    lower: float = -math.inf
-    upper: float = math.inf
+    lower_limit: float = -math.inf
+    upper_limit: float = math.inf
     effort_limit: float = math.inf
     velocity_limit: float = math.inf
 
     @property
-    def unit(self) -> str:
+    def coordinate_unit(self) -> str:
         """Unit of the coordinate, `rad` or `m`."""
         return "rad" if self.kind == "revolute" else "m"
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A named frame fixed to a joint's moving side (`joint` = -1: to the world)."""
+    """A named frame fixed to a joint's moving side (`joint_index` = -1: to the world)."""
 
-    joint: int
+    joint_index: int
     placement: Placement
 
 
 @dataclass(frozen=True)
-class Line:
+class LinkChain:
     """A chain of straight links along which points are located by arc length.
 
     Attributes
     ----------
-    tips : tuple of str
+    tip_frames : tuple of str
         Frame at the far end of every link, base to tip; its translation is the link, whose base is the joint's origin.
-    parts : tuple of float
+    length_fractions : tuple of float
         Part of the nominal arc length that each link has; they sum to one.
     """
 
-    tips: tuple[str, ...]
-    parts: tuple[float, ...]
+    tip_frames: tuple[str, ...]
+    length_fractions: tuple[float, ...]
 
-    def locate(self, part: float) -> tuple[str, float]:
+    def locate_arc_length(self, length_fraction: float) -> tuple[str, float]:
         """Tip frame of the link that contains a fraction of the arc length (0 to 1), and the fraction of that link."""
         before = 0.0
-        for tip, own in zip(self.tips, self.parts, strict=True):
+        for tip, own in zip(self.tip_frames, self.length_fractions, strict=True):
             # what ends a link belongs to it, not to the next one
-            if part <= before + own * (1 + 1e-9) or tip == self.tips[-1]:
-                return tip, min((part - before) / own, 1.0)
+            if length_fraction <= before + own * (1 + 1e-9) or tip == self.tip_frames[-1]:
+                return tip, min((length_fraction - before) / own, 1.0)
             before += own
         raise ModelError("a line has no links")
 
 
 @dataclass(frozen=True, repr=False)
-class Mechanism(Shown):
+class Mechanism(ReprMixin):
     """A tree of joints, parents before children.
 
     Attributes
@@ -172,7 +172,7 @@ class Mechanism(Shown):
     frames : mapping of str to Frame
     parameters : Parameters
         Those on which placements and inertias depend.
-    lines : mapping of str to Line
+    link_chains : mapping of str to Line
         Chains of straight links along which `NAME:40%` names a point by arc length.
     """
 
@@ -180,15 +180,15 @@ class Mechanism(Shown):
     joints: tuple[Joint, ...]
     frames: Mapping[str, Frame]
     parameters: Parameters = field(default_factory=Parameters)
-    lines: Mapping[str, Line] = field(default_factory=dict)
+    link_chains: Mapping[str, LinkChain] = field(default_factory=dict)
 
-    def _summary(self) -> Summary:
+    def _summary(self) -> ReprSummary:
         rows = [("joint", "type", "moves with"), *((j.name, j.kind, self._carrier(j)) for j in self.joints)]
-        joints, frames = counted(len(self.joints), "joint"), counted(len(self.frames), "frame")
-        return Summary(f"{self.name}, {joints} and {frames}", rows)
+        joints, frames = count_with_noun(len(self.joints), "joint"), count_with_noun(len(self.frames), "frame")
+        return ReprSummary(f"{self.name}, {joints} and {frames}", rows)
 
     def _carrier(self, joint: Joint) -> str:
-        return "the world" if joint.parent < 0 else self.joints[joint.parent].name
+        return "the world" if joint.parent_index < 0 else self.joints[joint.parent_index].name
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
@@ -196,20 +196,20 @@ class Mechanism(Shown):
         return tuple(joint.name for joint in self.joints)
 
     @property
-    def parents(self) -> tuple[int, ...]:
+    def parent_indices(self) -> tuple[int, ...]:
         """Parent index of every joint, -1 for the world."""
-        return tuple(joint.parent for joint in self.joints)
+        return tuple(joint.parent_index for joint in self.joints)
 
     def joint_index(self, name: str) -> int:
         """Index of a joint by name; `ModelError` with the nearest name where there is none."""
         names = self.joint_names
         if name not in names:
-            raise ModelError(f"there is no joint '{name}'", where=self.name, hint=nearest(name, names))
+            raise ModelError(f"there is no joint '{name}'", where=self.name, hint=nearest_name_hint(name, names))
         return names.index(name)
 
     def has_frame(self, name: str) -> bool:
         """Whether there is a frame of a name, or a segment for a name such as `T1:40%`."""
-        return name in self.frames or (":" in name and name.partition(":")[0] in self.lines)
+        return name in self.frames or (":" in name and name.partition(":")[0] in self.link_chains)
 
     def frame(self, name: str) -> Frame:
         """A frame by name, or a point of a line by its arc length from the base, such as `T1:40%`.
@@ -226,21 +226,23 @@ class Mechanism(Shown):
             return self.frames[name]
         line, _, said = name.partition(":")
         if not self.has_frame(name):
-            known = (*self.frames, *(f"{entry}:{said}" for entry in self.lines if said))
-            raise ModelError(f"there is no frame '{name}'", where=self.name, hint=nearest(name, known))
-        tip, part = self.lines[line].locate(_fraction(name, said))
+            known = (*self.frames, *(f"{entry}:{said}" for entry in self.link_chains if said))
+            raise ModelError(f"there is no frame '{name}'", where=self.name, hint=nearest_name_hint(name, known))
+        tip, part = self.link_chains[line].locate_arc_length(_fraction(name, said))
         end = self.frames[tip]
-        return Frame(end.joint, Placement(end.placement.rotation, part * end.placement.translation))
+        return Frame(end.joint_index, Placement(end.placement.rotation, part * end.placement.translation))
 
-    def ancestors(self, index: int) -> tuple[int, ...]:
+    def ancestor_joints(self, index: int) -> tuple[int, ...]:
         """Indices of the joints from the root to joint `index`, itself included; empty for the world."""
         chain = []
         while index >= 0:
             chain.append(index)
-            index = self.joints[index].parent
+            index = self.joints[index].parent_index
         return tuple(reversed(chain))
 
-    def joined(self, other: Mechanism, frame: str | None = None, placement: ArrayLike | None = None) -> Mechanism:
+    def with_mechanism(
+        self, other: Mechanism, frame: str | None = None, placement: ArrayLike | None = None
+    ) -> Mechanism:
         """This mechanism with another one attached to one of its frames.
 
         Parameters
@@ -252,11 +254,11 @@ class Mechanism(Shown):
         placement : array_like, shape (4, 4), optional
             Of its root in that frame.
         """
-        root = Placement.identity() if placement is None else Placement.of(placement)
+        root = Placement.identity() if placement is None else Placement.from_matrix(placement)
         at = -1
         if frame is not None:
             carrier = self.frame(frame)
-            at, root = carrier.joint, carrier.placement @ root
+            at, root = carrier.joint_index, carrier.placement @ root
         shift = len(self.joints)
         clash = sorted((set(self.joint_names) & set(other.joint_names)) | (set(self.frames) & set(other.frames)))
         if clash:
@@ -267,18 +269,18 @@ class Mechanism(Shown):
 
         joints = list(self.joints)
         for joint in other.joints:
-            parent, local = moved(joint.parent, joint.placement)
-            joints.append(replace(joint, parent=parent, placement=local))
+            parent, local = moved(joint.parent_index, joint.placement)
+            joints.append(replace(joint, parent_index=parent, placement=local))
         frames = dict(self.frames)
         for name, entry in other.frames.items():
-            index, local = moved(entry.joint, entry.placement)
+            index, local = moved(entry.joint_index, entry.placement)
             frames[name] = Frame(index, local)
         return Mechanism(
             f"{self.name}+{other.name}" if self.joints else other.name,
             tuple(joints),
             frames,
-            self.parameters.joined(other.parameters),
-            {**self.lines, **other.lines},
+            self.parameters.with_added(other.parameters),
+            {**self.link_chains, **other.link_chains},
         )
 
     def with_frame(self, name: str, frame: str | None, placement: ArrayLike) -> Mechanism:
@@ -296,10 +298,10 @@ class Mechanism(Shown):
         if name in self.frames:
             raise ModelError(f"there is a frame '{name}' already", where=self.name)
         carrier = Frame(-1, Placement.identity()) if frame is None else self.frame(frame)
-        added = Frame(carrier.joint, carrier.placement @ Placement.of(placement))
+        added = Frame(carrier.joint_index, carrier.placement @ Placement.from_matrix(placement))
         return replace(self, frames={**self.frames, name: added})
 
-    def numeric(self, values: Mapping[str, float] | None = None) -> Mechanism:
+    def with_numeric_values(self, values: Mapping[str, float] | None = None) -> Mechanism:
         """The mechanism with numbers in place of its parameters, which are then empty."""
         return self._evaluated(self.parameters.symbols, self.parameters.vector(values))
 
@@ -308,20 +310,25 @@ class Mechanism(Shown):
             function = ca.Function("number", [symbols], [expression])
             return ca.SX(ca.densify(function(theta)))
 
-        return replace(self.mapped(number), parameters=Parameters())
+        return replace(self.map_expressions(number), parameters=Parameters())
 
-    def mapped(self, change: Callable[[ca.SX], ca.SX]) -> Mechanism:
+    def map_expressions(self, change: Callable[[ca.SX], ca.SX]) -> Mechanism:
         """The mechanism with `change` applied to every expression of its placements and inertias."""
         joints = tuple(
             replace(
-                joint, placement=joint.placement.mapped(change), bodies=tuple(b.mapped(change) for b in joint.bodies)
+                joint,
+                placement=joint.placement.map_expressions(change),
+                bodies=tuple(b.map_expressions(change) for b in joint.bodies),
             )
             for joint in self.joints
         )
-        frames = {name: Frame(frame.joint, frame.placement.mapped(change)) for name, frame in self.frames.items()}
+        frames = {
+            name: Frame(frame.joint_index, frame.placement.map_expressions(change))
+            for name, frame in self.frames.items()
+        }
         return replace(self, joints=joints, frames=frames)
 
-    def inserted(self, index: int, chain: Sequence[Joint]) -> Mechanism:
+    def with_inserted_joints(self, index: int, chain: Sequence[Joint]) -> Mechanism:
         """The mechanism with a chain of joints inserted at an index; nothing is attached to the chain yet.
 
         Parameters
@@ -336,11 +343,11 @@ class Mechanism(Shown):
         def moved(joint: int) -> int:
             return joint + count if joint >= index else joint
 
-        joints = [replace(joint, parent=moved(joint.parent)) for joint in self.joints]
+        joints = [replace(joint, parent_index=moved(joint.parent_index)) for joint in self.joints]
         joints[index:index] = [
-            joint if i == 0 else replace(joint, parent=index + i - 1) for i, joint in enumerate(chain)
+            joint if i == 0 else replace(joint, parent_index=index + i - 1) for i, joint in enumerate(chain)
         ]
-        frames = {name: Frame(moved(frame.joint), frame.placement) for name, frame in self.frames.items()}
+        frames = {name: Frame(moved(frame.joint_index), frame.placement) for name, frame in self.frames.items()}
         return replace(self, joints=tuple(joints), frames=frames)
 
 
@@ -361,7 +368,7 @@ def _fraction(name: str, said: str) -> float:
     return value / 100.0
 
 
-def merged(bodies: Iterable[Inertia]) -> Inertia | None:
+def merge_bodies(bodies: Iterable[Inertia]) -> Inertia | None:
     """One rigid body equal to several; None for no body or zero mass."""
     entries = list(bodies)
     if not entries:
@@ -371,9 +378,9 @@ def merged(bodies: Iterable[Inertia]) -> Inertia | None:
         return None
     if not all(b.gravity_fraction is None or b.gravity_fraction.is_one() for b in entries):
         raise ModelError("a body whose weight is not its mass times gravity cannot be merged or written to a file")
-    com = sum((b.mass * b.com for b in entries), ca.SX(ca.DM.zeros(3))) / mass
+    com = sum((b.mass * b.center_of_mass for b in entries), ca.SX(ca.DM.zeros(3))) / mass
     inertia = ca.SX(ca.DM.zeros(3, 3))
     for body in entries:
-        offset = body.com - com
-        inertia += body.about_com + body.mass * (ca.dot(offset, offset) * ca.SX.eye(3) - offset @ offset.T)
+        offset = body.center_of_mass - com
+        inertia += body.inertia_about_com + body.mass * (ca.dot(offset, offset) * ca.SX.eye(3) - offset @ offset.T)
     return Inertia(mass, com, ca.densify(inertia))

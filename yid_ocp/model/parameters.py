@@ -10,10 +10,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.errors import ConfigError, nearest
-from yid_ocp.shown import Shown, Summary, counted
+from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
+from yid_ocp.errors import ConfigError, nearest_name_hint
 
-Vector = NDArray[np.float64]
+_Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Parameter:
             )
 
 
-class Parameters(Shown):
+class Parameters(ReprMixin):
     """The ordered, immutable set of a model's parameters, which defines the order of `theta`.
 
     Parameters
@@ -77,10 +77,10 @@ class Parameters(Shown):
                 f"parameter named twice: {', '.join(twice)}", hint="give each part of the model its own name"
             )
 
-    def _summary(self) -> Summary:
+    def _summary(self) -> ReprSummary:
         rows = [("parameter", "value", "unit", "lower", "upper")]
         rows += [(e.name, f"{e.value:.4g}", e.unit, f"{e.lower:g}", f"{e.upper:g}") for e in self]
-        return Summary(counted(len(self), "parameter"), rows)
+        return ReprSummary(count_with_noun(len(self), "parameter"), rows)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -107,10 +107,10 @@ class Parameters(Shown):
     def index(self, name: str) -> int:
         """Index of a parameter in `theta`; `ConfigError` with the nearest name where there is none."""
         if name not in self._index:
-            raise ConfigError(f"there is no parameter '{name}'", hint=nearest(name, self._index))
+            raise ConfigError(f"there is no parameter '{name}'", hint=nearest_name_hint(name, self._index))
         return self._index[name]
 
-    def vector(self, values: Mapping[str, float] | None = None) -> Vector:
+    def vector(self, values: Mapping[str, float] | None = None) -> _Vector:
         """The vector theta of nominal values, some of them replaced.
 
         Parameters
@@ -152,11 +152,11 @@ class Parameters(Shown):
             for entry in self._entries
         )
 
-    def joined(self, *others: Iterable[Parameter]) -> Parameters:
+    def with_added(self, *others: Iterable[Parameter]) -> Parameters:
         """These parameters followed by others."""
         return Parameters([*self._entries, *(entry for other in others for entry in other)])
 
-    def bounds(self, names: Sequence[str]) -> tuple[Vector, Vector]:
+    def bounds(self, names: Sequence[str]) -> tuple[_Vector, _Vector]:
         """Lower and upper bounds of the named parameters, two arrays of shape (len(names),)."""
         chosen = [self[name] for name in names]
         return np.array([e.lower for e in chosen], dtype=float), np.array([e.upper for e in chosen], dtype=float)

@@ -13,25 +13,25 @@ Matrix = NDArray[np.float64]
 
 
 # URDF writers round pi to a dozen digits; entries this close to 0 and 1 are meant to be exactly that.
-SNAP = 1e-11
+_SNAP_TOLERANCE = 1e-11
 
 
-def snapped(matrix: Matrix) -> Matrix:
-    """The matrix with entries within `SNAP` of -1, 0 and 1 replaced by these numbers."""
+def snap_to_unit_entries(matrix: Matrix) -> Matrix:
+    """The matrix with entries within `_SNAP_TOLERANCE` of -1, 0 and 1 replaced by these numbers."""
     result = np.array(matrix, dtype=float)
     for exact in (-1.0, 0.0, 1.0):
-        result[np.abs(result - exact) < SNAP] = exact
+        result[np.abs(result - exact) < _SNAP_TOLERANCE] = exact
     return result
 
 
-def transform(rotation: ArrayLike, translation: ArrayLike) -> Matrix:
+def homogeneous_transform(rotation: ArrayLike, translation: ArrayLike) -> Matrix:
     """Homogeneous 4x4 matrix from a rotation (3, 3) and a translation (3,) [m]."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = np.asarray(rotation, float), np.asarray(translation, float)
     return matrix
 
 
-def roll_pitch_yaw(roll: float, pitch: float, yaw: float) -> Matrix:
+def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Matrix:
     """Rotation matrix Rz(yaw) Ry(pitch) Rx(roll), the URDF convention [rad]."""
     cr, sr, cp, sp, cy, sy = *_cs(roll), *_cs(pitch), *_cs(yaw)
     return np.array(
@@ -43,8 +43,8 @@ def roll_pitch_yaw(roll: float, pitch: float, yaw: float) -> Matrix:
     )
 
 
-def angles_of(rotation: Matrix) -> tuple[float, float, float]:
-    """Roll, pitch and yaw [rad] of a rotation matrix, the inverse of `roll_pitch_yaw`."""
+def rpy_from_rotation(rotation: Matrix) -> tuple[float, float, float]:
+    """Roll, pitch and yaw [rad] of a rotation matrix, the inverse of `rotation_from_rpy`."""
     # the roll is taken in the frame that yaw and pitch leave, which holds at and near pitch = 90 degrees too
     yaw = math.atan2(rotation[1, 0], rotation[0, 0])
     pitch = math.atan2(-rotation[2, 0], math.hypot(rotation[0, 0], rotation[1, 0]))
@@ -52,13 +52,13 @@ def angles_of(rotation: Matrix) -> tuple[float, float, float]:
     return math.atan2(s * rotation[0, 2] - c * rotation[1, 2], c * rotation[1, 1] - s * rotation[0, 1]), pitch, yaw
 
 
-def turn(axis: ArrayLike, sine: float, cosine: float) -> Matrix:
+def axis_angle_rotation(axis: ArrayLike, sine: float, cosine: float) -> Matrix:
     """Rotation matrix about a unit axis, from the sine and cosine of the angle (Rodrigues' formula)."""
     skew = _skew(np.asarray(axis, float))
     return np.eye(3) + sine * skew + (1 - cosine) * skew @ skew
 
 
-def about_axis(axis: Sequence[float], angle: ca.SX) -> ca.SX:
+def symbolic_axis_rotation(axis: Sequence[float], angle: ca.SX) -> ca.SX:
     """Rotation matrix about a numeric unit axis by a symbolic angle [rad], shape (3, 3)."""
     c, s = ca.cos(angle), ca.sin(angle)
     for k in range(3):
@@ -73,10 +73,10 @@ def about_axis(axis: Sequence[float], angle: ca.SX) -> ca.SX:
     return ca.SX(ca.DM(along)) + c * ca.SX(ca.DM(np.eye(3) - along)) + s * ca.SX(ca.DM(_skew(u)))
 
 
-def symbolic_roll_pitch_yaw(roll: ca.SX, pitch: ca.SX, yaw: ca.SX | None = None) -> ca.SX:
+def symbolic_rotation_from_rpy(roll: ca.SX, pitch: ca.SX, yaw: ca.SX | None = None) -> ca.SX:
     """Rotation matrix Rz(yaw) Ry(pitch) Rx(roll) of symbolic angles [rad], shape (3, 3); without yaw Ry Rx."""
-    turned = about_axis((0.0, 1.0, 0.0), pitch) @ about_axis((1.0, 0.0, 0.0), roll)
-    return ca.densify(turned if yaw is None else about_axis((0.0, 0.0, 1.0), yaw) @ turned)
+    turned = symbolic_axis_rotation((0.0, 1.0, 0.0), pitch) @ symbolic_axis_rotation((1.0, 0.0, 0.0), roll)
+    return ca.densify(turned if yaw is None else symbolic_axis_rotation((0.0, 0.0, 1.0), yaw) @ turned)
 
 
 def _cs(angle: float) -> tuple[float, float]:
@@ -87,7 +87,7 @@ def _skew(u: Matrix) -> Matrix:
     return np.array([[0, -u[2], u[1]], [u[2], 0, -u[0]], [-u[1], u[0], 0]])
 
 
-def placement_matrix(xyz: ArrayLike = (0.0, 0.0, 0.0), rpy: ArrayLike = (0.0, 0.0, 0.0)) -> Matrix:
+def transform_from_xyz_rpy(xyz: ArrayLike = (0.0, 0.0, 0.0), rpy: ArrayLike = (0.0, 0.0, 0.0)) -> Matrix:
     """Homogeneous 4x4 matrix from a translation [m] and roll, pitch, yaw [rad]."""
     angles = np.asarray(rpy, float)
-    return transform(roll_pitch_yaw(*angles), xyz)
+    return homogeneous_transform(rotation_from_rpy(*angles), xyz)

@@ -11,16 +11,24 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from yid_ocp.errors import ModelError, nearest
-from yid_ocp.model.drives import PositionServos, Servo, Spring, joint_dampers, joint_servos, joint_spring, weightless
-from yid_ocp.model.flexible import AXES, ElasticJoint, FlexibleObject, SegmentLayout
+from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
+from yid_ocp.errors import ModelError, nearest_name_hint
+from yid_ocp.model.flexible import UNIT_AXES, ElasticJoint, FlexibleObject, SegmentLayout
 from yid_ocp.model.kinematics import Kinematics
 from yid_ocp.model.mechanism import Frame, Joint, Mechanism, Placement
 from yid_ocp.model.parameters import Parameters
-from yid_ocp.shown import Shown, Summary, counted
+from yid_ocp.model.servos_and_springs import (
+    PositionServo,
+    PositionServoOptions,
+    RobotJointSpring,
+    build_joint_servos,
+    joint_damping_parameters,
+    joint_spring_parameters,
+    without_gravity,
+)
 
-GraspKind = Literal["point", "axis", "weld"]
-EQUATIONS: dict[str, tuple[str, ...]] = {
+_GraspKind = Literal["point", "axis", "weld"]
+_GRASP_EQUATION_NAMES: dict[str, tuple[str, ...]] = {
     "point": ("x", "y", "z"),
     "axis": ("x", "y", "z", "tilt_x", "tilt_y"),
     "weld": ("x", "y", "z", "turn_x", "turn_y", "turn_z"),
@@ -36,58 +44,58 @@ class Grasp:
     ----------
     name : str
         `left`, `right`, `gripper`, or a clamp's name.
-    holder, held : str
+    holder_frame, held_frame : str
         Frames; their origins coincide.
     kind : "point", "axis" or "weld"
         3 equations (positions), 5 (and the direction of the z axes), 6 (and the orientation).
-    rotation : casadi.SX, shape (3, 3)
-        Orientation of `held` in `holder` for `axis` and `weld`.
-    offset : casadi.SX, shape (3, 1)
+    held_orientation : casadi.SX, shape (3, 3)
+        Orientation of `held_frame` in `holder_frame` for `axis` and `weld`.
+    holder_offset : casadi.SX, shape (3, 1)
         Where the grasped point sits in the holder's frame [m].
-    slip : casadi.SX
+    axial_slip : casadi.SX
         How far the grasped point has crept along the object's z axis [m].
     compliance : casadi.SX
         C in phi(q_{k+1}) = C lam_k / h [m/N]; zero for a rigid grasp.
-    relaxation : casadi.SX, optional
+    relaxation_time : casadi.SX, optional
         T in phi(q_{k+1}) + T (phi(q_{k+1}) - phi(q_k)) / h = C lam_k / h, damping over stiffness of the grasp [s].
     """
 
     name: str
-    holder: str
-    held: str
-    kind: GraspKind = "point"
-    rotation: ca.SX = field(default_factory=lambda: ca.SX(ca.DM.eye(3)))
-    offset: ca.SX = field(default_factory=lambda: ca.SX(ca.DM.zeros(3)))
-    slip: ca.SX = field(default_factory=lambda: ca.SX(0))
+    holder_frame: str
+    held_frame: str
+    kind: _GraspKind = "point"
+    held_orientation: ca.SX = field(default_factory=lambda: ca.SX(ca.DM.eye(3)))
+    holder_offset: ca.SX = field(default_factory=lambda: ca.SX(ca.DM.zeros(3)))
+    axial_slip: ca.SX = field(default_factory=lambda: ca.SX(0))
     compliance: ca.SX = field(default_factory=lambda: ca.SX(0))
-    relaxation: ca.SX | None = None
+    relaxation_time: ca.SX | None = None
 
     @property
-    def equations(self) -> int:
+    def n_equations(self) -> int:
         """Number of scalar constraint equations."""
-        return len(EQUATIONS[self.kind])
+        return len(_GRASP_EQUATION_NAMES[self.kind])
 
     @property
     def equation_names(self) -> tuple[str, ...]:
         """Names of the equations: `left.x`, ..., then tilts for `axis` or rotations for `weld`."""
-        return tuple(f"{self.name}.{part}" for part in EQUATIONS[self.kind])
+        return tuple(f"{self.name}.{part}" for part in _GRASP_EQUATION_NAMES[self.kind])
 
-    def mapped(self, change: Callable[[ca.SX], ca.SX]) -> Grasp:
+    def map_expressions(self, change: Callable[[ca.SX], ca.SX]) -> Grasp:
         """The grasp with `change` applied to every expression."""
         return replace(
             self,
-            rotation=change(self.rotation),
-            offset=change(self.offset),
-            slip=change(self.slip),
+            held_orientation=change(self.held_orientation),
+            holder_offset=change(self.holder_offset),
+            axial_slip=change(self.axial_slip),
             compliance=change(self.compliance),
-            relaxation=None if self.relaxation is None else change(self.relaxation),
+            relaxation_time=None if self.relaxation_time is None else change(self.relaxation_time),
         )
 
-    def residual(self, kinematics: Kinematics) -> ca.SX:
+    def constraint_residual(self, kinematics: Kinematics) -> ca.SX:
         """Constraint residual phi(q), shape (equations, 1): positions [m], then direction or orientation [rad]."""
-        holder = kinematics.pose(self.holder) @ Placement(self.rotation, self.offset)
-        held = kinematics.pose(self.held)
-        point = held.translation - held.rotation[:, 2] * self.slip
+        holder = kinematics.frame_pose(self.holder_frame) @ Placement(self.held_orientation, self.holder_offset)
+        held = kinematics.frame_pose(self.held_frame)
+        point = held.translation - held.rotation[:, 2] * self.axial_slip
         rows = [holder.translation - point]
         if self.kind == "axis":
             rows.append(holder.rotation[:, :2].T @ held.rotation[:, 2])
@@ -97,14 +105,17 @@ class Grasp:
             rows.append(0.5 * ca.vertcat(*(error[i, j] - error[j, i] for i, j in pairs)))
         return ca.vertcat(*rows)
 
-    def alignment(self, kinematics: Kinematics) -> ca.SX:
+    def axis_misalignment(self, kinematics: Kinematics) -> ca.SX:
         """Differences between the axes that the grasp aligns, shape (0, 3 or 9; 1).
 
-        Redundant beside `residual`, but not zero where axes point in opposite ways: for a search that starts far off.
+        Redundant beside `constraint_residual`, but not zero where axes point in opposite ways: for a search that starts far off.
         """
         if self.kind == "point":
             return ca.SX(0, 1)
-        difference = kinematics.pose(self.holder).rotation @ self.rotation - kinematics.pose(self.held).rotation
+        difference = (
+            kinematics.frame_pose(self.holder_frame).rotation @ self.held_orientation
+            - kinematics.frame_pose(self.held_frame).rotation
+        )
         return difference[:, 2] if self.kind == "axis" else ca.vec(difference)
 
 
@@ -125,7 +136,7 @@ class MidpointState:
         Motor torques held over the step [N m], or what servos are commanded [rad or m].
     constraint_force : casadi.SX, shape (m, 1)
         lam_k / h [N or N m].
-    internal : mapping of str to int
+    internal_rows : mapping of str to int
         Row of each internal coordinate in `z`, by name.
     h : casadi.SX
         Length of the step [s].
@@ -139,7 +150,7 @@ class MidpointState:
     z_rate: ca.SX
     u: ca.SX
     constraint_force: ca.SX
-    internal: Mapping[str, int]
+    internal_rows: Mapping[str, int]
     h: ca.SX
 
 
@@ -156,11 +167,11 @@ class NodeState:
     z : casadi.SX, shape (nz, 1)
     effort : casadi.SX, shape (n, 1)
         Torque at every joint that has one: the motor torque where driven, the predicted effort where prescribed.
-    internal : mapping of str to int
+    internal_rows : mapping of str to int
         Row of each internal coordinate in `z`, by name.
-    camera : Placement or None
+    camera_pose : Placement or None
         Pose in the world of the camera that measures; None for any other sensor.
-    frame : str or None
+    marked_frame : str or None
         Frame of the mechanism that the channel marks; None for a joint.
     """
 
@@ -169,16 +180,16 @@ class NodeState:
     q: ca.SX
     z: ca.SX
     effort: ca.SX
-    internal: Mapping[str, int]
-    camera: Placement | None = None
-    frame: str | None = None
+    internal_rows: Mapping[str, int]
+    camera_pose: Placement | None = None
+    marked_frame: str | None = None
 
 
 @dataclass(frozen=True)
-class ClosedForce:
+class ForceWithDerivatives:
     """A dissipative generalized force F(q, v) of wrenches on bodies, with its derivatives in closed form.
 
-    With S_j and D_j as in `RigidBody`, for i an ancestor of joint j or j itself:
+    With S_j and D_j as in `RigidBodyDerivatives`, for i an ancestor of joint j or j itself:
 
         dF_j/dv_i = dF_i/dv_j = S_i . A_j       dF_j/dq_i = D_i . A_j       dF_i/dq_j = S_i . T_j
 
@@ -195,38 +206,38 @@ class ClosedForce:
 
 
 @dataclass(frozen=True)
-class Terms:
+class StepTerms:
     """Energy, forces and equations that one effect adds to a step.
 
     Attributes
     ----------
     lagrangian : casadi.SX
         Scalar added to L(q, v) [J].
-    force : casadi.SX, optional, shape (n, 1)
+    generalized_force : casadi.SX, optional, shape (n, 1)
         Generalized force F(q, v, u, z) [N m or N].
-    viscous : casadi.SX, optional, shape (n, 1)
+    dissipative_force : casadi.SX, optional, shape (n, 1)
         The part of the force that only takes energy out, in proportion to velocity [N m or N].
-    internal : mapping of str to casadi.SX
+    internal_equations : mapping of str to casadi.SX
         Equation (= 0) of each internal coordinate that the term owns, at the midpoint.
-    at_rest : mapping of str to casadi.SX
+    static_equations : mapping of str to casadi.SX
         Equation (= 0) that takes its place in a static equilibrium, where its own says nothing or cannot hold.
-    closed : ClosedForce, optional
+    force_with_derivatives : ClosedForce, optional
         A dissipative force on bodies whose slopes are given, because differentiating it would cost too much.
     """
 
     lagrangian: ca.SX = field(default_factory=lambda: ca.SX(0))
-    force: ca.SX | None = None
-    viscous: ca.SX | None = None
-    internal: Mapping[str, ca.SX] = field(default_factory=dict)
-    at_rest: Mapping[str, ca.SX] = field(default_factory=dict)
-    closed: ClosedForce | None = None
+    generalized_force: ca.SX | None = None
+    dissipative_force: ca.SX | None = None
+    internal_equations: Mapping[str, ca.SX] = field(default_factory=dict)
+    static_equations: Mapping[str, ca.SX] = field(default_factory=dict)
+    force_with_derivatives: ForceWithDerivatives | None = None
 
 
 @runtime_checkable
 class Effect(Protocol):
     """Interface of an unmodelled effect or another addition to the nominal model.
 
-    `modify` changes the description (masses, lengths, grasps, gravity, added joints); `terms` adds energy, force and
+    `apply_to_system` changes the description (masses, lengths, grasps, gravity, added joints); `step_terms` adds energy, force and
     equations of internal coordinates. At neutral parameters both must leave the nominal model unchanged.
     """
 
@@ -246,36 +257,36 @@ class Effect(Protocol):
         ...
 
     @property
-    def internal(self) -> Mapping[str, ca.SX]:
-        """The effect's internal coordinates (without momentum): name to the symbol that `modify` uses."""
+    def internal_coordinates(self) -> Mapping[str, ca.SX]:
+        """The effect's internal coordinates (without momentum): name to the symbol that `apply_to_system` uses."""
         ...
 
-    def modify(self, system: System) -> System:
+    def apply_to_system(self, system: System) -> System:
         """The system with the effect's changes of masses, lengths, grasps, gravity or joints."""
         ...
 
-    def terms(self, state: MidpointState) -> Terms:
+    def step_terms(self, state: MidpointState) -> StepTerms:
         """Energy, forces and internal equations that the effect adds to one step."""
         ...
 
-    def measure(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
+    def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
         """What a sensor reads instead of `output`; `channel` is `group.point` or `joints.quantity.JOINT`."""
         ...
 
 
 @runtime_checkable
-class RecordedEffect(Effect, Protocol):
+class RecordingErrorEffect(Effect, Protocol):
     """Interface of an effect on recorded inputs and times.
 
     Recorded torques drive the model, recorded angles prescribe it or are followed: there the reading is known and the
     true value is sought, the opposite of `measure`.
     """
 
-    def correct(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
+    def corrected_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
         """The true value for a recorded `joints.position.JOINT` or `joints.effort.JOINT`, at the true `effort`."""
         ...
 
-    def delay(self, channel: str, camera: bool) -> ca.SX:
+    def added_delay(self, channel: str, camera: bool) -> ca.SX:
         """How long before its recorded time a sample was true [s].
 
         `channel` is as in `measure`, or `torque.JOINT` for a recorded torque that drives the model: it then acts so
@@ -283,7 +294,7 @@ class RecordedEffect(Effect, Protocol):
         """
         ...
 
-    def lag(self, channel: str) -> ca.SX:
+    def lag_time_constant(self, channel: str) -> ca.SX:
         """Time constant with which a torque follows the recorded one, or a recorded effort the true one [s].
 
         `channel` is `torque.JOINT` or `joints.effort.JOINT`.
@@ -292,7 +303,7 @@ class RecordedEffect(Effect, Protocol):
 
 
 @dataclass(frozen=True, repr=False)
-class System(Shown):
+class System(ReprMixin):
     """A mechanism with springs, dampers, grasps, inputs and effects.
 
     Attributes
@@ -301,8 +312,8 @@ class System(Shown):
         Arms first (left, then right), then the object.
     parameters : Parameters
         Fixes the order of theta.
-    elastic : tuple of ElasticJoint
-    damping : mapping of joint name to casadi.SX
+    elastic_joints : tuple of ElasticJoint
+    joint_damping : mapping of joint name to casadi.SX
         Viscous coefficients of joints that are not elastic [N m s/rad].
     grasps : tuple of Grasp
     driven : tuple of str
@@ -313,34 +324,34 @@ class System(Shown):
         Joints whose coordinate is known, in the order of s.
     gravity : casadi.SX, shape (3, 1)
         [m/s^2], in the world frame.
-    time_scale : casadi.SX
+    recorded_time_scale : casadi.SX
         Factor on the recorded time step.
-    compliant : mapping of joint name to casadi.SX
+    joint_compliances : mapping of joint name to casadi.SX
         Coordinates held by a spring of this compliance [rad/(N m)], zero meaning rigid; their equations and momentum
         are multiplied by it so that they stay regular at zero.
-    relaxing : mapping of joint name to float
+    joint_relaxation_times : mapping of joint name to float
         Relaxation time T of some compliant coordinates [s]: q + T dq/dt = compliance x torque. A massless one needs it
         to forget a start that does not fit its load.
-    segments : tuple of SegmentLayout
-    points : tuple of str
+    segment_layouts : tuple of SegmentLayout
+    point_frames : tuple of str
         Frames that a sensor may see.
     effects : tuple of Effect
     """
 
     mechanism: Mechanism
     parameters: Parameters
-    elastic: tuple[ElasticJoint, ...] = ()
-    damping: Mapping[str, ca.SX] = field(default_factory=dict)
+    elastic_joints: tuple[ElasticJoint, ...] = ()
+    joint_damping: Mapping[str, ca.SX] = field(default_factory=dict)
     grasps: tuple[Grasp, ...] = ()
     driven: tuple[str, ...] = ()
-    servos: Mapping[str, Servo] = field(default_factory=dict)
+    servos: Mapping[str, PositionServo] = field(default_factory=dict)
     prescribed: tuple[str, ...] = ()
     gravity: ca.SX = field(default_factory=lambda: ca.SX(ca.DM([0.0, 0.0, -9.81])))
-    time_scale: ca.SX = field(default_factory=lambda: ca.SX(1))
-    compliant: Mapping[str, ca.SX] = field(default_factory=dict)
-    relaxing: Mapping[str, float] = field(default_factory=dict)
-    segments: tuple[SegmentLayout, ...] = ()
-    points: tuple[str, ...] = ()
+    recorded_time_scale: ca.SX = field(default_factory=lambda: ca.SX(1))
+    joint_compliances: Mapping[str, ca.SX] = field(default_factory=dict)
+    joint_relaxation_times: Mapping[str, float] = field(default_factory=dict)
+    segment_layouts: tuple[SegmentLayout, ...] = ()
+    point_frames: tuple[str, ...] = ()
     effects: tuple[Effect, ...] = ()
 
     @staticmethod
@@ -353,10 +364,10 @@ class System(Shown):
         prescribed: Sequence[str] = (),
         damping: float | Mapping[str, float] = 0.0,
         gravity: ArrayLike = (0.0, 0.0, -9.81),
-        points: Sequence[str] | None = None,
+        point_frames: Sequence[str] | None = None,
         effects: Sequence[Effect] = (),
-        springs: Mapping[str, Spring] | None = None,
-        servos: PositionServos | None = None,
+        springs: Mapping[str, RobotJointSpring] | None = None,
+        servos: PositionServoOptions | None = None,
     ) -> System:
         """A system from a robot, objects, grasps and effects.
 
@@ -373,7 +384,7 @@ class System(Shown):
             Viscous damping of the robot's joints [N m s/rad]; becomes the parameters `JOINT.damping`.
         gravity : array_like, shape (3,)
             [m/s^2]
-        points : sequence of str, optional
+        point_frames : sequence of str, optional
             Frames that sensors may see, points along a segment as `T1:40%`; the segments' tips `w_*` when absent.
         effects : sequence of Effect
         springs : mapping of str to Spring, optional
@@ -396,26 +407,30 @@ class System(Shown):
             raise ModelError(f"gravity = {acceleration}", allowed="three numbers [m/s^2]")
         tree = mechanism if mechanism is not None else Mechanism("system", (), {})
         wanted = dict(damping) if isinstance(damping, Mapping) else dict.fromkeys(tree.joint_names, float(damping))
-        dampers = joint_dampers(tree, wanted)
+        dampers = joint_damping_parameters(tree, wanted)
         entries = list(dampers.values())
         elastic: list[ElasticJoint] = []
         for joint, spring in (springs or {}).items():
-            stiffness, rest = joint_spring(tree, joint, spring)
+            stiffness, rest = joint_spring_parameters(tree, joint, spring)
             entries += [stiffness, rest]
             elastic.append(ElasticJoint(joint, joint, "bend", "", stiffness.symbol, ca.SX(0), rest.symbol))
-        moved, own = ({}, []) if servos is None else joint_servos(tree, driven, servos.commands)
+        moved, own = ({}, []) if servos is None else build_joint_servos(tree, driven, servos.command_interpolation)
         entries += own
-        tree = weightless(tree) if servos is not None and servos.gravity_compensation else tree
+        tree = without_gravity(tree) if servos is not None and servos.has_gravity_compensation else tree
         segments: list[SegmentLayout] = []
         for item, frame, placement in objects:
-            tree = tree.joined(item.mechanism, frame, placement)
-            elastic += item.elastic
-            segments += item.segments
-        seen = tuple(points) if points is not None else tuple(name for name in tree.frames if name.startswith("w_"))
+            tree = tree.with_mechanism(item.mechanism, frame, placement)
+            elastic += item.elastic_joints
+            segments += item.segment_layouts
+        seen = (
+            tuple(point_frames)
+            if point_frames is not None
+            else tuple(name for name in tree.frames if name.startswith("w_"))
+        )
         _check_names(tree, grasps, driven, prescribed, seen)
         system = System(
             tree,
-            tree.parameters.joined(entries),
+            tree.parameters.with_added(entries),
             tuple(elastic),
             {joint: parameter.symbol for joint, parameter in dampers.items()},
             tuple(grasps),
@@ -423,8 +438,8 @@ class System(Shown):
             moved,
             tuple(prescribed),
             ca.SX(ca.DM(acceleration)),
-            segments=tuple(segments),
-            points=seen,
+            segment_layouts=tuple(segments),
+            point_frames=seen,
         )
         return system.with_effects(effects)
 
@@ -432,28 +447,31 @@ class System(Shown):
         """This system with additional effects, whose parameters are appended to theta in the order given."""
         system = self
         for effect in effects:
-            system = replace(system, parameters=system.parameters.joined(effect.parameters))
-            system = effect.modify(system)
+            system = replace(system, parameters=system.parameters.with_added(effect.parameters))
+            system = effect.apply_to_system(system)
             system = replace(system, effects=(*system.effects, effect))
         return system
 
-    def _summary(self) -> Summary:
+    def _summary(self) -> ReprSummary:
         kinds = {"driven": len(self.driven), "prescribed": len(self.prescribed)}
-        kinds["passive"] = self.size - sum(kinds.values())
+        kinds["passive"] = self.n_coordinates - sum(kinds.values())
         moved = ", ".join(f"{count} {kind}" for kind, count in kinds.items() if count)
-        parts = [f"{counted(self.size, 'coordinate')} ({moved})", counted(self.constraint_count, "constraint")]
+        parts = [
+            f"{count_with_noun(self.n_coordinates, 'coordinate')} ({moved})",
+            count_with_noun(self.n_constraints, "constraint"),
+        ]
         parts += [f"{effect.kind}@{effect.location}" for effect in self.effects]
-        return Summary(f"{self.mechanism.name}, {', '.join(parts)}", self.parameters._summary().rows)
+        return ReprSummary(f"{self.mechanism.name}, {', '.join(parts)}", self.parameters._summary().table_rows)
 
     @property
-    def size(self) -> int:
+    def n_coordinates(self) -> int:
         """n, the number of configuration variables."""
         return len(self.mechanism.joints)
 
     @property
-    def constraint_count(self) -> int:
+    def n_constraints(self) -> int:
         """m, the number of scalar constraints."""
-        return sum(grasp.equations for grasp in self.grasps)
+        return sum(grasp.n_equations for grasp in self.grasps)
 
     @cached_property
     def driven_indices(self) -> tuple[int, ...]:
@@ -468,86 +486,98 @@ class System(Shown):
     @cached_property
     def free_indices(self) -> tuple[int, ...]:
         """Configuration indices that are not prescribed."""
-        return tuple(i for i in range(self.size) if i not in self.prescribed_indices)
+        return tuple(i for i in range(self.n_coordinates) if i not in self.prescribed_indices)
 
     @property
-    def internal(self) -> dict[str, ca.SX]:
+    def internal_coordinates(self) -> dict[str, ca.SX]:
         """Internal coordinates in the order of z: name to the symbol that stands for it in grasps and placements."""
-        return {name: symbol for effect in self.effects for name, symbol in effect.internal.items()}
+        return {name: symbol for effect in self.effects for name, symbol in effect.internal_coordinates.items()}
 
-    def segment(self, name: str) -> SegmentLayout:
+    def segment_layout(self, name: str) -> SegmentLayout:
         """Layout of a segment by name; `ModelError` with the nearest name where there is none."""
-        for entry in self.segments:
+        for entry in self.segment_layouts:
             if entry.name == name:
                 return entry
-        raise ModelError(f"there is no segment '{name}'", hint=nearest(name, [s.name for s in self.segments]))
+        raise ModelError(
+            f"there is no segment '{name}'", hint=nearest_name_hint(name, [s.name for s in self.segment_layouts])
+        )
 
-    def mapped(self, change: Callable[[ca.SX], ca.SX]) -> System:
+    def map_expressions(self, change: Callable[[ca.SX], ca.SX]) -> System:
         """The system with `change` applied to every expression of its description."""
         elastic = tuple(
-            replace(e, stiffness=change(e.stiffness), damping=change(e.damping), rest=change(e.rest))
-            for e in self.elastic
+            replace(e, stiffness=change(e.stiffness), damping=change(e.damping), rest_angle=change(e.rest_angle))
+            for e in self.elastic_joints
         )
         segments = tuple(
-            replace(s, lengths=tuple(change(x) for x in s.lengths), radius=change(s.radius), mass=change(s.mass))
-            for s in self.segments
+            replace(
+                s, link_lengths=tuple(change(x) for x in s.link_lengths), radius=change(s.radius), mass=change(s.mass)
+            )
+            for s in self.segment_layouts
         )
         return replace(
             self,
-            mechanism=self.mechanism.mapped(change),
-            elastic=elastic,
-            damping={joint: change(value) for joint, value in self.damping.items()},
-            servos={joint: servo.mapped(change) for joint, servo in self.servos.items()},
-            grasps=tuple(grasp.mapped(change) for grasp in self.grasps),
+            mechanism=self.mechanism.map_expressions(change),
+            elastic_joints=elastic,
+            joint_damping={joint: change(value) for joint, value in self.joint_damping.items()},
+            servos={joint: servo.map_expressions(change) for joint, servo in self.servos.items()},
+            grasps=tuple(grasp.map_expressions(change) for grasp in self.grasps),
             gravity=change(self.gravity),
-            time_scale=change(self.time_scale),
-            compliant={joint: change(value) for joint, value in self.compliant.items()},
-            segments=segments,
+            recorded_time_scale=change(self.recorded_time_scale),
+            joint_compliances={joint: change(value) for joint, value in self.joint_compliances.items()},
+            segment_layouts=segments,
         )
 
     def elastic_energy(self, q: ca.SX) -> ca.SX:
         """Elastic energy, the sum of 1/2 stiffness (q - rest)^2 over the elastic joints [J]."""
         energy = ca.SX(0)
-        for spring in self.elastic:
-            deflection = q[self.mechanism.joint_index(spring.joint)] - spring.rest
+        for spring in self.elastic_joints:
+            deflection = q[self.mechanism.joint_index(spring.joint_name)] - spring.rest_angle
             energy += 0.5 * spring.stiffness * deflection**2
         return energy
 
     def viscous_force(self, v: ca.SX) -> ca.SX:
         """Generalized force of all viscous dampers, shape (n, 1) [N m]."""
-        force = [ca.SX(0)] * self.size
-        for spring in self.elastic:
-            index = self.mechanism.joint_index(spring.joint)
+        force = [ca.SX(0)] * self.n_coordinates
+        for spring in self.elastic_joints:
+            index = self.mechanism.joint_index(spring.joint_name)
             force[index] = force[index] - spring.damping * v[index]
-        for joint, coefficient in self.damping.items():
+        for joint, coefficient in self.joint_damping.items():
             index = self.mechanism.joint_index(joint)
             force[index] = force[index] - coefficient * v[index]
         return ca.vertcat(*force)
 
     def input_force(self, u: ca.SX, q: ca.SX, v: ca.SX) -> ca.SX:
         """Generalized force of motor torques and servos, shape (n, 1) [N m]."""
-        force = [ca.SX(0)] * self.size
+        force = [ca.SX(0)] * self.n_coordinates
         for row, (joint, index) in enumerate(zip(self.driven, self.driven_indices, strict=True)):
             servo = self.servos.get(joint)
             force[index] = u[row] if servo is None else servo.torque(u[row], q[index], v[index])
         return ca.vertcat(*force)
 
-    def constraints(self, kinematics: Kinematics) -> ca.SX:
+    def constraint_residual(self, kinematics: Kinematics) -> ca.SX:
         """Constraint residual phi(q) of all grasps, shape (m, 1)."""
-        return ca.vertcat(*(grasp.residual(kinematics) for grasp in self.grasps)) if self.grasps else ca.SX(0, 1)
+        return (
+            ca.vertcat(*(grasp.constraint_residual(kinematics) for grasp in self.grasps))
+            if self.grasps
+            else ca.SX(0, 1)
+        )
 
-    def constraint_relaxation(self) -> ca.SX | None:
+    def constraint_relaxation_times(self) -> ca.SX | None:
         """Relaxation times T in phi + T dphi/dt = C lam / h, shape (m, 1) [s]; None where no grasp has one."""
-        if all(grasp.relaxation is None for grasp in self.grasps):
+        if all(grasp.relaxation_time is None for grasp in self.grasps):
             return None
         zero = ca.SX(0)
         return ca.vertcat(
-            *(zero if g.relaxation is None else g.relaxation for g in self.grasps for _ in range(g.equations))
+            *(
+                zero if g.relaxation_time is None else g.relaxation_time
+                for g in self.grasps
+                for _ in range(g.n_equations)
+            )
         )
 
     def constraint_compliance(self) -> ca.SX:
         """Diagonal of C in phi(q_{k+1}) = C lam_k / h, shape (m, 1)."""
-        rows = [grasp.compliance for grasp in self.grasps for _ in range(grasp.equations)]
+        rows = [grasp.compliance for grasp in self.grasps for _ in range(grasp.n_equations)]
         return ca.vertcat(*rows) if rows else ca.SX(0, 1)
 
 
@@ -570,8 +600,8 @@ def _check_names(
     if both := sorted(set(driven) & set(prescribed)):
         raise ModelError(f"joint '{both[0]}' is both driven and prescribed", allowed="one of the two")
     for grasp in grasps:
-        tree.frame(grasp.holder)
-        tree.frame(grasp.held)
+        tree.frame(grasp.holder_frame)
+        tree.frame(grasp.held_frame)
     for point in points:
         tree.frame(point)
 
@@ -590,6 +620,6 @@ def floating_clamp(name: str, frame: str | None = None) -> Mechanism:
     joints = tuple(
         Joint(f"{name}_{prefix}{letter}", kind, 3 * block + a - 1, Placement.identity(), axis)
         for block, (prefix, kind) in enumerate(kinds)
-        for a, (letter, axis) in enumerate(AXES.items())
+        for a, (letter, axis) in enumerate(UNIT_AXES.items())
     )
     return Mechanism(name, joints, {frame or name: Frame(5, Placement.identity())})

@@ -19,27 +19,33 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.errors import ModelError, nearest
+from yid_ocp.errors import ModelError, nearest_name_hint
 from yid_ocp.files import is_file
-from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, merged
+from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, merge_bodies
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.model.rotations import Matrix, angles_of, snapped, transform, turn
+from yid_ocp.model.rotations import (
+    Matrix,
+    axis_angle_rotation,
+    homogeneous_transform,
+    rpy_from_rotation,
+    snap_to_unit_entries,
+)
 
 # Stands for no limit where URDF asks for a number.
-UNLIMITED = 1e9
+_UNLIMITED_VALUE = 1e9
 
 # Of metres, radians, kilograms and kg m^2; squares of more would not be finite for long.
-LARGEST = 1e12
+_MAX_NUMBER = 1e12
 
 # Of digits in the file: how far principal moments may miss what they have to be.
-ROUNDED = 1e-2
+_PRINCIPAL_MOMENT_RTOL = 1e-2
 
 log = logging.getLogger(__name__)
 
-MOVABLE = {"revolute", "continuous", "prismatic"}
+_MOVABLE_JOINT_TYPES = {"revolute", "continuous", "prismatic"}
 
 
-def robot_description_file(robot: str) -> Path:
+def example_robot_urdf(robot: str) -> Path:
     """Path of a robot's URDF file in the installed example-robot-data package.
 
     Parameters
@@ -64,10 +70,10 @@ def robot_description_file(robot: str) -> Path:
         if candidate in files:
             return files[candidate]
     stems = {path.stem for path in files.values()}
-    raise ModelError(f"example-robot-data has no robot '{robot}'", hint=nearest(robot, stems))
+    raise ModelError(f"example-robot-data has no robot '{robot}'", hint=nearest_name_hint(robot, stems))
 
 
-def robot_file(robot: str | Path) -> Path:
+def resolve_urdf_path(robot: str | Path) -> Path:
     """Path of a robot's URDF file from its name in the settings; the file need not exist.
 
     Parameters
@@ -83,12 +89,12 @@ def robot_file(robot: str | Path) -> Path:
     """
     scheme, _, name = str(robot).partition(":")
     if scheme == "package":
-        return robot_description_file(name)
+        return example_robot_urdf(name)
     if scheme != "default":
         return Path(robot)
     known = _shipped()
     if name not in known:
-        raise ModelError(f"no URDF '{name}' ships with yid_ocp", where=str(robot), hint=nearest(name, known))
+        raise ModelError(f"no URDF '{name}' ships with yid_ocp", where=str(robot), hint=nearest_name_hint(name, known))
     return known[name]
 
 
@@ -116,7 +122,7 @@ def read_urdf(
     Parameters
     ----------
     path : str or Path
-        As `robot_file`: a URDF file, `package:baxter` (or any robot folder of example-robot-data), `default:NAME.urdf`.
+        As `resolve_urdf_path`: a URDF file, `package:baxter` (or any robot folder of example-robot-data), `default:NAME.urdf`.
     joints : sequence of str, optional
         Names of the joints to keep as degrees of freedom, which are then ordered as given as far as parents come
         first; all movable ones when absent.
@@ -148,7 +154,9 @@ def read_urdf(
         if joint.child in dropped and joint.name in (*(kept or ()), *locked):
             raise ModelError(f"joint '{joint.name}' carries a link that is left out", where=str(file))
     following = _mimicked(robot, kept, locked, str(file))
-    movable = [joint.name for joint in robot.joints if joint.type in MOVABLE and joint.name not in following]
+    movable = [
+        joint.name for joint in robot.joints if joint.type in _MOVABLE_JOINT_TYPES and joint.name not in following
+    ]
     found = _walk(links, dropped, movable if kept is None else kept, locked, str(file))
     order = _parents_first(found.joints, movable if kept is None else kept)
 
@@ -156,16 +164,16 @@ def read_urdf(
     made: list[Joint] = []
     for entry in order:
         carrier, at, source = found.joints[entry]
-        carried = merged(found.bodies.get(entry, ()))
+        carried = merge_bodies(found.bodies.get(entry, ()))
         if carried is not None and parametric:
             mass = float(carried.mass)
             parameter = Parameter(f"{entry}.mass", mass, "kg", 0.0, math.inf, f"mass of what {entry} carries")
             parameters.append(parameter)
-            carried = replace(carried.scaled(parameter.symbol / mass), mass=parameter.symbol)
+            carried = replace(carried.scaled_by(parameter.symbol / mass), mass=parameter.symbol)
         parent = order.index(carrier) if carrier is not None else -1
-        made.append(_joint(source, parent, Placement.of(at), () if carried is None else (carried,)))
+        made.append(_joint(source, parent, Placement.from_matrix(at), () if carried is None else (carried,)))
     named = {
-        link: Frame(-1 if carrier is None else order.index(carrier), Placement.of(at))
+        link: Frame(-1 if carrier is None else order.index(carrier), Placement.from_matrix(at))
         for link, (carrier, at) in found.frames.items()
     }
     return Mechanism(name or robot.name, tuple(made), named, Parameters(parameters))
@@ -197,7 +205,7 @@ class _Found:
 
 
 def _file(path: str | Path) -> Path:
-    file = robot_file(path)
+    file = resolve_urdf_path(path)
     if not is_file(file):
         raise ModelError(f"there is no URDF file '{file}'", hint="give a path, or package:NAME for example-robot-data")
     return file
@@ -251,11 +259,11 @@ def _numbers(text: str, count: int, what: str, where: str, infinite: bool = Fals
         numbers = [float(word) for word in words]
     except ValueError:
         numbers = []
-    wrong = any(math.isnan(value) or (abs(value) > LARGEST and not infinite) for value in numbers)
+    wrong = any(math.isnan(value) or (abs(value) > _MAX_NUMBER and not infinite) for value in numbers)
     if len(numbers) != count or wrong:
         allowed = "one number" if count == 1 else f"{count} numbers"
         raise ModelError(
-            f"{what} is '{text[:60]}'", where=where, allowed=f"{allowed}, at most {LARGEST:g}, with blanks between"
+            f"{what} is '{text[:60]}'", where=where, allowed=f"{allowed}, at most {_MAX_NUMBER:g}, with blanks between"
         )
     return numbers
 
@@ -264,14 +272,14 @@ def _check_bodies(link: str, tensor: Matrix, where: str) -> None:
     """Refuse negative moments of inertia; warn of moments that no mass distribution has."""
     least, middle, most = np.linalg.eigvalsh(0.5 * (tensor + tensor.T))
     values = ", ".join(f"{value:.3g}" for value in (least, middle, most))
-    if least < -ROUNDED * max(most, -least):
+    if least < -_PRINCIPAL_MOMENT_RTOL * max(most, -least):
         raise ModelError(
             f"link '{link}' has a negative moment of inertia (principal moments {values} kg m^2)",
             where=where,
             allowed="three that are zero or more",
             hint="correct the inertia, or leave the link out",
         )
-    if least + middle < (1 - ROUNDED) * most:
+    if least + middle < (1 - _PRINCIPAL_MOMENT_RTOL) * most:
         log.warning(
             "%s: link '%s' has principal moments of inertia of %s kg m^2, which no body has: the largest is at most "
             "the sum of the others",
@@ -296,7 +304,7 @@ def _mimicked(robot: Any, wanted: Collection[str] | None, locked: dict[str, floa
             raise ModelError(
                 f"joint '{name}' follows a joint '{mimic.joint}' that is not there",
                 where=where,
-                hint=nearest(str(mimic.joint), joints),
+                hint=nearest_name_hint(str(mimic.joint), joints),
             )
         if name in locked:
             continue
@@ -314,15 +322,15 @@ def _checked(robot: Any, file: Path, wanted: Sequence[str]) -> dict[str, _Link]:
     """The links by name, the root first, after a check of all joints and links."""
     where = str(file)
     for joint in robot.joints:
-        if joint.type not in MOVABLE | {"fixed"}:
+        if joint.type not in _MOVABLE_JOINT_TYPES | {"fixed"}:
             allowed = "revolute, continuous, prismatic, fixed"
             raise ModelError(f"joint '{joint.name}' has type '{joint.type}'", where=where, allowed=allowed)
-        if joint.type in MOVABLE and joint.axis is not None and np.linalg.norm(joint.axis) < 1e-9:
+        if joint.type in _MOVABLE_JOINT_TYPES and joint.axis is not None and np.linalg.norm(joint.axis) < 1e-9:
             raise ModelError(f"joint '{joint.name}' has a zero axis", where=where)
-    known = [joint.name for joint in robot.joints if joint.type in MOVABLE]
+    known = [joint.name for joint in robot.joints if joint.type in _MOVABLE_JOINT_TYPES]
     for name in wanted:
         if name not in known:
-            raise ModelError(f"there is no movable joint '{name}'", where=where, hint=nearest(name, known))
+            raise ModelError(f"there is no movable joint '{name}'", where=where, hint=nearest_name_hint(name, known))
     names = [link.name for link in robot.links]
     for joint in robot.joints:
         for link in (joint.parent, joint.child):
@@ -330,7 +338,7 @@ def _checked(robot: Any, file: Path, wanted: Sequence[str]) -> dict[str, _Link]:
                 raise ModelError(
                     f"joint '{joint.name}' names a link '{link}' that is not there",
                     where=where,
-                    hint=nearest(str(link), names),
+                    hint=nearest_name_hint(str(link), names),
                 )
     below = [joint.child for joint in robot.joints]
     roots = [name for name in dict.fromkeys(names) if name not in below]
@@ -367,8 +375,8 @@ def _walk(
             tensor = np.zeros((3, 3)) if inertial.inertia is None else np.asarray(inertial.inertia, float)
             if carrier is not None:
                 _check_bodies(link, tensor, where)
-            body = Inertia.of(float(inertial.mass), np.zeros(3), tensor)
-            found.bodies.setdefault(carrier, []).append(body.moved(Placement.of(at @ origin)))
+            body = Inertia.from_values(float(inertial.mass), np.zeros(3), tensor)
+            found.bodies.setdefault(carrier, []).append(body.transformed_by(Placement.from_matrix(at @ origin)))
         for joint in links[link].joints:
             if joint.child in dropped:
                 continue
@@ -398,11 +406,11 @@ def _parents_first(joints: Mapping[str, tuple[str | None, Matrix, Any]], wanted:
 def _joint(source: Any, parent: int, placement: Placement, bodies: tuple[Inertia, ...]) -> Joint:
     """The file's joint with its limits, infinite where there are none."""
     limit = source.limit
-    axis = snapped(_unit_axis(source))
+    axis = snap_to_unit_entries(_unit_axis(source))
     continuous = source.type == "continuous" or limit is None
 
     def bound(value: float | None, otherwise: float) -> float:
-        return otherwise if value is None or abs(value) >= UNLIMITED else float(value)
+        return otherwise if value is None or abs(value) >= _UNLIMITED_VALUE else float(value)
 
     return Joint(
         source.name,
@@ -424,8 +432,8 @@ def _locked_motion(joint: Any, locked: Mapping[str, float]) -> Matrix:
     value = _locked_value(joint, locked)
     axis = _unit_axis(joint)
     if joint.type == "prismatic":
-        return transform(np.eye(3), value * axis)
-    return transform(turn(axis, math.sin(value), math.cos(value)), np.zeros(3))
+        return homogeneous_transform(np.eye(3), value * axis)
+    return homogeneous_transform(axis_angle_rotation(axis, math.sin(value), math.cos(value)), np.zeros(3))
 
 
 def _locked_value(joint: Any, locked: Mapping[str, float]) -> float:
@@ -444,7 +452,9 @@ def _with_all_below(without: Sequence[str], links: Mapping[str, _Link], where: s
     while waiting:
         link = waiting.pop()
         if link not in links:
-            raise ModelError(f"there is no link '{link}' to leave out", where=where, hint=nearest(link, links))
+            raise ModelError(
+                f"there is no link '{link}' to leave out", where=where, hint=nearest_name_hint(link, links)
+            )
         found.add(link)
         waiting += [joint.child for joint in links[link].joints]
     return found
@@ -455,27 +465,29 @@ def _unit_axis(joint: Any) -> NDArray[np.float64]:
     return axis / np.linalg.norm(axis)
 
 
-def urdf_text(mechanism: Mechanism, values: Mapping[str, float] | None = None) -> str:
+def mechanism_to_urdf(mechanism: Mechanism, values: Mapping[str, float] | None = None) -> str:
     """URDF text of a mechanism: one link per joint, named frames as links on fixed joints.
 
     Bodies are merged into one inertial per link. Placements keep full precision. Reading the text back with
     `read_urdf(..., parametric=False)` gives the same numbers to 1e-12.
     """
-    mechanism = mechanism.numeric(values)
+    mechanism = mechanism.with_numeric_values(values)
     robot = ElementTree.Element("robot", name=mechanism.name)
 
     def link_name(wanted: str, joint: int) -> str:
         frame = mechanism.frames.get(wanted)
         if frame is None:
             return wanted
-        same = frame.joint == joint and np.array_equal(np.array(ca.DM(frame.placement.matrix())), np.eye(4))
+        same = frame.joint_index == joint and np.array_equal(
+            np.array(ca.DM(frame.placement.homogeneous_matrix())), np.eye(4)
+        )
         return wanted if same else link_name(f"{wanted}_", joint)
 
     links = [link_name("world", -1)] + [link_name(f"{joint.name}_link", i) for i, joint in enumerate(mechanism.joints)]
     ElementTree.SubElement(robot, "link", name=links[0])
     for i, joint in enumerate(mechanism.joints):
         _write_link(robot, links[i + 1], joint)
-        _write_joint(robot, joint, links[joint.parent + 1], links[i + 1])
+        _write_joint(robot, joint, links[joint.parent_index + 1], links[i + 1])
     for name, frame in mechanism.frames.items():
         if name in links:
             continue
@@ -484,7 +496,7 @@ def urdf_text(mechanism: Mechanism, values: Mapping[str, float] | None = None) -
         while fixed in mechanism.joint_names:
             fixed += "_"
         element = ElementTree.SubElement(robot, "joint", name=fixed, type="fixed")
-        _connect(element, frame.placement, links[frame.joint + 1], name)
+        _connect(element, frame.placement, links[frame.joint_index + 1], name)
     ElementTree.indent(robot)
     return ElementTree.tostring(robot, encoding="unicode") + "\n"
 
@@ -492,27 +504,27 @@ def urdf_text(mechanism: Mechanism, values: Mapping[str, float] | None = None) -
 def _write_link(robot: ElementTree.Element, name: str, joint: Joint) -> None:
     """The link that a joint moves, with the joint's bodies merged."""
     link = ElementTree.SubElement(robot, "link", name=name)
-    body = merged(joint.bodies)
+    body = merge_bodies(joint.bodies)
     if body is None:
         return
     inertial = ElementTree.SubElement(link, "inertial")
-    ElementTree.SubElement(inertial, "origin", xyz=_digits(np.array(ca.DM(body.com)).ravel()), rpy="0 0 0")
+    ElementTree.SubElement(inertial, "origin", xyz=_digits(np.array(ca.DM(body.center_of_mass)).ravel()), rpy="0 0 0")
     ElementTree.SubElement(inertial, "mass", value=_digits([float(body.mass)]))
-    tensor = np.array(ca.DM(body.about_com))
+    tensor = np.array(ca.DM(body.inertia_about_com))
     keys = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
     ElementTree.SubElement(inertial, "inertia", {key: _digits([tensor[ij]]) for key, ij in keys.items()})
 
 
 def _write_joint(robot: ElementTree.Element, joint: Joint, parent: str, child: str) -> None:
     values = {
-        "lower": joint.lower,
-        "upper": joint.upper,
+        "lower": joint.lower_limit,
+        "upper": joint.upper_limit,
         "effort": joint.effort_limit,
         "velocity": joint.velocity_limit,
     }
-    limits = {key: _digits([max(-UNLIMITED, min(value, UNLIMITED))]) for key, value in values.items()}
+    limits = {key: _digits([max(-_UNLIMITED_VALUE, min(value, _UNLIMITED_VALUE))]) for key, value in values.items()}
     kind: str = joint.kind
-    if kind == "revolute" and math.isinf(joint.lower) and math.isinf(joint.upper):
+    if kind == "revolute" and math.isinf(joint.lower_limit) and math.isinf(joint.upper_limit):
         kind, limits = "continuous", {key: limits[key] for key in ("effort", "velocity")}
     element = ElementTree.SubElement(robot, "joint", name=joint.name, type=kind)
     _connect(element, joint.placement, parent, child)
@@ -523,7 +535,7 @@ def _write_joint(robot: ElementTree.Element, joint: Joint, parent: str, child: s
 
 def _connect(element: ElementTree.Element, placement: Placement, parent: str, child: str) -> None:
     rotation, translation = np.array(ca.DM(placement.rotation)), np.array(ca.DM(placement.translation)).ravel()
-    ElementTree.SubElement(element, "origin", xyz=_digits(translation), rpy=_digits(angles_of(rotation)))
+    ElementTree.SubElement(element, "origin", xyz=_digits(translation), rpy=_digits(rpy_from_rotation(rotation)))
     ElementTree.SubElement(element, "parent", link=parent)
     ElementTree.SubElement(element, "child", link=child)
 

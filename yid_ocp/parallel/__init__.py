@@ -1,17 +1,17 @@
 """Parallel work: threads, processes and cluster clients, which no other package starts."""
 
-from yid_ocp.parallel.lockstep import ask_together as ask_together
-from yid_ocp.parallel.lockstep import map_in_step as map_in_step
-from yid_ocp.parallel.processes import ThisProcess as ThisProcess
+from yid_ocp.parallel.batched_evaluation import batched_call as batched_call
+from yid_ocp.parallel.batched_evaluation import map_with_batched_calls as map_with_batched_calls
+from yid_ocp.parallel.processes import InlineExecutor as InlineExecutor
 from yid_ocp.parallel.processes import process_pool as process_pool
-from yid_ocp.parallel.tasks import LOCAL as LOCAL
-from yid_ocp.parallel.tasks import Progress as Progress
-from yid_ocp.parallel.tasks import Task as Task
-from yid_ocp.parallel.tasks import TaskResult as TaskResult
-from yid_ocp.parallel.tasks import Workers as Workers
-from yid_ocp.parallel.tasks import run_tasks as run_tasks
-from yid_ocp.parallel.tasks import values_of as values_of
-from yid_ocp.parallel.threads import SYMBOLIC as SYMBOLIC
-from yid_ocp.parallel.threads import Once as Once
-from yid_ocp.parallel.threads import map_threads as map_threads
-from yid_ocp.parallel.threads import processors as processors
+from yid_ocp.parallel.resumable_tasks import LOCAL_WORKERS as LOCAL_WORKERS
+from yid_ocp.parallel.resumable_tasks import Task as Task
+from yid_ocp.parallel.resumable_tasks import TaskResult as TaskResult
+from yid_ocp.parallel.resumable_tasks import WorkerConfig as WorkerConfig
+from yid_ocp.parallel.resumable_tasks import _TaskProgressCallback as _TaskProgressCallback
+from yid_ocp.parallel.resumable_tasks import require_task_values as require_task_values
+from yid_ocp.parallel.resumable_tasks import run_tasks as run_tasks
+from yid_ocp.parallel.threads import CASADI_LOCK as CASADI_LOCK
+from yid_ocp.parallel.threads import LockedCache as LockedCache
+from yid_ocp.parallel.threads import map_in_threads as map_in_threads
+from yid_ocp.parallel.threads import processor_count as processor_count

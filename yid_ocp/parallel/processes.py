@@ -10,10 +10,10 @@ from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from typing import Any
 
-from yid_ocp.parallel.threads import THREADS, processors, threads
+from yid_ocp.parallel.threads import THREADS_VARIABLE, max_threads, processor_count
 
 
-class ThisProcess(Executor):
+class InlineExecutor(Executor):
     """An executor that runs each call at once in the calling process, for work too small for a process."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -32,14 +32,14 @@ def process_pool(workers: int | None = None) -> ProcessPoolExecutor:
     They are started anew instead of forked: a fork copies the locks of threads that it does not copy. Together they use
     as many threads as this process might.
     """
-    count = workers or processors()
+    count = workers or processor_count()
     context = multiprocessing.get_context("spawn")
-    each = max(1, threads() // count)
+    each = max(1, max_threads() // count)
     return ProcessPoolExecutor(count, mp_context=context, initializer=_begin_worker, initargs=(each,))
 
 
 def _begin_worker(threads: int) -> None:
-    os.environ[THREADS] = str(threads)
+    os.environ[THREADS_VARIABLE] = str(threads)
     for name in ("SIGINT", "SIGHUP"):  # a terminal sends them to all; the parent says when to end
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)

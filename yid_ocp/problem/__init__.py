@@ -1,7 +1,7 @@
 """The estimation problem: recordings placed on the nodes of a rollout, predictions, and residuals with derivatives."""
 
+from yid_ocp.problem.estimation_problem import EstimationProblem as EstimationProblem
+from yid_ocp.problem.evaluation import EquilibriumGuesses as EquilibriumGuesses
 from yid_ocp.problem.evaluation import Evaluation as Evaluation
-from yid_ocp.problem.evaluation import WarmStart as WarmStart
 from yid_ocp.problem.options import ProblemOptions as ProblemOptions
 from yid_ocp.problem.options import SensorOptions as SensorOptions
-from yid_ocp.problem.problem import EstimationProblem as EstimationProblem

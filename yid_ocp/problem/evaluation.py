@@ -9,15 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.problem.constant_errors import ConstantErrors, slopes_by_constants
+from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
+from yid_ocp.problem.constant_sensor_errors import ConstantErrorModel, constant_error_sensitivities
 from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.measurements import Measurements, Rows, huber
-from yid_ocp.problem.noise import Innovations
-from yid_ocp.problem.outcome import EpisodeResult
-from yid_ocp.shown import Shown, Summary, counted
+from yid_ocp.problem.input_noise import WhiteningFilter
+from yid_ocp.problem.measurements import Measurements, ResidualBlock, huber_loss
+from yid_ocp.problem.prediction_result import EpisodePrediction
 
 Array = NDArray[np.float64]
-WarmStart = tuple[Array | None, ...]
+EquilibriumGuesses = tuple[Array | None, ...]
 """For each recording, a configuration near the equilibrium from which it starts; None where it is not known."""
 
 
@@ -38,25 +38,25 @@ class ResidualRows:
     weak_priors: slice
 
     @property
-    def informing(self) -> slice:
+    def without_weak_priors(self) -> slice:
         """Slice of the data and the stated priors, without the weak priors."""
         return slice(0, self.stated_priors.stop)
 
     @staticmethod
-    def of(episodes: Sequence[Episode], stated: int, weak: int) -> ResidualRows:
+    def from_episodes(episodes: Sequence[Episode], stated: int, weak: int) -> ResidualRows:
         """Layout from the episodes' measurements and the numbers of stated and weak priors."""
         at, groups = 0, []
         for episode in episodes:
             own = []
-            for samples in episode.samples:
-                own.append(slice(at, at + samples.count))
-                at += samples.count
+            for samples in episode.measurements:
+                own.append(slice(at, at + samples.n_residuals))
+                at += samples.n_residuals
             groups.append(tuple(own))
         return ResidualRows(tuple(groups), slice(0, at), slice(at, at + stated), slice(at + stated, at + stated + weak))
 
 
 @dataclass(frozen=True, repr=False)
-class Evaluation(Shown):
+class Evaluation(ReprMixin):
     """Cost, residual and optional Jacobian of an estimation problem at one unknown vector.
 
     Attributes
@@ -67,7 +67,7 @@ class Evaluation(Shown):
     jacobian : ndarray, shape (nr, nx), or None
     ok : bool
     message : str
-    episodes : tuple of EpisodeResult
+    episode_predictions : tuple of EpisodeResult
     """
 
     cost: float
@@ -75,62 +75,66 @@ class Evaluation(Shown):
     jacobian: Array | None
     ok: bool
     message: str
-    episodes: tuple[EpisodeResult, ...]
+    episode_predictions: tuple[EpisodePrediction, ...]
 
-    def _summary(self) -> Summary:
-        slopes = "" if self.jacobian is None else f", by {counted(self.jacobian.shape[1], 'unknown')}"
-        said = f"cost {self.cost:.6g} of {counted(len(self.residual), 'residual')}{slopes}"
-        return Summary(said if self.ok else f"failed, {self.message}")
+    def _summary(self) -> ReprSummary:
+        slopes = "" if self.jacobian is None else f", by {count_with_noun(self.jacobian.shape[1], 'unknown')}"
+        said = f"cost {self.cost:.6g} of {count_with_noun(len(self.residual), 'residual')}{slopes}"
+        return ReprSummary(said if self.ok else f"failed, {self.message}")
 
     @property
-    def warm(self) -> WarmStart:
+    def equilibrium_guesses(self) -> EquilibriumGuesses:
         """Guesses of the initial equilibria for evaluating a nearby point."""
-        return tuple(result.warm for result in self.episodes)
+        return tuple(result.equilibrium_guess for result in self.episode_predictions)
 
 
-def joined(measurements: Sequence[Measurements], result: EpisodeResult, threshold: float = math.inf) -> Rows:
+def _sensor_whitened_residual(
+    measurements: Sequence[Measurements], result: EpisodePrediction, threshold: float = math.inf
+) -> ResidualBlock:
     """Residual of one recording in units of the sensors' noise, group after group."""
-    slopes = result.sensitivities or (None,) * len(measurements)
+    slopes = result.output_sensitivities or (None,) * len(measurements)
     parts = [
-        samples.rows(predicted, by_unknowns, threshold)
-        for samples, predicted, by_unknowns in zip(measurements, result.predicted, slopes, strict=True)
+        samples.residual_block(predicted, by_unknowns, threshold)
+        for samples, predicted, by_unknowns in zip(measurements, result.predicted_outputs, slopes, strict=True)
     ]
     jacobians = [part.jacobian for part in parts if part.jacobian is not None]
-    return Rows(
+    return ResidualBlock(
         sum(part.cost for part in parts),
         np.concatenate([part.residual for part in parts]),
         np.vstack(jacobians) if jacobians else None,
-        np.concatenate([part.factor for part in parts]),
+        np.concatenate([part.robust_factor for part in parts]),
     )
 
 
-def residual_rows(episode: Episode, whitening: Innovations | None, result: EpisodeResult, threshold: float) -> Rows:
+def whitened_episode_residual(
+    episode: Episode, whitening: WhiteningFilter | None, result: EpisodePrediction, threshold: float
+) -> ResidualBlock:
     """Whitened residual of one episode: by sensor noise, or by the frozen Kalman filter where one is given.
 
-    Constant sensor errors count as noise, see `ConstantErrors`.
+    Constant sensor errors count as noise, see `ConstantErrorModel`.
     """
-    by_constants = slopes_by_constants(episode.samples)
+    by_constants = constant_error_sensitivities(episode.measurements)
     if whitening is None and not by_constants.shape[1]:
-        return joined(episode.samples, result, threshold)
-    plain = joined(episode.samples, result)
+        return _sensor_whitened_residual(episode.measurements, result, threshold)
+    plain = _sensor_whitened_residual(episode.measurements, result)
     columns = plain.residual[:, None]
     if plain.jacobian is not None:
         columns = np.hstack([columns, plain.jacobian])
     if whitening is not None:
-        columns, by_constants = _innovations(whitening, columns, by_constants, result.push)
+        columns, by_constants = _innovations(whitening, columns, by_constants, result.torque_correction_columns)
     if by_constants.shape[1]:
-        columns = ConstantErrors.of(by_constants).whitened(columns)
-    cost, factor = huber(columns[:, 0], threshold)
+        columns = ConstantErrorModel.from_sensitivities(by_constants).whiten(columns)
+    cost, factor = huber_loss(columns[:, 0], threshold)
     columns = factor[:, None] * columns
-    return Rows(cost, columns[:, 0], None if plain.jacobian is None else columns[:, 1:], factor)
+    return ResidualBlock(cost, columns[:, 0], None if plain.jacobian is None else columns[:, 1:], factor)
 
 
 def _innovations(
-    whitening: Innovations, columns: Array, by_constants: Array, push: Array | None
+    whitening: WhiteningFilter, columns: Array, by_constants: Array, push: Array | None
 ) -> tuple[Array, Array]:
     """Columns and slopes by constant errors of sensors, which drive nothing, turned into innovations."""
     kept, more = columns.shape[1], by_constants.shape[1]
     if push is not None:
         push = np.pad(push, ((0, 0), (0, 0), (0, more)))
-    made = whitening.whitened(np.hstack([columns, by_constants]), push)[0]
+    made = whitening.whiten(np.hstack([columns, by_constants]), push)[0]
     return made[:, :kept], made[:, kept:]

@@ -12,15 +12,15 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from yid_ocp.errors import DataError
-from yid_ocp.problem.grid import Grid
+from yid_ocp.problem.time_grid import TimeGrid
 from yid_ocp.sensors import Sensor, SensorData
 
 Array = NDArray[np.float64]
-Weighting = Literal["whitened", "paper"]
+ResidualWeighting = Literal["whitened", "paper"]
 
 
 @dataclass(frozen=True)
-class Rows:
+class ResidualBlock:
     """One block of a residual: robust cost, weighted residual and Jacobian.
 
     Attributes
@@ -29,14 +29,14 @@ class Rows:
         Loss: half the sum of squares, or Huber's.
     residual : ndarray, shape (nr,)
     jacobian : ndarray, shape (nr, d), or None
-    factor : ndarray, shape (nr,)
+    robust_factor : ndarray, shape (nr,)
         Robust weights, already multiplied into residual and Jacobian.
     """
 
     cost: float
     residual: Array
     jacobian: Array | None
-    factor: Array
+    robust_factor: Array
 
 
 @dataclass(frozen=True)
@@ -56,11 +56,11 @@ class Measurements:
         Factor that turns a difference into a residual, zero where there is no measurement.
     std : ndarray, shape (M, k)
         Standard deviation of the noise, in the sensor's unit; NaN where it is not known.
-    span : (int, int)
+    predictable_nodes : (int, int)
         First and last node at which the sensor can be predicted.
     bias_std : ndarray, shape (k,)
         Standard deviation of a constant error of every output, in the sensor's unit; zero where there is none.
-    correlation : ndarray, shape (M, k, k), or None
+    noise_correlation : ndarray, shape (M, k, k), or None
         Of the noise of the outputs of one sample; None where they are independent.
     """
 
@@ -70,71 +70,76 @@ class Measurements:
     value: Array
     weight: Array
     std: Array
-    span: tuple[int, int]
+    predictable_nodes: tuple[int, int]
     bias_std: Array
-    correlation: Array | None = None
+    noise_correlation: Array | None = None
 
     @property
     def channel_of_column(self) -> tuple[str, ...]:
         """Channel name of each of the k outputs."""
-        return tuple(channel for channel in self.sensor.channels for _ in range(self.sensor.width))
+        return tuple(channel for channel in self.sensor.channel_names for _ in range(self.sensor.outputs_per_channel))
 
     @property
-    def nodes(self) -> NDArray[np.int64]:
+    def evaluation_nodes(self) -> NDArray[np.int64]:
         """Nodes at which the sensor function must be evaluated, sorted."""
         if self.node.ndim > 1:
             # with the neighbours that a slope needs
-            low, high = int(self.node.min(initial=self.span[1])), int(self.node.max(initial=self.span[0]))
-            return np.arange(max(low - 1, self.span[0]), min(high + 2, self.span[1] + 1))
+            low, high = (
+                int(self.node.min(initial=self.predictable_nodes[1])),
+                int(self.node.max(initial=self.predictable_nodes[0])),
+            )
+            return np.arange(max(low - 1, self.predictable_nodes[0]), min(high + 2, self.predictable_nodes[1] + 1))
         after = self.node[self.fraction > 0] + 1
         return np.unique(np.concatenate([self.node, after]))
 
     @property
-    def seen(self) -> NDArray[np.bool_]:
+    def is_used(self) -> NDArray[np.bool_]:
         """Mask of measured outputs with positive weight, shape (M, k)."""
         return self.weight > 0
 
     @property
-    def count(self) -> int:
+    def n_residuals(self) -> int:
         """Number of residuals that the measurements yield."""
         return int(np.count_nonzero(self.weight > 0))
 
     @cached_property
-    def mixing(self) -> scipy.sparse.csr_array | None:
+    def decorrelation_matrix(self) -> scipy.sparse.csr_array | None:
         """Matrix R^(-1/2) that decorrelates normalized residuals, shape (nr, nr); None without correlation.
 
         R is the noise correlation of one sample's outputs; zero-phase (ZCA) whitening (Kessy, Lewin and Strimmer 2018,
         doi:10.1080/00031305.2016.1277159).
         """
-        if self.correlation is None:
+        if self.noise_correlation is None:
             return None
-        seen = self.seen
+        seen = self.is_used
         together = seen[:, :, None] & seen[:, None, :]
-        size, turn = np.linalg.eigh(np.where(together, self.correlation, np.eye(seen.shape[1])))
+        size, turn = np.linalg.eigh(np.where(together, self.noise_correlation, np.eye(seen.shape[1])))
         blocks = (turn / np.sqrt(np.maximum(size, 1e-12))[:, None, :]) @ turn.transpose(0, 2, 1)
         place = np.cumsum(seen).reshape(seen.shape) - 1
         row, column = (np.broadcast_to(p, blocks.shape)[together] for p in (place[:, :, None], place[:, None, :]))
-        return scipy.sparse.csr_array((blocks[together], (row, column)), shape=(self.count, self.count))
+        return scipy.sparse.csr_array((blocks[together], (row, column)), shape=(self.n_residuals, self.n_residuals))
 
-    def independent(self, rows: Any) -> Any:
+    def decorrelate(self, rows: Any) -> Any:
         """Decorrelate rows normalized by their standard deviations, shape (nr,) or (nr, d), dense or sparse."""
-        return rows if self.mixing is None else self.mixing @ rows
+        return rows if self.decorrelation_matrix is None else self.decorrelation_matrix @ rows
 
-    def whitened(self, predicted: Array) -> Array:
+    def whitened_residual(self, predicted: Array) -> Array:
         """Whitened residual, prediction minus measurement, zero where nothing was measured, shape (M, k)."""
         plain = np.asarray(self.weight * np.where(self.weight > 0, predicted - self.value, 0.0))
-        if self.mixing is not None:
-            plain[self.seen] = self.mixing @ plain[self.seen]
+        if self.decorrelation_matrix is not None:
+            plain[self.is_used] = self.decorrelation_matrix @ plain[self.is_used]
         return plain
 
-    def pulled(self, pull: Array) -> Array:
-        """Adjoint of `whitened`: derivative of a cost by the prediction from that by the residual, shape (M, k)."""
-        if self.mixing is not None:
+    def whitening_adjoint(self, pull: Array) -> Array:
+        """Adjoint of `whitened_residual`: derivative of a cost by the prediction from that by the residual, shape (M, k)."""
+        if self.decorrelation_matrix is not None:
             pull = pull.copy()
-            pull[self.seen] = self.mixing.T @ pull[self.seen]
+            pull[self.is_used] = self.decorrelation_matrix.T @ pull[self.is_used]
         return np.asarray(pull * self.weight)
 
-    def rows(self, predicted: Array, slopes: Array | None = None, threshold: float = math.inf) -> Rows:
+    def residual_block(
+        self, predicted: Array, slopes: Array | None = None, threshold: float = math.inf
+    ) -> ResidualBlock:
         """Residual block of these measurements with robust weights and, with slopes, its Jacobian.
 
         Parameters
@@ -145,28 +150,30 @@ class Measurements:
         threshold : float
             Of Huber's loss [standard deviations].
         """
-        raw = self.whitened(predicted)
-        cost, factor = huber(raw, threshold)
-        seen, jacobian = self.seen, None
+        raw = self.whitened_residual(predicted)
+        cost, factor = huber_loss(raw, threshold)
+        seen, jacobian = self.is_used, None
         robust = factor[seen]
         if slopes is not None:
-            jacobian = robust[:, None] * self.independent(self.weight[seen][:, None] * slopes[seen])
-        return Rows(cost, robust * raw[seen], jacobian, robust)
+            jacobian = robust[:, None] * self.decorrelate(self.weight[seen][:, None] * slopes[seen])
+        return ResidualBlock(cost, robust * raw[seen], jacobian, robust)
 
-    def late(self, steps: Array) -> Measurements:
+    def delayed_by(self, steps: Array) -> Measurements:
         """The same samples shifted back by a delay of each output [steps], within the span.
 
         Parameters
         ----------
         steps : ndarray, shape (k,)
         """
-        position = np.clip((self.node + self.fraction)[:, None] - steps, *self.span)
+        position = np.clip((self.node + self.fraction)[:, None] - steps, *self.predictable_nodes)
         near = np.rint(position)
         position = np.where(np.abs(position - near) < 1e-9, near, position)
-        node = np.minimum(np.floor(position), max(self.span[1] - 1, self.span[0])).astype(np.int64)
+        node = np.minimum(np.floor(position), max(self.predictable_nodes[1] - 1, self.predictable_nodes[0])).astype(
+            np.int64
+        )
         return replace(self, node=node, fraction=position - node)
 
-    def slope(self, at_nodes: Array, unmoved: Measurements, steps: Array) -> Array:
+    def prediction_rate(self, at_nodes: Array, unmoved: Measurements, steps: Array) -> Array:
         """Rate of change of a prediction per step for delayed samples, shape (M, k); at a node the mean of both sides.
 
         Parameters
@@ -176,7 +183,7 @@ class Measurements:
             The measurements before the delay.
         steps : ndarray, shape (k,)
         """
-        nodes, column = self.nodes, np.arange(at_nodes.shape[1])
+        nodes, column = self.evaluation_nodes, np.arange(at_nodes.shape[1])
         if not len(nodes):  # a short piece may hold no sample of a slow sensor
             return np.zeros((0, at_nodes.shape[1]))
         place = self.node - nodes[0]
@@ -188,20 +195,22 @@ class Measurements:
         middle = place + np.rint(self.fraction).astype(np.int64)
         rate = np.where(on, (at(middle + 1) - at(middle - 1)) / 2, at(place + 1) - at(place))
         position = (unmoved.node + unmoved.fraction)[:, None] - steps
-        return np.where((position < self.span[0] - 1e-9) | (position > self.span[1] + 1e-9), 0.0, rate)
+        return np.where(
+            (position < self.predictable_nodes[0] - 1e-9) | (position > self.predictable_nodes[1] + 1e-9), 0.0, rate
+        )
 
     def interpolate(self, at_nodes: Array) -> Array:
-        """Interpolate values at `nodes`, shape (len(nodes), ...), to the samples, shape (M, ...)."""
-        nodes = self.nodes
+        """Interpolate values at `evaluation_nodes`, shape (len(nodes), ...), to the samples, shape (M, ...)."""
+        nodes = self.evaluation_nodes
         column = () if self.node.ndim == 1 else (np.arange(at_nodes.shape[1]),)
         before = at_nodes[(np.searchsorted(nodes, self.node), *column)]
         after = at_nodes[(np.minimum(np.searchsorted(nodes, self.node + 1), len(nodes) - 1), *column)]
         fraction = self.fraction.reshape(*self.fraction.shape, *([1] * (at_nodes.ndim - self.fraction.ndim)))
         return np.where(fraction > 0, (1 - fraction) * before + fraction * after, before)
 
-    def distribute(self, at_samples: Array) -> Array:
+    def interpolation_adjoint(self, at_samples: Array) -> Array:
         """Transpose of `interpolate`, shape (M, ...) to (len(nodes), ...)."""
-        nodes = self.nodes
+        nodes = self.evaluation_nodes
         result = np.zeros((len(nodes), *at_samples.shape[1:]))
         fraction = self.fraction.reshape(*self.fraction.shape, *([1] * (at_samples.ndim - self.fraction.ndim)))
         between = self.fraction > 0
@@ -216,26 +225,34 @@ class Measurements:
         return result
 
 
-def placed(data: SensorData, grid: Grid, where: str) -> Measurements:
+def place_on_grid(data: SensorData, grid: TimeGrid, where: str) -> Measurements:
     """Locate a sensor's data on the nodes of a rollout; raises `DataError` where a noise level is not positive."""
     seen = np.isfinite(data.value)
     if np.any(seen & ~(data.std > 0)):
         raise DataError(
             "a noise level is zero or missing",
-            where=f"{where}: {data.sensor.group}",
+            where=f"{where}: {data.sensor.group_name}",
             allowed="a positive standard deviation",
             hint="set it under `sensors`",
         )
     weight = np.where(seen, 1.0 / np.where(data.std > 0, data.std, 1.0), 0.0)
-    node, fraction = grid.locate(data.t)
+    node, fraction = grid.node_and_fraction(data.t)
     std = np.where(seen, data.std, np.nan)
     bias = np.zeros(data.value.shape[1]) if data.bias_std is None else data.bias_std
     return Measurements(
-        data.sensor, node, fraction, data.value, weight, std, data.span or (0, grid.steps), bias, data.correlation
+        data.sensor,
+        node,
+        fraction,
+        data.value,
+        weight,
+        std,
+        data.predictable_nodes or (0, grid.steps),
+        bias,
+        data.noise_correlation,
     )
 
 
-def paper_weighting(samples: Measurements, grid: Grid) -> Measurements:
+def with_paper_weights(samples: Measurements, grid: TimeGrid) -> Measurements:
     """Measurements with the source paper's weights: 1 at the nearest node, 0 at k = 0, the last node counted twice.
 
     J = sum_{k=1..N} 1/2 sigma_k |w_k - wbar_k|^2 + 1/2 |w_N - wbar_N|^2 for measured points [m^2].
@@ -245,10 +262,10 @@ def paper_weighting(samples: Measurements, grid: Grid) -> Measurements:
     weight[nearest_node == 0] = 0.0
     weight[nearest_node == grid.steps] *= np.sqrt(2.0)
     none, exact = np.zeros(len(samples.bias_std)), np.zeros(len(nearest_node))
-    return replace(samples, node=nearest_node, fraction=exact, weight=weight, bias_std=none, correlation=None)
+    return replace(samples, node=nearest_node, fraction=exact, weight=weight, bias_std=none, noise_correlation=None)
 
 
-def huber(residual: Array, scale: float) -> tuple[float, Array]:
+def huber_loss(residual: Array, scale: float) -> tuple[float, Array]:
     """Return Huber's loss of whitened residuals and the factors that turn residuals into a weighted least squares.
 
     Parameters

@@ -15,40 +15,40 @@ import scipy.stats
 from numpy.typing import NDArray
 
 from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.low_pass import LowPass, effort_filter
+from yid_ocp.problem.estimation_problem import EstimationProblem
+from yid_ocp.problem.low_pass_filter import LowPassFilter, effort_filter
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.problem import EstimationProblem
 
 Array = NDArray[np.float64]
 
-WINDOW = 0.5
+RESIDUAL_WINDOW_LENGTH = 0.5
 """Length of the time windows in which a residual is tested [s]."""
 
 
 @dataclass(frozen=True)
-class GapLimits:
+class GapCriteria:
     """Criteria for a residual that exceeds noise: significance level and size.
 
     Attributes
     ----------
-    level : float
+    significance_level : float
         Significance below which a residual is more than noise.
-    smallest_gap : float
+    min_excess_chi2 : float
         chi2/n - 1 below which a significant excess is ignored.
     noise_fraction : float
         Fraction of the stated standard deviations that is noise; the rest represents model error.
     """
 
-    level: float = 0.01
-    smallest_gap: float = 0.1
+    significance_level: float = 0.01
+    min_excess_chi2: float = 0.1
     noise_fraction: float = 1.0
 
 
-USUAL = GapLimits()
+DEFAULT_GAP_CRITERIA = GapCriteria()
 
 
 @dataclass(frozen=True)
-class Series:
+class ResidualChannel:
     """One scalar sensor output of one recording: its times, residual indices and noise autocorrelation.
 
     Attributes
@@ -58,9 +58,9 @@ class Series:
     unit : str
     t : ndarray, shape (M,)
         Times since the start of the recording [s].
-    rows : ndarray of int, shape (M,)
+    residual_indices : ndarray of int, shape (M,)
         Indices in the residual.
-    colour : ndarray, shape (L + 1,)
+    noise_autocorrelation : ndarray, shape (L + 1,)
         Autocorrelation of the noise at lags 0 to L samples.
     """
 
@@ -69,102 +69,102 @@ class Series:
     group: str
     unit: str
     t: Array
-    rows: NDArray[np.int64]
-    colour: Array
+    residual_indices: NDArray[np.int64]
+    noise_autocorrelation: Array
 
 
 @dataclass(frozen=True)
-class Floor:
+class ChannelNoiseLevel:
     """Noise standard deviation that is assumed for one channel.
 
     Attributes
     ----------
     channel, unit : str
-    std : float
+    noise_std : float
         Median standard deviation of its samples, after smoothing where they are smoothed, in `unit`.
-    samples : int
+    n_samples : int
     """
 
     channel: str
     unit: str
-    std: float
-    samples: int
+    noise_std: float
+    n_samples: int
 
 
 @dataclass(frozen=True)
-class Window:
+class _ResidualWindow:
     """Test of one channel's residual in one time window.
 
     Attributes
     ----------
     recording, channel : str
-    begin, end : float
+    start_time, end_time : float
         [s]
-    z : float
+    z_score : float
         Excess of r'r over its expectation, in standard deviations.
-    flagged : bool
+    is_flagged : bool
         Whether it is more than chance among all windows (false-discovery rate).
     """
 
     recording: str
     channel: str
-    begin: float
-    end: float
-    z: float
-    flagged: bool
+    start_time: float
+    end_time: float
+    z_score: float
+    is_flagged: bool
 
 
 @dataclass(frozen=True)
-class NullTest:
+class NullTestResult:
     """Result of the null test: chi2, p-values and whiteness of a residual.
 
     Attributes
     ----------
     chi2_per_dof : float
-    degrees : float
+    degrees_of_freedom : float
         Effective, of coloured noise.
     p_value : float
         Probability of a residual this large under noise alone.
-    channels : dict of channel to float
+    channel_chi2 : dict of channel to float
         Mean square of its whitened residual.
-    whiteness : dict of channel to float
+    whiteness_p_values : dict of channel to float
         p-value of its first autocorrelations under the noise's colour (Ljung-Box; NaN for smoothed channels).
     windows : tuple of Window
     """
 
     chi2_per_dof: float
-    degrees: float
+    degrees_of_freedom: float
     p_value: float
-    channels: dict[str, float]
-    whiteness: dict[str, float]
-    windows: tuple[Window, ...]
+    channel_chi2: dict[str, float]
+    whiteness_p_values: dict[str, float]
+    windows: tuple[_ResidualWindow, ...]
 
 
-def noise_floor(problem: EstimationProblem) -> tuple[Floor, ...]:
+def channel_noise_levels(problem: EstimationProblem) -> tuple[ChannelNoiseLevel, ...]:
     """Noise levels that the problem assumes, channel by channel."""
     found: dict[str, list[Array]] = {}
     units: dict[str, str] = {}
     for episode in problem.episodes:
-        for samples in episode.samples:
+        for samples in episode.measurements:
             for column, channel in enumerate(samples.channel_of_column):
                 found.setdefault(channel, []).append(samples.std[np.isfinite(samples.std[:, column]), column])
                 units[channel] = samples.sensor.unit
     joined = {channel: np.concatenate(parts) for channel, parts in found.items()}
-    return tuple(Floor(c, units[c], float(np.median(v)), len(v)) for c, v in joined.items() if len(v))
+    return tuple(ChannelNoiseLevel(c, units[c], float(np.median(v)), len(v)) for c, v in joined.items() if len(v))
 
 
-def spread(colour: Array) -> float:
+def _variance_inflation(colour: Array) -> float:
     """Variance inflation 1 + 2 sum rho_l^2 of a mean square of autocorrelated noise."""
     return float(1 + 2 * np.sum(colour[1:] ** 2))
 
 
-def null_test(
-    series: Sequence[Series],
+def run_null_test(
+    series: Sequence[ResidualChannel],
     residual: Array,
     parameters: int,
-    level: float = USUAL.level,
-    window: float = WINDOW,
-) -> NullTest:
+    level: float = DEFAULT_GAP_CRITERIA.significance_level,
+    window: float = RESIDUAL_WINDOW_LENGTH,
+) -> NullTestResult:
     """Test a whitened residual against the hypothesis that it is noise alone.
 
     Parameters
@@ -179,20 +179,26 @@ def null_test(
     window : float
         Their length [s].
     """
-    count = sum(len(s.rows) for s in series)
-    effective = max(sum(len(s.rows) / spread(s.colour) for s in series) - parameters, 1.0)
-    total = float(sum(np.sum(residual[s.rows] ** 2) for s in series))
+    count = sum(len(s.residual_indices) for s in series)
+    effective = max(
+        sum(len(s.residual_indices) / _variance_inflation(s.noise_autocorrelation) for s in series) - parameters, 1.0
+    )
+    total = float(sum(np.sum(residual[s.residual_indices] ** 2) for s in series))
     ratio = total / max(count - parameters, 1)
     p_value = float(scipy.stats.chi2.sf(ratio * effective, effective))
     channels, whiteness = {}, {}
     for channel in dict.fromkeys(s.channel for s in series):
         own = [s for s in series if s.channel == channel]
-        channels[channel] = float(np.mean(np.concatenate([residual[s.rows] for s in own]) ** 2))
-        whiteness[channel] = _whiteness([residual[s.rows] for s in own]) if len(own[0].colour) == 1 else float("nan")
-    return NullTest(ratio, effective, p_value, channels, whiteness, _windows(series, residual, level, window))
+        channels[channel] = float(np.mean(np.concatenate([residual[s.residual_indices] for s in own]) ** 2))
+        whiteness[channel] = (
+            _whiteness([residual[s.residual_indices] for s in own])
+            if len(own[0].noise_autocorrelation) == 1
+            else float("nan")
+        )
+    return NullTestResult(ratio, effective, p_value, channels, whiteness, _windows(series, residual, level, window))
 
 
-def whitened_beside(residual: Array, spread: Array) -> Array:
+def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
     """Whiten a residual by its noise and by k further independent errors, (I + F F')^(-1/2) r.
 
     Parameters
@@ -207,7 +213,7 @@ def whitened_beside(residual: Array, spread: Array) -> Array:
     return np.asarray(residual + columns @ ((1 / np.hypot(1.0, sizes) - 1) * (columns.T @ residual)))
 
 
-def more_than_noise(tests: Sequence[NullTest], limits: GapLimits = USUAL) -> bool:
+def exceeds_noise(tests: Sequence[NullTestResult], limits: GapCriteria = DEFAULT_GAP_CRITERIA) -> bool:
     """Whether residuals of one model exceed noise, both significantly and by a relevant size.
 
     Parameters
@@ -216,10 +222,13 @@ def more_than_noise(tests: Sequence[NullTest], limits: GapLimits = USUAL) -> boo
         Of the recordings that were fitted, of those held out, or of both.
     limits : GapLimits
     """
-    return smallest_p_value(tests) < limits.level and max(test.chi2_per_dof for test in tests) > 1 + limits.smallest_gap
+    return (
+        bonferroni_p_value(tests) < limits.significance_level
+        and max(test.chi2_per_dof for test in tests) > 1 + limits.min_excess_chi2
+    )
 
 
-def smallest_p_value(tests: Sequence[NullTest]) -> float:
+def bonferroni_p_value(tests: Sequence[NullTestResult]) -> float:
     """Bonferroni-corrected smallest p-value of several tests."""
     return min(1.0, len(tests) * min(test.p_value for test in tests))
 
@@ -240,9 +249,11 @@ def _whiteness(parts: Sequence[Array], lags: int = 10) -> float:
     return float(scipy.stats.chi2.sf(statistic, degrees)) if degrees else float("nan")
 
 
-def _windows(series: Sequence[Series], residual: Array, level: float, length: float) -> tuple[Window, ...]:
+def _windows(
+    series: Sequence[ResidualChannel], residual: Array, level: float, length: float
+) -> tuple[_ResidualWindow, ...]:
     raw: list[tuple[str, str, float, float, float, float]] = []
-    merged: dict[tuple[str, str], list[Series]] = {}
+    merged: dict[tuple[str, str], list[ResidualChannel]] = {}
     for s in series:
         merged.setdefault((s.recording, s.channel), []).append(s)
     for (recording, channel), own in merged.items():
@@ -251,18 +262,18 @@ def _windows(series: Sequence[Series], residual: Array, level: float, length: fl
             begin, total, degrees, count = k * length, 0.0, 0.0, 0
             for s in own:
                 inside = (s.t >= begin) & (s.t < begin + length)
-                r = residual[s.rows[inside]]
+                r = residual[s.residual_indices[inside]]
                 total, count = total + float(r @ r), count + len(r)
-                degrees += len(r) / spread(s.colour)
+                degrees += len(r) / _variance_inflation(s.noise_autocorrelation)
             if count:
                 p = float(scipy.stats.chi2.sf(total / count * degrees, degrees))
                 z = (total / count - 1) * np.sqrt(degrees / 2)
                 raw.append((recording, channel, begin, min(begin + length, last), float(z), p))
-    flagged = discoveries([entry[5] for entry in raw], len(raw), level)
-    return tuple(Window(*entry[:5], flag) for entry, flag in zip(raw, flagged, strict=True))
+    flagged = benjamini_hochberg_mask([entry[5] for entry in raw], len(raw), level)
+    return tuple(_ResidualWindow(*entry[:5], flag) for entry, flag in zip(raw, flagged, strict=True))
 
 
-def discoveries(p_values: Sequence[float], tries: float, level: float) -> list[bool]:
+def benjamini_hochberg_mask(p_values: Sequence[float], tries: float, level: float) -> list[bool]:
     """Which of several p-values are significant at a false-discovery rate.
 
     Benjamini and Hochberg (1995), doi:10.1111/j.2517-6161.1995.tb02031.x.
@@ -289,32 +300,32 @@ def sample_times(episode: Episode, samples: Measurements) -> Array:
     return np.asarray((samples.node + samples.fraction) * episode.grid.time_step)
 
 
-def residual_series(problem: EstimationProblem) -> tuple[Series, ...]:
+def residual_channels(problem: EstimationProblem) -> tuple[ResidualChannel, ...]:
     """Channels of a problem's residual: one entry for each scalar output of each recording."""
-    series: list[Series] = []
-    for episode, groups in zip(problem.episodes, problem.rows.measurements, strict=True):
-        for samples, rows in zip(episode.samples, groups, strict=True):
+    series: list[ResidualChannel] = []
+    for episode, groups in zip(problem.episodes, problem.residual_rows.measurements, strict=True):
+        for samples, rows in zip(episode.measurements, groups, strict=True):
             t = sample_times(episode, samples)
-            place = np.full(samples.seen.shape, -1)
-            place[samples.seen] = np.arange(rows.start, rows.stop)
-            colour = noise_colour(problem, episode, samples)
+            place = np.full(samples.is_used.shape, -1)
+            place[samples.is_used] = np.arange(rows.start, rows.stop)
+            colour = _sensor_noise_autocorrelation(problem, episode, samples)
             for column, channel in enumerate(samples.channel_of_column):
-                seen = samples.seen[:, column]
+                seen = samples.is_used[:, column]
                 if seen.any():
-                    text = (episode.name, channel, samples.sensor.group, samples.sensor.unit)
-                    series.append(Series(*text, t[seen], place[seen, column], colour))
+                    text = (episode.name, channel, samples.sensor.group_name, samples.sensor.unit)
+                    series.append(ResidualChannel(*text, t[seen], place[seen, column], colour))
     return tuple(series)
 
 
-def noise_colour(problem: EstimationProblem, episode: Episode, samples: Measurements) -> Array:
+def _sensor_noise_autocorrelation(problem: EstimationProblem, episode: Episode, samples: Measurements) -> Array:
     """Autocorrelation of a sensor's noise at lags 0, 1, ... samples: white, except for smoothed efforts."""
-    if not samples.sensor.efforts:
+    if not samples.sensor.effort_joints:
         return np.ones(1)
     low_pass, step = effort_filter(problem.options.path_cutoff), episode.grid.time_step
-    return smoothed_colour(low_pass, step)[:: low_pass.stride(step)]
+    return _filtered_noise_autocorrelation(low_pass, step)[:: low_pass.decorrelation_stride(step)]
 
 
-def smoothed_colour(low_pass: LowPass, step: float) -> Array:
+def _filtered_noise_autocorrelation(low_pass: LowPassFilter, step: float) -> Array:
     """Autocorrelation of filtered white noise at lags 0, 1, ... times `step` [s]."""
     if not np.isfinite(low_pass.cutoff):
         return np.ones(1)

@@ -9,28 +9,34 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.report.tables import readable
+from yid_ocp.report.tables import display_scale_and_unit
 
 if TYPE_CHECKING:
     import plotly.graph_objects
 
 Array = NDArray[np.float64]
 
-INK, PALE, PAPER = "#22303c", "#d9dee3", "#ffffff"
-COLORS = ("#0b6e99", "#c2571a", "#5b8c2a", "#8a4f9e")
-DASHES = ("solid", "dash", "dot", "dashdot")
-BEFORE, AFTER, MEASURED = COLORS[1], COLORS[0], "#8d99a4"
-DIVERGING = ((0.0, "#2166ac"), (0.25, "#92c5de"), (0.5, PAPER), (0.75, "#f4a582"), (1.0, "#b2182b"))
-RISING = ((0.0, PAPER), (0.5, "#b9d9e6"), (0.9, "#0b6e99"), (1.0, "#06405a"))
-DARK: Mapping[str, str] = {
-    INK: "#e3e9ee",
-    PALE: "#3b4650",
-    PAPER: "#151b20",
-    COLORS[0]: "#4fb3dc",
-    COLORS[1]: "#f2955a",
-    COLORS[2]: "#9acb62",
-    COLORS[3]: "#cba0dc",
-    MEASURED: "#98a5b0",
+TEXT_COLOR, GRID_COLOR, BACKGROUND_COLOR = "#22303c", "#d9dee3", "#ffffff"
+LINE_COLORS = ("#0b6e99", "#c2571a", "#5b8c2a", "#8a4f9e")
+_LINE_DASHES = ("solid", "dash", "dot", "dashdot")
+BEFORE_COLOR, AFTER_COLOR, MEASURED_COLOR = LINE_COLORS[1], LINE_COLORS[0], "#8d99a4"
+DIVERGING_COLORSCALE = (
+    (0.0, "#2166ac"),
+    (0.25, "#92c5de"),
+    (0.5, BACKGROUND_COLOR),
+    (0.75, "#f4a582"),
+    (1.0, "#b2182b"),
+)
+SEQUENTIAL_COLORSCALE = ((0.0, BACKGROUND_COLOR), (0.5, "#b9d9e6"), (0.9, "#0b6e99"), (1.0, "#06405a"))
+DARK_MODE_COLORS: Mapping[str, str] = {
+    TEXT_COLOR: "#e3e9ee",
+    GRID_COLOR: "#3b4650",
+    BACKGROUND_COLOR: "#151b20",
+    LINE_COLORS[0]: "#4fb3dc",
+    LINE_COLORS[1]: "#f2955a",
+    LINE_COLORS[2]: "#9acb62",
+    LINE_COLORS[3]: "#cba0dc",
+    MEASURED_COLOR: "#98a5b0",
     "#2166ac": "#6fb2f2",
     "#92c5de": "#37627f",
     "#f4a582": "#86493a",
@@ -39,12 +45,18 @@ DARK: Mapping[str, str] = {
     "#06405a": "#a9e0f6",
 }
 """What every color becomes on a dark page; figures use no other colors."""
-LONGEST = 1200  # points of a curve; beyond this the page grows and the eye sees no more
-EPOCH = 1e4  # times from which single precision loses milliseconds [s]
-ROW, SMALL, GAP, TOP, BOTTOM = 130, 76, 30, 64, 44  # heights in a figure of rows [px]
+_MAX_CURVE_POINTS = 1200  # points of a curve; beyond this the page grows and the eye sees no more
+_MAX_SINGLE_PRECISION_TIME = 1e4  # times from which single precision loses milliseconds [s]
+_ROW_HEIGHT, _LOW_ROW_HEIGHT, _ROW_GAP, _TOP_MARGIN, _BOTTOM_MARGIN = (
+    130,
+    76,
+    30,
+    64,
+    44,
+)  # heights in a figure of rows [px]
 
 
-def html(figure: plotly.graph_objects.Figure) -> str:
+def figure_html(figure: plotly.graph_objects.Figure) -> str:
     """HTML element of a figure; the page's script draws it in light or dark colors."""
     figure.update_layout(template=None)  # all is said here; the default one is some kilobytes each
     told = str(figure.to_json()).replace("<", "\\u003c")
@@ -54,7 +66,7 @@ def html(figure: plotly.graph_objects.Figure) -> str:
     )
 
 
-def cost_history(costs: Sequence[float], notes: Sequence[str]) -> plotly.graph_objects.Figure:
+def cost_history_figure(costs: Sequence[float], notes: Sequence[str]) -> plotly.graph_objects.Figure:
     """Figure of the cost at every accepted point, one curve per intermediate horizon."""
     import plotly.graph_objects as go
 
@@ -68,40 +80,40 @@ def cost_history(costs: Sequence[float], notes: Sequence[str]) -> plotly.graph_o
                 y=list(costs[begin:i]),
                 mode="lines+markers",
                 name=notes[begin] or "whole recordings",
-                line={"color": COLORS[stages % len(COLORS)]},
+                line={"color": LINE_COLORS[stages % len(LINE_COLORS)]},
             )
             begin, stages = i, stages + 1
-    return styled(figure, 320, "accepted point", "cost", log_y=True)
+    return apply_page_style(figure, 320, "accepted point", "cost", log_y=True)
 
 
 @dataclass(frozen=True)
-class Curve:
+class TimePlot:
     """Data of one plot over time: measured points and predicted lines.
 
     Attributes
     ----------
-    title : str
+    axis_title : str
         Of its axis, with the unit.
     t, measured : ndarray, shape (M,)
     lines : mapping of name to (t (K,), value (K,))
-    band : float or None
+    band_half_height : float or None
         Half the height of what is shaded about zero.
-    spans : sequence of (float, float)
+    marked_intervals : sequence of (float, float)
         Stretches of time that are marked.
-    small : bool
+    is_low_row : bool
         Whether its row is a low one.
     """
 
-    title: str
+    axis_title: str
     t: Array
     measured: Array
     lines: Mapping[str, tuple[Array, Array]]
-    band: float | None = None
-    spans: Sequence[tuple[float, float]] = ()
-    small: bool = False
+    band_half_height: float | None = None
+    marked_intervals: Sequence[tuple[float, float]] = ()
+    is_low_row: bool = False
 
 
-def compared(
+def prediction_and_residual_plots(
     title: str,
     unit: str,
     t: Array,
@@ -109,7 +121,7 @@ def compared(
     std: Array,
     lines: Mapping[str, Array],
     course: tuple[Array, Array] | None = None,
-) -> tuple[Curve, Curve]:
+) -> tuple[TimePlot, TimePlot]:
     """Two plots: measured and predicted values, and their residual with a band of two noise standard deviations.
 
     Parameters
@@ -122,25 +134,25 @@ def compared(
         The first of them at more times, for what is measured seldom.
     """
     seen = np.isfinite(measured) & np.isfinite(std)
-    factor, shown = readable(unit)
+    factor, shown = display_scale_and_unit(unit)
     drawn = {name: (t, values) for name, values in lines.items()}
     if course is not None:
         drawn[next(iter(lines))] = course
-    left = {name: in_pieces(t[seen], factor * (values - measured)[seen]) for name, values in lines.items()}
+    left = {name: _broken_at_gaps(t[seen], factor * (values - measured)[seen]) for name, values in lines.items()}
     noise = float(np.median(std[seen])) if seen.any() else 0.0
-    above = Curve(f"{title} [{unit}]", t, measured, drawn)
-    return above, Curve(f"residual [{shown}]", t[:0], t[:0], left, 2 * factor * noise or None, small=True)
+    above = TimePlot(f"{title} [{unit}]", t, measured, drawn)
+    return above, TimePlot(f"residual [{shown}]", t[:0], t[:0], left, 2 * factor * noise or None, is_low_row=True)
 
 
-def in_pieces(t: Array, values: Array) -> tuple[Array, Array]:
+def _broken_at_gaps(t: Array, values: Array) -> tuple[Array, Array]:
     """Times and values with NaN inserted in long gaps between measurements."""
     steps = np.diff(t)
     breaks = np.flatnonzero(steps > 5 * np.median(steps)) + 1 if len(steps) else np.zeros(0, int)
     return np.insert(t, breaks, t[breaks]), np.insert(values, breaks, np.nan)
 
 
-def over_time(
-    curves: Sequence[Curve], dots: str = COLORS[1], lines: Mapping[str, str] | None = None
+def time_plots_figure(
+    curves: Sequence[TimePlot], dots: str = LINE_COLORS[1], lines: Mapping[str, str] | None = None
 ) -> plotly.graph_objects.Figure:
     """Figure with measured points and lines, one row per plot.
 
@@ -155,11 +167,11 @@ def over_time(
     from plotly.subplots import make_subplots
 
     names = list(dict.fromkeys(name for curve in curves for name in curve.lines))
-    colors = dict(lines or {name: COLORS[i % len(COLORS)] for i, name in enumerate(names)})
-    heights = [SMALL if curve.small else ROW for curve in curves]
-    inner = sum(heights) + GAP * (len(curves) - 1)
+    colors = dict(lines or {name: LINE_COLORS[i % len(LINE_COLORS)] for i, name in enumerate(names)})
+    heights = [_LOW_ROW_HEIGHT if curve.is_low_row else _ROW_HEIGHT for curve in curves]
+    inner = sum(heights) + _ROW_GAP * (len(curves) - 1)
     figure = make_subplots(
-        rows=len(curves), cols=1, shared_xaxes=True, vertical_spacing=GAP / inner, row_heights=heights
+        rows=len(curves), cols=1, shared_xaxes=True, vertical_spacing=_ROW_GAP / inner, row_heights=heights
     )
     told: set[str] = set()
     for row, curve in enumerate(curves, start=1):
@@ -174,59 +186,60 @@ def over_time(
         for name, (t, value) in curve.lines.items():
             keep = _thinned(len(t))
             # what is measured seldom may have neighbours on neither side
-            mode = "lines+markers" if curve.small and len(t) <= 60 else "lines"
+            mode = "lines+markers" if curve.is_low_row and len(t) <= 60 else "lines"
             figure.add_scatter(
                 x=_times(t[keep]), y=_short(value[keep]), mode=mode, name=name, showlegend=name not in told,
                 legendgroup=name, line={"color": colors[name], "width": 1.5}, marker={"size": 4}, row=row, col=1,
             )  # fmt: skip
             told.add(name)
-        if curve.band is not None:
-            shade = {"fillcolor": PALE, "opacity": 0.7, "line_width": 0, "layer": "below"}
-            figure.add_hrect(y0=-curve.band, y1=curve.band, row=row, col=1, **shade)
-        for begin, end in curve.spans:
+        if curve.band_half_height is not None:
+            shade = {"fillcolor": GRID_COLOR, "opacity": 0.7, "line_width": 0, "layer": "below"}
+            figure.add_hrect(y0=-curve.band_half_height, y1=curve.band_half_height, row=row, col=1, **shade)
+        for begin, end in curve.marked_intervals:
             figure.add_vrect(
-                x0=begin, x1=end, row=row, col=1, fillcolor=AFTER, opacity=0.2, line_width=0, layer="below"
+                x0=begin, x1=end, row=row, col=1, fillcolor=AFTER_COLOR, opacity=0.2, line_width=0, layer="below"
             )
-    figure = styled(figure, inner + TOP + BOTTOM, "", "")
+    figure = apply_page_style(figure, inner + _TOP_MARGIN + _BOTTOM_MARGIN, "", "")
     figure.update_yaxes(nticks=4)
     for row, curve in enumerate(curves, start=1):
         # beside a low row a turned title has no room, and collides with that of the next one
         top = figure.layout[f"yaxis{row if row > 1 else ''}"].domain[1]
         figure.add_annotation(
-            text=curve.title, x=0, xref="paper", xanchor="left", y=top, yref="paper", yanchor="bottom",
+            text=curve.axis_title, x=0, xref="paper", xanchor="left", y=top, yref="paper", yanchor="bottom",
             showarrow=False, font={"size": 12},
         )  # fmt: skip
     figure.update_layout(
-        margin={"l": 54, "r": 12, "t": TOP, "b": BOTTOM}, legend={"y": 1 + 22 / inner, "yanchor": "bottom"}
+        margin={"l": 54, "r": 12, "t": _TOP_MARGIN, "b": _BOTTOM_MARGIN},
+        legend={"y": 1 + 22 / inner, "yanchor": "bottom"},
     )
     figure.update_xaxes(title_text="time [s]", row=len(curves), col=1)
     return figure
 
 
-def lines_over_time(curve: Curve) -> plotly.graph_objects.Figure:
+def lines_over_time_figure(curve: TimePlot) -> plotly.graph_objects.Figure:
     """Figure of the lines of one plot, each in its own color."""
     import plotly.graph_objects as go
 
     figure = go.Figure()
     for i, (name, (t, value)) in enumerate(curve.lines.items()):
-        keep, style = _thinned(len(t)), {"color": COLORS[i % len(COLORS)], "width": 1.5}
-        style |= {"dash": DASHES[i // len(COLORS) % len(DASHES)]}
+        keep, style = _thinned(len(t)), {"color": LINE_COLORS[i % len(LINE_COLORS)], "width": 1.5}
+        style |= {"dash": _LINE_DASHES[i // len(LINE_COLORS) % len(_LINE_DASHES)]}
         figure.add_scatter(x=_times(t[keep]), y=_short(value[keep]), mode="lines", name=name, line=style)
-    if curve.band is not None:
-        shade = {"fillcolor": PALE, "opacity": 0.7, "line_width": 0, "layer": "below"}
-        figure.add_hrect(y0=-curve.band, y1=curve.band, **shade)
+    if curve.band_half_height is not None:
+        shade = {"fillcolor": GRID_COLOR, "opacity": 0.7, "line_width": 0, "layer": "below"}
+        figure.add_hrect(y0=-curve.band_half_height, y1=curve.band_half_height, **shade)
     # the legend below takes as many rows as the screen is narrow
     below = {"orientation": "h", "y": -0.22, "yanchor": "top", "x": 0, "font": {"size": 11}}
-    figure = styled(figure, 320 + 8 * len(curve.lines), "time [s]", "")
+    figure = apply_page_style(figure, 320 + 8 * len(curve.lines), "time [s]", "")
     figure.update_layout(legend=below, margin={"t": 30})
     figure.add_annotation(
-        text=curve.title, x=0, xref="paper", xanchor="left", y=1, yref="paper", yanchor="bottom", showarrow=False,
+        text=curve.axis_title, x=0, xref="paper", xanchor="left", y=1, yref="paper", yanchor="bottom", showarrow=False,
         font={"size": 12},
     )  # fmt: skip
     return figure
 
 
-def residual_histogram(residuals: Mapping[str, Array]) -> plotly.graph_objects.Figure:
+def residual_histogram_figure(residuals: Mapping[str, Array]) -> plotly.graph_objects.Figure:
     """Histogram figure of whitened residuals per sensor group, with the standard normal density."""
     import plotly.graph_objects as go
 
@@ -235,19 +248,23 @@ def residual_histogram(residuals: Mapping[str, Array]) -> plotly.graph_objects.F
     for i, (name, values) in enumerate(residuals.items()):
         bins = np.linspace(-edge, edge, int(np.clip(2 * np.sqrt(len(values)), 8, 60)) + 1)
         density, _ = np.histogram(np.clip(values, -edge, edge), bins=bins, density=True)
-        line = {"color": COLORS[i % len(COLORS)], "shape": "hvh"}
+        line = {"color": LINE_COLORS[i % len(LINE_COLORS)], "shape": "hvh"}
         middle = 0.5 * (bins[1:] + bins[:-1])
         label = f"{name} ({len(values)} values)"
         figure.add_scatter(x=middle.tolist(), y=density.tolist(), mode="lines", line=line, name=label)
     even = np.linspace(-edge, edge, 121)
     normal = np.exp(-0.5 * even**2) / np.sqrt(2 * np.pi)
     figure.add_scatter(
-        x=even.tolist(), y=normal.tolist(), mode="lines", line={"color": INK, "dash": "dot"}, name="standard normal"
+        x=even.tolist(),
+        y=normal.tolist(),
+        mode="lines",
+        line={"color": TEXT_COLOR, "dash": "dot"},
+        name="standard normal",
     )
-    return styled(figure, 340, "residual in standard deviations", "density")
+    return apply_page_style(figure, 340, "residual in standard deviations", "density")
 
 
-def falling(costs: Mapping[str, tuple[Sequence[float], Sequence[float]]]) -> plotly.graph_objects.Figure:
+def cost_over_time_figure(costs: Mapping[str, tuple[Sequence[float], Sequence[float]]]) -> plotly.graph_objects.Figure:
     """Figure of each method's relative excess cost over wall time, from (seconds, cost)."""
     import plotly.graph_objects as go
 
@@ -258,12 +275,12 @@ def falling(costs: Mapping[str, tuple[Sequence[float], Sequence[float]]]) -> plo
             least = min(c for _, c in known)
             figure.add_scatter(
                 x=[s for s, _ in known], y=[max(c / max(least, 1e-300) - 1.0, 1e-9) for _, c in known],
-                mode="lines+markers", name=name, line={"color": COLORS[i % len(COLORS)]},
+                mode="lines+markers", name=name, line={"color": LINE_COLORS[i % len(LINE_COLORS)]},
             )  # fmt: skip
-    return styled(figure, 340, "wall time [s]", "cost over its lowest, less one", log_y=True)
+    return apply_page_style(figure, 340, "wall time [s]", "cost over its lowest, less one", log_y=True)
 
 
-def rates(
+def rate_intervals_figure(
     curves: Mapping[str, Mapping[float, Mapping[str, float]]],
     x: str,
     y: str,
@@ -275,7 +292,7 @@ def rates(
 
     figure = go.Figure()
     if diagonal:
-        line = {"color": MEASURED, "dash": "dot"}
+        line = {"color": MEASURED_COLOR, "dash": "dot"}
         figure.add_scatter(x=[0, 1], y=[0, 1], mode="lines", line=line, showlegend=False, hoverinfo="skip")
     for i, (name, known) in enumerate(curves.items()):
         own = list(known.values())
@@ -287,16 +304,16 @@ def rates(
         }
         figure.add_scatter(
             x=list(known), y=[entry["rate"] for entry in own], mode="lines+markers", name=name, error_y=bars,
-            line={"color": COLORS[i % len(COLORS)]},
+            line={"color": LINE_COLORS[i % len(LINE_COLORS)]},
         )  # fmt: skip
-    figure = styled(figure, 340, x, y)
+    figure = apply_page_style(figure, 340, x, y)
     figure.update_yaxes(range=[-0.03, 1.03])
     if log_x:
         figure.update_xaxes(type="log")
     return figure
 
 
-def profiles(
+def profile_likelihood_figure(
     curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], level: float
 ) -> plotly.graph_objects.Figure:
     """Profile-likelihood figure: increase of chi2 over the parameter's value relative to the estimate."""
@@ -304,19 +321,19 @@ def profiles(
 
     figure = go.Figure()
     for i, (name, (ratio, delta)) in enumerate(curves.items()):
-        line = {"color": COLORS[i % len(COLORS)], "dash": "solid" if i < len(COLORS) else "dash"}
+        line = {"color": LINE_COLORS[i % len(LINE_COLORS)], "dash": "solid" if i < len(LINE_COLORS) else "dash"}
         figure.add_scatter(x=list(ratio), y=list(delta), mode="lines+markers", name=name, line=line)
-    figure.add_hline(y=level, line={"color": INK, "dash": "dot"}, annotation_text="95 %")
-    figure = styled(figure, 380, "value over best value", "chi2 above the best")
+    figure.add_hline(y=level, line={"color": TEXT_COLOR, "dash": "dot"}, annotation_text="95 %")
+    figure = apply_page_style(figure, 380, "value over best value", "chi2 above the best")
     figure.update_xaxes(type="log", range=[-1.0, 1.0])
     figure.update_yaxes(range=[-0.2, 2.5 * level])
     return figure
 
 
 def _thinned(count: int) -> NDArray[np.int64]:
-    if count <= LONGEST:
+    if count <= _MAX_CURVE_POINTS:
         return np.arange(count)
-    return np.unique(np.linspace(0, count - 1, LONGEST).astype(np.int64))
+    return np.unique(np.linspace(0, count - 1, _MAX_CURVE_POINTS).astype(np.int64))
 
 
 def _short(values: Array) -> NDArray[np.float32]:
@@ -325,10 +342,10 @@ def _short(values: Array) -> NDArray[np.float32]:
 
 
 def _times(t: Array) -> NDArray[np.floating]:
-    return np.asarray(t, float) if len(t) and np.nanmax(np.abs(t)) > EPOCH else _short(t)
+    return np.asarray(t, float) if len(t) and np.nanmax(np.abs(t)) > _MAX_SINGLE_PRECISION_TIME else _short(t)
 
 
-def styled(
+def apply_page_style(
     figure: plotly.graph_objects.Figure, height: int, x: str, y: str, log_y: bool = False
 ) -> plotly.graph_objects.Figure:
     """The given figure after setting height, axis titles, colors and fonts of the page."""
@@ -337,14 +354,14 @@ def styled(
         "margin": {"l": 70, "r": 20, "t": 30, "b": 45},
         "paper_bgcolor": "rgba(0,0,0,0)",
         "plot_bgcolor": "rgba(0,0,0,0)",
-        "font": {"family": "system-ui, sans-serif", "size": 13, "color": INK},
+        "font": {"family": "system-ui, sans-serif", "size": 13, "color": TEXT_COLOR},
         "legend": {"orientation": "h", "y": 1.0, "yanchor": "bottom", "x": 0},
         "hovermode": "closest",
-        "modebar": {"bgcolor": "rgba(0,0,0,0)", "color": MEASURED, "activecolor": COLORS[0]},
+        "modebar": {"bgcolor": "rgba(0,0,0,0)", "color": MEASURED_COLOR, "activecolor": LINE_COLORS[0]},
     }
     figure.update_layout(**layout)
-    figure.update_xaxes(title_text=x or None, gridcolor=PALE, zeroline=False, linecolor=PALE)
-    figure.update_yaxes(gridcolor=PALE, zeroline=False, linecolor=PALE)
+    figure.update_xaxes(title_text=x or None, gridcolor=GRID_COLOR, zeroline=False, linecolor=GRID_COLOR)
+    figure.update_yaxes(gridcolor=GRID_COLOR, zeroline=False, linecolor=GRID_COLOR)
     if y:
         figure.update_yaxes(title_text=y)
     if log_y:

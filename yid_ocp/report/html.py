@@ -11,15 +11,15 @@ from importlib import util
 from pathlib import Path
 
 from yid_ocp.files import write_text
-from yid_ocp.report.blocks import Command, Statement, Table
-from yid_ocp.report.figures import DARK
-from yid_ocp.report.sections import SECTIONS, Findings, written_sections
-from yid_ocp.solvers.words import VERDICT_WORDS
+from yid_ocp.report.figures import DARK_MODE_COLORS
+from yid_ocp.report.sections import REPORT_SECTIONS, ReportData, render_sections
+from yid_ocp.report.summary_blocks import CodeBlock, SummaryStatement, SummaryTable
+from yid_ocp.solvers.fit_messages import VERDICT_WORDS
 
 log = logging.getLogger(__name__)
-ABOVE = 2
+_SHARED_SCRIPT_LEVELS = 2
 """Levels above a page where a script that it may share is looked for: a batch is two above the pages of its runs."""
-LONG = 24
+_WRAP_LENGTH = 24
 """Characters from which the cells of a column are wrapped."""
 _VERDICTS = {words: verdict for verdict, words in VERDICT_WORDS.items()}
 _NUMBER = re.compile(
@@ -27,11 +27,11 @@ _NUMBER = re.compile(
 )
 
 
-def write_report(path: Path, findings: Findings) -> bool:
+def write_report(path: Path, findings: ReportData) -> bool:
     """Write the HTML report and return whether it was written.
 
     Plotly's script is packed into it, so that it can be sent alone and needs no network; or it refers to a copy that
-    `share_script` left in its folder, or up to two above.
+    `write_shared_plotly_script` left in its folder, or up to two above.
 
     Parameters
     ----------
@@ -52,23 +52,23 @@ def write_report(path: Path, findings: Findings) -> bool:
         return False
     import jinja2
 
-    beside = {str(SECTIONS[name].folder) for name in SECTIONS}
+    beside = {str(REPORT_SECTIONS[name].template_folder) for name in REPORT_SECTIONS}
     loader = jinja2.ChoiceLoader([jinja2.PackageLoader("yid_ocp.report"), jinja2.FileSystemLoader(sorted(beside))])
     environment = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters |= {"number": number, "listed": cell_class, "verdict": _VERDICTS.get}
+    environment.filters |= {"number": _format_number, "listed": _column_classes, "verdict": _VERDICTS.get}
     environment.tests |= {
-        "statement": lambda block: isinstance(block, Statement),
-        "table": lambda block: isinstance(block, Table),
-        "command": lambda block: isinstance(block, Command),
+        "statement": lambda block: isinstance(block, SummaryStatement),
+        "table": lambda block: isinstance(block, SummaryTable),
+        "command": lambda block: isinstance(block, CodeBlock),
     }
-    sections = written_sections(findings, environment)
+    sections = render_sections(findings, environment)
     shared = _shared(path)
     page = environment.get_template("page.html").render(
         findings=findings,
         sections=sections,
-        dark=DARK,
+        dark=DARK_MODE_COLORS,
         shared=shared,
         packed="" if shared else _packed(),
     )
@@ -76,7 +76,7 @@ def write_report(path: Path, findings: Findings) -> bool:
     return True
 
 
-def share_script(folder: Path) -> None:
+def write_shared_plotly_script(folder: Path) -> None:
     """Write one copy of plotly's script to a folder, shared by pages up to two levels below.
 
     Raises
@@ -101,7 +101,7 @@ def _script_name() -> str:
 
 def _shared(path: Path) -> str:
     """Where a page finds a script that it shares, relative to itself; empty where there is none."""
-    folders = [path.parent, *path.parent.parents][: ABOVE + 1]
+    folders = [path.parent, *path.parent.parents][: _SHARED_SCRIPT_LEVELS + 1]
     found = next((folder / _script_name() for folder in folders if (folder / _script_name()).is_file()), None)
     return "" if found is None else Path(os.path.relpath(found, path.parent)).as_posix()
 
@@ -114,20 +114,20 @@ def _packed() -> str:
     return base64.b64encode(small).decode("ascii")
 
 
-def number(value: object, digits: int = 4) -> str:
+def _format_number(value: object, digits: int = 4) -> str:
     """A number formatted for display; a dash for None."""
     if value is None:
         return "–"
     return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
 
 
-def cell_class(table: Table) -> list[str]:
-    """CSS class of every column (`number`, `long` or `text`); empty for columns without an entry."""
+def _column_classes(table: SummaryTable) -> list[str]:
+    """CSS class of every column (`_format_number`, `long` or `text`); empty for columns without an entry."""
     head, *body = table.rows
     columns = [[row[i] for row in body] for i in range(len(head))]
     kinds: list[str] = []
     for cells in columns:
         numbers, longest = all(map(_NUMBER.match, cells)), max(map(len, cells), default=0)
         named = any(cells) or head[len(kinds)]
-        kinds.append("" if not named else "number" if numbers else "long" if longest > LONG else "text")
+        kinds.append("" if not named else "number" if numbers else "long" if longest > _WRAP_LENGTH else "text")
     return kinds

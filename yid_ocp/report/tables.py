@@ -7,17 +7,17 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from yid_ocp.data.doubt import CAUSES
-from yid_ocp.report.blocks import Block, Command, Rows, Statement, Table
-from yid_ocp.solvers.words import VERDICT_WORDS
+from yid_ocp.data.issues import ISSUE_CAUSES
+from yid_ocp.report.summary_blocks import CodeBlock, SummaryBlock, SummaryStatement, SummaryTable, TableRows
+from yid_ocp.solvers.fit_messages import VERDICT_WORDS
 
-MOST_ALIKE = 3  # doubts of one kind
-MOST_OFFSETS = 4  # recordings side by side
-LEAST_SHARE, MOST_WINDOWS = 0.005, 6  # of places that are listed
-MOST_POINTS = 4  # a group of more points is shown as a whole; result.json has every point
+_MAX_ISSUES_PER_CAUSE = 3  # doubts of one kind
+_MAX_OFFSET_RECORDINGS = 4  # recordings side by side
+_MIN_GAP_SHARE, _MAX_WINDOWS = 0.005, 6  # of places that are listed
+_MAX_SINGLE_CHANNELS = 4  # a group of more points is shown as a whole; result.json has every point
 
 
-GUESSES = {
+_BASELINE_DESCRIPTIONS = {
     "stays": "points stay where they were first seen",
     "zero": "an effort of zero",
     "moves_with_clamps": "points move with the mean of the clamps",
@@ -26,61 +26,63 @@ GUESSES = {
 """Predictions without a model."""
 
 
-def readable(unit: str) -> tuple[float, str]:
+def display_scale_and_unit(unit: str) -> tuple[float, str]:
     """Scale factor and unit for display: metres become millimetres, other units stay."""
     return (1e3, "mm") if unit == "m" else (1.0, unit)
 
 
-def error_words(value: float | None, unit: str, digits: int = 3) -> tuple[str, str]:
+def format_error_and_unit(value: float | None, unit: str, digits: int = 3) -> tuple[str, str]:
     """Formatted value and display unit of an error; a dash for None."""
-    factor, shown = readable(unit)
+    factor, shown = display_scale_and_unit(unit)
     return ("–" if value is None else f"{factor * value:.{digits}g}"), shown
 
 
 @dataclass(frozen=True)
-class DoubtRow:
-    """One issue of a recording; `evidence` is the ratio of the statistic to its limit."""
+class _IssueRow:
+    """One issue of a recording; `limit_ratio` is the ratio of the statistic to its limit."""
 
     cause: str
     where: str
-    sure: str
-    evidence: float
+    confidence: str
+    limit_ratio: float
     what: str
     advice: str
     setting: str
 
 
-def doubt_rows(result: Mapping[str, Any]) -> list[DoubtRow]:
-    """Issues of a result for display: at most `MOST_ALIKE` per cause, then the number of further ones."""
-    rows: list[DoubtRow] = []
+def _issue_rows(result: Mapping[str, Any]) -> list[_IssueRow]:
+    """Issues of a result for display: at most `_MAX_ISSUES_PER_CAUSE` per cause, then the number of further ones."""
+    rows: list[_IssueRow] = []
     for cause in dict.fromkeys(entry["cause"] for entry in result.get("doubts", ())):
         alike = [entry for entry in result["doubts"] if entry["cause"] == cause]
-        for i, entry in enumerate(alike[:MOST_ALIKE]):
-            last, more = i == MOST_ALIKE - 1, len(alike) - MOST_ALIKE
+        for i, entry in enumerate(alike[:_MAX_ISSUES_PER_CAUSE]):
+            last, more = i == _MAX_ISSUES_PER_CAUSE - 1, len(alike) - _MAX_ISSUES_PER_CAUSE
             where = entry["where"] + (f" and {more} more" if last and more > 0 else "")
             told = (entry["sure"], entry["evidence"], entry["what"], entry["advice"], entry["setting"])
-            rows.append(DoubtRow(CAUSES[cause], where, *told))
+            rows.append(_IssueRow(ISSUE_CAUSES[cause], where, *told))
     return rows
 
 
-def doubt_blocks(result: Mapping[str, Any]) -> list[Block]:
+def issue_blocks(result: Mapping[str, Any]) -> list[SummaryBlock]:
     """Summary blocks on issues of the recordings: a table and advice; empty without issues."""
-    shown = doubt_rows(result)
+    shown = _issue_rows(result)
     if not shown:
         return []
-    rows: Rows = [("in doubt", "where", "how sure", "times its limit")]
-    rows += [(row.cause, row.where, row.sure, f"{row.evidence:.3g}") for row in shown]
-    blocks: list[Block] = [Table(rows, "In doubt")]
+    rows: TableRows = [("in doubt", "where", "how sure", "times its limit")]
+    rows += [(row.cause, row.where, row.confidence, f"{row.limit_ratio:.3g}") for row in shown]
+    blocks: list[SummaryBlock] = [SummaryTable(rows, "In doubt")]
     for row in shown:
-        blocks.append(Statement(f"{row.cause}: {row.what}; {row.advice}"))
-        blocks += [Command(row.setting)] if row.setting else []
+        blocks.append(SummaryStatement(f"{row.cause}: {row.what}; {row.advice}"))
+        blocks += [CodeBlock(row.setting)] if row.setting else []
     if any(entry["weight"] != "warning" for entry in result["doubts"]):
-        blocks.append(Statement("no number is said to be found while a recording of the run is in doubt", "verdict"))
+        blocks.append(
+            SummaryStatement("no number is said to be found while a recording of the run is in doubt", "verdict")
+        )
     return blocks
 
 
 @dataclass(frozen=True)
-class HeldOutRow:
+class _HeldOutErrorRow:
     """Held-out error of one channel or group of points, with the error of every baseline [unit]."""
 
     recording: str
@@ -90,7 +92,7 @@ class HeldOutRow:
     baselines: Mapping[str, float]
 
 
-def held_out_rows(result: Mapping[str, Any]) -> list[HeldOutRow]:
+def held_out_error_rows(result: Mapping[str, Any]) -> list[_HeldOutErrorRow]:
     """Held-out errors of a `yid-solve/1` result for display."""
     units = {channel: entry["unit"] for channel, entry in result["residuals"].items()}
     rows = []
@@ -100,7 +102,7 @@ def held_out_rows(result: Mapping[str, Any]) -> list[HeldOutRow]:
                 continue
             members = [unit for name, unit in units.items() if name == channel or name.startswith(f"{channel}.")]
             baselines = {name: errors[channel] for name, errors in entry["baselines"].items() if channel in errors}
-            rows.append(HeldOutRow(entry["recording"], channel, rmse, members[0] if members else "", baselines))
+            rows.append(_HeldOutErrorRow(entry["recording"], channel, rmse, members[0] if members else "", baselines))
     return rows
 
 
@@ -108,14 +110,14 @@ def _hidden(errors: Mapping[str, float]) -> set[str]:
     hidden: set[str] = set()
     for group in errors:
         members = {channel for channel in errors if channel.startswith(f"{group}.")}
-        if len(members) > MOST_POINTS:
+        if len(members) > _MAX_SINGLE_CHANNELS:
             hidden |= members
         elif members:
             hidden.add(group)
     return hidden
 
 
-def medians(rows: Sequence[HeldOutRow]) -> list[HeldOutRow]:
+def median_error_rows(rows: Sequence[_HeldOutErrorRow]) -> list[_HeldOutErrorRow]:
     """Median error over recordings of every channel that at least three of them have."""
     channels = dict.fromkeys(row.channel for row in rows)
     result = []
@@ -125,18 +127,18 @@ def medians(rows: Sequence[HeldOutRow]) -> list[HeldOutRow]:
             names = [name for name in own[0].baselines if all(name in row.baselines for row in own)]
             baselines = {name: statistics.median(row.baselines[name] for row in own) for name in names}
             median = statistics.median(row.rmse for row in own)
-            result.append(HeldOutRow(f"median of {len(own)}", channel, median, own[0].unit, baselines))
+            result.append(_HeldOutErrorRow(f"median of {len(own)}", channel, median, own[0].unit, baselines))
     return result
 
 
-def guess_words(rows: Sequence[HeldOutRow]) -> str:
+def baseline_legend(rows: Sequence[_HeldOutErrorRow]) -> str:
     """Legend that explains the model-free baselines; empty without any."""
     named = dict.fromkeys(name for row in rows for name in row.baselines)
-    said = "; ".join(f"{name}, {GUESSES[name]}" for name in named if name in GUESSES)
+    said = "; ".join(f"{name}, {_BASELINE_DESCRIPTIONS[name]}" for name in named if name in _BASELINE_DESCRIPTIONS)
     return f"without a model: {said}" if said else ""
 
 
-def moved_sentences(result: Mapping[str, Any]) -> list[str]:
+def discretisation_sentences(result: Mapping[str, Any]) -> list[str]:
     """One sentence per refinement on the estimates that it shifts by more than their standard deviation."""
     said = []
     for key, words in (("links", "twice the links"), ("time_step", "half the time step")):
@@ -150,13 +152,13 @@ def moved_sentences(result: Mapping[str, Any]) -> list[str]:
     return said
 
 
-def offset_rows(result: Mapping[str, Any]) -> Rows:
+def torque_offset_rows(result: Mapping[str, Any]) -> TableRows:
     """Table rows of the torque offsets of a result, one per joint; empty without offsets."""
     offsets: Mapping[str, Mapping[str, Any]] = result.get("torque_offsets", {})
     if not offsets:
         return []
-    shown = dict(list(offsets.items())[:MOST_OFFSETS])
-    rows: Rows = [("torque offset [N m]", *shown, "expected")]
+    shown = dict(list(offsets.items())[:_MAX_OFFSET_RECORDINGS])
+    rows: TableRows = [("torque offset [N m]", *shown, "expected")]
     for joint in dict.fromkeys(joint for entry in shown.values() for joint in entry):
         own = [entry.get(joint) for entry in shown.values()]
         cells = ["" if known is None else f"{known['value']:.2f} ± {known['std']:.2f}" for known in own]
@@ -168,19 +170,19 @@ def offset_rows(result: Mapping[str, Any]) -> Rows:
     return rows
 
 
-def guess_sentences(worse: Sequence[Mapping[str, Any]]) -> list[str]:
+def worse_than_baseline_sentences(worse: Sequence[Mapping[str, Any]]) -> list[str]:
     """Sentences on channels that a model-free baseline predicts better than the model."""
     lines = []
-    for entry in worse[:MOST_POINTS]:
-        own, other = (" ".join(error_words(entry[key], entry["unit"])).rstrip() for key in ("rmse", "guess"))
+    for entry in worse[:_MAX_SINGLE_CHANNELS]:
+        own, other = (" ".join(format_error_and_unit(entry[key], entry["unit"])).rstrip() for key in ("rmse", "guess"))
         where = f"{entry['channel']} of {entry['recording']}"
         lines.append(f"worse than a guess without a model: {where}, {own} against {other} ({entry['baseline']})")
-    if len(worse) > MOST_POINTS:
-        lines.append(f"and so for {len(worse) - MOST_POINTS} more channels, in result.json")
+    if len(worse) > _MAX_SINGLE_CHANNELS:
+        lines.append(f"and so for {len(worse) - _MAX_SINGLE_CHANNELS} more channels, in result.json")
     return lines
 
 
-def blind_tables(result: Mapping[str, Any]) -> dict[str, Rows]:
+def blind_tables(result: Mapping[str, Any]) -> dict[str, TableRows]:
     """Tables of a `yid-blind/1` result by title: score, detection by size, experiments, cases."""
 
     def share(value: float | None, digits: int = 0) -> str:
@@ -192,7 +194,7 @@ def blind_tables(result: Mapping[str, Any]) -> dict[str, Rows]:
         return f"{share(own['rate'])} ({own['count']} of {own['of']}, {share(own['low'])} to {share(own['high'])})"
 
     sure = {name: rate(own) for name, own in result["intervals"].items()}
-    marks: Rows = [
+    marks: TableRows = [
         ("what", "value, and its binomial 95 % interval"),
         ("false alarms on clean data", sure["false_alarms"]),
         ("true kind and place first, of the gaps found", sure["kind_first"]),
@@ -210,15 +212,17 @@ def blind_tables(result: Mapping[str, Any]) -> dict[str, Rows]:
         ("their 95 % intervals that hold the truth", sure["interval_coverage"]),
         ("time of one diagnosis", "-" if result["seconds"] is None else f"{result['seconds']:.0f} s"),
     ]
-    sizes: Rows = [("size / detectable", "cases", "gap seen", "kind and place first", "alone or in a set of three")]
+    sizes: TableRows = [
+        ("size / detectable", "cases", "gap seen", "kind and place first", "alone or in a set of three")
+    ]
     for size, entry in result["detection"].items():
         own = result["detection_intervals"][size]
         sizes.append((size, str(entry["cases"]), *(rate(own[key]) for key in ("gap", "first", "right"))))
-    experiments: Rows = [("experiment", "cases", "false alarms", "right")]
+    experiments: TableRows = [("experiment", "cases", "false alarms", "right")]
     for name, own in result["experiments"].items():
         experiments.append((name, str(own["cases"]), rate(own["false_alarms"]), rate(own["right"])))
     told = ("case", "experiment", "sort", "truth", "size", "verdict", "added")
-    cases: Rows = [(*told, "not separable", "place", "closure", "best", "time")]
+    cases: TableRows = [(*told, "not separable", "place", "closure", "best", "time")]
     for entry in result["marks"]:
         wrong = "" if entry["right"] or entry["category"] == "finer_chain" else " (wrong)"
         cases.append((
@@ -242,11 +246,11 @@ def blind_tables(result: Mapping[str, Any]) -> dict[str, Rows]:
     return tables
 
 
-def _threshold_rows(calibration: Mapping[str, Any], rate: Callable[[Mapping[str, Any]], str]) -> Rows:
+def _threshold_rows(calibration: Mapping[str, Any], rate: Callable[[Mapping[str, Any]], str]) -> TableRows:
     """Quantiles of a `yid-calibration/1` beside what is set."""
     kinds = {"clean": "clean recordings", "named": "effects named right", "refitted": "effects refitted"}
     head = ("diagnosis.", "is", "advised", "what", "quantile", "coverage", "of", "effects beyond it, by size")
-    rows: Rows = [(*head, "strange ones beyond it")]
+    rows: TableRows = [(*head, "strange ones beyond it")]
     for own in calibration["rules"].values():
         name, value = own["setting"], "-" if own["quantile"] is None else f"{own['quantile']:.3g}"
         sizes = ", ".join(f"{size}: {rate(found)}" for size, found in own["effects_beyond"].items())
@@ -276,31 +280,31 @@ def blind_sentences(result: Mapping[str, Any]) -> list[str]:
     return said
 
 
-def gap_rows(result: Mapping[str, Any]) -> Rows:
+def gap_error_rows(result: Mapping[str, Any]) -> TableRows:
     """Table rows of held-out errors of a diagnosis: nominal model, and after each added effect."""
     before, steps = result["gap"]["before"], result.get("steps", ())
-    rows: Rows = [("held-out channel", "nominal", *(f"+ {step['added']}" for step in steps), "unit")]
+    rows: TableRows = [("held-out channel", "nominal", *(f"+ {step['added']}" for step in steps), "unit")]
     for channel, error in before["rmse"].items():
         unit = before["unit"][channel]
-        later = (error_words(step["rmse"].get(channel), unit)[0] for step in steps)
-        rows.append((channel, error_words(error, unit)[0], *later, readable(unit)[1]))
+        later = (format_error_and_unit(step["rmse"].get(channel), unit)[0] for step in steps)
+        rows.append((channel, format_error_and_unit(error, unit)[0], *later, display_scale_and_unit(unit)[1]))
     return rows
 
 
-def place_rows(result: Mapping[str, Any]) -> Rows:
+def gap_location_rows(result: Mapping[str, Any]) -> TableRows:
     """Table rows of gap locations with their share of the gap and time windows."""
-    rows: Rows = [("where", "share of the gap", "when [s]")]
+    rows: TableRows = [("where", "share of the gap", "when [s]")]
     for place in result.get("where", ()):
-        if place["share"] > LEAST_SHARE:
-            when = ", ".join(f"{begin:.3g} to {end:.3g}" for begin, end in place["windows"][:MOST_WINDOWS])
-            more = ", …" if len(place["windows"]) > MOST_WINDOWS else ""
+        if place["share"] > _MIN_GAP_SHARE:
+            when = ", ".join(f"{begin:.3g} to {end:.3g}" for begin, end in place["windows"][:_MAX_WINDOWS])
+            more = ", …" if len(place["windows"]) > _MAX_WINDOWS else ""
             rows.append((place["location"], f"{100 * place['share']:.1f} %", when + more))
     return rows
 
 
-def event_rows(result: Mapping[str, Any]) -> Rows:
+def event_rows(result: Mapping[str, Any]) -> TableRows:
     """Table rows of the events of a diagnosis."""
-    rows: Rows = [("event", "recording", "from [s]", "to [s]", "peak", "impulse", "unit")]
+    rows: TableRows = [("event", "recording", "from [s]", "to [s]", "peak", "impulse", "unit")]
     for own in result.get("events", ()):
         size = ("–" if own["peak"] is None else f"{own['peak']:.3g}", _impulse(own))
         times = ("–" if own[key] is None else f"{own[key]:.4g}" for key in ("from", "to"))
@@ -314,7 +318,7 @@ def _impulse(event: Mapping[str, Any]) -> str:
     return f"{event['impulse']:.3g}" + ("" if event["std"] is None else f" ± {event['std']:.2g}")
 
 
-def plan_rows(result: Mapping[str, Any]) -> Sequence[tuple[str, ...]]:
+def plan_joint_rows(result: Mapping[str, Any]) -> Sequence[tuple[str, ...]]:
     """Table rows of travel, velocity and effort that a plan requires of each joint."""
 
     def percent(share: float | None) -> str:
@@ -351,7 +355,7 @@ def plan_sentences(result: Mapping[str, Any]) -> list[str]:
     return said
 
 
-def information_rows(result: Mapping[str, Any]) -> Sequence[tuple[str, ...]]:
+def parameter_information_rows(result: Mapping[str, Any]) -> Sequence[tuple[str, ...]]:
     """Table rows of the parameter stds that an informative motion is expected to give."""
 
     def percent(std: float | None) -> str:
@@ -364,7 +368,7 @@ def information_rows(result: Mapping[str, Any]) -> Sequence[tuple[str, ...]]:
     return rows
 
 
-def distance_rows(result: Mapping[str, Any]) -> Sequence[tuple[str, ...]]:
+def effect_distance_rows(result: Mapping[str, Any]) -> Sequence[tuple[str, ...]]:
     """Table rows of distances between effects before and after an informative motion [std]."""
     rows = [("effect", "beside what could be", "apart in the recordings", "apart in this motion")]
     for own in result["distances"]:

@@ -7,51 +7,58 @@ import textwrap
 from collections.abc import Sequence
 
 from yid_ocp.data import Recording
-from yid_ocp.data.readers import Contents
-from yid_ocp.report.blocks import Block, Command, Rows, Table
+from yid_ocp.data.readers import FileContents
+from yid_ocp.report.summary_blocks import CodeBlock, SummaryBlock, SummaryTable, TableRows
 
-PROSE, NOTE, LONGEST = 100, 118, 200
+_PROSE_WIDTH, _NOTE_WIDTH, _MAX_UNWRAPPED_NOTE = 100, 118, 200
 """Widths to which sentences and notes are wrapped, and characters of a note that is left in one line."""
 
 
-def lines(blocks: Sequence[Block]) -> list[str]:
+def terminal_lines(blocks: Sequence[SummaryBlock]) -> list[str]:
     """Text lines of summary blocks: aligned tables, wrapped sentences and notes."""
     result: list[str] = []
     for block in blocks:
-        if isinstance(block, Table):
-            if block.long:
+        if isinstance(block, SummaryTable):
+            if block.is_page_only:
                 continue
-            result += ["", *table(block.rows), ""] if result and result[-1] else [*table(block.rows), ""]
-        elif isinstance(block, Command):
+            result += (
+                ["", *aligned_table_lines(block.rows), ""]
+                if result and result[-1]
+                else [*aligned_table_lines(block.rows), ""]
+            )
+        elif isinstance(block, CodeBlock):
             result += [f"  {line}" for line in block.text.splitlines()]
         elif block.text.endswith("."):
-            result += textwrap.wrap(block.text, PROSE)
-        elif len(block.text) > LONGEST:
-            result += textwrap.wrap(block.text, NOTE, subsequent_indent="  ")
+            result += textwrap.wrap(block.text, _PROSE_WIDTH)
+        elif len(block.text) > _MAX_UNWRAPPED_NOTE:
+            result += textwrap.wrap(block.text, _NOTE_WIDTH, subsequent_indent="  ")
         else:
             result.append(block.text)
     return result[:-1] if result and not result[-1] else result
 
 
-def recording_summary(recording: Recording) -> list[str]:
+def recording_summary_lines(recording: Recording) -> list[str]:
     """Text lines on the contents of a recording."""
-    rows: Rows = [("group", "samples", "names")]
+    rows: TableRows = [("group", "samples", "names")]
     for group in recording.groups:
         rows.append((getattr(group, "name", "joints"), str(len(group.t)), ", ".join(group.names)))
     notes = ["", *(f"note: {note}" for note in recording.notes)] if recording.notes else []
-    return [*table(rows), "", f"{recording.duration:g} s", *notes]
+    return [*aligned_table_lines(rows), "", f"{recording.duration:g} s", *notes]
 
 
-def contents_summary(contents: Contents) -> list[str]:
+def file_contents_lines(contents: FileContents) -> list[str]:
     """Text lines on the contents of a file of another tool."""
-    rows: Rows = [("source", "type", "count", "Hz", "becomes", "note")]
+    rows: TableRows = [("source", "type", "count", "Hz", "becomes", "note")]
     for source in contents.sources:
-        rate = f"{source.rate:.4g}" if math.isfinite(source.rate) else ""
-        rows.append((source.name, source.kind, str(source.count), rate, source.becomes or "-", source.note))
-    return [*table(rows), *(["", *(f"note: {note}" for note in contents.notes)] if contents.notes else [])]
+        rate = f"{source.mean_rate:.4g}" if math.isfinite(source.mean_rate) else ""
+        rows.append((source.name, source.kind, str(source.n_samples), rate, source.imported_as or "-", source.note))
+    return [
+        *aligned_table_lines(rows),
+        *(["", *(f"note: {note}" for note in contents.notes)] if contents.notes else []),
+    ]
 
 
-def table(rows: Rows) -> list[str]:
+def aligned_table_lines(rows: TableRows) -> list[str]:
     """Rows as aligned lines, the first one as head; columns without an entry are left out."""
     kept = [i for i in range(len(rows[0])) if any(row[i] for row in rows)]
     widths = [max(len(row[i]) for row in rows) for i in kept]

@@ -3,16 +3,16 @@
 from importlib import import_module
 from pkgutil import iter_modules
 
-from yid_ocp.sensors.base import SENSORS as SENSORS
+from yid_ocp.sensors.base import SENSOR_READERS as SENSOR_READERS
 from yid_ocp.sensors.base import Sensor as Sensor
+from yid_ocp.sensors.base import SensorContext as SensorContext
 from yid_ocp.sensors.base import SensorData as SensorData
-from yid_ocp.sensors.base import Surroundings as Surroundings
-from yid_ocp.sensors.base import joint_columns as joint_columns
+from yid_ocp.sensors.base import recorded_joint_columns as recorded_joint_columns
 from yid_ocp.sensors.base import sensor_function as sensor_function
 from yid_ocp.sensors.joints import EffortSensor as EffortSensor
 from yid_ocp.sensors.joints import PositionSensor as PositionSensor
 from yid_ocp.sensors.points import PointSensor as PointSensor
-from yid_ocp.sensors.points import camera_pose as camera_pose
+from yid_ocp.sensors.points import recorded_camera_pose as recorded_camera_pose
 
 # every file of this folder registers its sensors when it is imported
 for _module in iter_modules(__path__):

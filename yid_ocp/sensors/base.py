@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.errors import DataError, nearest
+from yid_ocp.errors import DataError, nearest_name_hint
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeState, System
@@ -27,12 +27,12 @@ class Sensor(Protocol):
     """
 
     @property
-    def group(self) -> str:
+    def group_name(self) -> str:
         """Name of the recording's group, such as `points_camera`."""
         ...
 
     @property
-    def channels(self) -> tuple[str, ...]:
+    def channel_names(self) -> tuple[str, ...]:
         """Names of the channels, in the order of the outputs."""
         ...
 
@@ -42,38 +42,38 @@ class Sensor(Protocol):
         ...
 
     @property
-    def width(self) -> int:
+    def outputs_per_channel(self) -> int:
         """Number of outputs per channel: 3 for a point, 1 for a joint."""
         ...
 
     @property
-    def frames(self) -> tuple[str, ...]:
+    def frame_names(self) -> tuple[str, ...]:
         """Name of the mechanism's frame that each channel marks; none for joints."""
         ...
 
     @property
-    def points(self) -> tuple[str, ...]:
+    def point_names(self) -> tuple[str, ...]:
         """Recorded name of the point that each channel marks; none for joints."""
         ...
 
     @property
-    def efforts(self) -> tuple[str, ...]:
+    def effort_joints(self) -> tuple[str, ...]:
         """Names of joints whose predicted effort it reads, filtered like the path; none for other sensors."""
         ...
 
     @property
-    def camera(self) -> Placement | None:
+    def camera_pose(self) -> Placement | None:
         """Pose of the camera in the world; None for any other sensor."""
         ...
 
     @property
-    def baseline(self) -> Literal["zero", "stays"]:
+    def naive_prediction(self) -> Literal["zero", "stays"]:
         """What a trivial prediction without a model is: zero, or the first measured value."""
         ...
 
     def __hash__(self) -> int: ...
 
-    def output(self, state: NodeState) -> ca.SX:
+    def ideal_reading(self, state: NodeState) -> ca.SX:
         """What the sensor reads at a node without effects, shape (width * len(channels), 1)."""
         ...
 
@@ -93,20 +93,20 @@ def sensor_function(system: System, sensor: Sensor, names: tuple[str, ...]) -> c
     casadi.Function
         (q, z, effort, theta) to (y, dy/dq, dy/dz, dy/deffort, dy/dtheta); effort has one entry for every joint.
     """
-    rows = {name: i for i, name in enumerate(system.internal)}
-    q, z = ca.SX.sym("q", system.size), ca.SX.sym("z", len(rows))
-    effort = ca.SX.sym("effort", system.size)
+    rows = {name: i for i, name in enumerate(system.internal_coordinates)}
+    q, z = ca.SX.sym("q", system.n_coordinates), ca.SX.sym("z", len(rows))
+    effort = ca.SX.sym("effort", system.n_coordinates)
     kinematics = forward_kinematics(system.mechanism, q)
-    state = NodeState(system, kinematics, q, z, effort, rows, sensor.camera)
-    parts = ca.vertsplit(sensor.output(state), sensor.width)
+    state = NodeState(system, kinematics, q, z, effort, rows, sensor.camera_pose)
+    parts = ca.vertsplit(sensor.ideal_reading(state), sensor.outputs_per_channel)
     read = []
-    marked = sensor.frames or (None,) * len(sensor.channels)
-    for channel, part, frame in zip(sensor.channels, parts, marked, strict=True):
+    marked = sensor.frame_names or (None,) * len(sensor.channel_names)
+    for channel, part, frame in zip(sensor.channel_names, parts, marked, strict=True):
         for effect in system.effects:
-            part = effect.measure(channel, part, replace(state, frame=frame))
+            part = effect.distorted_reading(channel, part, replace(state, marked_frame=frame))
         read.append(part)
     output = ca.vertcat(*read)
-    symbols = ca.vertcat(*system.internal.values()) if rows else ca.SX(0, 1)
+    symbols = ca.vertcat(*system.internal_coordinates.values()) if rows else ca.SX(0, 1)
     output = ca.densify(ca.substitute(output, symbols, z))
     chosen = ca.vertcat(*(system.parameters[name].symbol for name in names)) if names else ca.SX(0, 1)
     outputs = [output, *(ca.jacobian(output, x) for x in (q, z, effort, chosen))]
@@ -151,7 +151,7 @@ class JointData(Protocol):
     @property
     def effort_bias_std(self) -> float | Array | None: ...  # noqa: D102
     @property
-    def effort_taken_as(self) -> str: ...  # noqa: D102
+    def effort_kind_or_default(self) -> str: ...  # noqa: D102
     @property
     def position_std(self) -> float | Array | None: ...  # noqa: D102
 
@@ -171,7 +171,7 @@ EffortKind = Literal["sample", "mean", "command"]
 """What a recorded effort is: the sampled torque, its mean until the next sample, or a command held until then."""
 
 
-class Choice(Protocol):
+class SensorUsage(Protocol):
     """Settings of one recorded group, as in `problem.options.SensorOptions`."""
 
     @property
@@ -185,50 +185,50 @@ class Choice(Protocol):
     @property
     def bias_std(self) -> float | Mapping[str, float] | None: ...  # noqa: D102
     @property
-    def kind(self) -> EffortKind | None: ...  # noqa: D102
+    def effort_kind(self) -> EffortKind | None: ...  # noqa: D102
 
 
-class Smoothing(Protocol):
-    """A zero-phase low-pass filter, as in `problem.low_pass.LowPass`."""
+class SmoothingFilter(Protocol):
+    """A zero-phase low-pass filter, as in `problem.effort_filter.LowPassFilter`."""
 
     @property
     def cutoff(self) -> float: ...  # noqa: D102
     @property
-    def settling(self) -> float: ...  # noqa: D102
+    def settling_time(self) -> float: ...  # noqa: D102
 
     def __call__(self, t: Array, values: Array) -> Array: ...  # noqa: D102
-    def stride(self, step: float) -> int: ...  # noqa: D102
-    def gains(self, step: float) -> tuple[float, float, float]: ...  # noqa: D102
+    def decorrelation_stride(self, step: float) -> int: ...  # noqa: D102
+    def noise_gains(self, step: float) -> tuple[float, float, float]: ...  # noqa: D102
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class SensorContext:
     """What is needed to read a sensor's measurements from a recording.
 
     Attributes
     ----------
     system : System
     recording : RecordingData
-    choice : callable
+    sensor_usage : callable
         From a group's name to how it is used.
-    times : ndarray, shape (N + 1,)
+    node_times : ndarray, shape (N + 1,)
         Of the rollout's nodes [s].
     time_step : float
         Between them [s].
-    low_pass : Smoothing
+    effort_filter : Smoothing
         That of efforts of prescribed joints.
-    inertia : callable
+    joint_mass_matrices : callable
         From joint names and some of their configurations, shape (K, k), to their part of the mass matrix in each of
         them, shape (K, k, k) [kg m^2 or kg].
     """
 
     system: System
     recording: RecordingData
-    choice: Callable[[str], Choice]
-    times: Array
+    sensor_usage: Callable[[str], SensorUsage]
+    node_times: Array
     time_step: float
-    low_pass: Smoothing
-    inertia: Callable[[tuple[str, ...], Array], Array]
+    effort_filter: SmoothingFilter
+    joint_mass_matrices: Callable[[tuple[str, ...], Array], Array]
 
 
 @dataclass(frozen=True)
@@ -242,11 +242,11 @@ class SensorData:
         [s]
     value, std : ndarray, shape (M, k)
         Outputs, NaN where there is none, and the standard deviations of their noise, in the sensor's unit.
-    span : (int, int), optional
+    predictable_nodes : (int, int), optional
         First and last node at which the sensor can be predicted; all of them when absent.
     bias_std : ndarray, optional, shape (k,)
         Standard deviations of an error of every output that is constant in one recording; none when absent.
-    correlation : ndarray, optional, shape (M, k, k)
+    noise_correlation : ndarray, optional, shape (M, k, k)
         Of the noise of the outputs of one sample; none when absent.
     """
 
@@ -254,22 +254,22 @@ class SensorData:
     t: Array
     value: Array
     std: Array
-    span: tuple[int, int] | None = None
+    predictable_nodes: tuple[int, int] | None = None
     bias_std: Array | None = None
-    correlation: Array | None = None
+    noise_correlation: Array | None = None
 
 
-SENSORS: Registry[Callable[[Surroundings], list[SensorData]]] = Registry("kind of sensor")
+SENSOR_READERS: Registry[Callable[[SensorContext], list[SensorData]]] = Registry("kind of sensor")
 """Functions that take all measurements of one kind of sensor from a recording, by kind."""
 
 
-def joint_columns(joints: JointData, names: tuple[str, ...], where: str) -> list[int]:
+def recorded_joint_columns(joints: JointData, names: tuple[str, ...], where: str) -> list[int]:
     """Column indices of the named joints in a recording; `DataError` for a joint that is not recorded."""
     for name in names:
         if name not in joints.names:
             raise DataError(
                 f"joint '{name}' of the model is not recorded",
                 where=f"{where}: joints",
-                hint=nearest(name, joints.names),
+                hint=nearest_name_hint(name, joints.names),
             )
     return [joints.names.index(name) for name in names]

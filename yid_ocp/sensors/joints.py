@@ -11,14 +11,23 @@ import casadi as ca
 import numpy as np
 import scipy.special
 
-from yid_ocp.errors import ConfigError, DataError, nearest
+from yid_ocp.errors import ConfigError, DataError, nearest_name_hint
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeState
-from yid_ocp.sensors.base import SENSORS, Array, Choice, JointData, PointData, SensorData, Surroundings, joint_columns
+from yid_ocp.sensors.base import (
+    SENSOR_READERS,
+    Array,
+    JointData,
+    PointData,
+    SensorContext,
+    SensorData,
+    SensorUsage,
+    recorded_joint_columns,
+)
 
-EFFORT = "joints.effort"
-POSITION = "joints.position"
-DIFFERENCES = 6
+EFFORT_GROUP = "joints.effort"
+POSITION_GROUP = "joints.position"
+NOISE_DIFFERENCE_ORDER = 6
 """Order of the differences that estimate a noise level; they remove any motion that is slow against the sampling."""
 
 
@@ -26,31 +35,31 @@ DIFFERENCES = 6
 class _JointSensor:
     """A sensor of named joints with one output per joint and no points."""
 
-    joints: tuple[str, ...]
-    group: str
+    joint_names: tuple[str, ...]
+    group_name: str
 
     @property
-    def channels(self) -> tuple[str, ...]:
+    def channel_names(self) -> tuple[str, ...]:
         """`joints.QUANTITY.JOINT` for every joint."""
-        return tuple(f"{self.group}.{joint}" for joint in self.joints)
+        return tuple(f"{self.group_name}.{joint}" for joint in self.joint_names)
 
     @property
-    def width(self) -> int:
+    def outputs_per_channel(self) -> int:
         """One output per joint."""
         return 1
 
     @property
-    def frames(self) -> tuple[str, ...]:
+    def frame_names(self) -> tuple[str, ...]:
         """No points."""
         return ()
 
     @property
-    def points(self) -> tuple[str, ...]:
+    def point_names(self) -> tuple[str, ...]:
         """No points."""
         return ()
 
     @property
-    def camera(self) -> Placement | None:
+    def camera_pose(self) -> Placement | None:
         """No camera."""
         return None
 
@@ -59,7 +68,7 @@ class _JointSensor:
 class PositionSensor(_JointSensor):
     """Encoders of named driven joints."""
 
-    group: str = POSITION
+    group_name: str = POSITION_GROUP
 
     @property
     def unit(self) -> str:
@@ -67,25 +76,25 @@ class PositionSensor(_JointSensor):
         return "rad"
 
     @property
-    def efforts(self) -> tuple[str, ...]:
+    def effort_joints(self) -> tuple[str, ...]:
         """No efforts."""
         return ()
 
     @property
-    def baseline(self) -> Literal["zero", "stays"]:
+    def naive_prediction(self) -> Literal["zero", "stays"]:
         """Every joint keeps its first angle."""
         return "stays"
 
-    def output(self, state: NodeState) -> ca.SX:
+    def ideal_reading(self, state: NodeState) -> ca.SX:
         """Angles of the joints, shape (nj, 1) [rad]."""
-        return ca.vertcat(*(state.q[state.system.mechanism.joint_index(joint)] for joint in self.joints))
+        return ca.vertcat(*(state.q[state.system.mechanism.joint_index(joint)] for joint in self.joint_names))
 
 
 @dataclass(frozen=True)
 class EffortSensor(_JointSensor):
     """Efforts of named prescribed joints, predicted by the discrete inverse dynamics."""
 
-    group: str = EFFORT
+    group_name: str = EFFORT_GROUP
 
     @property
     def unit(self) -> str:
@@ -93,27 +102,27 @@ class EffortSensor(_JointSensor):
         return "N m"
 
     @property
-    def efforts(self) -> tuple[str, ...]:
+    def effort_joints(self) -> tuple[str, ...]:
         """All its joints."""
-        return self.joints
+        return self.joint_names
 
     @property
-    def baseline(self) -> Literal["zero", "stays"]:
+    def naive_prediction(self) -> Literal["zero", "stays"]:
         """Zero effort."""
         return "zero"
 
-    def output(self, state: NodeState) -> ca.SX:
+    def ideal_reading(self, state: NodeState) -> ca.SX:
         """Efforts of the joints, shape (nj, 1) [N m]."""
-        return ca.vertcat(*(state.effort[state.system.mechanism.joint_index(joint)] for joint in self.joints))
+        return ca.vertcat(*(state.effort[state.system.mechanism.joint_index(joint)] for joint in self.joint_names))
 
 
-def of_arm(group: PointData) -> bool:
+def is_measured_by_arm(group: PointData) -> bool:
     """Whether the arm itself measured these points, usually from its encoders."""
     return "arm" in (group.sensor, group.name.rpartition("_")[2])
 
 
-@SENSORS.register(POSITION)
-def measured_angles(around: Surroundings) -> list[SensorData]:
+@SENSOR_READERS.register(POSITION_GROUP)
+def read_joint_angles(around: SensorContext) -> list[SensorData]:
     """Measurements of driven joints' angles without the first sample, which defines the initial configuration.
 
     Raises
@@ -121,10 +130,10 @@ def measured_angles(around: Surroundings) -> list[SensorData]:
     ConfigError
         They are asked for beside points of the arm, which as a rule are computed from them.
     """
-    joints, choice, system = around.recording.joints, around.choice(POSITION), around.system
+    joints, choice, system = around.recording.joints, around.sensor_usage(POSITION_GROUP), around.system
     names = system.driven if joints is not None else ()
-    arm = [group.name for group in around.recording.points if of_arm(group)]
-    arm = [name for name in arm if around.choice(name).use is not False]
+    arm = [group.name for group in around.recording.points if is_measured_by_arm(group)]
+    arm = [name for name in arm if around.sensor_usage(name).use is not False]
     if joints is None or not names or choice.use is False or (choice.use is None and arm):
         return []
     if arm:
@@ -134,15 +143,15 @@ def measured_angles(around: Surroundings) -> list[SensorData]:
             hint=f"set sensors.{arm[0]}.use: false, or leave the encoders out",
         )
     where = around.recording.name
-    later = joints.t > around.times[0] + 1e-9
-    later &= joints.t <= around.times[-1] + 1e-9
-    value = joints.position[later][:, joint_columns(joints, names, where)]
-    std = np.broadcast_to(angle_std(joints, names, choice, where), value.shape)
+    later = joints.t > around.node_times[0] + 1e-9
+    later &= joints.t <= around.node_times[-1] + 1e-9
+    value = joints.position[later][:, recorded_joint_columns(joints, names, where)]
+    std = np.broadcast_to(joint_angle_noise_std(joints, names, choice, where), value.shape)
     return [SensorData(PositionSensor(names), joints.t[later], value, std)]
 
 
-@SENSORS.register(EFFORT)
-def measured_efforts(around: Surroundings) -> list[SensorData]:
+@SENSOR_READERS.register(EFFORT_GROUP)
+def read_joint_efforts(around: SensorContext) -> list[SensorData]:
     """Measurements of prescribed joints' efforts, low-pass filtered and thinned out to independent samples.
 
     Raises
@@ -150,17 +159,17 @@ def measured_efforts(around: Surroundings) -> list[SensorData]:
     DataError
         No noise level, or a recording too short for the filter.
     """
-    joints, choice = around.recording.joints, around.choice(EFFORT)
+    joints, choice = around.recording.joints, around.sensor_usage(EFFORT_GROUP)
     if joints is None or joints.effort is None or choice.use is False:
         return []
     names = tuple(name for name in around.system.prescribed if name in joints.names)
     if not names:
         return []
-    times, low_pass, where = around.times, around.low_pass, around.recording.name
-    effort = low_pass(joints.t, joints.effort[:, joint_columns(joints, names, where)])
+    times, low_pass, where = around.node_times, around.effort_filter, around.recording.name
+    effort = low_pass(joints.t, joints.effort[:, recorded_joint_columns(joints, names, where)])
     # what stands for an interval belongs to its middle
     period = float(np.median(np.diff(joints.t)))
-    late = 0.0 if joints.effort_taken_as == "sample" else 0.5 * period
+    late = 0.0 if joints.effort_kind_or_default == "sample" else 0.5 * period
     measured = np.stack([np.interp(times, joints.t + late, column) for column in effort.T], axis=1)
     # Smoothed values repeat their neighbours: only as many are kept as count as independent. Both ends are left out:
     # the filter sees one side alone there, the impulse at node 0 depends on the motion before the recording and that at
@@ -168,8 +177,8 @@ def measured_efforts(around: Surroundings) -> list[SensorData]:
     # Steps shorter than the recording's period have nodes between its samples, where nothing was measured.
     step, steps = around.time_step, len(times) - 1
     apart = max(1, round(period / step))
-    ends = apart * math.ceil(max(1, math.ceil(low_pass.settling / step)) / apart)
-    kept = np.arange(ends, steps + 1 - ends, apart * math.ceil(low_pass.stride(step) / apart))
+    ends = apart * math.ceil(max(1, math.ceil(low_pass.settling_time / step)) / apart)
+    kept = np.arange(ends, steps + 1 - ends, apart * math.ceil(low_pass.decorrelation_stride(step) / apart))
     if not len(kept):
         raise DataError(
             f"{steps * step:.3g} s of efforts are too short for a filter of {low_pass.cutoff:g} Hz",
@@ -178,43 +187,47 @@ def measured_efforts(around: Surroundings) -> list[SensorData]:
             hint="use a longer recording, or raise problem.path_cutoff",
         )
     std, correlation = _smoothed_effort_noise(around, names, choice, period, times[kept])
-    bias = torque_bias_std(joints, names, choice)
+    bias = joint_torque_bias_std(joints, names, choice)
     return [SensorData(EffortSensor(names), times[kept], measured[kept], std, (1, steps - 1), bias, correlation)]
 
 
 # -- noise levels -----------------------------------------------------------------------------------------------------
 
 
-def is_stated(joints: JointData, group: str, choice: Choice) -> bool:
+def is_noise_std_stated(joints: JointData, group: str, choice: SensorUsage) -> bool:
     """Whether the recording or the settings state the noise std of `joints.effort` or `joints.position`."""
-    recorded = joints.effort_std if group == EFFORT else joints.position_std
+    recorded = joints.effort_std if group == EFFORT_GROUP else joints.position_std
     return choice.std is not None or recorded is not None
 
 
-def angle_std(joints: JointData, names: Sequence[str], choice: Choice, where: str) -> Array:
+def joint_angle_noise_std(joints: JointData, names: Sequence[str], choice: SensorUsage, where: str) -> Array:
     """Noise standard deviation of driven joints' encoders, stated or estimated, shape (len(names),) [rad]."""
     given = choice.std if choice.std is not None else joints.position_std
     if given is None:
-        return estimated_std(joints.position[:, joint_columns(joints, tuple(names), where)], where, POSITION, "rad")
-    return by_joint(given, joints.names, names, "sensors.joints.position.std")
+        return _estimated_noise_std(
+            joints.position[:, recorded_joint_columns(joints, tuple(names), where)], where, POSITION_GROUP, "rad"
+        )
+    return values_by_joint(given, joints.names, names, "sensors.joints.position.std")
 
 
-def torque_std(joints: JointData, names: Sequence[str], choice: Choice, where: str) -> Array:
+def joint_torque_noise_std(joints: JointData, names: Sequence[str], choice: SensorUsage, where: str) -> Array:
     """Noise standard deviation of driven joints' recorded torques, stated or estimated, shape (len(names),) [N m]."""
     given = choice.std if choice.std is not None else joints.effort_std
     if given is None:
         assert joints.effort is not None
-        return estimated_std(joints.effort[:, joint_columns(joints, tuple(names), where)], where, EFFORT, "N m")
-    return by_joint(given, joints.names, names, "sensors.joints.effort.std")
+        return _estimated_noise_std(
+            joints.effort[:, recorded_joint_columns(joints, tuple(names), where)], where, EFFORT_GROUP, "N m"
+        )
+    return values_by_joint(given, joints.names, names, "sensors.joints.effort.std")
 
 
-def torque_bias_std(joints: JointData, names: Sequence[str], choice: Choice) -> Array:
+def joint_torque_bias_std(joints: JointData, names: Sequence[str], choice: SensorUsage) -> Array:
     """Standard deviation of a constant error of recorded torques, zero if unknown, shape (len(names),) [N m]."""
     given = choice.bias_std if choice.bias_std is not None else joints.effort_bias_std
-    return by_joint(0.0 if given is None else given, joints.names, names, "sensors.joints.effort.bias_std")
+    return values_by_joint(0.0 if given is None else given, joints.names, names, "sensors.joints.effort.bias_std")
 
 
-def estimated_std(values: Array, where: str, group: str, unit: str) -> Array:
+def _estimated_noise_std(values: Array, where: str, group: str, unit: str) -> Array:
     """White-noise standard deviation of evenly sampled channels, estimated from high-order differences.
 
     Parameters
@@ -228,33 +241,33 @@ def estimated_std(values: Array, where: str, group: str, unit: str) -> Array:
     ndarray, shape (k,)
         Whatever else is as fast as the sampling counts as noise, so that this is rather too much than too little.
     """
-    if len(values) <= DIFFERENCES:
+    if len(values) <= NOISE_DIFFERENCE_ORDER:
         raise DataError(
             f"{len(values)} samples are too few to see the noise of {group}",
             where=where,
-            allowed=f"more than {DIFFERENCES}",
+            allowed=f"more than {NOISE_DIFFERENCE_ORDER}",
             hint=f"set sensors.{group}.std [{unit}]",
         )
-    size = math.sqrt(scipy.special.comb(2 * DIFFERENCES, DIFFERENCES))
-    found = np.sqrt(np.mean(np.diff(values, DIFFERENCES, axis=0) ** 2, axis=0)) / size
+    size = math.sqrt(scipy.special.comb(2 * NOISE_DIFFERENCE_ORDER, NOISE_DIFFERENCE_ORDER))
+    found = np.sqrt(np.mean(np.diff(values, NOISE_DIFFERENCE_ORDER, axis=0) ** 2, axis=0)) / size
     return np.asarray(found)
 
 
-def by_joint(
+def values_by_joint(
     given: float | Array | Mapping[str, float], recorded: Sequence[str], names: Sequence[str], key: str
 ) -> Array:
     """One value per joint in `names`, from one value for all, one per recorded joint, or a mapping."""
     if isinstance(given, Mapping):
         for name in names:
             if name not in given:
-                raise ConfigError(f"joint '{name}' has no value", where=key, hint=nearest(name, given))
+                raise ConfigError(f"joint '{name}' has no value", where=key, hint=nearest_name_hint(name, given))
         return np.array([float(given[name]) for name in names])
     wide = np.broadcast_to(np.asarray(given, float), (len(recorded),))
     return wide[[list(recorded).index(name) for name in names]]
 
 
 def _smoothed_effort_noise(
-    around: Surroundings, names: tuple[str, ...], choice: Choice, period: float, times: Array
+    around: SensorContext, names: tuple[str, ...], choice: SensorUsage, period: float, times: Array
 ) -> tuple[Array, Array | None]:
     """Noise of filtered efforts at some times, from the effort sensors and from accelerations of noisy encoders.
 
@@ -276,17 +289,17 @@ def _smoothed_effort_noise(
             where=where,
             hint="set sensors.joints.effort.std [N m], from a stretch at rest or the data sheet",
         )
-    std = by_joint(given, joints.names, names, "sensors.joints.effort.std")
-    value_gain, _, second_gain = around.low_pass.gains(period)
-    encoders = around.choice(POSITION)
+    std = values_by_joint(given, joints.names, names, "sensors.joints.effort.std")
+    value_gain, _, second_gain = around.effort_filter.noise_gains(period)
+    encoders = around.sensor_usage(POSITION_GROUP)
     known = encoders.std if encoders.std is not None else joints.position_std
-    angle = by_joint(0.0 if known is None else known, joints.names, names, "sensors.joints.position.std")
+    angle = values_by_joint(0.0 if known is None else known, joints.names, names, "sensors.joints.position.std")
     own = (std * value_gain) ** 2
     if not np.any(angle > 0):
         return np.broadcast_to(np.sqrt(own), (len(times), len(names))), None
-    measured = joints.position[:, joint_columns(joints, names, where)]
+    measured = joints.position[:, recorded_joint_columns(joints, names, where)]
     angles = np.stack([np.interp(times, joints.t, column) for column in measured.T], axis=1)
-    by_acceleration = around.inertia(names, angles) * (angle * second_gain)
+    by_acceleration = around.joint_mass_matrices(names, angles) * (angle * second_gain)
     covariance = by_acceleration @ by_acceleration.transpose(0, 2, 1) + np.diag(own)
     total = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     return total, covariance / (total[:, :, None] * total[:, None, :])

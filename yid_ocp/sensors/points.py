@@ -9,10 +9,10 @@ from typing import Literal
 import casadi as ca
 import numpy as np
 
-from yid_ocp.errors import ConfigError, DataError, nearest
+from yid_ocp.errors import ConfigError, DataError, nearest_name_hint
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeState
-from yid_ocp.sensors.base import SENSORS, Choice, PointData, SensorData, Surroundings
+from yid_ocp.sensors.base import SENSOR_READERS, PointData, SensorContext, SensorData, SensorUsage
 
 
 @dataclass(frozen=True)
@@ -21,25 +21,25 @@ class PointSensor:
 
     Attributes
     ----------
-    group : str
+    group_name : str
         The recording's group, `points_camera` for example.
-    points : tuple of str
+    point_names : tuple of str
         Names in the recording.
-    frames : tuple of str
+    frame_names : tuple of str
         Frames of the mechanism that they mark.
-    pose : tuple of tuple of float, optional
+    camera_pose_matrix : tuple of tuple of float, optional
         4x4 pose of the camera in the world; None for a sensor that is no camera.
     """
 
-    group: str
-    points: tuple[str, ...]
-    frames: tuple[str, ...]
-    pose: tuple[tuple[float, ...], ...] | None = None
+    group_name: str
+    point_names: tuple[str, ...]
+    frame_names: tuple[str, ...]
+    camera_pose_matrix: tuple[tuple[float, ...], ...] | None = None
 
     @property
-    def channels(self) -> tuple[str, ...]:
+    def channel_names(self) -> tuple[str, ...]:
         """`group.point` for every point."""
-        return tuple(f"{self.group}.{point}" for point in self.points)
+        return tuple(f"{self.group_name}.{point}" for point in self.point_names)
 
     @property
     def unit(self) -> str:
@@ -47,32 +47,32 @@ class PointSensor:
         return "m"
 
     @property
-    def width(self) -> int:
+    def outputs_per_channel(self) -> int:
         """Three coordinates per point."""
         return 3
 
     @property
-    def efforts(self) -> tuple[str, ...]:
+    def effort_joints(self) -> tuple[str, ...]:
         """No joints."""
         return ()
 
     @property
-    def camera(self) -> Placement | None:
+    def camera_pose(self) -> Placement | None:
         """Pose of the camera; None where no camera measures."""
-        return None if self.pose is None else Placement.of(self.pose)
+        return None if self.camera_pose_matrix is None else Placement.from_matrix(self.camera_pose_matrix)
 
     @property
-    def baseline(self) -> Literal["zero", "stays"]:
+    def naive_prediction(self) -> Literal["zero", "stays"]:
         """Every point stays where it was first seen."""
         return "stays"
 
-    def output(self, state: NodeState) -> ca.SX:
+    def ideal_reading(self, state: NodeState) -> ca.SX:
         """Positions of all points, stacked, shape (3 np, 1) [m]."""
-        return ca.vertcat(*(state.kinematics.position(frame) for frame in self.frames))
+        return ca.vertcat(*(state.kinematics.frame_position(frame) for frame in self.frame_names))
 
 
-@SENSORS.register("points")
-def measured_points(around: Surroundings) -> list[SensorData]:
+@SENSOR_READERS.register("points")
+def read_point_groups(around: SensorContext) -> list[SensorData]:
     """Measurements of every used group of points.
 
     Raises
@@ -81,13 +81,13 @@ def measured_points(around: Surroundings) -> list[SensorData]:
         A group none of whose points is a frame, a chosen point that is not in it, or no noise level.
     """
     return [
-        _points(around, group, around.choice(group.name))
+        _points(around, group, around.sensor_usage(group.name))
         for group in around.recording.points
-        if around.choice(group.name).use is not False
+        if around.sensor_usage(group.name).use is not False
     ]
 
 
-def _points(around: Surroundings, group: PointData, choice: Choice) -> SensorData:
+def _points(around: SensorContext, group: PointData, choice: SensorUsage) -> SensorData:
     where = around.recording.name
     wanted = choice.points if choice.points is not None else group.names
     frames = {p: choice.frames.get(p, p) for p in wanted}
@@ -99,22 +99,24 @@ def _points(around: Surroundings, group: PointData, choice: Choice) -> SensorDat
             raise DataError(
                 f"point '{point}' of '{group.name}' marks the frame '{frames[point]}', which the model does not have",
                 where=where,
-                hint=f"{nearest(frames[point], mechanism.frames)} (see sensors.{group.name})",
+                hint=f"{nearest_name_hint(frames[point], mechanism.frames)} (see sensors.{group.name})",
             )
     if not known:
         raise DataError(
             f"none of the points of group '{group.name}' is a frame of the model",
             where=where,
-            allowed=", ".join(around.system.points),
+            allowed=", ".join(around.system.point_frames),
             hint=f"name their frames (or T1:40%) under sensors.{group.name}.frames, or switch the group off",
         )
     for point in known:
         if point not in group.names:
             raise DataError(
-                f"point '{point}' is not in group '{group.name}'", where=where, hint=nearest(point, group.names)
+                f"point '{point}' is not in group '{group.name}'",
+                where=where,
+                hint=nearest_name_hint(point, group.names),
             )
     columns = [group.names.index(point) for point in known]
-    inside = (group.t >= around.times[0] - 1e-9) & (group.t <= around.times[-1] + 1e-9)
+    inside = (group.t >= around.node_times[0] - 1e-9) & (group.t <= around.node_times[-1] + 1e-9)
     value = group.position[inside][:, columns].reshape(int(inside.sum()), 3 * len(columns))
     if isinstance(choice.std, Mapping):
         raise ConfigError("a group of points takes one std", where=f"sensors.{group.name}.std")
@@ -128,11 +130,11 @@ def _points(around: Surroundings, group: PointData, choice: Choice) -> SensorDat
             where=where,
             hint=f"set sensors.{group.name}.std [m]",
         )
-    sensor = PointSensor(group.name, known, tuple(frames[p] for p in known), camera_pose(group))
+    sensor = PointSensor(group.name, known, tuple(frames[p] for p in known), recorded_camera_pose(group))
     return SensorData(sensor, group.t[inside], value, std)
 
 
-def camera_pose(group: PointData) -> tuple[tuple[float, ...], ...] | None:
+def recorded_camera_pose(group: PointData) -> tuple[tuple[float, ...], ...] | None:
     """4x4 pose of the camera that saw a group of points; None where no camera saw it.
 
     A group is a camera's when it has a pose, or when its name or its sensor says `camera`; without a pose the camera

@@ -16,18 +16,25 @@ import numpy as np
 import threadpoolctl
 from numpy.typing import NDArray
 
+from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import ConfigError, YidError
-from yid_ocp.problem.evaluation import Evaluation, WarmStart
-from yid_ocp.problem.null_test import USUAL, GapLimits
-from yid_ocp.problem.outcome import EpisodeResult
-from yid_ocp.problem.problem import EstimationProblem
-from yid_ocp.problem.validation import Series, series
+from yid_ocp.problem.estimation_problem import EstimationProblem
+from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
+from yid_ocp.problem.null_test import DEFAULT_GAP_CRITERIA, GapCriteria
+from yid_ocp.problem.prediction_errors import ChannelPrediction, channel_predictions
+from yid_ocp.problem.prediction_result import EpisodePrediction
 from yid_ocp.registry import Registry
-from yid_ocp.shown import Shown, Summary, counted
-from yid_ocp.solvers.judgement import Estimate, Fit, covariance_of_fit, estimates, judge_fit, uncertainty
-from yid_ocp.solvers.linear_model import settled
-from yid_ocp.solvers.off_neutral import off_neutral
-from yid_ocp.solvers.words import VERDICT_WORDS, finite, parameter_words
+from yid_ocp.solvers.effect_initialization import initialize_free_effects
+from yid_ocp.solvers.fit_messages import VERDICT_WORDS, finite_or_none, parameter_text
+from yid_ocp.solvers.linear_model import is_stationary
+from yid_ocp.solvers.uncertainty import (
+    GoodnessOfFit,
+    ParameterEstimate,
+    assess_goodness_of_fit,
+    covariance_and_chi2,
+    covariance_of_fit,
+    parameter_estimates,
+)
 
 if TYPE_CHECKING:
     import pandas
@@ -55,9 +62,9 @@ class Iterate:
     iteration : int
     cost : float
     x : ndarray, shape (nx,)
-    gradient : float
+    gradient_norm : float
         Largest scaled component of the projected gradient.
-    evaluations : int
+    n_evaluations : int
         Rollouts of all recordings so far.
     seconds : float
         Wall time so far.
@@ -68,14 +75,14 @@ class Iterate:
     iteration: int
     cost: float
     x: Array
-    gradient: float
-    evaluations: int
+    gradient_norm: float
+    n_evaluations: int
     seconds: float
     note: str = ""
 
 
 @dataclass(frozen=True, repr=False)
-class Solution(Shown):
+class Solution(ReprMixin):
     """Solution of an estimation problem: estimates, covariance, goodness of fit and history.
 
     Attributes
@@ -83,54 +90,54 @@ class Solution(Shown):
     status : Status
     message : str
         Why it ended, and what to try where it did not converge.
-    names : tuple of str
+    unknown_names : tuple of str
         Unknowns, in the order of `x`.
     x : ndarray, shape (nx,)
         Unknown vector of lowest cost.
     covariance : ndarray, shape (nx, nx)
         From the data and stated priors (the weak prior excluded), scaled by chi2 per degree of freedom above one, and
-        counting the misfit where the model does not explain the data (`judgement.counting_misfit`).
+        counting the misfit where the model does not explain the data (`judgement._misfit_sandwich_covariance`).
     parameters : dict of str to Estimate
         Free parameters shared by all recordings, and the fixed ones that the problem's model has.
     cost : float
-    fit : Fit
+    goodness_of_fit : Fit
         Whether the model explains the recordings.
     history : tuple of Iterate
-    iterations, evaluations : int
-    seconds : float
+    n_iterations, n_evaluations : int
+    wall_time : float
     evaluation : Evaluation or None
         At `x`.
-    method : str
+    solver_name : str
     problem : EstimationProblem, optional
         Problem as solved, whitened at `x`.
     """
 
     status: Status
     message: str
-    names: tuple[str, ...]
+    unknown_names: tuple[str, ...]
     x: Array
     covariance: Array
-    parameters: dict[str, Estimate]
+    parameters: dict[str, ParameterEstimate]
     cost: float
-    fit: Fit
+    goodness_of_fit: GoodnessOfFit
     history: tuple[Iterate, ...]
-    iterations: int
-    evaluations: int
-    seconds: float
+    n_iterations: int
+    n_evaluations: int
+    wall_time: float
     evaluation: Evaluation | None
-    method: str
+    solver_name: str
     problem: EstimationProblem | None = None
 
-    def _summary(self) -> Summary:
+    def _summary(self) -> ReprSummary:
         free = {name: entry for name, entry in self.parameters.items() if entry.free}
-        words = {name: parameter_words(e.value, finite(e.std), e.interval) for name, e in free.items()}
+        words = {name: parameter_text(e.value, finite_or_none(e.std), e.interval) for name, e in free.items()}
         rows = [("parameter", "value", "unit", "")]
         rows += [(name, words[name], e.unit, VERDICT_WORDS[e.verdict]) for name, e in free.items()]
         told = [f"{name} = {words[name]} {e.unit}" for name, e in free.items() if e.verdict == "identifiable"][:3]
-        more = f"and {counted(len(free) - len(told), 'more parameter')}" if len(free) > len(told) else ""
-        fit = f"chi2 per degree of freedom {self.fit.chi2_per_dof:.3g}"
-        how = f"{self.status.value.replace('_', ' ')} by {self.method}"
-        return Summary(", ".join(filter(None, (how, *told, more, fit))), rows)
+        more = f"and {count_with_noun(len(free) - len(told), 'more parameter')}" if len(free) > len(told) else ""
+        fit = f"chi2 per degree of freedom {self.goodness_of_fit.chi2_per_dof:.3g}"
+        how = f"{self.status.value.replace('_', ' ')} by {self.solver_name}"
+        return ReprSummary(", ".join(filter(None, (how, *told, more, fit))), rows)
 
     @property
     def std(self) -> dict[str, float]:
@@ -138,28 +145,30 @@ class Solution(Shown):
         return {name: entry.std for name, entry in self.parameters.items() if entry.free}
 
     @cached_property
-    def predicted(self) -> tuple[EpisodeResult | str, ...]:
+    def episode_predictions(self) -> tuple[EpisodePrediction | str, ...]:
         """Prediction of each recording from its recorded torques minus their offsets; empty without a result.
 
         A recording whose rollout fails under these torques has the error message in place of a prediction.
         """
-        if self.evaluation is None or self.problem is None or not self.problem.disturbed:
-            return () if self.evaluation is None else self.evaluation.episodes
-        problem = self.problem.weighted_by_sensors()
-        found = problem.evaluate(self.x, False, self.evaluation.warm)
+        if self.evaluation is None or self.problem is None or not self.problem.has_process_noise:
+            return () if self.evaluation is None else self.evaluation.episode_predictions
+        problem = self.problem.whitened_by_sensor_noise()
+        found = problem.evaluate(self.x, False, self.evaluation.equilibrium_guesses)
         if found.ok:
-            return found.episodes
+            return found.episode_predictions
         return tuple(
-            problem.predictor.run(episode, *problem.split(self.x, i), False)
+            problem.predictor.predict_episode(episode, *problem.split(self.x, i), False)
             for i, episode in enumerate(problem.episodes)
         )
 
-    def residuals(self) -> tuple[Series, ...]:
+    def channel_predictions(self) -> tuple[ChannelPrediction, ...]:
         """Measured and predicted samples of every channel of the recordings at `x`; empty without a result."""
-        pairs = zip(() if self.problem is None else self.problem.episodes, self.predicted, strict=False)
-        return tuple(s for episode, result in pairs if not isinstance(result, str) for s in series(episode, result))
+        pairs = zip(() if self.problem is None else self.problem.episodes, self.episode_predictions, strict=False)
+        return tuple(
+            s for episode, result in pairs if not isinstance(result, str) for s in channel_predictions(episode, result)
+        )
 
-    def to_frame(self) -> pandas.DataFrame:
+    def to_dataframe(self) -> pandas.DataFrame:
         """Parameters as a pandas data frame, free ones first: value, std, lower, upper, unit, verdict, free, initial.
 
         `lower` and `upper` are the 95 % interval, infinite at an open end and where nothing is known.
@@ -174,19 +183,19 @@ class Solution(Shown):
         except ImportError as error:
             raise ConfigError("pandas is not installed", hint="pip install 'yid-ocp[pandas]'") from error
         entries = sorted(self.parameters.items(), key=lambda entry: not entry[1].free)
-        rows = {name: (e.value, e.std, *e.ends, e.unit, e.verdict, e.free, e.initial) for name, e in entries}
+        rows = {name: (e.value, e.std, *e.interval_ends, e.unit, e.verdict, e.free, e.initial) for name, e in entries}
         columns = ["value", "std", "lower", "upper", "unit", "verdict", "free", "initial"]
         return pandas.DataFrame.from_dict(rows, orient="index", columns=columns).rename_axis("parameter")
 
 
-Callback = Callable[[Iterate], None]
+IterationCallback = Callable[[Iterate], None]
 
 
 @dataclass(frozen=True)
-class Outcome:
+class SolverResult:
     """Raw result of a solver: best unknown vector, termination status, message and history.
 
-    `warm` holds guesses of the equilibria at the best point, where known. `worn_out` tells that the search ended
+    `equilibrium_guesses` holds guesses of the equilibria at the best point, where known. `stopped_at_noise_level` tells that the search ended
     because many steps reduced the cost negligibly compared with the noise.
     """
 
@@ -194,9 +203,9 @@ class Outcome:
     message: str
     x: Array
     history: tuple[Iterate, ...]
-    evaluations: int
-    warm: WarmStart | None = None
-    worn_out: bool = False
+    n_evaluations: int
+    equilibrium_guesses: EquilibriumGuesses | None = None
+    stopped_at_noise_level: bool = False
 
 
 @runtime_checkable
@@ -208,77 +217,84 @@ class Solver(Protocol):
         """Name under which the solver is registered."""
         ...
 
-    def run(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
+    def minimize_cost(
+        self, problem: EstimationProblem, start: Array, callback: IterationCallback | None
+    ) -> SolverResult:
         """Minimise the problem's cost from `start`."""
         ...
 
 
 SOLVERS: Registry[type[Solver]] = Registry("solver")
-DEFAULT = "gauss_newton"
+_DEFAULT_SOLVER = "gauss_newton"
 """Name of the default solver."""
 
 
 @dataclass
-class Recorder:
+class IterationRecorder:
     """Records accepted iterates, counts evaluations and time, and calls the callback."""
 
-    callback: Callback | None
-    begun: float = field(default_factory=time.perf_counter)
-    evaluations: int = 0
+    callback: IterationCallback | None
+    start_time: float = field(default_factory=time.perf_counter)
+    n_evaluations: int = 0
     history: list[Iterate] = field(default_factory=list)
 
-    def accept(self, cost: float, x: Array, gradient: float, note: str = "") -> None:
+    def record_iterate(self, cost: float, x: Array, gradient: float, note: str = "") -> None:
         """Record an accepted iterate."""
-        seconds = time.perf_counter() - self.begun
-        entry = Iterate(len(self.history), cost, x.copy(), gradient, self.evaluations, seconds, note)
+        seconds = time.perf_counter() - self.start_time
+        entry = Iterate(len(self.history), cost, x.copy(), gradient, self.n_evaluations, seconds, note)
         self.history.append(entry)
         if self.callback is not None:
             self.callback(entry)
 
 
 # A start from which the rollout fails is approached over shorter horizons, each the start of the next [fraction].
-CONTINUATION = (0.06, 0.12, 0.25, 0.5)
+_HORIZON_FRACTIONS = (0.06, 0.12, 0.25, 0.5)
 # A fit whose chi2 per degree of freedom exceeds this may be a wrong valley (a soft object has several shapes at rest):
 # it is started again from these multiples of the initial values, and the best is kept.
-POOR_FIT = 5.0
-RESTARTS = (4.0, 2.0, 10.0)
+_POOR_CHI2_PER_DOF = 5.0
+RESTART_FACTORS = (4.0, 2.0, 10.0)
 # Beside noise that drives the motion a wrong valley may hide in chi2 per degree of freedom of 1.03. Where anything is
 # known worse than this part of its value, or has fallen below that part of its start, another start is tried.
-DOUBTFUL, COLLAPSED = 0.1, 0.02
+_LOOSE_RELATIVE_STD, _COLLAPSED_FRACTION = 0.1, 0.02
 # An arm that folds the object for a moment parts valleys that lie near each other: where the model does not explain the
 # recording, starts these factors off the best fit are tried, stiffer ones, with which less folds.
-NEARBY = (1.25, 1.6)
+_NEARBY_START_FACTORS = (1.25, 1.6)
 # A branch that is seen a few times a second has the phase of several frequencies: what is known worse than this part of
 # its value may have other valleys. It is moved by these factors, the others as the fit's covariance says, and where the
 # cost then rises by less than this part of what the fit predicts, the search goes on from there.
-LOOSE, APART, SHALLOW, OTHERS = 0.03, (1 / 2.5, 1 / 1.6, 1.6, 2.5), 0.2, 2
+_MIN_SCANNED_RELATIVE_STD, _SCAN_FACTORS, _MAX_COST_RISE_RATIO, _MAX_LOCAL_MINIMUM_STARTS = (
+    0.03,
+    (1 / 2.5, 1 / 1.6, 1.6, 2.5),
+    0.2,
+    2,
+)
 # Noise that drives the motion is linearised where a pass begins; passes end when one changes nothing.
-PASSES = 6
-REMEDY = "start nearer, widen the bounds, or use gauss_newton"
+_MAX_WHITENING_PASSES = 6
+_STALLED_REMEDY = "start nearer, widen the bounds, or use gauss_newton"
 
 
 def solve(
     problem: EstimationProblem,
     solver: Solver | None = None,
-    start: Sequence[float] | None = None,
-    callback: Callback | None = None,
-    limits: GapLimits = USUAL,
+    initial_unknowns: Sequence[float] | None = None,
+    callback: IterationCallback | None = None,
+    limits: GapCriteria = DEFAULT_GAP_CRITERIA,
     restarts: bool = True,
 ) -> Solution:
     """Solve an estimation problem and return estimates with uncertainty and verdicts.
 
-    Free effects begin off their neutral value (`off_neutral`) unless a start is given. Where the rollout fails at the
+    Free effects begin off their neutral value (`initialize_free_effects`) unless a start is given. Where the rollout fails at the
     start (a soft object snaps, an arm falls), the problem is first solved over its first seconds only, and then over
     longer and longer horizons. A poor fit is started again from other initial values. Where noise drives the motion,
     methods that can weigh residuals by it do so in several passes, its covariance frozen in each
-    (`EstimationProblem.weighted_at`); the answer of one that has its errors as unknowns is judged in the same way.
+    (`EstimationProblem.whitened_at`); the answer of one that has its errors as unknowns is judged in the same way.
 
     Parameters
     ----------
     problem : EstimationProblem
     solver : Solver, optional
         `GaussNewton()` when absent.
-    start : sequence of float, optional
+    initial_unknowns : sequence of float, optional
         Initial unknown vector; the problem's when absent.
     callback : callable, optional
         Called with every `Iterate`.
@@ -294,20 +310,31 @@ def solve(
     """
     # the matrices are small: threads of the linear algebra library cost more than they give
     with threadpoolctl.threadpool_limits(1):
-        return _solved(problem, solver or SOLVERS[DEFAULT](), start, callback, limits, RESTARTS if restarts else ())
+        return _solved(
+            problem,
+            solver or SOLVERS[_DEFAULT_SOLVER](),
+            initial_unknowns,
+            callback,
+            limits,
+            RESTART_FACTORS if restarts else (),
+        )
 
 
 def _solved(
     problem: EstimationProblem,
     solver: Solver,
     start: Sequence[float] | None,
-    callback: Callback | None,
-    limits: GapLimits,
+    callback: IterationCallback | None,
+    limits: GapCriteria,
     restarts: Sequence[float],
 ) -> Solution:
     begun = time.perf_counter()
     lower, upper = problem.bounds
-    first = off_neutral(problem, problem.start) if start is None else np.clip(np.asarray(start, float), lower, upper)
+    first = (
+        initialize_free_effects(problem, problem.initial_unknowns)
+        if start is None
+        else np.clip(np.asarray(start, float), lower, upper)
+    )
     best, evaluations, history = _attempt(problem, solver, first, callback)
     tried = number = 1
 
@@ -330,50 +357,56 @@ def _solved(
     for factor in restarts:
         if _good_fit(problem, best[1]):
             break
-        moved = np.where(problem.positive, np.clip(first * factor, lower, upper), first)
+        moved = np.where(problem.is_positive, np.clip(first * factor, lower, upper), first)
         try_from(moved, f"initial values x {factor:g}", 1 + len(restarts))
-    once = tried == 1 and restarts and problem.disturbed and carries_noise(solver)
+    once = tried == 1 and restarts and problem.has_process_noise and _accounts_for_process_noise(solver)
     if once and np.any(_doubtful(best[2], best[1], best[0].x, first)):
-        factor = RESTARTS[0]
-        moved = np.where(problem.positive, np.clip(first * factor, lower, upper), first)
+        factor = RESTART_FACTORS[0]
+        moved = np.where(problem.is_positive, np.clip(first * factor, lower, upper), first)
         try_from(moved, f"initial values x {factor:g}", 2)
-    most = number + len(NEARBY)
-    for factor in NEARBY if restarts and problem.disturbed and carries_covariance(solver) else ():
+    most = number + len(_NEARBY_START_FACTORS)
+    for factor in (
+        _NEARBY_START_FACTORS
+        if restarts and problem.has_process_noise and uses_process_noise_covariance(solver)
+        else ()
+    ):
         outcome, finish, weighted = best
-        if not finish.ok or judge_fit(weighted, finish, limits).explains:
+        if not finish.ok or assess_goodness_of_fit(weighted, finish, limits).explains:
             break
-        near = np.where(problem.positive, np.clip(outcome.x * factor, lower, upper), outcome.x)
+        near = np.where(problem.is_positive, np.clip(outcome.x * factor, lower, upper), outcome.x)
         try_from(near, f"best fit x {factor:g}", most)
-    looks = restarts and carries_covariance(solver)
+    looks = restarts and uses_process_noise_covariance(solver)
     valleys = _other_valleys(best[2], best[1], best[0].x) if looks else []
     most = number + len(valleys)
     for near in valleys:
         try_from(near, "another valley", most)
     outcome, finish, weighted = best
-    if problem.disturbed and not carries_noise(solver):
+    if problem.has_process_noise and not _accounts_for_process_noise(solver):
         remark = "; weighted by the sensors' noise alone, without the noise that drives the motion"
         outcome = replace(outcome, message=outcome.message + remark)
-    if not getattr(solver, "needs_rollout", True) and any(e.has_constant_errors for e in problem.episodes):
+    if not getattr(solver, "needs_rollout", True) and any(e.has_constant_sensor_errors for e in problem.episodes):
         remark = "; weighted without the constant errors that measured efforts may have"
         outcome = replace(outcome, message=outcome.message + remark)
     problem = weighted
-    fit = judge_fit(problem, finish, limits)
+    fit = assess_goodness_of_fit(problem, finish, limits)
     covariance = covariance_of_fit(problem, finish, fit)
     status, message = outcome.status, outcome.message
     if not finish.ok:
         status, message = Status.FAILED, finish.message
-    elif status == Status.CONVERGED and not (outcome.worn_out or settled(problem, outcome.x, finish)):
+    elif status == Status.CONVERGED and not (
+        outcome.stopped_at_noise_level or is_stationary(problem, outcome.x, finish)
+    ):
         status = Status.STALLED
-        message = f"the search stopped where a further step would lower the cost ({message}); {REMEDY}"
+        message = f"the search stopped where a further step would lower the cost ({message}); {_STALLED_REMEDY}"
     elif tried > 1:
         message += f" (best of {tried} starts)"
     return Solution(
         status,
         message,
-        problem.names,
+        problem.unknown_names,
         outcome.x,
         covariance,
-        estimates(problem, outcome.x, finish, covariance, fit),
+        parameter_estimates(problem, outcome.x, finish, covariance, fit),
         finish.cost,
         fit,
         tuple(history),
@@ -386,7 +419,7 @@ def _solved(
     )
 
 
-def _noting(callback: Callback | None, note: str) -> Callback | None:
+def _noting(callback: IterationCallback | None, note: str) -> IterationCallback | None:
     """The callback for a part of the search, whose points say which part it is."""
     if callback is None:
         return None
@@ -394,94 +427,98 @@ def _noting(callback: Callback | None, note: str) -> Callback | None:
 
 
 def _attempt(
-    problem: EstimationProblem, solver: Solver, x: Array, callback: Callback | None
-) -> tuple[tuple[Outcome, Evaluation, EstimationProblem], int, list[Iterate]]:
+    problem: EstimationProblem, solver: Solver, x: Array, callback: IterationCallback | None
+) -> tuple[tuple[SolverResult, Evaluation, EstimationProblem], int, list[Iterate]]:
     """One run from one start, by shorter horizons where the rollout fails there, and the problem as it was weighted."""
     history: list[Iterate] = []
     evaluations = 0
     if getattr(solver, "needs_rollout", True) and not problem.evaluate(x, derivatives=False).ok:
         longest = max(episode.grid.steps for episode in problem.episodes) * problem.step.time_step
-        for fraction in CONTINUATION:
+        for fraction in _HORIZON_FRACTIONS:
             try:
-                shorter = problem.shortened(fraction * longest)
+                shorter = problem.truncated_to(fraction * longest)
                 if not shorter.evaluate(x, derivatives=False).ok:
                     continue
-                part = solver.run(shorter, x, _noting(callback, f"first {fraction * longest:.3g} s"))
+                part = solver.minimize_cost(shorter, x, _noting(callback, f"first {fraction * longest:.3g} s"))
             except YidError as error:
                 # so short a piece may hold too little for a filter or a node, or nothing to compare with
                 log.info("the first %.3g s are left out: %s", fraction * longest, error)
                 continue
-            x, evaluations = part.x, evaluations + part.evaluations
+            x, evaluations = part.x, evaluations + part.n_evaluations
             history += [replace(entry, note=f"first {fraction * longest:.3g} s") for entry in part.history]
             if problem.evaluate(x, derivatives=False).ok:
                 break
-    passes = PASSES if problem.disturbed and carries_covariance(solver) else 1
+    passes = _MAX_WHITENING_PASSES if problem.has_process_noise and uses_process_noise_covariance(solver) else 1
     weighted, warm = problem, None
     for number in range(passes):
-        weighted = weighted.weighted_at(x, warm) if passes > 1 else problem
+        weighted = weighted.whitened_at(x, warm) if passes > 1 else problem
         which = f"pass {number + 1} of at most {passes}" if passes > 1 else ""
-        outcome = solver.run(weighted, x, _noting(callback, which) if which else callback)
-        x, warm, evaluations = outcome.x, outcome.warm, evaluations + outcome.evaluations
+        outcome = solver.minimize_cost(weighted, x, _noting(callback, which) if which else callback)
+        x, warm, evaluations = outcome.x, outcome.equilibrium_guesses, evaluations + outcome.n_evaluations
         history += outcome.history
         # the second pass is the first about torque offsets that are not guessed
         if number and len(outcome.history) < 2:
             break
-    if problem.disturbed and passes == 1 and carries_noise(solver):
+    if problem.has_process_noise and passes == 1 and _accounts_for_process_noise(solver):
         # it had the errors themselves as unknowns; what is judged is their likelihood about its answer
-        weighted = problem.weighted_at(x, warm, rounds=2)
-    return (outcome, weighted.evaluate(outcome.x, warm=outcome.warm), weighted), evaluations, history
+        weighted = problem.whitened_at(x, warm, rounds=2)
+    return (
+        (outcome, weighted.evaluate(outcome.x, equilibrium_guesses=outcome.equilibrium_guesses), weighted),
+        evaluations,
+        history,
+    )
 
 
 def _doubtful(problem: EstimationProblem, finish: Evaluation, x: Array, first: Array) -> NDArray[np.bool_]:
     """Positive unknowns that the data inform, but loosely, and those that have all but vanished."""
     if not finish.ok or finish.jacobian is None:
         return np.zeros(len(x), bool)
-    std = np.sqrt(np.maximum(np.diag(uncertainty(problem, finish)[0]), 0.0))
-    loose = (std > DOUBTFUL * np.abs(x)) & (std < 100 * np.abs(first))
-    return problem.positive & (loose | (x < COLLAPSED * first))
+    std = np.sqrt(np.maximum(np.diag(covariance_and_chi2(problem, finish)[0]), 0.0))
+    loose = (std > _LOOSE_RELATIVE_STD * np.abs(x)) & (std < 100 * np.abs(first))
+    return problem.is_positive & (loose | (x < _COLLAPSED_FRACTION * first))
 
 
 def _other_valleys(problem: EstimationProblem, finish: Evaluation, x: Array) -> list[Array]:
     """Starts from which a loosely known unknown may go to another value than the one found, the likeliest first."""
-    if not finish.ok or finish.jacobian is None or not problem.disturbed:
+    if not finish.ok or finish.jacobian is None or not problem.has_process_noise:
         return []
-    covariance, _ = uncertainty(problem, finish)
+    covariance, _ = covariance_and_chi2(problem, finish)
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     found: list[tuple[float, Array]] = []
     # what is hardly known stays where it is
     known = std < np.abs(x)
-    for i in np.flatnonzero(problem.positive & known & (std > LOOSE * np.abs(x))):
-        for factor in APART:
+    for i in np.flatnonzero(problem.is_positive & known & (std > _MIN_SCANNED_RELATIVE_STD * np.abs(x))):
+        for factor in _SCAN_FACTORS:
             along = np.where(known, covariance[:, i] / covariance[i, i], 0.0)
             moved = np.clip(x + along * (factor - 1.0) * x[i], *problem.bounds)
             # a stiffness counts by its logarithm where that says less: a slope that fades is no valley
             expected = 0.5 * (min(abs(factor - 1.0), abs(math.log(factor))) * x[i] / std[i]) ** 2
-            there = problem.evaluate(moved, derivatives=False, warm=finish.warm)
+            there = problem.evaluate(moved, derivatives=False, equilibrium_guesses=finish.equilibrium_guesses)
             rise = there.cost - finish.cost
-            if there.ok and expected > 2.0 and rise < SHALLOW * expected:
+            if there.ok and expected > 2.0 and rise < _MAX_COST_RISE_RATIO * expected:
                 found.append((rise, moved))
     found.sort(key=lambda entry: entry[0])
-    return [moved for _, moved in found[:OTHERS]]
+    return [moved for _, moved in found[:_MAX_LOCAL_MINIMUM_STARTS]]
 
 
-def carries_covariance(solver: Solver) -> bool:
+def uses_process_noise_covariance(solver: Solver) -> bool:
     """Whether a solver can whiten residuals by process noise."""
-    return bool(getattr(solver, "carries_covariance", False))
+    return bool(getattr(solver, "uses_process_noise_covariance", False))
 
 
-def carries_noise(solver: Solver) -> bool:
+def _accounts_for_process_noise(solver: Solver) -> bool:
     """Whether a solver accounts for process noise, by its covariance or with the errors as unknowns."""
-    return carries_covariance(solver) or bool(getattr(solver, "errors_are_unknowns", False))
+    return uses_process_noise_covariance(solver) or bool(getattr(solver, "estimates_torque_errors", False))
 
 
 def _good_fit(problem: EstimationProblem, finish: Evaluation) -> bool:
     """Whether a fit needs no other start: good, or with a cost that says nothing of noise."""
     if problem.options.weighting == "paper":
         return finish.ok
-    return finish.ok and uncertainty(problem, finish)[1] < POOR_FIT
+    return finish.ok and covariance_and_chi2(problem, finish)[1] < _POOR_CHI2_PER_DOF
 
 
-def projected_gradient(x: Array, gradient: Array, lower: Array, upper: Array, scale: Array) -> float:
+def projected_gradient_norm(x: Array, gradient: Array, lower: Array, upper: Array, scale: Array) -> float:
     """Infinity norm of the scaled gradient without components that push against a bound."""
     free = ~(((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0)))
     return float(np.max(np.abs(scale * gradient)[free], initial=0.0))

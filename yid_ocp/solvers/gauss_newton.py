@@ -10,21 +10,34 @@ import numpy as np
 from annotated_types import Ge, Gt
 from numpy.typing import NDArray
 
-from yid_ocp.options import About, check
+from yid_ocp.options import OptionInfo, check_option_bounds
+from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.problem import EstimationProblem
-from yid_ocp.solvers.base import SOLVERS, Callback, Iterate, Outcome, Recorder, Status, projected_gradient
-from yid_ocp.solvers.judgement import TWO_SIDED, uncertainty
-from yid_ocp.solvers.linear_model import bounded_step, promised, remaining, settled
+from yid_ocp.solvers.base import (
+    SOLVERS,
+    Iterate,
+    IterationCallback,
+    IterationRecorder,
+    SolverResult,
+    Status,
+    projected_gradient_norm,
+)
+from yid_ocp.solvers.linear_model import (
+    achievable_reduction,
+    bounded_least_squares_step,
+    is_stationary,
+    predicted_reduction,
+)
+from yid_ocp.solvers.uncertainty import CHI2_95_TWO_SIDED, covariance_and_chi2
 
 Array = NDArray[np.float64]
 
 # A positive unknown falls by no more than this factor in one step, until it is this part of its typical size.
-REACH, NEAR_ZERO = 10.0, 1e-3
+_MAX_DECREASE_FACTOR, _NEAR_ZERO_FRACTION = 10.0, 1e-3
 # So many accepted steps in a row are the end if together they save no more of the cost than this, a tenth of what one
 # standard deviation is worth, and move no unknown by more than this part of its standard deviation, and if the linear
 # model promises no more than what a 95 % interval is worth.
-PATIENCE, WORTHLESS, UNMOVED = 20, 0.05, 0.1
+_PATIENCE_STEPS, _NEGLIGIBLE_COST_REDUCTION, _NEGLIGIBLE_MOVE_STDS = 20, 0.05, 0.1
 
 
 @SOLVERS.register("gauss_newton")
@@ -34,7 +47,7 @@ class GaussNewton:
 
     Every iteration solves  min |J d + r|^2 + mu |d/s|^2  with  lower <= x + d <= upper, and accepts d when the cost
     falls by a fair part of what the linear model promised. A short step, or one that damping keeps from promising
-    anything, is no end: see `linear_model.settled`. Many steps that are worth nothing beside the noise are one: where
+    anything, is no end: see `linear_residual_models.is_stationary`. Many steps that are worth nothing beside the noise are one: where
     the valley is rough (friction that turns, fast waves over many seconds) the linear model promises what no step
     keeps.
 
@@ -43,78 +56,84 @@ class GaussNewton:
     Nocedal and Wright (2006), Numerical Optimization, chapter 10, doi:10.1007/978-0-387-40065-5.
     """
 
-    iterations: Annotated[int, Ge(1), About("limit on accepted steps")] = 60
+    max_iterations: Annotated[int, Ge(1), OptionInfo("limit on accepted steps")] = 60
     step_tolerance: Annotated[
         float,
         Gt(0),
-        About("converged when no unknown moves by more than this fraction of its size, and none should"),
+        OptionInfo("converged when no unknown moves by more than this fraction of its size, and none should"),
     ] = 1e-5
     cost_tolerance: Annotated[
-        float, Gt(0), About("converged when the promised relative reduction of the cost is below this")
+        float, Gt(0), OptionInfo("converged when the predicted_reduction relative reduction of the cost is below this")
     ] = 1e-8
-    damping: Annotated[
-        float, Gt(0), About("initial mu, in units of the largest diagonal entry of the scaled normal matrix")
+    initial_damping: Annotated[
+        float, Gt(0), OptionInfo("initial mu, in units of the largest diagonal entry of the scaled normal matrix")
     ] = 1e-6
     name: ClassVar[str] = "gauss_newton"
-    carries_covariance: ClassVar[bool] = True
+    uses_process_noise_covariance: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        check(self, f"solver {self.name}")
+        check_option_bounds(self, f"solver {self.name}")
 
-    def run(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
+    def minimize_cost(
+        self, problem: EstimationProblem, start: Array, callback: IterationCallback | None
+    ) -> SolverResult:
         """Minimize the problem's cost from `start` by Gauss-Newton steps."""
         lower, upper = problem.bounds
-        scale = problem.scales
-        recorder = Recorder(callback)
+        scale = problem.unknown_scales
+        recorder = IterationRecorder(callback)
         x = start.copy()
         now = problem.evaluate(x)
-        recorder.evaluations += 1
+        recorder.n_evaluations += 1
         if not now.ok or now.jacobian is None:
-            return Outcome(Status.FAILED, now.message, x, (), recorder.evaluations)
-        mu, rejected = self.damping, 0
+            return SolverResult(Status.FAILED, now.message, x, (), recorder.n_evaluations)
+        mu, rejected = self.initial_damping, 0
         while True:
             jacobian, residual = now.jacobian, now.residual
             assert jacobian is not None
             gradient = jacobian.T @ residual
             size = np.maximum(np.abs(x), scale)
             if rejected == 0:
-                recorder.accept(now.cost, x, projected_gradient(x, gradient, lower, upper, size))
+                recorder.record_iterate(now.cost, x, projected_gradient_norm(x, gradient, lower, upper, size))
                 saved = _saved(problem, recorder.history, now)
                 if saved is not None:
                     message = (
-                        f"the last {PATIENCE} steps lowered the cost by {saved:.2g} together and moved nothing by a "
+                        f"the last {_PATIENCE_STEPS} steps lowered the cost by {saved:.2g} together and moved nothing by a "
                         "tenth of its standard deviation"
                     )
                     ended = self._end(Status.CONVERGED, message, x, recorder, now)
-                    return replace(ended, worn_out=True)
-            if len(recorder.history) > self.iterations:
-                message = (
-                    f"no convergence in {self.iterations} iterations; raise solver.iterations or free fewer parameters"
-                )
+                    return replace(ended, stopped_at_noise_level=True)
+            if len(recorder.history) > self.max_iterations:
+                message = f"no convergence in {self.max_iterations} iterations; raise solver.max_iterations or free fewer parameters"
                 return self._end(Status.ITERATION_LIMIT, message, x, recorder, now)
             # the linear model is good for a factor, not for a jump to a bound at zero, whence little leads back
-            low = np.where(problem.positive & (x > NEAR_ZERO * scale), np.maximum(lower, x / REACH), lower)
-            step = bounded_step(jacobian * size, residual, mu, (low - x) / size, (upper - x) / size) * size
-            fall = promised(jacobian, residual, step)
+            low = np.where(
+                problem.is_positive & (x > _NEAR_ZERO_FRACTION * scale),
+                np.maximum(lower, x / _MAX_DECREASE_FACTOR),
+                lower,
+            )
+            step = (
+                bounded_least_squares_step(jacobian * size, residual, mu, (low - x) / size, (upper - x) / size) * size
+            )
+            fall = predicted_reduction(jacobian, residual, step)
             # damping makes any step promise little
-            if fall <= self.cost_tolerance * max(now.cost, 1e-300) and settled(problem, x, now):
+            if fall <= self.cost_tolerance * max(now.cost, 1e-300) and is_stationary(problem, x, now):
                 return self._end(Status.CONVERGED, "the cost cannot be lowered any further", x, recorder, now)
-            trial = problem.evaluate(np.clip(x + step, lower, upper), warm=now.warm)
-            recorder.evaluations += 1
+            trial = problem.evaluate(np.clip(x + step, lower, upper), equilibrium_guesses=now.equilibrium_guesses)
+            recorder.n_evaluations += 1
             gain = (now.cost - trial.cost) / fall if trial.ok and fall > 0 else -1.0
             if gain > 1e-3:
                 moved = float(np.max(np.abs(step) / size))
                 x, now, rejected = np.clip(x + step, lower, upper), trial, 0
                 mu = max(mu * (0.2 if gain > 0.5 else 1.0 if gain > 0.2 else 3.0), 1e-12)
-                if moved < self.step_tolerance and now.jacobian is not None and settled(problem, x, now):
-                    slope = projected_gradient(x, now.jacobian.T @ now.residual, lower, upper, size)
-                    recorder.accept(now.cost, x, slope)
+                if moved < self.step_tolerance and now.jacobian is not None and is_stationary(problem, x, now):
+                    slope = projected_gradient_norm(x, now.jacobian.T @ now.residual, lower, upper, size)
+                    recorder.record_iterate(now.cost, x, slope)
                     return self._end(Status.CONVERGED, "the step is below its tolerance", x, recorder, now)
                 continue
             rejected += 1
             mu = max(mu * 8.0, 1e-6)
             if mu > 1e10 or rejected > 40:
-                end = settled(problem, x, now)
+                end = is_stationary(problem, x, now)
                 status = Status.CONVERGED if end else Status.STALLED
                 message = (
                     "the cost cannot be lowered any further"
@@ -126,17 +145,24 @@ class GaussNewton:
                 )
                 return self._end(status, message, x, recorder, now)
 
-    def _end(self, status: Status, message: str, x: Array, recorder: Recorder, now: Evaluation) -> Outcome:
-        return Outcome(status, message, x, tuple(recorder.history), recorder.evaluations, now.warm)
+    def _end(
+        self, status: Status, message: str, x: Array, recorder: IterationRecorder, now: Evaluation
+    ) -> SolverResult:
+        return SolverResult(
+            status, message, x, tuple(recorder.history), recorder.n_evaluations, now.equilibrium_guesses
+        )
 
 
 def _saved(problem: EstimationProblem, history: Sequence[Iterate], now: Evaluation) -> float | None:
     """What the last steps saved of the cost together, if that is worth nothing; else None."""
-    if len(history) <= PATIENCE:
+    if len(history) <= _PATIENCE_STEPS:
         return None
-    before, last = history[-1 - PATIENCE], history[-1]
-    saved, unit = before.cost - last.cost, problem.noise**2
-    if saved > WORTHLESS * unit or remaining(problem, last.x, now) > 0.5 * TWO_SIDED * unit:
+    before, last = history[-1 - _PATIENCE_STEPS], history[-1]
+    saved, unit = before.cost - last.cost, problem.data_noise_unit**2
+    if (
+        saved > _NEGLIGIBLE_COST_REDUCTION * unit
+        or achievable_reduction(problem, last.x, now) > 0.5 * CHI2_95_TWO_SIDED * unit
+    ):
         return None
-    std = np.sqrt(np.maximum(np.diag(uncertainty(problem, now)[0]), 0.0))
-    return saved if np.all(np.abs(last.x - before.x) <= UNMOVED * std) else None
+    std = np.sqrt(np.maximum(np.diag(covariance_and_chi2(problem, now)[0]), 0.0))
+    return saved if np.all(np.abs(last.x - before.x) <= _NEGLIGIBLE_MOVE_STDS * std) else None

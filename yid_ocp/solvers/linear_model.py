@@ -9,16 +9,16 @@ import scipy.linalg
 import scipy.optimize
 from numpy.typing import NDArray
 
+from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.problem import EstimationProblem
 
 Array = NDArray[np.float64]
 
 # A fit is at its end where no step promises more than this part of the cost, or this much of it in units of the noise.
-SETTLED, NEGLIGIBLE = 1e-3, 1e-2
+_MAX_RELATIVE_REDUCTION, _MAX_NOISE_UNIT_REDUCTION = 1e-3, 1e-2
 
 
-def bounded_step(jacobian: Array, residual: Array, mu: float, lower: Array, upper: Array) -> Array:
+def bounded_least_squares_step(jacobian: Array, residual: Array, mu: float, lower: Array, upper: Array) -> Array:
     """Solve min |J d + r|^2 + mu c |d|^2 with lower <= d <= upper, c the largest squared column norm."""
     count = jacobian.shape[1]
     factor = scipy.linalg.qr(np.column_stack([jacobian, residual]), mode="r", check_finite=False)[0][: count + 1]
@@ -42,12 +42,12 @@ def bounded_step(jacobian: Array, residual: Array, mu: float, lower: Array, uppe
     return step
 
 
-def promised(jacobian: Array, residual: Array, step: Array) -> float:
+def predicted_reduction(jacobian: Array, residual: Array, step: Array) -> float:
     """Reduction of 1/2 |r|^2 that the linear model predicts for a step."""
     return -float((jacobian.T @ residual) @ step) - 0.5 * float(np.sum((jacobian @ step) ** 2))
 
 
-def settled(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> bool:
+def is_stationary(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> bool:
     """Whether a point is stationary: no step up to the unknowns' size predicts a relevant cost reduction.
 
     Parameters
@@ -57,23 +57,23 @@ def settled(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> boo
     evaluation : Evaluation
         At `x`, with its Jacobian.
     """
-    worth = max(SETTLED * evaluation.cost, NEGLIGIBLE * problem.noise**2)
-    return remaining(problem, x, evaluation) <= worth
+    worth = max(_MAX_RELATIVE_REDUCTION * evaluation.cost, _MAX_NOISE_UNIT_REDUCTION * problem.data_noise_unit**2)
+    return achievable_reduction(problem, x, evaluation) <= worth
 
 
-def remaining(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> float:
+def achievable_reduction(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> float:
     """Cost reduction that the linear model predicts for a step up to the unknowns' size; infinite without a Jacobian.
 
     The step is undamped and within the bounds; size is the larger of value and typical size. Parameters as of
-    `settled`.
+    `is_stationary`.
     """
     if evaluation.jacobian is None:
         return math.inf
     if not len(x):
         return 0.0
     lower, upper = problem.bounds
-    size = np.maximum(np.abs(x), problem.scales)
+    size = np.maximum(np.abs(x), problem.unknown_scales)
     scaled = evaluation.jacobian * size
     low, high = np.maximum((lower - x) / size, -1.0), np.minimum((upper - x) / size, 1.0)
-    step = bounded_step(scaled, evaluation.residual, 1e-14, low, high)
-    return promised(scaled, evaluation.residual, step)
+    step = bounded_least_squares_step(scaled, evaluation.residual, 1e-14, low, high)
+    return predicted_reduction(scaled, evaluation.residual, step)

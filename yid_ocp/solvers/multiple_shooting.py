@@ -19,21 +19,21 @@ from annotated_types import Ge, Gt
 from numpy.typing import NDArray
 
 from yid_ocp.errors import SolverError
-from yid_ocp.options import About, check
-from yid_ocp.problem.problem import EstimationProblem
-from yid_ocp.solvers.base import SOLVERS, Callback, Outcome, Recorder, Status
-from yid_ocp.solvers.program import SILENT, Hessian, NonlinearProgram, free_memory
-from yid_ocp.solvers.symbolic import RIDGE, transcribe, unknown_vector
-from yid_ocp.solvers.transcription import Transcription
+from yid_ocp.options import OptionInfo, check_option_bounds
+from yid_ocp.problem.estimation_problem import EstimationProblem
+from yid_ocp.solvers.base import SOLVERS, IterationCallback, IterationRecorder, SolverResult, Status
+from yid_ocp.solvers.compiled_transcription import CompiledTranscription
+from yid_ocp.solvers.nonlinear_program import QUIET_OPTIONS, HessianKind, NonlinearProgram, available_memory
+from yid_ocp.solvers.symbolic_transcription import MIN_RIDGE_FACTOR, transcribe, unknowns_from_program
 
 log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
-Form = Literal["symbolic", "compiled"]
+_TranscriptionForm = Literal["symbolic", "compiled"]
 
-MUCH = 2e9
+_MEMORY_WARNING_BYTES = 2e9
 """Estimated memory above which a warning is logged before solving [bytes]."""
-SUCCESS = {"Solve_Succeeded", "Solved_To_Acceptable_Level"}
+_IPOPT_SUCCESS = {"Solve_Succeeded", "Solved_To_Acceptable_Level"}
 
 
 @SOLVERS.register("multiple_shooting")
@@ -55,43 +55,47 @@ class MultipleShooting:
     """
 
     node_interval: Annotated[
-        int, Ge(1), About("steps between nodes; 1 makes every equation of motion and multiplier part of the program")
+        int,
+        Ge(1),
+        OptionInfo("steps between nodes; 1 makes every equation of motion and multiplier part of the program"),
     ] = 1
     transcription: Annotated[
-        Form | None,
-        About(
+        _TranscriptionForm | None,
+        OptionInfo(
             "whether the program is CasADi's own or calls the compiled step; when absent symbolic with a node at every "
             "step, else compiled, which alone can eliminate steps"
         ),
     ] = None
     hessian: Annotated[
-        Hessian,
-        About(
+        HessianKind,
+        OptionInfo(
             "of the Lagrangian; exact adds the curvature of equations and sensors (compiled: of equations alone, by "
             "differences of their Jacobian)"
         ),
     ] = "gauss_newton"
-    iterations: Annotated[int, Ge(1), About("limit on IPOPT's iterations")] = 200
-    tolerance: Annotated[float, Gt(0), About("IPOPT's tol")] = 1e-6
-    mu_init: Annotated[float, Gt(0), About("initial barrier parameter, in units of the initial cost")] = 1e-7
-    ipopt: Annotated[dict[str, Any], About("further options of IPOPT, which win")] = field(default_factory=dict)
+    max_iterations: Annotated[int, Ge(1), OptionInfo("limit on IPOPT's iterations")] = 200
+    tolerance: Annotated[float, Gt(0), OptionInfo("IPOPT's tol")] = 1e-6
+    mu_init: Annotated[float, Gt(0), OptionInfo("initial barrier parameter, in units of the initial cost")] = 1e-7
+    ipopt: Annotated[dict[str, Any], OptionInfo("further options of IPOPT, which win")] = field(default_factory=dict)
     name: ClassVar[str] = "multiple_shooting"
     needs_rollout: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        check(self, f"solver {self.name}")
+        check_option_bounds(self, f"solver {self.name}")
 
     @property
-    def form(self) -> Form:
+    def chosen_transcription(self) -> _TranscriptionForm:
         """Transcription that is used: `transcription`, else by `node_interval`."""
         return self.transcription or ("symbolic" if self.node_interval == 1 else "compiled")
 
     @property
-    def errors_are_unknowns(self) -> bool:
+    def estimates_torque_errors(self) -> bool:
         """Whether the torque errors are estimated as unknowns of the program."""
-        return self.form == "symbolic"
+        return self.chosen_transcription == "symbolic"
 
-    def run(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
+    def minimize_cost(
+        self, problem: EstimationProblem, start: Array, callback: IterationCallback | None
+    ) -> SolverResult:
         """Minimize the problem's cost from `start` with IPOPT on the chosen transcription."""
         if self.hessian not in ("gauss_newton", "exact"):
             raise SolverError(
@@ -107,50 +111,52 @@ class MultipleShooting:
                 allowed="exact",
                 hint="the node states number in the thousands; use hessian: gauss_newton",
             )
-        if self.form not in get_args(Form):
+        if self.chosen_transcription not in get_args(_TranscriptionForm):
             raise SolverError(
-                f"transcription = '{self.form}'", where="solver.transcription", allowed=", ".join(get_args(Form))
+                f"transcription = '{self.chosen_transcription}'",
+                where="solver.transcription",
+                allowed=", ".join(get_args(_TranscriptionForm)),
             )
-        if self.form == "symbolic" and self.node_interval != 1:
+        if self.chosen_transcription == "symbolic" and self.node_interval != 1:
             raise SolverError(
                 f"node_interval = {self.node_interval} with the symbolic transcription",
                 where="solver.transcription",
                 allowed="node_interval: 1",
                 hint="transcription: compiled eliminates the steps between nodes",
             )
-        return (self._symbolic if self.form == "symbolic" else self._compiled)(problem, start, callback)
+        return (self._symbolic if self.chosen_transcription == "symbolic" else self._compiled)(problem, start, callback)
 
-    def _symbolic(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
+    def _symbolic(self, problem: EstimationProblem, start: Array, callback: IterationCallback | None) -> SolverResult:
         program = transcribe(problem, start)
         assert program.ridge is not None
         held = _Held(program.ridge.scale)
         program = replace(program, ridge=replace(program.ridge, factor=_Factor(held, program.w.numel())))
-        needed, free = program.memory(self.hessian), free_memory()
+        needed, free = program.estimated_memory(self.hessian), available_memory()
         size = f"{program.w.numel()} unknowns, {program.g.numel()} equations, about {needed / 1e9:.2g} GB of memory"
-        log.log(logging.WARNING if needed > MUCH else logging.INFO, "IPOPT on %s", size)
+        log.log(logging.WARNING if needed > _MEMORY_WARNING_BYTES else logging.INFO, "IPOPT on %s", size)
         if needed > free:
             message = f"{size}, of which {free / 1e9:.2g} GB are free; take a longer time_step, a shorter duration or "
-            return Outcome(Status.FAILED, message + "gauss_newton", start, (), 0)
+            return SolverResult(Status.FAILED, message + "gauss_newton", start, (), 0)
         functions = ca.Function("point", [program.w, program.p], [program.f, program.grad_f, program.g])
-        watch = _Watch(problem, program, functions, held, Recorder(callback))
+        watch = _Watch(problem, program, functions, held, IterationRecorder(callback))
         options = self._options()
         options["ipopt"] = {"obj_scaling_factor": 1.0 / watch.unit, **options["ipopt"]}
-        solver = program.solver("ipopt", self.hessian, iteration_callback=watch, **options)
-        w = np.array(solver(**program.arguments)["x"]).ravel()
+        solver = program.make_solver("ipopt", self.hessian, iteration_callback=watch, **options)
+        w = np.array(solver(**program.solver_arguments)["x"]).ravel()
         w = w if np.all(np.isfinite(w)) else watch.best
-        defect = float(ca.norm_inf(functions(w, program.values)[2]))
+        defect = float(ca.norm_inf(functions(w, program.parameter_values)[2]))
         stats = solver.stats()
         status, message = self._ended(stats["return_status"], defect, 0)
         history, n = tuple(watch.recorder.history), problem.step.sizes["n"]
         warm = tuple(w[program.variables[f"q[{episode.name}]"].index[:n, 0]] for episode in problem.episodes)
-        x = unknown_vector(problem, program, w)
-        return Outcome(status, message, x, history, int(stats["n_call_nlp_g"]), warm)
+        x = unknowns_from_program(problem, program, w)
+        return SolverResult(status, message, x, history, int(stats["n_call_nlp_g"]), warm)
 
-    def _compiled(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
-        transcription = Transcription(problem, self.node_interval)
-        nlp = _Nlp(transcription, self.hessian, Recorder(callback))
-        w0 = transcription.guess(start)
-        lower, upper = transcription.bounds()
+    def _compiled(self, problem: EstimationProblem, start: Array, callback: IterationCallback | None) -> SolverResult:
+        transcription = CompiledTranscription(problem, self.node_interval)
+        nlp = _Nlp(transcription, self.hessian, IterationRecorder(callback))
+        w0 = transcription.initial_guess(start)
+        lower, upper = transcription.variable_bounds()
         nlp.prepare(w0)
         functions = nlp.functions()
         solver = ca.nlpsol("multiple_shooting", "ipopt", functions.pop("nlp"), {**self._options(), **functions})
@@ -159,18 +165,25 @@ class MultipleShooting:
         best = w if np.all(np.isfinite(w)) else nlp.best
         defect = float(np.max(np.abs(transcription.constraints(w, False)[0]), initial=0.0))
         status, message = self._ended(solver.stats()["return_status"], defect, nlp.lost)
-        history, evaluations = tuple(nlp.recorder.history), nlp.recorder.evaluations
-        return Outcome(status, message, transcription.unknowns(best), history, evaluations, transcription.warm)
+        history, evaluations = tuple(nlp.recorder.history), nlp.recorder.n_evaluations
+        return SolverResult(
+            status,
+            message,
+            transcription.unknowns_from_variables(best),
+            history,
+            evaluations,
+            transcription.equilibrium_guesses,
+        )
 
     def _options(self) -> dict[str, Any]:
         """Options of CasADi's IPOPT interface."""
         return {
-            **SILENT,
+            **QUIET_OPTIONS,
             "no_nlp_grad": True,
             "ipopt": {
                 "print_level": 0,
                 "sb": "yes",
-                "max_iter": self.iterations,
+                "max_iter": self.max_iterations,
                 "tol": self.tolerance,
                 "mu_init": self.mu_init,
                 "nlp_scaling_method": "none",
@@ -193,11 +206,11 @@ class MultipleShooting:
 
     def _ended(self, returned: str, defect: float, lost: int) -> tuple[Status, str]:
         """Status and message from IPOPT's own word, the largest defect and the trial points without a value."""
-        if returned in SUCCESS:
+        if returned in _IPOPT_SUCCESS:
             return Status.CONVERGED, f"IPOPT: {returned}, largest defect {defect:.1e}"
         if returned == "Maximum_Iterations_Exceeded":
-            limit = f"IPOPT stopped after {self.iterations} iterations, largest defect {defect:.1e}"
-            return Status.ITERATION_LIMIT, f"{limit}; raise solver.iterations"
+            limit = f"IPOPT stopped after {self.max_iterations} iterations, largest defect {defect:.1e}"
+            return Status.ITERATION_LIMIT, f"{limit}; raise solver.max_iterations"
         if lost:
             returned += f", {lost} trial points could not be worked out"
         remedy = "start nearer, use more nodes, or use gauss_newton"
@@ -208,14 +221,14 @@ class _Held:
     """A ridge that rises where parameters swing to and fro, and falls where they keep going."""
 
     def __init__(self, scale: Array) -> None:
-        self.factor = RIDGE
+        self.factor = MIN_RIDGE_FACTOR
         self._scale, self._change = scale, np.zeros(len(scale))
 
     def moved(self, before: Array, after: Array) -> None:
         """Take note of an iterate."""
         change = (after - before) / np.maximum(np.abs(after), self._scale)
         turned = float(change @ self._change) < 0
-        self.factor = 4.0 * self.factor if turned else max(0.5 * self.factor, RIDGE)
+        self.factor = 4.0 * self.factor if turned else max(0.5 * self.factor, MIN_RIDGE_FACTOR)
         self._change = change
 
 
@@ -244,13 +257,13 @@ class _Watch(ca.Callback):
         program: NonlinearProgram,
         functions: ca.Function,
         held: _Held,
-        recorder: Recorder,
+        recorder: IterationRecorder,
     ) -> None:
         ca.Callback.__init__(self)
-        self.recorder, self.best, self._held = recorder, program.start, held
+        self.recorder, self.best, self._held = recorder, program.initial_guess, held
         self._problem, self._program, self._functions = problem, program, functions
-        cost = float(functions(program.start, program.values)[0])
-        self.unit = max(cost, 0.5 * program.residual.numel() * problem.noise**2)
+        cost = float(functions(program.initial_guess, program.parameter_values)[0])
+        self.unit = max(cost, 0.5 * program.residual.numel() * problem.data_noise_unit**2)
         self._sizes = {"x": program.w.numel(), "f": 1, "g": program.g.numel(), "lam_x": program.w.numel()}
         self._sizes |= {"lam_g": program.g.numel(), "lam_p": program.p.numel()}
         self.construct("watch", {})
@@ -273,15 +286,15 @@ class _Watch(ca.Callback):
     def eval(self, arguments: Sequence[ca.DM]) -> list[int]:
         """Enter an iterate; never stops the solver."""
         w = np.array(arguments[0]).ravel()
-        cost, slope, _ = self._functions(w, self._program.values)
+        cost, slope, _ = self._functions(w, self._program.parameter_values)
         assert self._program.ridge is not None
         at = self._program.ridge.index
         self._held.moved(self.best[at], w[at])
         self.best = w
-        x = unknown_vector(self._problem, self._program, w)
-        self.recorder.evaluations += 1
+        x = unknowns_from_program(self._problem, self._program, w)
+        self.recorder.n_evaluations += 1
         note = "" if self.recorder.history else "start"
-        self.recorder.accept(float(cost), x, float(ca.norm_inf(slope)) / self.unit, note)
+        self.recorder.record_iterate(float(cost), x, float(ca.norm_inf(slope)) / self.unit, note)
         return [0]
 
 
@@ -334,15 +347,15 @@ class _Function(ca.Callback):
 class _Nlp:
     """Objective, constraints and their derivatives in the form that CasADi's IPOPT interface takes."""
 
-    def __init__(self, transcription: Transcription, hessian: Hessian, recorder: Recorder) -> None:
+    def __init__(self, transcription: CompiledTranscription, hessian: HessianKind, recorder: IterationRecorder) -> None:
         self.transcription = transcription
         self.hessian = hessian
         self.recorder = recorder
-        self.best = np.zeros(transcription.size)
+        self.best = np.zeros(transcription.n_variables)
         self.lost = 0
         self._asked = np.zeros(0)
-        count = len(transcription.problem.shared)
-        self._held = _Held(transcription.problem.scales[:count])
+        count = len(transcription.problem.shared_parameters)
+        self._held = _Held(transcription.problem.unknown_scales[:count])
         self._keep: list[_Function] = []
 
     def prepare(self, w0: Array) -> None:
@@ -363,26 +376,26 @@ class _Nlp:
         curvature = pattern_r.T @ pattern_r
         if self.hessian == "exact":
             curvature = curvature + pattern_g.T @ pattern_g
-        curvature = curvature + scipy.sparse.identity(t.size, format="csc")
+        curvature = curvature + scipy.sparse.identity(t.n_variables, format="csc")
         self._h = _Pattern(scipy.sparse.triu(curvature, format="csc"))
         residual, _, cost = t.residual(w0, False)
-        self._unit = max(cost, 0.5 * len(residual) * t.problem.noise**2)
+        self._unit = max(cost, 0.5 * len(residual) * t.problem.data_noise_unit**2)
         self.best = w0
-        self.recorder.evaluations += 1
-        self.recorder.accept(cost, w0[: len(t.problem.shared)], np.nan, "start")
+        self.recorder.n_evaluations += 1
+        self.recorder.record_iterate(cost, w0[: len(t.problem.shared_parameters)], np.nan, "start")
 
     def functions(self) -> dict[str, ca.Function]:
         """The functions `nlp`, `grad_f`, `jac_g` and `hess_lag`."""
         t = self.transcription
         count = self._g.shape[0]
         sparsity = {
-            "x": ca.Sparsity.dense(t.size, 1),
+            "x": ca.Sparsity.dense(t.n_variables, 1),
             "p": ca.Sparsity.dense(0, 1),
             "f": ca.Sparsity.dense(1, 1),
             "g": ca.Sparsity.dense(count, 1),
             "lam_f": ca.Sparsity.dense(1, 1),
             "lam_g": ca.Sparsity.dense(count, 1),
-            "grad_f": ca.Sparsity.dense(t.size, 1),
+            "grad_f": ca.Sparsity.dense(t.n_variables, 1),
             "jac_g": self._g.sparsity,
             "hess_lag": self._h.sparsity,
         }
@@ -401,7 +414,7 @@ class _Nlp:
     def _values(self, w: Array, _: Array) -> list:
         if not np.array_equal(w, self._asked):
             # IPOPT asks for the cost and for the constraints of a point one after the other
-            self.recorder.evaluations += 1
+            self.recorder.n_evaluations += 1
             self._asked = w
         cost, constraints = self.transcription.residual(w, False)[2], self.transcription.constraints(w, False)[0]
         self.lost += not (np.isfinite(cost) and np.all(np.isfinite(constraints)))
@@ -413,16 +426,18 @@ class _Nlp:
         gradient = slope.T @ residual
         if not np.array_equal(w, self.best):
             # IPOPT may ask more than once for the gradient at the point that it accepted
-            count = len(self.transcription.problem.shared)
+            count = len(self.transcription.problem.shared_parameters)
             self._held.moved(self.best[:count], w[:count])
             self.best = w
-            self.recorder.accept(cost, self.transcription.unknowns(w), float(np.max(np.abs(gradient))) / self._unit)
+            self.recorder.record_iterate(
+                cost, self.transcription.unknowns_from_variables(w), float(np.max(np.abs(gradient))) / self._unit
+            )
         return [cost / self._unit, gradient / self._unit]
 
     def _size(self, w: Array) -> Array:
         problem = self.transcription.problem
-        count = len(problem.shared)
-        return np.maximum(np.abs(w[:count]), problem.scales[:count])
+        count = len(problem.shared_parameters)
+        return np.maximum(np.abs(w[:count]), problem.unknown_scales[:count])
 
     def _jacobian(self, w: Array, _: Array) -> list:
         value, jacobian = self.transcription.constraints(w, True)
@@ -438,7 +453,7 @@ class _Nlp:
         ridge[: len(size)] = self._held.factor * 2 * cost / len(residual) / size**2
         matrix = (slope.T @ slope + scipy.sparse.diags(ridge)) * (float(lam_f[0]) / self._unit)
         if self.hessian == "exact":
-            matrix = matrix + self.transcription.curvature(w, lam_g)
+            matrix = matrix + self.transcription.constraint_hessian(w, lam_g)
         return [self._h.filled(scipy.sparse.triu(matrix, format="csc"))]
 
 

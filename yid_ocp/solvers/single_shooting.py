@@ -10,9 +10,16 @@ import scipy.optimize
 from annotated_types import Ge, Gt
 from numpy.typing import NDArray
 
-from yid_ocp.options import About, check
-from yid_ocp.problem.problem import EstimationProblem
-from yid_ocp.solvers.base import SOLVERS, Callback, Outcome, Recorder, Status, projected_gradient
+from yid_ocp.options import OptionInfo, check_option_bounds
+from yid_ocp.problem.estimation_problem import EstimationProblem
+from yid_ocp.solvers.base import (
+    SOLVERS,
+    IterationCallback,
+    IterationRecorder,
+    SolverResult,
+    Status,
+    projected_gradient_norm,
+)
 
 Array = NDArray[np.float64]
 
@@ -27,26 +34,28 @@ class SingleShooting:
     Zhu, Byrd, Lu, Nocedal (1997), ACM Trans. Math. Softw. 23(4):550, doi:10.1145/279232.279236.
     """
 
-    iterations: Annotated[int, Ge(1), About("limit on iterations")] = 200
+    max_iterations: Annotated[int, Ge(1), OptionInfo("limit on iterations")] = 200
     cost_tolerance: Annotated[
-        float, Gt(0), About("converged when the cost falls by less than this fraction in an iteration")
+        float, Gt(0), OptionInfo("converged when the cost falls by less than this fraction in an iteration")
     ] = 1e-9
     name: ClassVar[str] = "single_shooting"
 
     def __post_init__(self) -> None:
-        check(self, f"solver {self.name}")
+        check_option_bounds(self, f"solver {self.name}")
 
-    def run(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
+    def minimize_cost(
+        self, problem: EstimationProblem, start: Array, callback: IterationCallback | None
+    ) -> SolverResult:
         """Minimize the problem's cost from `start` by L-BFGS-B."""
         lower, upper = problem.bounds
-        scale = problem.scales
-        recorder = Recorder(callback)
-        first = problem.gradient(start)
-        recorder.evaluations += 1
+        scale = problem.unknown_scales
+        recorder = IterationRecorder(callback)
+        first = problem.cost_and_gradient(start)
+        recorder.n_evaluations += 1
         if not first[2].ok:
-            return Outcome(Status.FAILED, first[2].message, start, (), recorder.evaluations)
+            return SolverResult(Status.FAILED, first[2].message, start, (), recorder.n_evaluations)
         unit = max(first[0], 1e-300)
-        warm = first[2].warm
+        warm = first[2].equilibrium_guesses
         seen: dict[bytes, tuple[float, Array]] = {start.tobytes(): (first[0], first[1])}
         worst = 1e3
 
@@ -54,8 +63,8 @@ class SingleShooting:
             x = scaled * scale
             key = x.tobytes()
             if key not in seen:
-                cost, gradient, evaluation = problem.gradient(x, warm=warm)
-                recorder.evaluations += 1
+                cost, gradient, evaluation = problem.cost_and_gradient(x, equilibrium_guesses=warm)
+                recorder.n_evaluations += 1
                 # a failed rollout is a wall: the line search steps back from it
                 seen[key] = (cost, gradient) if evaluation.ok else (worst * unit, np.zeros_like(x))
             cost, gradient = seen[key]
@@ -64,7 +73,7 @@ class SingleShooting:
         def accepted(scaled: Array) -> None:
             x = scaled * scale
             cost, gradient = seen.get(x.tobytes(), (np.nan, np.zeros_like(x)))
-            recorder.accept(cost, x, projected_gradient(x, gradient, lower, upper, scale))
+            recorder.record_iterate(cost, x, projected_gradient_norm(x, gradient, lower, upper, scale))
 
         accepted(start / scale)
         result = scipy.optimize.minimize(
@@ -74,7 +83,13 @@ class SingleShooting:
             method="L-BFGS-B",
             bounds=scipy.optimize.Bounds(lower / scale, upper / scale),
             callback=lambda intermediate_result: accepted(intermediate_result.x),
-            options={"maxiter": self.iterations, "ftol": self.cost_tolerance, "gtol": 1e-9, "maxls": 40, "maxcor": 20},
+            options={
+                "maxiter": self.max_iterations,
+                "ftol": self.cost_tolerance,
+                "gtol": 1e-9,
+                "maxls": 40,
+                "maxcor": 20,
+            },
         )
         best = min(recorder.history, key=lambda entry: entry.cost if np.isfinite(entry.cost) else np.inf)
         status = (
@@ -82,4 +97,6 @@ class SingleShooting:
             if result.status == 0
             else (Status.ITERATION_LIMIT if result.status == 1 else Status.STALLED)
         )
-        return Outcome(status, str(result.message).lower(), best.x, tuple(recorder.history), recorder.evaluations, warm)
+        return SolverResult(
+            status, str(result.message).lower(), best.x, tuple(recorder.history), recorder.n_evaluations, warm
+        )

@@ -9,10 +9,17 @@ import numpy as np
 from annotated_types import Ge, Gt, Lt
 from numpy.typing import NDArray
 
-from yid_ocp.options import About, check
+from yid_ocp.options import OptionInfo, check_option_bounds
+from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.problem import EstimationProblem
-from yid_ocp.solvers.base import SOLVERS, Callback, Outcome, Recorder, Status, projected_gradient
+from yid_ocp.solvers.base import (
+    SOLVERS,
+    IterationCallback,
+    IterationRecorder,
+    SolverResult,
+    Status,
+    projected_gradient_norm,
+)
 
 Array = NDArray[np.float64]
 
@@ -26,7 +33,7 @@ class SteepestDescent:
 
     The first length tried in an iteration is twice the last accepted one, as in the paper, or Barzilai and Borwein's
     from the change of the gradient (`spectral`), which needs far fewer iterations; most of these pay only a few steps
-    later and want a `memory` of about 10.
+    later and want a `nonmonotone_memory` of about 10.
 
     References
     ----------
@@ -35,65 +42,69 @@ class SteepestDescent:
     Birgin, Martinez, Raydan (2000), SIAM J. Optim. 10(4):1196, doi:10.1137/S1052623497330963 (spectral, memory).
     """
 
-    iterations: Annotated[int, Ge(1), About("limit on accepted steps")] = 200
+    max_iterations: Annotated[int, Ge(1), OptionInfo("limit on accepted steps")] = 200
     gradient_tolerance: Annotated[
         float,
         Gt(0),
-        About("converged when the projected gradient times the unknowns' size is below this part of the cost"),
+        OptionInfo("converged when the projected gradient times the unknowns' size is below this part of the cost"),
     ] = 1e-5
-    sufficient_decrease: Annotated[float, Gt(0), Lt(1), About("Armijo's constant")] = 1e-4
-    shrink: Annotated[float, Gt(0), Lt(1), About("backtracking factor")] = 0.5
-    trial: Annotated[Literal["last", "spectral"], About("first length tried in an iteration; last is the paper's")] = (
-        "last"
-    )
-    memory: Annotated[
-        int, Ge(1), About("the cost must fall below the largest of so many last ones; 1 is the paper's")
+    sufficient_decrease: Annotated[float, Gt(0), Lt(1), OptionInfo("Armijo's constant")] = 1e-4
+    backtracking_factor: Annotated[float, Gt(0), Lt(1), OptionInfo("backtracking factor")] = 0.5
+    first_trial_step: Annotated[
+        Literal["last", "spectral"], OptionInfo("first length tried in an iteration; last is the paper's")
+    ] = "last"
+    nonmonotone_memory: Annotated[
+        int, Ge(1), OptionInfo("the cost must fall below the largest of so many last ones; 1 is the paper's")
     ] = 1
     name: ClassVar[str] = "steepest_descent"
 
     def __post_init__(self) -> None:
-        check(self, f"solver {self.name}")
+        check_option_bounds(self, f"solver {self.name}")
 
-    def run(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
+    def minimize_cost(
+        self, problem: EstimationProblem, start: Array, callback: IterationCallback | None
+    ) -> SolverResult:
         """Minimize the problem's cost from `start` by projected steepest descent."""
         lower, upper = problem.bounds
-        recorder = Recorder(callback)
+        recorder = IterationRecorder(callback)
         x = start.copy()
-        cost, gradient, evaluation = problem.gradient(x)
-        recorder.evaluations += 1
+        cost, gradient, evaluation = problem.cost_and_gradient(x)
+        recorder.n_evaluations += 1
         if not evaluation.ok:
-            return Outcome(Status.FAILED, evaluation.message, x, (), recorder.evaluations)
+            return SolverResult(Status.FAILED, evaluation.message, x, (), recorder.n_evaluations)
         # the first trial moves the unknowns by about a tenth of their size
-        length = 0.1 * float(np.linalg.norm(problem.scales)) / max(float(np.linalg.norm(gradient)), 1e-300)
-        for _ in range(self.iterations):
-            size = np.maximum(np.abs(x), problem.scales)
-            slope = projected_gradient(x, gradient, lower, upper, size)
-            recorder.accept(cost, x, slope)
-            reference = max(entry.cost for entry in recorder.history[-self.memory :])
+        length = 0.1 * float(np.linalg.norm(problem.unknown_scales)) / max(float(np.linalg.norm(gradient)), 1e-300)
+        for _ in range(self.max_iterations):
+            size = np.maximum(np.abs(x), problem.unknown_scales)
+            slope = projected_gradient_norm(x, gradient, lower, upper, size)
+            recorder.record_iterate(cost, x, slope)
+            reference = max(entry.cost for entry in recorder.history[-self.nonmonotone_memory :])
             if slope <= self.gradient_tolerance * max(cost, 1e-300):
                 return self._end(Status.CONVERGED, "the projected gradient vanishes", recorder, evaluation)
             while True:
                 trial = np.clip(x - length * gradient, lower, upper)
-                attempt = problem.evaluate(trial, False, evaluation.warm)
-                recorder.evaluations += 1
+                attempt = problem.evaluate(trial, False, evaluation.equilibrium_guesses)
+                recorder.n_evaluations += 1
                 needed = self.sufficient_decrease * float(gradient @ (x - trial))
                 if attempt.ok and attempt.cost <= reference - needed:
                     break
-                length *= self.shrink
+                length *= self.backtracking_factor
                 if np.max(np.abs(length * gradient) / size) < 1e-12:
                     return self._end(Status.STALLED, "no step along the gradient lowers the cost", recorder, evaluation)
             before, slope_before = x, gradient
             x = trial
-            cost, gradient, evaluation = problem.gradient(x, attempt)
-            length /= self.shrink
+            cost, gradient, evaluation = problem.cost_and_gradient(x, attempt)
+            length /= self.backtracking_factor
             moved, turned = x - before, gradient - slope_before
-            if self.trial == "spectral" and float(moved @ turned) > 0:
+            if self.first_trial_step == "spectral" and float(moved @ turned) > 0:
                 length = float(moved @ moved) / float(moved @ turned)
-        size = np.maximum(np.abs(x), problem.scales)
-        recorder.accept(cost, x, projected_gradient(x, gradient, lower, upper, size))
-        message = f"no convergence in {self.iterations} iterations, as is usual for this method; try gauss_newton"
+        size = np.maximum(np.abs(x), problem.unknown_scales)
+        recorder.record_iterate(cost, x, projected_gradient_norm(x, gradient, lower, upper, size))
+        message = f"no convergence in {self.max_iterations} iterations, as is usual for this method; try gauss_newton"
         return self._end(Status.ITERATION_LIMIT, message, recorder, evaluation)
 
-    def _end(self, status: Status, message: str, recorder: Recorder, last: Evaluation) -> Outcome:
+    def _end(self, status: Status, message: str, recorder: IterationRecorder, last: Evaluation) -> SolverResult:
         best = min(recorder.history, key=lambda entry: entry.cost)
-        return Outcome(status, message, best.x, tuple(recorder.history), recorder.evaluations, last.warm)
+        return SolverResult(
+            status, message, best.x, tuple(recorder.history), recorder.n_evaluations, last.equilibrium_guesses
+        )

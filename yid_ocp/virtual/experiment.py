@@ -9,25 +9,25 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate_recording
 from yid_ocp.errors import ConfigError
 from yid_ocp.model.system import Grasp, System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.model.y_object import y_object
-from yid_ocp.virtual.engine import EngineTerms, SimulatedRun, Simulation, simulate_in_mujoco
-from yid_ocp.virtual.mjcf import mujoco_module
-from yid_ocp.virtual.motion import Excitation, Motion, multisine
-from yid_ocp.virtual.posture import BAXTER_JOINTS, initial_posture
+from yid_ocp.virtual.inverse_kinematics import BAXTER_ARM_JOINTS, grasping_joint_angles
+from yid_ocp.virtual.mjcf import import_mujoco
+from yid_ocp.virtual.mujoco_simulation import SimulationOptions, SimulationResult, SimulatorTerms, simulate_in_mujoco
+from yid_ocp.virtual.multisine_motion import MultisineMotion, MultisineOptions, random_multisine
 
 Array = NDArray[np.float64]
-Generators = Mapping[str, np.random.Generator]
+_Generators = Mapping[str, np.random.Generator]
 
 # every sensor draws from a stream of its own, so that leaving one out changes no other; the order is part of the seed
 _STREAMS = ("position", "velocity", "effort", "arm_points", "frames", "camera_points", "effort_bias")
 _TRUE_QUANTITIES = ("bend", "twist", "damping", "twist_damping", "mass")
 
 
-def paper_system(arms: int) -> System:
+def baxter_foam_y_system(arms: int) -> System:
     """The paper's system: Baxter with one or two arms that hold the foam Y by point grasps.
 
     Parameters
@@ -48,34 +48,34 @@ def paper_system(arms: int) -> System:
     if arms not in (1, 2):
         raise ConfigError(f"arms = {arms}", where="paper_system", allowed="1 or 2")
     sides = ("left", "right")[:arms]
-    names = [f"{side}_{joint}" for side in sides for joint in BAXTER_JOINTS]
+    names = [f"{side}_{joint}" for side in sides for joint in BAXTER_ARM_JOINTS]
     robot = read_urdf("package:baxter", joints=names)
     grasps = [Grasp(side, f"{side}_gripper", held) for side, held in zip(sides, ("w_T2", "w_T3"), strict=False)]
     return System.build(robot, objects=[(y_object(), None, None)], grasps=grasps, driven=names, damping=0.05)
 
 
 @dataclass(frozen=True)
-class ArmNoise:
+class ArmSensorNoise:
     """Standard deviations of the noise on what the arm measures, drawn anew for every sample but for the bias.
 
     Attributes
     ----------
-    position, velocity : float
+    position_std, velocity_std : float
         Standard deviation of a joint's reading [rad], [rad/s].
-    effort, effort_bias : float or tuple of float, length nj
+    effort_std, effort_bias_std : float or tuple of float, length nj
         Standard deviation of the white noise, and of the constant offset, of a recorded (not the applied) torque [N m].
-    points : float
+    point_std : float
         Standard deviation of each coordinate of a grasped point [m].
-    stated : bool
+    records_effort_std : bool
         Whether the recording states the standard deviation of torques; it always states the others.
     """
 
-    position: float = 2e-4
-    velocity: float = 5e-3
-    effort: float | tuple[float, ...] = 0.0
-    effort_bias: float | tuple[float, ...] = 0.0
-    points: float = 1e-3
-    stated: bool = True
+    position_std: float = 2e-4
+    velocity_std: float = 5e-3
+    effort_std: float | tuple[float, ...] = 0.0
+    effort_bias_std: float | tuple[float, ...] = 0.0
+    point_std: float = 1e-3
+    records_effort_std: bool = True
 
 
 @dataclass(frozen=True)
@@ -84,25 +84,25 @@ class PointCamera:
 
     Attributes
     ----------
-    points : tuple of str, optional
+    visible_points : tuple of str, optional
         Points it can see; all points that no arm holds where absent.
-    std : float
+    point_std : float
         Standard deviation of the white noise on each coordinate of a point [m].
-    rate : float
+    frame_rate : float
         Mean rate of frames [Hz]; periods vary by a quarter either way.
-    gaps : bool
+    has_dropouts : bool
         Whether frames are lost for 1 to 1.5 s about once every 2.5 s of recording.
-    missing : float
+    hidden_probability : float
         Probability that a point is hidden in a frame (NaN).
     pose : array_like, shape (4, 4), optional
         Camera (x right, y down, z ahead) in the world; 2 m from the object, opposite the robot, where absent.
     """
 
-    points: tuple[str, ...] | None = None
-    std: float = 5e-3
-    rate: float = 3.0
-    gaps: bool = True
-    missing: float = 0.1
+    visible_points: tuple[str, ...] | None = None
+    point_std: float = 5e-3
+    frame_rate: float = 3.0
+    has_dropouts: bool = True
+    hidden_probability: float = 0.1
     pose: ArrayLike | None = None
 
 
@@ -113,37 +113,37 @@ class VirtualExperiment:
     Attributes
     ----------
     motion : Motion, optional
-        `multisine` with `seed` where absent.
-    posture : mapping of str to float, optional
-        Initial angles [rad or m]; `initial_posture` where absent.
+        `random_multisine` with `seed` where absent.
+    initial_joint_angles : mapping of str to float, optional
+        Initial angles [rad or m]; `grasping_joint_angles` where absent.
     simulation : Simulation
         Duration, rate of joints and arm points, rate of the controller, step of the simulator.
-    noise : ArmNoise
+    arm_noise : ArmNoise
     camera : PointCamera, optional
         None for no camera.
-    injected : EngineTerms, optional
+    injected_terms : EngineTerms, optional
         Forces and model changes that are not in the system's description.
     seed : int
         Seed of all noise; each sensor has its own stream, so that leaving one out changes no other.
-    name, description : str
+    recording_name, description : str
         Name and description of the recording; how it was made is appended to the description.
-    play : mapping of joint to float
+    gear_play : mapping of joint to float
         Backlash of gears behind servos, full width [rad].
     """
 
-    motion: Motion | None = None
-    posture: Mapping[str, float] | None = None
-    simulation: Simulation = field(default_factory=Simulation)
-    noise: ArmNoise = field(default_factory=ArmNoise)
+    motion: MultisineMotion | None = None
+    initial_joint_angles: Mapping[str, float] | None = None
+    simulation: SimulationOptions = field(default_factory=SimulationOptions)
+    arm_noise: ArmSensorNoise = field(default_factory=ArmSensorNoise)
     camera: PointCamera | None = field(default_factory=PointCamera)
-    injected: EngineTerms | None = None
+    injected_terms: SimulatorTerms | None = None
     seed: int = 0
-    name: str = "virtual"
+    recording_name: str = "virtual"
     description: str = ""
-    play: Mapping[str, float] = field(default_factory=dict)
+    gear_play: Mapping[str, float] = field(default_factory=dict)
 
 
-def virtual_experiment(
+def run_virtual_experiment(
     system: System, values: Mapping[str, float] | None = None, experiment: VirtualExperiment | None = None
 ) -> Recording:
     """Simulate a robot moving the object and return the recording of encoders, torques, points and camera.
@@ -172,12 +172,14 @@ def virtual_experiment(
     seeds = np.random.SeedSequence(chosen.seed).spawn(len(_STREAMS))
     streams = {name: np.random.default_rng(seed) for name, seed in zip(_STREAMS, seeds, strict=True)}
     duration = chosen.simulation.duration
-    posture = initial_posture(system, values) if chosen.posture is None else chosen.posture
+    posture = (
+        grasping_joint_angles(system, values) if chosen.initial_joint_angles is None else chosen.initial_joint_angles
+    )
     motion = chosen.motion
     if motion is None:
-        excitation = Excitation(duration=duration)
-        motion = multisine(system, values, seed=chosen.seed, posture=posture, excitation=excitation)
-    held = tuple(dict.fromkeys(grasp.held for grasp in system.grasps if grasp.held in system.points))
+        excitation = MultisineOptions(duration=duration)
+        motion = random_multisine(system, values, seed=chosen.seed, initial_joint_angles=posture, excitation=excitation)
+    held = tuple(dict.fromkeys(grasp.held_frame for grasp in system.grasps if grasp.held_frame in system.point_frames))
     visible = () if chosen.camera is None else _visible(system, held, chosen.camera)
     times = np.empty(0)
     if chosen.camera is not None and visible:
@@ -187,62 +189,64 @@ def virtual_experiment(
         values,
         motion,
         chosen.simulation,
-        posture=posture,
+        initial_joint_angles=posture,
         frame_times=times,
-        injected=chosen.injected,
-        play=chosen.play,
+        injected=chosen.injected_terms,
+        gear_play=chosen.gear_play,
     )
     groups = []
     if held:
-        groups.append(_arm_points(system, held, run, chosen.noise, streams))
-    if chosen.camera is not None and len(run.frame_t):
+        groups.append(_arm_points(system, held, run, chosen.arm_noise, streams))
+    if chosen.camera is not None and len(run.frame_times):
         groups.append(_camera_points(system, visible, run, chosen.camera, streams))
     theta = system.parameters.vector(values)
     names = system.parameters.names
     truth = {n: float(theta[i]) for i, n in enumerate(names) if n.rpartition(".")[2] in _TRUE_QUANTITIES}
-    made = _how_it_was_made(chosen, system, seen=len(run.frame_t) > 0)
+    made = _how_it_was_made(chosen, system, seen=len(run.frame_times) > 0)
     joints = _joints(system, run, chosen, streams)
     text = f"{chosen.description} {made}".strip()
     source = "yid_ocp virtual experiment"
-    return validate(Recording(joints, tuple(groups), text, source, chosen.name, truth=truth))
+    return validate_recording(
+        Recording(joints, tuple(groups), text, source, chosen.recording_name, true_parameters=truth)
+    )
 
 
 def _visible(system: System, held: tuple[str, ...], camera: PointCamera) -> tuple[str, ...]:
-    if camera.points is None:
-        return tuple(point for point in system.points if point not in held)
-    for point in camera.points:
-        if point not in system.points:
-            raise ConfigError(f"the camera cannot see '{point}'", allowed=", ".join(system.points))
-    return tuple(camera.points)
+    if camera.visible_points is None:
+        return tuple(point for point in system.point_frames if point not in held)
+    for point in camera.visible_points:
+        if point not in system.point_frames:
+            raise ConfigError(f"the camera cannot see '{point}'", allowed=", ".join(system.point_frames))
+    return tuple(camera.visible_points)
 
 
-def _joints(system: System, run: SimulatedRun, experiment: VirtualExperiment, streams: Generators) -> JointGroup:
-    driven, noise = list(system.driven_indices), experiment.noise
+def _joints(system: System, run: SimulationResult, experiment: VirtualExperiment, streams: _Generators) -> JointGroup:
+    driven, noise = list(system.driven_indices), experiment.arm_noise
     white, bias = (
         _by_joint(std, len(driven), f"ArmNoise.{name}")
-        for name, std in (("effort", noise.effort), ("effort_bias", noise.effort_bias))
+        for name, std in (("effort", noise.effort_std), ("effort_bias", noise.effort_bias_std))
     )
     offset = bias * streams["effort_bias"].standard_normal(len(driven))
     if system.servos:
         return JointGroup(
             names=tuple(system.driven),
             t=run.t,
-            position=_noisy(run.q[:, driven], noise.position, streams["position"]),
-            velocity=_noisy(run.v[:, driven], noise.velocity, streams["velocity"]),
+            position=_noisy(run.q[:, driven], noise.position_std, streams["position"]),
+            velocity=_noisy(run.v[:, driven], noise.velocity_std, streams["velocity"]),
             position_command=run.effort,
-            position_std=noise.position,
-            velocity_std=noise.velocity,
+            position_std=noise.position_std,
+            velocity_std=noise.velocity_std,
         )
     return JointGroup(
         names=tuple(system.driven),
         t=run.t,
-        position=_noisy(run.q[:, driven], noise.position, streams["position"]),
-        velocity=_noisy(run.v[:, driven], noise.velocity, streams["velocity"]),
+        position=_noisy(run.q[:, driven], noise.position_std, streams["position"]),
+        velocity=_noisy(run.v[:, driven], noise.velocity_std, streams["velocity"]),
         effort=_noisy(run.effort, white, streams["effort"]) + offset,
-        position_std=noise.position,
-        velocity_std=noise.velocity,
-        effort_std=white if noise.stated else None,
-        effort_bias_std=bias if noise.stated else None,
+        position_std=noise.position_std,
+        velocity_std=noise.velocity_std,
+        effort_std=white if noise.records_effort_std else None,
+        effort_bias_std=bias if noise.records_effort_std else None,
         effort_kind=experiment.simulation.effort_kind,
     )
 
@@ -254,44 +258,47 @@ def _by_joint(std: float | tuple[float, ...], joints: int, where: str) -> Array:
 
 
 def _arm_points(
-    system: System, held: tuple[str, ...], run: SimulatedRun, noise: ArmNoise, streams: Generators
+    system: System, held: tuple[str, ...], run: SimulationResult, noise: ArmSensorNoise, streams: _Generators
 ) -> PointGroup:
-    clean = run.points[:, [system.points.index(point) for point in held]]
-    position = _noisy(clean, noise.points, streams["arm_points"])
-    return PointGroup("points_arm", held, run.t, position, np.full(clean.shape, noise.points), sensor="arm")
+    clean = run.point_positions[:, [system.point_frames.index(point) for point in held]]
+    position = _noisy(clean, noise.point_std, streams["arm_points"])
+    return PointGroup("points_arm", held, run.t, position, np.full(clean.shape, noise.point_std), sensor="arm")
 
 
 def _camera_points(
-    system: System, visible: tuple[str, ...], run: SimulatedRun, camera: PointCamera, streams: Generators
+    system: System, visible: tuple[str, ...], run: SimulationResult, camera: PointCamera, streams: _Generators
 ) -> PointGroup:
     rng = streams["camera_points"]
-    clean = run.frame_points[:, [system.points.index(point) for point in visible]]
-    position = _noisy(clean, camera.std, rng)
-    position[rng.random(position.shape[:2]) < camera.missing] = np.nan
-    pose = _camera_pose(run.points[0].mean(0)) if camera.pose is None else np.asarray(camera.pose, float)
-    std = np.full(clean.shape, camera.std)
-    return PointGroup("points_camera", visible, run.frame_t, position, std, "camera", pose=pose)
+    clean = run.frame_point_positions[:, [system.point_frames.index(point) for point in visible]]
+    position = _noisy(clean, camera.point_std, rng)
+    position[rng.random(position.shape[:2]) < camera.hidden_probability] = np.nan
+    pose = _camera_pose(run.point_positions[0].mean(0)) if camera.pose is None else np.asarray(camera.pose, float)
+    std = np.full(clean.shape, camera.point_std)
+    return PointGroup("points_camera", visible, run.frame_times, position, std, "camera", pose=pose)
 
 
 def _how_it_was_made(experiment: VirtualExperiment, system: System, seen: bool) -> str:
-    simulation, noise, camera = experiment.simulation, experiment.noise, experiment.camera
-    held, sampled = 1e3 / (simulation.rate * simulation.controller_periods), 1e3 / simulation.rate
+    simulation, noise, camera = experiment.simulation, experiment.arm_noise, experiment.camera
+    held, sampled = (
+        1e3 / (simulation.sample_rate * simulation.controller_periods_per_sample),
+        1e3 / simulation.sample_rate,
+    )
     input_, efforts = f"commands of position servos held over each {held:g} ms, recorded every {sampled:g} ms", ""
     if not system.servos:
         input_ = f"torque held over each {held:g} ms and recorded as {simulation.effort_kind} every {sampled:g} ms"
-        efforts = f"effort {_listed(noise.effort)} N m, "
+        efforts = f"effort {_listed(noise.effort_std)} N m, "
     made = (
-        f"Virtual experiment in MuJoCo {mujoco_module().__version__} (implicitfast, "
+        f"Virtual experiment in MuJoCo {import_mujoco().__version__} (implicitfast, "
         f"{1e3 * simulation.time_step:g} ms inner step): multi-sine motion of {len(system.driven)} joints "
         f"from static equilibrium, {input_}, seed {experiment.seed}. White noise: "
-        f"joint position {noise.position:g} rad, velocity {noise.velocity:g} rad/s, "
-        f"{efforts}arm points {1e3 * noise.points:g} mm"
+        f"joint position {noise.position_std:g} rad, velocity {noise.velocity_std:g} rad/s, "
+        f"{efforts}arm points {1e3 * noise.point_std:g} mm"
     )
     if not system.servos:
-        made += f"; constant offset of the effort {_listed(noise.effort_bias)} N m"
+        made += f"; constant offset of the effort {_listed(noise.effort_bias_std)} N m"
     if camera is None or not seen:
         return made + "; no camera."
-    return made + f", camera {1e3 * camera.std:g} mm at about {camera.rate:g} Hz."
+    return made + f", camera {1e3 * camera.point_std:g} mm at about {camera.frame_rate:g} Hz."
 
 
 def _listed(std: float | tuple[float, ...]) -> str:
@@ -303,10 +310,10 @@ def _noisy(clean: Array, std: float | Array, rng: np.random.Generator) -> Array:
 
 
 def _frame_times(rng: np.random.Generator, duration: float, camera: PointCamera) -> Array:
-    count = math.ceil(2 * duration * camera.rate) + 2
-    times = np.cumsum(rng.uniform(0.75, 1.25, count) / camera.rate)
+    count = math.ceil(2 * duration * camera.frame_rate) + 2
+    times = np.cumsum(rng.uniform(0.75, 1.25, count) / camera.frame_rate)
     times = times[times < duration]
-    if camera.gaps:
+    if camera.has_dropouts:
         number = max(1, round(duration / 2.5))
         starts = duration / number * (np.arange(number) + rng.uniform(0.15, 0.45, number))
         lengths = rng.uniform(1.0, 1.5, number)

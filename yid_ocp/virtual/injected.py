@@ -19,25 +19,25 @@ from scipy.spatial.transform import Rotation
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.effects import make_effect
-from yid_ocp.effects.base import arms, object_joints
-from yid_ocp.errors import ConfigError, ModelError, choices
+from yid_ocp.effects.base import joints_by_arm, object_joints
+from yid_ocp.errors import ConfigError, ModelError, unknown_name_details
 from yid_ocp.model.system import System
-from yid_ocp.virtual.experiment import VirtualExperiment, virtual_experiment
-from yid_ocp.virtual.mjcf import mujoco_module
-from yid_ocp.virtual.outside import OUTSIDE, Force, Scene
-from yid_ocp.virtual.terms import Evaluator
+from yid_ocp.virtual.experiment import VirtualExperiment, run_virtual_experiment
+from yid_ocp.virtual.mjcf import import_mujoco
+from yid_ocp.virtual.out_of_library_effects import OUT_OF_LIBRARY_EFFECTS, EffectContext, ForceCallback
+from yid_ocp.virtual.rigid_body_terms import ParameterEvaluator
 
 Array = NDArray[np.float64]
 
-AIR_DENSITY = 1.2
+_AIR_DENSITY = 1.2
 """[kg/m^3]"""
-SMOOTHING = 0.02
+_FRICTION_SMOOTHING_SPEED = 0.02
 """v_s of dry friction [rad/s]."""
-FARTHEST = 1.0
+_MAX_PAYLOAD_DISTANCE = 1.0
 """Distance of a payload's mass from its frame [m]."""
 
 # a change of the system's description; servos are MuJoCo's own actuators, which delay and clip
-DESCRIBED: tuple[str, ...] = (
+_DESCRIPTION_KINDS: tuple[str, ...] = (
     "density",
     "point_mass",
     "length_scale",
@@ -51,9 +51,9 @@ DESCRIBED: tuple[str, ...] = (
     "servo_saturation",
 )
 # a term that MuJoCo's own model has
-MODELLED: tuple[str, ...] = ("kelvin_voigt", "joint_viscous", "rotor_inertia", "payload")
+_MUJOCO_MODEL_KINDS: tuple[str, ...] = ("kelvin_voigt", "joint_viscous", "rotor_inertia", "payload")
 # a force that is worked out here
-FORCED: tuple[str, ...] = (
+_FORCE_KINDS: tuple[str, ...] = (
     "cubic_stiffness",
     "standard_linear_solid",
     "hysteresis",
@@ -66,7 +66,7 @@ FORCED: tuple[str, ...] = (
     "effort_lag",
 )
 # an error of a sensor or clock
-SENSOR_ERRORS: tuple[str, ...] = (
+_SENSOR_ERROR_KINDS: tuple[str, ...] = (
     "effort_gain",
     "effort_offset",
     "effort_delay",
@@ -79,7 +79,7 @@ SENSOR_ERRORS: tuple[str, ...] = (
     "camera_latency",
     "surface_offset",
 )
-KINDS = (*DESCRIBED, *MODELLED, *FORCED, *SENSOR_ERRORS)
+INJECTABLE_KINDS = (*_DESCRIPTION_KINDS, *_MUJOCO_MODEL_KINDS, *_FORCE_KINDS, *_SENSOR_ERROR_KINDS)
 """Effect kinds of the library that can be simulated in MuJoCo."""
 
 
@@ -90,7 +90,7 @@ class InjectedEffect:
     Attributes
     ----------
     kind : str
-        Of `KINDS` or `OUTSIDE`.
+        Of `INJECTABLE_KINDS` or `OUT_OF_LIBRARY_EFFECTS`.
     location : str
     values : mapping of quantity to float
         As in the vocabulary; for those outside it `size`, in the unit of the force that it makes.
@@ -106,7 +106,7 @@ class InjectedEffect:
         return f"{self.kind}@{self.location}"
 
 
-def injected_experiment(
+def run_injected_experiment(
     system: System,
     values: Mapping[str, float],
     effects: Sequence[InjectedEffect],
@@ -136,85 +136,86 @@ def injected_experiment(
     ModelError
         A payload that is too far off, or takes away what is not there.
     ConfigError, ModelError, DataError
-        As `virtual_experiment`.
+        As `run_virtual_experiment`.
     """
-    known = (*KINDS, *OUTSIDE)
+    known = (*INJECTABLE_KINDS, *OUT_OF_LIBRARY_EFFECTS)
     for effect in effects:
         if effect.kind not in known:
             raise ConfigError(
                 f"{effect.kind} cannot be done in MuJoCo here",
                 where=effect.label,
-                **choices(effect.kind, known),
+                **unknown_name_details(effect.kind, known),
             )
-    described = [make_effect(e.kind, e.location, system, e.values) for e in effects if e.kind in DESCRIBED]
+    described = [make_effect(e.kind, e.location, system, e.values) for e in effects if e.kind in _DESCRIPTION_KINDS]
     changed = system.with_effects(described) if described else system
     # a servo acts on what its encoder reads: gears with play are part of the mechanics
     play = {e.location: e.values["width"] for e in effects if e.kind == "backlash" and e.location in system.servos}
-    inner = [e for e in effects if e.kind not in DESCRIBED and e.kind not in SENSOR_ERRORS]
-    injected = InjectedTerms(changed, values, inner) if inner else None
-    chosen = replace(experiment or VirtualExperiment(), injected=injected, play=play)
-    made = virtual_experiment(changed, values, chosen)
+    inner = [e for e in effects if e.kind not in _DESCRIPTION_KINDS and e.kind not in _SENSOR_ERROR_KINDS]
+    injected = _InjectedTerms(changed, values, inner) if inner else None
+    chosen = replace(experiment or VirtualExperiment(), injected_terms=injected, gear_play=play)
+    made = run_virtual_experiment(changed, values, chosen)
     for effect in effects:
-        if effect.kind in SENSOR_ERRORS and effect.location not in play:
-            made = with_sensor_error(made, system, effect)
+        if effect.kind in _SENSOR_ERROR_KINDS and effect.location not in play:
+            made = _with_sensor_error(made, system, effect)
     return made
 
 
-class InjectedTerms:
-    """Effects as MuJoCo terms: `prepare` edits the model, MuJoCo calls `force` at every step.
+class _InjectedTerms:
+    """Effects as MuJoCo terms: `edit_model` edits the model, MuJoCo calls `add_forces` at every step.
 
     Parameters
     ----------
     system : System
     values : mapping of str to float
     effects : sequence of InjectedEffect
-        Of `MODELLED`, `FORCED` or `OUTSIDE`.
+        Of `_MUJOCO_MODEL_KINDS`, `_FORCE_KINDS` or `OUT_OF_LIBRARY_EFFECTS`.
     """
 
     def __init__(self, system: System, values: Mapping[str, float], effects: Sequence[InjectedEffect]) -> None:
         self._system, self._effects = system, tuple(effects)
-        self._value = value = Evaluator(system, values)
-        self._scene = Scene(
+        self._value = value = ParameterEvaluator(system, values)
+        self._scene = EffectContext(
             system,
-            {s.joint: float(value(s.stiffness)[0]) for s in system.elastic},
-            {s.joint: float(value(s.rest)[0]) for s in system.elastic},
+            {s.joint_name: float(value(s.stiffness)[0]) for s in system.elastic_joints},
+            {s.joint_name: float(value(s.rest_angle)[0]) for s in system.elastic_joints},
         )
         self._shape = {
-            s.name: (float(value(s.radius)[0]), [float(value(x)[0]) for x in s.lengths]) for s in system.segments
+            s.name: (float(value(s.radius)[0]), [float(value(x)[0]) for x in s.link_lengths])
+            for s in system.segment_layouts
         }
-        self._forces: list[Force] = []
+        self._forces: list[ForceCallback] = []
 
-    def prepare(self, model: Any) -> None:
+    def edit_model(self, model: Any) -> None:
         """Edit a compiled `mujoco.MjModel` and work out the forces."""
         for effect in self._effects:
             size, place = effect.values, effect.location
             if effect.kind == "kelvin_voigt":
-                at, stiffness, _ = self._scene.springs(model, place)
+                at, stiffness, _ = self._scene.segment_springs(model, place)
                 model.dof_damping[at] += size["tau"] * stiffness
             elif effect.kind == "joint_viscous":
                 model.dof_damping[model.joint(place).id] += size["b"]
             elif effect.kind == "rotor_inertia":
                 model.dof_armature[model.joint(place).id] += size["armature"]
-            elif effect.kind in OUTSIDE:
-                self._forces.append(OUTSIDE[effect.kind](self._scene, model, place, size["size"]))
+            elif effect.kind in OUT_OF_LIBRARY_EFFECTS:
+                self._forces.append(OUT_OF_LIBRARY_EFFECTS[effect.kind](self._scene, model, place, size["size"]))
             elif effect.kind == "payload":
                 self._weigh(model, place, size)
             else:
                 self._forces.append(getattr(self, f"_{effect.kind}")(model, place, size))
 
-    def begin(self, data: Any) -> None:
+    def start_motion(self, data: Any) -> None:
         """Start the memory of effects that have one."""
-        self._scene.running = True
+        self._scene.has_motion_begun = True
 
-    def force(self, model: Any, data: Any) -> None:
+    def add_forces(self, model: Any, data: Any) -> None:
         """Add the forces to `qfrc_passive`."""
         for push in self._forces:
             push(model, data)
 
     # -- effects of the vocabulary ------------------------------------------------------------------------------------
 
-    def _cubic_stiffness(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
-        at, _, rest = self._scene.springs(model, place)
+    def _cubic_stiffness(self, model: Any, place: str, size: Mapping[str, float]) -> ForceCallback:
+        at, _, rest = self._scene.segment_springs(model, place)
         k3 = size["k3"]
 
         def push(_: Any, data: Any) -> None:
@@ -222,13 +223,13 @@ class InjectedTerms:
 
         return push
 
-    def _standard_linear_solid(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
-        at, stiffness, _ = self._scene.springs(model, place)
+    def _standard_linear_solid(self, model: Any, place: str, size: Mapping[str, float]) -> ForceCallback:
+        at, stiffness, _ = self._scene.segment_springs(model, place)
         branch, time = size["ratio"] * stiffness, size["relaxation_time"]
         state: dict[str, Any] = {"z": None, "t": 0.0}
 
         def push(_: Any, data: Any) -> None:
-            if not self._scene.running:
+            if not self._scene.has_motion_begun:
                 return
             q = np.array(data.qpos[at])
             if state["z"] is None:
@@ -241,13 +242,13 @@ class InjectedTerms:
 
         return push
 
-    def _hysteresis(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
-        at, _, _ = self._scene.springs(model, place)
+    def _hysteresis(self, model: Any, place: str, size: Mapping[str, float]) -> ForceCallback:
+        at, _, _ = self._scene.segment_springs(model, place)
         stiffness, angle = size["stiffness"], size["yield_angle"]
         state: dict[str, Any] = {"z": np.zeros(len(at)), "t": 0.0}
 
         def push(_: Any, data: Any) -> None:
-            if not self._scene.running:
+            if not self._scene.has_motion_begun:
                 return
             v = np.array(data.qvel[at])
             step = float(data.time) - state["t"]
@@ -258,12 +259,12 @@ class InjectedTerms:
 
         return push
 
-    def _aerodynamic_drag(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
-        mujoco = mujoco_module()
-        segment = self._system.segment(place)
-        bodies = [int(model.jnt_bodyid[model.joint(link[-1]).id]) for link in segment.links]
+    def _aerodynamic_drag(self, model: Any, place: str, size: Mapping[str, float]) -> ForceCallback:
+        mujoco = import_mujoco()
+        segment = self._system.segment_layout(place)
+        bodies = [int(model.jnt_bodyid[model.joint(link[-1]).id]) for link in segment.link_joints]
         radius, lengths = self._shape[place]
-        factor = [AIR_DENSITY * size["cd"] * radius * length for length in lengths]
+        factor = [_AIR_DENSITY * size["cd"] * radius * length for length in lengths]
         found = np.zeros(6)
 
         def push(model: Any, data: Any) -> None:
@@ -276,8 +277,8 @@ class InjectedTerms:
 
         return push
 
-    def _gravity_scale(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
-        mujoco = mujoco_module()
+    def _gravity_scale(self, model: Any, place: str, size: Mapping[str, float]) -> ForceCallback:
+        mujoco = import_mujoco()
         bodies = sorted({int(model.jnt_bodyid[model.joint(joint).id]) for joint in object_joints(self._system)})
         weights = [size["fraction"] * model.body_mass[body] * np.array(model.opt.gravity) for body in bodies]
 
@@ -287,7 +288,7 @@ class InjectedTerms:
 
         return push
 
-    def _joint_spring(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
+    def _joint_spring(self, model: Any, place: str, size: Mapping[str, float]) -> ForceCallback:
         # not MuJoCo's own spring, whose rest angle the search for the equilibrium uses to hold the arm
         at = model.joint(place).id
 
@@ -296,30 +297,30 @@ class InjectedTerms:
 
         return push
 
-    def _joint_coulomb(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
+    def _joint_coulomb(self, model: Any, place: str, size: Mapping[str, float]) -> ForceCallback:
         at = model.joint(place).id
 
         def push(_: Any, data: Any) -> None:
-            data.qfrc_passive[at] -= size["tau_c"] * math.tanh(data.qvel[at] / SMOOTHING)
+            data.qfrc_passive[at] -= size["tau_c"] * math.tanh(data.qvel[at] / _FRICTION_SMOOTHING_SPEED)
 
         return push
 
-    def _joint_stribeck(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
+    def _joint_stribeck(self, model: Any, place: str, size: Mapping[str, float]) -> ForceCallback:
         at = model.joint(place).id
 
         def push(_: Any, data: Any) -> None:
             v = float(data.qvel[at])
             fall = math.exp(-((v / size["v_stribeck"]) ** 2))
-            data.qfrc_passive[at] -= size["tau_s"] * fall * math.tanh(v / SMOOTHING)
+            data.qfrc_passive[at] -= size["tau_s"] * fall * math.tanh(v / _FRICTION_SMOOTHING_SPEED)
 
         return push
 
-    def _joint_presliding(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
+    def _joint_presliding(self, model: Any, place: str, size: Mapping[str, float]) -> ForceCallback:
         at = model.joint(place).id
         state = {"s": 0.0, "t": 0.0}
 
         def push(_: Any, data: Any) -> None:
-            if not self._scene.running:
+            if not self._scene.has_motion_begun:
                 return
             v, step = float(data.qvel[at]), float(data.time) - state["t"]
             if step > 0:
@@ -330,13 +331,13 @@ class InjectedTerms:
 
         return push
 
-    def _effort_lag(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
-        at, apart = model.joint(place).id, int(mujoco_module().mjtDisableBit.mjDSBL_EQUALITY)
+    def _effort_lag(self, model: Any, place: str, size: Mapping[str, float]) -> ForceCallback:
+        at, apart = model.joint(place).id, int(import_mujoco().mjtDisableBit.mjDSBL_EQUALITY)
         state: dict[str, Any] = {"z": None, "command": 0.0, "t": 0.0}
 
         def push(model: Any, data: Any) -> None:
             # the controller works with a model of its own, whose grasps are off: there no torque is applied
-            if not self._scene.running or model.opt.disableflags & apart:
+            if not self._scene.has_motion_begun or model.opt.disableflags & apart:
                 return
             command, step = float(data.qfrc_applied[at]), float(data.time) - state["t"]
             if state["z"] is None:
@@ -352,13 +353,15 @@ class InjectedTerms:
 
     def _weigh(self, model: Any, place: str, size: Mapping[str, float]) -> None:
         """Put a point of some mass, or take it, at (mx, my, mz)/mass in a frame."""
-        mujoco, value, where = mujoco_module(), self._value, f"payload@{place}"
+        mujoco, value, where = import_mujoco(), self._value, f"payload@{place}"
         frame, reach = self._system.mechanism.frame(place), np.array([size.get(f"m{a}", 0.0) for a in "xyz"])
-        body = int(model.jnt_bodyid[model.joint(self._system.mechanism.joints[frame.joint].name).id])
+        body = int(model.jnt_bodyid[model.joint(self._system.mechanism.joints[frame.joint_index].name).id])
         turn = value(frame.placement.rotation).reshape(3, 3, order="F")
         mass = size["mass"]
-        if not np.linalg.norm(reach) <= FARTHEST * abs(mass):
-            raise ModelError("its mass sits too far from its frame", where=where, allowed=f"within {FARTHEST:g} m")
+        if not np.linalg.norm(reach) <= _MAX_PAYLOAD_DISTANCE * abs(mass):
+            raise ModelError(
+                "its mass sits too far from its frame", where=where, allowed=f"within {_MAX_PAYLOAD_DISTANCE:g} m"
+            )
         point = value(frame.placement.translation) + turn @ reach / mass
         own, centre = float(model.body_mass[body]), np.array(model.body_ipos[body])
         w, x, y, z = model.body_iquat[body]
@@ -380,7 +383,7 @@ class InjectedTerms:
 # -- sensors and clocks -----------------------------------------------------------------------------------------------
 
 
-def with_sensor_error(recording: Recording, system: System, effect: InjectedEffect) -> Recording:
+def _with_sensor_error(recording: Recording, system: System, effect: InjectedEffect) -> Recording:
     """The recording as sensors with one given error would have measured it.
 
     Parameters
@@ -388,7 +391,7 @@ def with_sensor_error(recording: Recording, system: System, effect: InjectedEffe
     recording : Recording
     system : System
     effect : InjectedEffect
-        Of `SENSOR_ERRORS`.
+        Of `_SENSOR_ERROR_KINDS`.
     """
     if effect.kind.startswith("camera") or effect.kind == "surface_offset":
         points = tuple(
@@ -408,7 +411,7 @@ def _joint_error(joints: JointGroup, system: System, effect: InjectedEffect) -> 
     size = effect.values
     if effect.kind == "effort_delay":
         # what is recorded now acts only after the delay
-        for name in arms(system)[effect.location]:
+        for name in joints_by_arm(system)[effect.location]:
             column = joints.names.index(name)
             effort[:, column] = np.interp(joints.t + size["delay"], joints.t, joints.effort[:, column])
         return replace(joints, effort=effort)
@@ -442,8 +445,8 @@ def _camera_error(group: PointGroup, system: System, effect: InjectedEffect, dur
         inside = late <= duration
         std = None if group.std is None else group.std[inside]
         return replace(group, t=late[inside], position=position[inside], std=std)
-    value = Evaluator(system, {})
-    radius = {s.name: float(value(s.radius)[0]) for s in system.segments}
+    value = ParameterEvaluator(system, {})
+    radius = {s.name: float(value(s.radius)[0]) for s in system.segment_layouts}
     own = np.array([radius.get(name.removeprefix("w_").partition(":")[0], 0.0) for name in group.names])
     ray = centre - position
     away = ray / np.linalg.norm(ray, axis=2, keepdims=True)

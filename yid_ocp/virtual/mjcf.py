@@ -15,23 +15,30 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from yid_ocp.errors import ConfigError, DataError, ModelError
-from yid_ocp.model.drives import KNEE, NO_LIMIT
-from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, merged
+from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, merge_bodies
+from yid_ocp.model.servos_and_springs import TORQUE_LIMIT_POWER, UNLIMITED_EFFORT
 from yid_ocp.model.system import System
-from yid_ocp.virtual.terms import ASPECTS, Evaluator, JointTerms, actuation, effect_aspects, joint_terms
+from yid_ocp.virtual.rigid_body_terms import (
+    MODEL_ASPECTS,
+    JointDynamics,
+    ParameterEvaluator,
+    actuator_responses,
+    effect_terms_and_aspects,
+    joint_dynamics,
+)
 
 Array = NDArray[np.float64]
 
-NATIVE = frozenset(
+_NATIVE_ASPECTS = frozenset(
     {
         *("stiffness", "rest", "damping", "geometry", "inertia", "weight"),
         *("gravity", "grasp", "sprung_joint", "armature", "cubic_stiffness", "servo"),
     }
 )
 """Aspects of an effect for which MuJoCo has an equivalent term."""
-EMULATED = frozenset({"dry_friction", "grasp_compliance"})
+EMULATED_ASPECTS = frozenset({"dry_friction", "grasp_compliance"})
 """Aspects that MuJoCo can only approximate."""
-IGNORED = frozenset({"reading", "torque_gain", "torque_offset", "torque_delay", "torque_lag"})
+_IGNORED_ASPECTS = frozenset({"reading", "torque_gain", "torque_offset", "torque_delay", "torque_lag"})
 """Aspects of sensors and recorded torques that do not enter the mechanics."""
 
 _JOINTS_PER_BODY = 6  # as many as MuJoCo allows
@@ -47,7 +54,7 @@ def mujoco_xml(
     integrator: str = "implicitfast",
     emulate: bool = False,
     actuators: bool = False,
-    play: Mapping[str, float] | None = None,
+    gear_play: Mapping[str, float] | None = None,
 ) -> str:
     """The MJCF text of a system.
 
@@ -73,7 +80,7 @@ def mujoco_xml(
         Whether every driven joint has an actuator of its name whose control is the recorded torque, with gain, offset,
         delay and lag between that and the torque that acts; without, true torques go in as `qfrc_applied`. A servo
         always is an actuator, whose control is the command.
-    play : mapping of joint name to float, optional
+    gear_play : mapping of joint name to float, optional
         Backlash of gears, full width [rad]: the joint is then the motor's side, and a joint `NAME_play` follows it.
 
     Returns
@@ -85,14 +92,14 @@ def mujoco_xml(
     ------
     ModelError
         What MuJoCo cannot express: a moving body without mass, more than six massless joints at one place, a frame on
-        one of them, a compliant grasp, a cubic spring beside a rest angle, an effect beyond `NATIVE`.
+        one of them, a compliant grasp, a cubic spring beside a rest angle, an effect beyond `_NATIVE_ASPECTS`.
     ConfigError
         Unknown parameter, or `time_step` not positive.
     """
     if not time_step > 0:
         raise ConfigError(f"time_step = {time_step}", where="mujoco_xml", allowed="a positive number of seconds")
-    tree, weights = _weighed(replace(system.mechanism, parameters=system.parameters).numeric(values))
-    value = Evaluator(system, values)
+    tree, weights = _weighed(replace(system.mechanism, parameters=system.parameters).with_numeric_values(values))
+    value = ParameterEvaluator(system, values)
     _refuse_inexpressible(system, value, emulate)
 
     root = ElementTree.Element("mujoco", model=tree.name)
@@ -111,10 +118,10 @@ def mujoco_xml(
     sites = _sites(system, tree, value)
     base = ElementTree.SubElement(ElementTree.SubElement(root, "worldbody"), "body", name="world_base")
     ElementTree.SubElement(base, "inertial", pos="0 0 0", mass="0", diaginertia="0 0 0")  # Pinocchio asks for one
-    gears = {name: _play_attributes(width, time_step) for name, width in (play or {}).items()}
-    elements = _bodies(tree, weights, joint_terms(system, value), sites, base, gears)
+    gears = {name: _play_attributes(width, time_step) for name, width in (gear_play or {}).items()}
+    elements = _bodies(tree, weights, joint_dynamics(system, value), sites, base, gears)
     for name, frame in sites:
-        ElementTree.SubElement(elements[frame.joint], "site", {"name": name, **_pose(frame.placement)})
+        ElementTree.SubElement(elements[frame.joint_index], "site", {"name": name, **_pose(frame.placement)})
     _add_grasps(system, value, root, time_step)
     if actuators or system.servos:
         _add_actuators(system, value, ElementTree.SubElement(root, "actuator"), time_step)
@@ -125,7 +132,7 @@ def mujoco_xml(
 def _bodies(
     tree: Mechanism,
     weights: Mapping[str, float],
-    terms: Mapping[str, JointTerms],
+    terms: Mapping[str, JointDynamics],
     sites: list[tuple[str, Frame]],
     world: ElementTree.Element,
     gears: Mapping[str, Mapping[str, str]],
@@ -134,19 +141,19 @@ def _bodies(
 
     `gears` has attributes of the joint between a motor and what it moves, by the motor's joint.
     """
-    carried = {frame.joint: name for name, frame in reversed(sites)}
+    carried = {frame.joint_index: name for name, frame in reversed(sites)}
     elements: dict[int, ElementTree.Element] = {-1: world}
     for j, joint in enumerate(tree.joints):
         if _shares_body(tree, j):
-            elements[j] = elements[joint.parent]
-            if joint.parent in carried:
-                what = f"frame '{carried[joint.parent]}' sits on a joint that carries no mass"
+            elements[j] = elements[joint.parent_index]
+            if joint.parent_index in carried:
+                what = f"frame '{carried[joint.parent_index]}' sits on a joint that carries no mass"
                 raise ModelError(what, where=f"joint {joint.name}")
         else:
             elements[j] = ElementTree.SubElement(
-                elements[joint.parent], "body", {"name": f"{joint.name}_body", **_pose(joint.placement)}
+                elements[joint.parent_index], "body", {"name": f"{joint.name}_body", **_pose(joint.placement)}
             )
-        attributes = _joint_attributes(joint, terms.get(joint.name, JointTerms()))
+        attributes = _joint_attributes(joint, terms.get(joint.name, JointDynamics()))
         moved = ElementTree.SubElement(elements[j], "joint", attributes)
         if joint.name in gears:
             motor, name = elements[j], joint.name
@@ -162,12 +169,12 @@ def _bodies(
                 where=f"joint {joint.name}",
                 allowed="up to six; a body with mass on the last of them",
             )
-        body = merged(joint.bodies)
+        body = merge_bodies(joint.bodies)
         if body is not None:
             if joint.name in weights:
                 elements[j].set("gravcomp", _text([1 - weights[joint.name]]))
             ElementTree.SubElement(elements[j], "inertial", _inertial(body))
-        elif not any(_shares_body(tree, k) and tree.joints[k].parent == j for k in range(len(tree.joints))):
+        elif not any(_shares_body(tree, k) and tree.joints[k].parent_index == j for k in range(len(tree.joints))):
             raise ModelError(
                 f"nothing that '{joint.name}' moves has a mass",
                 where=f"joint {joint.name}",
@@ -189,22 +196,22 @@ def _weighed(tree: Mechanism) -> tuple[Mechanism, dict[str, float]]:
     return replace(tree, joints=joints), weights
 
 
-def _joint_attributes(joint: Joint, terms: JointTerms) -> dict[str, str]:
+def _joint_attributes(joint: Joint, terms: JointDynamics) -> dict[str, str]:
     attributes = {"name": joint.name, "axis": _text(joint.axis), "damping": _text([terms.damping])}
     attributes["type"] = "hinge" if joint.kind == "revolute" else "slide"
     if terms.stiffness > 0:
         attributes["stiffness"] = _text([terms.stiffness])
-        attributes["springref"] = _text([terms.pull / terms.stiffness])
-    if terms.cubic:
-        if terms.pull or not hasattr(mujoco_module().MjModel, "jnt_stiffnesspoly"):
+        attributes["springref"] = _text([terms.constant_force / terms.stiffness])
+    if terms.cubic_stiffness:
+        if terms.constant_force or not hasattr(import_mujoco().MjModel, "jnt_stiffnesspoly"):
             what = f"the spring at '{joint.name}' has a cubic part"
             allowed = "none beside a rest angle, and MuJoCo with polynomial stiffness (3.6 or newer)"
             raise ModelError(what, where="mujoco_xml", allowed=allowed)
-        attributes["stiffness"] = _text([terms.stiffness, 0.0, terms.cubic])
+        attributes["stiffness"] = _text([terms.stiffness, 0.0, terms.cubic_stiffness])
     if terms.armature:
         attributes["armature"] = _text([terms.armature])
-    if terms.friction:
-        attributes["frictionloss"] = _text([terms.friction])
+    if terms.dry_friction:
+        attributes["frictionloss"] = _text([terms.dry_friction])
     return attributes
 
 
@@ -214,7 +221,7 @@ def _play_attributes(width: float, time_step: float) -> dict[str, str]:
     return {**ends, "solreflimit": _text([5 * time_step, 1.0]), "solimplimit": "0.99 0.999 0.0001 0.5 2"}
 
 
-def _add_grasps(system: System, value: Evaluator, root: ElementTree.Element, time_step: float) -> None:
+def _add_grasps(system: System, value: ParameterEvaluator, root: ElementTree.Element, time_step: float) -> None:
     equality = ElementTree.SubElement(root, "equality")
     firm = {"solref": _text([2 * time_step, 1.0]), "solimp": "0.9999 0.9999 0.001 0.5 2"}
     for grasp in system.grasps:
@@ -222,7 +229,7 @@ def _add_grasps(system: System, value: Evaluator, root: ElementTree.Element, tim
         compliance = float(value(grasp.compliance)[0])
         if compliance > 0:
             # a tendon of no length pulls with its stiffness, and damps, along the line between both ends
-            relaxation = 0.0 if grasp.relaxation is None else float(value(grasp.relaxation)[0])
+            relaxation = 0.0 if grasp.relaxation_time is None else float(value(grasp.relaxation_time)[0])
             sizes = {"stiffness": _text([1 / compliance]), "damping": _text([relaxation / compliance])}
             tendons = root.find("tendon")
             tendons = ElementTree.SubElement(root, "tendon") if tendons is None else tendons
@@ -238,25 +245,25 @@ def _add_grasps(system: System, value: Evaluator, root: ElementTree.Element, tim
             ElementTree.SubElement(equality, kind, {"name": f"grasp_{grasp.name}{suffix}", **sites, **firm})
 
 
-def _add_actuators(system: System, value: Evaluator, actuator: ElementTree.Element, time_step: float) -> None:
+def _add_actuators(system: System, value: ParameterEvaluator, actuator: ElementTree.Element, time_step: float) -> None:
     """Actuators from recorded torques to those that act, and position servos."""
-    for joint, found in actuation(system, value).items():
+    for joint, found in actuator_responses(system, value).items():
         attributes, servo = {"name": joint, "joint": joint}, system.servos.get(joint)
-        gain, bias, delay, between = found.gain, [-found.offset, 0.0, 0.0], found.delay, "linear"
+        gain, bias, delay, between = found.gain, [-found.subtracted_offset, 0.0, 0.0], found.delay, "linear"
         if servo is not None:
-            own, damping, late, tightness = (float(value(x)[0]) for x in servo.parts)
+            own, damping, late, tightness = (float(value(x)[0]) for x in servo.coefficients)
             gain, bias, delay = own * gain, [own * bias[0], -own, -damping], delay + late
-            between = "zoh" if servo.commands == "held" else "linear"
-            limit = tightness ** (-1 / KNEE) if tightness > 0 else math.inf
-            if limit < NO_LIMIT:
+            between = "zoh" if servo.command_interpolation == "held" else "linear"
+            limit = tightness ** (-1 / TORQUE_LIMIT_POWER) if tightness > 0 else math.inf
+            if limit < UNLIMITED_EFFORT:
                 attributes |= {"forcelimited": "true", "forcerange": _text([-limit, limit])}
         attributes["gainprm"] = _text([gain])
         if any(bias):
             attributes |= {"biastype": "affine", "biasprm": _text(bias)}
-        if found.lag > 0:
-            attributes |= {"dyntype": "filterexact", "dynprm": _text([found.lag])}
+        if found.lag_time > 0:
+            attributes |= {"dyntype": "filterexact", "dynprm": _text([found.lag_time])}
         if delay > 0:
-            if not hasattr(mujoco_module().MjModel, "actuator_delay"):
+            if not hasattr(import_mujoco().MjModel, "actuator_delay"):
                 what, allowed = f"the torque of '{joint}' acts late", "MuJoCo with delays of actuators (3.5 or newer)"
                 raise ModelError(what, where="mujoco_xml", allowed=allowed)
             samples = math.ceil(delay / time_step) + 1
@@ -264,7 +271,7 @@ def _add_actuators(system: System, value: Evaluator, actuator: ElementTree.Eleme
         ElementTree.SubElement(actuator, "general", attributes)
 
 
-def mujoco_module() -> ModuleType:
+def import_mujoco() -> ModuleType:
     """The imported mujoco package; `DataError` if it is not installed."""
     try:
         import mujoco
@@ -275,58 +282,61 @@ def mujoco_module() -> ModuleType:
     return mujoco
 
 
-def compiled_model(text: str) -> Any:
+def compile_mjcf(text: str) -> Any:
     """A `mujoco.MjModel` compiled from MJCF text; `ModelError` if MuJoCo rejects it."""
     try:
-        return mujoco_module().MjModel.from_xml_string(text)
+        return import_mujoco().MjModel.from_xml_string(text)
     except ValueError as error:
         raise ModelError(f"MuJoCo does not accept the model: {error}", where="mujoco_xml") from error
 
 
-def _refuse_inexpressible(system: System, value: Evaluator, emulate: bool) -> None:
-    able = NATIVE | EMULATED if emulate else NATIVE
+def _refuse_inexpressible(system: System, value: ParameterEvaluator, emulate: bool) -> None:
+    able = _NATIVE_ASPECTS | EMULATED_ASPECTS if emulate else _NATIVE_ASPECTS
     for effect in system.effects:
-        for aspect in sorted(effect_aspects(system, effect, value)[1] - able - IGNORED):
+        for aspect in sorted(effect_terms_and_aspects(system, effect, value)[1] - able - _IGNORED_ASPECTS):
             raise ModelError(
-                f"effect '{effect.kind}@{effect.location}' has what MuJoCo cannot express: {ASPECTS[aspect]}",
+                f"effect '{effect.kind}@{effect.location}' has what MuJoCo cannot express: {MODEL_ASPECTS[aspect]}",
                 where="mujoco_xml",
-                allowed="effects that change " + ", ".join(ASPECTS[name] for name in ASPECTS if name in able),
+                allowed="effects that change "
+                + ", ".join(MODEL_ASPECTS[name] for name in MODEL_ASPECTS if name in able),
             )
     for grasp in system.grasps:
-        if not value.vanishes(grasp.compliance) and not (emulate and grasp.kind == "point"):
+        if not value.is_zero(grasp.compliance) and not (emulate and grasp.kind == "point"):
             allowed = "rigid grasps" if not emulate else "rigid grasps, and springs in place of point grasps"
             raise ModelError(f"grasp '{grasp.name}' is compliant", where="mujoco_xml", allowed=allowed)
-    for joint, compliance in system.compliant.items():
-        if value.vanishes(compliance):
+    for joint, compliance in system.joint_compliances.items():
+        if value.is_zero(compliance):
             allowed, hint = "a compliance above zero", "leave the effect out"
             raise ModelError(f"joint '{joint}' is rigid", where="mujoco_xml", allowed=allowed, hint=hint)
-    if not value.vanishes(system.time_scale - 1):
+    if not value.is_zero(system.recorded_time_scale - 1):
         raise ModelError("the clock is scaled", where="mujoco_xml", allowed="a clock that tells the true time")
 
 
 def _shares_body(tree: Mechanism, j: int) -> bool:
     """Whether joint j turns at the same place as its parent, which carries nothing but it."""
     joint = tree.joints[j]
-    if joint.parent < 0 or merged(tree.joints[joint.parent].bodies) is not None:
+    if joint.parent_index < 0 or merge_bodies(tree.joints[joint.parent_index].bodies) is not None:
         return False
-    alone = sum(other.parent == joint.parent for other in tree.joints) == 1
-    return alone and bool(np.array_equal(np.array(ca.DM(joint.placement.matrix())), np.eye(4)))
+    alone = sum(other.parent_index == joint.parent_index for other in tree.joints) == 1
+    return alone and bool(np.array_equal(np.array(ca.DM(joint.placement.homogeneous_matrix())), np.eye(4)))
 
 
-def _sites(system: System, tree: Mechanism, value: Evaluator) -> list[tuple[str, Frame]]:
-    sites = [(name, tree.frame(name)) for name in system.points]
+def _sites(system: System, tree: Mechanism, value: ParameterEvaluator) -> list[tuple[str, Frame]]:
+    sites = [(name, tree.frame(name)) for name in system.point_frames]
     for grasp in system.grasps:
-        holder, held = tree.frame(grasp.holder), tree.frame(grasp.held)
-        rotation = value(grasp.rotation).reshape(3, 3, order="F")
+        holder, held = tree.frame(grasp.holder_frame), tree.frame(grasp.held_frame)
+        rotation = value(grasp.held_orientation).reshape(3, 3, order="F")
         ends = {
-            "holder": (holder, Placement(ca.SX(ca.DM(rotation)), ca.SX(ca.DM(value(grasp.offset))))),
-            "held": (held, _along(-value(grasp.slip)[0])),
+            "holder": (holder, Placement(ca.SX(ca.DM(rotation)), ca.SX(ca.DM(value(grasp.holder_offset))))),
+            "held": (held, _along(-value(grasp.axial_slip)[0])),
         }
         for end, (frame, local) in ends.items():
             placement = frame.placement @ local
-            sites.append((f"grasp_{grasp.name}_{end}", Frame(frame.joint, placement)))
+            sites.append((f"grasp_{grasp.name}_{end}", Frame(frame.joint_index, placement)))
             if grasp.kind == "axis":
-                sites.append((f"grasp_{grasp.name}_{end}_ahead", Frame(frame.joint, placement @ _along(_AXIS_LEVER))))
+                sites.append(
+                    (f"grasp_{grasp.name}_{end}_ahead", Frame(frame.joint_index, placement @ _along(_AXIS_LEVER)))
+                )
     return sites
 
 
@@ -340,9 +350,9 @@ def _pose(placement: Placement) -> dict[str, str]:
 
 
 def _inertial(body: Inertia) -> dict[str, str]:
-    tensor = np.array(ca.DM(body.about_com))
+    tensor = np.array(ca.DM(body.inertia_about_com))
     full = [tensor[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
-    com = np.array(ca.DM(body.com)).ravel()
+    com = np.array(ca.DM(body.center_of_mass)).ravel()
     return {"pos": _text(com), "mass": _text([float(body.mass)]), "fullinertia": _text(full)}
 
 

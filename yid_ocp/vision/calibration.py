@@ -18,26 +18,26 @@ from annotated_types import Ge, Gt, Le
 from numpy.typing import NDArray
 
 from yid_ocp.errors import DataError
-from yid_ocp.options import About, check
-from yid_ocp.vision.clock import ClockOptions, Usual, agreed, own_offset
-from yid_ocp.vision.registration import (
-    CLOCK,
-    DRIFT,
-    FEWEST,
-    SCALE,
-    SHIFT,
-    SIZE,
-    TURN,
-    Arm,
+from yid_ocp.options import OptionInfo, check_option_bounds
+from yid_ocp.vision.camera_registration import (
+    CLOCK_DRIFT_INDEX,
+    CLOCK_OFFSET_INDEX,
+    DEPTH_SCALE_INDEX,
+    MIN_ARM_POINTS,
+    ROTATION_SLICE,
+    STATE_SIZE,
+    TRANSLATION_SLICE,
+    ArmSurface,
+    CalibrationFrame,
     CameraState,
-    Clouds,
-    Glimpse,
-    Presence,
-    RobustSum,
-    improved,
-    robust_sum,
-    starts,
+    CloudSearchTrees,
+    RobustCost,
+    SurfaceVisibility,
+    evaluate_robust_cost,
+    gauss_newton_step,
+    initial_camera_states,
 )
+from yid_ocp.vision.clock import CameraClockOptions, OnTimeFrames, estimate_stamp_delay, find_on_time_frames
 
 Array = NDArray[np.float64]
 
@@ -57,81 +57,94 @@ _CONTRADICTED = 3.0  # standard deviations
 
 
 @dataclass(frozen=True)
-class CalibrationOptions:
+class CameraCalibrationOptions:
     """Priors of the camera calibration, and how the visible arm is used for it."""
 
     fix_pose: Annotated[
         bool,
-        About(
+        OptionInfo(
             "whether the told pose and depth are kept, those of a hand-eye calibration for example; the arm then finds "
             "the clock and checks the rest"
         ),
     ] = False
-    frames: Annotated[int, Ge(_LEAST_FRAMES), About("so many, spread over the sequence, are compared with the arm")] = (
-        24
+    n_frames: Annotated[
+        int, Ge(_LEAST_FRAMES), OptionInfo("so many, spread over the sequence, are compared with the arm")
+    ] = 24
+    rotation_prior_std: Annotated[
+        float, Gt(0), OptionInfo("standard deviation of the told directions, about each axis", "rad")
+    ] = 0.06
+    translation_prior_std: Annotated[
+        float, Gt(0), OptionInfo("standard deviation of the told place, along each axis", "m")
+    ] = 0.04
+    depth_scale_prior_std: Annotated[float, Gt(0), OptionInfo("standard deviation of the scale of its depth")] = 0.03
+    depth_offset_prior_std: Annotated[float, Gt(0), OptionInfo("standard deviation of an offset of its depth", "m")] = (
+        0.01
     )
-    turn_std: Annotated[float, Gt(0), About("standard deviation of the told directions, about each axis", "rad")] = 0.06
-    shift_std: Annotated[float, Gt(0), About("standard deviation of the told place, along each axis", "m")] = 0.04
-    scale_std: Annotated[float, Gt(0), About("standard deviation of the scale of its depth")] = 0.03
-    depth_std: Annotated[float, Gt(0), About("standard deviation of an offset of its depth", "m")] = 0.01
-    least_seen: Annotated[
+    min_visible_fraction: Annotated[
         float,
         Gt(0),
         Le(1),
-        About(
+        OptionInfo(
             "of the arm's surface that the camera should see and nothing hides, at least this share must be in the "
             "clouds where the calibration has it"
         ),
     ] = 0.6
 
     def __post_init__(self) -> None:
-        check(self, "calibration options")
+        check_option_bounds(self, "calibration options")
 
-    def precision(self, clock: ClockOptions) -> Array:
+    def prior_precision(self, clock: CameraClockOptions) -> Array:
         """Inverse covariance of the prior, shape (10, 10)."""
-        std = [*[self.turn_std] * 3, *[self.shift_std] * 3, self.scale_std, self.depth_std]
+        std = [
+            *[self.rotation_prior_std] * 3,
+            *[self.translation_prior_std] * 3,
+            self.depth_scale_prior_std,
+            self.depth_offset_prior_std,
+        ]
         # a uniform distribution over what is searched; taken as it is where nothing is
-        return np.diag(np.array([*std, max(clock.search / math.sqrt(3.0), 1e-6), clock.drift_std]) ** -2)
+        return np.diag(
+            np.array([*std, max(clock.search_half_width / math.sqrt(3.0), 1e-6), clock.drift_prior_std]) ** -2
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration:
+class CameraCalibration:
     """Calibrated camera of a sequence.
 
     Attributes
     ----------
-    state : CameraState
+    camera_state : CameraState
         What is used: pose, depth, clock.
-    told : CameraState
-    usual : Usual or None
+    prior_state : CameraState
+    on_time_frames : Usual or None
         Of frames by themselves; None where the clock was not compared.
-    covariance : ndarray, shape (10, 10)
-        Of `state`, in the order of `CameraState.minus`; zero where nothing was estimated.
-    beside : ndarray, shape (10,)
+    state_covariance : ndarray, shape (10, 10)
+        Of `camera_state`, in the order of `CameraState.difference_from`; zero where nothing was estimated.
+    estimate_minus_used : ndarray, shape (10,)
         What the arm says less what is used: of a pose that was to be kept.
-    presence : Presence or None
+    arm_visibility : Presence or None
         How much of the arm was seen where it is.
-    frames : int
+    n_frames : int
         From which it was estimated.
     message : str
         In words.
     """
 
-    state: CameraState
-    told: CameraState
-    usual: Usual | None
-    covariance: Array
-    beside: Array
-    presence: Presence | None
-    frames: int
+    camera_state: CameraState
+    prior_state: CameraState
+    on_time_frames: OnTimeFrames | None
+    state_covariance: Array
+    estimate_minus_used: Array
+    arm_visibility: SurfaceVisibility | None
+    n_frames: int
     message: str
 
     @property
-    def camera(self) -> Array:
+    def camera_position(self) -> Array:
         """The camera's position, shape (3,) [m]."""
-        return self.state.pose[:3, 3]
+        return self.camera_state.pose[:3, 3]
 
-    def common_std(self, points: Array, velocity: Array, stamps: Array) -> Array:
+    def shared_point_std(self, points: Array, velocity: Array, stamps: Array) -> Array:
         """Standard deviations of points due to uncertainty of the camera's pose, depth and clock.
 
         Parameters
@@ -148,34 +161,36 @@ class Calibration:
         ndarray, shape (N, 3)
             [m]; the same error for all of them, as far as they stand at one place.
         """
-        slopes = np.empty((len(points), 3, SIZE))
-        slopes[:, :, :CLOCK] = self.state.slopes(points)
+        slopes = np.empty((len(points), 3, STATE_SIZE))
+        slopes[:, :, :CLOCK_OFFSET_INDEX] = self.camera_state.point_jacobian(points)
         # a point that is dated too early is where it came to be later
-        slopes[:, :, CLOCK] = velocity
-        slopes[:, :, DRIFT] = velocity * (stamps - self.state.about)[:, None]
-        variance = np.einsum("nij,jk,nik->ni", slopes, self.covariance, slopes)
+        slopes[:, :, CLOCK_OFFSET_INDEX] = velocity
+        slopes[:, :, CLOCK_DRIFT_INDEX] = velocity * (stamps - self.camera_state.clock_reference_stamp)[:, None]
+        variance = np.einsum("nij,jk,nik->ni", slopes, self.state_covariance, slopes)
         # a shape that is held by the gripper and seen elsewhere gives way in any direction
-        beside = slopes @ self.beside
+        beside = slopes @ self.estimate_minus_used
         evenly = np.linalg.norm(beside, axis=1, keepdims=True) / math.sqrt(3.0)
         return np.asarray(np.sqrt(variance + np.maximum(np.abs(beside), evenly) ** 2))
 
 
-def as_given(pose: Array, options: ClockOptions, reason: str = "") -> Calibration:
+def calibration_as_given(pose: Array, options: CameraClockOptions, reason: str = "") -> CameraCalibration:
     """Camera calibration taken from the frames and settings without estimation, with the reason."""
-    text = f"clock offset {1e3 * options.offset:.0f} ms as given" + (f": {reason}" if reason else "")
-    state = CameraState(pose, offset=options.offset)
-    return Calibration(state, state, None, np.zeros((SIZE, SIZE)), np.zeros(SIZE), None, 0, text)
+    text = f"clock offset {1e3 * options.initial_offset:.0f} ms as given" + (f": {reason}" if reason else "")
+    state = CameraState(pose, clock_offset=options.initial_offset)
+    return CameraCalibration(
+        state, state, None, np.zeros((STATE_SIZE, STATE_SIZE)), np.zeros(STATE_SIZE), None, 0, text
+    )
 
 
-def calibrate(
-    arm: Arm,
-    glimpses: Sequence[Glimpse],
+def calibrate_camera(
+    arm: ArmSurface,
+    glimpses: Sequence[CalibrationFrame],
     pose: Array,
     rng: np.random.Generator,
-    options: CalibrationOptions,
-    clock: ClockOptions,
+    options: CameraCalibrationOptions,
+    clock: CameraClockOptions,
     source: str = "sequence",
-) -> Calibration:
+) -> CameraCalibration:
     """Calibrate the camera of a sequence from some of its frames.
 
     Parameters
@@ -201,13 +216,13 @@ def calibrate(
         The arm is not seen, does not lie where the camera sees something, or moves too little to tell the time.
     """
     about = float(np.mean([g.stamp for g in glimpses])) if glimpses else 0.0
-    told = CameraState(pose, offset=clock.offset, about=about)
+    told = CameraState(pose, clock_offset=clock.initial_offset, clock_reference_stamp=about)
     try:
         return _Calibrator(arm, glimpses, told, rng, options, clock).run()
     except _UntoldError as reason:
-        if options.fix_pose and clock.search == 0:
-            return as_given(pose, clock, str(reason))
-        known = "track.options.calibration.fix_pose: true and track.options.clock.search: 0"
+        if options.fix_pose and clock.search_half_width == 0:
+            return calibration_as_given(pose, clock, str(reason))
+        known = "track.options.calibration.fix_pose: true and track.options.clock.search_half_width: 0"
         raise DataError(
             f"the camera cannot be calibrated by the arm: {reason}",
             where=source,
@@ -224,22 +239,22 @@ class _UntoldError(Exception):
 
 
 class _Calibrator:
-    """What one call of `calibrate` needs."""
+    """What one call of `calibrate_camera` needs."""
 
     def __init__(
         self,
-        arm: Arm,
-        glimpses: Sequence[Glimpse],
+        arm: ArmSurface,
+        glimpses: Sequence[CalibrationFrame],
         told: CameraState,
         rng: np.random.Generator,
-        options: CalibrationOptions,
-        clock: ClockOptions,
+        options: CameraCalibrationOptions,
+        clock: CameraClockOptions,
     ) -> None:
         self.arm, self.told, self.rng, self.options, self.clock = arm, told, rng, options, clock
-        self.precision = options.precision(clock)
+        self.precision = options.prior_precision(clock)
         self.glimpses = [g for g in (self._about_the_arm(g) for g in glimpses) if g is not None]
 
-    def run(self) -> Calibration:
+    def run(self) -> CameraCalibration:
         if len(self.glimpses) < _LEAST_FRAMES:
             raise _UntoldError(
                 f"it is in view in {len(self.glimpses)} frames, {_LEAST_FRAMES} are needed",
@@ -248,88 +263,104 @@ class _Calibrator:
         state, chosen = self._start(), self.glimpses
         for _ in range(2):  # once more without the frames that were stamped late
             state, found, used = self._settled(state, chosen)
-            own = [own_offset(self.arm, state, g.stamp, state.world(g.points), self.rng) for g in used]
-            usual = agreed(own)
-            chosen = [used[i] for i in usual.on_time]
+            own = [estimate_stamp_delay(self.arm, state, g.stamp, state.to_world(g.points), self.rng) for g in used]
+            usual = find_on_time_frames(own)
+            chosen = [used[i] for i in usual.frame_indices]
             if len(chosen) < _LEAST_FRAMES:
                 raise _UntoldError("its frames do not agree on one time", "check the time stamps")
-        presence = Clouds(chosen).presence(self.arm, state, _REACH)
+        presence = CloudSearchTrees(chosen).surface_visibility(self.arm, state, _REACH)
         self._check_presence(presence)
-        covariance = found.covariance(self.precision)
-        std = math.sqrt(covariance[CLOCK, CLOCK])
-        if self.clock.search > 0 and not std < self.clock.determined:
+        covariance = found.state_covariance(self.precision)
+        std = math.sqrt(covariance[CLOCK_OFFSET_INDEX, CLOCK_OFFSET_INDEX])
+        if self.clock.search_half_width > 0 and not std < self.clock.max_offset_std:
             raise _UntoldError(
                 f"it moves too little to tell the time: its clock is known to {1e3 * std:.0f} ms only",
-                "record a livelier motion, or give the clock's offset with track.options.clock.offset and search: 0",
+                "record a livelier motion, or give the clock's offset with track.options.clock.initial_offset and search: 0",
             )
-        used_state, beside = state, np.zeros(SIZE)
+        used_state, beside = state, np.zeros(STATE_SIZE)
         if self.options.fix_pose:
-            used_state = replace(self.told, offset=state.offset, drift=state.drift)
-            beside = state.minus(used_state)
+            used_state = replace(self.told, clock_offset=state.clock_offset, clock_drift=state.clock_drift)
+            beside = state.difference_from(used_state)
         text = _message(state, used_state, self.told, covariance, presence, self.arm, chosen, self.clock)
-        return Calibration(used_state, self.told, usual, covariance, beside, presence, len(chosen), text)
+        return CameraCalibration(used_state, self.told, usual, covariance, beside, presence, len(chosen), text)
 
-    def _about_the_arm(self, glimpse: Glimpse) -> Glimpse | None:
+    def _about_the_arm(self, glimpse: CalibrationFrame) -> CalibrationFrame | None:
         """The points in the directions where the arm is, as far as told; None where it is out of view."""
-        own = self.told.measured(self.arm.visible(self.told, glimpse.stamp)[0])
+        own = self.told.to_measured(self.arm.visible_points(self.told, glimpse.stamp)[0])
         points = glimpse.points[glimpse.points[:, 2] > 0]
-        if len(own) < FEWEST or not len(points):
+        if len(own) < MIN_ARM_POINTS or not len(points):
             return None
         at, towards = points[:, :2] / points[:, 2:], own[:, :2] / own[:, 2:]
         kept = ((at > towards.min(axis=0) - _AROUND) & (at < towards.max(axis=0) + _AROUND)).all(axis=1)
-        return Glimpse(glimpse.stamp, points[kept]) if np.count_nonzero(kept) >= FEWEST else None
+        return CalibrationFrame(glimpse.stamp, points[kept]) if np.count_nonzero(kept) >= MIN_ARM_POINTS else None
 
-    def _thinned(self, glimpse: Glimpse) -> Glimpse:
+    def _thinned(self, glimpse: CalibrationFrame) -> CalibrationFrame:
         count = len(glimpse.points)
         return replace(glimpse, points=glimpse.points[self.rng.choice(count, min(count, _THIN), replace=False)])
 
     def _start(self) -> CameraState:
         """The state near which most of the arm is where the camera sees something."""
         few = [self._thinned(glimpse) for glimpse in _some(self.glimpses, _START_FRAMES)]
-        tried = starts(self.arm, few, self.told, self.clock.search, _STARTS)
+        tried = initial_camera_states(self.arm, few, self.told, self.clock.search_half_width, _STARTS)
         if not tried:
             raise _UntoldError("it is hardly in view", "turn the camera so that it sees more of the arm")
-        clouds, best, most = Clouds(few), tried[0], -1.0
+        clouds, best, most = CloudSearchTrees(few), tried[0], -1.0
         for trial in tried:
             for reach in _WIDE:
                 trial = self._rounds(trial, few, reach, False, _FEW, _ROUNDS)[0]
-            presence = clouds.presence(self.arm, trial, 0.5 * _REACH)
+            presence = clouds.surface_visibility(self.arm, trial, 0.5 * _REACH)
             if presence.there - presence.through > most:
                 best, most = trial, presence.there - presence.through
             if most > _ENOUGH:
                 break
         return best
 
-    def _settled(self, state: CameraState, glimpses: Sequence[Glimpse]) -> tuple[CameraState, RobustSum, list[Glimpse]]:
+    def _settled(
+        self, state: CameraState, glimpses: Sequence[CalibrationFrame]
+    ) -> tuple[CameraState, RobustCost, list[CalibrationFrame]]:
         state = self._rounds(state, glimpses, _WIDE[-1], True, _FEW, _ROUNDS)[0]
         return self._rounds(state, glimpses, _REACH, True, _MANY, _LAST_ROUNDS)
 
     def _rounds(
-        self, state: CameraState, glimpses: Sequence[Glimpse], reach: float, along: bool, most: int, rounds: int
-    ) -> tuple[CameraState, RobustSum, list[Glimpse]]:
+        self,
+        state: CameraState,
+        glimpses: Sequence[CalibrationFrame],
+        reach: float,
+        along: bool,
+        most: int,
+        rounds: int,
+    ) -> tuple[CameraState, RobustCost, list[CalibrationFrame]]:
         """The state after some steps on at most so many points of each frame, the sum there, and those points."""
         chosen = []
         for glimpse in glimpses:
-            points = state.world(glimpse.points)
-            near = np.flatnonzero(self.arm.near(points, float(state.time(glimpse.stamp)), 1.5 * reach))
+            points = state.to_world(glimpse.points)
+            near = np.flatnonzero(
+                self.arm.is_near_surface(points, float(state.to_joint_time(glimpse.stamp)), 1.5 * reach)
+            )
             if len(near) > most:
                 near = self.rng.choice(near, most, replace=False)
-            if len(near) >= FEWEST:
-                chosen.append(Glimpse(glimpse.stamp, glimpse.points[near]))
+            if len(near) >= MIN_ARM_POINTS:
+                chosen.append(CalibrationFrame(glimpse.stamp, glimpse.points[near]))
         if len(chosen) < _LEAST_FRAMES:
             raise _UntoldError(
                 "what the camera sees does not lie on it", "check the told pose and the unit of the clouds"
             )
         for _ in range(rounds):
-            found = robust_sum([self.arm.rows(state, g, reach, along) for g in chosen], reach)
-            state, step = improved(state, found, self.told, self.precision)
+            found = evaluate_robust_cost(
+                [self.arm.calibration_equations(state, g, reach, along) for g in chosen], reach
+            )
+            state, step = gauss_newton_step(state, found, self.told, self.precision)
             if np.abs(step).max() < _SETTLED:
                 break
-        return state, robust_sum([self.arm.rows(state, g, reach, along) for g in chosen], reach), chosen
+        return (
+            state,
+            evaluate_robust_cost([self.arm.calibration_equations(state, g, reach, along) for g in chosen], reach),
+            chosen,
+        )
 
-    def _check_presence(self, presence: Presence) -> None:
+    def _check_presence(self, presence: SurfaceVisibility) -> None:
         free = presence.there + presence.through
-        if not presence.there >= self.options.least_seen * free:
+        if not presence.there >= self.options.min_visible_fraction * free:
             raise _UntoldError(
                 f"the camera sees through {100 * presence.through / max(free, 1e-9):.0f} % of its surface, wherever"
                 " camera and clock are put",
@@ -342,30 +373,33 @@ def _message(
     used: CameraState,
     told: CameraState,
     covariance: Array,
-    presence: Presence,
-    arm: Arm,
-    glimpses: Sequence[Glimpse],
-    clock: ClockOptions,
+    presence: SurfaceVisibility,
+    arm: ArmSurface,
+    glimpses: Sequence[CalibrationFrame],
+    clock: CameraClockOptions,
 ) -> str:
     """What the arm says, in words."""
     words = []
-    std = math.sqrt(covariance[CLOCK, CLOCK])
-    if clock.search > 0:
-        words.append(f"clock offset {1e3 * state.offset:.1f} ms ± {1e3 * std:.1f} ms (stamp minus joint time)")
+    std = math.sqrt(covariance[CLOCK_OFFSET_INDEX, CLOCK_OFFSET_INDEX])
+    if clock.search_half_width > 0:
+        words.append(f"clock offset {1e3 * state.clock_offset:.1f} ms ± {1e3 * std:.1f} ms (stamp minus joint time)")
     else:
-        words.append(f"clock offset {1e3 * state.offset:.1f} ms as given")
-    drift = math.sqrt(covariance[DRIFT, DRIFT])
-    if abs(state.drift) > 2 * drift:
-        words.append(f"its drift {1e3 * state.drift:.2f} ms in a second ± {1e3 * drift:.2f}")
+        words.append(f"clock offset {1e3 * state.clock_offset:.1f} ms as given")
+    drift = math.sqrt(covariance[CLOCK_DRIFT_INDEX, CLOCK_DRIFT_INDEX])
+    if abs(state.clock_drift) > 2 * drift:
+        words.append(f"its drift {1e3 * state.clock_drift:.2f} ms in a second ± {1e3 * drift:.2f}")
     middle = glimpses[len(glimpses) // 2]
-    points = arm.visible(state, middle.stamp)[0].mean(axis=0, keepdims=True)
-    away = np.linalg.norm(state.world(told.measured(points)) - points)
-    change = state.minus(told)
-    turn, shift = math.degrees(float(np.linalg.norm(change[TURN]))), float(np.linalg.norm(change[SHIFT]))
+    points = arm.visible_points(state, middle.stamp)[0].mean(axis=0, keepdims=True)
+    away = np.linalg.norm(state.to_world(told.to_measured(points)) - points)
+    change = state.difference_from(told)
+    turn, shift = (
+        math.degrees(float(np.linalg.norm(change[ROTATION_SLICE]))),
+        float(np.linalg.norm(change[TRANSLATION_SLICE])),
+    )
     if used is not state:
-        slopes = state.slopes(points)[0]
-        spread = slopes @ covariance[:CLOCK, :CLOCK] @ slopes.T
-        gap = slopes @ change[:CLOCK]
+        slopes = state.point_jacobian(points)[0]
+        spread = slopes @ covariance[:CLOCK_OFFSET_INDEX, :CLOCK_OFFSET_INDEX] @ slopes.T
+        gap = slopes @ change[:CLOCK_OFFSET_INDEX]
         size = float(gap @ np.linalg.solve(spread + 1e-6 * np.eye(3), gap))
         if size > _CONTRADICTED**2 * 3 and away > _NOTED:
             words.append(
@@ -375,13 +409,13 @@ def _message(
     elif away > _NOTED:
         words.append(
             f"the told camera sees the arm {1e3 * away:.0f} mm from where the joints have it: turned by {turn:.1f}"
-            f" degrees, shifted by {1e3 * shift:.0f} mm, depth scaled by {math.exp(-change[SCALE]):.3f}"
+            f" degrees, shifted by {1e3 * shift:.0f} mm, depth scaled by {math.exp(-change[DEPTH_SCALE_INDEX]):.3f}"
         )
     words.append(f"from {len(glimpses)} frames, with {100 * presence.there:.0f} % of the arm's surface in the clouds")
     return "; ".join(words)
 
 
-def _some(glimpses: Sequence[Glimpse], most: int) -> list[Glimpse]:
+def _some(glimpses: Sequence[CalibrationFrame], most: int) -> list[CalibrationFrame]:
     if len(glimpses) <= most:
         return list(glimpses)
     return [glimpses[int(k)] for k in np.linspace(0, len(glimpses) - 1, most).round()]

@@ -21,9 +21,16 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
 from yid_ocp.errors import ConfigError
-from yid_ocp.vision.frames import FrameSequence, checked_pose
-from yid_ocp.vision.lens import XTION, Pinhole
-from yid_ocp.vision.meshes import Mesh, Scene, Surfaces, numeric_mechanism, robot_meshes, tube_meshes
+from yid_ocp.vision.camera_intrinsics import XTION_INTRINSICS, CameraIntrinsics
+from yid_ocp.vision.frames import FrameSequence, validated_pose
+from yid_ocp.vision.surface_meshes import (
+    ArticulatedSurfaces,
+    CameraScene,
+    TriangleMesh,
+    load_robot_meshes,
+    numeric_mechanism,
+    tube_meshes_by_joint,
+)
 
 Array = NDArray[np.float64]
 
@@ -34,53 +41,53 @@ class DepthCamera:
 
     Attributes
     ----------
-    pinhole : Pinhole
+    intrinsics : Pinhole
     baseline : float
         Between projector and camera, along x [m].
-    nearest, furthest : float
+    min_depth, max_depth : float
         Range of depths that it measures [m].
     disparity_std : float
         Standard deviation of the disparity [pixels]; 1/16 gives 6 mm at 2 m.
     disparity_step : float
         Step of the disparity [pixels]; 1/8 gives 12 mm at 2 m.
-    correlation : float
+    noise_correlation_length : float
         Over how many pixels neighbouring errors are alike [pixels].
-    grazing : float
+    min_incidence_cosine : float
         Cosine of ray and normal below which nothing comes back; up to twice as much it comes back sometimes.
-    edge_jump : float
+    min_relative_edge_depth : float
         Difference in depth of neighbouring pixels that makes an edge, relative to depth.
-    edge_loss, edge_mix : float
+    edge_loss_probability, edge_mixing_probability : float
         Probability that a pixel at an edge is lost, or lies anywhere between front and back.
-    loss : float
+    loss_probability : float
         Probability that any pixel is lost.
-    outliers : float
-        Probability that a pixel's pattern is matched wrongly: its depth is then anywhere within `outlier_span`.
-    outlier_span : float
+    outlier_probability : float
+        Probability that a pixel's pattern is matched wrongly: its depth is then anywhere within `outlier_depth_range`.
+    outlier_depth_range : float
         [m], to either side of the true depth.
     """
 
-    pinhole: Pinhole = XTION
+    intrinsics: CameraIntrinsics = XTION_INTRINSICS
     baseline: float = 0.075
-    nearest: float = 0.8
-    furthest: float = 3.5
+    min_depth: float = 0.8
+    max_depth: float = 3.5
     disparity_std: float = 1 / 16
     disparity_step: float = 1 / 8
-    correlation: float = 0.7
-    grazing: float = 0.12
-    edge_jump: float = 0.02
-    edge_loss: float = 0.6
-    edge_mix: float = 0.05
-    loss: float = 0.01
-    outliers: float = 0.0
-    outlier_span: float = 0.4
+    noise_correlation_length: float = 0.7
+    min_incidence_cosine: float = 0.12
+    min_relative_edge_depth: float = 0.02
+    edge_loss_probability: float = 0.6
+    edge_mixing_probability: float = 0.05
+    loss_probability: float = 0.01
+    outlier_probability: float = 0.0
+    outlier_depth_range: float = 0.4
 
     def depth_std(self, depth: ArrayLike) -> Array:
         """Standard deviation of a measured depth, noise and steps together [m]:  z^2/(f b) sqrt(std^2 + step^2/12)."""
         z = np.asarray(depth, float)
         spread = math.hypot(self.disparity_std, self.disparity_step / math.sqrt(12.0))
-        return np.asarray(z**2 / (self.pinhole.fx * self.baseline) * spread)
+        return np.asarray(z**2 / (self.intrinsics.fx * self.baseline) * spread)
 
-    def measure(self, depth: Array, cosine: Array, rng: np.random.Generator) -> Array:
+    def simulate_depth_image(self, depth: Array, cosine: Array, rng: np.random.Generator) -> Array:
         """Simulated measurement of a depth image, with noise and lost pixels.
 
         Parameters
@@ -94,28 +101,30 @@ class DepthCamera:
         ndarray, shape (height, width)
             [m]; NaN where nothing was measured.
         """
-        scale = self.pinhole.fx * self.baseline
+        scale = self.intrinsics.fx * self.baseline
         shape = depth.shape
         white = rng.standard_normal(shape)
-        if self.correlation > 0:
-            white = gaussian_filter(white, self.correlation, mode="wrap")
+        if self.noise_correlation_length > 0:
+            white = gaussian_filter(white, self.noise_correlation_length, mode="wrap")
             white /= white.std()
         chance = rng.random((4, *shape))
         far = np.where(np.isfinite(depth), depth, 1e3)
         front, back = minimum_filter(far, size=3), maximum_filter(far, size=3)
-        edge = back - front > self.edge_jump * front
-        mixed = edge & (chance[0] < self.edge_mix) & (back < self.furthest)
+        edge = back - front > self.min_relative_edge_depth * front
+        mixed = edge & (chance[0] < self.edge_mixing_probability) & (back < self.max_depth)
         true = np.where(mixed, front + rng.random(shape) * (back - front), far)
-        wrong = chance[1] < self.outliers
-        true = np.where(wrong, true + self.outlier_span * rng.uniform(-1.0, 1.0, shape), true)
+        wrong = chance[1] < self.outlier_probability
+        true = np.where(wrong, true + self.outlier_depth_range * rng.uniform(-1.0, 1.0, shape), true)
         disparity = scale / np.maximum(true, 1e-3) + self.disparity_std * white
         if self.disparity_step > 0:
             disparity = np.rint(disparity / self.disparity_step) * self.disparity_step
         measured = scale / np.maximum(disparity, 1e-6)
-        lost = (far < self.nearest) | (far > self.furthest) | (measured < self.nearest) | (measured > self.furthest)
-        lost |= cosine < self.grazing * (1.0 + chance[2])
-        lost |= edge & ~mixed & (chance[0] > 1.0 - self.edge_loss)
-        lost |= chance[3] < self.loss
+        lost = (
+            (far < self.min_depth) | (far > self.max_depth) | (measured < self.min_depth) | (measured > self.max_depth)
+        )
+        lost |= cosine < self.min_incidence_cosine * (1.0 + chance[2])
+        lost |= edge & ~mixed & (chance[0] > 1.0 - self.edge_loss_probability)
+        lost |= chance[3] < self.loss_probability
         lost |= self._shadow(far)
         return np.where(lost, np.nan, measured)
 
@@ -123,7 +132,7 @@ class DepthCamera:
         """Pixels that the projector, on the camera's left, does not reach: another one of its line is nearer."""
         if self.baseline <= 0:
             return np.zeros(depth.shape, bool)
-        disparity = self.pinhole.fx * self.baseline / depth
+        disparity = self.intrinsics.fx * self.baseline / depth
         height, width = depth.shape
         margin = math.ceil(float(disparity.max())) + 1
         # the projector stands at x = -baseline, so that its image of a pixel lies to the right by the disparity
@@ -140,39 +149,41 @@ class FrameTiming:
 
     Attributes
     ----------
-    rate : float
+    mean_rate : float
         Mean rate [Hz].
-    spread : float
+    period_jitter : float
         Periods vary by this share either way.
-    dropped : float
+    dropped_fraction : float
         Share of frames that never arrive.
     latency : float
         By how much every stamp is later than the picture, and the camera's clock ahead, taken together [s].
     latency_std : float
         Standard deviation of the latency from frame to frame [s].
-    late : float
-        Share of frames that are stamped `late_by` [s] too late.
-    late_by : float
+    late_fraction : float
+        Share of frames that are stamped `late_stamp_delay` [s] too late.
+    late_stamp_delay : float
     """
 
-    rate: float = 3.0
-    spread: float = 0.25
-    dropped: float = 0.0
+    mean_rate: float = 3.0
+    period_jitter: float = 0.25
+    dropped_fraction: float = 0.0
     latency: float = 0.0
     latency_std: float = 0.0
-    late: float = 0.0
-    late_by: float = 0.15
+    late_fraction: float = 0.0
+    late_stamp_delay: float = 0.15
 
-    def times(self, start: float, stop: float, rng: np.random.Generator) -> tuple[Array, Array]:
+    def sample_times_and_stamps(self, start: float, stop: float, rng: np.random.Generator) -> tuple[Array, Array]:
         """Times of the pictures that arrive and their stamps, both shape (M,) [s]."""
-        if not (self.rate > 0 and 0 <= self.spread < 1):
-            raise ConfigError(f"rate = {self.rate}, spread = {self.spread}", allowed="rate > 0, 0 <= spread < 1")
-        count = math.ceil((stop - start) * self.rate / (1 - self.spread)) + 2
-        taken = start + np.cumsum(rng.uniform(1 - self.spread, 1 + self.spread, count) / self.rate)
+        if not (self.mean_rate > 0 and 0 <= self.period_jitter < 1):
+            raise ConfigError(
+                f"rate = {self.mean_rate}, spread = {self.period_jitter}", allowed="rate > 0, 0 <= spread < 1"
+            )
+        count = math.ceil((stop - start) * self.mean_rate / (1 - self.period_jitter)) + 2
+        taken = start + np.cumsum(rng.uniform(1 - self.period_jitter, 1 + self.period_jitter, count) / self.mean_rate)
         taken = taken[taken < stop]
-        taken = taken[rng.random(len(taken)) >= self.dropped]
+        taken = taken[rng.random(len(taken)) >= self.dropped_fraction]
         stamps = taken + self.latency + self.latency_std * rng.standard_normal(len(taken))
-        return taken, stamps + np.where(rng.random(len(taken)) < self.late, self.late_by, 0.0)
+        return taken, stamps + np.where(rng.random(len(taken)) < self.late_fraction, self.late_stamp_delay, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,49 +193,49 @@ class VirtualFrames:
     Attributes
     ----------
     sequence : FrameSequence
-    taken : ndarray, shape (M,)
+    capture_times : ndarray, shape (M,)
         Time of every picture on the simulator's clock [s].
-    q : ndarray, shape (M, n)
+    true_configurations : ndarray, shape (M, n)
         Configuration in every picture.
-    depth : sequence of ndarray
+    depth_images : sequence of ndarray
         `depth[i]` is the measured depth image of frame i, made when asked for [m].
-    course : callable
+    true_configuration_at : callable
         From a time to the configuration then, shape (n,).
     """
 
     sequence: FrameSequence
-    taken: Array
-    q: Array
-    depth: Sequence[Array]
-    course: Callable[[float], Array]
+    capture_times: Array
+    true_configurations: Array
+    depth_images: Sequence[Array]
+    true_configuration_at: Callable[[float], Array]
 
 
 @dataclass(frozen=True)
-class Background:
+class FloorAndWall:
     """Floor at height z and wall at position x around the robot [m]; None leaves one out."""
 
-    floor: float | None = -0.93
-    wall: float | None = -0.6
+    floor_height: float | None = -0.93
+    wall_position: float | None = -0.6
 
-    def mesh(self) -> Mesh | None:
+    def to_mesh(self) -> TriangleMesh | None:
         """Mesh of floor and wall as thin boxes; None if there is neither."""
         parts = []
-        if self.floor is not None:
+        if self.floor_height is not None:
             at = np.eye(4)
-            at[:3, 3] = [1.0, 0.0, self.floor - 0.01]
-            parts.append(Mesh.box([8.0, 8.0, 0.02]).moved(at))
-        if self.wall is not None:
+            at[:3, 3] = [1.0, 0.0, self.floor_height - 0.01]
+            parts.append(TriangleMesh.box([8.0, 8.0, 0.02]).transformed(at))
+        if self.wall_position is not None:
             at = np.eye(4)
-            at[:3, 3] = [self.wall - 0.01, 0.0, 0.5]
-            parts.append(Mesh.box([0.02, 8.0, 3.0]).moved(at))
-        return Mesh.joined(parts) if parts else None
+            at[:3, 3] = [self.wall_position - 0.01, 0.0, 0.5]
+            parts.append(TriangleMesh.box([0.02, 8.0, 3.0]).transformed(at))
+        return TriangleMesh.concatenate(parts) if parts else None
 
 
 @dataclass(eq=False)
 class _Images(Sequence[Array]):
     """Depth images, each rendered from its own seed when it is asked for; the last one is kept."""
 
-    surfaces: Surfaces
+    surfaces: ArticulatedSurfaces
     camera: DepthCamera
     pose: Array
     q: Array
@@ -238,9 +249,9 @@ class _Images(Sequence[Array]):
         number = int(index)
         if number not in self._kept:
             self._kept.clear()
-            depth, cosine, _ = self.surfaces.cast(self.camera.pinhole, self.pose, self.q[number])
+            depth, cosine, _ = self.surfaces.render_depth_image(self.camera.intrinsics, self.pose, self.q[number])
             rng = np.random.default_rng([self.seed, number])
-            self._kept[number] = self.camera.measure(depth, cosine, rng)
+            self._kept[number] = self.camera.simulate_depth_image(depth, cosine, rng)
         return self._kept[number]
 
 
@@ -252,7 +263,7 @@ class VirtualCamera:
     ----------
     pose : array_like, shape (4, 4)
         Camera in the world (x right, y down, z ahead) [m].
-    sensor : DepthCamera
+    depth_camera : DepthCamera
         An Asus Xtion Pro Live where absent.
     timing : FrameTiming
     background : Background, optional
@@ -262,13 +273,13 @@ class VirtualCamera:
     """
 
     pose: ArrayLike | None
-    sensor: DepthCamera = field(default_factory=DepthCamera)
+    depth_camera: DepthCamera = field(default_factory=DepthCamera)
     timing: FrameTiming = field(default_factory=FrameTiming)
-    background: Background | None = None
+    background: FloorAndWall | None = None
     seed: int = 0
 
 
-def virtual_frames(scene: Scene, t: ArrayLike, q: ArrayLike, camera: VirtualCamera) -> VirtualFrames:
+def render_virtual_frames(scene: CameraScene, t: ArrayLike, q: ArrayLike, camera: VirtualCamera) -> VirtualFrames:
     """Render the frames that a virtual camera takes of a motion.
 
     Parameters
@@ -291,31 +302,38 @@ def virtual_frames(scene: Scene, t: ArrayLike, q: ArrayLike, camera: VirtualCame
     DataError, ModelError
         No Open3D, no object, a mesh that cannot be read, or a pose that is none.
     """
-    sensor = camera.sensor
-    pose = checked_pose(camera.pose, "sequence")
+    sensor = camera.depth_camera
+    pose = validated_pose(camera.pose, "sequence")
     times, path = np.asarray(t, float), np.asarray(q, float)
-    taken, stamps = camera.timing.times(float(times[0]), float(times[-1]), np.random.default_rng(camera.seed))
+    taken, stamps = camera.timing.sample_times_and_stamps(
+        float(times[0]), float(times[-1]), np.random.default_rng(camera.seed)
+    )
     course = CubicSpline(times, path, axis=0)
     configuration = np.asarray(course(taken))
     images = _Images(_surfaces(scene, camera.background), sensor, pose, configuration, camera.seed)
     names = tuple(f"frame {i}" for i in range(len(taken)))
     made = FrameSequence(
-        stamps, names, pose, lambda i: sensor.pinhole.cloud(images[i]), sensor.pinhole, "virtual camera"
+        stamps,
+        names,
+        pose,
+        lambda i: sensor.intrinsics.points_from_depth(images[i]),
+        sensor.intrinsics,
+        "virtual camera",
     )
     return VirtualFrames(made, taken, configuration, images, lambda at: np.asarray(course(at)))
 
 
-def _surfaces(scene: Scene, background: Background | None) -> Surfaces:
+def _surfaces(scene: CameraScene, background: FloorAndWall | None) -> ArticulatedSurfaces:
     """Object, robot and what stands around them."""
-    tree = numeric_mechanism(scene.system, scene.values)
-    meshes = tube_meshes(scene.system, scene.values)
-    fixed = [] if background is None and scene.urdf is None else [(background or Background()).mesh()]
-    for joint, mesh in (robot_meshes(scene.urdf, tree) if scene.urdf is not None else {}).items():
+    tree = numeric_mechanism(scene.system, scene.parameter_values)
+    meshes = tube_meshes_by_joint(scene.system, scene.parameter_values)
+    fixed = [] if background is None and scene.robot_urdf is None else [(background or FloorAndWall()).to_mesh()]
+    for joint, mesh in (load_robot_meshes(scene.robot_urdf, tree) if scene.robot_urdf is not None else {}).items():
         if joint < 0:
             fixed.append(mesh)
         else:
             meshes[joint] = mesh
     still = [mesh for mesh in fixed if mesh is not None]
     if still:
-        meshes[-1] = Mesh.joined(still)
-    return Surfaces(tree, meshes)
+        meshes[-1] = TriangleMesh.concatenate(still)
+    return ArticulatedSurfaces(tree, meshes)

@@ -16,9 +16,9 @@ import numpy as np
 from annotated_types import Ge, Gt
 from numpy.typing import NDArray
 
-from yid_ocp.options import About, check
+from yid_ocp.options import OptionInfo, check_option_bounds
+from yid_ocp.vision.camera_registration import MIN_ARM_POINTS, ArmSurface, CameraState
 from yid_ocp.vision.filters import weighted_median
-from yid_ocp.vision.registration import FEWEST, Arm, CameraState
 
 Array = NDArray[np.float64]
 
@@ -40,21 +40,23 @@ _LARGEST_CHANGE = 0.05  # of an offset in one iteration [s]
 
 
 @dataclass(frozen=True)
-class ClockOptions:
+class CameraClockOptions:
     """Settings of the comparison of the camera's clock with the joints' clock."""
 
-    offset: Annotated[float, About("stamp minus joint time, as far as known", "s")] = 0.0
-    search: Annotated[
-        float, Ge(0), About("how far from there the offset is looked for; 0 to take it as it is", "s")
+    initial_offset: Annotated[float, OptionInfo("stamp minus joint time, as far as known", "s")] = 0.0
+    search_half_width: Annotated[
+        float, Ge(0), OptionInfo("how far from there the offset is looked for; 0 to take it as it is", "s")
     ] = 0.5
-    drift_std: Annotated[
-        float, Gt(0), About("standard deviation of the drift of the camera's clock, in seconds per second")
+    drift_prior_std: Annotated[
+        float, Gt(0), OptionInfo("standard deviation of the drift of the camera's clock, in seconds per second")
     ] = 1e-3
-    determined: Annotated[float, Gt(0), About("an offset of larger standard deviation is not used", "s")] = 0.02
-    late: Annotated[
+    max_offset_std: Annotated[float, Gt(0), OptionInfo("an offset of larger standard deviation is not used", "s")] = (
+        0.02
+    )
+    max_stamp_delay: Annotated[
         float,
         Gt(0),
-        About(
+        OptionInfo(
             "a frame whose own offset differs from the common one by more, and by more than four standard deviations, "
             "is dropped",
             "s",
@@ -62,11 +64,11 @@ class ClockOptions:
     ] = 0.03
 
     def __post_init__(self) -> None:
-        check(self, "clock options")
+        check_option_bounds(self, "clock options")
 
 
 @dataclass(frozen=True)
-class OwnOffset:
+class StampDelay:
     """Delay of one frame's time stamp beyond the common clock offset.
 
     Attributes
@@ -75,23 +77,23 @@ class OwnOffset:
         Its offset beyond the common one [s].
     std : float
         Of that; infinite where too few points lie on the arm [s].
-    misfit : float
+    mean_square_distance : float
         Mean square of its points' distances from the arm there [m^2].
     """
 
     delay: float
     std: float
-    misfit: float
+    mean_square_distance: float
 
 
-def own_offset(
-    arm: Arm,
+def estimate_stamp_delay(
+    arm: ArmSurface,
     state: CameraState,
     stamp: float,
     points: Array,
     rng: np.random.Generator,
     usual: float = 0.0,
-) -> OwnOffset | None:
+) -> StampDelay | None:
     """Estimate the delay of one frame's time stamp beyond the common offset.
 
     Parameters
@@ -112,24 +114,24 @@ def own_offset(
     OwnOffset or None
         None where the arm is not in view.
     """
-    t, origin = float(state.time(stamp)), state.pose[:3, 3]
+    t, origin = float(state.to_joint_time(stamp)), state.pose[:3, 3]
     points = points[rng.permutation(len(points))[:_THIN]]
-    chosen = points[arm.near(points, t, 2 * _REACH)][:_POINTS]
-    if len(chosen) < FEWEST:
+    chosen = points[arm.is_near_surface(points, t, 2 * _REACH)][:_POINTS]
+    if len(chosen) < MIN_ARM_POINTS:
         return None
     trial = _nearby(arm, origin, t, chosen, 0.0)
-    if trial.misfit > _UNUSUAL * usual:
+    if trial.mean_square_distance > _UNUSUAL * usual:
         steps = round(_FURTHEST / _COARSE)
         grid = _COARSE * np.arange(-steps, steps + 1)
         few = chosen[:_FEW]
         start = float(grid[int(np.argmin([_misfit(arm, origin, t - delay, few) for delay in grid]))])
         if abs(start) > _LEAST_LATE:
             other = _nearby(arm, origin, t, chosen, start)
-            trial = other if other.misfit < _CLEARLY * trial.misfit else trial
+            trial = other if other.mean_square_distance < _CLEARLY * trial.mean_square_distance else trial
     return trial
 
 
-def _nearby(arm: Arm, origin: Array, t: float, points: Array, start: float) -> OwnOffset:
+def _nearby(arm: ArmSurface, origin: Array, t: float, points: Array, start: float) -> StampDelay:
     """The offset not far from a start, by Gauss and Newton's method within one reach after the other.
 
     A shift of the frame is a further unknown, since the calibration is not exact: an arm that moves slowly tells a
@@ -138,25 +140,25 @@ def _nearby(arm: Arm, origin: Array, t: float, points: Array, start: float) -> O
     x = np.array([start, 0.0, 0.0, 0.0])
     hessian, sigma = np.zeros((4, 4)), _REACH
     for share in _NARROWING:
-        met = arm.met(points + x[1:], origin, t - x[0], share * _REACH, along=True)
-        if len(met.error) < FEWEST:
+        met = arm.match_points(points + x[1:], origin, t - x[0], share * _REACH, along=True)
+        if len(met.normal_distance) < MIN_ARM_POINTS:
             break
-        sigma = max(_TO_SIGMA * float(np.median(np.abs(met.error))), _LEAST_SIGMA)
-        slope = np.column_stack([met.rate, met.normal])
+        sigma = max(_TO_SIGMA * float(np.median(np.abs(met.normal_distance))), _LEAST_SIGMA)
+        slope = np.column_stack([met.normal_velocity, met.normal])
         prior = np.array([0.0, *[_ALIKE * (sigma / _SHIFT_STD) ** 2] * 3])
         hessian = slope.T @ slope + np.diag(prior) + 1e-9 * np.eye(4)
-        step = -np.linalg.solve(hessian, slope.T @ met.error + prior * x)
+        step = -np.linalg.solve(hessian, slope.T @ met.normal_distance + prior * x)
         x += np.clip(step, -_LARGEST_CHANGE, _LARGEST_CHANGE)
-    error = arm.met(points + x[1:], origin, t - x[0], _REACH, along=True).error
+    error = arm.match_points(points + x[1:], origin, t - x[0], _REACH, along=True).normal_distance
     on_arm = np.count_nonzero(np.abs(error) < _NARROWING[-1] * _REACH)
     std = math.inf
-    if on_arm >= max(_SHARE * len(points), FEWEST):
+    if on_arm >= max(_SHARE * len(points), MIN_ARM_POINTS):
         std = sigma * math.sqrt(_ALIKE * float(np.linalg.inv(hessian)[0, 0]))
-    return OwnOffset(float(x[0]), std, _mean_square(error, len(points)))
+    return StampDelay(float(x[0]), std, _mean_square(error, len(points)))
 
 
-def _misfit(arm: Arm, origin: Array, t: float, points: Array) -> float:
-    return _mean_square(arm.met(points, origin, t, _REACH, along=True).error, len(points))
+def _misfit(arm: ArmSurface, origin: Array, t: float, points: Array) -> float:
+    return _mean_square(arm.match_points(points, origin, t, _REACH, along=True).normal_distance, len(points))
 
 
 def _mean_square(error: Array, count: int) -> float:
@@ -165,33 +167,33 @@ def _mean_square(error: Array, count: int) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Usual:
+class OnTimeFrames:
     """Frames that agree on one clock offset, and their median misfit.
 
     Attributes
     ----------
-    on_time : tuple of int
+    frame_indices : tuple of int
         Those that agree on one offset.
-    misfit : float
+    median_square_distance : float
         Median of theirs [m^2].
     """
 
-    on_time: tuple[int, ...]
-    misfit: float
+    frame_indices: tuple[int, ...]
+    median_square_distance: float
 
 
-def agreed(own: Sequence[OwnOffset | None]) -> Usual:
+def find_on_time_frames(own: Sequence[StampDelay | None]) -> OnTimeFrames:
     """Frames whose delays agree, so that frames stamped late do not bias the others."""
     known = [(i, entry) for i, entry in enumerate(own) if entry is not None and math.isfinite(entry.std)]
     if not known:
-        return Usual((), 0.0)
+        return OnTimeFrames((), 0.0)
     delay, std = (np.array([getattr(entry, name) for _, entry in known]) for name in ("delay", "std"))
     apart = np.abs(delay - weighted_median(delay, std**-2))
     near = apart < np.maximum(_LEAST_LATE, _LATE * std)
     on_time = tuple(i for (i, _), good in zip(known, near, strict=True) if good)
-    return Usual(on_time, float(np.median([entry.misfit for _, entry in known])))
+    return OnTimeFrames(on_time, float(np.median([entry.mean_square_distance for _, entry in known])))
 
 
-def is_late(own: OwnOffset, options: ClockOptions) -> bool:
+def is_stamped_late(own: StampDelay, options: CameraClockOptions) -> bool:
     """Whether a frame's time stamp is significantly late."""
-    return abs(own.delay) > max(options.late, _LATE * own.std)
+    return abs(own.delay) > max(options.max_stamp_delay, _LATE * own.std)

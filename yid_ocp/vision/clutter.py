@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from yid_ocp.errors import ConfigError, ModelError, nearest
+from yid_ocp.errors import ConfigError, ModelError, nearest_name_hint
 from yid_ocp.files import is_file
 from yid_ocp.model.mechanism import Mechanism
-from yid_ocp.model.rotations import roll_pitch_yaw, transform
-from yid_ocp.vision.evidence import Thing, Tubes
-from yid_ocp.vision.evidence import nearest as nearest_place
-from yid_ocp.vision.meshes import ExtraMesh, Mesh, file_mesh
+from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
+from yid_ocp.vision.shape_evidence import ForeignCluster, TubeLinks
+from yid_ocp.vision.shape_evidence import nearest_on_tubes as nearest_place
+from yid_ocp.vision.surface_meshes import ExtraMesh, TriangleMesh, load_mesh_file
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -38,19 +38,19 @@ _TO_SIGMA = 1.4826
 
 
 @dataclass(frozen=True, eq=False)
-class Background:
+class BackgroundPoints:
     """Background points that do not belong to the object.
 
     Attributes
     ----------
     points : ndarray, shape (N, 3)
         In the world [m].
-    within : float
+    match_distance : float
         Distance at which a point belongs to it [m].
     """
 
     points: Array = field(default_factory=lambda: np.empty((0, 3)))
-    within: float = 0.0
+    match_distance: float = 0.0
 
     @cached_property
     def _tree(self) -> cKDTree:
@@ -60,19 +60,21 @@ class Background:
         """Whether points, shape (N, 3), lie within `within + beyond` [m] of the background, shape (N,)."""
         if not len(self.points) or not len(points):
             return np.zeros(len(points), bool)
-        reach = self.within + beyond
+        reach = self.match_distance + beyond
         return np.asarray(np.isfinite(self._tree.query(points, distance_upper_bound=reach)[0]))
 
     @staticmethod
-    def empty_scene(clouds: Sequence[Array], voxel: float, noise: float) -> Background:
+    def from_empty_scene(clouds: Sequence[Array], voxel: float, noise: float) -> BackgroundPoints:
         """Background from clouds of the scene without robot and object, in the world [m]."""
         if not clouds:
-            return Background()
+            return BackgroundPoints()
         cells = np.unique(np.floor(np.concatenate(clouds) / voxel).astype(np.int64), axis=0)
-        return Background(np.asarray((cells + 0.5) * voxel), _SIGMAS * noise + 0.5 * math.sqrt(3.0) * voxel)
+        return BackgroundPoints(np.asarray((cells + 0.5) * voxel), _SIGMAS * noise + 0.5 * math.sqrt(3.0) * voxel)
 
     @staticmethod
-    def still(clouds: Sequence[Array], shapes: Sequence[Tubes], voxel: float, noise: float, near: float) -> Background:
+    def from_static_points(
+        clouds: Sequence[Array], shapes: Sequence[TubeLinks], voxel: float, noise: float, near: float
+    ) -> BackgroundPoints:
         """Background from points that stay in most frames away from every fitted shape.
 
         Parameters
@@ -89,18 +91,18 @@ class Background:
             From the tubes' surface; what ever was so near may be the object's [m].
         """
         if not clouds or not shapes:
-            return Background()
+            return BackgroundPoints()
         cells = [np.unique(np.floor(cloud / voxel).astype(np.int64), axis=0) for cloud in clouds]
         place, count = np.unique(np.concatenate(cells), axis=0, return_counts=True)
         points: Array = np.asarray((place[count >= max(2.0, _MOST * len(clouds))] + 0.5) * voxel)
         for tubes in shapes:
             if len(points):
-                link, _, _, distance = nearest_place(tubes.corners, tubes.radius, points)
+                link, _, _, distance = nearest_place(tubes.link_ends, tubes.radius, points)
                 points = points[distance > tubes.radius[link] + near]
-        return Background(points, _SIGMAS * noise + 0.5 * math.sqrt(3.0) * voxel)
+        return BackgroundPoints(points, _SIGMAS * noise + 0.5 * math.sqrt(3.0) * voxel)
 
 
-def extra_meshes(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> dict[int, list[Mesh]]:
+def extra_meshes_by_joint(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> dict[int, list[TriangleMesh]]:
     """Meshes that the URDF does not have, by the index of the joint that carries them, -1 for the world.
 
     Raises
@@ -110,44 +112,44 @@ def extra_meshes(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> dict[int, 
     ModelError
         A file that cannot be read.
     """
-    made: dict[int, list[Mesh]] = {}
+    made: dict[int, list[TriangleMesh]] = {}
     for number, entry in enumerate(extra):
         where = f"model: extra_meshes: {number}"
         mesh = _shape(entry, where)
-        pose = transform(roll_pitch_yaw(*entry.rpy), entry.xyz)
+        pose = homogeneous_transform(rotation_from_rpy(*entry.rpy), entry.xyz)
         joint = -1
-        if entry.frame is not None:
-            if entry.frame not in mechanism.frames:
-                hint = nearest(entry.frame, list(mechanism.frames))
-                raise ConfigError(f"there is no link '{entry.frame}'", where=where, hint=hint)
-            frame = mechanism.frames[entry.frame]
-            joint, pose = frame.joint, np.array(ca.DM(frame.placement.matrix())) @ pose
-        made.setdefault(joint, []).append(mesh.moved(pose))
+        if entry.parent_frame is not None:
+            if entry.parent_frame not in mechanism.frames:
+                hint = nearest_name_hint(entry.parent_frame, list(mechanism.frames))
+                raise ConfigError(f"there is no link '{entry.parent_frame}'", where=where, hint=hint)
+            frame = mechanism.frames[entry.parent_frame]
+            joint, pose = frame.joint_index, np.array(ca.DM(frame.placement.homogeneous_matrix())) @ pose
+        made.setdefault(joint, []).append(mesh.transformed(pose))
     return made
 
 
-def _shape(entry: ExtraMesh, where: str) -> Mesh:
+def _shape(entry: ExtraMesh, where: str) -> TriangleMesh:
     given = [kind for kind in ("mesh", "box", "cylinder", "sphere") if getattr(entry, kind) is not None]
     if len(given) != 1:
         found = " and ".join(given) or "no shape"
         raise ConfigError(f"there is {found}", where=where, allowed="one of mesh, box, cylinder, sphere")
     if entry.box is not None:
-        return Mesh.box(entry.box)
+        return TriangleMesh.box(entry.box)
     if entry.cylinder is not None:
         radius, length = entry.cylinder
-        return Mesh.cylinder(radius, -0.5 * length, 0.5 * length)
+        return TriangleMesh.cylinder(radius, -0.5 * length, 0.5 * length)
     if entry.sphere is not None:
-        return Mesh.sphere(entry.sphere)
+        return TriangleMesh.sphere(entry.sphere)
     path = Path(str(entry.mesh))
     if not is_file(path):
         raise ModelError(
             f"there is no mesh '{path}'", where=where, hint="give a file that trimesh reads: STL, OBJ, DAE"
         )
-    return file_mesh(path)
+    return load_mesh_file(path)
 
 
 @dataclass(frozen=True, eq=False)
-class Foreign:
+class ForeignObject:
     """Foreign object seen in several frames.
 
     Attributes
@@ -173,15 +175,15 @@ class Foreign:
     text: str
 
 
-def foreign(
-    things: Sequence[tuple[float, Sequence[Thing]]],
+def group_foreign_objects(
+    things: Sequence[tuple[float, Sequence[ForeignCluster]]],
     total: int,
     noise: float,
     box: tuple[Array, Array],
     links: Callable[[float], Mapping[str, Array]],
     coloured: bool,
     background: bool = False,
-) -> tuple[Foreign, ...]:
+) -> tuple[ForeignObject, ...]:
     """Group the foreign clusters of all frames into foreign objects, each with advice.
 
     Parameters
@@ -201,7 +203,7 @@ def foreign(
     background : bool
         Whether what stands still in the frames is left out already.
     """
-    groups: list[list[tuple[float, Thing]]] = []
+    groups: list[list[tuple[float, ForeignCluster]]] = []
     for t, seen in things:
         for thing in seen:
             home = min(groups, key=lambda group: _apart(group[-1][1], thing), default=None)
@@ -210,13 +212,13 @@ def foreign(
             else:
                 groups.append([(t, thing)])
     groups = [group for group in groups if len(group) >= min(_FEWEST, total)]
-    groups.sort(key=lambda group: -sum(thing.points for _, thing in group))
+    groups.sort(key=lambda group: -sum(thing.n_points for _, thing in group))
     return tuple(_named(group, total, noise, box, links, coloured, background) for group in groups)
 
 
-def _apart(one: Thing, other: Thing) -> float:
+def _apart(one: ForeignCluster, other: ForeignCluster) -> float:
     """Distance of two things, in shares of their size in which they pass for the same."""
-    size = max(float(np.linalg.norm(one.size)), float(np.linalg.norm(other.size)), 1e-6)
+    size = max(float(np.linalg.norm(one.extent)), float(np.linalg.norm(other.extent)), 1e-6)
     return float(np.linalg.norm(one.centre - other.centre)) / (_ALIKE * size)
 
 
@@ -225,21 +227,21 @@ def _wandering(places: Array) -> float:
 
 
 def _named(
-    group: Sequence[tuple[float, Thing]],
+    group: Sequence[tuple[float, ForeignCluster]],
     total: int,
     noise: float,
     box: tuple[Array, Array],
     links: Callable[[float], Mapping[str, Array]],
     coloured: bool,
     background: bool,
-) -> Foreign:
+) -> ForeignObject:
     places = np.array([thing.centre for _, thing in group])
     centre = np.median(places, axis=0)
-    size = np.median([thing.size for _, thing in group], axis=0)
+    size = np.median([thing.extent for _, thing in group], axis=0)
     far = _wandering(places)
     # as arm and object hide parts of a still thing, the middle of the rest wanders within it
     span = np.ptp(places, axis=0)
-    moving = bool((span > np.maximum(2 * _SIGMAS * noise, _STILL * np.max([x.size for _, x in group], axis=0))).any())
+    moving = bool((span > np.maximum(2 * _SIGMAS * noise, _STILL * np.max([x.extent for _, x in group], axis=0))).any())
     link = ""
     if moving:
         poses = [links(t) for t, _ in group]
@@ -261,11 +263,11 @@ def _named(
     if link:
         text += f"give its shape under model.extra_meshes with frame: {link}"
     elif moving:
-        text += "take it out of view" if not beside else "leave it out with track.options.filters.lower and upper"
-        text += ", or give the object's colour under track.options.filters.colours" if coloured else ""
+        text += "take it out of view" if not beside else "leave it out with track.options.filters.box_lower and upper"
+        text += ", or give the object's colour under track.options.filters.object_colours" if coloured else ""
     else:
-        text += "" if background else "set track.options.background: frames, or "
-        text += "film the scene without object and robot for track.background"
-        text += "; or leave it out with track.options.filters.lower and upper" if beside else ""
-        text += "; if it is another arm, lock its joints (model.arms.locked)" if links(group[0][0]) else ""
-    return Foreign(centre, size, len(group), moving, link, text)
+        text += "" if background else "set track.options.background_estimation: frames, or "
+        text += "film the scene without object and robot for track.background_frames"
+        text += "; or leave it out with track.options.filters.box_lower and upper" if beside else ""
+        text += "; if it is another arm, lock its joints (model.arms.locked_joints)" if links(group[0][0]) else ""
+    return ForeignObject(centre, size, len(group), moving, link, text)

@@ -15,132 +15,140 @@ from scipy.spatial import cKDTree
 
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
-from yid_ocp.options import About, check
-from yid_ocp.vision.meshes import Surfaces, numeric_mechanism
+from yid_ocp.options import OptionInfo, check_option_bounds
+from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, numeric_mechanism
 
 Array = NDArray[np.float64]
-Triple = tuple[float, float, float]
+Coordinates = tuple[float, float, float]
 Mask = NDArray[np.bool_]
-Part = Annotated[float, Ge(0), Le(255)]
-Colour = tuple[Part, Part, Part]
+_ColourComponent = Annotated[float, Ge(0), Le(255)]
+_RgbColour = tuple[_ColourComponent, _ColourComponent, _ColourComponent]
 
 _USUAL = 3000  # points, at least, that tell how far neighbours usually are
 _TO_SIGMA = 1.4826  # from the median absolute deviation of a normal distribution to its standard deviation
 
 
 @dataclass(frozen=True, eq=False)
-class Cloud:
+class WeightedCloud:
     """Point cloud with weights.
 
     Attributes
     ----------
     points : ndarray, shape (N, 3)
         In the world [m].
-    weight : ndarray, shape (N,)
+    point_weights : ndarray, shape (N,)
         How many of the camera's points each one stands for.
     """
 
     points: Array
-    weight: Array
+    point_weights: Array
 
     def __len__(self) -> int:
         return len(self.points)
 
-    def keep(self, mask: NDArray[np.bool_] | NDArray[np.int64]) -> Cloud:
+    def select(self, mask: NDArray[np.bool_] | NDArray[np.int64]) -> WeightedCloud:
         """The points that a mask or a list of indices selects."""
-        return Cloud(self.points[mask], self.weight[mask])
+        return WeightedCloud(self.points[mask], self.point_weights[mask])
 
 
 @dataclass(frozen=True)
-class FilterOptions:
+class CloudFilterOptions:
     """Settings of the filters that select the object's points."""
 
-    voxel: Annotated[float, Gt(0), About("edge of the cubes in which points are averaged", "m")] = 0.008
-    padding: Annotated[
+    voxel_size: Annotated[float, Gt(0), OptionInfo("edge of the cubes in which points are averaged", "m")] = 0.008
+    robot_padding: Annotated[
         float,
         Gt(0),
-        About("points this near to the robot's surface belong to it; about five standard deviations of the depth", "m"),
+        OptionInfo(
+            "points this near to the robot's surface belong to it; about five standard deviations of the depth", "m"
+        ),
     ] = 0.03
-    lower: Annotated[Triple | None, About("corner of a box in the world outside of which points are left out", "m")] = (
-        None
-    )
-    upper: Annotated[Triple | None, About("the opposite corner", "m")] = None
-    floor: Annotated[
+    box_lower: Annotated[
+        Coordinates | None, OptionInfo("corner of a box in the world outside of which points are left out", "m")
+    ] = None
+    box_upper: Annotated[Coordinates | None, OptionInfo("the opposite corner", "m")] = None
+    floor_height: Annotated[
         float | None,
-        About(
+        OptionInfo(
             "points below this height are left out; when absent, those below floor_margin above the foot of an object "
             "that stands on one",
             "m",
         ),
     ] = None
-    floor_margin: Annotated[float, About("height above the foot of an object", "m")] = 0.05
+    floor_margin: Annotated[float, OptionInfo("height above the foot of an object", "m")] = 0.05
     reach_margin: Annotated[
         float,
         Gt(0),
-        About("points further from the object's root than its longest branch reaches, plus this, are left out", "m"),
+        OptionInfo(
+            "points further from the object's root than its longest branch reaches, plus this, are left out", "m"
+        ),
     ] = 0.1
-    behind: Annotated[
+    max_depth_behind_base: Annotated[
         float | None,
-        About(
+        OptionInfo(
             "points that are further from the camera than the robot's base by more than this, seen in the horizontal, "
             "are behind the robot and left out; null to keep them",
             "m",
         ),
     ] = 0.0
-    colours: Annotated[
-        tuple[Colour, ...],
-        About(
+    object_colours: Annotated[
+        tuple[_RgbColour, ...],
+        OptionInfo(
             "of the object: red, green and blue, 0 to 255; points of other colours are left out, where the clouds have "
             "colours; all are kept when empty"
         ),
     ] = ()
-    colour_angle: Annotated[
+    max_colour_angle: Annotated[
         float,
         Gt(0),
         Le(math.pi / 2),
-        About(
+        OptionInfo(
             "between a point's and the object's colour as directions, by which light and shade change nothing", "rad"
         ),
     ] = 0.2
-    neighbours: Annotated[int, Ge(1), About("of every point, whose mean distance tells whether it is alone")] = 12
-    outlier_ratio: Annotated[
+    outlier_neighbours: Annotated[
+        int, Ge(1), OptionInfo("of every point, whose mean distance tells whether it is alone")
+    ] = 12
+    outlier_z_max: Annotated[
         float,
         Gt(0),
-        About("a point is an outlier where that distance exceeds the median by so many (robust) standard deviations"),
+        OptionInfo(
+            "a point is an outlier where that distance exceeds the median by so many (robust) standard deviations"
+        ),
     ] = 4.0
-    least: Annotated[int, Ge(0), About("a frame with fewer points left is of no use")] = 150
-    most: Annotated[
-        int, Ge(1), About("of more points left, so many are drawn at random, to bound the time that a frame takes")
+    min_points: Annotated[int, Ge(0), OptionInfo("a frame with fewer points left is of no use")] = 150
+    max_points: Annotated[
+        int, Ge(1), OptionInfo("of more points left, so many are drawn at random, to bound the time that a frame takes")
     ] = 6000
 
     def __post_init__(self) -> None:
-        check(self, "filter options")
+        check_option_bounds(self, "filter options")
 
 
 @dataclass(frozen=True, eq=False)
-class Region:
+class RegionBounds:
     """Bounds of the region that the object can reach.
 
     Attributes
     ----------
     lower, upper : ndarray, shape (3,)
         Box in the world [m].
-    centre : ndarray, shape (3,)
+    root_position : ndarray, shape (3,)
         The object's root [m].
-    radius : float
+    max_reach : float
         How far it reaches from there [m].
-    ahead : ndarray, shape (3,)
+    camera_to_robot_direction : ndarray, shape (3,)
         Horizontal direction from the camera to the robot, zero where nothing is behind it.
-    limit : float
+    max_distance_along_direction : float
         Points with  ahead . p > limit  are behind the robot [m].
     """
 
     lower: Array
     upper: Array
-    centre: Array
-    radius: float
-    ahead: Array
-    limit: float
+    root_position: Array
+    max_reach: float
+    camera_to_robot_direction: Array
+    max_distance_along_direction: float
 
     def contains(self, points: Array) -> Mask:
         """Whether points, shape (N, 3), lie inside, shape (N,)."""
@@ -148,10 +156,10 @@ class Region:
         for axis in range(3):  # column by column, which is quicker than whole rows on large clouds
             inside &= (points[:, axis] >= self.lower[axis]) & (points[:, axis] <= self.upper[axis])
         rest = np.flatnonzero(inside)
-        inside[rest] = points[rest] @ self.ahead <= self.limit
+        inside[rest] = points[rest] @ self.camera_to_robot_direction <= self.max_distance_along_direction
         rest = np.flatnonzero(inside)
-        away = points[rest] - self.centre
-        inside[rest] = np.einsum("ij,ij->i", away, away) <= self.radius**2
+        away = points[rest] - self.root_position
+        inside[rest] = np.einsum("ij,ij->i", away, away) <= self.max_reach**2
         return inside
 
 
@@ -171,7 +179,7 @@ class ObjectRegion:
     def __init__(
         self,
         system: System,
-        options: FilterOptions,
+        options: CloudFilterOptions,
         values: Mapping[str, float] | None = None,
         *,
         anywhere: bool = False,
@@ -179,38 +187,40 @@ class ObjectRegion:
         tree = numeric_mechanism(system, values)
         symbols, theta = system.parameters.symbols, system.parameters.vector(values)
         lengths = {
-            s.name: float(sum(float(ca.Function("l", [symbols], [length])(theta)) for length in s.lengths))
-            for s in system.segments
+            s.name: float(sum(float(ca.Function("l", [symbols], [length])(theta)) for length in s.link_lengths))
+            for s in system.segment_layouts
         }
-        radius = max(float(ca.Function("r", [symbols], [s.radius])(theta)) for s in system.segments)
+        radius = max(float(ca.Function("r", [symbols], [s.radius])(theta)) for s in system.segment_layouts)
         reach: dict[str, float] = {}
-        for segment in system.segments:
-            reach[segment.name] = lengths[segment.name] + (reach[segment.parent] if segment.parent else 0.0)
-        first = next(s for s in system.segments if s.parent is None)
+        for segment in system.segment_layouts:
+            reach[segment.name] = lengths[segment.name] + (
+                reach[segment.parent_segment] if segment.parent_segment else 0.0
+            )
+        first = next(s for s in system.segment_layouts if s.parent_segment is None)
         self._radius = np.inf if anywhere else max(reach.values()) + radius + options.reach_margin
-        base = tree.joint_index(first.links[0][0])
-        q = ca.SX.sym("q", system.size)
+        base = tree.joint_index(first.link_joints[0][0])
+        q = ca.SX.sym("q", system.n_coordinates)
         kinematics = forward_kinematics(tree, q)
-        self._root = ca.Function("root", [q], [kinematics.origins[base]])
-        tips = [kinematics.position(f"w_{name}") for name in lengths if f"w_{name}" in tree.frames]
-        low = -np.inf if options.floor is None else options.floor
-        if options.floor is None and tree.joints[base].parent < 0 and tips and not anywhere:
-            rest = np.zeros(system.size)
+        self._root = ca.Function("root", [q], [kinematics.joint_origins[base]])
+        tips = [kinematics.frame_position(f"w_{name}") for name in lengths if f"w_{name}" in tree.frames]
+        low = -np.inf if options.floor_height is None else options.floor_height
+        if options.floor_height is None and tree.joints[base].parent_index < 0 and tips and not anywhere:
+            rest = np.zeros(system.n_coordinates)
             root = float(np.array(self._root(rest))[2, 0])
             heights = np.array(ca.Function("tips", [q], [ca.horzcat(*tips)])(rest))[2]
             if heights.min() > root:
                 low = root + options.floor_margin
-        self._lower = np.full(3, -np.inf) if options.lower is None else np.asarray(options.lower, float)
-        self._upper = np.full(3, np.inf) if options.upper is None else np.asarray(options.upper, float)
+        self._lower = np.full(3, -np.inf) if options.box_lower is None else np.asarray(options.box_lower, float)
+        self._upper = np.full(3, np.inf) if options.box_upper is None else np.asarray(options.box_upper, float)
         self._lower = self._lower.copy()
         self._lower[2] = max(self._lower[2], low)
-        self._behind = options.behind
-        elastic = {entry.joint for entry in system.elastic}
-        roots = [j for j in tree.joints if j.parent < 0 and j.name not in elastic and not anywhere]
+        self._behind = options.max_depth_behind_base
+        elastic = {entry.joint_name for entry in system.elastic_joints}
+        roots = [j for j in tree.joints if j.parent_index < 0 and j.name not in elastic and not anywhere]
         bases = [np.array(ca.DM(joint.placement.translation)).ravel() for joint in roots]
         self._base = np.mean(bases, axis=0) if bases else None
 
-    def at(self, q: ArrayLike, camera: ArrayLike) -> Region:
+    def bounds_at(self, q: ArrayLike, camera: ArrayLike) -> RegionBounds:
         """The region with the robot at a configuration, shape (n,), seen from a camera's position, shape (3,) [m]."""
         centre = np.array(self._root(np.asarray(q, float))).ravel()
         ahead, limit = np.zeros(3), 0.0
@@ -219,10 +229,10 @@ class ObjectRegion:
             length = float(np.linalg.norm(ahead))
             ahead = ahead / length if length > 0 else np.zeros(3)
             limit = float(ahead @ self._base) + self._behind
-        return Region(self._lower, self._upper, centre, self._radius, ahead, limit)
+        return RegionBounds(self._lower, self._upper, centre, self._radius, ahead, limit)
 
 
-def voxel_grid(points: Array, size: float) -> Cloud:
+def voxel_averages(points: Array, size: float) -> WeightedCloud:
     """Mean of the points in every cube of a grid.
 
     Parameters
@@ -238,21 +248,21 @@ def voxel_grid(points: Array, size: float) -> Cloud:
         One point for every cube that is not empty, weighted by how many were in it.
     """
     if not len(points):
-        return Cloud(np.empty((0, 3)), np.empty(0))
+        return WeightedCloud(np.empty((0, 3)), np.empty(0))
     cell = np.floor((points - points.min(0)) / size).astype(np.int64)
     extent = cell.max(0) + 1
     key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
     _, index, count = np.unique(key, return_inverse=True, return_counts=True)
     total = np.stack([np.bincount(index, points[:, axis]) for axis in range(3)], axis=1)
-    return Cloud(total / count[:, None], count.astype(np.float64))
+    return WeightedCloud(total / count[:, None], count.astype(np.float64))
 
 
-def without_robot(cloud: Cloud, robot: Surfaces, q: ArrayLike, padding: float) -> Mask:
-    """Whether points are further than `padding` [m] from the robot's surface, shape (N,)."""
-    return ~robot.within(cloud.points, q, padding)
+def is_not_robot(cloud: WeightedCloud, robot: ArticulatedSurfaces, q: ArrayLike, padding: float) -> Mask:
+    """Whether points are further than `robot_padding` [m] from the robot's surface, shape (N,)."""
+    return ~robot.is_within_distance(cloud.points, q, padding)
 
 
-def without_outliers(cloud: Cloud, neighbours: int, ratio: float, asked: Mask | None = None) -> Mask:
+def is_not_outlier(cloud: WeightedCloud, neighbours: int, ratio: float, asked: Mask | None = None) -> Mask:
     """Whether points are inliers of statistical outlier removal.
 
     A point stays where the mean distance d to its nearest neighbours satisfies  d <= median(d) + ratio s,  with s the
@@ -282,15 +292,15 @@ def without_outliers(cloud: Cloud, neighbours: int, ratio: float, asked: Mask | 
 
     some = np.arange(0, len(cloud), max(1, len(cloud) // _USUAL))
     distance = apart(some)
-    middle = weighted_median(distance, cloud.weight[some])
-    spread = _TO_SIGMA * weighted_median(np.abs(distance - middle), cloud.weight[some])
+    middle = weighted_median(distance, cloud.point_weights[some])
+    spread = _TO_SIGMA * weighted_median(np.abs(distance - middle), cloud.point_weights[some])
     index = np.flatnonzero(np.ones(len(cloud), bool) if asked is None else asked)
     stays = np.zeros(len(cloud), bool)
     stays[index] = apart(index) <= middle + ratio * spread
     return stays
 
 
-def of_colours(colours: ArrayLike, wanted: ArrayLike, angle: float) -> Mask:
+def has_any_colour(colours: ArrayLike, wanted: ArrayLike, angle: float) -> Mask:
     """Whether points have one of the given colours.
 
     Parameters

@@ -24,21 +24,28 @@ from annotated_types import Ge, Gt, Le
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import ConfigError, DataError
-from yid_ocp.least_squares import Quadratic, damped_newton
+from yid_ocp.least_squares import LocalQuadraticModel, minimize_by_damped_newton
 from yid_ocp.model.kinematics import Kinematics, forward_kinematics
 from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System
-from yid_ocp.options import About, check
-from yid_ocp.vision.evidence import Evidence, Sight, Tubes, gather, nearest, slender
-from yid_ocp.vision.fitted import Fit, SizeRows
-from yid_ocp.vision.meshes import numeric_mechanism
-from yid_ocp.vision.residuals import along_sight, nearest_way
-from yid_ocp.vision.starts import Anchor, Starts
+from yid_ocp.options import OptionInfo, check_option_bounds
+from yid_ocp.vision.initial_shapes import EndAnchor, InitialShapeFinder
+from yid_ocp.vision.shape_evidence import (
+    CloudObservation,
+    ShapeEvidence,
+    TubeLinks,
+    assess_shape,
+    nearest_on_tubes,
+    tube_like_nodes_and_points,
+)
+from yid_ocp.vision.shape_fit_result import DimensionEquations, FrameShapeFit
+from yid_ocp.vision.surface_meshes import numeric_mechanism
+from yid_ocp.vision.surface_residuals import line_of_sight_residuals, nearest_surface_residuals
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-NODE_FACTOR = math.pi / 4
+_NODE_RADIUS_FRACTION = math.pi / 4
 """Distance of the mean of a tube's visible half from its axis, as a fraction of its radius."""
 
 _SIGMAS = 3.0  # of a point, beyond which an end stands elsewhere than the shape has it
@@ -50,57 +57,61 @@ _TOLERANCE = 1e-4  # of a bend [rad] and, relative, of the cost, at which a pass
 
 
 @dataclass(frozen=True)
-class FitOptions:
+class ShapeFitOptions:
     """Settings of the shape fit."""
 
-    scales: Annotated[
+    node_loss_scales: Annotated[
         tuple[Annotated[float, Gt(0)], ...],
-        About(
+        OptionInfo(
             "scale of the robust loss on the nodes, pass after pass: wide first, to catch a start some decimetres off",
             "m",
         ),
     ] = (0.15, 0.05)
-    surface_scales: Annotated[
+    surface_loss_scales: Annotated[
         tuple[Annotated[float, Gt(0)], ...],
-        About("the same on the points of the cloud; empty for a fit to the nodes alone, as in the source paper", "m"),
+        OptionInfo(
+            "the same on the points of the cloud; empty for a fit to the nodes alone, as in the source paper", "m"
+        ),
     ] = (0.03, 0.015)
-    noise: Annotated[
-        float, Gt(0), About("standard deviation of one averaged point's distance from the surface", "m")
+    surface_noise_std: Annotated[
+        float, Gt(0), OptionInfo("standard deviation of one averaged point's distance from the surface", "m")
     ] = 0.006
-    noise_correlation: Annotated[
-        float, Gt(0), About("of how many points the errors are alike; divides the weight of all points together")
+    correlated_points: Annotated[
+        float, Gt(0), OptionInfo("of how many points the errors are alike; divides the weight of all points together")
     ] = 8.0
-    grasp_std: Annotated[
-        float, Gt(0), About("standard deviation between a gripper, by its joint angles, and what it holds", "m")
+    grasp_position_std: Annotated[
+        float, Gt(0), OptionInfo("standard deviation between a gripper, by its joint angles, and what it holds", "m")
     ] = 0.004
-    direction_std: Annotated[
-        float, Gt(0), About("the same of the axes that grasps of kind axis and weld make coincide", "rad")
+    grasp_direction_std: Annotated[
+        float, Gt(0), OptionInfo("the same of the axes that grasps of kind axis and weld make coincide", "rad")
     ] = 0.05
-    bend_std: Annotated[
-        float, Gt(0), About("bend of a joint of mean stiffness that costs as much as one standard deviation", "rad")
+    bend_prior_std: Annotated[
+        float,
+        Gt(0),
+        OptionInfo("bend of a joint of mean stiffness that costs as much as one standard deviation", "rad"),
     ] = 0.3
-    iterations: Annotated[int, Ge(1), About("at most so many in a pass")] = 25
-    weight_cap: Annotated[float, Gt(0), About("a point counts at most for so many of the camera's")] = 6.0
-    least_coverage: Annotated[
+    max_iterations: Annotated[int, Ge(1), OptionInfo("at most so many in a pass")] = 25
+    max_point_weight: Annotated[float, Gt(0), OptionInfo("a point counts at most for so many of the camera's")] = 6.0
+    min_link_coverage: Annotated[
         float,
         Ge(0),
         Le(1),
-        About("a link with points along a smaller fraction of its length is hidden, or not where the fit has it"),
+        OptionInfo("a link with points along a smaller fraction of its length is hidden, or not where the fit has it"),
     ] = 0.5
-    least_filled: Annotated[
+    min_tube_coverage: Annotated[
         float,
         Ge(0),
         Le(1),
-        About("a tube with points on a smaller share of its visible length is not where the fit has it"),
+        OptionInfo("a tube with points on a smaller share of its visible length is not where the fit has it"),
     ] = 0.75
 
     def __post_init__(self) -> None:
-        check(self, "fit options")
-        if not self.scales and not self.surface_scales:
+        check_option_bounds(self, "fit options")
+        if not self.node_loss_scales and not self.surface_loss_scales:
             raise ConfigError("there is no pass to fit in", where="fit options: scales", allowed="one scale or more")
 
 
-class ShapeFit:
+class ShapeFitter:
     """Fitter of the shape of a system's object to a camera's points.
 
     Parameters
@@ -110,7 +121,7 @@ class ShapeFit:
     values : mapping of str to float, optional
         Parameter values (lengths, radii, stiffnesses for the prior); nominal where absent.
     loose : sequence of str
-        Joints beside the bends that are sought as well, with next to no prior: see `starts.loosened`.
+        Joints beside the bends that are sought as well, with next to no prior: see `initial_shapes.with_free_root`.
 
     Raises
     ------
@@ -121,13 +132,13 @@ class ShapeFit:
     def __init__(
         self,
         system: System,
-        options: FitOptions | None = None,
+        options: ShapeFitOptions | None = None,
         values: Mapping[str, float] | None = None,
         loose: Sequence[str] = (),
     ) -> None:
         self.system = system
-        self.options = options or FitOptions()
-        if not system.segments:
+        self.options = options or ShapeFitOptions()
+        if not system.segment_layouts:
             raise DataError("the model has no object whose shape could be fitted", hint="give it segments")
         tree = numeric_mechanism(system, values)
         self._tree = tree
@@ -136,64 +147,66 @@ class ShapeFit:
         def number(expression: ca.SX) -> Array:
             return np.array(ca.densify(ca.Function("number", [symbols], [expression])(theta))).ravel()
 
-        bends = [entry for entry in system.elastic if entry.kind == "bend" and entry.axis]
-        self.bends = tuple(tree.joint_index(entry.joint) for entry in bends)
-        self.free = (*self.bends, *(tree.joint_index(name) for name in loose))
-        self.free_owner = (*(_owner(system, entry.joint) for entry in bends), *[""] * len(loose))
-        self.rest = np.zeros(system.size)
-        for entry in system.elastic:
-            self.rest[tree.joint_index(entry.joint)] = number(entry.rest)[0]
+        bends = [entry for entry in system.elastic_joints if entry.deformation == "bend" and entry.axis]
+        self.bend_joints = tuple(tree.joint_index(entry.joint_name) for entry in bends)
+        self.free_joints = (*self.bend_joints, *(tree.joint_index(name) for name in loose))
+        self.free_joint_segments = (*(_owner(system, entry.joint_name) for entry in bends), *[""] * len(loose))
+        self.rest_configuration = np.zeros(system.n_coordinates)
+        for entry in system.elastic_joints:
+            self.rest_configuration[tree.joint_index(entry.joint_name)] = number(entry.rest_angle)[0]
         stiffness = np.array([number(entry.stiffness)[0] for entry in bends])
         typical = stiffness.mean() if stiffness.max() > 0 else 1.0
-        self._prior = np.sqrt(np.maximum(stiffness / typical, _LEAST_STIFFNESS)) / self.options.bend_std
+        self._prior = np.sqrt(np.maximum(stiffness / typical, _LEAST_STIFFNESS)) / self.options.bend_prior_std
         self._prior = np.concatenate([self._prior, np.full(len(loose), _LOOSE)])
-        sought = {*(entry.joint for entry in system.elastic), *loose}
-        self.known = tuple(name for name in tree.joint_names if name not in sought)
+        sought = {*(entry.joint_name for entry in system.elastic_joints), *loose}
+        self.recorded_joint_names = tuple(name for name in tree.joint_names if name not in sought)
 
         radii, owners = [], []
-        for segment in system.segments:
-            radii += [number(segment.radius)[0]] * len(segment.links)
-            owners += [segment.name] * len(segment.links)
-        self.radius, self.owner = np.array(radii), tuple(owners)
-        q, columns = ca.SX.sym("q", system.size), list(self.free)
+        for segment in system.segment_layouts:
+            radii += [number(segment.radius)[0]] * len(segment.link_joints)
+            owners += [segment.name] * len(segment.link_joints)
+        self.link_radii, self.link_segments = np.array(radii), tuple(owners)
+        q, columns = ca.SX.sym("q", system.n_coordinates), list(self.free_joints)
         corners, seen, held, gap = _expressions(system, forward_kinematics(tree, q), self.options)
         held, gap = (ca.substitute(entry, symbols, ca.SX(ca.DM(theta))) for entry in (held, gap))
         self._corners = ca.Function("corners", [q], ca.cse([corners, ca.densify(ca.jacobian(corners, q)[:, columns])]))
         self._seen = ca.Function("seen", [q], ca.cse([seen, ca.densify(ca.jacobian(seen, q)[:, columns])]))
-        holders = [forward_kinematics(tree, q).position(grasp.holder) for grasp in system.grasps]
+        holders = [forward_kinematics(tree, q).frame_position(grasp.holder_frame) for grasp in system.grasps]
         self._holders = ca.Function("holders", [q], [ca.densify(ca.vertcat(ca.SX(0, 1), *holders))])
         self._gap = ca.Function("gap", [q], [ca.densify(gap)])
         self._held = ca.Function("held", [q], ca.cse([held, ca.densify(ca.jacobian(held, q)[:, columns])]))
         # how all this moves as the tubes grow
         full = _expressions(system, forward_kinematics(system.mechanism, q), self.options)[:3]
-        growth = np.zeros((len(theta), len(system.segments)))
-        for k, segment in enumerate(system.segments):
-            for name in ca.symvar(ca.vertcat(*segment.lengths)):
+        growth = np.zeros((len(theta), len(system.segment_layouts)))
+        for k, segment in enumerate(system.segment_layouts):
+            for name in ca.symvar(ca.vertcat(*segment.link_lengths)):
                 index = system.parameters.names.index(name.name())
                 growth[index, k] = theta[index]
         grown = [ca.densify(ca.mtimes(ca.jacobian(entry, symbols), ca.DM(growth))) for entry in full]
         self._grown = ca.Function("grown", [q], ca.cse(ca.substitute(grown, [symbols], [ca.SX(ca.DM(theta))])))
-        at_rest = self._corners(self.rest)[0]
+        at_rest = self._corners(self.rest_configuration)[0]
         self._lengths = np.linalg.norm(np.diff(np.array(at_rest).reshape(-1, 2, 3), axis=1)[:, 0], axis=1)
-        self.reach, self.free_ends = self._ends(np.array(at_rest).reshape(-1, 2, 3), tree)
+        self.tube_lengths, self.free_end_links = self._ends(np.array(at_rest).reshape(-1, 2, 3), tree)
 
     def _ends(self, corners: Array, tree: Mechanism) -> tuple[Array, tuple[int, ...]]:
         """Length of the tube that each link belongs to, and the links after which nothing comes."""
-        reach = np.array([self._lengths[[name == other for other in self.owner]].sum() for name in self.owner])
-        q = ca.SX.sym("q", self.system.size)
+        reach = np.array(
+            [self._lengths[[name == other for other in self.link_segments]].sum() for name in self.link_segments]
+        )
+        q = ca.SX.sym("q", self.system.n_coordinates)
         kinematics = forward_kinematics(tree, q)
-        held = [kinematics.position(grasp.held) for grasp in self.system.grasps]
-        places = np.array(ca.Function("held", [q], [ca.horzcat(ca.SX(3, 0), *held)])(self.rest)).T
+        held = [kinematics.frame_position(grasp.held_frame) for grasp in self.system.grasps]
+        places = np.array(ca.Function("held", [q], [ca.horzcat(ca.SX(3, 0), *held)])(self.rest_configuration)).T
         taken = np.concatenate([corners[:, 0], places])
         apart = np.linalg.norm(corners[:, 1][:, None] - taken, axis=2).min(axis=1)
         return reach, tuple(int(k) for k in np.flatnonzero(apart > _TOUCHING))
 
-    def solve(
+    def fit_frame(
         self,
-        sight: Sight,
+        sight: CloudObservation,
         q_known: Array,
         starts: Sequence[Array] = (),
-    ) -> Fit:
+    ) -> FrameShapeFit:
         """Fit the shape in one frame.
 
         Parameters
@@ -214,19 +227,19 @@ class ShapeFit:
         DataError
             There is no point.
         """
-        if not len(sight.points) or not len(sight.nodes):
+        if not len(sight.points) or not len(sight.skeleton_nodes):
             raise DataError("there is no point to fit to", where="fit")
-        free = list(self.free)
-        q = self.rest.copy()
-        known = [self.system.mechanism.joint_index(name) for name in self.known]
+        free = list(self.free_joints)
+        q = self.rest_configuration.copy()
+        known = [self.system.mechanism.joint_index(name) for name in self.recorded_joint_names]
         q[known] = q_known[known]
         begun = []
-        for start in starts or (self.rest,):
+        for start in starts or (self.rest_configuration,):
             trial = q.copy()
             trial[free] = start[free]
             begun.append(trial)
-        everything = _Left(np.ones(len(sight.nodes), bool), np.ones(len(sight.points), bool))
-        thin = _Left(*slender(sight, float(self.radius.max())))
+        everything = _Left(np.ones(len(sight.skeleton_nodes), bool), np.ones(len(sight.points), bool))
+        thin = _Left(*tube_like_nodes_and_points(sight, float(self.link_radii.max())))
         best = self._attempt(sight, begun, thin if thin.nodes.any() and thin.points.any() else everything)
         for left in (self._without(best, sight, self._links_of(self._failed(best.evidence))), everything):
             failed = self._failed(best.evidence)
@@ -241,24 +254,26 @@ class ShapeFit:
     def _rested(self, q: Array, tubes: Collection[str]) -> Array:
         """A configuration with some tubes as at rest."""
         trial = q.copy()
-        again = [index for index, owner in zip(self.free, self.free_owner, strict=True) if owner in tubes]
-        trial[again] = self.rest[again]
+        again = [
+            index for index, owner in zip(self.free_joints, self.free_joint_segments, strict=True) if owner in tubes
+        ]
+        trial[again] = self.rest_configuration[again]
         return trial
 
     def _links_of(self, tubes: Collection[str]) -> NDArray[np.bool_]:
-        return np.array([owner in tubes for owner in self.owner])
+        return np.array([owner in tubes for owner in self.link_segments])
 
-    def _rivals(self, best: _Attempt, sight: Sight) -> list[Array]:
+    def _rivals(self, best: _Attempt, sight: CloudObservation) -> list[Array]:
         """Other shapes that the cloud speaks for as much: where a thing touches a tube, that may go on along the thing.
 
         Everything is tried that is left without the points on which the tube lies from the contact on.
         """
-        if not best.evidence.contested.any() or not self.options.surface_scales:
+        if not best.evidence.is_contested.any() or not self.options.surface_loss_scales:
             return []
-        tubes = self.tubes(best.minimum.q)
-        touched = nearest(tubes.corners, tubes.radius, sight.points[best.evidence.contested])[0]
+        tubes = self.tubes_at(best.minimum.q)
+        touched = nearest_on_tubes(tubes.link_ends, tubes.radius, sight.points[best.evidence.is_contested])[0]
         found = []
-        for name in dict.fromkeys(self.owner[k] for k in sorted(set(touched.tolist()))):
+        for name in dict.fromkeys(self.link_segments[k] for k in sorted(set(touched.tolist()))):
             mine = self._links_of({name})
             onward = mine & (np.arange(len(mine)) >= min(k for k in touched if mine[k]))
             left = self._without(best, sight, onward)
@@ -268,134 +283,144 @@ class ShapeFit:
                     found.append(rival.minimum.q)
         return found
 
-    def _covered(self, evidence: Evidence) -> float:
+    def _covered(self, evidence: ShapeEvidence) -> float:
         """Share of the visible length that has points of its own."""
-        filled, empty = float(self._lengths @ evidence.filled), float(self._lengths @ evidence.empty)
+        filled, empty = (
+            float(self._lengths @ evidence.covered_fraction),
+            float(self._lengths @ evidence.visibly_empty_fraction),
+        )
         return filled / max(filled + empty, 1e-12)
 
-    def _failed(self, evidence: Evidence) -> set[str]:
+    def _failed(self, evidence: ShapeEvidence) -> set[str]:
         """Tubes of which too much is seen to be empty."""
         failed = set()
-        for name in dict.fromkeys(self.owner):
-            mine = self._lengths * np.array([name == owner for owner in self.owner])
-            filled, empty = float(mine @ evidence.filled), float(mine @ evidence.empty)
-            if empty > 0 and filled < self.options.least_filled * (filled + empty):
+        for name in dict.fromkeys(self.link_segments):
+            mine = self._lengths * np.array([name == owner for owner in self.link_segments])
+            filled, empty = float(mine @ evidence.covered_fraction), float(mine @ evidence.visibly_empty_fraction)
+            if empty > 0 and filled < self.options.min_tube_coverage * (filled + empty):
                 failed.add(name)
         return failed
 
-    def _without(self, attempt: _Attempt, sight: Sight, links: NDArray[np.bool_]) -> _Left:
+    def _without(self, attempt: _Attempt, sight: CloudObservation, links: NDArray[np.bool_]) -> _Left:
         """All nodes and points but those on which some links lie."""
-        tubes = self.tubes(attempt.minimum.q)
-        link = nearest(tubes.corners, tubes.radius, sight.points)[0]
-        wrong = links[link] & (attempt.evidence.own | attempt.evidence.contested)
-        node_link, _, _, distance = nearest(tubes.corners, tubes.radius, sight.nodes, NODE_FACTOR)
+        tubes = self.tubes_at(attempt.minimum.q)
+        link = nearest_on_tubes(tubes.link_ends, tubes.radius, sight.points)[0]
+        wrong = links[link] & (attempt.evidence.is_own | attempt.evidence.is_contested)
+        node_link, _, _, distance = nearest_on_tubes(
+            tubes.link_ends, tubes.radius, sight.skeleton_nodes, _NODE_RADIUS_FRACTION
+        )
         return _Left(~(links[node_link] & (distance < 2 * tubes.radius[node_link])), ~wrong)
 
-    def _attempt(self, sight: Sight, starts: Sequence[Array], left: _Left) -> _Attempt:
+    def _attempt(self, sight: CloudObservation, starts: Sequence[Array], left: _Left) -> _Attempt:
         """The best shape through some of the nodes and points, then through those that are surely its own."""
         on_nodes, on_points = self._tasks(sight, left)
-        tried = [self._minimise(_Minimum(start, np.eye(len(self.free)), math.inf, 0), on_nodes) for start in starts]
+        tried = [
+            self._minimise(_Minimum(start, np.eye(len(self.free_joints)), math.inf, 0), on_nodes) for start in starts
+        ]
         best = min(tried, key=lambda minimum: minimum.cost)
         last = self._minimise(best, on_points)
         iterations = sum(minimum.iterations for minimum in tried) + last.iterations - best.iterations
-        evidence = gather(self.tubes(last.q), sight, self.near)
+        evidence = assess_shape(self.tubes_at(last.q), sight, self.max_informative_distance)
         if on_points:
-            keep = ~(evidence.contested | evidence.foreign)
+            keep = ~(evidence.is_contested | evidence.is_foreign)
             if keep.any():
                 last = self._minimise(last, self._tasks(sight, _Left(left.nodes, keep))[1])
-                evidence = gather(self.tubes(last.q), sight, self.near)
+                evidence = assess_shape(self.tubes_at(last.q), sight, self.max_informative_distance)
         return _Attempt(replace(last, iterations=iterations + last.iterations), evidence)
 
     @property
-    def near(self) -> float:
+    def max_informative_distance(self) -> float:
         """Distance from the surface beyond which a point says nothing of the shape [m]."""
-        return (self.options.surface_scales or self.options.scales)[-1] * _NEAR
+        return (self.options.surface_loss_scales or self.options.node_loss_scales)[-1] * _NEAR
 
-    def _tasks(self, sight: Sight, left: _Left) -> tuple[list[_Task], list[_Task]]:
+    def _tasks(self, sight: CloudObservation, left: _Left) -> tuple[list[_Task], list[_Task]]:
         """The passes on the nodes and those on the points."""
-        options, camera = self.options, sight.camera
-        factor = 1.0 / (options.noise_correlation * options.noise**2)
-        weight = np.minimum(sight.weight, options.weight_cap)[left.points]
-        nodes, points = sight.nodes[left.nodes], sight.points[left.points]
+        options, camera = self.options, sight.camera_position
+        factor = 1.0 / (options.correlated_points * options.surface_noise_std**2)
+        weight = np.minimum(sight.point_weights, options.max_point_weight)[left.points]
+        nodes, points = sight.skeleton_nodes[left.nodes], sight.points[left.points]
         # nodes weigh together as much as the points, which share their errors
         node_weight = np.full(len(nodes), weight.sum() / max(len(nodes), 1)) * factor
-        anchors = sight.anchors
+        anchors = sight.end_anchors
         return (
-            [_Task(nodes, node_weight, NODE_FACTOR, scale, camera, anchors) for scale in options.scales],
-            [_Task(points, weight * factor, 1.0, scale, camera, anchors) for scale in options.surface_scales],
+            [
+                _Task(nodes, node_weight, _NODE_RADIUS_FRACTION, scale, camera, anchors)
+                for scale in options.node_loss_scales
+            ],
+            [_Task(points, weight * factor, 1.0, scale, camera, anchors) for scale in options.surface_loss_scales],
         )
 
     def _minimise(self, start: _Minimum, tasks: Sequence[_Task]) -> _Minimum:
         """One pass after the other, each from where the one before ended."""
-        free, end = list(self.free), start
+        free, end = list(self.free_joints), start
         for task in tasks:
             q = end.q.copy()
 
-            def about(bends: Array, task: _Task = task, q: Array = q) -> Quadratic:
+            def about(bends: Array, task: _Task = task, q: Array = q) -> LocalQuadraticModel:
                 trial = q.copy()
                 trial[free] = bends
                 return self._quadratic(trial, task)
 
-            found = damped_newton(
+            found = minimize_by_damped_newton(
                 about,
                 q[free],
-                iterations=self.options.iterations,
+                max_iterations=self.options.max_iterations,
                 step_tolerance=_TOLERANCE,
                 cost_tolerance=_TOLERANCE,
             )
             q[free] = found.x
-            end = _Minimum(q, found.model.hessian, found.model.cost, end.iterations + found.iterations)
+            end = _Minimum(q, found.final_model.hessian, found.final_model.cost, end.iterations + found.n_iterations)
         return end
 
-    def _judged(self, attempt: _Attempt, rivals: Sequence[Array], sight: Sight) -> Fit:
+    def _judged(self, attempt: _Attempt, rivals: Sequence[Array], sight: CloudObservation) -> FrameShapeFit:
         """The shape with its standard deviations, and what speaks for and against it."""
         minimum, evidence = attempt.minimum, attempt.evidence
-        q, on_shape = minimum.q, evidence.own | evidence.contested
+        q, on_shape = minimum.q, evidence.is_own | evidence.is_contested
         points, jacobian = (np.array(x) for x in self._seen(q))
         spread = jacobian @ np.linalg.solve(minimum.hessian, jacobian.T)
         places = points.reshape(-1, 3)
         own, every = (
-            self._tasks(sight, _Left(np.zeros(len(sight.nodes), bool), mask))[1][-1:]
-            for mask in (~(evidence.contested | evidence.foreign), ~evidence.foreign)
+            self._tasks(sight, _Left(np.zeros(len(sight.skeleton_nodes), bool), mask))[1][-1:]
+            for mask in (~(evidence.is_contested | evidence.is_foreign), ~evidence.is_foreign)
         )
         moved = np.zeros(places.shape)
-        if every and evidence.contested.any():
+        if every and evidence.is_contested.any():
             # how far the contested points would take the shape, if they counted
-            moved = (jacobian @ self._quadratic(q, every[0]).change(0.0)).reshape(-1, 3)
+            moved = (jacobian @ self._quadratic(q, every[0]).damped_step(0.0)).reshape(-1, 3)
         for rival in rivals:
-            moved = np.maximum(np.abs(moved), np.abs(self.place(rival) - places))
-        corners = self.tubes(q).corners
-        swath = self._swath_std(corners, places, evidence, sight.camera)
+            moved = np.maximum(np.abs(moved), np.abs(self.points_at(rival) - places))
+        corners = self.tubes_at(q).link_ends
+        swath = self._swath_std(corners, places, evidence, sight.camera_position)
         off_end = np.zeros(places.shape)
-        for k, offset in zip(self.free_ends, evidence.ends, strict=True):
-            if abs(offset) > _SIGMAS * max(self.options.noise, evidence.noise):
+        for k, offset in zip(self.free_end_links, evidence.end_offsets, strict=True):
+            if abs(offset) > _SIGMAS * max(self.options.surface_noise_std, evidence.noise_std):
                 at_end = np.linalg.norm(places - corners[k, 1], axis=1) < _TOUCHING
                 axis = (corners[k, 1] - corners[k, 0]) / np.linalg.norm(corners[k, 1] - corners[k, 0])
                 off_end[at_end] = offset * axis
-        return Fit(
+        return FrameShapeFit(
             q,
             places,
             np.sqrt(np.maximum(np.diag(spread), 0.0).reshape(-1, 3) + moved**2 + swath**2 + off_end**2),
-            evidence.distance,
-            evidence.noise,
-            evidence.filled,
-            evidence.empty,
+            evidence.mean_distance,
+            evidence.noise_std,
+            evidence.covered_fraction,
+            evidence.visibly_empty_fraction,
             self._seen_points(corners, places, evidence),
             np.array(self._gap(q)).reshape(-1, 3),
-            evidence.ends,
-            float(evidence.contested.sum() / max(on_shape.sum(), 1)),
-            evidence.things,
+            evidence.end_offsets,
+            float(evidence.is_contested.sum() / max(on_shape.sum(), 1)),
+            evidence.foreign_clusters,
             self._size_rows(q, own[0] if own else None, evidence),
             minimum.iterations,
             corners,
         )
 
-    def _quadratic(self, q: Array, task: _Task) -> Quadratic:
+    def _quadratic(self, q: Array, task: _Task) -> LocalQuadraticModel:
         """Cost, gradient and Gauss-Newton Hessian by the free bends."""
         out, jacobian = self._corners(q)
         corners, by_q = np.array(out).reshape(-1, 2, 3), np.array(jacobian)
-        surface = nearest_way(corners, self.radius, task.points, task.camera, task.share)
-        link, error, rows = surface.link, surface.error, surface.rows
+        surface = nearest_surface_residuals(corners, self.link_radii, task.points, task.camera, task.share)
+        link, error, rows = surface.link_indices, surface.signed_distance, surface.jacobian_by_link_ends
         square = (error / task.scale) ** 2
         cost = 0.5 * task.scale**2 * float(np.sum(task.weight * square / (1 + square)))
         weight = task.weight / (1 + square) ** 2
@@ -403,56 +428,65 @@ class ShapeFit:
         order = np.argsort(link, kind="stable")
         block, apart = rows[order], error[order]
         weighted = block * weight[order, None]
-        pull, stiff = np.zeros((len(self.radius), 6)), np.zeros((len(self.radius), 6, 6))
-        bounds = np.searchsorted(link[order], np.arange(len(self.radius) + 1))
+        pull, stiff = np.zeros((len(self.link_radii), 6)), np.zeros((len(self.link_radii), 6, 6))
+        bounds = np.searchsorted(link[order], np.arange(len(self.link_radii) + 1))
         for k, (begin, end) in enumerate(pairwise(bounds)):
             pull[k] = apart[begin:end] @ weighted[begin:end]
             stiff[k] = block[begin:end].T @ weighted[begin:end]
-        chain = by_q.reshape(len(self.radius), 6, -1)
+        chain = by_q.reshape(len(self.link_radii), 6, -1)
         gradient = by_q.T @ pull.ravel()
         hessian = by_q.T @ np.matmul(stiff, chain).reshape(by_q.shape)
         for anchor in task.anchors:
-            off = float(anchor.ahead @ (corners.reshape(-1, 3)[anchor.corner] - anchor.place)) / anchor.std
-            by_off = anchor.ahead @ by_q[3 * anchor.corner : 3 * anchor.corner + 3] / anchor.std
+            off = (
+                float(anchor.direction @ (corners.reshape(-1, 3)[anchor.link_end_index] - anchor.position))
+                / anchor.position_std
+            )
+            by_off = (
+                anchor.direction @ by_q[3 * anchor.link_end_index : 3 * anchor.link_end_index + 3] / anchor.position_std
+            )
             cost += 0.5 * off**2
             gradient += by_off * off
             hessian += np.outer(by_off, by_off)
         held, by_held = (np.array(x) for x in self._held(q))
         held = held.ravel()
-        bend = (q - self.rest)[list(self.free)] * self._prior
+        bend = (q - self.rest_configuration)[list(self.free_joints)] * self._prior
         cost += 0.5 * float(held @ held + bend @ bend)
         gradient += by_held.T @ held + bend * self._prior
         hessian += by_held.T @ by_held + np.diag(self._prior**2)
-        return Quadratic(cost, gradient, hessian)
+        return LocalQuadraticModel(cost, gradient, hessian)
 
-    def _seen_points(self, corners: Array, places: Array, evidence: Evidence) -> NDArray[np.bool_]:
+    def _seen_points(self, corners: Array, places: Array, evidence: ShapeEvidence) -> NDArray[np.bool_]:
         """A point is seen where a link that begins or ends there is, of a tube that is where it should be."""
         apart = np.linalg.norm(corners[:, :, None] - places, axis=3).min(axis=1)
         failed = self._failed(evidence)
-        sure = evidence.filled >= self.options.least_coverage
-        sure &= np.array([owner not in failed for owner in self.owner])
+        sure = evidence.covered_fraction >= self.options.min_link_coverage
+        sure &= np.array([owner not in failed for owner in self.link_segments])
         covered = (apart < _TOUCHING) & sure[:, None]
-        held = {grasp.held for grasp in self.system.grasps}
-        return np.asarray(covered.any(axis=0) | np.array([name in held for name in self.system.points]))
+        held = {grasp.held_frame for grasp in self.system.grasps}
+        return np.asarray(covered.any(axis=0) | np.array([name in held for name in self.system.point_frames]))
 
-    def starts(self) -> Starts:
-        """Finder of initial shapes for a system with a free root (`starts.loosened`)."""
-        lengths = np.linalg.norm(np.diff(np.array(self._corners(self.rest)[0]).reshape(-1, 2, 3), axis=1)[:, 0], axis=1)
-        by_owner = {name: lengths[[name == owner for owner in self.owner]] for name in dict.fromkeys(self.owner)}
-        return Starts(self.system, self._tree, self.rest, self.bends, by_owner)
+    def initial_shape_finder(self) -> InitialShapeFinder:
+        """Finder of initial shapes for a system with a free root (`initial_shapes.with_free_root`)."""
+        lengths = np.linalg.norm(
+            np.diff(np.array(self._corners(self.rest_configuration)[0]).reshape(-1, 2, 3), axis=1)[:, 0], axis=1
+        )
+        by_owner = {
+            name: lengths[[name == owner for owner in self.link_segments]] for name in dict.fromkeys(self.link_segments)
+        }
+        return InitialShapeFinder(self.system, self._tree, self.rest_configuration, self.bend_joints, by_owner)
 
-    def _swath_std(self, corners: Array, places: Array, evidence: Evidence, camera: Array) -> Array:
+    def _swath_std(self, corners: Array, places: Array, evidence: ShapeEvidence, camera: Array) -> Array:
         """Standard deviation of each point, shape (np, 3), that the spread across the links about it leaves [m]."""
         apart = np.linalg.norm(corners[:, :, None] - places, axis=3).min(axis=1)
         across = np.cross(corners[:, 1] - corners[:, 0], corners.mean(axis=1) - camera)
         across /= np.maximum(np.linalg.norm(across, axis=1), 1e-12)[:, None]
-        spread = np.sqrt(evidence.swath)[:, None] * np.abs(across)
+        spread = np.sqrt(evidence.excess_variance)[:, None] * np.abs(across)
         return np.asarray(np.max(np.where((apart < _TOUCHING)[..., None], spread[:, None], 0.0), axis=0))
 
-    def _size_rows(self, q: Array, task: _Task | None, evidence: Evidence) -> SizeRows:
+    def _size_rows(self, q: Array, task: _Task | None, evidence: ShapeEvidence) -> DimensionEquations:
         """What a frame's points say of lengths and radii at its shape."""
-        names = [segment.name for segment in self.system.segments]
-        free, many = len(self.free), len(names)
+        names = [segment.name for segment in self.system.segment_layouts]
+        free, many = len(self.free_joints), len(names)
         out, jacobian = self._corners(q)
         by_length, seen_by_length, held_by_length = (np.array(x) for x in self._grown(q))
         chain = np.hstack([np.array(jacobian), by_length])
@@ -466,25 +500,29 @@ class ShapeFit:
             hessian = hessian + weighted.T @ rows
 
         if task is not None:
-            depths = along_sight(np.array(out).reshape(-1, 2, 3), self.radius, task.points, task.camera)
-            weight = task.weight[depths.index] / (1 + (depths.error / task.scale) ** 2) ** 2
-            segment = np.array([names.index(owner) for owner in self.owner])
-            for k in range(len(self.radius)):
-                mine = depths.link == k
+            depths = line_of_sight_residuals(np.array(out).reshape(-1, 2, 3), self.link_radii, task.points, task.camera)
+            weight = task.weight[depths.point_indices] / (1 + (depths.signed_distance / task.scale) ** 2) ** 2
+            segment = np.array([names.index(owner) for owner in self.link_segments])
+            for k in range(len(self.link_radii)):
+                mine = depths.link_indices == k
                 rows = np.zeros((int(mine.sum()), total))
-                rows[:, : free + many] = depths.rows[mine] @ chain[6 * k : 6 * k + 6]
-                rows[:, free + many + segment[k]] = depths.by_radius[mine] * self.radius[k]
-                add(rows, depths.error[mine], weight[mine])
-        for k, offset in zip(self.free_ends, evidence.ends, strict=True):
+                rows[:, : free + many] = depths.jacobian_by_link_ends[mine] @ chain[6 * k : 6 * k + 6]
+                rows[:, free + many + segment[k]] = depths.derivative_by_radius[mine] * self.link_radii[k]
+                add(rows, depths.signed_distance[mine], weight[mine])
+        for k, offset in zip(self.free_end_links, evidence.end_offsets, strict=True):
             if np.isfinite(offset):
                 start, tip = np.array(out).reshape(-1, 2, 3)[k]
                 axis = (tip - start) / np.linalg.norm(tip - start)
                 rows = np.zeros((1, total))
                 rows[0, : free + many] = -axis @ chain[6 * k + 3 : 6 * k + 6]
-                add(rows, np.array([offset]), np.array([1.0 / max(self.options.noise, evidence.noise) ** 2]))
+                add(
+                    rows,
+                    np.array([offset]),
+                    np.array([1.0 / max(self.options.surface_noise_std, evidence.noise_std) ** 2]),
+                )
         held, by_held = (np.array(x) for x in self._held(q))
         add(np.hstack([by_held, held_by_length, np.zeros((len(held), many))]), held.ravel(), np.ones(len(held)))
-        gradient[:free] += (q - self.rest)[list(self.free)] * self._prior**2
+        gradient[:free] += (q - self.rest_configuration)[list(self.free_joints)] * self._prior**2
         hessian[:free, :free] += np.diag(self._prior**2)
         # the bends follow: dq = -H_qq^-1 (g_q + H_qx x)
         follow = np.linalg.solve(hessian[:free, :free], np.column_stack([gradient[:free], hessian[:free, free:]]))
@@ -492,18 +530,18 @@ class ShapeFit:
         curvature = hessian[free:, free:] - hessian[free:, :free] @ follow[:, 1:]
         moved = np.hstack([seen_by_length, np.zeros((len(seen_by_length), many))])
         moved = moved - np.array(self._seen(q)[1]) @ follow[:, 1:]
-        return SizeRows(pull, curvature, moved.reshape(-1, 3, 2 * many))
+        return DimensionEquations(pull, curvature, moved.reshape(-1, 3, 2 * many))
 
-    def tubes(self, q: Array) -> Tubes:
+    def tubes_at(self, q: Array) -> TubeLinks:
         """Tube links in the world at a configuration."""
         corners = np.array(self._corners(q)[0]).reshape(-1, 2, 3)
-        return Tubes(corners, self.radius, self.free_ends, self.reach)
+        return TubeLinks(corners, self.link_radii, self.free_end_links, self.tube_lengths)
 
-    def grips(self, q: ArrayLike) -> Array:
+    def gripper_positions_at(self, q: ArrayLike) -> Array:
         """Gripper positions at a configuration, shape (grasps, 3) [m]."""
         return np.array(self._holders(np.asarray(q, float))).reshape(-1, 3)
 
-    def place(self, q: ArrayLike) -> Array:
+    def points_at(self, q: ArrayLike) -> Array:
         """Positions of the system's points at a configuration, shape (np, 3) [m]."""
         return np.array(self._seen(np.asarray(q, float))[0]).reshape(-1, 3)
 
@@ -531,7 +569,7 @@ class _Attempt:
     """A shape and what the whole cloud says of it."""
 
     minimum: _Minimum
-    evidence: Evidence
+    evidence: ShapeEvidence
 
 
 @dataclass(frozen=True, eq=False)
@@ -543,27 +581,30 @@ class _Task:
     share: float
     scale: float
     camera: Array
-    anchors: Sequence[Anchor]
+    anchors: Sequence[EndAnchor]
 
 
 def _owner(system: System, joint: str) -> str:
     """Segment to which an elastic joint belongs."""
-    return next((s.name for s in system.segments if any(joint in names for names in s.links)), "")
+    return next((s.name for s in system.segment_layouts if any(joint in names for names in s.link_joints)), "")
 
 
-def _expressions(system: System, kinematics: Kinematics, options: FitOptions) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+def _expressions(system: System, kinematics: Kinematics, options: ShapeFitOptions) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
     """Corners of the links, the system's points, what grasps hold in standard deviations, and their gaps."""
     tree = kinematics.mechanism
     corners = []
-    for segment in system.segments:
-        for i, names in enumerate(segment.links):
-            corners += [kinematics.origins[tree.joint_index(names[0])], kinematics.position(f"{segment.name}_{i}_tip")]
+    for segment in system.segment_layouts:
+        for i, names in enumerate(segment.link_joints):
+            corners += [
+                kinematics.joint_origins[tree.joint_index(names[0])],
+                kinematics.frame_position(f"{segment.name}_{i}_tip"),
+            ]
     rows, gaps = [ca.SX(0, 1)], [ca.SX(0, 1)]
     for grasp in system.grasps:
-        residual, alignment = grasp.residual(kinematics), grasp.alignment(kinematics)
+        residual, alignment = grasp.constraint_residual(kinematics), grasp.axis_misalignment(kinematics)
         gaps.append(residual[:3])
-        rows.append(residual[:3] / options.grasp_std)
+        rows.append(residual[:3] / options.grasp_position_std)
         if grasp.kind != "point":  # the first column of a weld is a roll, which stays unknown
-            rows.append(alignment[-3:] / options.direction_std)
-    seen = ca.vertcat(*(kinematics.position(name) for name in system.points))
+            rows.append(alignment[-3:] / options.grasp_direction_std)
+    seen = ca.vertcat(*(kinematics.frame_position(name) for name in system.point_frames))
     return ca.vertcat(*corners), seen, ca.vertcat(*rows), ca.vertcat(*gaps)

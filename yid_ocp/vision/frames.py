@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import DataError
-from yid_ocp.vision.lens import Pinhole
+from yid_ocp.vision.camera_intrinsics import CameraIntrinsics
 
 Array = NDArray[np.float64]
 Colours = NDArray[np.uint8]
 
 
 @cache
-def open3d_module() -> ModuleType:
+def import_open3d() -> ModuleType:
     """The open3d package; `DataError` where it is not installed or cannot be loaded."""
     hint = "pip install 'yid-ocp[vision]'"
     try:
@@ -42,49 +42,51 @@ class FrameSequence:
 
     Attributes
     ----------
-    t : ndarray, shape (M,)
+    stamps : ndarray, shape (M,)
         Time stamps as the camera gave them, in the order of the frames: neither sorted nor unique [s].
-    names : tuple of str
-    pose : ndarray, shape (4, 4)
+    frame_names : tuple of str
+    camera_pose : ndarray, shape (4, 4)
         Camera (x right, y down, z ahead) in the world [m].
-    load : callable
+    load_cloud : callable
         From a frame's index to its cloud in the camera's frame, shape (N, 3) [m]; `DataError` where it cannot be read.
     intrinsics : Pinhole, optional
     source : str
         Where the frames come from, for messages.
-    colours : callable, optional
+    load_colours : callable, optional
         From a frame's index to the red, green and blue of each of its points, shape (N, 3), None where it has none.
     """
 
-    t: Array
-    names: tuple[str, ...]
-    pose: Array
-    load: Callable[[int], Array]
-    intrinsics: Pinhole | None = None
+    stamps: Array
+    frame_names: tuple[str, ...]
+    camera_pose: Array
+    load_cloud: Callable[[int], Array]
+    intrinsics: CameraIntrinsics | None = None
     source: str = "sequence"
-    colours: Callable[[int], Colours | None] | None = None
+    load_colours: Callable[[int], Colours | None] | None = None
 
     def __len__(self) -> int:
-        return len(self.names)
+        return len(self.frame_names)
 
-    def world(self, index: int) -> Array:
+    def load_world_cloud(self, index: int) -> Array:
         """Cloud of a frame in the world, shape (N, 3) [m]; `DataError` where it cannot be read."""
-        return self.load(index) @ self.pose[:3, :3].T + self.pose[:3, 3]
+        return self.load_cloud(index) @ self.camera_pose[:3, :3].T + self.camera_pose[:3, 3]
 
-    def select(self, indices: Sequence[int]) -> FrameSequence:
+    def select_frames(self, indices: Sequence[int]) -> FrameSequence:
         """The frame sequence with only these frames, in this order."""
         kept = [int(i) for i in indices]
-        names, colours = tuple(self.names[i] for i in kept), self.colours
+        names, colours = tuple(self.frame_names[i] for i in kept), self.load_colours
         return replace(
             self,
-            t=self.t[kept],
-            names=names,
-            load=lambda i: self.load(kept[i]),
-            colours=None if colours is None else lambda i: colours(kept[i]),
+            stamps=self.stamps[kept],
+            frame_names=names,
+            load_cloud=lambda i: self.load_cloud(kept[i]),
+            load_colours=None if colours is None else lambda i: colours(kept[i]),
         )
 
     @staticmethod
-    def of(t: ArrayLike, clouds: Sequence[ArrayLike], pose: ArrayLike, *, source: str = "sequence") -> FrameSequence:
+    def from_clouds(
+        t: ArrayLike, clouds: Sequence[ArrayLike], pose: ArrayLike, *, source: str = "sequence"
+    ) -> FrameSequence:
         """A frame sequence of clouds that are in memory.
 
         Parameters
@@ -99,10 +101,12 @@ class FrameSequence:
         """
         arrays = [np.asarray(cloud, float).reshape(-1, 3) for cloud in clouds]
         names = tuple(f"frame {i}" for i in range(len(arrays)))
-        return FrameSequence(np.asarray(t, float), names, checked_pose(pose, source), arrays.__getitem__, None, source)
+        return FrameSequence(
+            np.asarray(t, float), names, validated_pose(pose, source), arrays.__getitem__, None, source
+        )
 
 
-def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
+def look_at_pose(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
     """Pose of a camera (x right, y down, z ahead) at `eye` that looks at `target`, shape (4, 4) [m]."""
     position = np.asarray(eye, float)
     ahead = np.asarray(target, float) - position
@@ -115,7 +119,7 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) 
     return pose
 
 
-def checked_pose(pose: ArrayLike | None, where: str) -> Array:
+def validated_pose(pose: ArrayLike | None, where: str) -> Array:
     """A camera's pose as an array; `DataError` where it is missing or not a rigid transform."""
     hint = "give the camera in the world as a 4x4 matrix, x right, y down, z ahead, translation in metres"
     if pose is None:

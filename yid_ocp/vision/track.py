@@ -17,33 +17,46 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from yid_ocp.data.recording import Recording
-from yid_ocp.errors import ConfigError, DataError, ModelError, nearest
+from yid_ocp.errors import ConfigError, DataError, ModelError, nearest_name_hint
 from yid_ocp.model.system import System
-from yid_ocp.vision.calibration import Calibration, as_given, calibrate
-from yid_ocp.vision.clock import is_late, own_offset
-from yid_ocp.vision.clutter import Background, Foreign, extra_meshes, foreign
-from yid_ocp.vision.common import Common
-from yid_ocp.vision.doubt import Sizes, ask_sizes
-from yid_ocp.vision.ends import told, touching
-from yid_ocp.vision.evidence import Sight
-from yid_ocp.vision.filters import Cloud, ObjectRegion, of_colours, voxel_grid, without_outliers, without_robot
-from yid_ocp.vision.fit import ShapeFit
-from yid_ocp.vision.fitted import Fit
+from yid_ocp.vision.calibration import CameraCalibration, calibrate_camera, calibration_as_given
+from yid_ocp.vision.camera_registration import ArmSurface, CalibrationFrame
+from yid_ocp.vision.centerline import trace_centerline
+from yid_ocp.vision.clock import estimate_stamp_delay, is_stamped_late
+from yid_ocp.vision.clutter import BackgroundPoints, ForeignObject, extra_meshes_by_joint, group_foreign_objects
+from yid_ocp.vision.dimension_check import DimensionCheck, check_dimensions
+from yid_ocp.vision.filters import (
+    ObjectRegion,
+    WeightedCloud,
+    has_any_colour,
+    is_not_outlier,
+    is_not_robot,
+    voxel_averages,
+)
+from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.frames import FrameSequence
-from yid_ocp.vision.judgement import judged, measured, unfit
-from yid_ocp.vision.meshes import Mesh, Scene, Surfaces, numeric_mechanism, robot_meshes
+from yid_ocp.vision.initial_shapes import InitialShapeFinder, with_free_root
+from yid_ocp.vision.occlusion import OcclusionMap
 from yid_ocp.vision.options import TrackOptions
-from yid_ocp.vision.registration import Arm, Glimpse
-from yid_ocp.vision.results import FrameReport, Stages, Track
-from yid_ocp.vision.skeleton import Skeleton, skeleton
-from yid_ocp.vision.starts import Starts, loosened
-from yid_ocp.vision.trace import traced
-from yid_ocp.vision.view import View
+from yid_ocp.vision.root_selection import choose_root_ends, is_self_touching
+from yid_ocp.vision.sequence_calibration import SequenceCalibration
+from yid_ocp.vision.shape_evidence import CloudObservation
+from yid_ocp.vision.shape_fit_result import FrameShapeFit
+from yid_ocp.vision.skeleton import CloudSkeleton, extract_skeleton
+from yid_ocp.vision.surface_meshes import (
+    ArticulatedSurfaces,
+    CameraScene,
+    TriangleMesh,
+    load_robot_meshes,
+    numeric_mechanism,
+)
+from yid_ocp.vision.track_quality import reject_outlying_frames, rejection_reason, tracked_points
+from yid_ocp.vision.track_result import FrameReport, FrameStages, TrackResult
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Progress = Callable[[int, int, str], None]
-_Given = tuple[Array, View, Callable[[Array], Mask]]
+_ProgressCallback = Callable[[int, int, str], None]
+_Given = tuple[Array, OcclusionMap, Callable[[Array], Mask]]
 
 _ASKED = 8  # frames, at most, that are asked about the object's sizes
 _SOME = 2000  # points that tell how far away a cloud is
@@ -53,16 +66,16 @@ _AS_GOOD = 1.2  # times the distance of the best shape, up to which another one 
 _GRIP = 0.06  # about a grasp, beyond the tube's radius, a point may be the object's [m]
 
 
-def track(
-    scene: Scene,
+def track_object(
+    scene: CameraScene,
     recording: Recording | None,
     sequence: FrameSequence,
     options: TrackOptions | None = None,
     *,
     stages: Sequence[int] = (),
     empty: FrameSequence | None = None,
-    progress: Progress | None = None,
-) -> Track:
+    progress: _ProgressCallback | None = None,
+) -> TrackResult:
     """Track the object's points in a frame sequence.
 
     Parameters
@@ -94,18 +107,18 @@ def track(
     ModelError
         Meshes that cannot be read.
     """
-    tracker = Tracker(scene, recording, sequence, options or TrackOptions(), empty)
+    tracker = FrameTracker(scene, recording, sequence, options or TrackOptions(), empty)
     told = progress or (lambda done, total, text: None)
-    total = len(tracker.sample) + len(tracker.order)
-    common = tracker.common(lambda done, text: told(done, total, text))
+    total = len(tracker.calibration_frames) + len(tracker.frame_order)
+    common = tracker.calibrate_sequence(lambda done, text: told(done, total, text))
     frames = []
-    for done, i in enumerate(tracker.order, start=len(tracker.sample)):
-        told(done, total, f"fitting {sequence.names[i]}")
-        frames.append(tracker.frame(i, common))
+    for done, i in enumerate(tracker.frame_order, start=len(tracker.calibration_frames)):
+        told(done, total, f"fitting {sequence.frame_names[i]}")
+        frames.append(tracker.track_frame(i, common))
     told(total, total, "done")
-    found = tracker.finished(*tracker.judged(frames), common)
-    drawn = (tracker.stages(frame, common) for frame in found.frames if frame.index in stages)
-    return replace(found, stages=tuple(entry for entry in drawn if entry is not None))
+    found = tracker.to_track_result(*tracker.reject_outlying_frames(frames), common)
+    drawn = (tracker.frame_stages(frame, common) for frame in found.frame_reports if frame.index in stages)
+    return replace(found, frame_stages=tuple(entry for entry in drawn if entry is not None))
 
 
 @dataclass(eq=False)
@@ -113,11 +126,11 @@ class _Work:
     """A frame while it is worked on: its report so far and what is left of its cloud."""
 
     report: FrameReport
-    filtered: Cloud | None = None
-    skeleton: Skeleton | None = None
+    filtered: WeightedCloud | None = None
+    skeleton: CloudSkeleton | None = None
 
     def dropped(self, reason: str) -> _Work:
-        self.report = replace(self.report, reason=reason)
+        self.report = replace(self.report, drop_reason=reason)
         return self
 
 
@@ -125,167 +138,201 @@ class _Work:
 class _Look:
     """What a frame shows, once for every way in which it may, the robot's configuration, and where searches begin."""
 
-    sights: tuple[Sight, ...]
+    sights: tuple[CloudObservation, ...]
     q: Array
     starts: tuple[tuple[Array, ...], ...]
 
 
-class Tracker:
+class FrameTracker:
     """Tracker of single frames of a sequence, in any process.
 
     Parameters
     ----------
     scene, recording, sequence, options, empty
-        As `track`.
+        As `track_object`.
 
     Attributes
     ----------
-    order : tuple of int
+    frame_order : tuple of int
         All frames by their stamps.
-    sample : tuple of int
+    calibration_frames : tuple of int
         Frames from which what is common to all of them is found.
     """
 
     def __init__(
         self,
-        scene: Scene,
+        scene: CameraScene,
         recording: Recording | None,
         sequence: FrameSequence,
         options: TrackOptions,
         empty: FrameSequence | None = None,
     ) -> None:
-        system, values = scene.system, scene.values
+        system, values = scene.system, scene.parameter_values
         self._loose: tuple[str, ...] = ()
-        anywhere = options.root != "model"
+        anywhere = options.root_placement != "model"
         if anywhere:
-            if scene.urdf is not None:
-                hint = "set track.options.root to model, or model.robot to null"
+            if scene.robot_urdf is not None:
+                hint = "set track.options.root_placement to model, or model.robot to null"
                 raise ConfigError(
                     "a robot holds the object: its root is where the model has it", where="root", hint=hint
                 )
-            system, self._loose = loosened(system, values)
-        self.system, self.values, self.sequence, self.options, self.empty = system, values, sequence, options, empty
-        self.shape = self._shape_of(values)
-        self.starts = self.shape.starts() if anywhere else None
-        self.names = _chosen_points(system, options.points)
-        self.region = ObjectRegion(system, options.filters, values, anywhere=anywhere)
+            system, self._loose = with_free_root(system, values)
+        self.system, self.parameter_values, self.sequence, self.options, self.empty_scene = (
+            system,
+            values,
+            sequence,
+            options,
+            empty,
+        )
+        self.shape_fitter = self._shape_of(values)
+        self.initial_shape_finder = self.shape_fitter.initial_shape_finder() if anywhere else None
+        self.point_names = _chosen_points(system, options.tracked_points)
+        self.object_region = ObjectRegion(system, options.filters, values, anywhere=anywhere)
         # of a root that is sought nothing that was recorded is needed
-        self.span, self.angles = _joint_angles(system, recording, () if anywhere else self.shape.known)
+        self.joint_time_span, self.joint_angles_at = _joint_angles(
+            system, recording, () if anywhere else self.shape_fitter.recorded_joint_names
+        )
         tree = numeric_mechanism(system, values)
-        meshes: dict[int, Mesh] = {}
-        if scene.urdf is not None:
-            meshes = robot_meshes(scene.urdf, tree, options.mesh)
+        meshes: dict[int, TriangleMesh] = {}
+        if scene.robot_urdf is not None:
+            meshes = load_robot_meshes(scene.robot_urdf, tree, options.robot_mesh_kind)
             if all(joint < 0 for joint in meshes):
-                raise ModelError("no link of the robot moves with the model's joints", where=str(scene.urdf))
-        for joint, extra in extra_meshes(scene.extra, tree).items():
-            meshes[joint] = Mesh.joined([*([meshes[joint]] if joint in meshes else []), *extra])
-        self.robot = Surfaces(tree, meshes) if meshes else None
-        self.arm: Arm | None = None
-        if self.robot is not None and self.span is not None and scene.urdf is not None:
-            self.arm = Arm(self.robot, self.posture, self.shape.grips, float(self.shape.radius.max()) + _GRIP)
-        self.order, self._reasons = _by_stamp(sequence.t)
-        usable = [i for i in self.order if i not in self._reasons]
+                raise ModelError("no link of the robot moves with the model's joints", where=str(scene.robot_urdf))
+        for joint, extra in extra_meshes_by_joint(scene.extra_meshes, tree).items():
+            meshes[joint] = TriangleMesh.concatenate([*([meshes[joint]] if joint in meshes else []), *extra])
+        self.robot_surfaces = ArticulatedSurfaces(tree, meshes) if meshes else None
+        self.arm_surface: ArmSurface | None = None
+        if self.robot_surfaces is not None and self.joint_time_span is not None and scene.robot_urdf is not None:
+            self.arm_surface = ArmSurface(
+                self.robot_surfaces,
+                self.configuration_at_rest,
+                self.shape_fitter.gripper_positions_at,
+                float(self.shape_fitter.link_radii.max()) + _GRIP,
+            )
+        self.frame_order, self._reasons = _by_stamp(sequence.stamps)
+        usable = [i for i in self.frame_order if i not in self._reasons]
         self._check_clock(usable)
-        if options.filters.colours and sequence.colours is None:
-            hint = "leave track.options.filters.colours out, or record clouds with colours"
+        if options.filters.object_colours and sequence.load_colours is None:
+            hint = "leave track.options.filters.object_colours out, or record clouds with colours"
             raise DataError("the clouds have no colours", where=sequence.source, hint=hint)
         self._asked = _spread(usable, _ASKED)
-        self._shapes: dict[tuple[float, ...], ShapeFit] = {(): self.shape}
-        self.sample = _spread(usable, options.calibration.frames) if self.arm is not None else []
+        self._shapes: dict[tuple[float, ...], ShapeFitter] = {(): self.shape_fitter}
+        self.calibration_frames = _spread(usable, options.calibration.n_frames) if self.arm_surface is not None else []
 
-    def posture(self, t: float) -> Array:
+    def configuration_at_rest(self, t: float) -> Array:
         """Configuration at a time on the joints' clock with the object at rest; constant beyond the recording."""
-        q = self.shape.rest.copy()
-        if self.angles is not None:
-            q[[self.system.mechanism.joint_index(name) for name in self.shape.known]] = self.angles(t)
+        q = self.shape_fitter.rest_configuration.copy()
+        if self.joint_angles_at is not None:
+            q[[self.system.mechanism.joint_index(name) for name in self.shape_fitter.recorded_joint_names]] = (
+                self.joint_angles_at(t)
+            )
         return q
 
-    def common(self, progress: Callable[[int, str], None] = lambda done, text: None) -> Common:
+    def calibrate_sequence(self, progress: Callable[[int, str], None] = lambda done, text: None) -> SequenceCalibration:
         """Calibration shared by the sequence, estimated from some of its frames."""
         calibration = self._calibration(progress)
-        progress(len(self.sample), "comparing the object's sizes")
-        background = Background()
-        filters, noise = self.options.filters, self.options.fit.noise
-        if self.empty is not None:
-            clouds = [calibration.state.world(self._finite(self.empty, i)[0]) for i in range(len(self.empty))]
-            background = Background.empty_scene(clouds, filters.voxel, noise)
+        progress(len(self.calibration_frames), "comparing the object's sizes")
+        background = BackgroundPoints()
+        filters, noise = self.options.filters, self.options.shape_fit.surface_noise_std
+        if self.empty_scene is not None:
+            clouds = [
+                calibration.camera_state.to_world(self._finite(self.empty_scene, i)[0])
+                for i in range(len(self.empty_scene))
+            ]
+            background = BackgroundPoints.from_empty_scene(clouds, filters.voxel_size, noise)
         looks = [look for i in self._asked if (look := self._look(i, calibration, background)) is not None]
-        last: list[tuple[ShapeFit, Fit]] = []
+        last: list[tuple[ShapeFitter, FrameShapeFit]] = []
 
-        def fitted(values: Mapping[str, float], starts: Sequence[Array]) -> list[Fit]:
+        def fitted(values: Mapping[str, float], starts: Sequence[Array]) -> list[FrameShapeFit]:
             shape = self._shape_of(values)
             before: list[Array | None] = list(starts) if len(starts) == len(looks) else [None] * len(looks)
             last[:] = [
-                (shape, shape.solve(look.sights[0], look.q, look.starts[0] if start is None else (start,)))
+                (shape, shape.fit_frame(look.sights[0], look.q, look.starts[0] if start is None else (start,)))
                 for look, start in zip(looks, before, strict=True)
             ]
             return [fit for _, fit in last]
 
         shared = 0.0
         if looks:
-            places = self.shape.place(looks[0].q)
+            places = self.shape_fitter.points_at(looks[0].q)
             still = np.zeros(places.shape)
-            shared = float(calibration.common_std(places, still, np.zeros(len(places))).max())
-        sizes = ask_sizes(self.system, self.values, self.options.estimate, (noise, shared), fitted)
-        if self.options.background == "frames":
-            shapes = [shape.tubes(fit.q) for shape, fit in last if not unfit(fit, shape, self.options)]
+            shared = float(calibration.shared_point_std(places, still, np.zeros(len(places))).max())
+        sizes = check_dimensions(
+            self.system, self.parameter_values, self.options.estimated_dimensions, (noise, shared), fitted
+        )
+        if self.options.background_estimation == "frames":
+            shapes = [shape.tubes_at(fit.q) for shape, fit in last if not rejection_reason(fit, shape, self.options)]
             clouds = [look.sights[0].points for look in looks]
-            found = Background.still(clouds, shapes, 2 * filters.voxel, noise, self.shape.near)
+            found = BackgroundPoints.from_static_points(
+                clouds, shapes, 2 * filters.voxel_size, noise, self.shape_fitter.max_informative_distance
+            )
             points = np.concatenate([found.points, background.points])
-            background = Background(points, max(found.within, background.within))
-        return Common(calibration, sizes, background)
+            background = BackgroundPoints(points, max(found.match_distance, background.match_distance))
+        return SequenceCalibration(calibration, sizes, background)
 
-    def _calibration(self, progress: Callable[[int, str], None]) -> Calibration:
+    def _calibration(self, progress: Callable[[int, str], None]) -> CameraCalibration:
         options = self.options
-        if self.arm is None:
-            return as_given(self.sequence.pose, options.clock, "no robot to compare")
+        if self.arm_surface is None:
+            return calibration_as_given(self.sequence.camera_pose, options.clock, "no robot to compare")
         glimpses = []
-        for done, i in enumerate(self.sample):
-            progress(done, f"reading {self.sequence.names[i]}")
+        for done, i in enumerate(self.calibration_frames):
+            progress(done, f"reading {self.sequence.frame_names[i]}")
             try:
                 points = self._points(i)
             except DataError:
                 continue  # the second pass says why
-            glimpses.append(Glimpse(float(self.sequence.t[i]), voxel_grid(points, options.filters.voxel).points))
-        progress(len(self.sample), "calibrating the camera by the arm")
+            glimpses.append(
+                CalibrationFrame(
+                    float(self.sequence.stamps[i]), voxel_averages(points, options.filters.voxel_size).points
+                )
+            )
+        progress(len(self.calibration_frames), "calibrating the camera by the arm")
         rng = np.random.default_rng(options.seed)
-        pose, source = self.sequence.pose, self.sequence.source
-        return calibrate(self.arm, glimpses, pose, rng, options.calibration, options.clock, source)
+        pose, source = self.sequence.camera_pose, self.sequence.source
+        return calibrate_camera(self.arm_surface, glimpses, pose, rng, options.calibration, options.clock, source)
 
     def _check_clock(self, usable: Sequence[int]) -> None:
-        if self.span is None or not usable:
+        if self.joint_time_span is None or not usable:
             return
-        options, stamps = self.options.clock, self.sequence.t[list(usable)]
-        first, last = float(stamps.min()) - options.offset, float(stamps.max()) - options.offset
-        if first > self.span[1] + options.search or last < self.span[0] - options.search:
+        options, stamps = self.options.clock, self.sequence.stamps[list(usable)]
+        first, last = float(stamps.min()) - options.initial_offset, float(stamps.max()) - options.initial_offset
+        if (
+            first > self.joint_time_span[1] + options.search_half_width
+            or last < self.joint_time_span[0] - options.search_half_width
+        ):
             raise DataError(
-                f"the frames run from {first:.3f} s to {last:.3f} s, the joints from {self.span[0]:.3f} s to"
-                f" {self.span[1]:.3f} s: their clocks are not the same",
+                f"the frames run from {first:.3f} s to {last:.3f} s, the joints from {self.joint_time_span[0]:.3f} s to"
+                f" {self.joint_time_span[1]:.3f} s: their clocks are not the same",
                 where=self.sequence.source,
-                hint=f"give the clock offset (stamp minus joint time): {first + options.offset - self.span[0]:.3f} s if"
+                hint=f"give the clock offset (stamp minus joint time): {first + options.initial_offset - self.joint_time_span[0]:.3f} s if"
                 " both started together",
             )
 
-    def _shape(self, sizes: Sizes) -> ShapeFit:
+    def _shape(self, sizes: DimensionCheck) -> ShapeFitter:
         """The object with the sizes that were estimated."""
-        key = tuple(np.where(sizes.used, sizes.change, 0.0).tolist()) if any(sizes.used) else ()
+        key = tuple(np.where(sizes.is_estimated, sizes.log_ratio, 0.0).tolist()) if any(sizes.is_estimated) else ()
         if key not in self._shapes:
-            self._shapes[key] = self._shape_of(sizes.values(self.system, self.values))
+            self._shapes[key] = self._shape_of(sizes.parameter_values(self.system, self.parameter_values))
         return self._shapes[key]
 
-    def _shape_of(self, values: Mapping[str, float] | None) -> ShapeFit:
-        return ShapeFit(self.system, self.options.fit, values, self._loose)
+    def _shape_of(self, values: Mapping[str, float] | None) -> ShapeFitter:
+        return ShapeFitter(self.system, self.options.shape_fit, values, self._loose)
 
-    def _removed(self, q: Array, calibration: Calibration, background: Background) -> Callable[[Array], Mask]:
+    def _removed(
+        self, q: Array, calibration: CameraCalibration, background: BackgroundPoints
+    ) -> Callable[[Array], Mask]:
         """Which places the filters leave no points of, the robot at a configuration."""
-        region, padding = self.region.at(q, calibration.camera), self.options.filters.padding
-        within = padding + float(self.shape.radius.max())
+        region, padding = (
+            self.object_region.bounds_at(q, calibration.camera_position),
+            self.options.filters.robot_padding,
+        )
+        within = padding + float(self.shape_fitter.link_radii.max())
 
         def removed(places: Array) -> Mask:
             gone = ~region.contains(places)
-            if self.robot is not None:
-                gone |= self.robot.within(places, q, within)
-            return gone | background.contains(places, float(self.shape.radius.max()))
+            if self.robot_surfaces is not None:
+                gone |= self.robot_surfaces.is_within_distance(places, q, within)
+            return gone | background.contains(places, float(self.shape_fitter.link_radii.max()))
 
         return removed
 
@@ -296,7 +343,7 @@ class Tracker:
     @staticmethod
     def _finite(sequence: FrameSequence, index: int) -> tuple[Array, Mask]:
         """A frame's finite points in the camera's frame, and which of all its points they are."""
-        points = sequence.load(index)
+        points = sequence.load_cloud(index)
         finite: Mask = np.isfinite(points[:, 0] + points[:, 1] + points[:, 2])
         points = points if finite.all() else points[finite]
         if not len(points):
@@ -306,212 +353,233 @@ class Tracker:
             raise DataError(f"the cloud is not in metres: half of its points are {far:.0f} m away (millimetres?)")
         return points, finite
 
-    def _read(self, index: int, calibration: Calibration) -> tuple[Cloud, Array]:
+    def _read(self, index: int, calibration: CameraCalibration) -> tuple[WeightedCloud, Array]:
         """A frame's cloud in the world where the object can be, the robot's points among them, and all its points."""
         found, finite = self._finite(self.sequence, index)
-        points = calibration.state.world(found)
+        points = calibration.camera_state.to_world(found)
         filters = self.options.filters
-        q = self.posture(float(calibration.state.time(self.sequence.t[index])))
-        inside = self.region.at(q, calibration.camera).contains(points)
+        q = self.configuration_at_rest(float(calibration.camera_state.to_joint_time(self.sequence.stamps[index])))
+        inside = self.object_region.bounds_at(q, calibration.camera_position).contains(points)
         if not inside.any():
             raise DataError("no point lies where the object can be: check the camera's pose")
-        if filters.colours and self.sequence.colours is not None:
-            colours = self.sequence.colours(index)
+        if filters.object_colours and self.sequence.load_colours is not None:
+            colours = self.sequence.load_colours(index)
             if colours is None:
                 raise DataError("the cloud has no colours")
-            inside[inside] = of_colours(colours[finite][inside], filters.colours, filters.colour_angle)
+            inside[inside] = has_any_colour(colours[finite][inside], filters.object_colours, filters.max_colour_angle)
             if not inside.any():
                 raise DataError("no point has one of the object's colours: check filters.colours")
-        return voxel_grid(points[inside], filters.voxel), points
+        return voxel_averages(points[inside], filters.voxel_size), points
 
-    def frame(self, index: int, common: Common) -> FrameReport:
+    def track_frame(self, index: int, common: SequenceCalibration) -> FrameReport:
         """Report of one frame, independent of other frames."""
         return self._work(index, common).report
 
-    def stages(self, frame: FrameReport, common: Common) -> Stages | None:
+    def frame_stages(self, frame: FrameReport, common: SequenceCalibration) -> FrameStages | None:
         """Processing stages of a frame, for figures; None if its cloud cannot be read."""
         try:
-            cloud = common.calibration.state.world(self.sequence.load(frame.index))
+            cloud = common.camera_calibration.camera_state.to_world(self.sequence.load_cloud(frame.index))
         except DataError:
             return None
         work = self._work(frame.index, common)
         filtered = None if work.filtered is None else work.filtered.points
-        return Stages(
-            frame.name, frame.reason, common.calibration.camera, cloud, filtered, work.skeleton, work.report.fit
+        return FrameStages(
+            frame.name,
+            frame.drop_reason,
+            common.camera_calibration.camera_position,
+            cloud,
+            filtered,
+            work.skeleton,
+            work.report.shape_fit,
         )
 
-    def unread(self, index: int, calibration: Calibration, reason: str) -> FrameReport:
+    def unprocessed_report(self, index: int, calibration: CameraCalibration, reason: str) -> FrameReport:
         """Report of a frame before processing, with the reason if it is dropped."""
-        stamp = float(self.sequence.t[index])
-        t = float(calibration.state.time(stamp))
-        return FrameReport(index, self.sequence.names[index], stamp, t, reason, 0, 0, 0, math.nan, 0.0, None)
+        stamp = float(self.sequence.stamps[index])
+        t = float(calibration.camera_state.to_joint_time(stamp))
+        return FrameReport(index, self.sequence.frame_names[index], stamp, t, reason, 0, 0, 0, math.nan, 0.0, None)
 
-    def judged(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
+    def reject_outlying_frames(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
         """Frames with outlying ones dropped, and how the root end was chosen."""
-        rooted, note = told(frames, self.options)
-        return judged(rooted, self.options), note
+        rooted, note = choose_root_ends(frames, self.options)
+        return reject_outlying_frames(rooted, self.options), note
 
-    def finished(self, frames: Sequence[FrameReport], note: str, common: Common) -> Track:
+    def to_track_result(self, frames: Sequence[FrameReport], note: str, common: SequenceCalibration) -> TrackResult:
         """Tracking result of the frames; `DataError` if none is good."""
-        columns = [self.system.points.index(name) for name in self.names]
-        things = self.things(frames)
-        points = measured(frames, columns, common, things, self.options, self.sequence.source)
-        return Track(
-            self.names,
+        columns = [self.system.point_frames.index(name) for name in self.point_names]
+        things = self.foreign_objects(frames)
+        points = tracked_points(frames, columns, common, things, self.options, self.sequence.source)
+        return TrackResult(
+            self.point_names,
             points.t,
             points.q,
             points.position,
             points.std,
-            points.common,
+            points.shared_std,
             tuple(frames),
-            common.calibration,
-            common.sizes,
+            common.camera_calibration,
+            common.dimensions,
             things,
             note,
             (),
-            self.system.points,
-            self._shape(common.sizes).place,
+            self.system.point_frames,
+            self._shape(common.dimensions).points_at,
         )
 
-    def things(self, frames: Sequence[FrameReport]) -> tuple[Foreign, ...]:
+    def foreign_objects(self, frames: Sequence[FrameReport]) -> tuple[ForeignObject, ...]:
         """Foreign objects seen in the fitted frames."""
-        fitted = [(frame.t, frame.fit) for frame in frames if frame.fit is not None]
+        fitted = [(frame.joint_time, frame.shape_fit) for frame in frames if frame.shape_fit is not None]
         if not fitted:
             return ()
-        corners = np.concatenate([fit.centre_line.reshape(-1, 3) for _, fit in fitted])
-        radius = float(self.shape.radius.max())
+        corners = np.concatenate([fit.link_ends.reshape(-1, 3) for _, fit in fitted])
+        radius = float(self.shape_fitter.link_radii.max())
         box = corners.min(axis=0) - radius, corners.max(axis=0) + radius
-        seen, noise = [(t, fit.things) for t, fit in fitted], self.options.fit.noise
-        coloured, still = self.sequence.colours is not None, self.options.background == "frames"
-        return foreign(seen, len(fitted), noise, box, self._links, coloured, still)
+        seen, noise = [(t, fit.foreign_clusters) for t, fit in fitted], self.options.shape_fit.surface_noise_std
+        coloured, still = self.sequence.load_colours is not None, self.options.background_estimation == "frames"
+        return group_foreign_objects(seen, len(fitted), noise, box, self._links, coloured, still)
 
     def _links(self, t: float) -> dict[str, Array]:
         """Poses of what moves with the robot at a time, by the names of the joints."""
-        if self.robot is None:
+        if self.robot_surfaces is None:
             return {}
-        poses = self.robot.poses(self.posture(t))
+        poses = self.robot_surfaces.part_poses_at(self.configuration_at_rest(t))
         names = self.system.mechanism.joint_names
         return {
-            _link_of(self.system, names[j]): pose for j, pose in zip(self.robot.joints, poses, strict=True) if j >= 0
+            _link_of(self.system, names[j]): pose
+            for j, pose in zip(self.robot_surfaces.part_joints, poses, strict=True)
+            if j >= 0
         }
 
-    def _work(self, index: int, common: Common) -> _Work:
-        work = _Work(self.unread(index, common.calibration, self._reasons.get(index, "")))
-        look = self._prepared(work, common.calibration, common.background)
+    def _work(self, index: int, common: SequenceCalibration) -> _Work:
+        work = _Work(self.unprocessed_report(index, common.camera_calibration, self._reasons.get(index, "")))
+        look = self._prepared(work, common.camera_calibration, common.background)
         if look is None:
             return work
         begun = time.process_time()
-        shape = self._shape(common.sizes)
-        fits = [shape.solve(sight, look.q, starts) for sight, starts in zip(look.sights, look.starts, strict=True)]
-        fits.sort(key=lambda fit: fit.distance)
-        reason = unfit(fits[0], shape, self.options)
-        if self.starts is not None and not reason and touching(fits[0].centre_line, shape.radius):
+        shape = self._shape(common.dimensions)
+        fits = [shape.fit_frame(sight, look.q, starts) for sight, starts in zip(look.sights, look.starts, strict=True)]
+        fits.sort(key=lambda fit: fit.mean_distance)
+        reason = rejection_reason(fits[0], shape, self.options)
+        if (
+            self.initial_shape_finder is not None
+            and not reason
+            and is_self_touching(fits[0].link_ends, shape.link_radii)
+        ):
             reason = "the object crosses or touches itself"
-        other = fits[1] if len(fits) > 1 and fits[1].distance < _AS_GOOD * fits[0].distance else None
-        spent = work.report.seconds + time.process_time() - begun
-        work.report = replace(work.report, fit=fits[0], other=other, reason=reason, seconds=spent)
+        other = fits[1] if len(fits) > 1 and fits[1].mean_distance < _AS_GOOD * fits[0].mean_distance else None
+        spent = work.report.cpu_seconds + time.process_time() - begun
+        work.report = replace(
+            work.report, shape_fit=fits[0], alternative_fit=other, drop_reason=reason, cpu_seconds=spent
+        )
         return work
 
-    def _look(self, index: int, calibration: Calibration, background: Background) -> _Look | None:
+    def _look(self, index: int, calibration: CameraCalibration, background: BackgroundPoints) -> _Look | None:
         """A frame that can be fitted; None for others."""
         return self._prepared(
-            _Work(self.unread(index, calibration, self._reasons.get(index, ""))), calibration, background
+            _Work(self.unprocessed_report(index, calibration, self._reasons.get(index, ""))), calibration, background
         )
 
-    def _prepared(self, work: _Work, calibration: Calibration, background: Background) -> _Look | None:
+    def _prepared(self, work: _Work, calibration: CameraCalibration, background: BackgroundPoints) -> _Look | None:
         """What a frame shows of the object, None with the reason in its report."""
-        options, index, stamp, t = self.options, work.report.index, work.report.stamp, work.report.t
-        if work.report.reason:
+        options, index, stamp, t = self.options, work.report.index, work.report.stamp, work.report.joint_time
+        if work.report.drop_reason:
             return None
         try:
             cloud, raw = self._read(index, calibration)
         except DataError as error:
             work.dropped(error.what)
             return None
-        work.report = replace(work.report, raw=len(raw))
-        if self.span is not None and not self.span[0] <= t <= self.span[1]:
+        work.report = replace(work.report, n_raw_points=len(raw))
+        if self.joint_time_span is not None and not self.joint_time_span[0] <= t <= self.joint_time_span[1]:
             work.dropped("there are no joint angles at its time")
             return None
         rng = np.random.default_rng([options.seed, index])
-        usual = calibration.usual
-        if self.arm is not None and usual is not None:
-            own = own_offset(self.arm, calibration.state, stamp, cloud.points, rng, usual.misfit)
+        usual = calibration.on_time_frames
+        if self.arm_surface is not None and usual is not None:
+            own = estimate_stamp_delay(
+                self.arm_surface, calibration.camera_state, stamp, cloud.points, rng, usual.median_square_distance
+            )
             if own is not None and math.isfinite(own.std):
-                work.report = replace(work.report, delay=own.delay)
-                if is_late(own, options.clock):
+                work.report = replace(work.report, stamp_delay=own.delay)
+                if is_stamped_late(own, options.clock):
                     work.dropped(f"its stamp is late: by {1e3 * own.delay:.0f} ms")
                     return None
-        q = self.posture(t)
+        q = self.configuration_at_rest(t)
         filters, kept = options.filters, np.ones(len(cloud), bool)
-        if self.robot is not None:
-            kept = without_robot(cloud, self.robot, q, filters.padding)
+        if self.robot_surfaces is not None:
+            kept = is_not_robot(cloud, self.robot_surfaces, q, filters.robot_padding)
         kept[kept] = ~background.contains(cloud.points[kept])
         # beside the robot's points: among all surfaces, wrong points are few
-        cloud = cloud.keep(without_outliers(cloud, filters.neighbours, filters.outlier_ratio, kept))
-        work.filtered, work.report = cloud, replace(work.report, filtered=len(cloud))
-        if len(cloud) < options.filters.least:
+        cloud = cloud.select(is_not_outlier(cloud, filters.outlier_neighbours, filters.outlier_z_max, kept))
+        work.filtered, work.report = cloud, replace(work.report, n_filtered_points=len(cloud))
+        if len(cloud) < options.filters.min_points:
             work.dropped(f"too few points of the object: {len(cloud)} left")
             return None
-        if len(cloud) > options.filters.most:
-            cloud = cloud.keep(np.sort(rng.choice(len(cloud), options.filters.most, replace=False)))
-            work.report = replace(work.report, filtered=len(cloud))
+        if len(cloud) > options.filters.max_points:
+            cloud = cloud.select(np.sort(rng.choice(len(cloud), options.filters.max_points, replace=False)))
+            work.report = replace(work.report, n_filtered_points=len(cloud))
         begun = time.process_time()
-        view = View(raw, calibration.state.pose, self.sequence.intrinsics, cloud.points)
-        given = calibration.camera, view, self._removed(q, calibration, background)
+        view = OcclusionMap(raw, calibration.camera_state.pose, self.sequence.intrinsics, cloud.points)
+        given = calibration.camera_position, view, self._removed(q, calibration, background)
         try:
             look = (
                 self._held(work, cloud, q, rng, given)
-                if self.starts is None
-                else self._anywhere(self.starts, work, cloud, rng, given)
+                if self.initial_shape_finder is None
+                else self._anywhere(self.initial_shape_finder, work, cloud, rng, given)
             )
         except DataError as error:
             work.dropped(error.what)
             return None
-        work.report = replace(work.report, seconds=time.process_time() - begun)
+        work.report = replace(work.report, cpu_seconds=time.process_time() - begun)
         return look
 
-    def _held(self, work: _Work, cloud: Cloud, q: Array, rng: np.random.Generator, given: _Given) -> _Look:
+    def _held(self, work: _Work, cloud: WeightedCloud, q: Array, rng: np.random.Generator, given: _Given) -> _Look:
         """What is seen of an object whose root is where the model has it."""
-        found = skeleton(cloud, rng, self.options.walk)
-        work.skeleton, work.report = found, replace(work.report, nodes=len(found.nodes))
+        found = extract_skeleton(cloud, rng, self.options.skeleton)
+        work.skeleton, work.report = found, replace(work.report, n_skeleton_nodes=len(found.nodes))
         if not len(found.nodes):
             raise DataError("no part of the cloud is dense enough for a skeleton")
-        rest = cloud.keep(found.connected)
+        rest = cloud.select(found.has_node)
         work.filtered = rest
-        return _Look((Sight(rest.points, rest.weight, found.nodes, *given),), q, ((),))
+        return _Look((CloudObservation(rest.points, rest.point_weights, found.nodes, *given),), q, ((),))
 
-    def _anywhere(self, starts: Starts, work: _Work, cloud: Cloud, rng: np.random.Generator, given: _Given) -> _Look:
+    def _anywhere(
+        self, starts: InitialShapeFinder, work: _Work, cloud: WeightedCloud, rng: np.random.Generator, given: _Given
+    ) -> _Look:
         """What is seen of an object whose root is sought, with the ends that it may have where."""
-        diameter, options = 2.0 * float(self.shape.radius.max()), self.options
-        course = traced(cloud, diameter, options.walk.link_length, rng)
-        work.skeleton, work.report = course.skeleton, replace(work.report, nodes=len(course.nodes))
-        if len(course.loops):
+        diameter, options = 2.0 * float(self.shape_fitter.link_radii.max()), self.options
+        course = trace_centerline(cloud, diameter, options.skeleton.max_edge_length, rng)
+        work.skeleton, work.report = course.to_skeleton, replace(work.report, n_skeleton_nodes=len(course.nodes))
+        if len(course.loop_positions):
             raise DataError("the object crosses or touches itself: its cloud closes a loop")
-        found = starts.of(course)
-        if options.root_near is not None:
-            place = np.array(options.root_near)
-            near = min(found, key=lambda start: float(np.linalg.norm(start.root - place))).root
-            found = [start for start in found if np.array_equal(start.root, near)]
+        found = starts.find_initial_shapes(course)
+        if options.approximate_root_position is not None:
+            place = np.array(options.approximate_root_position)
+            near = min(found, key=lambda start: float(np.linalg.norm(start.root_position - place))).root_position
+            found = [start for start in found if np.array_equal(start.root_position, near)]
         own = cKDTree(course.nodes).query(cloud.points)[0] < 2.0 * diameter
-        rest = cloud.keep(own)
+        rest = cloud.select(own)
         work.filtered = rest
-        sights = tuple(Sight(rest.points, rest.weight, course.nodes, *given, anchors=start.anchors) for start in found)
-        return _Look(sights, self.shape.rest, tuple((start.q,) for start in found))
+        sights = tuple(
+            CloudObservation(rest.points, rest.point_weights, course.nodes, *given, end_anchors=start.end_anchors)
+            for start in found
+        )
+        return _Look(sights, self.shape_fitter.rest_configuration, tuple((start.q,) for start in found))
 
 
 def _link_of(system: System, joint: str) -> str:
     """Name of a frame that stands still beside a joint's moving side: its link, as far as the model has it."""
     index = system.mechanism.joint_index(joint)
-    return next((name for name, frame in system.mechanism.frames.items() if frame.joint == index), joint)
+    return next((name for name, frame in system.mechanism.frames.items() if frame.joint_index == index), joint)
 
 
 def _chosen_points(system: System, wanted: tuple[str, ...] | None) -> tuple[str, ...]:
     if wanted is None:
-        held = {grasp.held for grasp in system.grasps}
-        return tuple(name for name in system.points if name not in held) or system.points
+        held = {grasp.held_frame for grasp in system.grasps}
+        return tuple(name for name in system.point_frames if name not in held) or system.point_frames
     for name in wanted:
-        if name not in system.points:
-            hint = nearest(name, system.points)
+        if name not in system.point_frames:
+            hint = nearest_name_hint(name, system.point_frames)
             raise ConfigError(f"there is no point '{name}'", where="track options: points", hint=hint)
     return wanted
 
@@ -534,7 +602,7 @@ def _joint_angles(
             raise DataError(
                 f"joint '{name}' of the model is not recorded",
                 where=f"{recording.name}: joints",
-                hint=nearest(name, joints.names),
+                hint=nearest_name_hint(name, joints.names),
             )
     columns = [joints.names.index(name) for name in known]
     t, position = joints.t, joints.position[:, columns]

@@ -15,76 +15,76 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.analysis.history import history
+from yid_ocp.analysis.estimate_history import assess_drift
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import Run
-from yid_ocp.errors import ConfigError, OutputError, YidError, nearest
-from yid_ocp.files import file_sha256, jsonable, reason, write_json
-from yid_ocp.parallel import LOCAL, Task, TaskResult, Workers, run_tasks
-from yid_ocp.progress import SILENT, Progress
-from yid_ocp.report.html import share_script, write_report
-from yid_ocp.report.sections import Findings
+from yid_ocp.config.settings import RunSettings
+from yid_ocp.errors import ConfigError, OutputError, YidError, nearest_name_hint
+from yid_ocp.files import file_sha256, os_error_reason, to_json_types, write_json
+from yid_ocp.parallel import LOCAL_WORKERS, Task, TaskResult, WorkerConfig, run_tasks
+from yid_ocp.progress import NULL_PROGRESS, Progress
+from yid_ocp.report.html import write_report, write_shared_plotly_script
+from yid_ocp.report.sections import ReportData
 from yid_ocp.report.summaries import batch_summary
-from yid_ocp.version import versions
-from yid_ocp.workflow.baseline import read_estimates, refuse_unlike
+from yid_ocp.version import installed_versions
+from yid_ocp.workflow.baseline_runs import read_estimates, require_same_model
 from yid_ocp.workflow.build import input_files
-from yid_ocp.workflow.command import DONE, FAILED, carry_out, given_workers
+from yid_ocp.workflow.command_runner import EXIT_DONE, EXIT_FAILED, run_and_print, workers_from_arguments
 from yid_ocp.workflow.diagnose import run_diagnose
-from yid_ocp.workflow.folder import now
 from yid_ocp.workflow.report import history_result
+from yid_ocp.workflow.run_folder import local_time_text
 from yid_ocp.workflow.solve import run_solve
 
-FORMAT = "yid-batch/1"
-RESULT, RUNS, TASKS = "batch.json", "runs", "tasks"
+_RESULT_FORMAT = "yid-batch/1"
+_RESULT_FILE, _RUNS_FOLDER, _TASKS_FOLDER = "batch.json", "runs", "tasks"
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Member:
+class BatchRun:
     """Configuration and overrides of one run of a batch.
 
     Attributes
     ----------
     name : str
         Of its folder.
-    config : Path
-    settings : tuple of str
+    config_file : Path
+    overrides : tuple of str
         `a.b=c` each, over those of the file.
     """
 
     name: str
-    config: Path
-    settings: tuple[str, ...]
+    config_file: Path
+    overrides: tuple[str, ...]
 
-    def load(self) -> Run:
+    def load_settings(self) -> RunSettings:
         """Load the run's settings; errors as `load_config`."""
-        return load_config(self.config, self.settings)
+        return load_config(self.config_file, self.overrides)
 
 
 @dataclass(frozen=True)
-class BatchOutcome:
+class BatchCommandResult:
     """Result of `run_batch`: the folder and the contents of its batch.json."""
 
     folder: Path
     result: dict[str, Any]
 
     @property
-    def ok(self) -> bool:
+    def is_successful(self) -> bool:
         """Whether every run succeeded."""
         return all(entry["ok"] for entry in self.result["runs"])
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    members = batch_members(arguments.configs, arguments.recordings, arguments.overrides)
-    workers = given_workers(arguments) or LOCAL
+    members = list_batch_runs(arguments.configs, arguments.recordings, arguments.overrides)
+    workers = workers_from_arguments(arguments) or LOCAL_WORKERS
     out = arguments.out or Path("runs") / f"batch-{time.strftime('%Y%m%d-%H%M%S')}"
-    outcome = carry_out(
+    outcome = run_and_print(
         lambda shown: run_batch(members, out, arguments.each, workers, shown, _again(arguments, out)),
         batch_summary,
         arguments,
     )
-    return DONE if outcome.ok else FAILED
+    return EXIT_DONE if outcome.is_successful else EXIT_FAILED
 
 
 def _again(arguments: argparse.Namespace, out: str | Path) -> str:
@@ -94,9 +94,9 @@ def _again(arguments: argparse.Namespace, out: str | Path) -> str:
     return shlex.join([*words, "--out", str(out)])
 
 
-def batch_members(
+def list_batch_runs(
     configs: Sequence[str | Path], recordings: str | None = None, overrides: Sequence[str] = ()
-) -> list[Member]:
+) -> list[BatchRun]:
     """Runs of a batch: one per configuration, or one per configuration and matching recording.
 
     Parameters
@@ -117,7 +117,7 @@ def batch_members(
     for i, path in enumerate(paths):
         if not path.is_file():
             near = [entry.name for entry in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
-            hint = nearest(path.name, near) if near else "check the path"
+            hint = nearest_name_hint(path.name, near) if near else "check the path"
             raise ConfigError("there is no such configuration file", where=str(path), hint=hint)
         if path.resolve() in [other.resolve() for other in paths[:i]]:
             raise ConfigError("a configuration is given twice", where=str(path), hint="list every one once")
@@ -140,39 +140,39 @@ def batch_members(
     return _named(entries)
 
 
-def _named(entries: Sequence[tuple[str, Path, tuple[str, ...]]]) -> list[Member]:
+def _named(entries: Sequence[tuple[str, Path, tuple[str, ...]]]) -> list[BatchRun]:
     """Members with names of their own, those of one stem numbered."""
-    members: list[Member] = []
+    members: list[BatchRun] = []
     for stem, path, settings in entries:
         taken, name, number = {member.name for member in members}, stem, 1
         while name in taken:
             number += 1
             name = f"{stem}-{number}"
-        members.append(Member(name, path.resolve(), settings))
+        members.append(BatchRun(name, path.resolve(), settings))
     return members
 
 
 def run_batch(
-    members: Sequence[Member],
+    members: Sequence[BatchRun],
     out: str | Path,
     command: str = "solve",
-    workers: Workers | Executor = LOCAL,
-    progress: Progress = SILENT,
-    again: str = "",
-) -> BatchOutcome:
+    workers: WorkerConfig | Executor = LOCAL_WORKERS,
+    progress: Progress = NULL_PROGRESS,
+    command_line: str = "",
+) -> BatchCommandResult:
     """Run a command for every run of a batch; finished runs in the folder are reused.
 
     Parameters
     ----------
     members : sequence of Member
-        See `batch_members`.
+        See `list_batch_runs`.
     out : str or Path
         Folder: `runs/NAME/` (a run folder each), `tasks/` (results of tasks, see `yid_ocp.parallel`), then `batch.json`
         (`yid-batch/1`) and `report.html`.
     command : {'solve', 'diagnose'}
     workers : Workers or Executor, optional
     progress : Progress, optional
-    again : str
+    command_line : str
         The command line that does the same, for the report.
 
     Returns
@@ -187,12 +187,12 @@ def run_batch(
     WorkerError
     """
     folder = _folder(Path(out))
-    share_script(folder)
+    write_shared_plotly_script(folder)
     results: dict[str, TaskResult] = {}
     tasks = []
     for member in members:
         try:
-            run = member.load()
+            run = member.load_settings()
             # what it depends on beside its settings; their content counts, wherever they stand
             inputs = sorted({str(path.absolute()) for path in input_files(run).values()})
             for path in inputs:
@@ -203,35 +203,35 @@ def run_batch(
             continue
         arguments = {
             "name": member.name,
-            "config": member.config,
-            "settings": list(member.settings),
+            "config": member.config_file,
+            "settings": list(member.overrides),
             "inputs": [Path(path) for path in inputs],
             "command": command,
-            "folder": str(folder / RUNS),
+            "folder": str(folder / _RUNS_FOLDER),
         }
         tasks.append(Task(member.name, arguments))
-    progress.stage(f"{command} of {len(tasks)} runs")
-    done = run_tasks(run_member, tasks, folder / TASKS, workers, progress.advance)
+    progress.begin_stage(f"{command} of {len(tasks)} runs")
+    done = run_tasks(run_batch_task, tasks, folder / _TASKS_FOLDER, workers, progress.report_parts_done)
     results |= {entry.name: entry for entry in done}
     entries = [_entry(results[member.name], folder) for member in members]
     result = {
-        "format": FORMAT,
+        "format": _RESULT_FORMAT,
         "command": command,
-        "again": again,
+        "again": command_line,
         "runs": entries,
-        "history": _alike([folder / RUNS / entry["name"] for entry in entries if entry["ok"]]),
-        "date": now(),
-        "versions": versions(),
+        "history": _alike([folder / _RUNS_FOLDER / entry["name"] for entry in entries if entry["ok"]]),
+        "date": local_time_text(),
+        "versions": installed_versions(),
     }
-    written: dict[str, Any] = jsonable(result)
-    write_json(folder / RESULT, written)
-    progress.stage("writing the report")
+    written: dict[str, Any] = to_json_types(result)
+    write_json(folder / _RESULT_FILE, written)
+    progress.begin_stage("writing the report")
     about = f"{len(entries)} runs of {command} side by side."
-    write_report(folder / "report.html", Findings(folder.name, about, written))
-    return BatchOutcome(folder, written)
+    write_report(folder / "report.html", ReportData(folder.name, about, written))
+    return BatchCommandResult(folder, written)
 
 
-def run_member(
+def run_batch_task(
     name: str, config: Path, settings: Sequence[str], inputs: Sequence[Path], command: str, folder: str
 ) -> dict[str, Any]:
     """Task: run one member in its own folder, replacing an earlier attempt; returns its entry for batch.json."""
@@ -250,7 +250,7 @@ def run_member(
         judged, fit = result["parameters"], result["fit"]
         status, ok, message = result["status"], result["status"] == "converged", result["message"]
     kept = ("value", "std", "unit", "verdict")
-    found: dict[str, Any] = jsonable({
+    found: dict[str, Any] = to_json_types({
         "status": status,
         "ok": ok,
         "message": message,
@@ -264,7 +264,10 @@ def run_member(
 
 def _entry(result: TaskResult, folder: Path) -> dict[str, Any]:
     """What stands of a run in batch.json."""
-    own = {"name": result.name, "folder": f"{RUNS}/{result.name}" if (folder / RUNS / result.name).is_dir() else None}
+    own = {
+        "name": result.name,
+        "folder": f"{_RUNS_FOLDER}/{result.name}" if (folder / _RUNS_FOLDER / result.name).is_dir() else None,
+    }
     if result.error:
         failed = {"status": "error", "ok": False, "message": result.error, "chi2_per_dof": None, "effects": []}
         return own | failed | {"parameters": {}, "seconds": None}
@@ -276,8 +279,8 @@ def _alike(folders: Sequence[Path]) -> dict[str, Any] | None:
     try:
         if len(folders) < 2:
             return None
-        refuse_unlike(folders)
-        found: dict[str, Any] = history_result(history([read_estimates(folder) for folder in folders]))
+        require_same_model(folders)
+        found: dict[str, Any] = history_result(assess_drift([read_estimates(folder) for folder in folders]))
     except YidError:
         return None
     return found
@@ -287,14 +290,14 @@ def _folder(path: Path) -> Path:
     """The folder of a batch, made or found."""
     folder = path.expanduser().absolute()
     try:
-        if folder.is_dir() and any(folder.iterdir()) and not (folder / TASKS).is_dir():
+        if folder.is_dir() and any(folder.iterdir()) and not (folder / _TASKS_FOLDER).is_dir():
             raise OutputError(
                 "the folder holds something that is no batch",
                 where=str(folder),
                 allowed="a new name, an empty folder, or the folder of a batch, which goes on",
                 hint="choose another name with --out",
             )
-        (folder / RUNS).mkdir(parents=True, exist_ok=True)
+        (folder / _RUNS_FOLDER).mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f"the folder cannot be made: {reason(error)}", where=str(folder)) from error
+        raise OutputError(f"the folder cannot be made: {os_error_reason(error)}", where=str(folder)) from error
     return folder

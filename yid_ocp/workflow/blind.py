@@ -14,47 +14,64 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.config.reader import DEFAULT, DIAGNOSIS_DEFAULT, load_config
-from yid_ocp.config.settings import Run, dump_config
-from yid_ocp.data.hdf5 import read_recording, write_recording
+from yid_ocp.config.reader import DEFAULT_CONFIG, DEFAULT_DIAGNOSIS_CONFIG, load_config
+from yid_ocp.config.settings import RunSettings, dump_config
+from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.diagnosis.blind import (
-    PURPOSES,
-    Case,
-    Label,
-    Planned,
-    answer,
-    best_closure,
-    calibrate,
-    mark,
-    opened,
-    opened_wide,
-    planned,
-    score,
-    seal,
+    ENSEMBLE_PURPOSES,
+    BlindCase,
+    CaseLabel,
+    PlannedCase,
+    best_possible_closure,
+    calibrate_thresholds,
+    diagnose_case,
+    open_sealed_labels,
+    permissive_thresholds,
+    plan_cases,
+    score_case,
+    score_ensemble,
+    seal_labels,
 )
-from yid_ocp.diagnosis.finding import statistics
+from yid_ocp.diagnosis.diagnosis_result import threshold_statistics
 from yid_ocp.errors import ConfigError, OutputError, YidError
-from yid_ocp.files import jsonable, write_json, write_text
-from yid_ocp.parallel import LOCAL, Task, Workers, run_tasks, values_of
-from yid_ocp.progress import SILENT, Progress
+from yid_ocp.files import to_json_types, write_json, write_text
+from yid_ocp.parallel import LOCAL_WORKERS, Task, WorkerConfig, require_task_values, run_tasks
+from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.html import write_report
-from yid_ocp.report.pictures import draw_blind
-from yid_ocp.report.sections import Findings
+from yid_ocp.report.png_figures import draw_blind_results
+from yid_ocp.report.sections import ReportData
 from yid_ocp.report.summaries import blind_summary
 from yid_ocp.report.tables import blind_markdown
-from yid_ocp.version import package_code, versions
-from yid_ocp.workflow.command import DONE, carry_out, given_workers
-from yid_ocp.workflow.experiments import VARIATIONS, Experiment, experiments_of, refuse_unfit
-from yid_ocp.workflow.folder import now
+from yid_ocp.version import installed_versions, package_source_hash
+from yid_ocp.workflow.blind_experiments import (
+    EXPERIMENT_VARIATIONS,
+    BlindExperiment,
+    list_experiments,
+    require_blind_compatible,
+)
+from yid_ocp.workflow.command_runner import EXIT_DONE, run_and_print, workers_from_arguments
+from yid_ocp.workflow.run_folder import local_time_text
 
-COMMITMENT, LABELS, RESULT, TABLE = "commitment.json", "sealed/labels.json", "result.json", "table.md"
-THRESHOLDS = "thresholds.json"
-CONFIGS, PREPARED, DRAWN, CASES, ANSWERS, BEST = "configs", "prepared", "sealed/drawn", "cases", "answers", "best"
+_COMMITMENT_FILE, _LABELS_FILE, _RESULT_FILE, _TABLE_FILE = (
+    "commitment.json",
+    "sealed/labels.json",
+    "result.json",
+    "table.md",
+)
+_THRESHOLDS_FILE = "thresholds.json"
+_CONFIGS_FOLDER, _PREPARED_FOLDER, _DRAWN_FOLDER, _CASES_FOLDER, _ANSWERS_FOLDER, _BEST_FOLDER = (
+    "configs",
+    "prepared",
+    "sealed/drawn",
+    "cases",
+    "answers",
+    "best",
+)
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class BlindOutcome:
+class BlindCommandResult:
     """Result of `run_blind`: the folder and the contents of its result.json."""
 
     folder: Path
@@ -64,40 +81,40 @@ class BlindOutcome:
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     given = arguments.configs or [None]
-    runs = [load_config(path, arguments.overrides, DIAGNOSIS_DEFAULT) for path in given]
-    if not arguments.configs and arguments.cases >= TWO_ARMS:
-        runs.append(load_config(None, arguments.overrides, DEFAULT))
-    workers = given_workers(arguments) or LOCAL
-    purpose = PURPOSES[int(arguments.calibration)]
+    runs = [load_config(path, arguments.overrides, DEFAULT_DIAGNOSIS_CONFIG) for path in given]
+    if not arguments.configs and arguments.cases >= _MIN_TWO_ARM_CASES:
+        runs.append(load_config(None, arguments.overrides, DEFAULT_CONFIG))
+    workers = workers_from_arguments(arguments) or LOCAL_WORKERS
+    purpose = ENSEMBLE_PURPOSES[int(arguments.calibration)]
     out = arguments.out or f"{runs[0].name}-blind-{'calibration-' if arguments.calibration else ''}{arguments.seed}"
 
-    def proved(shown: Progress) -> BlindOutcome:
+    def proved(shown: Progress) -> BlindCommandResult:
         return run_blind(runs, out, arguments.cases, arguments.seed, shown, workers, purpose)
 
-    carry_out(proved, blind_summary, arguments)
-    return DONE
+    run_and_print(proved, blind_summary, arguments)
+    return EXIT_DONE
 
 
-TWO_ARMS = 100
+_MIN_TWO_ARM_CASES = 100
 """Cases from which the embedded proof has experiments with two arms as well."""
 
 
 def run_blind(
-    runs: Sequence[Run],
+    runs: Sequence[RunSettings],
     out: str | Path,
     count: int = 20,
     seed: int = 1,
-    progress: Progress = SILENT,
-    workers: Workers | Executor = LOCAL,
-    purpose: str = PURPOSES[0],
-) -> BlindOutcome:
+    progress: Progress = NULL_PROGRESS,
+    workers: WorkerConfig | Executor = LOCAL_WORKERS,
+    purpose: str = ENSEMBLE_PURPOSES[0],
+) -> BlindCommandResult:
     """Run a blind validation of the diagnosis in several processes; finished parts in the folder are reused.
 
     Parameters
     ----------
     runs : sequence of Run
         Configurations: models, posture and sensors of their first recordings, `diagnosis.candidates`. Each is varied
-        (`workflow.experiments.VARIATIONS`) as far as there are cases for it.
+        (`workflow.blind_experiments.EXPERIMENT_VARIATIONS`) as far as there are cases for it.
     out : str or Path
         Folder: `configs/`, `prepared/` (what is detectable in every experiment), `cases/` (recordings),
         `sealed/labels.json`, `commitment.json` (hash of the labels, written before the first diagnosis, and of the
@@ -124,60 +141,60 @@ def run_blind(
     """
     folder = Path(out).absolute()
     if count < 1:
-        raise runs[0].refuse(f"an ensemble of {count} cases", "diagnosis", hint="give --cases from 1")
+        raise runs[0].config_error(f"an ensemble of {count} cases", "diagnosis", hint="give --cases from 1")
     if seed < 0:
         raise ConfigError(f"seed = {seed}", where="--seed", allowed="a whole number from 0")
     for entry in runs:
-        refuse_unfit(entry)
+        require_blind_compatible(entry)
     try:
         cases = _made(_named(runs), folder, count, seed, progress, workers, purpose)
-        progress.stage(f"diagnosing {count} cases")
-        answers = _done(diagnosed, cases, folder / ANSWERS, workers, progress)
-        commitment = json.loads((folder / COMMITMENT).read_text("utf-8"))
-        labels = opened((folder / LABELS).read_text("utf-8"), commitment["sha256"])
-        progress.stage("scoring")
+        progress.begin_stage(f"diagnosing {count} cases")
+        answers = _done(diagnose_case_task, cases, folder / _ANSWERS_FOLDER, workers, progress)
+        commitment = json.loads((folder / _COMMITMENT_FILE).read_text("utf-8"))
+        labels = open_sealed_labels((folder / _LABELS_FILE).read_text("utf-8"), commitment["sha256"])
+        progress.begin_stage("scoring")
         best = _best(cases, labels, answers, folder, progress, workers)
     except KeyboardInterrupt:
         log.warning("finished cases are in %s; the same command goes on with the others", folder)
         raise
     marks = [
-        mark(label, found["result"], best.get(label.case, math.nan), float(found["seconds"]))
+        score_case(label, found["result"], best.get(label.case, math.nan), float(found["seconds"]))
         for label, found in zip(labels, answers, strict=True)
     ]
-    files = [folder / CONFIGS / f"{entry.name}.yaml" for entry in runs]
-    flags = ["--cases", count, "--seed", seed, *(["--calibration"] if purpose == PURPOSES[1] else [])]
+    files = [folder / _CONFIGS_FOLDER / f"{entry.name}.yaml" for entry in runs]
+    flags = ["--cases", count, "--seed", seed, *(["--calibration"] if purpose == ENSEMBLE_PURPOSES[1] else [])]
     again = shlex.join(["yid-ocp", "blind", *map(str, files), *map(str, flags)])
-    result = score(marks) | {
+    result = score_ensemble(marks) | {
         "seed": seed,
         "purpose": purpose,
-        "code": package_code(),
+        "code": package_source_hash(),
         "code_of_cases": commitment["code"],
         "command": again,
-        "date": now(),
-        "versions": versions(),
+        "date": local_time_text(),
+        "installed_versions": installed_versions(),
         "candidates": {entry.name: entry.diagnosis.candidates for entry in runs},
-        "variations": {name: varied.words for name, varied in VARIATIONS.items()},
+        "variations": {name: varied.description for name, varied in EXPERIMENT_VARIATIONS.items()},
     }
-    if purpose == PURPOSES[1]:
-        found = calibrate(labels, marks, answers, runs[0].diagnosis)
+    if purpose == ENSEMBLE_PURPOSES[1]:
+        found = calibrate_thresholds(labels, marks, answers, runs[0].diagnosis)
         result["calibration_of_thresholds"] = found
         made = {key: result[key] for key in ("cases", "seed", "code", "code_of_cases", "command", "date", "versions")}
-        write_json(folder / THRESHOLDS, jsonable(found | made))
-    written = jsonable(result)
-    write_json(folder / RESULT, written)
-    write_text(folder / TABLE, "\n".join(blind_markdown(written)) + "\n")
-    draw_blind(folder, written)
-    if all(entry.output.report for entry in runs):
-        progress.stage("writing the report")
+        write_json(folder / _THRESHOLDS_FILE, to_json_types(found | made))
+    written = to_json_types(result)
+    write_json(folder / _RESULT_FILE, written)
+    write_text(folder / _TABLE_FILE, "\n".join(blind_markdown(written)) + "\n")
+    draw_blind_results(folder, written)
+    if all(entry.output.write_report for entry in runs):
+        progress.begin_stage("writing the report")
         said = f"{count} virtual cases whose effect was withheld, diagnosed, then opened."
-        write_report(folder / "report.html", Findings(folder.name, said, written))
-    return BlindOutcome(folder, written)
+        write_report(folder / "report.html", ReportData(folder.name, said, written))
+    return BlindCommandResult(folder, written)
 
 
 # -- the ensemble -----------------------------------------------------------------------------------------------------
 
 
-def _named(runs: Sequence[Run]) -> dict[str, Run]:
+def _named(runs: Sequence[RunSettings]) -> dict[str, RunSettings]:
     names = [entry.name for entry in runs]
     twice = [name for i, name in enumerate(names) if name in names[:i]]
     if twice:
@@ -188,16 +205,16 @@ def _named(runs: Sequence[Run]) -> dict[str, Run]:
 
 
 def _made(
-    runs: Mapping[str, Run],
+    runs: Mapping[str, RunSettings],
     folder: Path,
     count: int,
     seed: int,
     progress: Progress,
-    workers: Workers | Executor,
+    workers: WorkerConfig | Executor,
     purpose: str,
 ) -> list[Task]:
     """The diagnosis of every case, of those in the folder or made now; labels are sealed before this returns."""
-    commitment = folder / COMMITMENT
+    commitment = folder / _COMMITMENT_FILE
     configs = {name: dump_config(entry) for name, entry in runs.items()}
     if not commitment.exists():
         _make(configs, folder, count, seed, progress, workers, purpose)
@@ -209,15 +226,15 @@ def _made(
             hint="choose another folder, or the same configurations, --cases, --seed and --calibration",
         )
     tasks = []
-    for entry in json.loads((folder / CASES / "cases.json").read_text("utf-8")):
+    for entry in json.loads((folder / _CASES_FOLDER / "cases.json").read_text("utf-8")):
         name = str(entry["name"])
         config, _, variation = str(entry["experiment"]).rpartition(".")
         arguments = {
-            **Experiment(folder / CONFIGS / f"{config}.yaml", variation, seed, purpose).told,
-            "first": folder / PREPARED / f"{entry['experiment']}.h5",
+            **BlindExperiment(folder / _CONFIGS_FOLDER / f"{config}.yaml", variation, seed, purpose).task_arguments,
+            "first": folder / _PREPARED_FOLDER / f"{entry['experiment']}.h5",
             "name": name,
-            "estimate": [folder / CASES / file for file in entry["estimate"]],
-            "held_out": folder / CASES / entry["held_out"],
+            "estimate": [folder / _CASES_FOLDER / file for file in entry["estimate"]],
+            "held_out": folder / _CASES_FOLDER / entry["held_out"],
         }
         tasks.append(Task(name, {**arguments, "without": entry["without"]}))
     return tasks
@@ -229,64 +246,76 @@ def _make(
     count: int,
     seed: int,
     progress: Progress,
-    workers: Workers | Executor,
+    workers: WorkerConfig | Executor,
     purpose: str,
 ) -> None:
     """Draw the cases and commit to their labels."""
     try:
-        for name in (CONFIGS, PREPARED, CASES, DRAWN):
+        for name in (_CONFIGS_FOLDER, _PREPARED_FOLDER, _CASES_FOLDER, _DRAWN_FOLDER):
             (folder / name).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"the folder cannot be made: {error}", where=str(folder)) from error
     for name, text in configs.items():
-        write_text(folder / CONFIGS / f"{name}.yaml", text)
-    files = {name: folder / CONFIGS / f"{name}.yaml" for name in configs}
-    experiments, chains = experiments_of(files, seed, purpose)
-    weights = {name: VARIATIONS[entry.variation].weight for name, entry in experiments.items()}
-    plan = planned(count, seed, weights, chains, purpose)
+        write_text(folder / _CONFIGS_FOLDER / f"{name}.yaml", text)
+    files = {name: folder / _CONFIGS_FOLDER / f"{name}.yaml" for name in configs}
+    experiments, chains = list_experiments(files, seed, purpose)
+    weights = {name: EXPERIMENT_VARIATIONS[entry.variation].case_fraction for name, entry in experiments.items()}
+    plan = plan_cases(count, seed, weights, chains, purpose)
     used = [name for name in experiments if any(entry.experiment == name for entry in plan)]
-    progress.stage(f"preparing {len(used)} {'experiment' if len(used) == 1 else 'experiments'}")
-    tasks = [Task(name, {**experiments[name].told, "folder": str(folder / PREPARED), "name": name}) for name in used]
-    _done(prepared, tasks, folder / PREPARED / "tasks", workers, progress)
-    progress.stage(f"making {count} cases")
+    progress.begin_stage(f"preparing {len(used)} {'experiment' if len(used) == 1 else 'experiments'}")
+    tasks = [
+        Task(name, {**experiments[name].task_arguments, "folder": str(folder / _PREPARED_FOLDER), "name": name})
+        for name in used
+    ]
+    _done(prepare_experiment, tasks, folder / _PREPARED_FOLDER / "tasks", workers, progress)
+    progress.begin_stage(f"making {count} cases")
     tasks = []
     for entry in plan:
         name = entry.experiment
-        known = {"first": folder / PREPARED / f"{name}.h5", "detectable": folder / PREPARED / f"{name}.json"}
-        wanted = {"planned": asdict(entry), "folder": str(folder / CASES)}
-        tasks.append(Task(f"case {entry.number}", {**experiments[name].told, **known, **wanted}))
-    made = _done(drawn, tasks, folder / DRAWN, workers, progress)
-    text, digest = seal([Label.from_dict(entry["label"]) for entry in made])
-    write_text(folder / LABELS, text)
-    write_json(folder / CASES / "cases.json", [entry["case"] for entry in made])
+        known = {
+            "first": folder / _PREPARED_FOLDER / f"{name}.h5",
+            "detectable": folder / _PREPARED_FOLDER / f"{name}.json",
+        }
+        wanted = {"planned": asdict(entry), "folder": str(folder / _CASES_FOLDER)}
+        tasks.append(Task(f"case {entry.number}", {**experiments[name].task_arguments, **known, **wanted}))
+    made = _done(draw_case, tasks, folder / _DRAWN_FOLDER, workers, progress)
+    text, digest = seal_labels([CaseLabel.from_dict(entry["label"]) for entry in made])
+    write_text(folder / _LABELS_FILE, text)
+    write_json(folder / _CASES_FOLDER / "cases.json", [entry["case"] for entry in made])
     said = {"sha256": digest, "cases": count, "seed": seed, "purpose": purpose, "configs": dict(configs)}
-    write_json(folder / COMMITMENT, said | {"code": package_code()})
+    write_json(folder / _COMMITMENT_FILE, said | {"code": package_source_hash()})
 
 
 # -- tasks ------------------------------------------------------------------------------------------------------------
 
 
 def _done(
-    function: Callable[..., Any], tasks: Sequence[Task], folder: Path, workers: Workers | Executor, progress: Progress
+    function: Callable[..., Any],
+    tasks: Sequence[Task],
+    folder: Path,
+    workers: WorkerConfig | Executor,
+    progress: Progress,
 ) -> list[Any]:
     """What a function finds for each task; one experiment after the other, so that a worker builds each once."""
     order = sorted(range(len(tasks)), key=lambda i: [str(tasks[i].arguments[key]) for key in ("config", "variation")])
-    found = values_of(run_tasks(function, [tasks[i] for i in order], folder, workers, progress.advance))
+    found = require_task_values(
+        run_tasks(function, [tasks[i] for i in order], folder, workers, progress.report_parts_done)
+    )
     return [value for _, value in sorted(zip(order, found, strict=True), key=lambda pair: pair[0])]
 
 
-def prepared(config: Path, variation: str, seed: int, purpose: str, folder: str, name: str) -> dict[str, int]:
+def prepare_experiment(config: Path, variation: str, seed: int, purpose: str, folder: str, name: str) -> dict[str, int]:
     """Task: write an experiment's first recording and the detectable size of every candidate."""
-    experiment = Experiment(config, variation, seed, purpose)
+    experiment = BlindExperiment(config, variation, seed, purpose)
     first = Path(folder) / f"{name}.h5"
-    experiment.begin(first)
-    _, ensemble = experiment.ensemble(first)
-    detectable = [entry.to_dict() for entry in ensemble.detectable]
+    experiment.write_first_recording(first)
+    _, ensemble = experiment.build_ensemble(first)
+    detectable = [entry.to_dict() for entry in ensemble.detectable_effects]
     write_json(Path(folder) / f"{name}.json", detectable)
     return {"candidates": len(detectable)}
 
 
-def drawn(
+def draw_case(
     config: Path,
     variation: str,
     seed: int,
@@ -297,23 +326,23 @@ def drawn(
     folder: str,
 ) -> dict[str, Any]:
     """Task: write the recordings of a case; returns its label and the data given to its diagnosis."""
-    _, ensemble = Experiment(config, variation, seed, purpose).ensemble(first)
-    ensemble.knowing(json.loads(detectable.read_text("utf-8")))
-    case, label = ensemble.draw(Planned(**planned))
-    for recording in (*case.estimate, case.held_out):
+    _, ensemble = BlindExperiment(config, variation, seed, purpose).build_ensemble(first)
+    ensemble.load_detectable_effects(json.loads(detectable.read_text("utf-8")))
+    case, label = ensemble.draw_case(PlannedCase(**planned))
+    for recording in (*case.estimation_recordings, case.held_out_recording):
         write_recording(recording, Path(folder) / f"{recording.name}.h5")
     told = {
         "name": case.name,
         "experiment": planned["experiment"],
-        "estimate": [f"{recording.name}.h5" for recording in case.estimate],
-        "held_out": f"{case.held_out.name}.h5",
-        "without": list(case.without),
+        "estimate": [f"{recording.name}.h5" for recording in case.estimation_recordings],
+        "held_out": f"{case.held_out_recording.name}.h5",
+        "without": list(case.excluded_kinds),
     }
-    found: dict[str, Any] = jsonable({"label": label.to_dict(), "case": told})
+    found: dict[str, Any] = to_json_types({"label": label.to_dict(), "case": told})
     return found
 
 
-def diagnosed(
+def diagnose_case_task(
     config: Path,
     variation: str,
     seed: int,
@@ -328,24 +357,26 @@ def diagnosed(
 
     For calibration, one without a gap has `open` too: the statistics of a diagnosis that takes anything for a gap.
     """
-    run, ensemble = Experiment(config, variation, seed, purpose).ensemble(first)
+    run, ensemble = BlindExperiment(config, variation, seed, purpose).build_ensemble(first)
     case = _case(name, estimate, held_out, without)
     begun = time.perf_counter()
     try:
-        result = answer(ensemble, case, run.diagnosis.candidates, run.diagnosis).to_dict()
+        result = diagnose_case(ensemble, case, run.diagnosis.candidates, run.diagnosis).to_dict()
     except YidError as error:
         result = _nothing(str(error))
-    found: dict[str, Any] = jsonable({"seconds": time.perf_counter() - begun, "result": result})
-    if purpose == PURPOSES[1] and result["verdict"] == "no_gap":
-        anything = opened_wide(run.diagnosis)
+    found: dict[str, Any] = to_json_types({"seconds": time.perf_counter() - begun, "result": result})
+    if purpose == ENSEMBLE_PURPOSES[1] and result["verdict"] == "no_gap":
+        anything = permissive_thresholds(run.diagnosis)
         try:
-            found["open"] = jsonable(statistics(answer(ensemble, case, run.diagnosis.candidates, anything)))
+            found["open"] = to_json_types(
+                threshold_statistics(diagnose_case(ensemble, case, run.diagnosis.candidates, anything))
+            )
         except YidError as error:
             found["open"] = {"message": str(error)}
     return found
 
 
-def closed_at_best(
+def true_effect_closure(
     config: Path,
     variation: str,
     seed: int,
@@ -357,26 +388,26 @@ def closed_at_best(
     label: Mapping[str, Any],
 ) -> float | None:
     """Task: fraction of a case's gap closed by its refitted true effects; None where it cannot be computed."""
-    run, ensemble = Experiment(config, variation, seed, purpose).ensemble(first)
+    run, ensemble = BlindExperiment(config, variation, seed, purpose).build_ensemble(first)
     case = _case(name, estimate, held_out, ())
     try:
-        best = best_closure(ensemble, case, Label.from_dict(label), run.diagnosis.candidates)
+        best = best_possible_closure(ensemble, case, CaseLabel.from_dict(label), run.diagnosis.candidates)
     except YidError:
         return None
     return best if math.isfinite(best) else None
 
 
-def _case(name: str, estimate: Sequence[Path], held_out: Path, without: Sequence[str]) -> Case:
-    return Case(name, tuple(read_recording(path) for path in estimate), read_recording(held_out), tuple(without))
+def _case(name: str, estimate: Sequence[Path], held_out: Path, without: Sequence[str]) -> BlindCase:
+    return BlindCase(name, tuple(read_recording(path) for path in estimate), read_recording(held_out), tuple(without))
 
 
 def _best(
     cases: Sequence[Task],
-    labels: Sequence[Label],
+    labels: Sequence[CaseLabel],
     answers: Sequence[Mapping[str, Any]],
     folder: Path,
     progress: Progress,
-    workers: Workers | Executor,
+    workers: WorkerConfig | Executor,
 ) -> dict[str, float]:
     """By case, what its true effects close, where one of them or two were withheld and a gap was seen."""
     tasks = []
@@ -385,7 +416,7 @@ def _best(
         if gap and label.category in ("single", "pair"):
             arguments = {key: value for key, value in case.arguments.items() if key != "without"}
             tasks.append(Task(case.name, {**arguments, "label": label.to_dict()}))
-    best = _done(closed_at_best, tasks, folder / BEST, workers, progress)
+    best = _done(true_effect_closure, tasks, folder / _BEST_FOLDER, workers, progress)
     return {task.name: value for task, value in zip(tasks, best, strict=True) if value is not None}
 
 

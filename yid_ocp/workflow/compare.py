@@ -1,4 +1,4 @@
-"""The command `compare`: runs several solvers on one problem and tests whether they agree."""
+"""The command `compare_methods`: runs several solvers on one problem and tests whether they agree."""
 
 from __future__ import annotations
 
@@ -7,40 +7,40 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.analysis.compare import Comparison, compare
-from yid_ocp.analysis.published import PUBLISHED, published_sentences
+from yid_ocp.analysis.compare import MethodComparison, compare_methods
+from yid_ocp.analysis.paper_comparison import PAPER_ESTIMATES, explain_paper_estimates
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import Run
+from yid_ocp.config.settings import RunSettings
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.progress import SILENT, Progress
-from yid_ocp.report.pictures import draw_convergence
+from yid_ocp.progress import NULL_PROGRESS, Progress
+from yid_ocp.report.png_figures import draw_convergence
 from yid_ocp.report.summaries import compare_summary
 from yid_ocp.solvers import SOLVERS, Iterate
 from yid_ocp.solvers.base import Solver
 from yid_ocp.workflow.build import build_problem
-from yid_ocp.workflow.command import DONE, FAILED, carry_out
-from yid_ocp.workflow.doubts import doubts_result
-from yid_ocp.workflow.folder import new_run_folder
-from yid_ocp.workflow.solve import doubted, solve_result
+from yid_ocp.workflow.command_runner import EXIT_DONE, EXIT_FAILED, run_and_print
+from yid_ocp.workflow.recording_issues import issues_result
+from yid_ocp.workflow.run_folder import new_run_folder
+from yid_ocp.workflow.solve import solve_result, with_fit_issues
 
-FORMAT = "yid-compare/1"
+_RESULT_FORMAT = "yid-compare/1"
 
 
 @dataclass(frozen=True)
-class CompareOutcome:
+class CompareCommandResult:
     """Result of `run_compare`: the run folder, result.json's contents and the comparison."""
 
     folder: Path
     result: dict[str, Any]
-    comparison: Comparison
+    comparison: MethodComparison
 
     @property
-    def ok(self) -> bool:
+    def is_successful(self) -> bool:
         """Whether any method converged."""
-        return any(run.solution.status.value == "converged" for run in self.comparison.runs)
+        return any(run.solution.status.value == "converged" for run in self.comparison.method_results)
 
 
-def chosen_solvers(run: Run) -> list[Solver]:
+def _chosen_solvers(run: RunSettings) -> list[Solver]:
     """Solvers listed in `compare.methods`, with their settings.
 
     Raises
@@ -49,18 +49,20 @@ def chosen_solvers(run: Run) -> list[Solver]:
         None at all.
     """
     if not run.compare.methods:
-        raise run.refuse("there is no method to compare", "compare", "methods", allowed=", ".join(SOLVERS))
+        raise run.config_error("there is no method to compare", "compare", "methods", allowed=", ".join(SOLVERS))
     return list(run.compare.methods.values())
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     settings = load_config(arguments.config, arguments.overrides)
-    outcome = carry_out(lambda shown: run_compare(settings, arguments.out, shown), compare_summary, arguments)
-    return DONE if outcome.ok else FAILED
+    outcome = run_and_print(lambda shown: run_compare(settings, arguments.out, shown), compare_summary, arguments)
+    return EXIT_DONE if outcome.is_successful else EXIT_FAILED
 
 
-def run_compare(run: Run, out: str | Path | None = None, progress: Progress = SILENT) -> CompareOutcome:
+def run_compare(
+    run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS
+) -> CompareCommandResult:
     """Run every method, compare, and write the run folder.
 
     Parameters
@@ -78,11 +80,11 @@ def run_compare(run: Run, out: str | Path | None = None, progress: Progress = SI
     ------
     ConfigError, DataError, ModelError, OutputError
     """
-    solvers = chosen_solvers(run)
-    published = published_answers(run)
+    solvers = _chosen_solvers(run)
+    published = _paper_estimates(run)
     with new_run_folder(run, out, "compare") as folder:
-        folder.begin(run, "compare")
-        progress.stage("building the model and its compiled step")
+        folder.begin_run(run, "compare")
+        progress.begin_stage("building the model and its compiled step")
         problem = build_problem(run)
         truth = _truth(problem)
         current, names = [""], [solver.name for solver in solvers]
@@ -91,68 +93,74 @@ def run_compare(run: Run, out: str | Path | None = None, progress: Progress = SI
             if name != current[0]:
                 current[0] = name
                 count = f", method {names.index(name) + 1} of {len(names)}" if name in names else ""
-                progress.stage(f"solving by {name}{count}")
-            folder.log("iterate", method=name, iteration=entry.iteration, cost=entry.cost, seconds=entry.seconds)
-            progress.iterate(entry)
+                progress.begin_stage(f"solving by {name}{count}")
+            folder.log_event("iterate", method=name, iteration=entry.iteration, cost=entry.cost, seconds=entry.seconds)
+            progress.report_iterate(entry)
 
-        comparison = compare(problem, solvers, truth, iterate, run.diagnosis.of_a_fit)
+        comparison = compare_methods(problem, solvers, truth, iterate, run.diagnosis.fit_gap_limits)
         draw_convergence(folder.path / "convergence.png", comparison)
-        own = comparison.judged.problem or problem
-        judged, doubts = doubted(own, comparison.judged, comparison.judged_held_out)
-        comparison = replace(comparison, judged=judged)
-        experiment = run.compare.published
-        said = published_sentences(experiment, comparison.judged.parameters, truth) if experiment else ()
+        own = comparison.verdict_solution.problem or problem
+        judged, doubts = with_fit_issues(own, comparison.verdict_solution, comparison.verdict_held_out_predictions)
+        comparison = replace(comparison, verdict_solution=judged)
+        experiment = run.compare.paper_experiment
+        said = explain_paper_estimates(experiment, comparison.verdict_solution.parameters, truth) if experiment else ()
         about = {
-            "doubts": doubts_result(doubts),
+            "doubts": issues_result(doubts),
             "published": published,
             "published_explained": list(said),
             "truth": truth,
         }
-        written = folder.finish(compare_result(problem, comparison) | about)
-        held_out = tuple(comparison.judged_held_out)
-        known = {"problem": own, "solution": judged, "held_out": held_out, "more": {"comparison": comparison}}
-        folder.report(run, written, progress, **known)
-    return CompareOutcome(folder.path, written, comparison)
+        written = folder.write_result(_compare_result(problem, comparison) | about)
+        held_out = tuple(comparison.verdict_held_out_predictions)
+        known = {"problem": own, "solution": judged, "held_out": held_out, "section_data": {"comparison": comparison}}
+        folder.write_report_page(run, written, progress, **known)
+    return CompareCommandResult(folder.path, written, comparison)
 
 
-def compare_result(problem: EstimationProblem, comparison: Comparison) -> dict[str, Any]:
+def _compare_result(problem: EstimationProblem, comparison: MethodComparison) -> dict[str, Any]:
     """`yid-compare/1` without inputs, versions and what is known beside.
 
     One `yid-solve/1` for each method, with its cost in time, and for the run whose verdicts count, `judged`.
     """
     methods = {}
-    for run in comparison.runs:
-        methods[run.method] = solve_result(problem, run.solution, run.held_out) | {
+    for run in comparison.method_results:
+        methods[run.method] = solve_result(problem, run.solution, run.held_out_predictions) | {
             "whitened_cost": run.whitened_cost,
             "wall_seconds": run.wall_seconds,
             "cpu_seconds": run.cpu_seconds,
-            "peak_memory_mib": run.peak_memory,
-            "disagreements": comparison.agreement[run.method],
+            "peak_memory_mib": run.peak_memory_mib,
+            "disagreements": comparison.disagreements[run.method],
         }
     return {
-        "format": FORMAT,
+        "format": _RESULT_FORMAT,
         "methods": methods,
-        "reference": comparison.reference,
-        "agree": comparison.agree,
-        "explained": list(comparison.explained),
-        "disturbed": comparison.disturbed,
-        "judged": solve_result(comparison.judged.problem or problem, comparison.judged, comparison.judged_held_out),
+        "reference": comparison.reference_method,
+        "agree": comparison.is_consistent,
+        "explained": list(comparison.explanations),
+        "disturbed": comparison.has_process_noise,
+        "judged": solve_result(
+            comparison.verdict_solution.problem or problem,
+            comparison.verdict_solution,
+            comparison.verdict_held_out_predictions,
+        ),
     }
 
 
-def published_answers(run: Run) -> dict[str, float]:
-    """The paper's estimates for the experiment named by `compare.published`; empty where none is named."""
-    name = run.compare.published
+def _paper_estimates(run: RunSettings) -> dict[str, float]:
+    """The paper's estimates for the experiment named by `compare.paper_experiment`; empty where none is named."""
+    name = run.compare.paper_experiment
     if name is None:
         return {}
-    if name not in PUBLISHED:
-        raise run.refuse(f"the paper has no experiment '{name}'", "compare", "published", allowed=", ".join(PUBLISHED))
-    return PUBLISHED[name]
+    if name not in PAPER_ESTIMATES:
+        raise run.config_error(
+            f"the paper has no experiment '{name}'", "compare", "published", allowed=", ".join(PAPER_ESTIMATES)
+        )
+    return PAPER_ESTIMATES[name]
 
 
 def _truth(problem: EstimationProblem) -> dict[str, float]:
     """Parameter values that the recordings of a virtual experiment carry along."""
     known: dict[str, float] = {}
     for episode in problem.episodes:
-        known |= {name: value for name, value in episode.recording.truth.items() if name in problem.free}
+        known |= {name: value for name, value in episode.recording.true_parameters.items() if name in problem.free}
     return known

@@ -9,7 +9,7 @@ from typing import Any
 
 from yid_ocp.errors import ConfigError, YidError
 
-FORMATS = ("mjcf", "urdf", "sdf", "yaml", "csv", "mcap")
+_EXPORT_FORMATS = ("mjcf", "urdf", "sdf", "yaml", "csv", "mcap")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -23,7 +23,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def answer(parser: argparse.ArgumentParser) -> None:
+def complete_arguments(parser: argparse.ArgumentParser) -> None:
     """Print completions for the calling shell and exit; does nothing without the package argcomplete.
 
     Parameters
@@ -42,7 +42,7 @@ def answer(parser: argparse.ArgumentParser) -> None:
         "runs": library.DirectoriesCompleter(),
         "baseline": library.DirectoriesCompleter(),
         "source": library.FilesCompleter(("h5", "hdf5")),
-        "format": library.ChoicesCompleter(FORMATS),
+        "format": library.ChoicesCompleter(_EXPORT_FORMATS),
         "overrides": _settings,
     }
     for command in _commands(parser):
@@ -59,10 +59,10 @@ def _commands(parser: argparse.ArgumentParser) -> list[argparse.ArgumentParser]:
 
 def _settings(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[str]:
     """Keys of `--set` that begin so, with names that the given configuration has."""
-    from yid_ocp.config.reader import settable  # it takes a second, which no other completion needs
+    from yid_ocp.config.reader import settable_keys  # it takes a second, which no other completion needs
 
     given = getattr(parsed_args, "config", None) or next(iter(getattr(parsed_args, "configs", None) or ()), None)
     try:
-        return settable(prefix, given)
+        return settable_keys(prefix, given)
     except YidError:
-        return settable(prefix)
+        return settable_keys(prefix)

@@ -11,34 +11,39 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.analysis.history import Estimates, together
-from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
-from yid_ocp.config.settings import Run, dump_config
+from yid_ocp.analysis.estimate_history import RunEstimates, pool_estimates
+from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG, load_config
+from yid_ocp.config.settings import RunSettings, dump_config
 from yid_ocp.data.recording import Recording
-from yid_ocp.diagnosis import Finding, diagnose
-from yid_ocp.diagnosis.baseline import with_baseline
-from yid_ocp.diagnosis.finding import model_result
+from yid_ocp.diagnosis import DiagnosisResult, diagnose
+from yid_ocp.diagnosis.baseline_comparison import with_baseline_prior
+from yid_ocp.diagnosis.diagnosis_result import final_model_to_dict
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.progress import SILENT, Point, Progress
-from yid_ocp.report.scene import Scene, Told, scene
+from yid_ocp.progress import NULL_PROGRESS, AcceptedIterate, Progress
+from yid_ocp.report.animation import Animation, ModelTrajectory, make_animation
 from yid_ocp.report.summaries import diagnose_summary
-from yid_ocp.sensors.joints import EFFORT, POSITION
+from yid_ocp.sensors.joints import EFFORT_GROUP, POSITION_GROUP
 from yid_ocp.solvers import Solution, solve
-from yid_ocp.workflow.baseline import earlier_runs, recordings_without, refuse_same, with_effects_of
+from yid_ocp.workflow.baseline_runs import (
+    baseline_estimates,
+    load_reference_recordings,
+    require_distinct_recordings,
+    with_baseline_effects,
+)
 from yid_ocp.workflow.build import build_problem
-from yid_ocp.workflow.command import DONE, carry_out
-from yid_ocp.workflow.doubts import doubts_result
-from yid_ocp.workflow.folder import RunFolder, new_run_folder, used_versions
-from yid_ocp.workflow.information import next_plan
-from yid_ocp.workflow.refits import Refits
-from yid_ocp.workflow.torque_offsets import torque_offsets
-from yid_ocp.workflow.trajectories import Prediction, write_diagnosis_trajectories
+from yid_ocp.workflow.command_runner import EXIT_DONE, run_and_print
+from yid_ocp.workflow.information_planning import next_plan_settings
+from yid_ocp.workflow.recording_issues import issues_result
+from yid_ocp.workflow.refit_store import JsonRefitStore
+from yid_ocp.workflow.run_folder import RunFolder, new_run_folder, software_versions
+from yid_ocp.workflow.torque_offset_results import estimated_torque_offsets
+from yid_ocp.workflow.trajectories import HeldOutPrediction, write_diagnosis_trajectories
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class DiagnoseOutcome:
+class DiagnoseCommandResult:
     """Result of `run_diagnose`.
 
     Attributes
@@ -47,25 +52,27 @@ class DiagnoseOutcome:
         The finished run folder.
     result : dict
         Contents of result.json.
-    finding : Finding
+    diagnosis : Finding
     """
 
     folder: Path
     result: dict[str, Any]
-    finding: Finding
+    diagnosis: DiagnosisResult
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    settings = load_config(arguments.config, arguments.overrides, DIAGNOSIS_DEFAULT)
+    settings = load_config(arguments.config, arguments.overrides, DEFAULT_DIAGNOSIS_CONFIG)
     if arguments.baseline:
         said = tuple(str(Path(folder).expanduser().resolve()) for folder in arguments.baseline)
         settings = replace(settings, diagnosis=replace(settings.diagnosis, baseline=said))
-    carry_out(lambda shown: run_diagnose(settings, arguments.out, shown), diagnose_summary, arguments)
-    return DONE
+    run_and_print(lambda shown: run_diagnose(settings, arguments.out, shown), diagnose_summary, arguments)
+    return EXIT_DONE
 
 
-def run_diagnose(run: Run, out: str | Path | None = None, progress: Progress = SILENT) -> DiagnoseOutcome:
+def run_diagnose(
+    run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS
+) -> DiagnoseCommandResult:
     """Diagnose and write the run folder; finished refits of an interrupted, identical run are reused.
 
     Parameters
@@ -84,43 +91,45 @@ def run_diagnose(run: Run, out: str | Path | None = None, progress: Progress = S
     ConfigError, DataError, ModelError, SolverError, OutputError
     """
     with new_run_folder(run, out, "diagnose") as folder:
-        folder.begin(run, "diagnose", _flags(run))
-        refits = Refits(folder, folder.inputs, dump_config(run), used_versions())
+        folder.begin_run(run, "diagnose", _flags(run))
+        refits = JsonRefitStore(folder, folder.input_hashes, dump_config(run), software_versions())
         told_and_kept = _Kept(progress, folder)
-        progress.stage("building the model and its compiled step")
-        runs = earlier_runs(run)
-        without, said = recordings_without(run)
+        progress.begin_stage("building the model and its compiled step")
+        runs = baseline_estimates(run)
+        without, said = load_reference_recordings(run)
         if said:
-            folder.log("message", level="WARNING", source="baseline", text=said)
-        run = with_effects_of(run, runs)
-        problem = build_problem(run, without=without)
-        refuse_same(run, problem, runs, without)
+            folder.log_event("message", level="WARNING", source="baseline", text=said)
+        run = with_baseline_effects(run, runs)
+        problem = build_problem(run, reference_recordings=without)
+        require_distinct_recordings(run, problem, runs, without)
         if runs:
-            problem = with_baseline(problem, together(runs)[0])
+            problem = with_baseline_prior(problem, pool_estimates(runs)[0])
         try:
             finding = _found(run, problem, refits, told_and_kept, runs, without)
         except KeyboardInterrupt:
             if len(refits):
                 log.warning("%d finished refits are in %s; the same command resumes them", len(refits), refits.file)
             raise
-        folder.log("end", verdict=finding.verdict, effects=[effect.label for effect in finding.effects])
-        predicted = predictions(finding)
+        folder.log_event("end", verdict=finding.verdict, effects=[effect.label for effect in finding.accepted_effects])
+        predicted = _held_out_predictions(finding)
         write_diagnosis_trajectories(folder.path / "trajectories.h5", finding, predicted)
-        last = finding.last
-        offsets = torque_offsets(last.problem, last.problem.vector(last.values))
+        last = finding.final_model
+        offsets = estimated_torque_offsets(last.problem, last.problem.vector(last.values))
         told = finding.to_dict()
-        moving = not last.problem.options.clamps and bool(last.problem.system.driven or last.problem.system.prescribed)
+        moving = not last.problem.options.clamp_paths and bool(
+            last.problem.system.driven or last.problem.system.prescribed
+        )
         own = {
-            "model": model_result(finding),
-            "doubts": doubts_result(problem.options.doubts),
+            "model": final_model_to_dict(finding),
+            "doubts": issues_result(problem.options.data_issues),
             "torque_offsets": offsets,
-            "next_plan": next_plan(told["confusable"] if moving else (), folder.target),
+            "next_plan": next_plan_settings(told["confusable"] if moving else (), folder.final_path),
         }
-        written = folder.finish(told | own)
+        written = folder.write_result(told | own)
         more = {"finding": finding, "predictions": predicted}
-        folder.report(run, written, progress, problem=problem, scenes=_scenes(finding, predicted), more=more)
-    refits.clear()
-    return DiagnoseOutcome(folder.path, written, finding)
+        folder.write_report_page(run, written, progress, problem=problem, animations=_scenes(finding, predicted), section_data=more)
+    refits.delete_file()
+    return DiagnoseCommandResult(folder.path, written, finding)
 
 
 @dataclass(frozen=True)
@@ -130,55 +139,55 @@ class _Kept:
     shown: Progress
     folder: RunFolder
 
-    def stage(self, text: str) -> None:
-        self.folder.log("stage", text=text)
-        self.shown.stage(text)
+    def begin_stage(self, text: str) -> None:
+        self.folder.log_event("stage", text=text)
+        self.shown.begin_stage(text)
 
-    def iterate(self, entry: Point) -> None:
-        self.shown.iterate(entry)
+    def report_iterate(self, entry: AcceptedIterate) -> None:
+        self.shown.report_iterate(entry)
 
-    def advance(self, done: int, total: int, text: str) -> None:
-        self.folder.log("part", done=done, total=total, text=text)
-        self.shown.advance(done, total, text)
+    def report_parts_done(self, done: int, total: int, text: str) -> None:
+        self.folder.log_event("part", done=done, total=total, text=text)
+        self.shown.report_parts_done(done, total, text)
 
 
 def _found(
-    run: Run,
+    run: RunSettings,
     problem: EstimationProblem,
-    refits: Refits,
+    refits: JsonRefitStore,
     progress: Progress,
-    runs: Sequence[Estimates],
+    runs: Sequence[RunEstimates],
     without: Sequence[Recording],
-) -> Finding:
+) -> DiagnosisResult:
     said = run.diagnosis
     nominal: Solution | None = None
     if said.noise_fraction < 1 and problem.held_out:
         # in units of noise the solver would take any fit for a bad one and start again elsewhere
-        progress.stage("solving the nominal model")
-        nominal = solve(problem, run.solver, callback=progress.iterate)
+        progress.begin_stage("solving the nominal model")
+        nominal = solve(problem, run.solver, callback=progress.report_iterate)
     return diagnose(
-        in_units_of_noise(problem, run),
+        _with_noise_only_stds(problem, run),
         said.candidates,
         thresholds=said,
         solution=nominal,
         progress=progress,
         store=refits,
         baseline=runs,
-        without=without,
-        leave_out=said.leave_out,
+        reference_recordings=without,
+        exclude=said.exclude,
     )
 
 
-def _flags(run: Run) -> list[str]:
+def _flags(run: RunSettings) -> list[str]:
     """What the command was given beside the configuration: baselines that it does not say itself."""
-    if any(origin.startswith("--set") for origin in run.places.values()):
+    if any(origin.startswith("--set") for origin in run.key_locations.values()):
         return []
-    if any(key[:2] == ("diagnosis", "baseline") for key in run.places):
+    if any(key[:2] == ("diagnosis", "baseline") for key in run.key_locations):
         return []
     return [part for folder in run.diagnosis.baseline for part in ("--baseline", folder)]
 
 
-def in_units_of_noise(problem: EstimationProblem, run: Run) -> EstimationProblem:
+def _with_noise_only_stds(problem: EstimationProblem, run: RunSettings) -> EstimationProblem:
     """The problem with all stated standard deviations scaled by `diagnosis.noise_fraction` to noise alone.
 
     Errors of torques and angles that drive the motion, priors and weak prior shrink alike, so that every fit stays what
@@ -196,7 +205,7 @@ def in_units_of_noise(problem: EstimationProblem, run: Run) -> EstimationProblem
     for group, field in sorted(_noise_levels(problem)):
         level = getattr(sensors[group], field) if group in sensors else None
         if level is None:
-            raise run.refuse(
+            raise run.config_error(
                 f"the fraction of noise in the {field} of '{group}' is given, but not the {field}",
                 "diagnosis",
                 "noise_fraction",
@@ -208,31 +217,33 @@ def in_units_of_noise(problem: EstimationProblem, run: Run) -> EstimationProblem
         replace(
             options,
             sensors=sensors,
-            priors={name: share * std for name, std in options.priors.items()},
-            joint_prior=options.joint_prior.scaled(dict.fromkeys(options.joint_prior.names, share)),
+            prior_stds={name: share * std for name, std in options.prior_stds.items()},
+            multivariate_prior=options.multivariate_prior.scaled_by(
+                dict.fromkeys(options.multivariate_prior.parameter_names, share)
+            ),
             huber_threshold=options.huber_threshold / share,
             weak_prior_factor=options.weak_prior_factor**share if options.weak_prior_factor > 0 else 0.0,
-            configuration_std=share * options.configuration_std,
-            velocity_std=share * options.velocity_std,
+            start_configuration_std=share * options.start_configuration_std,
+            start_velocity_std=share * options.start_velocity_std,
         )
     )
 
 
 def _noise_levels(problem: EstimationProblem) -> set[tuple[str, str]]:
     """Group and field of every noise level that residuals or their weights depend on."""
-    levels = {(samples.sensor.group, "std") for episode in problem.episodes for samples in episode.samples}
+    levels = {(samples.sensor.group_name, "std") for episode in problem.episodes for samples in episode.measurements}
     recorded = [e.recording.joints.position_std for e in problem.episodes if e.recording.joints is not None]
-    encoders = problem.options.sensors.get(POSITION)
-    if (EFFORT, "std") in levels and any(std is not None and np.any(std) for std in recorded):
-        levels.add((POSITION, "std"))  # the encoders' noise is part of that of efforts
+    encoders = problem.options.sensors.get(POSITION_GROUP)
+    if (EFFORT_GROUP, "std") in levels and any(std is not None and np.any(std) for std in recorded):
+        levels.add((POSITION_GROUP, "std"))  # the encoders' noise is part of that of efforts
     if encoders is not None and encoders.std is not None:
-        levels.add((POSITION, "std"))
-    for errors in (episode.errors for episode in problem.episodes):
+        levels.add((POSITION_GROUP, "std"))
+    for errors in (episode.input_errors for episode in problem.episodes):
         if errors is not None:
             given = {
-                (EFFORT, "std"): errors.torque_std,
-                (EFFORT, "bias_std"): errors.bias_std,
-                (POSITION, "std"): errors.angle_std,
+                (EFFORT_GROUP, "std"): errors.torque_std,
+                (EFFORT_GROUP, "bias_std"): errors.torque_bias_std,
+                (POSITION_GROUP, "std"): errors.angle_std,
             }
             levels |= {level for level, std in given.items() if np.any(std > 0)}
     return levels
@@ -242,11 +253,11 @@ def _times(share: float, std: float | Mapping[str, float]) -> float | Mapping[st
     return {name: share * value for name, value in std.items()} if isinstance(std, Mapping) else share * std
 
 
-def predictions(finding: Finding) -> list[Prediction]:
+def _held_out_predictions(finding: DiagnosisResult) -> list[HeldOutPrediction]:
     """Held-out episodes with predictions of the nominal and of the final model; failed ones are left out."""
     before, after = (
-        fit.problem.weighted_by_sensors().validate(fit.problem.vector(fit.values))
-        for fit in (finding.nominal, finding.last)
+        fit.problem.whitened_by_sensor_noise().predict_held_out(fit.problem.vector(fit.values))
+        for fit in (finding.nominal_model, finding.final_model)
     )
     return [
         (episode, first, last)
@@ -255,17 +266,19 @@ def predictions(finding: Finding) -> list[Prediction]:
     ]
 
 
-def _scenes(finding: Finding, predicted: Sequence[Prediction]) -> list[Scene]:
+def _scenes(finding: DiagnosisResult, predicted: Sequence[HeldOutPrediction]) -> list[Animation]:
     """What was predicted of every held-out recording, without the effects and with them."""
-    fits = {"nominal model": finding.nominal}
-    fits |= {"with the effects": finding.last} if finding.effects else {}
+    fits = {"nominal model": finding.nominal_model}
+    fits |= {"with the effects": finding.final_model} if finding.accepted_effects else {}
     scenes = []
     for episode, *outcomes in predicted:
         told = []
         for (name, fit), outcome in zip(fits.items(), outcomes, strict=False):
             system, predictor = fit.problem.system, fit.problem.predictor
             theta, _ = fit.problem.split(fit.problem.vector(fit.values), 0)
-            q = outcome.rollout.state[:, : system.size]
-            told.append(Told(name, system, predictor.own_theta(episode, theta), episode.grid.times, q))
-        scenes.append(scene(f"{episode.name} (held out)", told, episode.recording))
+            q = outcome.rollout.state[:, : system.n_coordinates]
+            told.append(
+                ModelTrajectory(name, system, predictor.episode_theta(episode, theta), episode.grid.node_times, q)
+            )
+        scenes.append(make_animation(f"{episode.name} (held out)", told, episode.recording))
     return scenes

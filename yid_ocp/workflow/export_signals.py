@@ -10,19 +10,19 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.data.hdf5_file import open_hdf5
+from yid_ocp.data.hdf5_io import open_checked_hdf5
 from yid_ocp.errors import DataError
-from yid_ocp.export.mcap import Signal, export_mcap
-from yid_ocp.workflow.baseline import run_result
-from yid_ocp.workflow.trajectories import DIAGNOSED, SOLVED
+from yid_ocp.export.mcap import TopicSignal, export_mcap
+from yid_ocp.workflow.baseline_runs import read_run_result
+from yid_ocp.workflow.trajectories import DIAGNOSIS_TRAJECTORIES_FORMAT, SOLVE_TRAJECTORIES_FORMAT
 
 Array = NDArray[np.float64]
-PREDICTIONS: Mapping[str, Mapping[str, str]] = {
-    SOLVED: {"predicted": "predicted"},
-    DIAGNOSED: {"before": "nominal", "after": "with_effects"},
+_PREDICTION_TOPICS: Mapping[str, Mapping[str, str]] = {
+    SOLVE_TRAJECTORIES_FORMAT: {"predicted": "predicted"},
+    DIAGNOSIS_TRAJECTORIES_FORMAT: {"before": "nominal", "after": "with_effects"},
 }
 """Arrays of a sensor's group, and the first part of the topics that tell them."""
-RESERVED = ("where", "events", "unknowns", "recordings")
+_RESERVED_GROUPS = ("where", "events", "unknowns", "recordings")
 
 
 def export_run_signals(folder: str | Path, out: str | Path) -> tuple[list[Path], list[str]]:
@@ -51,15 +51,15 @@ def export_run_signals(folder: str | Path, out: str | Path) -> tuple[list[Path],
     ConfigError, DataError, OutputError
     """
     folder, out = Path(folder), Path(out)
-    run_result(folder)
+    read_run_result(folder)
     files, notes = [], []
-    with open_hdf5(folder / "trajectories.h5") as file:
+    with open_checked_hdf5(folder / "trajectories.h5") as file:
         form = str(file.attrs.get("format", ""))
-        if form not in PREDICTIONS:
+        if form not in _PREDICTION_TOPICS:
             raise DataError(
                 f"the trajectories are of format '{form}'",
                 where=str(folder / "trajectories.h5"),
-                allowed=", ".join(PREDICTIONS),
+                allowed=", ".join(_PREDICTION_TOPICS),
                 hint="run it again",
             )
         for name, signals in _recordings(file, form).items():
@@ -70,34 +70,34 @@ def export_run_signals(folder: str | Path, out: str | Path) -> tuple[list[Path],
     return files, notes
 
 
-def _recordings(file: h5py.File, form: str) -> dict[str, list[Signal]]:
+def _recordings(file: h5py.File, form: str) -> dict[str, list[TopicSignal]]:
     """Signals by recording, those that have any."""
-    parent = file.get("recordings", {}) if form == SOLVED else file
-    found: dict[str, list[Signal]] = {}
+    parent = file.get("recordings", {}) if form == SOLVE_TRAJECTORIES_FORMAT else file
+    found: dict[str, list[TopicSignal]] = {}
     for name in parent:
-        if form == SOLVED or name not in RESERVED:
-            found.setdefault(name, []).extend(_of_recording(parent[name], PREDICTIONS[form]))
+        if form == SOLVE_TRAJECTORIES_FORMAT or name not in _RESERVED_GROUPS:
+            found.setdefault(name, []).extend(_of_recording(parent[name], _PREDICTION_TOPICS[form]))
     for name, group in file.get("where", {}).items():
         found.setdefault(name, []).extend(_unknown(group))
     for name, channels in file.get("events", {}).items():
         for channel, group in channels.items():
             values = {"effort": np.array(group["value"])[:, None]}
-            signal = Signal(f"/events/{_topic(channel)}", "joints", np.array(group["t"]), values, (channel,))
+            signal = TopicSignal(f"/events/{_topic(channel)}", "joints", np.array(group["t"]), values, (channel,))
             found.setdefault(name, []).append(signal)
     return {name: signals for name, signals in found.items() if any(len(signal.t) for signal in signals)}
 
 
-def _of_recording(group: h5py.Group, predictions: Mapping[str, str]) -> Iterator[Signal]:
+def _of_recording(group: h5py.Group, predictions: Mapping[str, str]) -> Iterator[TopicSignal]:
     if "q" in group:
         joints, t = _texts(group.attrs["joints"]), np.array(group["t"])
-        yield Signal("/predicted/joint_states", "joints", t, {"position": np.array(group["q"])}, joints)
+        yield TopicSignal("/predicted/joint_states", "joints", t, {"position": np.array(group["q"])}, joints)
         if "command" in group:
             values = {"position": np.array(group["command"])}
-            yield Signal("/predicted/commands", "joints", t[:-1], values, _texts(group.attrs["driven"]))
+            yield TopicSignal("/predicted/commands", "joints", t[:-1], values, _texts(group.attrs["driven"]))
         for key, names in (("torque", "driven"), ("effort", "prescribed")):
             if key in group and len(group.attrs[names]):
                 values = {"effort": np.array(group[key])}
-                yield Signal(f"/predicted/{names}_efforts", "joints", t[:-1], values, _texts(group.attrs[names]))
+                yield TopicSignal(f"/predicted/{names}_efforts", "joints", t[:-1], values, _texts(group.attrs[names]))
     for sensor in group.values():
         if not isinstance(sensor, h5py.Group):
             continue
@@ -110,20 +110,20 @@ def _of_recording(group: h5py.Group, predictions: Mapping[str, str]) -> Iterator
             yield from _of_sensor(sensor, residual, predicted - measured)
 
 
-def _of_sensor(sensor: h5py.Group, begin: str, values: Array) -> Iterator[Signal]:
+def _of_sensor(sensor: h5py.Group, begin: str, values: Array) -> Iterator[TopicSignal]:
     """Joints of a group as one topic, points as one each; differences of places are vectors."""
     channels, t = _texts(sensor.attrs["channels"]), np.array(sensor["t"])
     if values.shape[1] == len(channels):
         quantity = channels[0].split(".")[1]
         names = [channel.rsplit(".", 1)[1] for channel in channels]
-        yield Signal(f"/{begin}/joints/{quantity}", "joints", t, {quantity: values}, names)
+        yield TopicSignal(f"/{begin}/joints/{quantity}", "joints", t, {quantity: values}, names)
         return
     for i, channel in enumerate(channels):
         kind: Any = "vector" if begin.startswith("residual") else "point"
-        yield Signal(f"/{begin}/points/{_topic(channel)}", kind, t, {"xyz": values[:, 3 * i : 3 * i + 3]})
+        yield TopicSignal(f"/{begin}/points/{_topic(channel)}", kind, t, {"xyz": values[:, 3 * i : 3 * i + 3]})
 
 
-def _unknown(group: h5py.Group) -> Iterator[Signal]:
+def _unknown(group: h5py.Group) -> Iterator[TopicSignal]:
     """Unknown forces, pushes, offsets and biases, where each interval begins and where the last one ends."""
     edges = np.array(group["edges"]) + float(group.attrs.get("start", 0.0))
     mean = np.array(group["mean"])
@@ -135,7 +135,7 @@ def _unknown(group: h5py.Group) -> Iterator[Signal]:
     forces = [i for i, kind in enumerate(kinds) if kind == "force" and kept[i]]
     if forces:
         told = [names[i] for i in forces]
-        yield Signal("/unknown/joint_states", "joints", edges, {"effort": held[:, forces]}, told)
+        yield TopicSignal("/unknown/joint_states", "joints", edges, {"effort": held[:, forces]}, told)
     shapes: Mapping[str, tuple[str, Any]] = {
         "push": ("push", "wrench"), "offset": ("offset", "vector"), "bias": ("bias", "vector")
     }  # fmt: skip
@@ -143,7 +143,7 @@ def _unknown(group: h5py.Group) -> Iterator[Signal]:
         for owner, columns in _triples(names, kinds, kind).items():
             if kept[[i for i in columns if i is not None]].any():
                 xyz = np.stack([np.zeros(len(edges)) if i is None else held[:, i] for i in columns], axis=1)
-                yield Signal(f"/unknown/{words}/{_topic(owner)}", form, edges, {"xyz": xyz})
+                yield TopicSignal(f"/unknown/{words}/{_topic(owner)}", form, edges, {"xyz": xyz})
 
 
 def _triples(names: Sequence[str], kinds: Sequence[str], kind: str) -> dict[str, list[int | None]]:

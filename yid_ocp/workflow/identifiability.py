@@ -10,116 +10,120 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+from yid_ocp.analysis.cable_memory_check import decide_cable_memory
 from yid_ocp.analysis.identifiability import (
-    GRASP_STD,
-    Identifiability,
-    StartKnowledge,
+    GRASP_OFFSET_PRIOR_STD,
+    IdentifiabilityResult,
+    InitialStateKnowledge,
     identifiability,
-    with_grasp_offsets,
+    with_grasp_offset_effects,
 )
-from yid_ocp.analysis.profile import small
-from yid_ocp.analysis.start_in_motion import safe_start
-from yid_ocp.analysis.what_if import Outcome, WhatIf, what_if
+from yid_ocp.analysis.profile import is_small_problem
+from yid_ocp.analysis.what_if import ChangedExperimentResult, ExperimentRanking, what_if
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import Run
+from yid_ocp.config.settings import RunSettings
 from yid_ocp.model.system import System
-from yid_ocp.parallel import Workers
+from yid_ocp.parallel import WorkerConfig
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.null_test import GapLimits
-from yid_ocp.progress import SILENT, Progress
+from yid_ocp.problem.null_test import GapCriteria
+from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.summaries import identifiability_summary
 from yid_ocp.solvers import Iterate, Solution, Status, solve
 from yid_ocp.workflow.build import build_problem, build_step, build_system
-from yid_ocp.workflow.command import DONE, FAILED, carry_out, given_workers
-from yid_ocp.workflow.doubts import doubts_result
-from yid_ocp.workflow.elsewhere import Elsewhere
-from yid_ocp.workflow.folder import RunFolder, new_run_folder
-from yid_ocp.workflow.second_arm import second_arm
+from yid_ocp.workflow.command_runner import EXIT_DONE, EXIT_FAILED, run_and_print, workers_from_arguments
+from yid_ocp.workflow.identifiability_tasks import IdentifiabilityTasks
+from yid_ocp.workflow.recording_issues import issues_result
+from yid_ocp.workflow.run_folder import RunFolder, new_run_folder
+from yid_ocp.workflow.second_arm import system_with_second_arm
 
-FORMAT = "yid-identifiability/1"
+_RESULT_FORMAT = "yid-identifiability/1"
 
 
 @dataclass(frozen=True)
-class Question:
+class IdentifiabilityOptions:
     """Options of an identifiability analysis beyond the run's settings.
 
     Attributes
     ----------
-    at : "solution" or "initial"
+    evaluation_point : "solution" or "initial"
         Point at which to judge: where the solver ends, or the initial values, without solving.
-    start : "assumed" or "unknown"
+    start_knowledge : "assumed" or "unknown"
         Initial states as the settings have them, so that verdicts are those of `solve`, or all estimated along.
-    grasp_std : float or None
+    grasp_offset_std : float or None
         Prior standard deviation of where the grasps sit [m]; None for grasps as the settings have them.
-    intervals : "auto", "all" or sequence of str
+    interval_parameters : "auto", "all" or sequence of str
         Parameters whose interval by profile likelihood is wanted; `auto` for all of a small problem, none of a large
         one.
-    what_if : bool
+    rank_changes : bool
         Whether to rank changes of the experiment.
     """
 
-    at: Literal["solution", "initial"] = "solution"
-    start: StartKnowledge = "assumed"
-    grasp_std: float | None = None
-    intervals: Literal["auto", "all"] | Sequence[str] = "auto"
-    what_if: bool = False
+    evaluation_point: Literal["solution", "initial"] = "solution"
+    start_knowledge: InitialStateKnowledge = "assumed"
+    grasp_offset_std: float | None = None
+    interval_parameters: Literal["auto", "all"] | Sequence[str] = "auto"
+    rank_changes: bool = False
 
     @property
-    def flags(self) -> list[str]:
+    def command_line_flags(self) -> list[str]:
         """The options as command-line flags."""
-        names = self.intervals if isinstance(self.intervals, str) else ",".join(self.intervals) or "none"
+        names = (
+            self.interval_parameters
+            if isinstance(self.interval_parameters, str)
+            else ",".join(self.interval_parameters) or "none"
+        )
         said = {
-            "--what-if": self.what_if,
-            "--initial": self.at == "initial",
-            "--unknown-start": self.start == "unknown",
-            "--unknown-grasp": self.grasp_std is not None,
+            "--what-if": self.rank_changes,
+            "--initial": self.evaluation_point == "initial",
+            "--unknown-start": self.start_knowledge == "unknown",
+            "--unknown-grasp": self.grasp_offset_std is not None,
         }
         asked = [flag for flag, given in said.items() if given]
         return asked + ([] if names == "auto" else ["--intervals", names])
 
 
 @dataclass(frozen=True)
-class IdentifiabilityOutcome:
+class IdentifiabilityCommandResult:
     """Result of `run_identifiability`: run folder, result.json's contents and the analysis (None if it failed)."""
 
     folder: Path
     result: dict[str, Any]
-    information: Identifiability | None
+    analysis: IdentifiabilityResult | None
 
     @property
-    def ok(self) -> bool:
+    def is_successful(self) -> bool:
         """Whether the analysis was possible."""
-        return self.information is not None
+        return self.analysis is not None
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     settings = load_config(arguments.config, arguments.overrides)
     names = [name for name in arguments.intervals.split(",") if name]
-    asked = Question(
-        at="initial" if arguments.initial else "solution",
-        start="unknown" if arguments.unknown_start else "assumed",
-        grasp_std=GRASP_STD if arguments.unknown_grasp else None,
-        intervals={"auto": "auto", "all": "all", "none": ()}.get(arguments.intervals, names),
-        what_if=arguments.what_if,
+    asked = IdentifiabilityOptions(
+        evaluation_point="initial" if arguments.initial else "solution",
+        start_knowledge="unknown" if arguments.unknown_start else "assumed",
+        grasp_offset_std=GRASP_OFFSET_PRIOR_STD if arguments.unknown_grasp else None,
+        interval_parameters={"auto": "auto", "all": "all", "none": ()}.get(arguments.intervals, names),
+        rank_changes=arguments.what_if,
     )
 
-    workers = given_workers(arguments)
+    workers = workers_from_arguments(arguments)
 
-    def judged(shown: Progress) -> IdentifiabilityOutcome:
+    def judged(shown: Progress) -> IdentifiabilityCommandResult:
         return run_identifiability(settings, arguments.out, shown, asked, workers)
 
-    outcome = carry_out(judged, identifiability_summary, arguments)
-    return DONE if outcome.ok else FAILED
+    outcome = run_and_print(judged, identifiability_summary, arguments)
+    return EXIT_DONE if outcome.is_successful else EXIT_FAILED
 
 
 def run_identifiability(
-    run: Run,
+    run: RunSettings,
     out: str | Path | None = None,
-    progress: Progress = SILENT,
-    question: Question | None = None,
-    workers: Workers | Executor | None = None,
-) -> IdentifiabilityOutcome:
+    progress: Progress = NULL_PROGRESS,
+    options: IdentifiabilityOptions | None = None,
+    workers: WorkerConfig | Executor | None = None,
+) -> IdentifiabilityCommandResult:
     """Solve, analyse identifiability and write the run folder.
 
     Parameters
@@ -128,7 +132,7 @@ def run_identifiability(
     out : str or Path, optional
         The run folder; see `new_run_folder`.
     progress : Progress, optional
-    question : Question, optional
+    options : Question, optional
     workers : Workers or Executor, optional
         Who works out intervals, one parameter a task, and the experiments of `what_if`; this process when absent.
 
@@ -141,117 +145,123 @@ def run_identifiability(
     ------
     ConfigError, DataError, ModelError, SolverError, OutputError
     """
-    asked = question or Question()
+    asked = options or IdentifiabilityOptions()
     with new_run_folder(run, out, "identifiability") as folder:
-        folder.begin(run, "identifiability", asked.flags)
-        progress.stage("building the model and its compiled step")
+        folder.begin_run(run, "identifiability", asked.command_line_flags)
+        progress.begin_stage("building the model and its compiled step")
         system = build_system(run)
-        problem = build_problem(run, build_step(run, with_grasp_offsets(system)))
-        limits = run.diagnosis.of_a_fit
+        problem = build_problem(run, build_step(run, with_grasp_offset_effects(system)))
+        limits = run.diagnosis.fit_gap_limits
         solution, whole = None, problem
-        if asked.at == "solution":
+        if asked.evaluation_point == "solution":
             solved = _solved(run, problem, folder, progress)
-            safe = safe_start(problem, run.solver, solved, limits)
+            safe = decide_cable_memory(problem, run.solver, solved, limits)
             problem, solution = safe.problem, safe.solution
         elsewhere = None
         if workers is not None:
-            point = (problem, solution, problem is whole, asked.start, asked.grasp_std)
-            elsewhere = Elsewhere.of(workers, folder, run, *point, progress)
+            point = (problem, solution, problem is whole, asked.start_knowledge, asked.grasp_offset_std)
+            elsewhere = IdentifiabilityTasks.from_run(workers, folder, run, *point, progress)
         unknown = information = ranking = None
         if solution is None or solution.status != Status.FAILED:
-            progress.stage("Fisher information")
-            unknown = identifiability(problem, solution, start="unknown", grasp_std=GRASP_STD, limits=limits)
+            progress.begin_stage("Fisher information")
+            unknown = identifiability(
+                problem, solution, start="unknown", grasp_std=GRASP_OFFSET_PRIOR_STD, limits=limits
+            )
             information = _information(problem, solution, asked, progress, limits, elsewhere)
-            if asked.what_if:
+            if asked.rank_changes:
                 ranking = _ranking(run, system, problem, solution, asked, progress, elsewhere)
-        result = identifiability_result(problem, solution, information, unknown, ranking, asked)
-        folder.log("end", status=result["status"], message=result["message"])
-        written = folder.finish(result)
-        folder.report(run, written, progress, problem=problem, solution=solution)
+        result = _identifiability_result(problem, solution, information, unknown, ranking, asked)
+        folder.log_event("end", status=result["status"], message=result["message"])
+        written = folder.write_result(result)
+        folder.write_report_page(run, written, progress, problem=problem, solution=solution)
     if elsewhere is not None:
-        elsewhere.clear()
-    return IdentifiabilityOutcome(folder.path, written, information)
+        elsewhere.delete_results()
+    return IdentifiabilityCommandResult(folder.path, written, information)
 
 
-def _solved(run: Run, problem: EstimationProblem, folder: RunFolder, progress: Progress) -> Solution:
-    progress.stage(f"solving for {len(problem.start)} unknowns by {run.solver.name}")
+def _solved(run: RunSettings, problem: EstimationProblem, folder: RunFolder, progress: Progress) -> Solution:
+    progress.begin_stage(f"solving for {len(problem.initial_unknowns)} unknowns by {run.solver.name}")
 
     def iterate(entry: Iterate) -> None:
-        folder.log("iterate", iteration=entry.iteration, cost=entry.cost, seconds=entry.seconds)
-        progress.iterate(entry)
+        folder.log_event("iterate", iteration=entry.iteration, cost=entry.cost, seconds=entry.seconds)
+        progress.report_iterate(entry)
 
-    return solve(problem, run.solver, callback=iterate, limits=run.diagnosis.of_a_fit)
+    return solve(problem, run.solver, callback=iterate, limits=run.diagnosis.fit_gap_limits)
 
 
 def _information(
     problem: EstimationProblem,
     solution: Solution | None,
-    asked: Question,
+    asked: IdentifiabilityOptions,
     progress: Progress,
-    limits: GapLimits,
-    elsewhere: Elsewhere | None,
-) -> Identifiability:
-    judged = partial(identifiability, problem, solution, start=asked.start, grasp_std=asked.grasp_std, limits=limits)
+    limits: GapCriteria,
+    elsewhere: IdentifiabilityTasks | None,
+) -> IdentifiabilityResult:
+    judged = partial(
+        identifiability, problem, solution, start=asked.start_knowledge, grasp_std=asked.grasp_offset_std, limits=limits
+    )
     information = judged()
     wanted = _wanted(problem, information, asked)
     if not wanted:
         return information
-    if elsewhere is not None and set(wanted) <= set(information.names):
-        progress.stage(f"intervals of {len(wanted)} parameters by profile likelihood")
-        return elsewhere.with_profiles(information, wanted)
+    if elsewhere is not None and set(wanted) <= set(information.parameter_names):
+        progress.begin_stage(f"intervals of {len(wanted)} parameters by profile likelihood")
+        return elsewhere.with_profile_likelihoods(information, wanted)
     return judged(intervals=wanted, progress=progress)
 
 
 def _ranking(
-    run: Run,
+    run: RunSettings,
     system: System,
     problem: EstimationProblem,
     solution: Solution | None,
-    asked: Question,
+    asked: IdentifiabilityOptions,
     progress: Progress,
-    elsewhere: Elsewhere | None,
-) -> WhatIf:
-    other = second_arm(run, system)
+    elsewhere: IdentifiabilityTasks | None,
+) -> ExperimentRanking:
+    other = system_with_second_arm(run, system)
     return what_if(
         problem,
         solution,
-        start=asked.start,
-        grasp_std=asked.grasp_std,
-        second_arm=None if other is None else with_grasp_offsets(other),
+        start=asked.start_knowledge,
+        grasp_std=asked.grasp_offset_std,
+        two_arm_system=None if other is None else with_grasp_offset_effects(other),
         progress=progress,
-        judge=None if elsewhere is None else elsewhere.judge(),
+        evaluate_changes=None if elsewhere is None else elsewhere.change_evaluator(),
     )
 
 
-def _wanted(problem: EstimationProblem, information: Identifiability, asked: Question) -> Sequence[str]:
+def _wanted(
+    problem: EstimationProblem, information: IdentifiabilityResult, asked: IdentifiabilityOptions
+) -> Sequence[str]:
     """Parameters whose intervals are worked out."""
-    if asked.intervals not in ("auto", "all"):
-        return asked.intervals
-    return information.names if asked.intervals == "all" or small(problem) else ()
+    if asked.interval_parameters not in ("auto", "all"):
+        return asked.interval_parameters
+    return information.parameter_names if asked.interval_parameters == "all" or is_small_problem(problem) else ()
 
 
-def identifiability_result(
+def _identifiability_result(
     problem: EstimationProblem,
     solution: Solution | None,
-    information: Identifiability | None,
-    unknown: Identifiability | None,
-    ranking: WhatIf | None,
-    asked: Question,
+    information: IdentifiabilityResult | None,
+    unknown: IdentifiabilityResult | None,
+    ranking: ExperimentRanking | None,
+    asked: IdentifiabilityOptions,
 ) -> dict[str, Any]:
     """`yid-identifiability/1` without inputs and versions."""
     result: dict[str, Any] = {
-        "format": FORMAT,
+        "format": _RESULT_FORMAT,
         "status": "not_solved" if solution is None else solution.status.value,
         "message": "judged at the initial values" if solution is None else solution.message,
-        "at": asked.at,
-        "start": asked.start,
-        "grasp_std": asked.grasp_std if problem.system.grasps else None,
+        "at": asked.evaluation_point,
+        "start": asked.start_knowledge,
+        "grasp_std": asked.grasp_offset_std if problem.system.grasps else None,
         "parameters": {},
         "correlations": {"names": [], "matrix": []},
         "directions": [],
         "nuisances": 0,
-        "fit": None if solution is None else asdict(solution.fit),
-        "doubts": doubts_result(problem.options.doubts),
+        "fit": None if solution is None else asdict(solution.goodness_of_fit),
+        "doubts": issues_result(problem.options.data_issues),
         "profiles": {},
         "what_if": None,
     }
@@ -263,24 +273,24 @@ def identifiability_result(
         spread = max(entry.std_relative, unsure.std_relative)
         own = {"std_relative_unknown": spread, "verdict_unknown": unsure.verdict}
         result["parameters"][name] = asdict(entry) | own
-    result["correlations"] = {"names": information.names, "matrix": information.correlations}
+    result["correlations"] = {"names": information.parameter_names, "matrix": information.correlations}
     result["directions"] = [asdict(direction) for direction in information.directions]
-    result["nuisances"] = len(information.nuisances)
+    result["nuisances"] = len(information.nuisance_names)
     result["profiles"] = {
         name: {"values": profile.values, "delta_chi2": profile.delta_chi2, "notes": profile.notes}
         for name, profile in information.profiles.items()
     }
     if ranking is not None:
         result["what_if"] = {
-            "base": _outcome(ranking.base),
-            "singles": [_outcome(entry) for entry in ranking.singles],
-            "smallest": [_outcome(entry) for entry in ranking.smallest],
-            "greedy": [_outcome(entry) for entry in ranking.greedy],
-            "searched": ranking.searched,
+            "base": _outcome(ranking.unchanged_experiment),
+            "singles": [_outcome(entry) for entry in ranking.single_changes],
+            "smallest": [_outcome(entry) for entry in ranking.smallest_sufficient_sets],
+            "greedy": [_outcome(entry) for entry in ranking.greedy_sequence],
+            "searched": ranking.n_evaluated_sets,
         }
     return result
 
 
-def _outcome(entry: Outcome) -> dict[str, Any]:
+def _outcome(entry: ChangedExperimentResult) -> dict[str, Any]:
     gain = entry.gain if entry.verdicts else None
     return asdict(entry) | {"gain": gain}

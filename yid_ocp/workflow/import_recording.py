@@ -11,15 +11,15 @@ from typing import Any
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import ImportSettings
-from yid_ocp.data import Recording, preview, read_any, write_recording
-from yid_ocp.data.readers.base import units_of
+from yid_ocp.data import Recording, preview_file, read_any, write_recording
+from yid_ocp.data.readers.base import parse_units
 from yid_ocp.errors import ConfigError
-from yid_ocp.progress import SILENT, Progress
-from yid_ocp.report.terminal import contents_summary, recording_summary
-from yid_ocp.workflow.command import DONE, print_json, print_lines, tell
-from yid_ocp.workflow.progress import shown
+from yid_ocp.progress import NULL_PROGRESS, Progress
+from yid_ocp.report.terminal import file_contents_lines, recording_summary_lines
+from yid_ocp.workflow.command_runner import EXIT_DONE, print_json, print_lines, print_result
+from yid_ocp.workflow.progress_display import show_progress
 
-FORMAT = "yid-import/1"
+_RESULT_FORMAT = "yid-import/1"
 _LISTS = {"joint_topics": "--joint-topic", "joints": "--joints"}
 _MAPPINGS: Mapping[str, tuple[str, Callable[[str], Any]]] = {
     "points": ("--points", str),
@@ -34,31 +34,35 @@ _SWITCHES = {("header", False): "--no-header", ("skip_bad_lines", True): "--skip
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     if arguments.preview:
-        with shown(arguments) as progress:
-            progress.stage(f"reading {arguments.file}")
-            contents = preview(arguments.file, progress)
-        options = {**contents.options, **given_options(arguments)}
-        lines = contents_summary(contents)
-        if not own(arguments.file):
-            lines += ["", "to import it:", f"  {command_line(arguments.file, options)}"]
+        with show_progress(arguments) as progress:
+            progress.begin_stage(f"reading {arguments.file}")
+            contents = preview_file(arguments.file, progress)
+        options = {**contents.reader_options, **reader_options_from_arguments(arguments)}
+        lines = file_contents_lines(contents)
+        if not is_recording_file(arguments.file):
+            lines += ["", "to import it:", f"  {_import_command_line(arguments.file, options)}"]
         if arguments.json:
-            print_json({"format": FORMAT, "recording": None, **asdict(contents)})
+            print_json({"format": _RESULT_FORMAT, "recording": None, **asdict(contents)})
         else:
             print_lines(lines)
-        return DONE
+        return EXIT_DONE
     if arguments.out is None:
         allowed = "--out RECORDING.h5, or --preview to look only"
         raise ConfigError("nothing says where to write the recording", where="--out", allowed=allowed)
     settings = load_config(arguments.config).import_ if arguments.config else ImportSettings()
-    with shown(arguments) as progress:
-        recording = imported(arguments.file, options_of_settings(settings) | given_options(arguments), progress)
+    with show_progress(arguments) as progress:
+        recording = read_foreign_recording(
+            arguments.file, _reader_options_from_settings(settings) | reader_options_from_arguments(arguments), progress
+        )
         write_recording(recording, arguments.out)
-    result = {"format": FORMAT, "recording": arguments.out, **recording_result(recording)}
-    tell(arguments, result, lambda: recording_summary(recording), f"recording: {arguments.out}", arguments.out)
-    return DONE
+    result = {"format": _RESULT_FORMAT, "recording": arguments.out, **recording_contents(recording)}
+    print_result(
+        arguments, result, lambda: recording_summary_lines(recording), f"recording: {arguments.out}", arguments.out
+    )
+    return EXIT_DONE
 
 
-def recording_result(recording: Recording) -> dict[str, Any]:
+def recording_contents(recording: Recording) -> dict[str, Any]:
     """Contents of a recording as plain data: duration, groups and notes."""
     return {
         "duration": recording.duration,
@@ -70,7 +74,9 @@ def recording_result(recording: Recording) -> dict[str, Any]:
     }
 
 
-def imported(file: str | Path, options: Mapping[str, Any], progress: Progress = SILENT) -> Recording:
+def read_foreign_recording(
+    file: str | Path, options: Mapping[str, Any], progress: Progress = NULL_PROGRESS
+) -> Recording:
     """Recording read from a file of another tool, with the file's hash in `source`.
 
     Parameters
@@ -85,25 +91,25 @@ def imported(file: str | Path, options: Mapping[str, Any], progress: Progress = 
     DataError
         As `read_any`.
     """
-    progress.stage(f"reading {file}")
+    progress.begin_stage(f"reading {file}")
     recording = read_any(file, progress=progress, **options)
-    if recording.sha256 is None or own(file):
+    if recording.sha256 is None or is_recording_file(file):
         return recording
     return replace(recording, source=f"{recording.source} (SHA-256 {recording.sha256})")
 
 
-def own(file: str | Path) -> bool:
+def is_recording_file(file: str | Path) -> bool:
     """Whether a file is a recording of this package, judged by its suffix."""
     return Path(file).suffix.lower() in (".h5", ".hdf5")
 
 
-def options_of_settings(settings: ImportSettings) -> dict[str, Any]:
+def _reader_options_from_settings(settings: ImportSettings) -> dict[str, Any]:
     """Reader options from the section `import` of the settings."""
     said = ((entry.name, getattr(settings, entry.name)) for entry in fields(settings))
     return {name: value for name, value in said if value is not None}
 
 
-def given_options(arguments: argparse.Namespace) -> dict[str, Any]:
+def reader_options_from_arguments(arguments: argparse.Namespace) -> dict[str, Any]:
     """Reader options from the command-line flags.
 
     Raises
@@ -120,7 +126,7 @@ def given_options(arguments: argparse.Namespace) -> dict[str, Any]:
         entries = _split(getattr(arguments, key))
         if entries:
             options[key] = _pairs(entries, flag, kind, numbered=key == "columns")
-    units = units_of(_split(arguments.units))
+    units = parse_units(_split(arguments.units))
     return options | ({"units": units} if units else {})
 
 
@@ -144,7 +150,7 @@ def _pairs(entries: Sequence[str], flag: str, kind: Callable[[str], Any], number
     return pairs
 
 
-def command_line(file: str | Path, options: Mapping[str, Any]) -> str:
+def _import_command_line(file: str | Path, options: Mapping[str, Any]) -> str:
     """Shell command that imports a file with the given reader options."""
     words = ["yid-ocp", "import", str(file)]
     for key, value in options.items():

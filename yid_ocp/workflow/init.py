@@ -9,24 +9,30 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.schema import schema
+from yid_ocp.config.schema import config_json_schema
 from yid_ocp.data import Recording, read_recording, write_recording
 from yid_ocp.errors import ConfigError, DataError, OutputError
-from yid_ocp.files import new_file, write_text
+from yid_ocp.files import atomic_write, write_text
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.progress import Progress
 from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.command import DONE, tell
-from yid_ocp.workflow.commented import Object, configuration
-from yid_ocp.workflow.import_recording import given_options, imported, own
-from yid_ocp.workflow.progress import shown
-from yid_ocp.workflow.proposal import Branch, Proposal, propose, relative, split_at_rest
+from yid_ocp.workflow.command_runner import EXIT_DONE, print_result
+from yid_ocp.workflow.commented_config import ObjectDescription, commented_config_text
+from yid_ocp.workflow.config_proposal import (
+    BranchDescription,
+    ConfigProposal,
+    propose_config,
+    relative_posix_path,
+    rest_split_time,
+)
+from yid_ocp.workflow.import_recording import is_recording_file, read_foreign_recording, reader_options_from_arguments
+from yid_ocp.workflow.progress_display import show_progress
 
-FORMAT = "yid-init/1"
-SCHEMA = "yid-ocp.schema.json"
-LINKS = {"cable": 8, "beam": 6, "tree": 4, "y": 4}
-NEEDED = {"cable": ("length", "mass", "radius"), "beam": ("length", "mass"), "tree": (), "y": ()}
-MEANING = {"length": "its length [m]", "mass": "its mass [kg]", "radius": "its radius [m]"}
+_RESULT_FORMAT = "yid-init/1"
+_SCHEMA_FILE = "yid-ocp.schema.json"
+_DEFAULT_LINKS = {"cable": 8, "beam": 6, "tree": 4, "foam_y": 4}
+_REQUIRED_OPTIONS = {"cable": ("length", "mass", "radius"), "beam": ("length", "mass"), "tree": (), "foam_y": ()}
+_OPTION_MEANINGS = {"length": "its length [m]", "mass": "its mass [kg]", "radius": "its radius [m]"}
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -35,35 +41,35 @@ def run(arguments: argparse.Namespace) -> int:
     if out.suffix not in (".yaml", ".yml"):
         raise ConfigError(f"the configuration is called '{out.name}'", where="--out", allowed="NAME.yaml")
     read_urdf(arguments.robot)
-    item = described(arguments)
-    with shown(arguments) as progress:
+    item = _object_from_arguments(arguments)
+    with show_progress(arguments) as progress:
         made = _recordings(arguments, out, progress)
     recordings = [recording or read_recording(file) for file, recording in made.items()]
-    proposal = propose(
+    proposal = propose_config(
         arguments.robot,
         recordings,
         item.branches,
         holder=arguments.holder,
         grasps=_grasps(arguments.grasp),
-        standing=item.kind == "y",
+        standing=item.kind == "foam_y",
     )
     made = _split(made, recordings, proposal, out)
     _refuse_existing([out, *(file for file, raw in made.items() if raw is not None)], arguments.replace)
-    imports = given_options(arguments)
+    imports = reader_options_from_arguments(arguments)
     robot = arguments.robot
-    where = robot if robot.startswith(("package:", "default:")) else relative(robot, out.parent)
-    files = [relative(file, out.parent) for file in made]
-    text = configuration(where, item, proposal, files, imports, SCHEMA)
+    where = robot if robot.startswith(("package:", "default:")) else relative_posix_path(robot, out.parent)
+    files = [relative_posix_path(file, out.parent) for file in made]
+    text = commented_config_text(where, item, proposal, files, imports, _SCHEMA_FILE)
     _write(out, text, {file: raw for file, raw in made.items() if raw is not None})
-    result = {"format": FORMAT, "configuration": str(out), "recordings": files, "proposal": asdict(proposal)}
-    tell(arguments, result, lambda: summary(proposal, out), f"configuration: {out}", str(out))
-    return DONE
+    result = {"format": _RESULT_FORMAT, "configuration": str(out), "recordings": files, "proposal": asdict(proposal)}
+    print_result(arguments, result, lambda: _summary_lines(proposal, out), f"configuration: {out}", str(out))
+    return EXIT_DONE
 
 
 # -- what was asked ---------------------------------------------------------------------------------------------------
 
 
-def described(arguments: argparse.Namespace) -> Object:
+def _object_from_arguments(arguments: argparse.Namespace) -> ObjectDescription:
     """Object description from the command-line options.
 
     Raises
@@ -72,11 +78,11 @@ def described(arguments: argparse.Namespace) -> Object:
         A number that is missing or impossible; the error names its option.
     """
     kind = arguments.object
-    links = LINKS[kind] if arguments.links is None else arguments.links
+    links = _DEFAULT_LINKS[kind] if arguments.links is None else arguments.links
     if not 1 <= links <= 64:
         raise ConfigError(f"the object has {links} links", where="--links", allowed="1 to 64")
-    if kind == "y":
-        return Object(kind, (), links)
+    if kind == "foam_y":
+        return ObjectDescription(kind, (), links)
     for name in ("length", "mass", "radius"):
         value = getattr(arguments, name)
         if value is not None and not 0 < value < float("inf"):
@@ -84,13 +90,13 @@ def described(arguments: argparse.Namespace) -> Object:
     if arguments.branch:
         if kind != "tree":
             raise ConfigError(f"a {kind} has no branches", where="--branch", allowed="--object tree")
-        return Object(kind, _grown([_branch(text) for text in arguments.branch]), links)
-    needed = ("length", "mass", "radius") if kind == "tree" and arguments.branches else NEEDED[kind]
+        return ObjectDescription(kind, _grown([_branch(text) for text in arguments.branch]), links)
+    needed = ("length", "mass", "radius") if kind == "tree" and arguments.branches else _REQUIRED_OPTIONS[kind]
     section = _numbers(arguments.section, 2, "--section") if arguments.section else None
     for name in needed:
         if getattr(arguments, name) is None:
             what = f"each branch of a tree needs a {name}" if kind == "tree" else f"a {kind} needs a {name}"
-            raise ConfigError(what, where=f"--{name}", allowed=MEANING[name], hint=f"add --{name} NUMBER")
+            raise ConfigError(what, where=f"--{name}", allowed=_OPTION_MEANINGS[name], hint=f"add --{name} NUMBER")
     if kind == "tree" and not arguments.branches:
         raise ConfigError(
             "a tree needs branches",
@@ -100,26 +106,30 @@ def described(arguments: argparse.Namespace) -> Object:
         )
     if kind == "beam" and section is None and arguments.radius is None:
         hint = "add --radius NUMBER, or --section WIDTH,HEIGHT"
-        raise ConfigError("a beam needs a radius or a section", where="--radius", allowed=MEANING["radius"], hint=hint)
+        raise ConfigError(
+            "a beam needs a radius or a section", where="--radius", allowed=_OPTION_MEANINGS["radius"], hint=hint
+        )
     size = None if section is None else (section[0], section[1])
     if kind != "tree":
         radius = None if size else arguments.radius
-        return Object(kind, (Branch(kind, arguments.length, arguments.mass, radius, size),), links)
-    return Object(kind, _star(arguments.branches, arguments.length, arguments.mass, arguments.radius), links)
+        return ObjectDescription(
+            kind, (BranchDescription(kind, arguments.length, arguments.mass, radius, size),), links
+        )
+    return ObjectDescription(kind, _star(arguments.branches, arguments.length, arguments.mass, arguments.radius), links)
 
 
-def _star(count: int, length: float, mass: float, radius: float) -> tuple[Branch, ...]:
+def _star(count: int, length: float, mass: float, radius: float) -> tuple[BranchDescription, ...]:
     """Equal branches across the z axis of what holds them, the first one along its x axis."""
     if not 1 <= count <= 16:
         raise ConfigError(f"the tree has {count} branches", where="--branches", allowed="1 to 16")
     quarter = 1.5707963
     return tuple(
-        Branch(f"b{i + 1}", length, mass, radius, rpy=(0.0, quarter, round(4 * quarter * i / count, 7)))
+        BranchDescription(f"b{i + 1}", length, mass, radius, rpy=(0.0, quarter, round(4 * quarter * i / count, 7)))
         for i in range(count)
     )
 
 
-def _grown(branches: Sequence[Branch]) -> tuple[Branch, ...]:
+def _grown(branches: Sequence[BranchDescription]) -> tuple[BranchDescription, ...]:
     """The branches, each with a name of its own and on one that comes before it."""
     names: list[str] = []
     for branch in branches:
@@ -132,7 +142,7 @@ def _grown(branches: Sequence[Branch]) -> tuple[Branch, ...]:
     return tuple(branches)
 
 
-def _branch(text: str) -> Branch:
+def _branch(text: str) -> BranchDescription:
     said, equals, numbers = text.partition("=")
     name, at, parent = said.partition("@")
     shape = "NAME=LENGTH,MASS,RADIUS, or with ROLL,PITCH,YAW; NAME@PARENT grows on the end of PARENT"
@@ -143,7 +153,7 @@ def _branch(text: str) -> Branch:
     if min(values[:3]) <= 0:
         raise ConfigError(f"'{text}' has a size that is not above 0", where="--branch", allowed=shape)
     turn = (values[3], values[4], values[5]) if count == 6 else (0.0, 0.0, 0.0)
-    return Branch(name, values[0], values[1], values[2], rpy=turn, parent=parent or None)
+    return BranchDescription(name, values[0], values[1], values[2], rpy=turn, parent=parent or None)
 
 
 def _numbers(text: str, count: int, flag: str) -> list[float]:
@@ -171,17 +181,17 @@ def _grasps(given: Sequence[str]) -> dict[str, str]:
 
 def _recordings(arguments: argparse.Namespace, out: Path, progress: Progress) -> dict[Path, Recording | None]:
     """Files of the recordings; with what is to be written there where they are of another tool."""
-    options = given_options(arguments)
+    options = reader_options_from_arguments(arguments)
     made: dict[Path, Recording | None] = {}
     for name in arguments.files:
         file = Path(name)
-        if own(file):
+        if is_recording_file(file):
             if options:
                 flags = ", ".join(options)
                 raise ConfigError(f"{file.name} is a recording already", where=flags, hint="leave these options out")
             made[file] = None
         else:
-            recording = imported(file, options, progress)
+            recording = read_foreign_recording(file, options, progress)
             made[out.parent / f"{recording.name}.h5"] = recording
     if len(made) < len(arguments.files):
         raise DataError("two of the files would become one recording", where=", ".join(arguments.files))
@@ -189,13 +199,13 @@ def _recordings(arguments: argparse.Namespace, out: Path, progress: Progress) ->
 
 
 def _split(
-    made: dict[Path, Recording | None], recordings: Sequence[Recording], proposal: Proposal, out: Path
+    made: dict[Path, Recording | None], recordings: Sequence[Recording], proposal: ConfigProposal, out: Path
 ) -> dict[Path, Recording | None]:
     """A single recording in two files where it comes to rest in between, the second one to be held out."""
     if len(recordings) > 1:
         return made
     [whole] = recordings
-    time = split_at_rest(whole, proposal.joints)
+    time = rest_split_time(whole, proposal.joints)
     if time is None:
         return made
     first, last = (min(g.t[0] for g in whole.groups), max(g.t[-1] for g in whole.groups))
@@ -203,7 +213,7 @@ def _split(
     parts = {"estimate": (first, time), "held_out": (time, last)}
     return {
         out.parent / f"{whole.name}_{name}.h5": replace(
-            whole.slice(*span), name=f"{whole.name}_{name}", notes=(*whole.notes, note.format(*span))
+            whole.time_slice(*span), name=f"{whole.name}_{name}", notes=(*whole.notes, note.format(*span))
         )
         for name, span in parts.items()
     }
@@ -221,26 +231,26 @@ def _write(out: Path, text: str, made: Mapping[Path, Recording]) -> None:
     try:
         for file, recording in made.items():
             write_recording(recording, file)
-        with new_file(out) as temporary:
+        with atomic_write(out) as temporary:
             temporary.write_text(text, encoding="utf-8")
             build_system(load_config(temporary))
     except BaseException:
         for file in set(made) - before:
             file.unlink(missing_ok=True)
         raise
-    write_text(out.parent / SCHEMA, json.dumps(schema(), indent=1) + "\n")
+    write_text(out.parent / _SCHEMA_FILE, json.dumps(config_json_schema(), indent=1) + "\n")
 
 
-def summary(proposal: Proposal, out: Path) -> list[str]:
+def _summary_lines(proposal: ConfigProposal, out: Path) -> list[str]:
     """Text lines on the proposed configuration and the next commands."""
-    held = ", ".join(dict.fromkeys([proposal.holder, *proposal.grasps]))
+    held = ", ".join(dict.fromkeys([proposal.holder_frame, *proposal.grasps]))
     lines = [
         f"joints: {', '.join(proposal.joints)}",
         f"held by: {held}",
-        f"mode: {proposal.mode}: {proposal.mode_why}",
-        f"start: {proposal.start}: {proposal.start_why}",
+        f"mode: {proposal.arm_mode}: {proposal.arm_mode_reason}",
+        f"start: {proposal.initial_state}: {proposal.initial_state_reason}",
     ]
-    for group, places in proposal.places.items():
-        lines += [f"{group}: {place.point} at {place.frame or '?'}, {place.why}" for place in places]
+    for group, places in proposal.point_placements.items():
+        lines += [f"{group}: {place.point} at {place.frame or '?'}, {place.reason}" for place in places]
     lines += ["", f"next: yid-ocp check {out}, then yid-ocp solve {out}", ""]
     return lines

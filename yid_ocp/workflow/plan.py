@@ -1,4 +1,4 @@
-"""The command `plan`: plans an arm motion with the identified model and writes it for simulation and robot."""
+"""The command `plan_motion`: plans an arm motion with the identified model and writes it for simulation and robot."""
 
 from __future__ import annotations
 
@@ -14,54 +14,59 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import Run
-from yid_ocp.data.hdf5 import write_recording
-from yid_ocp.data.hdf5_file import open_hdf5
-from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate
-from yid_ocp.export.csv import export_csv
-from yid_ocp.export.trajectory import joint_trajectory
+from yid_ocp.config.settings import RunSettings
+from yid_ocp.data.hdf5_io import open_checked_hdf5
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate_recording
+from yid_ocp.data.recording_hdf5 import write_recording
+from yid_ocp.export.csv_tables import export_csv
+from yid_ocp.export.ros_trajectory import joint_trajectory_message
 from yid_ocp.integrator.step import Step
-from yid_ocp.planning.information import InformationPlan
-from yid_ocp.planning.plan import Known, Plan, plan
-from yid_ocp.problem.grid import make_grid
-from yid_ocp.problem.inputs import prescribed_path
-from yid_ocp.problem.low_pass import LowPass
-from yid_ocp.progress import SILENT, Progress
-from yid_ocp.report.scene import Scene, Told, scene
+from yid_ocp.planning.information_plan import InformativeMotionPlan
+from yid_ocp.planning.motion_plan import MotionPlan, ParameterCovariance, plan_motion
+from yid_ocp.problem.low_pass_filter import LowPassFilter
+from yid_ocp.problem.recorded_inputs import prescribed_path
+from yid_ocp.problem.time_grid import make_time_grid
+from yid_ocp.progress import NULL_PROGRESS, Progress
+from yid_ocp.report.animation import Animation, ModelTrajectory, make_animation
 from yid_ocp.report.summaries import plan_summary
-from yid_ocp.workflow.build import build_cable, build_step, located, parameter_settings, read_recordings
-from yid_ocp.workflow.command import DONE, FAILED, carry_out
-from yid_ocp.workflow.folder import new_run_folder
-from yid_ocp.workflow.information import information_result, informed, refuse_other_effects, run_result
+from yid_ocp.workflow.build import build_cable, build_step, locate_errors, parameter_settings, read_recordings
+from yid_ocp.workflow.command_runner import EXIT_DONE, EXIT_FAILED, run_and_print
+from yid_ocp.workflow.information_planning import (
+    information_plan_result,
+    plan_from_settings,
+    read_parameter_run,
+    require_same_effects,
+)
+from yid_ocp.workflow.run_folder import new_run_folder
 
-FORMAT = "yid-plan/1"
-EFFORT_STD, POINT_STD = 0.1, 1e-3  # stated in the recording of a plan, for whoever estimates on it [N m], [m]
+_RESULT_FORMAT = "yid-plan/1"
+_EFFORT_STD, _POINT_STD = 0.1, 1e-3  # stated in the recording of a plan, for whoever estimates on it [N m], [m]
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class PlanOutcome:
+class PlanCommandResult:
     """Result of `run_plan`: the run folder, the contents of result.json and the plan."""
 
     folder: Path
     result: dict[str, Any]
-    plan: Plan | InformationPlan
+    plan: MotionPlan | InformativeMotionPlan
 
     @property
-    def ok(self) -> bool:
+    def is_successful(self) -> bool:
         """Whether the goal was reached within all limits."""
-        return self.plan.reached
+        return self.plan.is_successful
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     settings = load_config(arguments.config, arguments.overrides)
-    outcome = carry_out(lambda shown: run_plan(settings, arguments.out, shown), plan_summary, arguments)
-    return DONE if outcome.ok else FAILED
+    outcome = run_and_print(lambda shown: run_plan(settings, arguments.out, shown), plan_summary, arguments)
+    return EXIT_DONE if outcome.is_successful else EXIT_FAILED
 
 
-def run_plan(run: Run, out: str | Path | None = None, progress: Progress = SILENT) -> PlanOutcome:
-    """Plan the motion of `plan` and write `recording.h5`, CSV tables, `trajectory.json`, result.json and the report.
+def run_plan(run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS) -> PlanCommandResult:
+    """Plan the motion of `plan_motion` and write `recording.h5`, CSV tables, `trajectory.json`, result.json and the report.
 
     Parameters
     ----------
@@ -80,33 +85,38 @@ def run_plan(run: Run, out: str | Path | None = None, progress: Progress = SILEN
     ConfigError, DataError, ModelError, OutputError
     """
     with new_run_folder(run, out, "plan") as folder:
-        folder.begin(run, "plan")
-        progress.stage("building the model and its compiled step")
-        found: Plan | InformationPlan
+        folder.begin_run(run, "plan")
+        progress.begin_stage("building the model and its compiled step")
+        found: MotionPlan | InformativeMotionPlan
         if run.plan.goal == "information":
-            found, source = informed(run, progress)
+            found, source = plan_from_settings(run, progress)
         else:
-            step = planning_step(run)
-            theta, known, source = identified(run, step)
-            options = replace(run.plan, posture=start_posture(run, step))
-            with located(run, "plan"):
-                found = plan(step, options, theta, known, progress)
-        recording = as_recording(run, found)
+            step = compile_planning_step(run)
+            theta, known, source = identified_parameters(run, step)
+            options = replace(run.plan, start_joint_positions=start_configuration(run, step))
+            with locate_errors(run, "plan"):
+                found = plan_motion(step, options, theta, known, progress)
+        recording = _plan_as_recording(run, found)
         write_recording(recording, folder.path / "recording.h5")
         export_csv(recording, folder.path / "csv")
-        trajectory = joint_trajectory(
-            found.joints, found.t, found.position, found.velocity, found.acceleration, found.effort
+        trajectory = joint_trajectory_message(
+            found.joint_names,
+            found.t,
+            found.joint_positions,
+            found.joint_velocities,
+            found.joint_accelerations,
+            found.joint_efforts,
         )
-        folder.write("trajectory.json", json.dumps(trajectory, indent=1) + "\n")
-        folder.log("end", reached=found.reached, message=found.message)
-        told = plan_result(run, found) if isinstance(found, Plan) else information_result(run, found)
-        written = folder.finish(motion_result(run, found, source) | told)
-        more = {"plan" if isinstance(found, Plan) else "information": found}
-        folder.report(run, written, progress, scenes=_scenes(found), more=more)
-    return PlanOutcome(folder.path, written, found)
+        folder.write_text_file("trajectory.json", json.dumps(trajectory, indent=1) + "\n")
+        folder.log_event("end", reached=found.is_successful, message=found.message)
+        told = _plan_result(run, found) if isinstance(found, MotionPlan) else information_plan_result(run, found)
+        written = folder.write_result(_motion_result(run, found, source) | told)
+        more = {"plan" if isinstance(found, MotionPlan) else "information": found}
+        folder.write_report_page(run, written, progress, animations=_scenes(found), section_data=more)
+    return PlanCommandResult(folder.path, written, found)
 
 
-def planning_step(run: Run) -> Step:
+def compile_planning_step(run: RunSettings) -> Step:
     """The compiled step of a run with prescribed arms, for planning."""
     arms = replace(run.model.arms, mode="prescribed")
     model = replace(run.model, arms=arms)
@@ -114,7 +124,7 @@ def planning_step(run: Run) -> Step:
     return build_step(replace(run, model=model, recordings=recordings))
 
 
-def start_posture(run: Run, step: Step) -> Mapping[str, float] | None:
+def start_configuration(run: RunSettings, step: Step) -> Mapping[str, float] | None:
     """Joint positions at the start of the motion: from the settings, else from the first recording.
 
     None where neither says it: then it begins where the arms first grasp the undeformed object. Two arms that hold a
@@ -125,17 +135,17 @@ def start_posture(run: Run, step: Step) -> Mapping[str, float] | None:
     DataError
         The recording does not hold a joint that moves.
     """
-    if run.plan.posture is not None or not run.recordings.estimate:
-        return run.plan.posture
+    if run.plan.start_joint_positions is not None or not run.recordings.estimate:
+        return run.plan.start_joint_positions
     recording, cable, system = read_recordings(run, "estimate")[0], build_cable(run), step.system
-    clamps = () if cable is None else cable.clamps
-    grid = make_grid(recording, step.time_step, run.problem.duration)
-    with located(run, "recordings", "estimate", 0):
-        path = prescribed_path(recording, system, grid, LowPass(run.problem.path_cutoff), clamps)
+    clamps = () if cable is None else cable.clamp_paths
+    grid = make_time_grid(recording, step.time_step, run.problem.duration)
+    with locate_errors(run, "recordings", "estimate", 0):
+        path = prescribed_path(recording, system, grid, LowPassFilter(run.problem.path_cutoff), clamps)
     return dict(zip(system.prescribed, map(float, path[0]), strict=True))
 
 
-def identified(run: Run, step: Step) -> tuple[Array, Known, dict[str, Any]]:
+def identified_parameters(run: RunSettings, step: Step) -> tuple[Array, ParameterCovariance, dict[str, Any]]:
     """Parameters, their covariance, and where both come from: a run folder of `solve`, or the settings.
 
     Raises
@@ -145,16 +155,20 @@ def identified(run: Run, step: Step) -> tuple[Array, Known, dict[str, Any]]:
     """
     parameters = step.system.parameters
     theta = parameters.vector()
-    if run.plan.run is None:
+    if run.plan.parameter_run is None:
         free = [name for name, said in parameter_settings(run, parameters).items() if said.free]
-        return theta, Known(), {"run": None, "parameters": {name: parameters[name].value for name in free}}
-    result, folder = run_result(run, ("solve",))
+        return (
+            theta,
+            ParameterCovariance(),
+            {"run": None, "parameters": {name: parameters[name].value for name in free}},
+        )
+    result, folder = read_parameter_run(run, ("solve",))
     solved = folder / "trajectories.h5"
-    refuse_other_effects(run, result["parameters"], parameters.names)
+    require_same_effects(run, result["parameters"], parameters.names)
     found = {name: entry["value"] for name, entry in result["parameters"].items() if name in parameters}
     for name, value in found.items():
         theta[parameters.index(name)] = value
-    with open_hdf5(solved) as data:
+    with open_checked_hdf5(solved) as data:
         names = [str(name) for name in data["unknowns"].attrs["names"]]
         covariance = np.array(data["unknowns/covariance"])
     usable = [i for i, name in enumerate(names) if name in found and np.all(np.isfinite(covariance[i, i]))]
@@ -162,71 +176,78 @@ def identified(run: Run, step: Step) -> tuple[Array, Known, dict[str, Any]]:
     lost = [name for name in lost if name not in [names[i] for i in usable]]
     chosen = np.nan_to_num(covariance[np.ix_(usable, usable)])
     source = {"run": str(folder), "parameters": found, "uncertainty_unknown": lost}
-    return theta, Known(tuple(names[i] for i in usable), chosen), source
+    return theta, ParameterCovariance(tuple(names[i] for i in usable), chosen), source
 
 
-def as_recording(run: Run, found: Plan | InformationPlan) -> Recording:
+def _plan_as_recording(run: RunSettings, found: MotionPlan | InformativeMotionPlan) -> Recording:
     """The planned motion as a recording: joints, and object points predicted by the model."""
     joints = JointGroup(
-        found.joints, found.t, found.position, found.velocity, found.effort,
-        position_command=found.position, velocity_command=found.velocity, effort_kind="sample",
-        effort_std=EFFORT_STD, clock="nominal",
+        found.joint_names, found.t, found.joint_positions, found.joint_velocities, found.joint_efforts,
+        position_command=found.joint_positions, velocity_command=found.joint_velocities, effort_kind="sample",
+        effort_std=_EFFORT_STD, clock="nominal",
     )  # fmt: skip
-    names = tuple(found.points)
+    names = tuple(found.point_trajectories)
     points: tuple[PointGroup, ...] = ()
     if names:
-        position = np.stack([found.points[name] for name in names], axis=1)
-        std = np.full(position.shape, POINT_STD)
+        position = np.stack([found.point_trajectories[name] for name in names], axis=1)
+        std = np.full(position.shape, _POINT_STD)
         points = (PointGroup("points_planned", names, found.t, position, std, sensor="plan"),)
-    truth = dict(zip(found.mover.step.system.parameters.names, map(float, found.mover.theta), strict=True))
+    truth = dict(zip(found.simulator.step.system.parameters.names, map(float, found.simulator.theta), strict=True))
     text = f"{run.description} Planned motion, goal {run.plan.goal}.".strip()
-    return validate(Recording(joints, points, text, "yid_ocp plan", "recording", truth=truth))
+    return validate_recording(Recording(joints, points, text, "yid_ocp plan", "recording", true_parameters=truth))
 
 
-def motion_result(run: Run, found: Plan | InformationPlan, source: dict[str, Any]) -> dict[str, Any]:
+def _motion_result(
+    run: RunSettings, found: MotionPlan | InformativeMotionPlan, source: dict[str, Any]
+) -> dict[str, Any]:
     """Entries of `yid-plan/1` common to all goals, without inputs and versions."""
-    joints = found.mover.step.system.mechanism.joints
-    limits = [joints[i] for i in found.mover.joints]
+    joints = found.simulator.step.system.mechanism.joints
+    limits = [joints[i] for i in found.simulator.joint_indices]
     shares = {
         joint.name: {
-            "velocity": _share(found.velocity[:, i], joint.velocity_limit),
-            "effort": _share(found.effort[:, i], joint.effort_limit),
-            "travel": float(np.ptp(found.position[:, i])),
+            "velocity": _share(found.joint_velocities[:, i], joint.velocity_limit),
+            "effort": _share(found.joint_efforts[:, i], joint.effort_limit),
+            "travel": float(np.ptp(found.joint_positions[:, i])),
         }
         for i, joint in enumerate(limits)
     }
     return {
-        "format": FORMAT,
-        "status": "done" if found.reached else "failed",
+        "format": _RESULT_FORMAT,
+        "status": "done" if found.is_successful else "failed",
         "message": found.message,
         "goal": run.plan.goal,
-        "duration": found.mover.path.duration,
-        "settle": run.plan.settle,
+        "duration": found.simulator.path.duration,
+        "settle": run.plan.hold_duration,
         "joints": shares,
         "from": source,
     }
 
 
-def plan_result(run: Run, found: Plan) -> dict[str, Any]:
+def _plan_result(run: RunSettings, found: MotionPlan) -> dict[str, Any]:
     """Entries of `yid-plan/1` for a point that is moved to a target."""
     return {
         "point": run.plan.point,
-        "place": found.place.tolist(),
-        "error": found.error,
-        "swing": found.swing,
-        "off_path": found.off_path,
-        "time_step": found.mover.step.time_step,
-        "std": None if found.std is None else found.std.tolist(),
-        "tolerance": run.plan.tolerance,
-        "evaluations": found.evaluations,
+        "place": found.target_position.tolist(),
+        "error": found.max_position_error,
+        "swing": found.max_residual_speed,
+        "off_path": found.max_path_deviation,
+        "time_step": found.simulator.step.time_step,
+        "std": None if found.end_position_std is None else found.end_position_std.tolist(),
+        "tolerance": run.plan.position_tolerance,
+        "evaluations": found.n_evaluations,
     }
 
 
-def _scenes(found: Plan | InformationPlan) -> list[Scene]:
+def _scenes(found: MotionPlan | InformativeMotionPlan) -> list[Animation]:
     """The planned motion, as the model has it."""
-    system = found.mover.step.system
-    state = found.state if isinstance(found, Plan) else found.rollout.state
-    return [scene("planned", [Told("planned", system, found.mover.theta, found.t, state[:, : system.size])])]
+    system = found.simulator.step.system
+    state = found.state_trajectory if isinstance(found, MotionPlan) else found.rollout.state
+    return [
+        make_animation(
+            "planned",
+            [ModelTrajectory("planned", system, found.simulator.theta, found.t, state[:, : system.n_coordinates])],
+        )
+    ]
 
 
 def _share(values: Array, limit: float) -> float | None:

@@ -11,22 +11,22 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.config.settings import Run
+from yid_ocp.config.settings import RunSettings
 from yid_ocp.effects import EFFECTS
 from yid_ocp.errors import ConfigError, YidError
 from yid_ocp.files import file_sha256
 from yid_ocp.registry import Registry
-from yid_ocp.sensors import SENSORS
+from yid_ocp.sensors import SENSOR_READERS
 
-GROUP = "yid_ocp.effects"
+_ENTRY_POINT_GROUP = "yid_ocp.effects"
 """Entry points of this group are modules that register effects or sensors when they are imported."""
 
-_REGISTRIES: tuple[Registry[Any], ...] = (EFFECTS, SENSORS)
+_REGISTRIES: tuple[Registry[Any], ...] = (EFFECTS, SENSOR_READERS)
 _loaded: dict[str, str] = {}  # what this process has run: file or entry point, and the hash or distribution
 
 
-def load_plugins(run: Run) -> None:
-    """Import the files of `plugins` and the entry points of `GROUP`, each once per process.
+def load_plugins(run: RunSettings) -> None:
+    """Import the files of `plugins` and the entry points of `_ENTRY_POINT_GROUP`, each once per process.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def load_plugins(run: Run) -> None:
             with _registering(name, f"{entry.value} of {of}", "update that package, or remove it", None, imported):
                 entry.load()
             _loaded[name] = of
-    for path, where in plugin_files(run):
+    for path, where in _plugin_files(run):
         name, digest = str(path.resolve()), file_sha256(path)
         if _loaded.get(name, digest) != digest:
             raise ConfigError("the plug-in changed after it was loaded", where=where, hint="start a new Python")
@@ -55,13 +55,13 @@ def load_plugins(run: Run) -> None:
             _loaded[name] = digest
 
 
-def plugin_files(run: Run) -> list[tuple[Path, str]]:
+def _plugin_files(run: RunSettings) -> list[tuple[Path, str]]:
     """Plug-in files, each with the location of its setting."""
-    return [(Path(path), run.where("plugins", i)) for i, path in enumerate(run.plugins)]
+    return [(Path(path), run.describe_location("plugins", i)) for i, path in enumerate(run.plugins)]
 
 
 def plugin_versions() -> dict[str, str]:
-    """Package and version of every entry point of `GROUP`."""
+    """Package and version of every entry point of `_ENTRY_POINT_GROUP`."""
     return {f"entry point {entry.name}": _distribution(entry) for entry in _installed()}
 
 
@@ -70,7 +70,7 @@ def _distribution(entry: metadata.EntryPoint) -> str:
 
 
 def _installed() -> Sequence[metadata.EntryPoint]:
-    return sorted(metadata.entry_points(group=GROUP), key=lambda entry: entry.name)
+    return sorted(metadata.entry_points(group=_ENTRY_POINT_GROUP), key=lambda entry: entry.name)
 
 
 def _run(path: Path, digest: str) -> None:
@@ -107,7 +107,7 @@ def _registering(
             )
     except (Exception, SystemExit) as error:
         for registry, known in zip(_REGISTRIES, before, strict=True):
-            registry.forget(set(registry) - known)
+            registry.unregister(set(registry) - known)
         if isinstance(error, YidError):
             raise ConfigError(
                 f"the {name} cannot be used: {error.what}" if error.where != where else error.what,

@@ -9,40 +9,40 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.analysis.history import History, history
-from yid_ocp.config.settings import Run
+from yid_ocp.analysis.estimate_history import EstimateHistory, assess_drift
+from yid_ocp.config.settings import RunSettings
 from yid_ocp.errors import ConfigError
 from yid_ocp.files import file_sha256
-from yid_ocp.progress import SILENT, Progress
+from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.html import write_report
-from yid_ocp.report.sections import Findings
+from yid_ocp.report.sections import ReportData
 from yid_ocp.report.summaries import history_summary
-from yid_ocp.version import versions
-from yid_ocp.workflow.baseline import read_estimates, refuse_unlike
-from yid_ocp.workflow.command import DONE, carry_out
-from yid_ocp.workflow.folder import new_run_folder, now
+from yid_ocp.version import installed_versions
+from yid_ocp.workflow.baseline_runs import read_estimates, require_same_model
+from yid_ocp.workflow.command_runner import EXIT_DONE, run_and_print
+from yid_ocp.workflow.run_folder import local_time_text, new_run_folder
 
-FORMAT = "yid-history/1"
+_RESULT_FORMAT = "yid-history/1"
 
 
 @dataclass(frozen=True)
-class ReportOutcome:
+class ReportCommandResult:
     """Result of `run_report`: the folder, contents of history.json and the history."""
 
     folder: Path
     result: dict[str, Any]
-    history: History
+    history: EstimateHistory
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    carry_out(lambda shown: run_report(arguments.runs, arguments.out, shown), history_summary, arguments)
-    return DONE
+    run_and_print(lambda shown: run_report(arguments.runs, arguments.out, shown), history_summary, arguments)
+    return EXIT_DONE
 
 
 def run_report(
-    folders: Sequence[str | Path], out: str | Path | None = None, progress: Progress = SILENT
-) -> ReportOutcome:
+    folders: Sequence[str | Path], out: str | Path | None = None, progress: Progress = NULL_PROGRESS
+) -> ReportCommandResult:
     """Compare runs of one model and write `history.json` and report.html.
 
     Parameters
@@ -74,54 +74,54 @@ def run_report(
     if twice:
         raise ConfigError("a run is given twice, and would count twice", where=twice[0], hint="list every run once")
     estimates = [read_estimates(path) for path in paths]
-    refuse_unlike(paths)
-    progress.stage(f"comparing {len(paths)} runs")
-    found = history(estimates)
-    with new_run_folder(Run(name="history"), out, "report") as folder:
+    require_same_model(paths)
+    progress.begin_stage(f"comparing {len(paths)} runs")
+    found = assess_drift(estimates)
+    with new_run_folder(RunSettings(name="history"), out, "report") as folder:
         inputs = {str(path): file_sha256(path / "result.json") for path in paths}
-        folder.log("start", command="report", versions=versions(), inputs=inputs)
+        folder.log_event("start", command="report", versions=installed_versions(), inputs=inputs)
         again = shlex.join(["yid-ocp", "report", *map(str, folders)])
-        made = {"command": again, "date": now(), "inputs": inputs, "versions": versions()}
+        made = {"command": again, "date": local_time_text(), "inputs": inputs, "versions": installed_versions()}
         result = history_result(found) | made
-        written = folder.write_json("history.json", result)
-        progress.stage("writing the report")
-        write_report(folder.path / "report.html", Findings("history", "Runs of one model side by side.", written))
-    return ReportOutcome(folder.path, written, found)
+        written = folder.write_json_file("history.json", result)
+        progress.begin_stage("writing the report")
+        write_report(folder.path / "report.html", ReportData("history", "Runs of one model side by side.", written))
+    return ReportCommandResult(folder.path, written, found)
 
 
-def history_result(found: History) -> dict[str, Any]:
+def history_result(found: EstimateHistory) -> dict[str, Any]:
     """`yid-history/1` without inputs and versions."""
     return {
-        "format": FORMAT,
-        "level": found.level,
+        "format": _RESULT_FORMAT,
+        "level": found.significance_level,
         "chi2": found.chi2,
-        "degrees": found.degrees,
+        "degrees": found.degrees_of_freedom,
         "p_value": found.p_value,
         "runs": [
             {
-                "name": entry.run,
+                "name": entry.run_name,
                 "chi2": entry.chi2,
-                "degrees": entry.degrees,
+                "degrees": entry.degrees_of_freedom,
                 "p_value": entry.p_value,
-                "worst": entry.worst,
-                "explains": entry.explains,
-                "distrusted": entry.distrusted,
+                "worst": entry.worst_parameter,
+                "explains": entry.is_fit_adequate,
+                "distrusted": entry.is_outlier,
             }
-            for entry in found.against
+            for entry in found.run_consistencies
         ],
         "parameters": {
             entry.name: {
                 "unit": entry.unit,
                 "values": {
                     run: {"value": value, "std": std}
-                    for run, value, std in zip(entry.runs, entry.values, entry.std, strict=True)
+                    for run, value, std in zip(entry.run_names, entry.values, entry.std, strict=True)
                 },
                 "mean": entry.mean,
                 "mean_std": entry.mean_std,
                 "chi2": entry.chi2,
                 "p_value": entry.p_value,
-                "drifted": entry.drifted,
+                "drifted": entry.has_drifted,
             }
-            for entry in found.parameters
+            for entry in found.parameter_drifts
         },
     }

@@ -1,4 +1,4 @@
-"""The command `schema`: the JSON Schema of configuration files, for editors."""
+"""The command `config_json_schema`: the JSON Schema of configuration files, for editors."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import argparse
 import json
 from pathlib import Path
 
-from yid_ocp.config.schema import schema
+from yid_ocp.config.schema import config_json_schema
 from yid_ocp.files import write_text
-from yid_ocp.workflow.command import DONE
+from yid_ocp.workflow.command_runner import EXIT_DONE
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    text = json.dumps(schema(), indent=1)
+    text = json.dumps(config_json_schema(), indent=1)
     if arguments.out is None:
         print(text)
-        return DONE
+        return EXIT_DONE
     write_text(Path(arguments.out), text + "\n")
     print(arguments.out)
-    return DONE
+    return EXIT_DONE

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from yid_ocp.config.settings import GraspSettings, Run
+from yid_ocp.config.settings import GraspSettings, RunSettings
 from yid_ocp.errors import YidError
 from yid_ocp.model.system import System
 from yid_ocp.workflow.build import build_system
 
-OTHER_SIDE = {"left": "right", "right": "left"}
+_OTHER_SIDE = {"left": "right", "right": "left"}
 
 
-def second_arm(run: Run, system: System) -> System | None:
+def system_with_second_arm(run: RunSettings, system: System) -> System | None:
     """The run's system with the second arm at a free end of the object; None where impossible."""
     model = run.model
     joints = model.arms.joints
@@ -20,19 +20,21 @@ def second_arm(run: Run, system: System) -> System | None:
         return None
     side, grasp = next(iter(model.grasp.items()))
     prefix = f"{side}_"
-    if side not in OTHER_SIDE or not all(name.startswith(prefix) for name in (*joints, grasp.holder)):
+    if side not in _OTHER_SIDE or not all(name.startswith(prefix) for name in (*joints, grasp.holder_frame)):
         return None
-    parents = {segment.parent for segment in system.segments}
-    free = [f"w_{s.name}" for s in system.segments if s.name not in parents and f"w_{s.name}" != grasp.held]
+    parents = {segment.parent_segment for segment in system.segment_layouts}
+    free = [
+        f"w_{s.name}" for s in system.segment_layouts if s.name not in parents and f"w_{s.name}" != grasp.held_frame
+    ]
     if not free:
         return None
 
     def mirrored(name: str) -> str:
-        return f"{OTHER_SIDE[side]}_{name.removeprefix(prefix)}"
+        return f"{_OTHER_SIDE[side]}_{name.removeprefix(prefix)}"
 
     arms = replace(model.arms, joints=(*joints, *(mirrored(name) for name in joints)))
-    added = GraspSettings(holder=mirrored(grasp.holder), held=free[0], kind=grasp.kind, rpy=grasp.rpy)
-    changed = replace(model, arms=arms, grasp={**model.grasp, OTHER_SIDE[side]: added})
+    added = GraspSettings(holder_frame=mirrored(grasp.holder_frame), held_frame=free[0], kind=grasp.kind, rpy=grasp.rpy)
+    changed = replace(model, arms=arms, grasp={**model.grasp, _OTHER_SIDE[side]: added})
     try:
         return build_system(replace(run, model=changed))
     except YidError:

@@ -11,26 +11,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import Run
-from yid_ocp.data.hdf5 import write_recording
+from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.recording import Recording
+from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.simulated import recorded
-from yid_ocp.progress import SILENT, Progress
-from yid_ocp.report.scene import Scene, Told, recorded_scene, scene
+from yid_ocp.problem.synthetic_recording import recording_from_prediction
+from yid_ocp.progress import NULL_PROGRESS, Progress
+from yid_ocp.report.animation import Animation, ModelTrajectory, make_animation, recording_animation
 from yid_ocp.report.summaries import simulate_summary
 from yid_ocp.workflow.build import build_step, build_system, problem_options, read_recordings
-from yid_ocp.workflow.command import DONE, FAILED, carry_out
-from yid_ocp.workflow.folder import new_run_folder
+from yid_ocp.workflow.command_runner import EXIT_DONE, EXIT_FAILED, run_and_print
+from yid_ocp.workflow.run_folder import new_run_folder
 
-FORMAT = "yid-simulate/1"
-DURATION = 5.0  # of a virtual experiment whose configuration does not say [s]
+_RESULT_FORMAT = "yid-simulate/1"
+_DEFAULT_DURATION = 5.0  # of a virtual experiment whose configuration does not say [s]
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class SimulateOutcome:
+class SimulateCommandResult:
     """Result of `run_simulate`.
 
     Attributes
@@ -47,7 +47,7 @@ class SimulateOutcome:
     recording: Recording | None
 
     @property
-    def ok(self) -> bool:
+    def is_successful(self) -> bool:
         """Whether a recording was made."""
         return self.recording is not None
 
@@ -56,16 +56,20 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     settings = load_config(arguments.config, arguments.overrides)
 
-    def simulated(shown: Progress) -> SimulateOutcome:
+    def simulated(shown: Progress) -> SimulateCommandResult:
         return run_simulate(settings, arguments.out, shown, arguments.seed, arguments.noise)
 
-    outcome = carry_out(simulated, simulate_summary, arguments)
-    return DONE if outcome.ok else FAILED
+    outcome = run_and_print(simulated, simulate_summary, arguments)
+    return EXIT_DONE if outcome.is_successful else EXIT_FAILED
 
 
 def run_simulate(
-    run: Run, out: str | Path | None = None, progress: Progress = SILENT, seed: int = 0, noise: bool = False
-) -> SimulateOutcome:
+    run: RunSettings,
+    out: str | Path | None = None,
+    progress: Progress = NULL_PROGRESS,
+    seed: int = 0,
+    noise: bool = False,
+) -> SimulateCommandResult:
     """Write `recording.h5`: the model moved by the inputs of the first recording, or a virtual experiment without one.
 
     With a recording under `recordings.estimate`, its torques or prescribed motion drive the model with the parameters'
@@ -88,15 +92,15 @@ def run_simulate(
     ConfigError, DataError, ModelError, OutputError
     """
     with new_run_folder(run, out, "simulate") as folder:
-        folder.begin(run, "simulate", _flags(seed, noise))
+        folder.begin_run(run, "simulate", _flags(seed, noise))
         system = build_system(run)
-        scenes: list[Scene] = []
+        scenes: list[Animation] = []
         made: Recording | str
         if run.recordings.estimate:
             made, scenes = _predicted(run, system, progress, seed if noise else None)
         else:
             made, scenes = _virtual(run, system, progress, seed)
-        result: dict[str, Any] = {"format": FORMAT, "status": "done", "message": "", "seed": seed}
+        result: dict[str, Any] = {"format": _RESULT_FORMAT, "status": "done", "message": "", "seed": seed}
         if isinstance(made, str):
             result |= {"status": "failed", "message": made}
             recording = None
@@ -106,12 +110,12 @@ def run_simulate(
             result |= {
                 "duration": recording.duration,
                 "groups": {getattr(g, "name", "joints"): {"samples": len(g.t)} for g in recording.groups},
-                "truth": dict(recording.truth),
+                "truth": dict(recording.true_parameters),
             }
-        written = folder.finish(result)
+        written = folder.write_result(result)
         more = {"recordings": [] if recording is None else [recording], "system": system}
-        folder.report(run, written, progress, scenes=scenes, more=more)
-    return SimulateOutcome(folder.path, written, recording)
+        folder.write_report_page(run, written, progress, animations=scenes, section_data=more)
+    return SimulateCommandResult(folder.path, written, recording)
 
 
 def _flags(seed: int, noise: bool) -> list[str]:
@@ -119,41 +123,46 @@ def _flags(seed: int, noise: bool) -> list[str]:
     return [*(["--seed", str(seed)] if seed else []), *(["--noise"] if noise else [])]
 
 
-def _virtual(run: Run, system: System, progress: Progress, seed: int) -> tuple[Recording, list[Scene]]:
-    from yid_ocp.virtual.engine import Simulation
-    from yid_ocp.virtual.experiment import VirtualExperiment, virtual_experiment
+def _virtual(run: RunSettings, system: System, progress: Progress, seed: int) -> tuple[Recording, list[Animation]]:
+    from yid_ocp.virtual.experiment import VirtualExperiment, run_virtual_experiment
+    from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
     if run.model.robot is None:
-        raise run.refuse(
+        raise run.config_error(
             "nothing moves an object without a robot by itself",
             "recordings",
             "estimate",
             allowed="a recording whose start, clamps and times are taken over",
             hint="list one, or set model.robot for a virtual experiment",
         )
-    progress.stage("simulating a virtual experiment in MuJoCo")
-    duration = run.problem.duration or DURATION
+    progress.begin_stage("simulating a virtual experiment in MuJoCo")
+    duration = run.problem.duration or _DEFAULT_DURATION
     experiment = VirtualExperiment(
-        simulation=Simulation(duration), seed=seed, name=run.name, description=run.description
+        simulation=SimulationOptions(duration), seed=seed, recording_name=run.name, description=run.description
     )
-    made = virtual_experiment(system, None, experiment)
-    alone = recorded_scene("recorded", system, system.parameters.vector(), made)
+    made = run_virtual_experiment(system, None, experiment)
+    alone = recording_animation("recorded", system, system.parameters.vector(), made)
     return made, [] if alone is None else [alone]
 
 
-def _predicted(run: Run, system: System, progress: Progress, seed: int | None) -> tuple[Recording | str, list[Scene]]:
-    progress.stage("building the model and its compiled step")
+def _predicted(
+    run: RunSettings, system: System, progress: Progress, seed: int | None
+) -> tuple[Recording | str, list[Animation]]:
+    progress.begin_stage("building the model and its compiled step")
     step = build_step(run, system)
     first = replace(run, recordings=replace(run.recordings, estimate=run.recordings.estimate[:1]))
     recordings = read_recordings(first, "estimate")
-    options = replace(problem_options(run, step.system, recordings), local=(), priors={})
+    options = replace(problem_options(run, step.system, recordings), local_parameters=(), prior_stds={})
     problem = EstimationProblem(step, recordings, (), options)
     episode = problem.episodes[0]
-    progress.stage(f"rolling out {episode.grid.steps} steps")
-    outcome = problem.predictor.run(episode, problem.theta, np.zeros(len(problem.start)), False)
+    progress.begin_stage(f"rolling out {episode.grid.steps} steps")
+    outcome = problem.predictor.predict_episode(episode, problem.theta, np.zeros(len(problem.initial_unknowns)), False)
     if isinstance(outcome, str):
         return outcome, []
-    made = recorded(problem.predictor, episode, outcome, problem.theta, seed, run.description)
-    theta, q = problem.predictor.own_theta(episode, problem.theta), outcome.rollout.state[:, : step.system.size]
-    told = Told("simulated", step.system, theta, episode.grid.times, q)
-    return made, [scene("simulated", [told], episode.recording)]
+    made = recording_from_prediction(problem.predictor, episode, outcome, problem.theta, seed, run.description)
+    theta, q = (
+        problem.predictor.episode_theta(episode, problem.theta),
+        outcome.rollout.state[:, : step.system.n_coordinates],
+    )
+    told = ModelTrajectory("simulated", step.system, theta, episode.grid.node_times, q)
+    return made, [make_animation("simulated", [told], episode.recording)]

@@ -10,35 +10,45 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.analysis.plausibility import check_fit
-from yid_ocp.analysis.profile import with_intervals
-from yid_ocp.analysis.start_in_motion import safe_start
+from yid_ocp.analysis.cable_memory_check import decide_cable_memory
+from yid_ocp.analysis.data_quality import check_fit_residuals
+from yid_ocp.analysis.profile import with_profile_intervals
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import Run
-from yid_ocp.data.doubt import Doubt
-from yid_ocp.model.cable import Cable
+from yid_ocp.config.settings import RunSettings
+from yid_ocp.data.issues import Issue
+from yid_ocp.model.cable import CableTopology
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.outcome import EpisodeResult
-from yid_ocp.problem.validation import channel_errors
-from yid_ocp.progress import SILENT, Progress
+from yid_ocp.problem.prediction_errors import rmse_by_channel
+from yid_ocp.problem.prediction_result import EpisodePrediction
+from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.summaries import solve_summary
 from yid_ocp.solvers import Iterate, Solution, Status, solve
-from yid_ocp.solvers.judgement import distrusted, known_covariance
+from yid_ocp.solvers.uncertainty import covariance_to_dict, mark_not_trusted
 from yid_ocp.workflow.build import build_cable, build_problem
-from yid_ocp.workflow.command import DONE, FAILED, carry_out
-from yid_ocp.workflow.doubts import doubts_result
-from yid_ocp.workflow.folder import new_run_folder
-from yid_ocp.workflow.held_out import guess_doubts, held_out_entry, worse_than_guess
-from yid_ocp.workflow.refine import Discretisation, counted, discretisation, steadied, wanted
-from yid_ocp.workflow.torque_offsets import torque_offsets
-from yid_ocp.workflow.trajectories import write_trajectories
+from yid_ocp.workflow.command_runner import EXIT_DONE, EXIT_FAILED, run_and_print
+from yid_ocp.workflow.discretisation_check import (
+    DiscretisationShifts,
+    measure_discretisation_shifts,
+    requested_refinements,
+    with_discretisation_uncertainty,
+    with_stability_check,
+)
+from yid_ocp.workflow.held_out_errors import (
+    channels_worse_than_baseline,
+    prediction_error_entry,
+    worse_than_baseline_issues,
+)
+from yid_ocp.workflow.recording_issues import issues_result
+from yid_ocp.workflow.run_folder import new_run_folder
+from yid_ocp.workflow.torque_offset_results import estimated_torque_offsets
+from yid_ocp.workflow.trajectories import write_solve_trajectories
 
-FORMAT = "yid-solve/1"
+_RESULT_FORMAT = "yid-solve/1"
 
 
 @dataclass(frozen=True)
-class SolveOutcome:
+class SolveCommandResult:
     """Result of `run_solve`.
 
     Attributes
@@ -57,7 +67,7 @@ class SolveOutcome:
     problem: EstimationProblem
 
     @property
-    def ok(self) -> bool:
+    def is_successful(self) -> bool:
         """Whether the solver converged."""
         return self.solution.status == Status.CONVERGED
 
@@ -65,11 +75,13 @@ class SolveOutcome:
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     settings = load_config(arguments.config, arguments.overrides)
-    outcome = carry_out(lambda shown: run_solve(settings, arguments.out, shown), solve_summary, arguments)
-    return DONE if outcome.ok else FAILED
+    outcome = run_and_print(lambda shown: run_solve(settings, arguments.out, shown), solve_summary, arguments)
+    return EXIT_DONE if outcome.is_successful else EXIT_FAILED
 
 
-def run_solve(run: Run, out: str | Path | None = None, progress: Progress = SILENT) -> SolveOutcome:
+def run_solve(
+    run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS
+) -> SolveCommandResult:
     """Estimate, validate and write the run folder.
 
     Parameters
@@ -89,52 +101,58 @@ def run_solve(run: Run, out: str | Path | None = None, progress: Progress = SILE
     ConfigError, DataError, ModelError, OutputError
     """
     with new_run_folder(run, out) as folder:
-        folder.begin(run, "solve")
-        progress.stage("building the model and its compiled step")
+        folder.begin_run(run, "solve")
+        progress.begin_stage("building the model and its compiled step")
         problem = build_problem(run)
-        progress.stage(f"solving for {len(problem.start)} unknowns by {run.solver.name}")
+        progress.begin_stage(f"solving for {len(problem.initial_unknowns)} unknowns by {run.solver.name}")
 
         def iterate(entry: Iterate) -> None:
-            values = {name: float(value) for name, value in zip(problem.shared, entry.x, strict=False)}
-            folder.log("iterate", iteration=entry.iteration, cost=entry.cost, gradient=entry.gradient, x=values)
-            progress.iterate(entry)
+            values = {name: float(value) for name, value in zip(problem.shared_parameters, entry.x, strict=False)}
+            folder.log_event(
+                "iterate", iteration=entry.iteration, cost=entry.cost, gradient=entry.gradient_norm, x=values
+            )
+            progress.report_iterate(entry)
 
-        solution = solve(problem, run.solver, callback=iterate, limits=run.diagnosis.of_a_fit)
-        safe = safe_start(problem, run.solver, solution, run.diagnosis.of_a_fit)
-        solution, stability = steadied(safe.problem, safe.solution)
+        solution = solve(problem, run.solver, callback=iterate, limits=run.diagnosis.fit_gap_limits)
+        safe = decide_cable_memory(problem, run.solver, solution, run.diagnosis.fit_gap_limits)
+        solution, stability = with_stability_check(safe.problem, safe.solution)
         problem = solution.problem or safe.problem
-        solution = with_intervals(problem, solution, progress)
-        finer = Discretisation({})
+        solution = with_profile_intervals(problem, solution, progress)
+        finer = DiscretisationShifts({})
         if solution.evaluation is not None:
-            finer = discretisation(run, problem, solution.x, solution.evaluation, wanted(run), progress)
+            finer = measure_discretisation_shifts(
+                run, problem, solution.x, solution.evaluation, requested_refinements(run), progress
+            )
         # the ± and the verdict of everything below count how far the estimate is from a fine model's
-        data_std, solution = solution.std, counted(solution, finer)
-        progress.stage("predicting the held-out recordings")
-        held_out = problem.validate(solution.x)
+        data_std, solution = solution.std, with_discretisation_uncertainty(solution, finer)
+        progress.begin_stage("predicting the held-out recordings")
+        held_out = problem.predict_held_out(solution.x)
         cable = build_cable(run)
-        solution, doubts = doubted(problem, solution, held_out, cable)
-        folder.log("end", status=solution.status.value, message=solution.message, seconds_solving=solution.seconds)
-        write_trajectories(folder.path / "trajectories.h5", problem, solution, held_out)
+        solution, doubts = with_fit_issues(problem, solution, held_out, cable)
+        folder.log_event(
+            "end", status=solution.status.value, message=solution.message, seconds_solving=solution.wall_time
+        )
+        write_solve_trajectories(folder.path / "trajectories.h5", problem, solution, held_out)
         more = {
-            "doubts": doubts_result(doubts),
+            "doubts": issues_result(doubts),
             "safeguard": safe.message,
-            "covariance": covariance_result(solution, data_std),
-            "discretisation": finer.result(data_std),
+            "covariance": _covariance_result(solution, data_std),
+            "discretisation": finer.to_result(data_std),
             "discretisation_notes": list(finer.notes),
             "stability": stability,
-            "torque_offsets": {} if solution.evaluation is None else torque_offsets(problem, solution.x),
+            "torque_offsets": {} if solution.evaluation is None else estimated_torque_offsets(problem, solution.x),
         }
-        written = folder.finish(solve_result(problem, solution, held_out, cable) | more)
-        folder.report(run, written, progress, problem=problem, solution=solution, held_out=tuple(held_out))
-    return SolveOutcome(folder.path, written, solution, problem)
+        written = folder.write_result(solve_result(problem, solution, held_out, cable) | more)
+        folder.write_report_page(run, written, progress, problem=problem, solution=solution, held_out=tuple(held_out))
+    return SolveCommandResult(folder.path, written, solution, problem)
 
 
-def doubted(
+def with_fit_issues(
     problem: EstimationProblem,
     solution: Solution,
-    held_out: Sequence[tuple[Episode, EpisodeResult | str]],
-    cable: Cable | None = None,
-) -> tuple[Solution, tuple[Doubt, ...]]:
+    held_out: Sequence[tuple[Episode, EpisodePrediction | str]],
+    cable: CableTopology | None = None,
+) -> tuple[Solution, tuple[Issue, ...]]:
     """The solution with untrusted verdicts where its fit raises issues, and all issues of the data.
 
     Parameters
@@ -143,51 +161,54 @@ def doubted(
         As it was solved.
     solution : Solution
     held_out : sequence of (Episode, EpisodeResult or str)
-        From `EstimationProblem.validate`.
+        From `EstimationProblem.predict_held_out`.
     cable : Cable, optional
         For the baselines that it has.
     """
     if solution.evaluation is None:
-        return solution, problem.options.doubts
+        return solution, problem.options.data_issues
     fitted, predicted, residuals = _predictions(problem, solution, held_out, cable)
-    found = check_fit(problem, solution.x, solution.evaluation) + guess_doubts([*predicted, *fitted], _units(residuals))
+    found = check_fit_residuals(problem, solution.x, solution.evaluation) + worse_than_baseline_issues(
+        [*predicted, *fitted], _units(residuals)
+    )
     if all(doubt.weight == "warning" for doubt in found):
-        return solution, (*problem.options.doubts, *found)
-    believed = replace(solution.fit, believed=False)
-    solution = replace(solution, fit=believed, parameters=distrusted(solution.parameters))
-    return solution, (*problem.options.doubts, *found)
+        return solution, (*problem.options.data_issues, *found)
+    believed = replace(solution.goodness_of_fit, believed=False)
+    solution = replace(solution, goodness_of_fit=believed, parameters=mark_not_trusted(solution.parameters))
+    return solution, (*problem.options.data_issues, *found)
 
 
-def covariance_result(solution: Solution, data_std: Mapping[str, float]) -> dict[str, Any]:
+def _covariance_result(solution: Solution, data_std: Mapping[str, float]) -> dict[str, Any]:
     """Covariance of the shared free parameters as plain data, from the data alone.
 
     How far a finer model is counts in the reported ±, not here: another run of this model is as far from it.
     """
-    names = [name for name in data_std if name in solution.names]
-    at = [solution.names.index(name) for name in names]
+    names = [name for name in data_std if name in solution.unknown_names]
+    at = [solution.unknown_names.index(name) for name in names]
     if not solution.covariance.size:
         return {"names": [], "matrix": []}
-    return known_covariance(names, solution.covariance[np.ix_(at, at)], [data_std[name] for name in names])
+    return covariance_to_dict(names, solution.covariance[np.ix_(at, at)], [data_std[name] for name in names])
 
 
 def solve_result(
     problem: EstimationProblem,
     solution: Solution,
-    held_out: Sequence[tuple[Episode, EpisodeResult | str]],
-    cable: Cable | None = None,
+    held_out: Sequence[tuple[Episode, EpisodePrediction | str]],
+    cable: CableTopology | None = None,
 ) -> dict[str, Any]:
     """Entries of `yid-solve/1` without inputs and versions."""
     fitted, predicted, residuals = _predictions(problem, solution, held_out, cable)
     return {
-        "format": FORMAT,
+        "format": _RESULT_FORMAT,
         "status": solution.status.value,
         "message": solution.message,
         "parameters": {name: asdict(entry) for name, entry in solution.parameters.items()},
         "cost": solution.cost,
-        "iterations": solution.iterations,
-        "evaluations": solution.evaluations,
-        "seconds": solution.seconds,
-        "fit": asdict(solution.fit) | {"worse_than_guess": worse_than_guess([*predicted, *fitted], _units(residuals))},
+        "iterations": solution.n_iterations,
+        "evaluations": solution.n_evaluations,
+        "seconds": solution.wall_time,
+        "fit": asdict(solution.goodness_of_fit)
+        | {"channels_worse_than_baseline": channels_worse_than_baseline([*predicted, *fitted], _units(residuals))},
         "residuals": residuals,
         "held_out": predicted,
     }
@@ -196,18 +217,22 @@ def solve_result(
 def _predictions(
     problem: EstimationProblem,
     solution: Solution,
-    held_out: Sequence[tuple[Episode, EpisodeResult | str]],
-    cable: Cable | None,
+    held_out: Sequence[tuple[Episode, EpisodePrediction | str]],
+    cable: CableTopology | None,
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]], Mapping[str, Any]]:
     """Errors of the recordings that were fitted and of those held out beside guesses, and of every channel fitted."""
     residuals: Mapping[str, Any] = {}
     fitted: list[dict[str, Any]] = []
     if solution.evaluation is not None:
-        done = solution.predicted
+        done = solution.episode_predictions
         able = [(r, e) for r, e in zip(done, problem.episodes, strict=True) if not isinstance(r, str)]
-        residuals = channel_errors([result for result, _ in able], [episode for _, episode in able])
-        fitted = [held_out_entry(problem, *pair, cable) for pair in zip(problem.episodes, done, strict=True)]
-    return fitted, [held_out_entry(problem, episode, outcome, cable) for episode, outcome in held_out], residuals
+        residuals = rmse_by_channel([result for result, _ in able], [episode for _, episode in able])
+        fitted = [prediction_error_entry(problem, *pair, cable) for pair in zip(problem.episodes, done, strict=True)]
+    return (
+        fitted,
+        [prediction_error_entry(problem, episode, outcome, cable) for episode, outcome in held_out],
+        residuals,
+    )
 
 
 def _units(residuals: Mapping[str, Any]) -> dict[str, str]:

@@ -14,40 +14,47 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import Run, VirtualFramesSettings
-from yid_ocp.data.hdf5 import write_recording
+from yid_ocp.config.settings import RunSettings, VirtualFramesSettings
 from yid_ocp.data.recording import Recording
+from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.errors import DataError, YidError
 from yid_ocp.model.system import System
-from yid_ocp.parallel import Workers
-from yid_ocp.progress import SILENT, Progress
-from yid_ocp.report.scene import Told
-from yid_ocp.report.scene import scene as moving
+from yid_ocp.parallel import WorkerConfig
+from yid_ocp.progress import NULL_PROGRESS, Progress
+from yid_ocp.report.animation import ModelTrajectory
+from yid_ocp.report.animation import make_animation as moving
 from yid_ocp.report.summaries import track_summary
-from yid_ocp.vision.calibration import Calibration
-from yid_ocp.vision.camera import DepthCamera, FrameTiming, VirtualCamera, VirtualFrames, virtual_frames
-from yid_ocp.vision.clutter import Foreign
-from yid_ocp.vision.common import Common
-from yid_ocp.vision.doubt import Sizes
-from yid_ocp.vision.fit import ShapeFit
-from yid_ocp.vision.folders import write_frames
-from yid_ocp.vision.frames import look_at
-from yid_ocp.vision.pictures import draw_stages, draw_track
-from yid_ocp.vision.registration import CLOCK, DEPTH, DRIFT, SCALE, SHIFT, TURN
-from yid_ocp.vision.results import FrameReport, Track, dropped
-from yid_ocp.vision.track import Tracker
-from yid_ocp.workflow.build import build_system, located, recording_file
-from yid_ocp.workflow.command import DONE, carry_out, given_workers
-from yid_ocp.workflow.doubts import doubts_result, of_one
-from yid_ocp.workflow.folder import RunFolder, new_run_folder
-from yid_ocp.workflow.tracked_frames import FrameTasks, empty_scene, opened, scene_of
+from yid_ocp.vision.calibration import CameraCalibration
+from yid_ocp.vision.camera import DepthCamera, FrameTiming, VirtualCamera, VirtualFrames, render_virtual_frames
+from yid_ocp.vision.camera_registration import (
+    CLOCK_DRIFT_INDEX,
+    CLOCK_OFFSET_INDEX,
+    DEPTH_OFFSET_INDEX,
+    DEPTH_SCALE_INDEX,
+    ROTATION_SLICE,
+    TRANSLATION_SLICE,
+)
+from yid_ocp.vision.clutter import ForeignObject
+from yid_ocp.vision.dimension_check import DimensionCheck
+from yid_ocp.vision.fit import ShapeFitter
+from yid_ocp.vision.frame_folder import write_frame_folder
+from yid_ocp.vision.frames import look_at_pose
+from yid_ocp.vision.sequence_calibration import SequenceCalibration
+from yid_ocp.vision.track import FrameTracker
+from yid_ocp.vision.track_figures import draw_frame_stages, draw_track
+from yid_ocp.vision.track_result import FrameReport, TrackResult, count_drop_reasons
+from yid_ocp.workflow.build import build_system, locate_errors, recording_path
+from yid_ocp.workflow.command_runner import EXIT_DONE, run_and_print, workers_from_arguments
+from yid_ocp.workflow.frame_tasks import FrameTasks, camera_scene, open_frames, read_background_frames
+from yid_ocp.workflow.recording_issues import issues_result, single_recording_issues
+from yid_ocp.workflow.run_folder import RunFolder, new_run_folder
 
-FORMAT = "yid-track/1"
+_RESULT_FORMAT = "yid-track/1"
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class TrackOutcome:
+class TrackCommandResult:
     """Result of `run_track`.
 
     Attributes
@@ -63,7 +70,7 @@ class TrackOutcome:
 
     folder: Path
     result: dict[str, Any]
-    track: Track
+    track: TrackResult
     recording: Recording
 
 
@@ -71,18 +78,18 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     overrides = (*arguments.overrides, *(["track.options.calibration.fix_pose=true"] if arguments.fix_pose else ()))
     settings = load_config(arguments.config, overrides)
-    workers = given_workers(arguments)
-    carry_out(lambda shown: run_track(settings, arguments.out, shown, workers), track_summary, arguments)
-    return DONE
+    workers = workers_from_arguments(arguments)
+    run_and_print(lambda shown: run_track(settings, arguments.out, shown, workers), track_summary, arguments)
+    return EXIT_DONE
 
 
 def run_track(
-    run: Run,
+    run: RunSettings,
     out: str | Path | None = None,
-    progress: Progress = SILENT,
-    workers: Workers | Executor | None = None,
-) -> TrackOutcome:
-    """Track the frames of `track.frames`, or of a virtual camera where there are none.
+    progress: Progress = NULL_PROGRESS,
+    workers: WorkerConfig | Executor | None = None,
+) -> TrackCommandResult:
+    """Track the frames of `track.frames_path`, or of a virtual camera where there are none.
 
     The joint angles are those of the first recording under `recordings.estimate`; a virtual frame sequence has its own,
     and an object without a robot needs none. Frames are done one by one; what an interrupted run did of them is used
@@ -108,54 +115,62 @@ def run_track(
     """
     settings = run.track
     with new_run_folder(run, out, "track") as folder:
-        folder.begin(run, "track")
+        folder.begin_run(run, "track")
         system = build_system(run)
         filmed = _filmed(run, system, folder, progress)
         refused: DataError | None = None
         try:
-            with located(run, "track"):
-                seen, recording = opened(filmed.tasks.run)
-                tracker = Tracker(scene_of(run, system), recording, seen, settings.options, empty_scene(run))
-                doubts = [] if recording is None else of_one(run, system, recording)
-                progress.stage("finding what is common to the frames")
-                common = filmed.tasks.common()
-                progress.stage("tracking")
-                frames, note = tracker.judged(filmed.tasks.frames(tracker, common, workers, progress))
-                found: Track | None = None
+            with locate_errors(run, "track"):
+                seen, recording = open_frames(filmed.tasks.settings)
+                tracker = FrameTracker(
+                    camera_scene(run, system), recording, seen, settings.options, read_background_frames(run)
+                )
+                doubts = [] if recording is None else single_recording_issues(run, system, recording)
+                progress.begin_stage("finding what is common to the frames")
+                common = filmed.tasks.calibrate_sequence()
+                progress.begin_stage("tracking")
+                frames, note = tracker.reject_outlying_frames(
+                    filmed.tasks.track_frames(tracker, common, workers, progress)
+                )
+                found: TrackResult | None = None
                 try:
-                    found = tracker.finished(frames, note, common)
+                    found = tracker.to_track_result(frames, note, common)
                 except DataError as error:
                     refused = error
         except YidError:
             filmed.clear()
             raise
-        progress.stage("drawing")
-        for frame in _drawn(frames, settings.pictures):
-            stages = tracker.stages(frame, common)
+        progress.begin_stage("drawing")
+        for frame in _drawn(frames, settings.n_drawn_frames):
+            stages = tracker.frame_stages(frame, common)
             if stages is not None:
-                draw_stages(stages, folder.path / "pictures")
-        result = track_result(frames, common, tracker.things(frames), found) | {"root": note}
+                draw_frame_stages(stages, folder.path / "pictures")
+        result = _track_result(frames, common, tracker.foreign_objects(frames), found) | {"root": note}
         told, tracked = [], None
         if found is not None:
             draw_track(found, folder.path / "track.png")
-            tracked = found.recording(recording)
+            tracked = found.to_recording(recording)
             write_recording(tracked, folder.path / "recording.h5")
             # what was tracked may be elsewhere than the object reaches, where the model says where it stands
-            if settings.options.root == "model":
-                doubts += [doubt for doubt in of_one(run, system, tracked) if doubt.cause.startswith("point_")]
-            shape = Told("fitted shape", tracker.system, system.parameters.vector(), found.t, found.q)
+            if settings.options.root_placement == "model":
+                doubts += [
+                    doubt for doubt in single_recording_issues(run, system, tracked) if doubt.cause.startswith("point_")
+                ]
+            shape = ModelTrajectory(
+                "fitted shape", tracker.system, system.parameters.vector(), found.t, found.configurations
+            )
             told = [moving("tracked", [shape], tracked)]
             if filmed.made is not None:
-                result["truth_errors"] = truth_errors(system, found, filmed.made)
-        result |= {"doubts": doubts_result(doubts), "refused": "" if refused is None else refused.what}
-        written = folder.finish(result)
+                result["_truth_errors"] = _truth_errors(system, found, filmed.made)
+        result |= {"doubts": issues_result(doubts), "refused": "" if refused is None else refused.what}
+        written = folder.write_result(result)
         files = [folder.path / "track.png", *sorted((folder.path / "pictures").glob("*.png"))]
         more = {"pictures": [path for path in files if path.exists()]}
-        folder.report(run, written, progress, scenes=told, more=more)
+        folder.write_report_page(run, written, progress, animations=told, section_data=more)
         filmed.clear()
     if refused is not None or found is None or tracked is None:
         raise _with_folder(refused, folder.path)
-    return TrackOutcome(folder.path, written, found, tracked)
+    return TrackCommandResult(folder.path, written, found, tracked)
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,36 +185,36 @@ class _Filmed:
         """Remove what stands beside the run folder."""
         for path in self.own:
             shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
-        self.tasks.clear()
+        self.tasks.delete_results()
 
 
-def _filmed(run: Run, system: System, folder: RunFolder, progress: Progress) -> _Filmed:
+def _filmed(run: RunSettings, system: System, folder: RunFolder, progress: Progress) -> _Filmed:
     settings = run.track
-    if settings.frames is not None:
-        opened(run)  # says in words of the settings what is wrong with the files
-        joints = recording_file(run.recordings.estimate[0]) if run.recordings.estimate else None
-        with located(run, "track", "frames"):
-            tasks = FrameTasks.of(run, Path(settings.frames), joints, folder.partial)
-        folder.inputs[settings.frames] = tasks.inputs["frames"]
+    if settings.frames_path is not None:
+        open_frames(run)  # says in words of the settings what is wrong with the files
+        joints = recording_path(run.recordings.estimate[0]) if run.recordings.estimate else None
+        with locate_errors(run, "track", "frames"):
+            tasks = FrameTasks.from_run(run, Path(settings.frames_path), joints, folder.resume_folder)
+        folder.input_hashes[settings.frames_path] = tasks.input_hashes["frames"]
         return _Filmed(tasks)
-    progress.stage("simulating a virtual experiment in MuJoCo")
-    recording, made = simulated_frames(run, system, settings.virtual)
-    progress.stage("filming it")
-    folder.partial.mkdir(parents=True, exist_ok=True)
-    frames, joints = folder.partial / "frames", folder.partial / f"{run.name}.h5"
-    write_frames(made.sequence, frames)
+    progress.begin_stage("simulating a virtual experiment in MuJoCo")
+    recording, made = simulate_frames(run, system, settings.virtual_frames)
+    progress.begin_stage("filming it")
+    folder.resume_folder.mkdir(parents=True, exist_ok=True)
+    frames, joints = folder.resume_folder / "frames", folder.resume_folder / f"{run.name}.h5"
+    write_frame_folder(made.sequence, frames)
     write_recording(recording, joints)
     if settings.keep_frames:
         shutil.copytree(frames, folder.path / "frames")
-    return _Filmed(FrameTasks.of(run, frames, joints, folder.partial), made, (frames, joints))
+    return _Filmed(FrameTasks.from_run(run, frames, joints, folder.resume_folder), made, (frames, joints))
 
 
 def _drawn(frames: Sequence[FrameReport], count: int) -> list[FrameReport]:
     """Frames to draw: some of all, evenly spread, and as many of those that were dropped, each for another reason."""
     chosen = {int(i) for i in np.linspace(0, len(frames) - 1, count + 2)[1:-1]}
-    reasons = [frames[k].reason.partition(":")[0] for k in sorted(chosen)]
+    reasons = [frames[k].drop_reason.partition(":")[0] for k in sorted(chosen)]
     for k, frame in enumerate(frames):
-        kind = frame.reason.partition(":")[0]
+        kind = frame.drop_reason.partition(":")[0]
         if kind and kind not in reasons and len(chosen) < 2 * count:
             chosen.add(k)
             reasons.append(kind)
@@ -212,151 +227,162 @@ def _with_folder(refused: DataError | None, folder: Path) -> DataError:
     return DataError(refused.what, where=refused.where, allowed=refused.allowed, hint=hint)
 
 
-def track_result(
-    frames: Sequence[FrameReport], common: Common, things: Sequence[Foreign], found: Track | None
+def _track_result(
+    frames: Sequence[FrameReport],
+    common: SequenceCalibration,
+    things: Sequence[ForeignObject],
+    found: TrackResult | None,
 ) -> dict[str, Any]:
     """`yid-track/1` without doubts, inputs and versions; `found` is None where no frame is good."""
-    spent = [frame.seconds for frame in frames if frame.fit is not None]
+    spent = [frame.cpu_seconds for frame in frames if frame.shape_fit is not None]
     return {
-        "format": FORMAT,
-        "camera": camera_result(common.calibration),
-        "sizes": sizes_result(common.sizes),
+        "format": _RESULT_FORMAT,
+        "camera": _camera_result(common.camera_calibration),
+        "sizes": _sizes_result(common.dimensions),
         "things": [asdict(thing) for thing in things],
         "points": {} if found is None else _points(found),
         "truth_errors": {},
-        "dropped": dropped(frames),
+        "dropped": count_drop_reasons(frames),
         "fit_seconds": float(np.mean(spent)) if spent else 0.0,
         "frames": [
             {
                 "name": frame.name,
                 "stamp": frame.stamp,
-                "t": frame.t,
-                "reason": frame.reason,
-                "raw_points": frame.raw,
-                "object_points": frame.filtered,
-                "nodes": frame.nodes,
-                "delay": None if np.isnan(frame.delay) else frame.delay,
-                "distance": None if frame.fit is None else frame.fit.distance,
-                "covered": None if frame.fit is None else frame.fit.covered,
-                "contested": None if frame.fit is None else frame.fit.contested,
-                "seconds": frame.seconds,
+                "t": frame.joint_time,
+                "reason": frame.drop_reason,
+                "raw_points": frame.n_raw_points,
+                "object_points": frame.n_filtered_points,
+                "nodes": frame.n_skeleton_nodes,
+                "delay": None if np.isnan(frame.stamp_delay) else frame.stamp_delay,
+                "distance": None if frame.shape_fit is None else frame.shape_fit.mean_distance,
+                "covered": None if frame.shape_fit is None else frame.shape_fit.visible_coverage,
+                "contested": None if frame.shape_fit is None else frame.shape_fit.contested_fraction,
+                "seconds": frame.cpu_seconds,
             }
             for frame in frames
         ],
     }
 
 
-def sizes_result(sizes: Sizes) -> dict[str, Any]:
+def _sizes_result(sizes: DimensionCheck) -> dict[str, Any]:
     """Lengths and radii as plain data: model value, value fitted to the frames, and its standard deviation."""
-    fits = sizes.told * np.exp(sizes.change)
+    fits = sizes.model_values * np.exp(sizes.log_ratio)
     return {
-        "frames": sizes.frames,
+        "frames": sizes.n_frames,
         "messages": list(sizes.messages),
         "of": {
             name: {
-                "model": sizes.told[i],
-                "fits": fits[i] if sizes.known[i] else None,
-                "std": fits[i] * sizes.std[i] if sizes.known[i] else None,
-                "doubted": bool(sizes.doubted[i]),
-                "used": sizes.used[i],
+                "model": sizes.model_values[i],
+                "fits": fits[i] if sizes.is_determined[i] else None,
+                "std": fits[i] * sizes.log_ratio_std[i] if sizes.is_determined[i] else None,
+                "doubted": bool(sizes.is_contradicted[i]),
+                "used": sizes.is_estimated[i],
             }
             for i, name in enumerate(sizes.names)
         },
     }
 
 
-def camera_result(calibration: Calibration) -> dict[str, Any]:
+def _camera_result(calibration: CameraCalibration) -> dict[str, Any]:
     """Camera calibration as plain data: estimated and specified pose, depth and clock, with stds."""
-    state, told, change = calibration.state, calibration.told, calibration.state.minus(calibration.told)
-    std = np.sqrt(np.diag(calibration.covariance))
+    state, told, change = (
+        calibration.camera_state,
+        calibration.prior_state,
+        calibration.camera_state.difference_from(calibration.prior_state),
+    )
+    std = np.sqrt(np.diag(calibration.state_covariance))
     return {
         "message": calibration.message,
-        "estimated": calibration.frames > 0,
-        "frames": calibration.frames,
+        "estimated": calibration.n_frames > 0,
+        "frames": calibration.n_frames,
         "pose": state.pose,
         "told_pose": told.pose,
-        "turned": float(np.linalg.norm(change[TURN])),
-        "turn_std": std[TURN],
-        "shifted": float(np.linalg.norm(change[SHIFT])),
-        "shift_std": std[SHIFT],
-        "depth_factor": state.factor,
-        "depth_factor_std": std[SCALE],
-        "depth_offset": state.depth,
-        "depth_offset_std": std[DEPTH],
-        "clock_offset": state.offset,
-        "clock_offset_std": std[CLOCK],
-        "clock_about": state.about,
-        "clock_drift": state.drift,
-        "clock_drift_std": std[DRIFT],
-        "presence": None if calibration.presence is None else asdict(calibration.presence),
+        "turned": float(np.linalg.norm(change[ROTATION_SLICE])),
+        "turn_std": std[ROTATION_SLICE],
+        "shifted": float(np.linalg.norm(change[TRANSLATION_SLICE])),
+        "shift_std": std[TRANSLATION_SLICE],
+        "depth_factor": state.depth_scale,
+        "depth_factor_std": std[DEPTH_SCALE_INDEX],
+        "depth_offset": state.depth_offset,
+        "depth_offset_std": std[DEPTH_OFFSET_INDEX],
+        "clock_offset": state.clock_offset,
+        "clock_offset_std": std[CLOCK_OFFSET_INDEX],
+        "clock_about": state.clock_reference_stamp,
+        "clock_drift": state.clock_drift,
+        "clock_drift_std": std[CLOCK_DRIFT_INDEX],
+        "presence": None if calibration.arm_visibility is None else asdict(calibration.arm_visibility),
     }
 
 
-def _points(found: Track) -> dict[str, Any]:
+def _points(found: TrackResult) -> dict[str, Any]:
     seen = np.asarray(np.isfinite(found.position).all(axis=2))
     return {
         name: {
             "frames": int(seen[:, i].sum()),
             "std": float(np.median(found.std[seen[:, i], i])) if seen[:, i].any() else None,
-            "common_std": float(np.median(found.common[seen[:, i], i])) if seen[:, i].any() else None,
+            "common_std": float(np.median(found.shared_std[seen[:, i], i])) if seen[:, i].any() else None,
         }
-        for i, name in enumerate(found.names)
+        for i, name in enumerate(found.point_names)
     }
 
 
-def truth_errors(system: System, found: Track, made: VirtualFrames) -> Mapping[str, Mapping[str, float]]:
+def _truth_errors(system: System, found: TrackResult, made: VirtualFrames) -> Mapping[str, Mapping[str, float]]:
     """Median and largest error of every tracked point against the simulated truth [m]."""
-    shape = ShapeFit(system)
-    columns = [system.points.index(name) for name in found.names]
-    truth = np.array([shape.place(made.course(t))[columns] for t in found.t])
+    shape = ShapeFitter(system)
+    columns = [system.point_frames.index(name) for name in found.point_names]
+    truth = np.array([shape.points_at(made.true_configuration_at(t))[columns] for t in found.t])
     apart = np.linalg.norm(found.position - truth, axis=2)
     return {
         name: {"median": float(np.nanmedian(apart[:, i])), "largest": float(np.nanmax(apart[:, i]))}
-        for i, name in enumerate(found.names)
+        for i, name in enumerate(found.point_names)
         if np.isfinite(apart[:, i]).any()
     }
 
 
-def simulated_frames(run: Run, system: System, settings: VirtualFramesSettings) -> tuple[Recording, VirtualFrames]:
+def simulate_frames(
+    run: RunSettings, system: System, settings: VirtualFramesSettings
+) -> tuple[Recording, VirtualFrames]:
     """Recording and camera frames of a virtual experiment, with initial parameter values as truth.
 
     Raises
     ------
     ConfigError, DataError, ModelError
     """
-    from yid_ocp.virtual.engine import Simulation, simulate_in_mujoco
-    from yid_ocp.virtual.experiment import VirtualExperiment, virtual_experiment
-    from yid_ocp.virtual.motion import Excitation, multisine
-    from yid_ocp.virtual.posture import initial_posture
+    from yid_ocp.virtual.experiment import VirtualExperiment, run_virtual_experiment
+    from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
+    from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
+    from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 
-    for name in settings.offsets:
+    for name in settings.grasp_start_offsets:
         if name not in [grasp.name for grasp in system.grasps]:
             known = ", ".join(grasp.name for grasp in system.grasps)
-            raise run.refuse(f"there is no grasp '{name}'", "track", "virtual", "offsets", name, allowed=known)
-    with located(run, "track", "virtual"):
-        posture = initial_posture(system, offsets=settings.offsets)
-        simulation = Simulation(settings.duration)
-        excitation = Excitation(travel=settings.travel, duration=settings.duration)
-        motion = multisine(system, seed=settings.seed, posture=posture, excitation=excitation)
+            raise run.config_error(f"there is no grasp '{name}'", "track", "virtual", "offsets", name, allowed=known)
+    with locate_errors(run, "track", "virtual"):
+        posture = grasping_joint_angles(system, offsets=settings.grasp_start_offsets)
+        simulation = SimulationOptions(settings.duration)
+        excitation = MultisineOptions(gripper_travel=settings.max_gripper_travel, duration=settings.duration)
+        motion = random_multisine(system, seed=settings.seed, initial_joint_angles=posture, excitation=excitation)
         experiment = VirtualExperiment(
             motion=motion,
-            posture=posture,
+            initial_joint_angles=posture,
             simulation=simulation,
             camera=None,
             seed=settings.seed,
-            name=run.name,
+            recording_name=run.name,
             description=run.description,
         )
-        recording = virtual_experiment(system, None, experiment)
+        recording = run_virtual_experiment(system, None, experiment)
         # the same once more, for the shape that a recording does not hold
-        truth = simulate_in_mujoco(system, None, motion, simulation, posture=posture)
+        truth = simulate_in_mujoco(system, None, motion, simulation, initial_joint_angles=posture)
         timing = FrameTiming(
-            settings.rate,
-            dropped=settings.dropped,
+            settings.frame_rate,
+            dropped_fraction=settings.dropped_fraction,
             latency=settings.latency,
             latency_std=settings.latency_std,
         )
-        pose = look_at(settings.eye, settings.target)
-        camera = VirtualCamera(pose, DepthCamera(outliers=settings.outliers), timing, seed=settings.seed)
-        made = virtual_frames(scene_of(run, system), truth.t, truth.q, camera)
+        pose = look_at_pose(settings.camera_position, settings.camera_target)
+        camera = VirtualCamera(
+            pose, DepthCamera(outlier_probability=settings.outlier_fraction), timing, seed=settings.seed
+        )
+        made = render_virtual_frames(camera_scene(run, system), truth.t, truth.q, camera)
     return recording, made

@@ -10,22 +10,25 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from yid_ocp.data.hdf5_file import new_hdf5
-from yid_ocp.diagnosis import Finding
-from yid_ocp.diagnosis.localise import units
+from yid_ocp.data.hdf5_io import create_hdf5_atomically
+from yid_ocp.diagnosis import DiagnosisResult
+from yid_ocp.diagnosis.localise import unknown_units
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.estimation_problem import Episode, EpisodePrediction
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.problem import Episode, EpisodeResult
 from yid_ocp.solvers import Solution
 
-SOLVED = "yid-trajectories/1"
-DIAGNOSED = "yid-diagnosis-trajectories/1"
-Prediction = tuple[Episode, EpisodeResult, EpisodeResult]
+SOLVE_TRAJECTORIES_FORMAT = "yid-trajectories/1"
+DIAGNOSIS_TRAJECTORIES_FORMAT = "yid-diagnosis-trajectories/1"
+HeldOutPrediction = tuple[Episode, EpisodePrediction, EpisodePrediction]
 """A held-out recording, its prediction by the nominal model and that with the effects."""
 
 
-def write_trajectories(
-    path: Path, problem: EstimationProblem, solution: Solution, held_out: Sequence[tuple[Episode, EpisodeResult | str]]
+def write_solve_trajectories(
+    path: Path,
+    problem: EstimationProblem,
+    solution: Solution,
+    held_out: Sequence[tuple[Episode, EpisodePrediction | str]],
 ) -> None:
     """Write trajectories, predictions and unknowns with covariance as `yid-trajectories/1`.
 
@@ -38,13 +41,13 @@ def write_trajectories(
     ------
     OutputError
     """
-    pairs: list[tuple[str, Episode, EpisodeResult | str]] = [("held_out", *pair) for pair in held_out]
+    pairs: list[tuple[str, Episode, EpisodePrediction | str]] = [("held_out", *pair) for pair in held_out]
     if solution.evaluation is not None:
-        done = solution.predicted
+        done = solution.episode_predictions
         pairs = [("estimate", e, r) for e, r in zip(problem.episodes, done, strict=True)] + pairs
-    with _file(path, SOLVED) as file:
+    with _file(path, SOLVE_TRAJECTORIES_FORMAT) as file:
         unknowns = file.create_group("unknowns")
-        unknowns.attrs["names"] = _texts(solution.names)
+        unknowns.attrs["names"] = _texts(solution.unknown_names)
         unknowns.create_dataset("x", data=solution.x)
         unknowns.create_dataset("covariance", data=solution.covariance)
         for role, episode, outcome in pairs:
@@ -56,9 +59,9 @@ def write_trajectories(
             if isinstance(outcome, str):
                 group.attrs["message"] = outcome
                 continue
-            n, rollout = problem.system.size, outcome.rollout
+            n, rollout = problem.system.n_coordinates, outcome.rollout
             arrays = {
-                "t": episode.grid.times,
+                "t": episode.grid.node_times,
                 "q": rollout.state[:, :n],
                 "p": rollout.state[:, n : 2 * n],
                 "multipliers": rollout.multipliers,
@@ -66,11 +69,11 @@ def write_trajectories(
                 "effort": rollout.effort,
             }
             _store(group, arrays)
-            for samples, predicted in zip(episode.samples, outcome.predicted, strict=True):
+            for samples, predicted in zip(episode.measurements, outcome.predicted_outputs, strict=True):
                 _store_sensor(group, episode, samples, {"predicted": predicted})
 
 
-def write_diagnosis_trajectories(path: Path, finding: Finding, predicted: Sequence[Prediction]) -> None:
+def write_diagnosis_trajectories(path: Path, finding: DiagnosisResult, predicted: Sequence[HeldOutPrediction]) -> None:
     """Write held-out predictions and smoothed unknowns as `yid-diagnosis-trajectories/1`.
 
     `RECORDING/GROUP/` for every held-out recording: `t` (M,) [s], `measured`, `before`, `after`, `std` (M, k) and the
@@ -79,7 +82,7 @@ def write_diagnosis_trajectories(path: Path, finding: Finding, predicted: Sequen
     `where/RECORDING/` for every recording that was estimated on, where there was a gap to locate: `edges` (J + 1,) [s]
     since its first node, of the intervals over which unknowns are constant; `mean` and `std` (J, nd) of the unknown
     forces, offsets and biases about the nominal model and `prior` (nd,), the standard deviation at the largest
-    evidence, zero where a group was not taken in; the attributes `unknowns`, `locations`, `kinds`, `units` (nd,) each,
+    evidence, zero where a group was not taken in; the attributes `unknowns`, `possible_locations`, `kinds`, `unknown_units` (nd,) each,
     and `start`, the time of the first node [s].
 
     `events/RECORDING/CHANNEL/` where a force acted as an event: `t` (M,) [s], `value` (M,) the force beside what model
@@ -89,37 +92,37 @@ def write_diagnosis_trajectories(path: Path, finding: Finding, predicted: Sequen
     ------
     OutputError
     """
-    with _file(path, DIAGNOSED) as file:
+    with _file(path, DIAGNOSIS_TRAJECTORIES_FORMAT) as file:
         for episode, before, after in predicted:
-            for k, samples in enumerate(episode.samples):
-                both = {"before": before.predicted[k], "after": after.predicted[k]}
+            for k, samples in enumerate(episode.measurements):
+                both = {"before": before.predicted_outputs[k], "after": after.predicted_outputs[k]}
                 _store_sensor(file.require_group(episode.name), episode, samples, both)
-        for trace in () if finding.smoothed is None else finding.smoothed.traces:
-            assert finding.smoothed is not None
-            episodes = finding.nominal.problem.episodes
+        for trace in () if finding.smoother_result is None else finding.smoother_result.smoothed_unknowns:
+            assert finding.smoother_result is not None
+            episodes = finding.nominal_model.problem.episodes
             group = file.create_group(f"where/{trace.recording}")
-            group.attrs["start"] = next(e.grid.start for e in episodes if e.name == trace.recording)
-            group.attrs["unknowns"] = _texts(trace.unknowns)
-            group.attrs["locations"] = _texts([source.location for source in trace.sources])
-            group.attrs["kinds"] = _texts([source.kind for source in trace.sources])
-            group.attrs["units"] = _texts(units(finding.nominal.problem.system, trace))
-            variance = np.array([finding.smoothed.variance[source] for source in trace.sources])
+            group.attrs["start"] = next(e.grid.start_time for e in episodes if e.name == trace.recording)
+            group.attrs["unknowns"] = _texts(trace.unknown_names)
+            group.attrs["locations"] = _texts([source.location for source in trace.unknown_groups])
+            group.attrs["kinds"] = _texts([source.kind for source in trace.unknown_groups])
+            group.attrs["unknown_units"] = _texts(unknown_units(finding.nominal_model.problem.system, trace))
+            variance = np.array([finding.smoother_result.group_variance[source] for source in trace.unknown_groups])
             arrays = {
-                "edges": trace.edges,
-                "mean": trace.mean * trace.reference,
-                "std": trace.std * trace.reference,
-                "prior": np.sqrt(variance) * trace.reference,
+                "edges": trace.interval_edges,
+                "mean": trace.posterior_mean * trace.reference_std,
+                "std": trace.posterior_std * trace.reference_std,
+                "prior": np.sqrt(variance) * trace.reference_std,
             }
             _store(group, arrays)
-        for force in finding.events.forces:
+        for force in finding.events.force_series:
             group = file.create_group(f"events/{force.recording}/{force.channel}")
             group.attrs["unit"] = force.unit
-            _store(group, {"t": force.t, "value": force.value, "allowed": force.allowed})
+            _store(group, {"t": force.t, "value": force.force, "allowed": force.allowed_model_error})
 
 
 @contextlib.contextmanager
 def _file(path: Path, form: str) -> Iterator[h5py.File]:
-    with new_hdf5(path) as file:
+    with create_hdf5_atomically(path) as file:
         file.attrs["format"] = form
         yield file
 
@@ -128,10 +131,10 @@ def _store_sensor(
     parent: h5py.Group, episode: Episode, samples: Measurements, predicted: Mapping[str, NDArray[np.float64]]
 ) -> None:
     """What a sensor measured and what was predicted of it."""
-    group = parent.create_group(samples.sensor.group)
-    group.attrs["channels"] = _texts(samples.sensor.channels)
+    group = parent.create_group(samples.sensor.group_name)
+    group.attrs["channels"] = _texts(samples.sensor.channel_names)
     group.attrs["unit"] = samples.sensor.unit
-    times = episode.grid.start + episode.grid.time_step * (samples.node + samples.fraction)
+    times = episode.grid.start_time + episode.grid.time_step * (samples.node + samples.fraction)
     _store(group, {"t": times, "measured": samples.value, **predicted, "std": samples.std})
 
 

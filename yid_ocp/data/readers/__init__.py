@@ -10,13 +10,13 @@ from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any
 
-from yid_ocp.data.hdf5 import read_recording
 from yid_ocp.data.readers.base import PREVIEWS as PREVIEWS
 from yid_ocp.data.readers.base import READERS as READERS
-from yid_ocp.data.readers.base import Contents, Source, rate_of
+from yid_ocp.data.readers.base import FileContents, FileSource, mean_sample_rate
 from yid_ocp.data.recording import Recording
-from yid_ocp.errors import DataError, choices, nearest
-from yid_ocp.progress import SILENT, Progress
+from yid_ocp.data.recording_hdf5 import read_recording
+from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
+from yid_ocp.progress import NULL_PROGRESS, Progress
 
 for _suffix in (".h5", ".hdf5"):
     READERS.register(_suffix)(read_recording)
@@ -25,7 +25,7 @@ for _format in iter_modules(__path__):
     import_module(f"{__name__}.{_format.name}")
 
 
-def read_any(path: str | os.PathLike[str], *, progress: Progress = SILENT, **options: Any) -> Recording:
+def read_any(path: str | os.PathLike[str], *, progress: Progress = NULL_PROGRESS, **options: Any) -> Recording:
     """Read a recording of any known format, chosen by its suffix.
 
     Parameters
@@ -56,12 +56,12 @@ def read_any(path: str | os.PathLike[str], *, progress: Progress = SILENT, **opt
             raise DataError(
                 f"the reader of '{known_as}' files has no option '{name}'",
                 where=str(path),
-                **choices(name, known),
+                **unknown_name_details(name, known),
             )
     return reader(path, **options, **_told(reader, progress))
 
 
-def preview(path: str | os.PathLike[str], progress: Progress = SILENT) -> Contents:
+def preview_file(path: str | os.PathLike[str], progress: Progress = NULL_PROGRESS) -> FileContents:
     """List the contents of a file of any known format, and the options for `read_any`.
 
     Parameters
@@ -85,10 +85,10 @@ def preview(path: str | os.PathLike[str], progress: Progress = SILENT) -> Conten
         return PREVIEWS[known_as](path, **_told(PREVIEWS[known_as], progress))
     recording = read_any(path)
     sources = (
-        Source(getattr(g, "name", "joints"), "group", len(g.t), rate_of(g.t), ", ".join(g.names))
+        FileSource(getattr(g, "name", "joints"), "group", len(g.t), mean_sample_rate(g.t), ", ".join(g.names))
         for g in recording.groups
     )
-    return Contents(tuple(sources), {}, ("a recording already", *recording.notes))
+    return FileContents(tuple(sources), {}, ("a recording already", *recording.notes))
 
 
 def _told(reader: Callable[..., Any], progress: Progress) -> dict[str, Any]:
@@ -100,7 +100,7 @@ def _format_of(path: Path) -> str:
     """Key of the reader of a file or folder."""
     if not path.suffix and not path.exists():
         near = [entry.name for entry in path.parent.iterdir()] if path.parent.is_dir() else []
-        hint = nearest(path.name, near) if near else "check the path"
+        hint = nearest_name_hint(path.name, near) if near else "check the path"
         raise DataError("there is no such file", where=str(path), hint=hint)
     key = path.suffix.lower()
     if path.is_dir():
@@ -109,6 +109,6 @@ def _format_of(path: Path) -> str:
         raise DataError(
             f"there is no reader for '{key}' files",
             where=str(path),
-            **choices(key, READERS),
+            **unknown_name_details(key, READERS),
         )
     return key

@@ -11,23 +11,23 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.data.joined import held, joined
+from yid_ocp.data.clock_merging import merge_on_fastest_clock, zero_order_hold
 from yid_ocp.data.readers.base import (
     PREVIEWS,
     READERS,
-    Contents,
-    Source,
+    FileContents,
+    FileSource,
     check_point_names,
-    finished,
-    guessed_units,
-    renamings,
+    convert_to_si_and_validate,
+    guess_units,
+    parse_renamings,
 )
 from yid_ocp.data.recording import Array, JointGroup, PointGroup, Recording
-from yid_ocp.errors import DataError, choices, nearest
+from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
 from yid_ocp.files import file_sha256
-from yid_ocp.progress import SILENT, Progress
+from yid_ocp.progress import NULL_PROGRESS, Progress
 
-TOLD = 5000  # messages from one word of progress to the next
+_PROGRESS_INTERVAL = 5000  # messages from one word of progress to the next
 _JOINT_STATE = "sensor_msgs/msg/JointState"
 _POINT_STAMPED = "geometry_msgs/msg/PointStamped"
 _POSES = (
@@ -91,11 +91,11 @@ def read_bag(
     gears: Mapping[str, float] | None = None,
     sensor: str = "unknown",
     description: str = "",
-    progress: Progress = SILENT,
+    progress: Progress = NULL_PROGRESS,
 ) -> Recording:
     """Read a ROS 1 bag, a ROS 2 bag folder or an MCAP file.
 
-    `sensor_msgs/JointState` becomes the joints, of several topics on one clock (`yid_ocp.data.joined`); stamped points,
+    `sensor_msgs/JointState` becomes the joints, of several topics on one clock (`yid_ocp.data.clock_merging`); stamped points,
     poses and transforms of `geometry_msgs`, and frames of `/tf`, become points, one group per frame of reference. Times
     are the headers' stamps (the times of recording if a message has none), from the first message on. A joint channel
     that is empty, or NaN throughout, was not measured and is left out. Topics that are not used are in `notes`.
@@ -118,7 +118,7 @@ def read_bag(
         Distance from a pose's origin [m] at which NAME_x, NAME_y and NAME_z on its axes become points too, so that
         its orientation is kept.
     units, torque_constants, gears
-        As `yid_ocp.data.readers.base.finished`.
+        As `yid_ocp.data.readers.base.convert_to_si_and_validate`.
     sensor : str
         What saw the points.
     description : str
@@ -166,14 +166,14 @@ def read_bag(
         f"{topic.name} was left out ({topic.kind}, {topic.count})" for topic in bag.topics if topic.name not in used
     ]
     raw = Recording(joint_group, tuple(found), description, path.name, path.stem, digest, notes=(*notes, *more, *left))
-    return finished(raw, str(path), units=units, torque_constants=torque_constants, gears=gears)
+    return convert_to_si_and_validate(raw, str(path), units=units, torque_constants=torque_constants, gears=gears)
 
 
 @PREVIEWS.register(".bag")
 @PREVIEWS.register(".mcap")
 @PREVIEWS.register(".db3")
 @PREVIEWS.register("folder")
-def preview_bag(path: str | os.PathLike[str], progress: Progress = SILENT) -> Contents:
+def preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRESS) -> FileContents:
     """What a bag holds: its topics, what they would become, and units that their values look like.
 
     Raises
@@ -205,10 +205,10 @@ def preview_bag(path: str | os.PathLike[str], progress: Progress = SILENT) -> Co
     if any(message.content.axes is not None for message in bag.places if ":" not in message.source):
         notes.append("poses have orientations: --pose-axes 0.1 keeps them as points 0.1 m along the axes")
     raw = _for_guess(bag)
-    units, why = guessed_units(raw) if raw is not None else ({}, ())
+    units, why = guess_units(raw) if raw is not None else ({}, ())
     if units:
         options["units"] = units
-    return Contents(tuple(sources), options, (*notes, *why))
+    return FileContents(tuple(sources), options, (*notes, *why))
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------
@@ -237,8 +237,8 @@ def _bag(path: Path, trees: Sequence[str] | None, progress: Progress) -> _Bag:
             total = sum(connection.msgcount for connection in wanted)
             # an empty selection would mean all topics, images included
             for done, (connection, logged, data) in enumerate(reader.messages(wanted) if wanted else ()):
-                if done % TOLD == 0:
-                    progress.advance(done, total, "messages")
+                if done % _PROGRESS_INTERVAL == 0:
+                    progress.report_parts_done(done, total, "messages")
                 content: Any = reader.deserialize(data, connection.msgtype)
                 if connection.msgtype in _TREES:
                     places += [
@@ -325,9 +325,9 @@ def _joints(
     for topic in (*(topics or ()), *((command,) if command else ())):
         if topic not in known:
             what = f"there are no joint states on the topic '{topic}'"
-            raise DataError(what, where=where, **choices(topic, known))
+            raise DataError(what, where=where, **unknown_name_details(topic, known))
     chosen = [topic for topic in (known if topics is None else topics) if topic != command]
-    wanted = None if joints is None else renamings(joints, "joint", where)
+    wanted = None if joints is None else parse_renamings(joints, "joint", where)
     found, notes = [], []
     if wanted is not None:
         _check_together(bag, chosen, wanted, where)
@@ -370,7 +370,7 @@ def _check_together(bag: _Bag, topics: Sequence[str], wanted: Mapping[str, str],
     allowed = "; ".join(dict.fromkeys(", ".join(names) for names in sets)) or "no joints were recorded"
     for name in wanted:
         if name not in known:
-            hint = nearest(name, known) if known else ""
+            hint = nearest_name_hint(name, known) if known else ""
             raise DataError(f"there is no joint '{name}'", where=where, allowed=allowed, hint=hint)
     got = {name for topic in topics for name in _own(wanted, [n for n, source in sets.items() if source == topic])}
     if got != set(wanted):
@@ -384,10 +384,12 @@ def _on_one_clock(
     if not groups:
         return None, ()
     made = [(entry.topic, _joint_group(entry, seconds, f"{where}: {entry.topic}")) for entry in groups]
-    together, notes = joined([pair for pair, e in zip(made, groups, strict=True) if not e.command], where)
+    together, notes = merge_on_fastest_clock(
+        [pair for pair, e in zip(made, groups, strict=True) if not e.command], where
+    )
     for entry, (_, group) in zip(groups, made, strict=True):
         if entry.command:
-            together = replace(together, position_command=held(group, together.t))
+            together = replace(together, position_command=zero_order_hold(group, together.t))
     return together, notes
 
 
@@ -416,7 +418,7 @@ def _joint_group(entry: _States, seconds: Callable[[_Message], float], where: st
 # -- points -----------------------------------------------------------------------------------------------------------
 
 
-Places = dict[str, list[tuple[str, _Message]]]
+_MessagesByFrame = dict[str, list[tuple[str, _Message]]]
 
 
 def _names_of(bag: _Bag) -> dict[str, str]:
@@ -429,7 +431,7 @@ def _names_of(bag: _Bag) -> dict[str, str]:
     return names
 
 
-def _named_places(bag: _Bag, points: Mapping[str, str] | None, where: str) -> Places:
+def _named_places(bag: _Bag, points: Mapping[str, str] | None, where: str) -> _MessagesByFrame:
     """Sort the points by frame of reference, each with its name."""
     present = sorted({message.source for message in bag.places})
     names = _names_of(bag) if points is None else dict(points)
@@ -437,9 +439,11 @@ def _named_places(bag: _Bag, points: Mapping[str, str] | None, where: str) -> Pl
         if source not in present and points is not None:
             trees = [topic.name for topic in bag.topics if topic.kind in _TREES]
             what = f"there are no points on the topic '{source}'"
-            raise DataError(what, where=where, **choices(source, [*present, *(f"{tree}:FRAME" for tree in trees)]))
+            raise DataError(
+                what, where=where, **unknown_name_details(source, [*present, *(f"{tree}:FRAME" for tree in trees)])
+            )
     check_point_names(names, where)
-    groups: Places = {}
+    groups: _MessagesByFrame = {}
     for message in bag.places:
         if message.source in names:
             frame = message.content.frame.strip("/") or "unknown"
@@ -499,7 +503,7 @@ def _point_group(
 # -- preview ----------------------------------------------------------------------------------------------------------
 
 
-def _preview_source(topic: _Topic, bag: _Bag, names: Mapping[str, str]) -> Source:
+def _preview_source(topic: _Topic, bag: _Bag, names: Mapping[str, str]) -> FileSource:
     own = [m for m in (*bag.states, *bag.places) if m.source.partition(":")[0] == topic.name]
     logged = [message.logged for message in own]
     span = 1e-9 * (max(logged) - min(logged)) if logged else 0.0
@@ -514,7 +518,7 @@ def _preview_source(topic: _Topic, bag: _Bag, names: Mapping[str, str]) -> Sourc
     elif topic.kind in _TREES:
         children = sorted({message.source.partition(":")[2] for message in own})
         note = f"frames {', '.join(children)}: --points {topic.name}:FRAME=POINT"
-    return Source(topic.name, topic.kind, topic.count, rate, becomes, note if topic.count else "no messages")
+    return FileSource(topic.name, topic.kind, topic.count, rate, becomes, note if topic.count else "no messages")
 
 
 def _for_guess(bag: _Bag) -> Recording | None:

@@ -10,26 +10,26 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.data.recording import JOINT_CHANNELS, Array, JointGroup, PointGroup, Recording, validate
-from yid_ocp.errors import DataError, choices
+from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, Array, JointGroup, PointGroup, Recording, validate_recording
+from yid_ocp.errors import DataError, unknown_name_details
 from yid_ocp.registry import Registry
 
-Reader = Callable[..., Recording]
+RecordingReader = Callable[..., Recording]
 
 
 @dataclass(frozen=True)
-class Source:
+class FileSource:
     """One data source in a file of another tool: a topic, a column or a marker.
 
     Attributes
     ----------
     name, kind : str
         What the file calls it, and its type.
-    count : int
+    n_samples : int
         Messages or values.
-    rate : float
+    mean_rate : float
         Mean rate [Hz]; NaN where it has none.
-    becomes : str
+    imported_as : str
         What an import makes of it, empty where it is left out.
     note : str
         Why it is left out, or what should be looked at.
@@ -37,37 +37,37 @@ class Source:
 
     name: str
     kind: str
-    count: int
-    rate: float
-    becomes: str = ""
+    n_samples: int
+    mean_rate: float
+    imported_as: str = ""
     note: str = ""
 
 
 @dataclass(frozen=True)
-class Contents:
+class FileContents:
     """Contents of a file of another tool, and the reader options that import it.
 
     Attributes
     ----------
     sources : tuple of Source
-    options : mapping of str to object
+    reader_options : mapping of str to object
         Named options of the reader.
     notes : tuple of str
         What else should be known, such as guesses of units.
     """
 
-    sources: tuple[Source, ...]
-    options: Mapping[str, Any] = field(default_factory=dict)
+    sources: tuple[FileSource, ...]
+    reader_options: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
 
-READERS: Registry[Reader] = Registry("recording format")
+READERS: Registry[RecordingReader] = Registry("recording format")
 """Readers by file suffix, and by word for what is stored as a folder; each takes a path, then named options."""
 
-PREVIEWS: Registry[Callable[..., Contents]] = Registry("recording format with a preview")
+PREVIEWS: Registry[Callable[..., FileContents]] = Registry("recording format with a preview")
 """Functions that list a file's contents without importing it, by the same keys; each takes a path."""
 
-SKIP = "skip"
+SKIP_COLUMN = "skip"
 """Column meaning that leaves the column out."""
 
 _TO_SI: Mapping[str, Mapping[str, float]] = {
@@ -78,12 +78,12 @@ _TO_SI: Mapping[str, Mapping[str, float]] = {
     "N m": {"N m": 1.0, "N mm": 1e-3, "mN m": 1e-3, "A": 1.0, "mA": 1e-3},
 }
 _CURRENTS = ("A", "mA")
-_QUANTITIES: Mapping[str, str] = {"t": "s", **JOINT_CHANNELS, "points": "m"}
-LARGEST_PLAUSIBLE = {"position": 2.1 * math.pi, "points": 20.0}
+_QUANTITIES: Mapping[str, str] = {"t": "s", **JOINT_CHANNEL_UNITS, "points": "m"}
+_MAX_PLAUSIBLE_VALUES = {"position": 2.1 * math.pi, "points": 20.0}
 """Largest plausible angle [rad] and coordinate [m]; larger values look like degrees or millimetres."""
 
 
-def units_of(words: Iterable[str]) -> dict[str, str]:
+def parse_units(words: Iterable[str]) -> dict[str, str]:
     """Unit of each quantity, parsed from `quantity=unit` or from a unit alone.
 
     Parameters
@@ -109,7 +109,7 @@ def units_of(words: Iterable[str]) -> dict[str, str]:
         of = next((si for si, known in _TO_SI.items() if _spaceless(word) in map(_spaceless, known)), None)
         if of is None:
             known = [unit for table in _TO_SI.values() for unit in table]
-            raise DataError(f"'{word}' is no unit", where="units", **choices(word, known))
+            raise DataError(f"'{word}' is no unit", where="units", **unknown_name_details(word, known))
         units |= {quantity: word for quantity, si in _QUANTITIES.items() if si == of}
     return units
 
@@ -126,17 +126,17 @@ def _factors(units: Mapping[str, str], where: str) -> dict[str, float]:
             raise DataError(
                 f"a unit is given for '{quantity}', which is no quantity",
                 where=where,
-                **choices(quantity, _QUANTITIES),
+                **unknown_name_details(quantity, _QUANTITIES),
             )
         known = {_spaceless(name): factor for name, factor in _TO_SI[_QUANTITIES[quantity]].items()}
         if _spaceless(unit) not in known:
             what, names = f"'{unit}' is not a unit of '{quantity}'", tuple(_TO_SI[_QUANTITIES[quantity]])
-            raise DataError(what, where=where, **choices(unit, names))
+            raise DataError(what, where=where, **unknown_name_details(unit, names))
         factors[quantity] = known[_spaceless(unit)]
     return factors
 
 
-def renamings(entries: Iterable[str], noun: str, where: str) -> dict[str, str]:
+def parse_renamings(entries: Iterable[str], noun: str, where: str) -> dict[str, str]:
     """Mapping from recorded names to new names, parsed from `name` or `recorded=name`.
 
     Raises
@@ -156,7 +156,7 @@ def renamings(entries: Iterable[str], noun: str, where: str) -> dict[str, str]:
     return found
 
 
-def finished(
+def convert_to_si_and_validate(
     raw: Recording,
     where: str,
     *,
@@ -187,12 +187,12 @@ def finished(
     Raises
     ------
     DataError
-        A joint, point, quantity or unit that is not known, a current without torque constants, or as `validate`.
+        A joint, point, quantity or unit that is not known, a current without torque constants, or as `validate_recording`.
     """
     factors = _factors(units or {}, where)
     group = raw.joints
     if group is not None and joints is not None:
-        group = _chosen_joints(group, renamings(joints, "joint", where), where)
+        group = _chosen_joints(group, parse_renamings(joints, "joint", where), where)
     seen = raw.points if points is None else _chosen_points(raw.points, points, where)
     if group is not None:
         channels: dict[str, Any] = {name: factors[name] * values for name, values in group.channels.items()}
@@ -211,7 +211,7 @@ def finished(
         )
         for entry in seen
     )
-    return validate(replace(raw, joints=group, points=seen), where=where)
+    return validate_recording(replace(raw, joints=group, points=seen), where=where)
 
 
 def _chosen_joints(group: JointGroup, chosen: Mapping[str, str], where: str) -> JointGroup:
@@ -220,7 +220,7 @@ def _chosen_joints(group: JointGroup, chosen: Mapping[str, str], where: str) -> 
             raise DataError(
                 f"there is no joint '{name}'",
                 where=where,
-                **choices(name, group.names),
+                **unknown_name_details(name, group.names),
             )
     at = [group.names.index(name) for name in chosen]
     channels: dict[str, Any] = {name: values[:, at] for name, values in group.channels.items()}
@@ -231,7 +231,7 @@ def _chosen_points(groups: Sequence[PointGroup], chosen: Mapping[str, str], wher
     known = [name for group in groups for name in group.names]
     for name in chosen:
         if name not in known:
-            raise DataError(f"there is no point '{name}'", where=where, **choices(name, known))
+            raise DataError(f"there is no point '{name}'", where=where, **unknown_name_details(name, known))
     check_point_names(chosen, where)
     kept = []
     for group in groups:
@@ -263,7 +263,7 @@ def _torque_factors(
                 raise DataError(
                     f"{word} is given for '{pattern}', which is no joint",
                     where=where,
-                    **choices(pattern, names),
+                    **unknown_name_details(pattern, names),
                 )
             if not (math.isfinite(value) and value != 0):
                 raise DataError(f"{word} of '{pattern}' is {value:g}", where=where, allowed="a number that is not zero")
@@ -291,24 +291,24 @@ def _torque_factors(
     return factors
 
 
-def rate_of(t: Array) -> float:
+def mean_sample_rate(t: Array) -> float:
     """Mean rate of samples [Hz]; NaN for fewer than two."""
     span = float(t[-1] - t[0]) if len(t) > 1 else 0.0
     return (len(t) - 1) / span if span > 0 else math.nan
 
 
-def guessed_units(recording: Recording) -> tuple[dict[str, str], tuple[str, ...]]:
+def guess_units(recording: Recording) -> tuple[dict[str, str], tuple[str, ...]]:
     """Units guessed from values of a raw recording that cannot be SI, and the reasons in words."""
     units: dict[str, str] = {}
     notes = []
     joints = recording.joints
     if joints is not None and joints.position.size:
         widest = float(np.nanmax(np.abs(joints.position), initial=0.0))
-        if widest > LARGEST_PLAUSIBLE["position"]:
+        if widest > _MAX_PLAUSIBLE_VALUES["position"]:
             units["position"] = "deg"
             notes.append(f"angles reach {widest:.3g}: they look like degrees")
     farthest = max((float(np.nanmax(np.abs(g.position), initial=0.0)) for g in recording.points), default=0.0)
-    if farthest > LARGEST_PLAUSIBLE["points"]:
+    if farthest > _MAX_PLAUSIBLE_VALUES["points"]:
         units["points"] = "mm"
         notes.append(f"points reach {farthest:.3g}: they look like millimetres")
     for group in recording.groups:

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.data.readers.base import PREVIEWS, READERS, Contents, Source, finished
+from yid_ocp.data.readability_check import check_readable_in_fork
+from yid_ocp.data.readers.base import PREVIEWS, READERS, FileContents, FileSource, convert_to_si_and_validate
 from yid_ocp.data.recording import Array, PointGroup, Recording
-from yid_ocp.data.trial import try_first
 from yid_ocp.errors import DataError
 from yid_ocp.files import file_sha256
 
@@ -32,7 +32,7 @@ class _Markers:
     t: Array
     position: Array
     unit: str
-    others: tuple[Source, ...]
+    others: tuple[FileSource, ...]
 
 
 @READERS.register(".c3d")
@@ -81,11 +81,11 @@ def read_c3d(
     group = PointGroup("points", found.names, found.t, found.position, None, sensor, frame, None, "nominal")
     notes = tuple(f"{entry.name} was left out ({entry.note})" for entry in found.others)
     raw = Recording(None, (group,), description, path.name, path.stem, digest, notes=notes)
-    return finished(raw, str(path), points=points, units={**own, **(units or {})})
+    return convert_to_si_and_validate(raw, str(path), points=points, units={**own, **(units or {})})
 
 
 @PREVIEWS.register(".c3d")
-def preview_c3d(path: str | os.PathLike[str]) -> Contents:
+def preview_c3d(path: str | os.PathLike[str]) -> FileContents:
     """What a C3D file holds; errors as `read_c3d`."""
     path = Path(path)
     file_sha256(path)
@@ -93,7 +93,7 @@ def preview_c3d(path: str | os.PathLike[str]) -> Contents:
     rate = 1.0 / float(found.t[1] - found.t[0]) if len(found.t) > 1 else math.nan
     seen: NDArray[np.bool_] = np.asarray(np.isfinite(found.position).all(axis=2))
     sources = [
-        Source(
+        FileSource(
             name,
             "marker",
             int(seen[:, i].sum()),
@@ -105,7 +105,7 @@ def preview_c3d(path: str | os.PathLike[str]) -> Contents:
     ]
     notes = [f"the file says that its unit is {found.unit}"] if found.unit else ["the file says no unit: --units mm?"]
     options = {"points": {name: name for name in found.names}}
-    return Contents((*sources, *found.others), options, tuple(notes))
+    return FileContents((*sources, *found.others), options, tuple(notes))
 
 
 def _markers(path: Path) -> _Markers:
@@ -115,7 +115,7 @@ def _markers(path: Path) -> _Markers:
         raise DataError(
             "reading C3D files needs the package ezc3d", where=str(path), hint="pip install 'yid-ocp[c3d]'"
         ) from error
-    try_first(path, _complaint, "C3D")
+    check_readable_in_fork(path, _complaint, "C3D")
     try:
         file = ezc3d.c3d(str(path))
         parameters = file["parameters"]
@@ -151,9 +151,9 @@ def _markers(path: Path) -> _Markers:
         what = "no labelled marker of the C3D file was ever seen"
         raise DataError(what, where=str(path), allowed="labelled 3-D points", hint="label them and export it again")
     others = [
-        Source(labels[i] or f"marker {i + 1}", "marker", int((~unseen[:, i]).sum()), rate, "", why[i]) for i in why
+        FileSource(labels[i] or f"marker {i + 1}", "marker", int((~unseen[:, i]).sum()), rate, "", why[i]) for i in why
     ]
-    others += [Source(name, "analog", 0, math.nan, "", "an analog channel") for name in analog]
+    others += [FileSource(name, "analog", 0, math.nan, "", "an analog channel") for name in analog]
     names = _short([labels[i] for i in kept])
     t = np.arange(len(position)) / rate
     return _Markers(names, t, position[:, kept], unit, tuple(others))

@@ -15,18 +15,18 @@ import numpy as np
 from yid_ocp.data.readers.base import (
     PREVIEWS,
     READERS,
-    SKIP,
-    Contents,
-    Source,
-    finished,
-    guessed_units,
-    rate_of,
+    SKIP_COLUMN,
+    FileContents,
+    FileSource,
+    convert_to_si_and_validate,
+    guess_units,
+    mean_sample_rate,
 )
-from yid_ocp.data.recording import JOINT_CHANNELS, Array, Clock, JointGroup, PointGroup, Recording
-from yid_ocp.errors import DataError, choices, nearest
+from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, Array, ClockKind, JointGroup, PointGroup, Recording
+from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
 from yid_ocp.files import file_sha256
 
-_PREFIXES = {"q_": "position", **{f"{channel}_": channel for channel in JOINT_CHANNELS}}
+_PREFIXES = {"q_": "position", **{f"{channel}_": channel for channel in JOINT_CHANNEL_UNITS}}
 _NUMBERED = {"q": "position", "dq": "velocity", "cmd": "position_command"}
 """What Isaac Sim's system identification calls the columns of joints 1, 2, ..., whatever the case."""
 _AXES = ("x", "y", "z")
@@ -49,7 +49,7 @@ def read_csv(
     units: Mapping[str, str] | None = None,
     torque_constants: Mapping[str, float] | None = None,
     gears: Mapping[str, float] | None = None,
-    clock: Clock = "recorded",
+    clock: ClockKind = "recorded",
     sensor: str = "unknown",
     frame: str = "world",
     description: str = "",
@@ -76,7 +76,7 @@ def read_csv(
     delimiter : str
         One character between cells.
     joints, points, units, torque_constants, gears
-        As `yid_ocp.data.readers.base.finished`.
+        As `yid_ocp.data.readers.base.convert_to_si_and_validate`.
     clock : {'recorded', 'nominal'}
         Whether the times were measured.
     sensor, frame : str
@@ -99,7 +99,7 @@ def read_csv(
     meanings, table, notes = _read_table(path, delimiter, columns or {}, header, skip_bad_lines)
     raw = _raw(meanings, table, str(path), clock, sensor, frame)
     made = Recording(raw.joints, raw.points, description, path.name, path.stem, digest, notes=notes)
-    return finished(
+    return convert_to_si_and_validate(
         made,
         str(path),
         joints=joints,
@@ -114,7 +114,7 @@ def _raw(
     meanings: Sequence[tuple[str, str]],
     table: Array,
     where: str,
-    clock: Clock = "recorded",
+    clock: ClockKind = "recorded",
     sensor: str = "unknown",
     frame: str = "world",
 ) -> Recording:
@@ -137,7 +137,7 @@ def _raw(
 
 
 @PREVIEWS.register(".csv")
-def preview_csv(path: str | os.PathLike[str]) -> Contents:
+def preview_csv(path: str | os.PathLike[str]) -> FileContents:
     """What a table holds: columns, what their names say, and units that its values look like.
 
     Raises
@@ -181,11 +181,11 @@ def preview_csv(path: str | os.PathLike[str]) -> Contents:
     known = [(m, i) for i, m in enumerate(meanings) if m and numeric[i]]
     t = table[:, next((i for m, i in known if m == ("t", "")), 0)]
     sources = tuple(
-        Source(
+        FileSource(
             name,
             "numbers" if ok else "text",
             int(np.isfinite(column).sum()),
-            rate_of(t) if ok and len(t) > 1 else math.nan,
+            mean_sample_rate(t) if ok and len(t) > 1 else math.nan,
             ":".join(part for part in (meaning or ()) if part),
             "" if meaning else "its name does not say what it is",
         )
@@ -194,18 +194,18 @@ def preview_csv(path: str | os.PathLike[str]) -> Contents:
     notes = [f"{bad} of {len(rows)} lines are no rows of numbers"] if bad else []
     clean = table[np.isfinite(t)]
     try:
-        units, why = guessed_units(_raw([m for m, _ in known], clean[:, [i for _, i in known]], str(path)))
+        units, why = guess_units(_raw([m for m, _ in known], clean[:, [i for _, i in known]], str(path)))
     except (DataError, ValueError):  # a channel that is not complete: its meaning has to be given first
         units, why = {}, ()
     if units:
         options["units"] = units
-    return Contents(sources, options, (*notes, *why))
+    return FileContents(sources, options, (*notes, *why))
 
 
 def _proposed(name: str, numeric: bool) -> str:
     """A meaning to be filled in for a column whose name does not say it."""
     if not numeric:
-        return SKIP
+        return SKIP_COLUMN
     return "CHANNEL:JOINT" if name.isdecimal() else f"CHANNEL:{name}"
 
 
@@ -319,7 +319,7 @@ def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> 
         found = {name: match for name in header if (match := re.fullmatch(pattern, name))}
         if not found:
             what = f"there is no column '{key}'"
-            raise DataError(what, where=where, **choices(key, header))
+            raise DataError(what, where=where, **unknown_name_details(key, header))
         for name, match in found.items():
             given[name] = meaning.replace("*", match.group(1)) if "*" in key else meaning
     meanings: list[tuple[str, str] | None] = []
@@ -332,7 +332,7 @@ def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> 
                 allowed="t, "
                 + ", ".join(f"{prefix}<joint>" for prefix in _PREFIXES)
                 + ", <point>_x, <point>_y, <point>_z",
-                hint=f"rename it, or say what it is: columns {name}=position:JOINT, or {name}={SKIP} to leave it out",
+                hint=f"rename it, or say what it is: columns {name}=position:JOINT, or {name}={SKIP_COLUMN} to leave it out",
             )
         if own and own in meanings:
             other = header[meanings.index(own)]
@@ -357,18 +357,18 @@ def _conventional_meaning(column: str) -> tuple[str, str] | None:
 
 
 def _given_meaning(column: str, given: str, where: str) -> tuple[str, str] | None:
-    if given == SKIP:
+    if given == SKIP_COLUMN:
         return None
     if given == "t":
         return "t", ""
     kind, _, name = given.partition(":")
-    known = (*JOINT_CHANNELS, *_AXES)
+    known = (*JOINT_CHANNEL_UNITS, *_AXES)
     if not name or kind not in known:
         raise DataError(
             f"column '{column}' is given the meaning '{given}'",
             where=where,
-            allowed=f"t, {SKIP}, or KIND:NAME with a joint's or a point's name and one of {', '.join(known)}",
-            hint=nearest(kind, known) if kind not in known else f"{kind}:NAME",
+            allowed=f"t, {SKIP_COLUMN}, or KIND:NAME with a joint's or a point's name and one of {', '.join(known)}",
+            hint=nearest_name_hint(kind, known) if kind not in known else f"{kind}:NAME",
         )
     return kind, name
 
@@ -376,7 +376,7 @@ def _given_meaning(column: str, given: str, where: str) -> tuple[str, str] | Non
 def _joint_columns(
     meanings: Sequence[tuple[str, str]], table: Array, where: str
 ) -> tuple[tuple[str, ...], dict[str, Array]]:
-    found = [meaning for meaning in meanings if meaning[0] in JOINT_CHANNELS]
+    found = [meaning for meaning in meanings if meaning[0] in JOINT_CHANNEL_UNITS]
     names = tuple(dict.fromkeys(joint for _, joint in found))
     used = dict.fromkeys(["position", *(channel for channel, _ in found)]) if found else {}
     return names, {channel: _gather(meanings, table, [(channel, name) for name in names], where) for channel in used}

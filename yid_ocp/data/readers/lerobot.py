@@ -12,9 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.data.readers.base import PREVIEWS, READERS, Contents, Source, finished, guessed_units
+from yid_ocp.data.readers.base import (
+    PREVIEWS,
+    READERS,
+    FileContents,
+    FileSource,
+    convert_to_si_and_validate,
+    guess_units,
+)
 from yid_ocp.data.recording import Array, JointGroup, Recording
-from yid_ocp.errors import DataError, choices
+from yid_ocp.errors import DataError, unknown_name_details
 from yid_ocp.files import file_sha256
 
 _STATE, _ACTION = "observation.state", "action"
@@ -66,7 +73,7 @@ def read_lerobot(
     joints : sequence of str, optional
         Joints to keep, `name` or `recorded=name`, in this order: a gripper that is not in the model is left out so.
     units, torque_constants, gears
-        As `yid_ocp.data.readers.base.finished`. Many of these robots record degrees.
+        As `yid_ocp.data.readers.base.convert_to_si_and_validate`. Many of these robots record degrees.
     description : str
         What was recorded.
 
@@ -94,11 +101,13 @@ def read_lerobot(
         notes=tuple(f"{name} was left out ({why})" for name, why in left),
     )
     where = f"{dataset.folder}, episode {episode}"
-    return finished(raw, where, joints=joints, units=units, torque_constants=torque_constants, gears=gears)
+    return convert_to_si_and_validate(
+        raw, where, joints=joints, units=units, torque_constants=torque_constants, gears=gears
+    )
 
 
 @PREVIEWS.register("LeRobot dataset")
-def preview_lerobot(path: str | os.PathLike[str]) -> Contents:
+def preview_lerobot(path: str | os.PathLike[str]) -> FileContents:
     """What a LeRobot dataset holds, by its first episode; errors as `read_lerobot`."""
     dataset = _dataset(Path(path))
     table, _ = _episode(dataset, 0)
@@ -106,7 +115,7 @@ def preview_lerobot(path: str | os.PathLike[str]) -> Contents:
     group = JointGroup(names, np.asarray(table["frame_index"], float) / dataset.rate, clock="nominal", **channels)
     why, count = dict(left), len(group.t)
     sources = tuple(
-        Source(
+        FileSource(
             name,
             str(feature.get("dtype", "")),
             count,
@@ -116,13 +125,13 @@ def preview_lerobot(path: str | os.PathLike[str]) -> Contents:
         )
         for name, feature in dataset.features.items()
     )
-    units, guesses = guessed_units(Recording(group))
+    units, guesses = guess_units(Recording(group))
     options: dict[str, Any] = {"episode": 0, "joints": list(names)}
     if units:
         options["units"] = units | ({"position_command": units["position"]} if "position" in units else {})
     said = f"{dataset.episodes} episodes at {dataset.rate:g} Hz, {dataset.info.get('codebase_version', 'no version')}"
     robot = dataset.info.get("robot_type")
-    return Contents(sources, options, (said + (f", recorded on {robot}" if robot else ""), *guesses))
+    return FileContents(sources, options, (said + (f", recorded on {robot}" if robot else ""), *guesses))
 
 
 def _dataset(folder: Path) -> _Dataset:
@@ -144,7 +153,7 @@ def _dataset(folder: Path) -> _Dataset:
     if not (math.isfinite(rate) and rate > 0):
         raise DataError(f"the dataset has {rate:g} frames a second", where=where, allowed="a number above 0")
     if _STATE not in features:
-        raise DataError(f"the dataset has no {_STATE}", where=where, **choices(_STATE, features))
+        raise DataError(f"the dataset has no {_STATE}", where=where, **unknown_name_details(_STATE, features))
     return _Dataset(folder, rate, features, episodes, info)
 
 

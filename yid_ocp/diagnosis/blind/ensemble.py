@@ -16,28 +16,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.data.recording import Recording
-from yid_ocp.diagnosis.blind.plan import PURPOSES, SIZES, Planned
-from yid_ocp.diagnosis.diagnose import nominal_fit
-from yid_ocp.diagnosis.hypotheses import CandidateProblem, Choice, chosen_effects
-from yid_ocp.diagnosis.screening import Linearisation, Signature, linearise
-from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
-from yid_ocp.effects.base import EffectBase, Quantity, segment_springs
+from yid_ocp.diagnosis.blind.ensemble_plan import DETECTABLE_MULTIPLES, ENSEMBLE_PURPOSES, PlannedCase
+from yid_ocp.diagnosis.diagnose import fit_nominal_model
+from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, CandidateChoice, make_candidate_effects
+from yid_ocp.diagnosis.screening import CandidateLinearization, EffectSignature, linearize_candidates
+from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
+from yid_ocp.effects.base import EffectBase, ParameterDefinition, segment_springs
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.virtual.engine import Simulation
-from yid_ocp.virtual.experiment import ArmNoise, PointCamera, VirtualExperiment
-from yid_ocp.virtual.injected import KINDS, InjectedEffect, injected_experiment
-from yid_ocp.virtual.motion import Excitation, multisine
-from yid_ocp.virtual.outside import OUTSIDE
+from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperiment
+from yid_ocp.virtual.injected import INJECTABLE_KINDS, InjectedEffect, run_injected_experiment
+from yid_ocp.virtual.mujoco_simulation import SimulationOptions
+from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
+from yid_ocp.virtual.out_of_library_effects import OUT_OF_LIBRARY_EFFECTS
 
 Array = NDArray[np.float64]
 
-DRAWS = 64
+MAX_CASE_DRAWS = 64
 """Motions, objects and effects drawn for a case until one can be simulated; of 300, one was given up after eight."""
-SPREAD = 1.5
+_STIFFNESS_SPREAD_FACTOR = 1.5
 """Factor by which true stiffnesses lie above or below the problem's start, at most."""
-OUTSIDE_SIZES: Mapping[str, tuple[str, float, float, str]] = {
+_OUT_OF_LIBRARY_SIZES: Mapping[str, tuple[str, float, float, str]] = {
     "torque_ripple": ("joint", 0.5, 2.0, ""),
     "saturating_drive": ("joint", 0.75, 0.9, "torque"),
     "warming_gear": ("joint", 1.0, 4.0, ""),
@@ -54,12 +54,12 @@ OUTSIDE_SIZES: Mapping[str, tuple[str, float, float, str]] = {
     "one_way_damping": ("segment", 0.3, 1.0, ""),
 }
 """Of effects outside the library: where they sit, their least and largest size, and what of it they are parts of."""
-TRAVEL, TRAVEL_TOGETHER = 0.15, 0.08
+_GRIPPER_TRAVEL, _SHARED_GRIPPER_TRAVEL = 0.15, 0.08
 """How far the grippers go, one alone and several on one object, which they soon bring to snap [m]."""
 
 
 @dataclass(frozen=True)
-class Label:
+class CaseLabel:
     """True effects and parameters of a case, sealed until scoring.
 
     Attributes
@@ -89,38 +89,38 @@ class Label:
         return own | {"injected": [asdict(effect) for effect in self.injected]}
 
     @staticmethod
-    def from_dict(data: Mapping[str, Any]) -> Label:
+    def from_dict(data: Mapping[str, Any]) -> CaseLabel:
         """From JSON."""
         injected = tuple(InjectedEffect(**entry) for entry in data["injected"])
-        return Label(**{**data, "injected": injected})
+        return CaseLabel(**{**data, "injected": injected})
 
 
 @dataclass(frozen=True)
-class Case:
+class BlindCase:
     """Recordings and candidate exclusions of a case, as given to the diagnosis.
 
     Attributes
     ----------
     name : str
-    estimate : tuple of Recording
-    held_out : Recording
-    without : tuple of str
+    estimation_recordings : tuple of Recording
+    held_out_recording : Recording
+    excluded_kinds : tuple of str
         Kinds that are left out of the library; mostly one that has nothing to do with the case.
     """
 
     name: str
-    estimate: tuple[Recording, ...]
-    held_out: Recording
-    without: tuple[str, ...]
+    estimation_recordings: tuple[Recording, ...]
+    held_out_recording: Recording
+    excluded_kinds: tuple[str, ...]
 
 
-def seal(labels: Sequence[Label]) -> tuple[str, str]:
+def seal_labels(labels: Sequence[CaseLabel]) -> tuple[str, str]:
     """Return the labels as JSON text and its SHA-256 hash, published before the diagnosis."""
     text = json.dumps([label.to_dict() for label in labels], indent=1, sort_keys=True, allow_nan=False)
     return text, hashlib.sha256(text.encode()).hexdigest()
 
 
-def opened(text: str, commitment: str) -> list[Label]:
+def open_sealed_labels(text: str, commitment: str) -> list[CaseLabel]:
     """Read sealed labels after checking their hash.
 
     Raises
@@ -130,61 +130,69 @@ def opened(text: str, commitment: str) -> list[Label]:
     """
     if hashlib.sha256(text.encode()).hexdigest() != commitment:
         raise DataError("the labels are not those that were committed to", where="sealed labels")
-    return [Label.from_dict(entry) for entry in json.loads(text)]
+    return [CaseLabel.from_dict(entry) for entry in json.loads(text)]
 
 
 @dataclass(frozen=True)
-class Conditions:
+class RecordingConditions:
     """Settings of the synthetic recordings of an experiment.
 
     Attributes
     ----------
-    recordings : int
+    estimation_count : int
         To estimate on; one more is held out.
-    noise : ArmNoise
+    arm_noise : ArmNoise
     simulation : Simulation
         Duration of each, and the engine's step.
-    vision : bool
+    has_camera : bool
         Whether a camera sees the object.
     purpose : str
-        Of `PURPOSES`.
+        Of `ENSEMBLE_PURPOSES`.
     """
 
-    recordings: int = 1
-    noise: ArmNoise = field(default_factory=ArmNoise)
-    simulation: Simulation = field(default_factory=Simulation)
-    vision: bool = False
-    purpose: str = PURPOSES[0]
+    estimation_count: int = 1
+    arm_noise: ArmSensorNoise = field(default_factory=ArmSensorNoise)
+    simulation: SimulationOptions = field(default_factory=SimulationOptions)
+    has_camera: bool = False
+    purpose: str = ENSEMBLE_PURPOSES[0]
 
 
 @dataclass(frozen=True)
-class Detectable:
+class DetectableEffect:
     """Sensitivity of an experiment to an effect, which gives its detectable size.
 
     Attributes
     ----------
     effect : EffectBase
-    shape : dict of str to float
+    shape_values : dict of str to float
         Values of its shape parameters.
-    columns : ndarray, shape (p, p)
+    sensitivity_factor : ndarray, shape (p, p)
         |columns a| is by how many standard deviations of the data the amplitudes a move the residual.
     """
 
     effect: EffectBase
-    shape: Mapping[str, float]
-    columns: Array
+    shape_values: Mapping[str, float]
+    sensitivity_factor: Array
 
     @staticmethod
-    def of(signature: Signature) -> Detectable:
+    def from_signature(signature: EffectSignature) -> DetectableEffect:
         """Build from a candidate's signature on a clean recording."""
-        return Detectable(signature.effect, signature.shape, np.asarray(np.linalg.qr(signature.columns, mode="r")))
+        return DetectableEffect(
+            signature.effect,
+            signature.shape_values,
+            np.asarray(np.linalg.qr(signature.projected_sensitivity, mode="r")),
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON."""
-        return {"effect": self.effect.label, "shape": dict(self.shape), "columns": self.columns.tolist()}
+        return {
+            "effect": self.effect.label,
+            "shape": dict(self.shape_values),
+            "columns": self.sensitivity_factor.tolist(),
+        }
 
 
-class Ensemble:
+class CaseGenerator:
     """Generator of random blind cases of one experiment.
 
     Parameters
@@ -198,7 +206,7 @@ class Ensemble:
         The library.
     limits : Thresholds
         For the detectable size.
-    simulated : System, optional
+    simulated_system : System, optional
         What moves, where that is not the problem's: the same with its arms driven.
     conditions : Conditions
         Whether there is a camera is seen from the problem's first recording.
@@ -214,14 +222,14 @@ class Ensemble:
         problem: EstimationProblem,
         seed: int,
         finer: Callable[[int], System] | None = None,
-        candidates: Choice = "all",
-        limits: Thresholds = DEFAULTS,
+        candidates: CandidateChoice = "all",
+        limits: Thresholds = DEFAULT_THRESHOLDS,
         *,
-        simulated: System | None = None,
-        conditions: Conditions | None = None,
+        simulated_system: System | None = None,
+        conditions: RecordingConditions | None = None,
     ) -> None:
-        self.simulated = problem.system if simulated is None else simulated
-        if not self.simulated.driven or self.simulated.prescribed:
+        self.simulated_system = problem.system if simulated_system is None else simulated_system
+        if not self.simulated_system.driven or self.simulated_system.prescribed:
             raise ConfigError(
                 "a blind proof moves driven arms",
                 where="model",
@@ -232,27 +240,27 @@ class Ensemble:
         self.problem, self.seed, self._finer = problem, seed, finer
         self._candidates, self._limits = candidates, limits
         recording = problem.episodes[0].recording
-        self.posture = first_posture(self.simulated, recording)
+        self.initial_configuration = initial_joint_positions(self.simulated_system, recording)
         seen = any(group.pose is not None for group in recording.points)
-        self.conditions = replace(conditions or Conditions(), vision=seen)
-        self._effects = chosen_effects(problem.system, [recording], candidates)
-        if not {effect.kind for effect in self._effects} & set(KINDS):
+        self.conditions = replace(conditions or RecordingConditions(), has_camera=seen)
+        self._effects = make_candidate_effects(problem.system, [recording], candidates)
+        if not {effect.kind for effect in self._effects} & set(INJECTABLE_KINDS):
             raise ConfigError(
                 "none of the candidates can be done in MuJoCo",
                 where="diagnosis.candidates",
-                allowed=", ".join(KINDS),
+                allowed=", ".join(INJECTABLE_KINDS),
             )
-        self._detectable: tuple[Detectable, ...] | None = None
+        self._detectable: tuple[DetectableEffect, ...] | None = None
 
     def _rng(self, *path: int) -> np.random.Generator:
-        return np.random.default_rng([self.seed, PURPOSES.index(self.conditions.purpose), *path])
+        return np.random.default_rng([self.seed, ENSEMBLE_PURPOSES.index(self.conditions.purpose), *path])
 
-    def truth(self, rng: np.random.Generator) -> dict[str, float]:
+    def draw_true_parameters(self, rng: np.random.Generator) -> dict[str, float]:
         """Draw true values of the free parameters, log-uniform about their start."""
         start = dict(zip(self.problem.system.parameters.names, self.problem.theta, strict=True))
-        return {name: float(start[name] * SPREAD ** rng.uniform(-1, 1)) for name in self.problem.free}
+        return {name: float(start[name] * _STIFFNESS_SPREAD_FACTOR ** rng.uniform(-1, 1)) for name in self.problem.free}
 
-    def record(
+    def simulate_recording(
         self,
         truth: Mapping[str, float],
         injected: Sequence[InjectedEffect],
@@ -261,51 +269,57 @@ class Ensemble:
         links: int = 1,
     ) -> Recording:
         """Simulate one recording with injected effects; it carries no description or truth."""
-        system = self.simulated
+        system = self.simulated_system
         if links > 1:
             assert self._finer is not None
             system = self._finer(links)
-        values = truth if links == 1 else finer_values(self.simulated, system, truth)
-        made = recorded(self.simulated, system, self.posture, truth, values, injected, rng, self.conditions)
-        return replace(made, name=name, description="", source="", truth={})
+        values = truth if links == 1 else finer_chain_parameters(self.simulated_system, system, truth)
+        made = simulate_random_motion(
+            self.simulated_system, system, self.initial_configuration, truth, values, injected, rng, self.conditions
+        )
+        return replace(made, name=name, description="", source="", true_parameters={})
 
-    def point(self) -> Linearisation:
+    def linearize_clean_recordings(self) -> CandidateLinearization:
         """Return the candidates' signatures on clean recordings."""
         rng = self._rng(0)
-        names = [f"clean_{i}" for i in range(self.conditions.recordings)]
-        clean = tuple(self.record(self.truth(rng), (), rng, name) for name in names)
-        problem = self.of(clean)
-        effects = chosen_effects(problem.system, clean, self._candidates)
-        composed = CandidateProblem.of(problem, effects, [self.record(self.truth(rng), (), rng, "other")])
-        nominal = nominal_fit(problem, composed, limits=self._limits)
+        names = [f"clean_{i}" for i in range(self.conditions.estimation_count)]
+        clean = tuple(self.simulate_recording(self.draw_true_parameters(rng), (), rng, name) for name in names)
+        problem = self.nominal_problem(clean)
+        effects = make_candidate_effects(problem.system, clean, self._candidates)
+        composed = AllCandidatesProblem.from_problem(
+            problem, effects, [self.simulate_recording(self.draw_true_parameters(rng), (), rng, "other")]
+        )
+        nominal = fit_nominal_model(problem, composed, limits=self._limits)
         # weighted by all noise, that of torques too
         composed = replace(composed, problem=nominal.problem)
-        return linearise(composed, (), nominal.values, self._limits.shape_values)
+        return linearize_candidates(composed, (), nominal.values, self._limits.shape_grid_size)
 
     @property
-    def detectable(self) -> tuple[Detectable, ...]:
+    def detectable_effects(self) -> tuple[DetectableEffect, ...]:
         """Detectable size of every candidate, computed once."""
         if self._detectable is None:
-            self._detectable = tuple(Detectable.of(signature) for signature in self.point().signatures)
+            self._detectable = tuple(
+                DetectableEffect.from_signature(signature) for signature in self.linearize_clean_recordings().signatures
+            )
         return self._detectable
 
-    def knowing(self, detectable: Sequence[Mapping[str, Any]]) -> None:
-        """Load detectable sizes computed by another process, from `Detectable.to_dict`."""
+    def load_detectable_effects(self, detectable: Sequence[Mapping[str, Any]]) -> None:
+        """Load detectable sizes computed by another process, from `DetectableEffect.to_dict`."""
         by_label = {effect.label: effect for effect in self._effects}
         self._detectable = tuple(
-            Detectable(
+            DetectableEffect(
                 by_label[entry["effect"]], dict(entry["shape"]), np.atleast_2d(np.array(entry["columns"], float))
             )
             for entry in detectable
         )
 
-    def of(self, recordings: Sequence[Recording]) -> EstimationProblem:
+    def nominal_problem(self, recordings: Sequence[Recording]) -> EstimationProblem:
         """Return the nominal estimation problem of some recordings."""
         nominal = self.problem
         values = dict(zip(nominal.system.parameters.names, map(float, nominal.theta), strict=True))
         return EstimationProblem(nominal.step, list(recordings), nominal.free, nominal.options, values)
 
-    def draw(self, wanted: Planned) -> tuple[Case, Label]:
+    def draw_case(self, wanted: PlannedCase) -> tuple[BlindCase, CaseLabel]:
         """Draw a planned case; the same seed and purpose give the same case.
 
         Raises
@@ -314,38 +328,41 @@ class Ensemble:
             None of several draws could be simulated.
         """
         name = f"case_{wanted.number:03d}"
-        purposes = [f"estimate_{i}" for i in range(self.conditions.recordings)]
-        for attempt in range(DRAWS):
+        purposes = [f"estimate_{i}" for i in range(self.conditions.estimation_count)]
+        for attempt in range(MAX_CASE_DRAWS):
             rng = self._rng(1, wanted.number, attempt)
-            truth = self.truth(rng)
+            truth = self.draw_true_parameters(rng)
             injected, multiple = self._injected(wanted, rng)
             links = 2 if wanted.category == "finer_chain" else 1
             try:
                 *estimate, held_out = (
-                    self.record(truth, injected, rng, f"{name}_{purpose}", links) for purpose in (*purposes, "held_out")
+                    self.simulate_recording(truth, injected, rng, f"{name}_{purpose}", links)
+                    for purpose in (*purposes, "held_out")
                 )
             except ModelError:
                 continue  # the motion throws the object about; draw another
             left_out = (injected[0].kind,) if wanted.category == "left_out" else self._other_kind(injected, rng)
-            label = Label(name, wanted.category, injected, multiple, truth, wanted.experiment)
-            return Case(name, tuple(estimate), held_out, left_out), label
+            label = CaseLabel(name, wanted.category, injected, multiple, truth, wanted.experiment)
+            return BlindCase(name, tuple(estimate), held_out, left_out), label
         raise ModelError(
-            f"none of {DRAWS} motions can be simulated",
+            f"none of {MAX_CASE_DRAWS} motions can be simulated",
             where=f"{name} of {wanted.experiment}",
             hint="take another --seed: a seed draws the same again",
         )
 
     def _other_kind(self, injected: Sequence[InjectedEffect], rng: np.random.Generator) -> tuple[str, ...]:
         at_work = {effect.kind for effect in injected}
-        kinds = sorted({entry.effect.kind for entry in self.detectable} - at_work)
+        kinds = sorted({entry.effect.kind for entry in self.detectable_effects} - at_work)
         return (str(rng.choice(kinds)),) if len(kinds) > 1 else ()
 
-    def _injected(self, wanted: Planned, rng: np.random.Generator) -> tuple[tuple[InjectedEffect, ...], float | None]:
+    def _injected(
+        self, wanted: PlannedCase, rng: np.random.Generator
+    ) -> tuple[tuple[InjectedEffect, ...], float | None]:
         if wanted.category in ("null", "finer_chain"):
             return (), None
         if wanted.category == "outside":
             return (self._outside(rng),), None
-        size = SIZES[-1] if wanted.multiple is None else wanted.multiple
+        size = DETECTABLE_MULTIPLES[-1] if wanted.multiple is None else wanted.multiple
         if wanted.category == "pair":
             (one, multiple), (two, _) = self._inside(rng, size), self._inside(rng, size)
             return ((one, two) if one.label != two.label else (one,)), multiple
@@ -355,15 +372,15 @@ class Ensemble:
     def _inside(self, rng: np.random.Generator, wanted: float) -> tuple[InjectedEffect, float]:
         """An effect of the library at so many times its detectable size, or as near as its range lets it come."""
         groups: dict[str, dict[str, list[int]]] = {}
-        for i, entry in enumerate(self.detectable):
-            if entry.effect.kind in KINDS:
+        for i, entry in enumerate(self.detectable_effects):
+            if entry.effect.kind in INJECTABLE_KINDS:
                 places = groups.setdefault(entry.effect.kind, {})
                 places.setdefault(entry.effect.location, []).append(i)
         best: tuple[InjectedEffect, float] | None = None
         for _ in range(40):
             kind = str(rng.choice(sorted(groups)))
             place = str(rng.choice(sorted(groups[kind])))
-            drawn = self._sized(self.detectable[int(rng.choice(groups[kind][place]))], rng, wanted)
+            drawn = self._sized(self.detectable_effects[int(rng.choice(groups[kind][place]))], rng, wanted)
             if drawn is None:
                 continue
             made, multiple = drawn
@@ -374,40 +391,42 @@ class Ensemble:
         assert best is not None
         return best
 
-    def _sized(self, entry: Detectable, rng: np.random.Generator, wanted: float) -> tuple[InjectedEffect, float] | None:
+    def _sized(
+        self, entry: DetectableEffect, rng: np.random.Generator, wanted: float
+    ) -> tuple[InjectedEffect, float] | None:
         """Amplitudes in a random proportion at so many times the detectable size, as far as the range allows."""
         effect = entry.effect
-        quantities: dict[str, Quantity] = {f"{effect.label}.{q.name}": q for q in effect.quantities}
-        room = {n: effect.prior_range[n] for n in effect.amplitudes}
-        neutral = np.array([quantities[n].neutral for n in effect.amplitudes])
-        low, high = (np.array([room[n][side] for n in effect.amplitudes]) - neutral for side in (0, 1))
+        quantities: dict[str, ParameterDefinition] = {f"{effect.label}.{q.name}": q for q in effect.definitions}
+        room = {n: effect.prior_ranges[n] for n in effect.amplitude_names}
+        neutral = np.array([quantities[n].neutral_value for n in effect.amplitude_names])
+        low, high = (np.array([room[n][side] for n in effect.amplitude_names]) - neutral for side in (0, 1))
         way = rng.uniform(low, high)
-        seen = float(np.linalg.norm(entry.columns @ way))
+        seen = float(np.linalg.norm(entry.sensitivity_factor @ way))
         if seen <= 0:
             return None
         reach = np.min(np.where(way > 0, high, low)[way != 0] / way[way != 0])
-        factor = min(wanted * self._limits.detection / seen, float(reach))
-        values = {**dict(zip(effect.amplitudes, neutral + factor * way, strict=True)), **entry.shape}
-        reported = {name: told.value for name, told in effect.reported(values).items()}
-        return InjectedEffect(effect.kind, effect.location, reported), factor * seen / self._limits.detection
+        factor = min(wanted * self._limits.detection_z / seen, float(reach))
+        values = {**dict(zip(effect.amplitude_names, neutral + factor * way, strict=True)), **entry.shape_values}
+        reported = {name: told.value for name, told in effect.reported_parameters(values).items()}
+        return InjectedEffect(effect.kind, effect.location, reported), factor * seen / self._limits.detection_z
 
     def _outside(self, rng: np.random.Generator) -> InjectedEffect:
-        system = self.simulated
+        system = self.simulated_system
         places: dict[str, tuple[str, ...]] = {
             "joint": system.driven[: max(len(system.driven) // 2, 1)],
-            "segment": tuple(segment.name for segment in system.segments),
+            "segment": tuple(segment.name for segment in system.segment_layouts),
             "grasp": tuple(grasp.name for grasp in system.grasps),
         }
-        known = [kind for kind in OUTSIDE if places[OUTSIDE_SIZES[kind][0]]]
+        known = [kind for kind in OUT_OF_LIBRARY_EFFECTS if places[_OUT_OF_LIBRARY_SIZES[kind][0]]]
         kind = str(rng.choice(known))
-        place, low, high, part_of = OUTSIDE_SIZES[kind]
+        place, low, high, part_of = _OUT_OF_LIBRARY_SIZES[kind]
         location = str(rng.choice(places[place]))
         size = float(rng.uniform(low, high))
         if part_of == "torque":
             size *= self._largest_torque(location)
         elif part_of == "stiffness":
             start = dict(zip(self.problem.system.parameters.names, self.problem.theta, strict=True))
-            bends = any(spring.kind == "bend" for spring in segment_springs(system, location))
+            bends = any(spring.deformation == "bend" for spring in segment_springs(system, location))
             size *= float(start.get(f"{location}.bend", 10.0)) if bends else 10.0
         return InjectedEffect(kind, location, {"size": size})
 
@@ -419,7 +438,7 @@ class Ensemble:
         return float(np.nanmax(np.abs(recorded.effort[:, recorded.names.index(joint)])))
 
 
-def recorded(
+def simulate_random_motion(
     nominal: System,
     simulated: System,
     posture: Mapping[str, float],
@@ -427,7 +446,7 @@ def recorded(
     values: Mapping[str, float],
     injected: Sequence[InjectedEffect],
     rng: np.random.Generator,
-    conditions: Conditions,
+    conditions: RecordingConditions,
 ) -> Recording:
     """Simulate a recording of a random motion planned for the nominal system.
 
@@ -443,21 +462,23 @@ def recorded(
         Of motion and noise.
     conditions : Conditions
     """
-    travel = TRAVEL if len(nominal.grasps) < 2 else TRAVEL_TOGETHER
-    excitation = Excitation(travel=travel, duration=conditions.simulation.duration)
-    motion = multisine(nominal, truth, seed=int(rng.integers(2**31)), posture=posture, excitation=excitation)
+    travel = _GRIPPER_TRAVEL if len(nominal.grasps) < 2 else _SHARED_GRIPPER_TRAVEL
+    excitation = MultisineOptions(gripper_travel=travel, duration=conditions.simulation.duration)
+    motion = random_multisine(
+        nominal, truth, seed=int(rng.integers(2**31)), initial_joint_angles=posture, excitation=excitation
+    )
     experiment = VirtualExperiment(
         motion=motion,
-        posture=posture,
+        initial_joint_angles=posture,
         simulation=conditions.simulation,
-        noise=conditions.noise,
-        camera=PointCamera() if conditions.vision else None,
+        arm_noise=conditions.arm_noise,
+        camera=PointCamera() if conditions.has_camera else None,
         seed=int(rng.integers(2**31)),
     )
-    return injected_experiment(simulated, values, injected, experiment)
+    return run_injected_experiment(simulated, values, injected, experiment)
 
 
-def first_posture(system: System, recording: Recording) -> dict[str, float]:
+def initial_joint_positions(system: System, recording: Recording) -> dict[str, float]:
     """Return the initial positions of the driven joints of a recording.
 
     Raises
@@ -477,7 +498,7 @@ def first_posture(system: System, recording: Recording) -> dict[str, float]:
     return {name: float(joints.position[0, names.index(name)]) for name in system.driven}
 
 
-def finer_values(nominal: System, finer: System, truth: Mapping[str, float]) -> dict[str, float]:
+def finer_chain_parameters(nominal: System, finer: System, truth: Mapping[str, float]) -> dict[str, float]:
     """Return the parameters of the same tubes with more links: joint springs and dampers scaled by their number.
 
     A segment whose links did not change, or whose stiffness is that of its cross section, keeps its values.
@@ -485,8 +506,8 @@ def finer_values(nominal: System, finer: System, truth: Mapping[str, float]) -> 
     start = dict(zip(nominal.parameters.names, map(float, nominal.parameters.vector()), strict=True))
     finer_start = dict(zip(finer.parameters.names, map(float, finer.parameters.vector()), strict=True))
     values = dict(truth)
-    for segment in nominal.segments:
-        factor = len(finer.segment(segment.name).links) / len(segment.links)
+    for segment in nominal.segment_layouts:
+        factor = len(finer.segment_layout(segment.name).link_joints) / len(segment.link_joints)
         for what in ("bend", "twist"):
             name = f"{segment.name}.{what}"
             if name in truth and start[name] > 0:

@@ -10,21 +10,21 @@ from typing import Any
 import numpy as np
 import scipy.stats
 
-from yid_ocp.diagnosis.blind.ensemble import Label
-from yid_ocp.diagnosis.blind.plan import SHARES
+from yid_ocp.diagnosis.blind.ensemble import CaseLabel
+from yid_ocp.diagnosis.blind.ensemble_plan import CATEGORY_SHARES
 from yid_ocp.effects import EFFECTS
 
-FORMAT = "yid-blind/1"
-SORTS = tuple(SHARES)
-STRANGE = ("outside", "left_out")
+_FORMAT = "yid-blind/1"
+_CATEGORIES = tuple(CATEGORY_SHARES)
+OUT_OF_LIBRARY_CATEGORIES = ("outside", "left_out")
 """Categories whose true effect is not among the candidates."""
-SET = 3
+_MAX_CONFUSABLE_SET = 3
 """Largest confusable set that counts as correct."""
-VERDICTS = ("no_gap", "unknown", "insufficient_data", "effect", "confusable")
+_VERDICTS = ("no_gap", "unknown", "insufficient_data", "effect", "confusable")
 
 
 @dataclass(frozen=True)
-class Mark:
+class CaseScore:
     """Score of one diagnosis against its label.
 
     Attributes
@@ -88,7 +88,9 @@ class Mark:
         return self.verdict if self.answer == "-" else self.answer.partition("@")[0]
 
 
-def mark(label: Label, result: Mapping[str, Any], best: float = math.nan, seconds: float = math.nan) -> Mark:
+def score_case(
+    label: CaseLabel, result: Mapping[str, Any], best: float = math.nan, seconds: float = math.nan
+) -> CaseScore:
     """Score a `yid-diagnosis/1` result against its label.
 
     Parameters
@@ -96,7 +98,7 @@ def mark(label: Label, result: Mapping[str, Any], best: float = math.nan, second
     label : Label
     result : mapping
     best : float
-        Of `best_closure`.
+        Of `best_possible_closure`.
     seconds : float
     """
     verdict = str(result["verdict"])
@@ -132,7 +134,7 @@ def mark(label: Label, result: Mapping[str, Any], best: float = math.nan, second
                 z[f"{effect.label}.{name}"] = miss / found["std"]
     closed, before = result["gap"]["closure"], result["gap"].get("before") or {}
     p_value = before.get("p_value")
-    return Mark(
+    return CaseScore(
         label.case,
         label.category,
         " + ".join(true) or "-",
@@ -156,19 +158,20 @@ def mark(label: Label, result: Mapping[str, Any], best: float = math.nan, second
 
 
 def _found(true: Sequence[str], named: Sequence[str], groups: Sequence[tuple[str, ...]]) -> bool:
-    """Whether every true effect has one of its own among those named: itself, or one in a set of at most `SET` with it.
+    """Whether every true effect has one of its own among those named: itself, or one in a set of at most `_MAX_CONFUSABLE_SET` with it.
 
     A set that has two of them in it says one of the two.
     """
     if not true:
         return True
     sets = [
-        {name, *(label for group in groups if name in group and len(group) <= SET for label in group)} for name in named
+        {name, *(label for group in groups if name in group and len(group) <= _MAX_CONFUSABLE_SET for label in group)}
+        for name in named
     ]
     return any(true[0] in own and _found(true[1:], [*named[:i], *named[i + 1 :]], groups) for i, own in enumerate(sets))
 
 
-def proportion(hits: Sequence[bool]) -> dict[str, float | int | None]:
+def binomial_proportion(hits: Sequence[bool]) -> dict[str, float | int | None]:
     """Return count, total, rate and its 95 % interval (Clopper and Pearson 1934, doi:10.1093/biomet/26.4.404).
 
     Parameters
@@ -183,7 +186,7 @@ def proportion(hits: Sequence[bool]) -> dict[str, float | int | None]:
     return {"count": count, "of": total, "rate": count / total, "low": low, "high": high}
 
 
-def score(marks: Sequence[Mark]) -> dict[str, Any]:
+def score_ensemble(marks: Sequence[CaseScore]) -> dict[str, Any]:
     """Return the rates over an ensemble; None for a rate without cases."""
 
     def mean(values: Sequence[float]) -> float | None:
@@ -192,7 +195,7 @@ def score(marks: Sequence[Mark]) -> dict[str, Any]:
     singles = [m for m in marks if m.category == "single"]
     seen = [m for m in singles if m.gap]
     named = [m for m in seen if m.answer != "-"]
-    strange = [m for m in marks if m.category in STRANGE]
+    strange = [m for m in marks if m.category in OUT_OF_LIBRARY_CATEGORIES]
     pairs = [m for m in marks if m.category == "pair"]
     errors = [entry for m in singles for entry in m.errors.values()]
     relative = [m.closure / m.best for m in singles if m.best > 0 and math.isfinite(m.closure)]
@@ -204,21 +207,24 @@ def score(marks: Sequence[Mark]) -> dict[str, Any]:
         "location_first": [m.location_first for m in seen],
         "sets_cover": [m.truth in m.named for m in named],
         "unknown_recall": [m.verdict == "unknown" for m in strange],
-        **{f"unknown_{sort}": [m.verdict == "unknown" for m in strange if m.category == sort] for sort in STRANGE},
+        **{
+            f"unknown_{sort}": [m.verdict == "unknown" for m in strange if m.category == sort]
+            for sort in OUT_OF_LIBRARY_CATEGORIES
+        },
         "unknown_location": [m.location_first for m in strange if m.gap],
         "pairs_right": [m.right for m in pairs],
         "pairs_named": [set(m.truth.split(" + ")) <= set(m.answer.split(" + ")) for m in pairs],
         "interval_coverage": [inside for _, inside in errors],
     }
-    intervals = {name: proportion(hits) for name, hits in shares.items()}
+    intervals = {name: binomial_proportion(hits) for name, hits in shares.items()}
     detected = {}
     for size in sizes:
         own = [m for m in singles if m.multiple == size]
         hits = {"gap": [m.gap for m in own], "first": [m.gap and m.kind_first for m in own]}
         hits["right"] = [m.right for m in own]
-        detected[f"{size:.3g}"] = {name: proportion(said) for name, said in hits.items()}
+        detected[f"{size:.3g}"] = {name: binomial_proportion(said) for name, said in hits.items()}
     return {
-        "format": FORMAT,
+        "format": _FORMAT,
         "cases": len(marks),
         **{name: entry["rate"] for name, entry in intervals.items()},
         "intervals": intervals,
@@ -232,34 +238,34 @@ def score(marks: Sequence[Mark]) -> dict[str, Any]:
         "parameter_error": None if not errors else float(np.median([e for e, _ in errors])),
         "seconds": mean([m.seconds for m in marks if math.isfinite(m.seconds)]),
         "experiments": _by_experiment(marks),
-        "confusion": confusion(marks),
-        "calibration": calibration(marks),
+        "confusion": _confusion_matrix(marks),
+        "calibration": _calibration_rates(marks),
         "marks": [asdict(m) for m in marks],
     }
 
 
-def _by_experiment(marks: Sequence[Mark]) -> dict[str, dict[str, Any]]:
+def _by_experiment(marks: Sequence[CaseScore]) -> dict[str, dict[str, Any]]:
     """Cases, false alarms and right answers of every experiment."""
     found = {}
     for name in dict.fromkeys(m.experiment for m in marks):
         own = [m for m in marks if m.experiment == name]
         found[name] = {
             "cases": len(own),
-            "false_alarms": proportion([m.gap for m in own if m.category == "null"]),
-            "right": proportion([m.right for m in own if m.category not in ("null", "finer_chain")]),
+            "false_alarms": binomial_proportion([m.gap for m in own if m.category == "null"]),
+            "right": binomial_proportion([m.right for m in own if m.category not in ("null", "finer_chain")]),
         }
     return found
 
 
-def confusion(marks: Sequence[Mark]) -> dict[str, Any]:
+def _confusion_matrix(marks: Sequence[CaseScore]) -> dict[str, Any]:
     """Return the confusion matrix: true classes (rows), answers (columns) and counts."""
-    rows = sorted({m.sort for m in marks}, key=lambda name: (name in SORTS, name))
-    columns = sorted({m.said for m in marks}, key=lambda name: (name in VERDICTS, name))
+    rows = sorted({m.sort for m in marks}, key=lambda name: (name in _CATEGORIES, name))
+    columns = sorted({m.said for m in marks}, key=lambda name: (name in _VERDICTS, name))
     counts = [[sum((m.sort, m.said) == (row, column) for m in marks) for column in columns] for row in rows]
     return {"true": rows, "said": columns, "counts": counts}
 
 
-def calibration(marks: Sequence[Mark]) -> dict[str, Any]:
+def _calibration_rates(marks: Sequence[CaseScore]) -> dict[str, Any]:
     """Return the empirical coverage of parameter intervals and of p-values of clean recordings.
 
     Of each nominal level: how many intervals of that level hold the truth, how many clean cases have a smaller p-value.
@@ -269,6 +275,6 @@ def calibration(marks: Sequence[Mark]) -> dict[str, Any]:
     levels = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
     quantiles = {level: float(scipy.stats.norm.ppf(0.5 * (1 + level))) for level in levels}
     return {
-        "intervals": [{"level": a, **proportion([x <= quantiles[a] for x in z])} for a in levels],
-        "p_values": [{"level": a, **proportion([x < a for x in p])} for a in (0.01, 0.05, 0.1, 0.2, 0.5)],
+        "intervals": [{"level": a, **binomial_proportion([x <= quantiles[a] for x in z])} for a in levels],
+        "p_values": [{"level": a, **binomial_proportion([x < a for x in p])} for a in (0.01, 0.05, 0.1, 0.2, 0.5)],
     }

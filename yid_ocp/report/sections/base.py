@@ -1,6 +1,6 @@
 """Common parts of all report sections: input data, registration and rendering.
 
-A section's function turns `Findings` into what its template needs, or into None where it has nothing to say.
+A section's function turns `ReportData` into what its template needs, or into None where it has nothing to say.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.outcome import EpisodeResult
+from yid_ocp.problem.prediction_result import EpisodePrediction
 from yid_ocp.registry import Registry
-from yid_ocp.report.scene import Scene
+from yid_ocp.report.animation import Animation
 from yid_ocp.solvers import Solution
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Findings:
+class ReportData:
     """Input data of a report: result, problem, solution and further objects of one run.
 
     Attributes
@@ -36,9 +36,9 @@ class Findings:
     problem : EstimationProblem, optional
     solution : Solution, optional
     held_out : sequence of (Episode, EpisodeResult or text)
-    scenes : sequence of Scene
+    animations : sequence of Scene
         What moves, where it does not follow from `problem`, `solution` and `held_out`.
-    more : mapping
+    section_data : mapping
         Whatever else a command's own sections need.
     """
 
@@ -47,70 +47,70 @@ class Findings:
     result: Mapping[str, Any]
     problem: EstimationProblem | None = None
     solution: Solution | None = None
-    held_out: Sequence[tuple[Episode, EpisodeResult | str]] = ()
-    scenes: Sequence[Scene] = ()
-    more: Mapping[str, Any] = field(default_factory=dict)
+    held_out: Sequence[tuple[Episode, EpisodePrediction | str]] = ()
+    animations: Sequence[Animation] = ()
+    section_data: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def episodes(self) -> list[tuple[str, Episode, EpisodeResult]]:
+    def predicted_episodes(self) -> list[tuple[str, Episode, EpisodePrediction]]:
         """Tuples (role, episode, prediction) of all episodes with a prediction; role is estimate or held_out."""
-        found: list[tuple[str, Episode, EpisodeResult]] = []
+        found: list[tuple[str, Episode, EpisodePrediction]] = []
         if self.problem is not None and self.solution is not None and self.solution.evaluation is not None:
-            done = self.solution.predicted
+            done = self.solution.episode_predictions
             pairs = zip(self.problem.episodes, done, strict=True)
             found += [("estimate", e, r) for e, r in pairs if not isinstance(r, str)]
         return found + [("held_out", e, r) for e, r in self.held_out if not isinstance(r, str)]
 
 
-Prepare = Callable[[Findings], Mapping[str, Any] | None]
+_PrepareContext = Callable[[ReportData], Mapping[str, Any] | None]
 
 
 @dataclass(frozen=True)
-class Section:
+class ReportSection:
     """One registered section: order, title and the function that prepares its template context."""
 
     order: int
     title: str
-    prepare: Prepare
+    prepare_context: _PrepareContext
 
     @property
-    def folder(self) -> Path:
+    def template_folder(self) -> Path:
         """Folder of the function's file, in which a plug-in's template is looked up."""
-        return Path(inspect.getfile(self.prepare)).parent
+        return Path(inspect.getfile(self.prepare_context)).parent
 
 
-SECTIONS: Registry[Section] = Registry("report section")
+REPORT_SECTIONS: Registry[ReportSection] = Registry("report section")
 
 
-def section(name: str, order: int, title: str) -> Callable[[Prepare], Prepare]:
+def register_section(name: str, order: int, title: str) -> Callable[[_PrepareContext], _PrepareContext]:
     """Decorator that registers a function as the section `name`, rendered by `NAME.html`, lower orders first."""
 
-    def enter(prepare: Prepare) -> Prepare:
-        SECTIONS.register(name)(Section(order, title, prepare))
+    def enter(prepare: _PrepareContext) -> _PrepareContext:
+        REPORT_SECTIONS.register(name)(ReportSection(order, title, prepare))
         return prepare
 
     return enter
 
 
-TURNING = {"position": "rad", "velocity": "rad/s", "effort": "N m", "position_command": "rad"}
-SLIDING = {"position": "m", "velocity": "m/s", "effort": "N", "position_command": "m"}
+_REVOLUTE_UNITS = {"position": "rad", "velocity": "rad/s", "effort": "N m", "position_command": "rad"}
+_PRISMATIC_UNITS = {"position": "m", "velocity": "m/s", "effort": "N", "position_command": "m"}
 
 
-def joint_unit(system: System | None, names: Sequence[str], channel: str) -> str:
+def joint_channel_unit(system: System | None, names: Sequence[str], channel: str) -> str:
     """Unit of a joint channel; joints unknown to the system count as revolute."""
     kinds = {} if system is None else {joint.name: joint.kind for joint in system.mechanism.joints}
     sliding = [kinds.get(name) == "prismatic" for name in names]
     if any(sliding) and not all(sliding):
-        return f"{TURNING[channel]}, {SLIDING[channel]}"
-    return SLIDING[channel] if names and all(sliding) else TURNING[channel]
+        return f"{_REVOLUTE_UNITS[channel]}, {_PRISMATIC_UNITS[channel]}"
+    return _PRISMATIC_UNITS[channel] if names and all(sliding) else _REVOLUTE_UNITS[channel]
 
 
-def written_sections(findings: Findings, environment: jinja2.Environment) -> list[dict[str, str]]:
+def render_sections(findings: ReportData, environment: jinja2.Environment) -> list[dict[str, str]]:
     """Name, title and HTML of every section with content, in order."""
     result = []
-    for name in sorted(SECTIONS, key=lambda entry: SECTIONS[entry].order):
-        context = SECTIONS[name].prepare(findings)
+    for name in sorted(REPORT_SECTIONS, key=lambda entry: REPORT_SECTIONS[entry].order):
+        context = REPORT_SECTIONS[name].prepare_context(findings)
         if context is not None:
             html = environment.get_template(f"{name}.html").render(context)
-            result.append({"name": name, "title": SECTIONS[name].title, "html": html})
+            result.append({"name": name, "title": REPORT_SECTIONS[name].title, "html": html})
     return result

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from yid_ocp.report import charts, figures
-from yid_ocp.report.sections.base import Findings, section
+from yid_ocp.report import categorical_charts, figures
+from yid_ocp.report.sections.base import ReportData, register_section
 
 
-@section("estimates", 10, "Estimates")
-def prepare(findings: Findings) -> Mapping[str, Any] | None:
+@register_section("estimates", 10, "Estimates")
+def estimates_context(findings: ReportData) -> Mapping[str, Any] | None:
     """Template context: free parameters ± 2 std, untrusted ones marked; one figure per unit."""
     result = findings.result
     by_unit: dict[str, dict[str, tuple[float, float | None, float, bool]]] = {}
@@ -20,4 +20,8 @@ def prepare(findings: Findings) -> Mapping[str, Any] | None:
             by_unit.setdefault(entry["unit"], {})[name] = (entry["value"], entry["std"], entry["initial"], found)
     if not by_unit:
         return None
-    return {"pictures": [figures.html(charts.estimates(values, unit)) for unit, values in by_unit.items()]}
+    return {
+        "pictures": [
+            figures.figure_html(categorical_charts.estimates_figure(values, unit)) for unit, values in by_unit.items()
+        ]
+    }

@@ -8,74 +8,87 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.outcome import EpisodeResult
+from yid_ocp.problem.prediction_result import EpisodePrediction
 from yid_ocp.report import figures
-from yid_ocp.report.figures import Curve
-from yid_ocp.report.sections.base import Findings, section
+from yid_ocp.report.figures import TimePlot
+from yid_ocp.report.sections.base import ReportData, register_section
 from yid_ocp.sensors import Sensor
 
-MOST_PICTURES = 24  # a page with more is too heavy to open; result.json and trajectories.h5 have them all
+_MAX_PICTURES = 24  # a page with more is too heavy to open; result.json and trajectories.h5 have them all
 
 
-@section("fit", 20, "How well it fits")
-def prepare(findings: Findings) -> Mapping[str, Any] | None:
+@register_section("fit", 20, "How well it fits")
+def fit_quality_context(findings: ReportData) -> Mapping[str, Any] | None:
     """Template context: measured and predicted values with residuals over time, and a residual histogram."""
-    if findings.problem is None or not findings.episodes:
+    if findings.problem is None or not findings.predicted_episodes:
         return None
     pictures: list[tuple[str, str]] = []
     left = 0
-    for role, episode, outcome in findings.episodes:
+    for role, episode, outcome in findings.predicted_episodes:
         for title, curves in _pictures(findings, role, episode, outcome):
-            if len(pictures) < MOST_PICTURES:
+            if len(pictures) < _MAX_PICTURES:
                 role_words = "held out" if role == "held_out" else "estimated on"
-                pictures.append((f"{title} in {episode.name} ({role_words})", figures.html(figures.over_time(curves))))
+                pictures.append(
+                    (
+                        f"{title} in {episode.name} ({role_words})",
+                        figures.figure_html(figures.time_plots_figure(curves)),
+                    )
+                )
             else:
                 left += 1
     residuals = _whitened(findings)
-    histogram = figures.html(figures.residual_histogram(residuals)) if residuals else None
+    histogram = figures.figure_html(figures.residual_histogram_figure(residuals)) if residuals else None
     return {"pictures": pictures, "left": left, "histogram": histogram}
 
 
-def _pictures(findings: Findings, role: str, episode: Episode, outcome: EpisodeResult) -> list[tuple[str, list[Curve]]]:
+def _pictures(
+    findings: ReportData, role: str, episode: Episode, outcome: EpisodePrediction
+) -> list[tuple[str, list[TimePlot]]]:
     assert findings.problem is not None
     step = findings.problem.step.time_step
     found = []
-    for samples, predicted in zip(episode.samples, outcome.predicted, strict=True):
-        t = episode.grid.start + step * (samples.node + samples.fraction)
+    for samples, predicted in zip(episode.measurements, outcome.predicted_outputs, strict=True):
+        t = episode.grid.start_time + step * (samples.node + samples.fraction)
         sensor, course = samples.sensor, None
-        if sensor.width == 3 and len(t) < episode.grid.steps / 2:
+        if sensor.outputs_per_channel == 3 and len(t) < episode.grid.steps / 2:
             course = _course(findings, role, episode, outcome, sensor)
-        for c, channel in enumerate(sensor.channels) if sensor.width == 3 else [(0, sensor.group)]:
-            columns = [3 * c + i for i in range(3)] if sensor.width == 3 else range(len(sensor.channels))
-            curves: list[Curve] = []
+        for c, channel in (
+            enumerate(sensor.channel_names) if sensor.outputs_per_channel == 3 else [(0, sensor.group_name)]
+        ):
+            columns = (
+                [3 * c + i for i in range(3)] if sensor.outputs_per_channel == 3 else range(len(sensor.channel_names))
+            )
+            curves: list[TimePlot] = []
             for i in columns:
-                name = "xyz"[i % 3] if sensor.width == 3 else sensor.channels[i].rsplit(".", 1)[1]
+                name = "xyz"[i % 3] if sensor.outputs_per_channel == 3 else sensor.channel_names[i].rsplit(".", 1)[1]
                 told = (t, samples.value[:, i], samples.std[:, i], {"predicted": predicted[:, i]})
-                smooth = None if course is None else (episode.grid.times, course[:, i])
-                curves += figures.compared(name, sensor.unit, *told, smooth)
+                smooth = None if course is None else (episode.grid.node_times, course[:, i])
+                curves += figures.prediction_and_residual_plots(name, sensor.unit, *told, smooth)
             found.append((channel, curves))
     return found
 
 
-def _course(findings: Findings, role: str, episode: Episode, outcome: EpisodeResult, sensor: Sensor) -> np.ndarray:
+def _course(
+    findings: ReportData, role: str, episode: Episode, outcome: EpisodePrediction, sensor: Sensor
+) -> np.ndarray:
     """What a sensor of points would have seen at every node, for one that looks seldom, shape (N + 1, k)."""
     problem, solution = findings.problem, findings.solution
     assert problem is not None
     assert solution is not None
     theta, _ = problem.split(solution.x, problem.episodes.index(episode) if role == "estimate" else 0)
-    n, state = problem.system.size, outcome.rollout.state
+    n, state = problem.system.n_coordinates, outcome.rollout.state
     efforts = np.zeros((len(state), n))
-    own = problem.predictor.own_theta(episode, theta)
-    seen = problem.functions.sensor(sensor, ())(state[:, :n], state[:, 2 * n :], efforts, own)
+    own = problem.predictor.episode_theta(episode, theta)
+    seen = problem.model_functions.compiled_sensor(sensor, ())(state[:, :n], state[:, 2 * n :], efforts, own)
     return np.asarray(seen[0][:, :, 0])
 
 
-def _whitened(findings: Findings) -> dict[str, np.ndarray]:
+def _whitened(findings: ReportData) -> dict[str, np.ndarray]:
     found: dict[str, list[np.ndarray]] = {}
-    for role, episode, outcome in findings.episodes:
+    for role, episode, outcome in findings.predicted_episodes:
         if role != "estimate":
             continue
-        for samples, predicted in zip(episode.samples, outcome.predicted, strict=True):
+        for samples, predicted in zip(episode.measurements, outcome.predicted_outputs, strict=True):
             ratio = (predicted - samples.value) / samples.std
-            found.setdefault(samples.sensor.group, []).append(ratio[np.isfinite(ratio)])
+            found.setdefault(samples.sensor.group_name, []).append(ratio[np.isfinite(ratio)])
     return {group: np.concatenate(parts) for group, parts in found.items() if sum(map(len, parts))}

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from yid_ocp.report.sections.base import Findings, section
+from yid_ocp.report.sections.base import ReportData, register_section
 
 
-@section("inputs", 90, "What it was made from")
-def prepare(findings: Findings) -> Mapping[str, Any] | None:
+@register_section("inputs", 90, "What it was made from")
+def provenance_context(findings: ReportData) -> Mapping[str, Any] | None:
     """Template context: date, command line, input hashes, versions and notes on non-finite values."""
     result = findings.result
     if "versions" not in result:

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from yid_ocp.analysis.compare import Comparison
-from yid_ocp.report import charts, figures
-from yid_ocp.report.sections.base import Findings, section
+from yid_ocp.analysis.compare import MethodComparison
+from yid_ocp.report import categorical_charts, figures
+from yid_ocp.report.sections.base import ReportData, register_section
 
 
-@section("methods", 10, "Methods")
-def prepare(findings: Findings) -> Mapping[str, Any] | None:
+@register_section("methods", 10, "Methods")
+def method_comparison_context(findings: ReportData) -> Mapping[str, Any] | None:
     """Template context: estimates of every method and its cost over time."""
-    comparison: Comparison | None = findings.more.get("comparison")
+    comparison: MethodComparison | None = findings.section_data.get("comparison")
     if comparison is None:
         return None
     judged = findings.result["judged"]["parameters"]
@@ -23,10 +23,13 @@ def prepare(findings: Findings) -> Mapping[str, Any] | None:
             own = {m: e["parameters"][name] for m, e in findings.result["methods"].items()}
             told = {method: (found["value"], found["std"]) for method, found in own.items()}
             by_unit.setdefault(entry["unit"], {})[name] = told
-    pictures = [("Estimates", figures.html(charts.side_by_side(rows, unit))) for unit, rows in by_unit.items()]
+    pictures = [
+        ("Estimates", figures.figure_html(categorical_charts.values_by_source_figure(rows, unit)))
+        for unit, rows in by_unit.items()
+    ]
     fallen = {}
-    for run in comparison.runs:
+    for run in comparison.method_results:
         history = [entry for entry in run.solution.history if not entry.note]
         fallen[run.method] = ([entry.seconds for entry in history], [entry.cost for entry in history])
-    pictures.append(("Cost over time", figures.html(figures.falling(fallen))))
+    pictures.append(("Cost over time", figures.figure_html(figures.cost_over_time_figure(fallen))))
     return {"pictures": pictures}

@@ -8,32 +8,32 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.report.figures import Curve, html, lines_over_time
-from yid_ocp.report.sections.base import Findings, joint_unit, section
+from yid_ocp.report.figures import TimePlot, figure_html, lines_over_time_figure
+from yid_ocp.report.sections.base import ReportData, joint_channel_unit, register_section
 
 
-@section("plan", 10, "The planned motion")
-def prepare(findings: Findings) -> Mapping[str, Any] | None:
+@register_section("plan", 10, "The planned motion")
+def planned_motion_context(findings: ReportData) -> Mapping[str, Any] | None:
     """Template context: distance of the point from its target, and joints over time."""
-    found = findings.more.get("plan")
+    found = findings.section_data.get("plan")
     if found is None:
         return None
     where = found.points.get(findings.result["point"])
     empty = np.zeros(0)
-    unit = partial(joint_unit, found.mover.step.system, found.joints)
+    unit = partial(joint_channel_unit, found.simulator.step.system, found.joints)
     curves = []
     if where is not None:
         off = 1e3 * (where - found.place)
         lines = {axis: (found.t, off[:, i]) for i, axis in enumerate("xyz")}
-        curves.append(Curve("from the place [mm]", empty, empty, lines, 1e3 * findings.result["tolerance"]))
+        curves.append(TimePlot("from the place [mm]", empty, empty, lines, 1e3 * findings.result["tolerance"]))
     moved = {name: (found.t, found.position[:, i] - found.position[0, i]) for i, name in enumerate(found.joints)}
-    curves.append(Curve(f"joints, from the start [{unit('position')}]", empty, empty, moved))
+    curves.append(TimePlot(f"joints, from the start [{unit('position')}]", empty, empty, moved))
     curves.append(
-        Curve(
+        TimePlot(
             f"effort [{unit('effort')}]",
             empty,
             empty,
             {n: (found.t, found.effort[:, i]) for i, n in enumerate(found.joints)},
         )
     )
-    return {"figures": [html(lines_over_time(curve)) for curve in curves]}
+    return {"figures": [figure_html(lines_over_time_figure(curve)) for curve in curves]}

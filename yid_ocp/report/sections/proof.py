@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.report import charts, figures
-from yid_ocp.report.sections.base import Findings, section
+from yid_ocp.report import categorical_charts, figures
+from yid_ocp.report.sections.base import ReportData, register_section
 
-CALIBRATED = {"intervals": "intervals of effects' parameters", "p_values": "p-values of clean recordings"}
+_CALIBRATION_LABELS = {"intervals": "intervals of effects' parameters", "p_values": "p-values of clean recordings"}
 
 
-@section("proof", 10, "What was seen and named")
-def prepare(findings: Findings) -> Mapping[str, Any] | None:
+@register_section("proof", 10, "What was seen and named")
+def blind_validation_context(findings: ReportData) -> Mapping[str, Any] | None:
     """Template context: detection rate by effect size, confusion matrix and calibration."""
     result = findings.result
     if result.get("format") != "yid-blind/1":
@@ -25,13 +25,13 @@ def prepare(findings: Findings) -> Mapping[str, Any] | None:
         for key, label in (("gap", "gap seen"), ("right", "named right"))
     }
     if result["detection"]:
-        picture = figures.rates(sizes, "size over the detectable size", "part of the cases", log_x=True)
-        pictures.append(("Detection by size, with binomial 95 % intervals", figures.html(picture)))
+        picture = figures.rate_intervals_figure(sizes, "size over the detectable size", "part of the cases", log_x=True)
+        pictures.append(("Detection by size, with binomial 95 % intervals", figures.figure_html(picture)))
     shown = result["confusion"]
     counts = np.array(shown["counts"], float).reshape(len(shown["true"]), len(shown["said"]))
     if counts.size:
-        picture = charts.counted(shown["true"], shown["said"], counts, "true", "said first")
-        pictures.append(("What was said of what", figures.html(picture)))
+        picture = categorical_charts.confusion_figure(shown["true"], shown["said"], counts, "true", "said first")
+        pictures.append(("What was said of what", figures.figure_html(picture)))
     kept = {
         label: {entry["level"]: entry for entry in result["calibration"][key] if entry["of"]}
         for key, label in (
@@ -40,6 +40,6 @@ def prepare(findings: Findings) -> Mapping[str, Any] | None:
         )
     }
     if any(kept.values()):
-        picture = figures.rates(kept, "promised", "kept", diagonal=True)
-        pictures.append(("What is promised, and what is kept", figures.html(picture)))
+        picture = figures.rate_intervals_figure(kept, "promised", "kept", diagonal=True)
+        pictures.append(("What is promised, and what is kept", figures.figure_html(picture)))
     return {"pictures": pictures} if pictures else None

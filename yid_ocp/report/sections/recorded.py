@@ -10,43 +10,43 @@ import numpy as np
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.model.system import System
 from yid_ocp.report import figures
-from yid_ocp.report.figures import Curve
-from yid_ocp.report.sections.base import Findings, joint_unit, section
+from yid_ocp.report.figures import TimePlot
+from yid_ocp.report.sections.base import ReportData, joint_channel_unit, register_section
 
-MOST = 3  # recordings that are drawn
-MOST_POINTS = 6  # points of a group; more are in the recording
-CHANNELS = ("position", "velocity", "effort", "position_command")
+_MAX_RECORDINGS = 3  # recordings that are drawn
+_MAX_POINTS = 6  # points of a group; more are in the recording
+_SHOWN_CHANNELS = ("position", "velocity", "effort", "position_command")
 
 
-@section("recorded", 30, "What was recorded")
-def prepare(findings: Findings) -> Mapping[str, Any] | None:
+@register_section("recorded", 30, "What was recorded")
+def recorded_signals_context(findings: ReportData) -> Mapping[str, Any] | None:
     """Template context: recorded joint channels and points over time."""
-    recordings: list[Recording] = findings.more.get("recordings", [])[:MOST]
-    system: System | None = findings.more.get("system")
+    recordings: list[Recording] = findings.section_data.get("recordings", [])[:_MAX_RECORDINGS]
+    system: System | None = findings.section_data.get("system")
     pictures = [
-        (f"{title} of {recording.name}", figures.html(figures.lines_over_time(curve)))
+        (f"{title} of {recording.name}", figures.figure_html(figures.lines_over_time_figure(curve)))
         for recording in recordings
         for title, curve in _curves(recording, system)
     ]
     return {"pictures": pictures} if pictures else None
 
 
-def _curves(recording: Recording, system: System | None) -> list[tuple[str, Curve]]:
+def _curves(recording: Recording, system: System | None) -> list[tuple[str, TimePlot]]:
     empty, found = np.zeros(0), []
     for group in recording.groups:
         if isinstance(group, JointGroup):
-            for channel in CHANNELS:
-                unit = joint_unit(system, group.names, channel)
+            for channel in _SHOWN_CHANNELS:
+                unit = joint_channel_unit(system, group.names, channel)
                 values = group.channels.get(channel)
                 if values is not None:
                     lines = {name: (group.t, values[:, i]) for i, name in enumerate(group.names)}
                     title = f"{channel.replace('_', ' ')} [{unit}]"
-                    found.append((f"Joints: {channel.replace('_', ' ')}", Curve(title, empty, empty, lines)))
+                    found.append((f"Joints: {channel.replace('_', ' ')}", TimePlot(title, empty, empty, lines)))
             continue
         lines = {
             f"{name}.{axis}": (group.t, group.position[:, i, c])
-            for i, name in enumerate(group.names[:MOST_POINTS])
+            for i, name in enumerate(group.names[:_MAX_POINTS])
             for c, axis in enumerate("xyz")
         }
-        found.append((f"Points: {group.name}", Curve("position [m]", empty, empty, lines)))
+        found.append((f"Points: {group.name}", TimePlot("position [m]", empty, empty, lines)))
     return found

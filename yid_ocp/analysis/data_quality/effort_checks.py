@@ -1,0 +1,383 @@
+"""Checks of recorded efforts against inverse dynamics: sign, gain, zero and lag of each joint.
+
+With measured effort e_j of joint j and the effort w_j that bodies and gravity need (Newton and Euler),
+
+    e_j / g_j = w_j + c_j + d_j v_j + s_j sign(v_j) + k_j q_j + (J' f)_j,
+
+linear in 1/g_j, offset, friction, springs and in the force f = f_0 + K (x - mean x) + D dx/dt + (quadratic in x) with
+which each grasp loads the arm, whatever it holds. All have priors of the size that robots have, so that a joint about
+which the recording says nothing keeps g = 1. Nothing is said of a joint whose effort is not explained: a counterbalance
+that the URDF does not have is no wrong sign.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.analysis.data_quality.recorded_joints import (
+    RecordedJointsModel,
+    SmoothedJointMotion,
+    effect_setting_line,
+    smoothed_joint_motion,
+)
+from yid_ocp.data.issues import Issue
+from yid_ocp.data.recording import Recording
+from yid_ocp.effects.base import joints_by_arm
+
+Array = NDArray[np.float64]
+
+_EFFORT_LIMIT_ERROR_FRACTION, _EFFORT_SPREAD_ERROR_FRACTION = 0.02, 0.1
+"""What a robot's model is off by: part of the joint's largest effort, part of the spread of what it needs."""
+_OFFSET_FRACTION, VISCOUS_FRICTION_FRACTION, _COULOMB_FRICTION_FRACTION, _JOINT_SPRING_FRACTION = 0.05, 0.04, 0.02, 0.02
+"""Usual sizes beside a joint's largest effort: of a zero's error, of friction [per rad/s, 1], of a spring [per rad]."""
+_GRASP_FORCE_STD, _GRASP_STIFFNESS_STD, _GRASP_QUADRATIC_STIFFNESS_STD, _GRASP_DAMPING_STD = 30.0, 150.0, 1500.0, 30.0
+"""Usual sizes of the force on a grasp [N], and by which it changes [N/m, N/m^2, N s/m]."""
+_WRONG_GAIN_FACTOR = 3.0
+"""Usual size of 1/g, and the factor from which a gain counts as wrong."""
+_MAX_EXPLAINED_RMS = 1.5
+"""Root mean square of what is left, in sizes of the model's error, up to which a joint's effort is explained."""
+_WELL_EXPLAINED_RMS = 0.5
+"""The same up to which nothing is left to be explained by a lag."""
+_WRONG_ROBOT_RMS = 3.0
+"""The same from which on it is not this robot's."""
+_MIN_FITTED_STD, _MAX_FITTED_EFFORT = 1e-12, 1e12  # where numbers end that a fit can be made of
+_MIN_Z = 5.0
+"""Standard deviations from which on a number counts."""
+_INDEPENDENT_SAMPLE_BANDWIDTH = 1.0
+"""Samples further apart than half of its inverse count as independent [Hz]."""
+_MIN_EFFORT = 1e-3
+"""Efforts below this tell nothing [N m]."""
+_LAG_SEARCH_STEP = 0.1
+"""Steps in which a lag of efforts behind the motion is looked for; a shorter one is no gross error [s]."""
+_IDLE_COMMAND_FRACTION = 0.2
+"""Part of the largest effort that a joint of which nothing is asked may seem to need: it swings, and has friction."""
+_MAX_EFFORT_RATIO = 1.3
+"""Factor by which an effort may exceed the URDF's limit, which some makers state for continuous use."""
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """`inverse` 1/g and its `std`, `offset` [N m], what is `left` in sizes of the model's error, each (k,); `cost`.
+
+    `direct` is the gain by which an effort's variation follows what is needed, `shift` by how much it is off in the
+    mean [N m]: without the prior, and not made smaller by noise of what was measured.
+    """
+
+    inverse: Array
+    std: Array
+    offset: Array
+    offset_std: Array
+    left: Array
+    direct: Array
+    shift: Array
+    cost: float
+
+
+def check_efforts(arm: RecordedJointsModel, recording: Recording) -> list[Issue]:
+    """Issues of recorded efforts that disagree with the inverse dynamics of the recorded motion.
+
+    Parameters
+    ----------
+    arm : Arm
+    recording : Recording
+    """
+    joints = recording.joints
+    motion = None if joints is None else smoothed_joint_motion(joints, arm.joint_names)
+    if joints is None or motion is None or motion.effort is None or len(motion.t) < 10:
+        return []
+    needed = arm.inverse_dynamics(motion.q, motion.v, motion.a)
+    largest = np.array([joint.effort_limit for joint in arm.joints])
+    size = np.where(np.isfinite(largest), largest, np.maximum(np.max(np.abs(needed), axis=0), 1e-9))
+    found = list(_limits(arm, motion, largest))
+    most = [float(np.max(np.abs(values), initial=0.0)) for values in (needed, motion.effort)]
+    if not most[0] > _MIN_EFFORT or not max(most) < _MAX_FITTED_EFFORT:
+        return [replace(doubt, recording=recording.name, group="joints") for doubt in found]
+    dead = _dead(
+        motion.effort,
+        needed,
+        _IDLE_COMMAND_FRACTION * size
+        if joints.effort_kind_or_default == "command"
+        else 2 * _EFFORT_LIMIT_ERROR_FRACTION * size,
+    )
+    if dead.any():
+        found.append(_zero(arm, dead))
+    else:
+        # motion to and fro that is late looks turned round, so that comes first
+        found += list(_late(arm, motion, needed, size)) or list(_by_joint(arm, motion, needed, size))
+    return [replace(doubt, recording=recording.name, group="joints") for doubt in found]
+
+
+def _limits(arm: RecordedJointsModel, motion: SmoothedJointMotion, largest: Array) -> Iterator[Issue]:
+    assert motion.effort is not None
+    ratio = np.percentile(np.abs(motion.effort), 99, axis=0) / largest
+    if np.any(ratio > _MAX_EFFORT_RATIO):
+        j = int(np.argmax(ratio))
+        yield Issue(
+            "effort_limits",
+            f"the effort of {arm.joint_names[j]} is {ratio[j]:.3g} times what it can bear ({largest[j]:.3g} N m)",
+            "not_trusted",
+            float(ratio[j]) / _MAX_EFFORT_RATIO,
+            "check the unit of efforts (N m) and the robot's description",
+            "",
+            "joints",
+            f"effort.{arm.joint_names[j]}",
+        )
+
+
+def _dead(effort: Array, needed: Array, least: Array) -> NDArray[np.bool_]:
+    """Joints whose effort is zero throughout although gravity and motion need more than the least that counts."""
+    wanted = np.sqrt(np.mean(needed**2, axis=0))
+    silent = np.max(np.abs(effort), axis=0) < 1e-3 * wanted
+    return np.asarray(silent & (wanted > least))
+
+
+def _zero(arm: RecordedJointsModel, dead: NDArray[np.bool_]) -> Issue:
+    names = [name for name, off in zip(arm.joint_names, dead, strict=True) if off]
+    which = "all joints" if dead.all() else ", ".join(names)
+    return Issue(
+        "effort_zero",
+        f"the effort of {which} is zero throughout, while gravity and motion need more",
+        "not_trusted",
+        1e3,
+        "record efforts; to leave these out, move the arms as measured and switch their efforts off",
+        "",
+        "joints",
+        "effort",
+        setting="model.arms.mode: prescribed, sensors.joints.effort.use: false",
+    )
+
+
+def _by_joint(arm: RecordedJointsModel, motion: SmoothedJointMotion, needed: Array, size: Array) -> Iterator[Issue]:
+    assert motion.effort is not None
+    loaded = _loaded(arm, motion, size)
+    # What is held can add to efforts, but not several times what the arm itself weighs, nor carry nearly all of that.
+    # A prior about one holds a gain that is a power of ten away, so efforts are scaled first.
+    ratio = float(np.linalg.norm(needed)) / max(float(np.linalg.norm(motion.effort)), 1e-300)
+    common = 10.0 ** round(math.log10(ratio)) if not 1 / _WRONG_GAIN_FACTOR < ratio < _WRONG_GAIN_FACTOR else 1.0
+    fit = _fitted(arm, motion, common * motion.effort, needed, size)
+    told = fit.std < np.maximum(0.6 * np.abs(fit.inverse), 0.35)
+    sound = told & (fit.left < _MAX_EXPLAINED_RMS) & (np.abs(fit.offset) < 3 * _OFFSET_FRACTION * size)
+    scale = 1.0
+    if common != 1.0 and sound.sum() >= 2:
+        scale = 1 / (common * max(float(np.median(np.abs(fit.inverse[sound]))), _MIN_FITTED_STD))
+    if not 1 / _WRONG_GAIN_FACTOR < scale < _WRONG_GAIN_FACTOR:
+        yield Issue(
+            "effort_gain",
+            f"efforts are about {scale:.2g} times what gravity and motion need",
+            "not_trusted",
+            max(scale, 1 / scale) / _WRONG_GAIN_FACTOR,
+            f"divide efforts by {1 / common:g}, if their unit is another",
+            channel="effort",
+            recording="",
+        )
+    turned = sound & (fit.inverse < -_MIN_Z * fit.std / 2) & (fit.inverse < -0.3)
+    upright = told & (fit.inverse > _MIN_Z * fit.std / 2) & (fit.inverse > 0.3)
+    if turned.sum() >= 2 and not upright.any():
+        depth = float(np.max(-fit.inverse[turned] / fit.std[turned])) / (_MIN_Z / 2)
+        yield _sign("all efforts have", depth, "effort")
+    else:
+        for j in np.flatnonzero(turned):
+            depth = float(-fit.inverse[j] / fit.std[j]) / (_MIN_Z / 2)
+            yield _sign(f"the effort of {arm.joint_names[j]} has", depth, f"effort.{arm.joint_names[j]}")
+    for j in np.flatnonzero(sound & ~turned):
+        inverse, off = float(fit.inverse[j]), abs(float(fit.inverse[j]) - 1) / float(fit.std[j])
+        weak, strong = (
+            inverse > _WRONG_GAIN_FACTOR,
+            0 < inverse < 1 / _WRONG_GAIN_FACTOR and fit.direct[j] > _WRONG_GAIN_FACTOR and not loaded[j],
+        )
+        if off > _MIN_Z and (weak or strong):
+            yield Issue(
+                "effort_gain",
+                f"the effort of {arm.joint_names[j]} is {1 / inverse:.2g} times what gravity and motion need",
+                "not_trusted",
+                off / _MIN_Z,
+                "find out what the number stands for",
+                "",
+                "joints",
+                f"effort.{arm.joint_names[j]}",
+            )
+    # a large zero error looks like a large gain; but then the variation follows as it should
+    off_zero = (
+        (fit.inverse > 0)
+        & (fit.inverse < 1 / _WRONG_GAIN_FACTOR)
+        & (fit.direct > 1 / _WRONG_GAIN_FACTOR)
+        & (fit.direct < _WRONG_GAIN_FACTOR)
+    )
+    offset = np.where(off_zero, fit.shift, fit.offset)
+    calm = (
+        told
+        & (fit.left < _MAX_EXPLAINED_RMS / 1.5)
+        & (off_zero | ((fit.inverse > 1 / _WRONG_GAIN_FACTOR) & (fit.inverse < _WRONG_GAIN_FACTOR)))
+    )
+    for j in np.flatnonzero(calm & ~loaded & (np.abs(offset) > 3 * _OFFSET_FRACTION * size)):
+        # springs that carry part of the weight are no wrong zero
+        balanced = offset[j] * np.mean(needed[:, j]) < 0 and abs(offset[j]) < np.max(np.abs(needed[:, j]))
+        sure = abs(offset[j]) > _MIN_Z * fit.offset_std[j]
+        if sure and not balanced:
+            yield Issue(
+                "effort_offset",
+                f"the zero of the effort of {arm.joint_names[j]} is off by {offset[j]:+.3g} N m",
+                "not_trusted",
+                abs(float(offset[j])) / (3 * _OFFSET_FRACTION * float(size[j])),
+                "let it be estimated, or set the sensor's zero",
+                "",
+                "joints",
+                f"effort.{arm.joint_names[j]}",
+                setting=effect_setting_line("effort_offset", arm.joint_names[j], "offset", float(offset[j])),
+            )
+    lost = fit.left > _WRONG_ROBOT_RMS
+    if arm.has_no_unknown_descendants and lost.sum() > len(arm.joint_names) / 2:
+        yield Issue(
+            "effort_unlike",
+            f"efforts of {lost.sum()} of {len(arm.joint_names)} joints are not what this robot needs for this motion: "
+            f"{np.median(fit.left[lost]):.2g} times what a robot's model is off by",
+            "not_trusted",
+            float(np.median(fit.left[lost])) / _WRONG_ROBOT_RMS,
+            "check that the recording is this robot's, its unit of time, and the order of joints",
+            "",
+            "joints",
+            "effort",
+        )
+
+
+def _sign(who: str, depth: float, channel: str) -> Issue:
+    return Issue(
+        "effort_sign",
+        f"{who} the opposite sign of what gravity and motion need",
+        "not_trusted",
+        depth,
+        "turn the sign; effort is what the motor does to the joint",
+        "",
+        "joints",
+        channel,
+    )
+
+
+def _late(arm: RecordedJointsModel, motion: SmoothedJointMotion, needed: Array, size: Array) -> Iterator[Issue]:
+    """Efforts that follow the motion late or early, all alike."""
+    assert motion.effort is not None
+    trials = _LAG_SEARCH_STEP * np.arange(-5, 6)
+    if motion.t[-1] - motion.t[0] < 4 * trials[-1]:
+        return
+    if np.max(_fitted(arm, motion, motion.effort, needed, size).left) < _WELL_EXPLAINED_RMS:
+        return
+    inside = (motion.t >= motion.t[0] + trials[-1]) & (motion.t <= motion.t[-1] - trials[-1])
+    kept = replace(motion, t=motion.t[inside], q=motion.q[inside], v=motion.v[inside], a=motion.a[inside])
+    costs = []
+    for late in trials:
+        moved = np.stack([np.interp(kept.t + late, motion.t, column) for column in motion.effort.T], axis=1)
+        costs.append(_fitted(arm, kept, moved, needed[inside], size).cost)
+    at = int(np.argmin(costs))
+    # twice over, so that what friction and grasp take up of a lag does not count
+    if abs(trials[at]) > 0.5 * _LAG_SEARCH_STEP and costs[at] < 0.4 * costs[len(trials) // 2]:
+        yield Issue(
+            "effort_lag",
+            f"efforts fit the motion best {abs(trials[at]):.2g} s {'earlier' if trials[at] > 0 else 'later'} than "
+            "they were recorded",
+            "not_trusted",
+            abs(float(trials[at])) / _LAG_SEARCH_STEP,
+            "shift their times",
+            "",
+            "joints",
+            "effort",
+            setting="; ".join(
+                effect_setting_line("effort_delay", name, "delay", float(trials[at]))
+                for name in joints_by_arm(arm.system)
+            )
+            if abs(trials[at]) <= _LAG_SEARCH_STEP
+            else "",
+        )
+
+
+def _fitted(arm: RecordedJointsModel, motion: SmoothedJointMotion, effort: Array, needed: Array, size: Array) -> _Fit:
+    count, width = needed.shape
+    error = _EFFORT_LIMIT_ERROR_FRACTION * size + _EFFORT_SPREAD_ERROR_FRACTION * needed.std(axis=0)
+    columns, spread = _by_itself(arm, motion, effort, size)
+    loads, sizes = _loads(arm, motion)
+    matrix = np.concatenate([columns, loads], axis=2) / error[:, None]
+    prior = np.concatenate([spread, sizes])
+    independent = max(2 * _INDEPENDENT_SAMPLE_BANDWIDTH * (motion.t[-1] - motion.t[0]), 2.0)
+    weight = math.sqrt(min(1.0, independent / count))
+    rows, target = weight * matrix.reshape(count * width, -1), weight * (needed / error).ravel()
+    normal = rows.T @ rows + np.diag(1 / prior**2)
+    pull = np.zeros(len(prior))
+    pull[:width] = 1 / prior[:width] ** 2
+    found = np.linalg.solve(normal, rows.T @ target + pull)
+    std = np.maximum(np.sqrt(np.diag(np.linalg.inv(normal))), _MIN_FITTED_STD)
+    remains = (rows @ found - target).reshape(count, width) / weight
+    others = np.concatenate([np.zeros(2 * width), found[2 * width :]])
+    explained = needed - np.einsum("njc,c->nj", matrix * error[:, None], others)
+    shift = effort.mean(axis=0) - explained.mean(axis=0)
+    moved, about = explained - explained.mean(axis=0), effort - effort.mean(axis=0)
+    direct = np.sum(about * moved, axis=0) / np.maximum(np.sum(moved**2, axis=0), 1e-12)
+    cost = float(
+        np.sum((rows @ found - target) ** 2) + np.sum(((found - (np.arange(len(prior)) < width)) / prior) ** 2)
+    )
+    own = slice(width, 2 * width)
+    return _Fit(
+        found[:width], std[:width], found[own], std[own], np.sqrt(np.mean(remains**2, axis=0)), direct, shift, cost
+    )
+
+
+def _by_itself(
+    arm: RecordedJointsModel, motion: SmoothedJointMotion, effort: Array, size: Array
+) -> tuple[Array, Array]:
+    """Columns of each joint alone, shape (N, k, 5 k), and their usual sizes: 1/g, offset, friction twice, spring."""
+    count, width = effort.shape
+    parts = [
+        (effort, np.full(width, _WRONG_GAIN_FACTOR)),
+        (-np.ones_like(effort), _OFFSET_FRACTION * size),
+        (-motion.v, VISCOUS_FRICTION_FRACTION * size),
+        (-np.tanh(motion.v / 0.02), _COULOMB_FRICTION_FRACTION * size),
+        (-(motion.q - motion.q.mean(axis=0)), _springs(arm, size)),
+    ]
+    columns = np.zeros((count, width, width * len(parts)))
+    for k, (values, _) in enumerate(parts):
+        for j in range(width):
+            columns[:, j, k * width + j] = values[:, j]
+    return columns, np.concatenate([spread for _, spread in parts])
+
+
+def _springs(arm: RecordedJointsModel, size: Array) -> Array:
+    """Usual size of a spring on each joint; large where the model has one whose stiffness is sought."""
+    sprung = {spring.joint_name for spring in arm.system.elastic_joints}
+    return np.where([name in sprung for name in arm.joint_names], 10 * size, _JOINT_SPRING_FRACTION * size)
+
+
+def _loaded(arm: RecordedJointsModel, motion: SmoothedJointMotion, size: Array) -> NDArray[np.bool_]:
+    """Joints on which what is held can act like a wrong zero."""
+    holders = tuple(grasp.holder_frame for grasp in arm.system.grasps if arm.is_frame_determined(grasp.holder_frame))
+    if not holders:
+        return np.zeros(len(arm.joint_names), bool)
+    _, by_angle = arm.frame_positions(holders, motion.q[:: max(1, len(motion.q) // 20)])
+    lever = np.max(np.linalg.norm(by_angle, axis=2), axis=(0, 1))
+    return np.asarray(_GRASP_FORCE_STD * lever > 3 * _OFFSET_FRACTION * size)
+
+
+def _loads(arm: RecordedJointsModel, motion: SmoothedJointMotion) -> tuple[Array, Array]:
+    """Columns of the force at every grasp, shape (N, k, 33 per grasp), and their usual sizes."""
+    holders = tuple(grasp.holder_frame for grasp in arm.system.grasps if arm.is_frame_determined(grasp.holder_frame))
+    count, width = motion.q.shape
+    if not holders:
+        return np.zeros((count, width, 0)), np.zeros(0)
+    place, by_angle = arm.frame_positions(holders, motion.q)
+    columns, sizes = [], []
+    for g in range(len(holders)):
+        moved = place[:, g] - place[:, g].mean(axis=0)
+        speed = np.einsum("nik,nk->ni", by_angle[:, g], motion.v)
+        for axis in range(3):
+            lever = by_angle[:, g, axis, :]
+            squares = [lever * (moved[:, [b]] * moved[:, [c]]) for b in range(3) for c in range(b, 3)]
+            columns += [lever, *(lever * moved[:, [b]] for b in range(3)), *squares, lever * speed[:, [axis]]]
+            sizes += [
+                _GRASP_FORCE_STD,
+                *[_GRASP_STIFFNESS_STD] * 3,
+                *[_GRASP_QUADRATIC_STIFFNESS_STD] * 6,
+                _GRASP_DAMPING_STD,
+            ]
+    return np.stack(columns, axis=2), np.array(sizes)

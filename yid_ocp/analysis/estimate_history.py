@@ -1,0 +1,288 @@
+"""Estimates of one model from several runs: pooled mean, drift of parameters, and outlier runs.
+
+For estimates x_i with covariances C_i of the same parameters, their mean is x = (sum C_i^-1)^-1 sum C_i^-1 x_i. Where
+nothing changed, chi2 = sum (x_i - x)' C_i^-1 (x_i - x) has (k - 1) n degrees of freedom. Where it is larger, the
+standard deviations of the mean are widened by sqrt(chi2/dof), Birge's ratio.
+
+References
+----------
+Birge (1932), Physical Review 40:207, doi:10.1103/PhysRev.40.207.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import scipy.stats
+from numpy.typing import NDArray
+
+from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
+
+Array = NDArray[np.float64]
+_MIN_CORRELATION_EIGENVALUE = 1e-12
+"""Smallest eigenvalue of a correlation matrix; what is known better than that follows from rounding."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RunEstimates(ReprMixin):
+    """Estimates of parameters from one run, with their covariance.
+
+    Attributes
+    ----------
+    run_name : str
+        Name of the run.
+    parameter_names : tuple of str, length n
+    values : ndarray, shape (n,)
+    covariance : ndarray, shape (n, n)
+    units : mapping of str to str
+    is_fit_adequate : bool
+        Whether the model explains the run's recordings; where not, the covariance includes the misfit.
+    effects : mapping of label to mapping of quantity to value
+        Effects that the run's model had beyond the nominal one, as `kind@location`.
+    """
+
+    run_name: str
+    parameter_names: tuple[str, ...]
+    values: Array
+    covariance: Array
+    units: Mapping[str, str] = field(default_factory=dict)
+    is_fit_adequate: bool = True
+    effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+
+    def _summary(self) -> ReprSummary:
+        rows = [("parameter", "value", "unit")]
+        known = zip(self.parameter_names, self.values, self.std, strict=True)
+        rows += [(name, f"{value:.4g} ± {std:.2g}", self.units.get(name, "")) for name, value, std in known]
+        return ReprSummary(
+            f"{count_with_noun(len(self.parameter_names), 'parameter')} of the run '{self.run_name}'", rows
+        )
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations, shape (n,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def select_parameters(self, names: Sequence[str]) -> RunEstimates:
+        """The estimates of the named parameters, in that order; names that the run lacks are skipped."""
+        at = [self.parameter_names.index(name) for name in names if name in self.parameter_names]
+        kept = tuple(self.parameter_names[i] for i in at)
+        covariance = self.covariance[np.ix_(at, at)]
+        return RunEstimates(
+            self.run_name, kept, self.values[at], covariance, self.units, self.is_fit_adequate, self.effects
+        )
+
+
+@dataclass(frozen=True)
+class ParameterDrift:
+    """Test whether one parameter has the same value in all runs.
+
+    Attributes
+    ----------
+    name, unit : str
+    run_names : tuple of str
+        That have it.
+    values, std : tuple of float
+    mean, mean_std : float
+        Pooled over these runs.
+    chi2, p_value : float
+        Of the differences; p is one where only one run has it.
+    has_drifted : bool
+        Whether p is below the requested level, Bonferroni-corrected for the number of parameters.
+    """
+
+    name: str
+    unit: str
+    run_names: tuple[str, ...]
+    values: tuple[float, ...]
+    std: tuple[float, ...]
+    mean: float
+    mean_std: float
+    chi2: float
+    p_value: float
+    has_drifted: bool
+
+
+@dataclass(frozen=True)
+class RunConsistency:
+    """Test of one run against the pooled estimates of all others.
+
+    Attributes
+    ----------
+    run_name : str
+    chi2 : float
+    degrees_of_freedom : int
+    p_value : float
+    worst_parameter : str
+        Parameter that differs most, in standard deviations.
+    is_fit_adequate : bool
+        Whether the model explained its recordings.
+    is_outlier : bool
+        Whether it alone disagrees with the others, which agree without it.
+    """
+
+    run_name: str
+    chi2: float
+    degrees_of_freedom: int
+    p_value: float
+    worst_parameter: str
+    is_fit_adequate: bool
+    is_outlier: bool
+
+
+@dataclass(frozen=True)
+class EstimateHistory:
+    """Drift of parameters and consistency of runs over several runs of one model.
+
+    Attributes
+    ----------
+    run_names : tuple of str
+    parameter_drifts : tuple of Drift
+    run_consistencies : tuple of Against
+    chi2, p_value : float
+        Of all differences together.
+    degrees_of_freedom : int
+    significance_level : float
+    """
+
+    run_names: tuple[str, ...]
+    parameter_drifts: tuple[ParameterDrift, ...]
+    run_consistencies: tuple[RunConsistency, ...]
+    chi2: float
+    degrees_of_freedom: int
+    p_value: float
+    significance_level: float
+
+    @property
+    def drifted_parameters(self) -> tuple[str, ...]:
+        """Names of parameters that differ significantly between runs."""
+        return tuple(entry.name for entry in self.parameter_drifts if entry.has_drifted)
+
+    @property
+    def outlier_runs(self) -> tuple[str, ...]:
+        """Names of runs that alone disagree with the others."""
+        return tuple(entry.run_name for entry in self.run_consistencies if entry.is_outlier)
+
+
+def nearest_positive_definite(covariance: Array) -> Array:
+    """A nearby invertible covariance with the same standard deviations: small correlation eigenvalues are raised."""
+    std = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(std, std))
+    clipped = (vectors * np.maximum(values, _MIN_CORRELATION_EIGENVALUE)) @ vectors.T
+    scale = std / np.sqrt(np.diag(clipped))
+    return np.asarray((clipped + clipped.T) / 2 * np.outer(scale, scale))
+
+
+def pool_estimates(runs: Sequence[RunEstimates]) -> tuple[RunEstimates, float, int]:
+    """Pool the estimates of several runs; returns them with chi2 of the differences and its degrees of freedom.
+
+    Parameters
+    ----------
+    runs : sequence of Estimates
+        Each may lack some of the parameters.
+
+    Returns
+    -------
+    Estimates
+        Of all parameters of any run, widened by Birge's ratio where the runs differ by more than they state.
+    chi2 : float
+    degrees : int
+    """
+    names = tuple(dict.fromkeys(name for run in runs for name in run.parameter_names))
+    information, sums = np.zeros((len(names), len(names))), np.zeros(len(names))
+    # in units of the first standard deviations known, so that nothing is lost to rounding
+    unit = np.array(
+        [
+            next(run.std[run.parameter_names.index(name)] for run in runs if name in run.parameter_names)
+            for name in names
+        ]
+    )
+    parts = []
+    for run in runs:
+        at = [names.index(name) for name in run.parameter_names]
+        inverse = np.linalg.inv(nearest_positive_definite(run.covariance) / np.outer(unit[at], unit[at]))
+        parts.append((at, inverse, run.values / unit[at]))
+        information[np.ix_(at, at)] += inverse
+        sums[at] += inverse @ parts[-1][2]
+    mean = np.linalg.solve(information, sums)
+    chi2 = float(sum((x - mean[at]) @ inverse @ (x - mean[at]) for at, inverse, x in parts))
+    degrees = sum(len(run.parameter_names) for run in runs) - len(names)
+    widened = max(1.0, chi2 / degrees) if degrees else 1.0
+    covariance = np.linalg.inv(information) * widened * np.outer(unit, unit)
+    units = {name: unit for run in runs for name, unit in run.units.items()}
+    effects = {label: own for run in runs for label, own in run.effects.items()}
+    label = runs[0].run_name if len(runs) == 1 else f"{len(runs)} runs"
+    explains = all(run.is_fit_adequate for run in runs)
+    return (
+        RunEstimates(label, names, mean * unit, np.asarray(covariance, float), units, explains, effects),
+        chi2,
+        degrees,
+    )
+
+
+def assess_drift(runs: Sequence[RunEstimates], level: float = 0.01) -> EstimateHistory:
+    """Test which parameters drifted between runs and which run is an outlier.
+
+    Each parameter is tested by its marginal variances, each run by its whole covariance. A run is an outlier where it
+    disagrees with the others and these agree without it, or better than with any other left out. With two runs none is.
+
+    Parameters
+    ----------
+    runs : sequence of Estimates
+        Two or more, in the order of time.
+    level : float
+        Significance level; divided by the number of parameters, and by that of runs.
+    """
+    names = tuple(dict.fromkeys(name for run in runs for name in run.parameter_names))
+    _, chi2, degrees = pool_estimates(runs)
+    drifts = tuple(_drift(name, runs, level / max(len(names), 1)) for name in names)
+    against = tuple(_against(i, runs, level / len(runs)) for i in range(len(runs)))
+    return EstimateHistory(
+        tuple(run.run_name for run in runs), drifts, against, chi2, degrees, chi2_p_value(chi2, degrees), level
+    )
+
+
+def _drift(name: str, runs: Sequence[RunEstimates], level: float) -> ParameterDrift:
+    own = [run.select_parameters((name,)) for run in runs if name in run.parameter_names]
+    mean, chi2, degrees = pool_estimates(own)
+    p = chi2_p_value(chi2, degrees)
+    values, std = tuple(float(run.values[0]) for run in own), tuple(float(run.std[0]) for run in own)
+    unit = mean.units.get(name, "")
+    places = tuple(run.run_name for run in own)
+    return ParameterDrift(
+        name, unit, places, values, std, float(mean.values[0]), float(mean.std[0]), chi2, p, p < level
+    )
+
+
+def _against(i: int, runs: Sequence[RunEstimates], level: float) -> RunConsistency:
+    """One run against the mean of all others; distrusted where they agree without it."""
+    chi2, degrees, worst = _apart(runs[i], [run for k, run in enumerate(runs) if k != i])
+    p = chi2_p_value(chi2, degrees)
+    without = []
+    for k in range(len(runs)):
+        _, rest, free = pool_estimates([run for j, run in enumerate(runs) if j != k])
+        without.append((rest, free))
+    rest, free = without[i]
+    alone = len(runs) > 2 and p < level and chi2_p_value(rest, free) >= level
+    alone = alone or (len(runs) > 2 and p < level and rest < 0.5 * min(r for k, (r, _) in enumerate(without) if k != i))
+    return RunConsistency(runs[i].run_name, chi2, degrees, p, worst, runs[i].is_fit_adequate, alone)
+
+
+def _apart(run: RunEstimates, others: Sequence[RunEstimates]) -> tuple[float, int, str]:
+    """chi2 of the difference of a run from others, its degrees of freedom, and what differs most."""
+    mean, _, _ = pool_estimates(others)
+    shared = [name for name in run.parameter_names if name in mean.parameter_names]
+    if not shared:
+        return 0.0, 0, ""
+    own, rest = run.select_parameters(shared), mean.select_parameters(shared)
+    apart, covariance = own.values - rest.values, nearest_positive_definite(own.covariance + rest.covariance)
+    std = np.sqrt(np.diag(covariance))
+    unit = apart / std
+    chi2 = float(unit @ np.linalg.solve(covariance / np.outer(std, std), unit))
+    return chi2, len(shared), shared[int(np.argmax(np.abs(unit)))]
+
+
+def chi2_p_value(chi2: float, degrees: int) -> float:
+    """Probability of a chi2 at least this large; 1 without degrees of freedom."""
+    return float(scipy.stats.chi2.sf(chi2, degrees)) if degrees else 1.0

@@ -1,0 +1,228 @@
+"""Comparison of a built model with Pinocchio: mass matrix, gravity forces and inverse dynamics.
+
+Pinocchio gets the robot in two ways: from the URDF file, which it reads itself, and joint by joint from the built
+system, object and effects included. The first detects errors in reading the file, the second errors in the mechanics.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from yid_ocp.analysis.step_diagnostics import with_numeric_parameters
+from yid_ocp.model.kinematics import (
+    forward_kinematics,
+    lagrangian_second_derivatives,
+    mass_matrix,
+    rigid_body_derivatives,
+)
+from yid_ocp.model.mechanism import Joint, Mechanism
+from yid_ocp.model.system import System
+
+Array = NDArray[np.float64]
+
+_RELATIVE_TOLERANCE = 1e-8  # of the largest entry; placements are rounded to 1e-11 of an exact quarter turn
+_N_RANDOM_CONFIGURATIONS = 3  # at which both are compared, besides the one that is given
+
+
+@dataclass(frozen=True)
+class PinocchioComparison:
+    """Relative differences between a model and Pinocchio's model of the same bodies.
+
+    Attributes
+    ----------
+    of : str
+        The compared model, in words.
+    mass, weight, motion : float
+        Largest difference of mass matrix, gravity forces and inverse dynamics, each divided by its largest entry.
+    """
+
+    of: str
+    mass: float
+    weight: float
+    motion: float
+
+    @property
+    def agrees(self) -> bool:
+        """Whether all three agree within rounding."""
+        return all(size <= _RELATIVE_TOLERANCE for size in (self.mass, self.weight, self.motion))
+
+    @property
+    def words(self) -> str:
+        """A sentence on the agreement or on each difference."""
+        if self.agrees:
+            largest = max(self.mass, self.weight, self.motion)
+            said = f"{self.of}: mass matrix, weight and inverse dynamics are Pinocchio's"
+            return f"{said} within {largest:.1g} of the largest entry"
+        parts = (("mass matrix", self.mass), ("weight", self.weight), ("inverse dynamics", self.motion))
+        wrong = [f"{name} by {100 * size:.2g} %" for name, size in parts if not size <= _RELATIVE_TOLERANCE]
+        return f"{self.of} differs from Pinocchio's: {', '.join(wrong)} of the largest entry"
+
+
+def compare_system_with_pinocchio(system: System, theta: Array, posture: Array) -> PinocchioComparison:
+    """Compare the built system, its parameters at `theta`, with Pinocchio's model of the same joints and bodies.
+
+    Parameters
+    ----------
+    system : System
+    theta : ndarray, shape (ntheta,)
+    posture : ndarray, shape (n,)
+        Compared besides `_N_RANDOM_CONFIGURATIONS` drawn ones [rad or m].
+    """
+    built = with_numeric_parameters(system, theta)
+    gravity = np.array(ca.DM(built.gravity)).ravel()
+    inert, heavy = (_assembled(built.mechanism, gravity, weight) for weight in (False, True))
+    return _compared("the built model", built.mechanism, gravity, inert, heavy, posture)
+
+
+def compare_urdf_with_pinocchio(
+    path: Path,
+    mechanism: Mechanism,
+    gravity: Array,
+    joints: Sequence[str] | None = None,
+    locked: Mapping[str, float] | None = None,
+    exclude_links: Sequence[str] = (),
+) -> PinocchioComparison:
+    """Compare a robot as this package read it from URDF with Pinocchio's reading of the same file.
+
+    Parameters
+    ----------
+    path : Path
+        URDF file.
+    mechanism : Mechanism
+        What `read_urdf` made of it with the same `joints`, `locked_joints` and `exclude_links`.
+    gravity : ndarray, shape (3,)
+        [m/s^2]
+    joints : sequence of str, optional
+        Joints that were kept; all movable ones when absent.
+    locked : mapping of str to float, optional
+        Values of joints that were not [rad or m].
+    exclude_links : sequence of str
+        Links that were left out with all that hangs on them.
+
+    Raises
+    ------
+    ValueError
+        Pinocchio does not read the file.
+    """
+    model, locked = pin.buildModelFromXML(_without(path, exclude_links)), locked or {}
+    if joints is not None:
+        at = pin.neutral(model)
+        for i, name in enumerate(model.names):
+            if i and name not in joints:
+                _place(at, model.joints[i], locked.get(name, _nearest_to_zero(model, model.joints[i])))
+        model = pin.buildReducedModel(model, [i for i in range(1, model.njoints) if model.names[i] not in joints], at)
+    model.gravity.linear = gravity
+    return _compared(
+        f"{path.name} as read", mechanism.with_numeric_values(), gravity, model, model, np.zeros(len(mechanism.joints))
+    )
+
+
+def _without(path: Path, links: Sequence[str]) -> str:
+    """Text of a URDF file without some links and all that hangs on them."""
+    root = ElementTree.parse(path).getroot()
+    dropped, joints = set(links), root.findall("joint")
+    for _ in joints:
+        dropped |= {_link(joint, "child") for joint in joints if _link(joint, "parent") in dropped}
+    for joint in joints:
+        if _link(joint, "child") in dropped:
+            root.remove(joint)
+    for link in root.findall("link"):
+        if link.get("name") in dropped:
+            root.remove(link)
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _link(joint: ElementTree.Element, end: str) -> str:
+    named = joint.find(end)
+    return "" if named is None else named.get("link", "")
+
+
+def _nearest_to_zero(model: Any, joint: Any) -> float:
+    """Where a joint is locked that nothing is said of: at zero, or at the bound next to it."""
+    if joint.nq != 1:
+        return 0.0
+    return float(np.clip(0.0, model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]))
+
+
+def _place(configuration: Array, joint: Any, value: float) -> None:
+    """Set a joint in Pinocchio's configuration, in which a continuous one is a cosine and a sine."""
+    values = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
+    configuration[joint.idx_q : joint.idx_q + joint.nq] = values
+
+
+def _assembled(mechanism: Mechanism, gravity: Array, weight: bool) -> Any:
+    """Pinocchio's model of a mechanism in numbers; with weight, masses are what gravity pulls at."""
+    model = pin.Model()
+    model.gravity.linear = gravity if weight else np.zeros(3)
+    # Pinocchio's mass matrix needs all that hangs on a joint to follow it at once
+    placed: dict[int, int] = {-1: 0}
+    for j in sorted(range(len(mechanism.joints)), key=mechanism.ancestor_joints):
+        joint = mechanism.joints[j]
+        placement = pin.SE3(_number(joint.placement.rotation), _number(joint.placement.translation).ravel())
+        index = model.addJoint(placed[joint.parent_index], _joint_model(joint), placement, joint.name)
+        placed[j] = index
+        for body in joint.bodies:
+            fraction = 1.0 if body.gravity_fraction is None or not weight else float(body.gravity_fraction)
+            mass, tensor = float(body.mass) * fraction, _number(body.inertia_about_com) * fraction
+            # gravity's forces do not depend on the inertia about the centre
+            inertia = pin.Inertia(mass, _number(body.center_of_mass).ravel(), tensor)
+            model.appendBodyToJoint(index, inertia, pin.SE3.Identity())
+    return model
+
+
+def _joint_model(joint: Joint) -> Any:
+    kind = pin.JointModelRevoluteUnaligned if joint.kind == "revolute" else pin.JointModelPrismaticUnaligned
+    return kind(*joint.axis)
+
+
+def _number(expression: ca.SX) -> Array:
+    return np.array(ca.DM(ca.densify(expression)))
+
+
+def _compared(
+    of: str, mechanism: Mechanism, gravity: Array, inert: Any, heavy: Any, posture: Array
+) -> PinocchioComparison:
+    """Largest differences at the posture and at drawn ones, in random motion.
+
+    `inert` gives mass matrix and inverse dynamics less gravity's forces, `heavy` these forces.
+    """
+    n = len(mechanism.joints)
+    q, v, a = (ca.SX.sym(name, n) for name in "qva")
+    kinematics = forward_kinematics(mechanism, q)
+    rigid = rigid_body_derivatives(kinematics, v, ca.SX(ca.DM(gravity)))
+    still = rigid_body_derivatives(kinematics, ca.SX.zeros(n), ca.SX(ca.DM(gravity))).lagrangian_by_q
+    mass, by_qv = mass_matrix(rigid, mechanism), lagrangian_second_derivatives(rigid, mechanism)[1]
+    ours = ca.Function("ours", [q, v, a], [mass, -still, mass @ a + by_qv.T @ v - rigid.lagrangian_by_q])
+    rng = np.random.default_rng(0)
+    joints = [inert.joints[inert.getJointId(name)] for name in mechanism.joint_names]
+    columns = [joint.idx_v for joint in joints]
+    worst = np.zeros(3)
+    data, weights = inert.createData(), heavy.createData()
+    for at in (posture, *rng.uniform(-1.0, 1.0, (_N_RANDOM_CONFIGURATIONS, n))):
+        speed, acceleration = rng.normal(size=(2, n))
+        theirs_q, theirs_v, theirs_a = pin.neutral(inert), np.zeros(inert.nv), np.zeros(inert.nv)
+        for joint, value in zip(joints, at, strict=True):
+            _place(theirs_q, joint, float(value))
+        theirs_v[columns], theirs_a[columns] = speed, acceleration
+        upper = np.triu(pin.crba(inert, data, theirs_q))
+        whole = (upper + np.triu(upper, 1).T)[np.ix_(columns, columns)]
+        weight = pin.computeGeneralizedGravity(heavy, weights, theirs_q)[columns].copy()
+        moving = pin.rnea(inert, data, theirs_q, theirs_v, theirs_a)[columns].copy()
+        if inert is not heavy:
+            moving += weight
+        for i, (found, expected) in enumerate(
+            zip(ours(at, speed, acceleration), (whole, weight[:, None], moving[:, None]), strict=True)
+        ):
+            size = float(np.max(np.abs(expected), initial=0.0))
+            difference = float(np.max(np.abs(np.array(ca.densify(found)) - expected), initial=0.0))
+            worst[i] = max(worst[i], difference / size if size > 0 else difference)
+    return PinocchioComparison(of, *map(float, worst))

@@ -1,0 +1,377 @@
+"""Structural sparsity of a step's matrices and of the KKT matrix of the NLP."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import maximum_bipartite_matching
+
+from yid_ocp.analysis.step_symbols import StepSymbols
+from yid_ocp.sensors import Sensor, sensor_function
+
+_BoolMatrix = NDArray[np.bool_]
+_ZERO_RTOL = 1e-14  # of the largest entry: rounding
+
+
+@dataclass(frozen=True)
+class NamedRange:
+    """A named range of row or column indices."""
+
+    name: str
+    start: int
+    stop: int
+
+
+@dataclass(frozen=True)
+class SparsityPattern:
+    """Structural nonzeros of a matrix, with names of its blocks, rows and columns.
+
+    Attributes
+    ----------
+    name, title : str
+        For files, and for people.
+    nonzero_mask : ndarray of bool, shape (r, c)
+    row_blocks, column_blocks : tuple of Span
+        Blocks, in order and without gaps.
+    row_labels, column_labels : tuple of str
+        One for every row and column.
+    marked_mask : ndarray of bool, shape (r, c), or None
+        Entries that are highlighted.
+    mark_label : str
+        Meaning of the highlighted entries.
+    """
+
+    name: str
+    title: str
+    nonzero_mask: _BoolMatrix
+    row_blocks: tuple[NamedRange, ...]
+    column_blocks: tuple[NamedRange, ...]
+    row_labels: tuple[str, ...]
+    column_labels: tuple[str, ...]
+    marked_mask: _BoolMatrix | None = None
+    mark_label: str = ""
+
+    def with_marked_nonzeros(self, values: NDArray[np.float64], where: str) -> SparsityPattern:
+        """The pattern with the numerically nonzero entries of one matrix highlighted."""
+        size = np.abs(values)
+        return replace(
+            self, marked_mask=size > _ZERO_RTOL * np.max(size, initial=0.0), mark_label=f"not zero at {where}"
+        )
+
+    @property
+    def n_nonzeros(self) -> int:
+        """Number of structurally nonzero entries."""
+        return int(np.count_nonzero(self.nonzero_mask))
+
+
+@dataclass(frozen=True)
+class KktSize:
+    """Size of the NLP with a node at every step.
+
+    Attributes
+    ----------
+    variables, constraints : int
+    jacobian_nonzeros : int
+        Of the constraints.
+    hessian_nonzeros : int
+        Both triangles of the exact Hessian of the steps' constraints times their multipliers; what measurements add to
+        it is not counted, and the start is linear in the parameters, as multiple shooting takes it.
+    """
+
+    variables: int
+    constraints: int
+    jacobian_nonzeros: int
+    hessian_nonzeros: int
+
+
+# -- one step ---------------------------------------------------------------------------------------------------------
+
+
+def step_sparsity_patterns(symbols: StepSymbols) -> dict[str, SparsityPattern]:
+    """Structural sparsity patterns of one step's matrices, by name.
+
+    Parameters
+    ----------
+    symbols : StepSymbols
+
+    Returns
+    -------
+    dict of str to Pattern
+        `dR_dy`, residual by unknowns; `A` = dx_{k+1}/dx_k, `B_u` and `B_theta` by the implicit function theorem;
+        `dR_dtheta`, all rows by the parameters.
+    """
+    whole = _mask(symbols.jacobian_pattern)
+    system = symbols.equations.system
+    free = list(system.free_indices)
+    joints = system.mechanism.joint_names
+
+    def block(row: str, column: str) -> _BoolMatrix:
+        return whole[symbols.block_slice(row), symbols.block_slice(column)]
+
+    def by(*columns: str) -> _BoolMatrix:
+        """Residual's rows by columns."""
+        parts = [np.hstack([block(row, column) for column in columns]) for row in ("del", "internal", "constraint")]
+        return np.vstack([parts[0][free], *parts[1:]])
+
+    by_new = by("q1", "z1", "lam")
+    nc = len(joints)
+    known = np.setdiff1d(np.arange(by_new.shape[1]), system.prescribed_indices)
+    by_unknown = by_new[:, known]
+    inverse = _inverse_sparsity(by_unknown)
+
+    def response(*columns: str) -> _BoolMatrix:
+        """The state after the step by columns."""
+        y = _times(inverse, by(*columns))
+        full = np.zeros((by_new.shape[1], y.shape[1]), bool)
+        full[known] = y
+        direct = np.hstack([block("p1", column) for column in columns])
+        p1 = direct | _times(np.hstack([block("p1", c) for c in ("q1", "z1", "lam")]), full)
+        nz = len(system.internal_coordinates)
+        return np.vstack([full[:nc], p1, full[nc : nc + nz]])
+
+    unknowns = _spans(symbols, [("q1", free), ("z1", None), ("lam", None)])
+    residual = _spans(symbols, [("del", free), ("internal", None), ("constraint", None)])
+    before, after = (_spans(symbols, [(f"{c}{k}", None) for c in "qpz"]) for k in (0, 1))
+    every = _spans(symbols, [(b.name, None) for b in symbols.row_blocks])
+    torque, theta = _spans(symbols, [("u", None)]), _spans(symbols, [("theta", None)])
+    return {
+        name: SparsityPattern(name, title, mask, rows[0], columns[0], rows[1], columns[1])
+        for name, title, mask, rows, columns in (
+            ("dR_dy", "residual of a step by its unknowns", by_unknown, residual, unknowns),
+            ("A", "A: state after a step by the state before it", response("q0", "p0", "z0"), after, before),
+            ("B_u", "B_u: state after a step by torques", response("u"), after, torque),
+            ("B_theta", "B_theta: state after a step by parameters", response("theta"), after, theta),
+            ("dR_dtheta", "dR/dtheta: equations by parameters", whole[:, symbols.block_slice("theta")], every, theta),
+        )
+    }
+
+
+def _inverse_sparsity(mask: _BoolMatrix) -> _BoolMatrix:
+    """Structural nonzeros of a matrix's inverse from those of the matrix.
+
+    With rows put in the order of a perfect matching the diagonal is full, and entry (i, j) of the inverse can differ
+    from zero where a path leads from i to j in the matrix's graph; all can where there is no perfect matching.
+    """
+    count = len(mask)
+    matched = maximum_bipartite_matching(scipy.sparse.csr_matrix(mask), perm_type="row")
+    if count == 0 or np.any(matched < 0):
+        return np.ones((count, count), bool)
+    reach = mask[matched]
+    for _ in range(int(np.ceil(np.log2(max(count, 2))))):
+        reach = _times(reach, reach)
+    result = np.zeros_like(mask)
+    result[:, matched] = reach
+    return result
+
+
+def _times(a: _BoolMatrix, b: _BoolMatrix) -> _BoolMatrix:
+    product: _BoolMatrix = (a.astype(np.float32) @ b.astype(np.float32)) > 0
+    return product
+
+
+def _mask(pattern: ca.Sparsity) -> _BoolMatrix:
+    mask = np.zeros(pattern.shape, bool)
+    row, column = pattern.get_triplet()
+    mask[row, column] = True
+    return mask
+
+
+# -- the NLP ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class NlpStageSparsity:
+    """Sparsity of one stage of the NLP, the same for all stages.
+
+    Attributes
+    ----------
+    constraint_mask : ndarray of bool, shape (r, w)
+        One step's constraints by (theta_free, x_k, x_{k+1}, lam_k).
+    hessian_mask : ndarray of bool, shape (w, w)
+        Of these constraints times their multipliers.
+    gauss_newton_mask : ndarray of bool, shape (f + nx, f + nx)
+        Gauss-Newton Hessian of the priors and of one reading of every sensor, by (theta_free, x_k).
+    constraint_blocks, state_blocks : tuple of Span
+        Blocks of a step's constraints and of a node's state.
+    constraint_labels, state_labels, multiplier_labels : tuple of str
+        Of their entries and of a step's multipliers.
+    n_free_parameters : int
+        Number of free parameters.
+    fixed_start_rows, estimated_start_rows : tuple of int
+        Rows of the first node's state that the start fixes, and that have a prior about it; the start depends on all
+        free parameters.
+    """
+
+    constraint_mask: _BoolMatrix
+    hessian_mask: _BoolMatrix
+    gauss_newton_mask: _BoolMatrix
+    constraint_blocks: tuple[NamedRange, ...]
+    state_blocks: tuple[NamedRange, ...]
+    constraint_labels: tuple[str, ...]
+    state_labels: tuple[str, ...]
+    multiplier_labels: tuple[str, ...]
+    n_free_parameters: int
+    fixed_start_rows: tuple[int, ...]
+    estimated_start_rows: tuple[int, ...]
+
+    @property
+    def n_multipliers(self) -> int:
+        """Number of multipliers of a step."""
+        return len(self.multiplier_labels)
+
+
+def nlp_stage_sparsity(
+    symbols: StepSymbols,
+    free: Sequence[str],
+    sensors: Sequence[Sensor],
+    followed: Sequence[int],
+    loose: Sequence[int] = (),
+) -> NlpStageSparsity:
+    """Sparsity of one stage of the NLP with a node at every step, in the order of `solvers.transcription`.
+
+    Parameters
+    ----------
+    symbols : StepSymbols
+    free : sequence of str
+        Parameters that are unknowns.
+    sensors : sequence of Sensor
+        Those that read nodes.
+    followed : sequence of int
+        Rows of the state that the tracking filter feeds back to the torques.
+    loose : sequence of int
+        Rows of the first node's state that are estimated, with a prior; the start fixes those that are not prescribed.
+    """
+    e, system = symbols.equations, symbols.equations.system
+    kept = list(system.free_indices)
+    rows = ca.vertcat(e.residual, e.p1)
+    chosen = ca.vertcat(*(system.parameters[name].symbol for name in free)) if free else ca.SX(0, 1)
+    local = ca.vertcat(chosen, e.q0, e.p0, e.z0, e.q1, e.z1, e.lam, e.u)
+    weights = ca.SX.sym("weights", rows.numel())
+    by_local = _mask(ca.jacobian_sparsity(rows, local))
+    curved = _mask(ca.jacobian_sparsity(ca.gradient(ca.dot(weights, rows), local), local))
+    f, n, nz, m, nu = len(free), system.n_coordinates, e.z0.numel(), e.lam.numel(), e.u.numel()
+    nx = 2 * n + nz
+    # where each local variable stands in the stage; torques are not unknowns, under the filter they follow the state
+    places = [*range(f + nx), *range(f + nx, f + nx + n), *range(f + nx + 2 * n, f + 2 * nx + m)]
+    placing = np.zeros((local.numel(), f + 2 * nx + m), bool)
+    placing[np.arange(len(places)), places] = True
+    placing[np.ix_(np.arange(len(places), len(places) + nu), f + np.array(followed, int))] = True
+    by_stage = _times(by_local, placing)
+    hessian = _times(_times(placing.T, curved), placing)
+    # the constraint on the momentum after the step holds that momentum itself
+    at = rows.numel() - n
+    by_stage[at + np.arange(n), f + nx + n + np.arange(n)] = True
+    measured = np.zeros((f + nx, f + nx), bool)
+    measured[np.arange(f), np.arange(f)] = True  # priors
+    for sensor in sensors:
+        function = sensor_function(system, sensor, tuple(free))
+        by_q, by_z, by_theta = (_mask(function.sparsity_out(i)) for i in (1, 2, 4))
+        reading = np.hstack([by_theta, by_q, np.zeros((len(by_q), n), bool), by_z])
+        measured |= _times(reading.T, reading)
+    row_spans, row_labels = _spans(symbols, [("del", kept), ("internal", None), ("constraint", None), ("p1", None)])
+    node_spans, node_labels = _spans(symbols, [("q0", None), ("p0", None), ("z0", None)])
+    lam_labels = _spans(symbols, [("lam", None)])[1]
+    spans, labels = (row_spans, node_spans), (row_labels, node_labels, lam_labels)
+    fixed = tuple(map(int, np.setdiff1d(np.arange(nx), [*system.prescribed_indices, *loose])))
+    return NlpStageSparsity(by_stage, hessian, measured, *spans, *labels, f, fixed, tuple(map(int, loose)))
+
+
+def kkt_size(stage: NlpStageSparsity, steps: Sequence[int]) -> KktSize:
+    """Size of the NLP of several recordings, whose numbers of steps are given."""
+    f, nx, m = stage.n_free_parameters, stage.state_blocks[-1].stop, stage.n_multipliers
+    height = len(stage.constraint_mask)
+    # every step after the first adds the same entries
+    one, two = (int(np.count_nonzero(_nlp_sparsity_masks(stage, k)[1])) for k in (1, 2))
+    shared = int(np.count_nonzero(stage.hessian_mask[:f, :f]))
+    return KktSize(
+        f + sum((k + 1) * nx + k * m for k in steps),
+        sum(len(stage.fixed_start_rows) + k * height for k in steps),
+        sum(len(stage.fixed_start_rows) * (1 + f) + k * int(np.count_nonzero(stage.constraint_mask)) for k in steps),
+        shared + sum(one - shared + (k - 1) * (two - one) for k in steps),
+    )
+
+
+def _nlp_sparsity_masks(stage: NlpStageSparsity, steps: int) -> tuple[_BoolMatrix, _BoolMatrix, _BoolMatrix]:
+    """Sparsity masks of one recording's constraint Jacobian, constraint Hessian and measurement Hessian."""
+    f, nx, m, fixed = stage.n_free_parameters, stage.state_blocks[-1].stop, stage.n_multipliers, stage.fixed_start_rows
+    width, height = f + (steps + 1) * nx + steps * m, len(stage.constraint_mask)
+    jacobian = np.zeros((len(fixed) + steps * height, width), bool)
+    hessian, measured = np.zeros((width, width), bool), np.zeros((width, width), bool)
+    jacobian[np.arange(len(fixed)), f + np.array(fixed, int)] = True
+    jacobian[: len(fixed), :f] = True
+    if stage.estimated_start_rows:
+        begun = np.concatenate([np.arange(f), f + np.array(stage.estimated_start_rows)])
+        measured[np.ix_(begun, begun)] = True
+    for k in range(steps + 1):
+        # x_0, lam_0, x_1, lam_1, ...
+        node = f + k * (nx + m)
+        here = np.concatenate([np.arange(f), node + np.arange(nx)])
+        measured[np.ix_(here, here)] |= stage.gauss_newton_mask
+        if k == steps:
+            break
+        columns = np.concatenate([here, node + nx + m + np.arange(nx), node + nx + np.arange(m)])
+        top = len(fixed) + k * height
+        jacobian[np.ix_(np.arange(top, top + height), columns)] |= stage.constraint_mask
+        hessian[np.ix_(columns, columns)] |= stage.hessian_mask
+    return jacobian, hessian, measured
+
+
+_LabelledBlocks = tuple[tuple[NamedRange, ...], tuple[str, ...]]
+
+
+def _spans(symbols: StepSymbols, wanted: Sequence[tuple[str, Sequence[int] | None]]) -> _LabelledBlocks:
+    """Blocks one after the other, each whole or some of it, with the labels of their entries."""
+    blocks = {block.name: block for block in (*symbols.row_blocks, *symbols.column_blocks)}
+    spans: list[NamedRange] = []
+    labels: list[str] = []
+    for name, chosen in wanted:
+        block = blocks[name]
+        kept = range(len(block.labels)) if chosen is None else chosen
+        spans.append(NamedRange(name, len(labels), len(labels) + len(kept)))
+        labels += [block.labels[i] for i in kept]
+    return tuple(spans), tuple(labels)
+
+
+def kkt_pattern(stage: NlpStageSparsity, free: Sequence[str], steps: int) -> SparsityPattern:
+    """The KKT matrix [[H, J'], [J, 0]] of the first steps of a recording, as if every node were measured.
+
+    Parameters
+    ----------
+    stage : Stages
+    free : sequence of str
+        Parameters that are unknowns.
+    steps : int
+    """
+    jacobian, hessian, measured = _nlp_sparsity_masks(stage, steps)
+    blank = np.zeros((len(jacobian), len(jacobian)), bool)
+    mask = np.vstack([np.hstack([hessian | measured, jacobian.T]), np.hstack([jacobian, blank])])
+    spans: list[NamedRange] = []
+    labels: list[str] = []
+
+    def add(name: str, own: Sequence[str]) -> None:
+        if own:
+            spans.append(NamedRange(name, len(labels), len(labels) + len(own)))
+            labels.extend(own)
+
+    add("theta", free)
+    for k in range(steps + 1):
+        for span in stage.state_blocks:
+            add(f"{span.name[0]}{k}", stage.state_labels[span.start : span.stop])
+        add(f"lam{k}", stage.multiplier_labels if k < steps else ())
+    add("start", [stage.state_labels[i] for i in stage.fixed_start_rows])
+    for k in range(steps):
+        for span in stage.constraint_blocks:
+            name = f"p{k + 1} rule" if span.name == "p1" else f"{span.name}{k}"
+            add(name, stage.constraint_labels[span.start : span.stop])
+    blocks, named = tuple(spans), tuple(labels)
+    title = f"KKT matrix of the NLP with a node at every step: the first {steps} steps"
+    marked = np.zeros_like(mask)
+    marked[: len(measured), : len(measured)] = measured
+    return SparsityPattern(
+        "kkt", title, mask, blocks, blocks, named, named, marked, "of a reading or a prior, where there is one"
+    )

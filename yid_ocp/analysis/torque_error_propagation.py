@@ -1,0 +1,271 @@
+"""Low-rank propagation of torque and encoder errors to all readings of a motion.
+
+Torques are wrong in every recorded sample and by a constant, angles that a tracking filter follows in every step: some
+thousands of unknowns in a recording, of which sensors see no more than smooth motions. With G their effect on all
+readings in units of the finest noise, the left singular vectors of G whose singular values are not small represent
+them; the neglected rest would add less than `_NEGLIGIBLE_STD` squared to any reading's variance.
+
+References
+----------
+Halko, Martinsson and Tropp (2011), SIAM Review 53:2, doi:10.1137/090771806 (singular vectors from random samples).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from yid_ocp.errors import SolverError
+from yid_ocp.integrator.linearized_steps import linearized_steps
+from yid_ocp.integrator.momentum_shift import torque_error_feedthrough
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.evaluation import Evaluation
+from yid_ocp.problem.input_noise import InputErrors, NominalTrajectory
+from yid_ocp.sensors import Sensor
+from yid_ocp.sensors.joints import PositionSensor
+
+Array = NDArray[np.float64]
+
+_NEGLIGIBLE_STD = 0.1
+"""Standard deviation that is left out, in units of a reading's noise."""
+_INITIAL_RANDOM_SAMPLES, _MAX_RANDOM_SAMPLES = 128, 512
+"""Random samples of all errors at first, twice as many as long as they are too few, and at most."""
+
+
+def episode_sensitivities(
+    problem: EstimationProblem,
+    evaluation: Evaluation,
+    x: Array,
+    i: int,
+    finest: Mapping[str, float],
+    encoders: EstimationProblem | None = None,
+) -> tuple[dict[tuple[str, str], Array], Array]:
+    """Sensitivities of an episode's points at every node, and Fisher information of its joint measurements.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        With every point in view at every node, of unit standard deviation.
+    evaluation : Evaluation
+        At `x`, with its Jacobian.
+    x : ndarray, shape (nx,)
+    i : int
+        Place of the episode.
+    finest : mapping of group to float
+        Least standard deviation of its points [m].
+    encoders : EstimationProblem, optional
+        The same with the encoders of driven joints as measurements.
+
+    Returns
+    -------
+    slopes : dict of (group, frame) to ndarray, shape (N + 1, 3, nx + q)
+        By the unknowns, then by the low-rank unknowns of torque and encoder errors.
+    information : ndarray, shape (nx + q, nx + q)
+        From joints, and the prior of these errors.
+    """
+    assert evaluation.jacobian is not None
+    episode, result = problem.episodes[i], evaluation.episode_predictions[i]
+    driving = episode if encoders is None else encoders.episodes[i]
+    shown, told = [], []
+    for samples, rows in zip(episode.measurements, problem.residual_rows.measurements[i], strict=True):
+        block = evaluation.jacobian[rows]
+        if samples.sensor.outputs_per_channel == 3:
+            shown.append((samples.sensor, block.reshape(len(samples.value), -1, len(x))))
+        else:
+            told.append(block)
+    course = problem.predictor.nominal_trajectory(episode, result, problem.split(x, i)[0])
+    units = [finest[sensor.group_name] for sensor, block in shown for _ in range(block.shape[1])]
+    by_state = [_by_state(course, sensor) for sensor, _ in shown]
+    if driving.input_errors is None:
+        blur = np.zeros((len(result.rollout.state), len(units), 0))
+    else:
+        if encoders is not None:
+            angles = np.zeros(
+                (len(course.rollout.state), len(driving.input_errors.angle_std), course.rollout.state.shape[1])
+            )
+            angles[:, np.arange(angles.shape[1]), list(problem.system.driven_indices)] = 1.0
+            by_state.append(angles)
+            units += list(driving.input_errors.angle_std)
+        scale = np.array(units)[:, None]
+        blur = scale * _low_rank_error_sensitivity(
+            course, driving.input_errors, np.concatenate(by_state, axis=1) / scale
+        )
+    slopes: dict[tuple[str, str], Array] = {}
+    at = 0
+    for sensor, block in shown:
+        parts = np.concatenate([block, blur[:, at : at + block.shape[1]]], axis=2)
+        parts = parts.reshape(len(parts), -1, 3, parts.shape[2])
+        slopes |= {(sensor.group_name, frame): parts[:, k] for k, frame in enumerate(sensor.frame_names)}
+        at += block.shape[1]
+    information = np.diag(np.repeat([0.0, 1.0], [len(x), blur.shape[2]]))
+    if encoders is not None:
+        told.append(_read_angles(encoders, x, i, blur[:, at:]))
+    for block in told:
+        width = block.shape[1]
+        information[:width, :width] += block.T @ block
+    return slopes, information
+
+
+def _by_state(course: NominalTrajectory, sensor: Sensor) -> Array:
+    """Slopes of a sensor's readings at every node by the state there, shape (N + 1, k, nx)."""
+    n, state = course.model_functions.step.sizes["n"], course.rollout.state
+    _, by_q, by_z, _, _ = course.model_functions.compiled_sensor(sensor, ())(
+        state[:, :n], state[:, 2 * n :], course.joint_efforts, course.theta
+    )
+    return np.concatenate([by_q, np.zeros_like(by_q), by_z], axis=2)
+
+
+def _read_angles(encoders: EstimationProblem, x: Array, i: int, blur: Array) -> Array:
+    """Slopes of what encoders measured, in units of their noise, by the unknowns and the errors, (r, nx + q)."""
+    evaluation = encoders.evaluate(x)
+    if not evaluation.ok or evaluation.jacobian is None:
+        raise SolverError(f"the model cannot be rolled out: {evaluation.message}")
+    for samples, rows in zip(encoders.episodes[i].measurements, encoders.residual_rows.measurements[i], strict=True):
+        if isinstance(samples.sensor, PositionSensor):
+            read = samples.interpolate(blur[samples.evaluation_nodes])
+            own = samples.residual_block(np.zeros(samples.value.shape), read).jacobian
+            assert own is not None
+            return np.hstack([evaluation.jacobian[rows], own])
+    return np.zeros((0, len(x) + blur.shape[2]))
+
+
+def _low_rank_error_sensitivity(course: NominalTrajectory, errors: InputErrors, slopes: Array) -> Array:
+    """Sensitivity of readings to a few unit-variance unknowns that represent all torque and encoder errors.
+
+    The tracking filter keeps the arms on what they followed. Where it follows encoders that are measurements, its share
+    of their noise is taken as independent of theirs, which is small beside that of torques.
+
+    Parameters
+    ----------
+    course : Course
+    errors : InputErrors
+    slopes : ndarray, shape (N + 1, k, nx)
+        Of readings at every node by the state there, in units of their finest noise.
+
+    Returns
+    -------
+    ndarray, shape (N + 1, k, q)
+        In the same units.
+    """
+    motion = _Motion.of(course, errors)
+    rng = np.random.default_rng(0)
+    shape, most = slopes.shape[:2], min(_MAX_RANDOM_SAMPLES, motion.size, slopes.shape[0] * slopes.shape[1])
+    count = min(_INITIAL_RANDOM_SAMPLES, most)
+    while True:
+        back = rng.standard_normal((motion.size, count))
+        for _ in range(2):
+            moved = motion.moved(back, slopes).reshape(-1, count)
+            basis, _ = scipy.linalg.qr(moved, mode="economic", overwrite_a=True, check_finite=False)
+            back = motion.pulled(basis.reshape(*shape, count), slopes)
+        squares, vectors = np.linalg.eigh(back.T @ back)
+        sizes = np.sqrt(np.maximum(squares, 0.0))
+        # a third: what so few samples miss is somewhat larger than the least that they find
+        if count == most or sizes[0] < _NEGLIGIBLE_STD / 3:
+            break
+        count = min(2 * count, most)
+    kept = sizes > _NEGLIGIBLE_STD / 3
+    return (basis @ (vectors[:, kept] * sizes[kept])).reshape(*shape, -1)
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """How errors of unit standard deviation move the state: those of the start, of samples, of steps, the constant one.
+
+    Attributes
+    ----------
+    by_state : ndarray, shape (N, nx, nx)
+    by_torque, by_angles : ndarray, shape (N, nx, nu)
+        By the torque, and by the noise of the angles that the filter follows.
+    start_by_angles, start_by_torque : ndarray, shape (nx, nu)
+    torque_std, bias_std : ndarray, shape (nu,)
+    sample : ndarray of int, shape (N,)
+        Counted from 0 without a gap.
+    """
+
+    by_state: Array
+    by_torque: Array
+    by_angles: Array
+    start_by_angles: Array
+    start_by_torque: Array
+    torque_std: Array
+    bias_std: Array
+    sample: NDArray[np.int64]
+
+    @staticmethod
+    def of(course: NominalTrajectory, errors: InputErrors) -> _Motion:
+        step, feedback = course.model_functions.step, course.tracking_feedback
+        momentum = course.model_functions.momentum_shift.momentum_by_torque(course.theta)
+        by_state, by_torque, by_angles = [], [], []
+        for k, here in enumerate(linearized_steps(step, course.theta, course.rollout)):
+            state, angles, by_error = (
+                here.state_by_state.copy(),
+                np.zeros_like(here.state_by_torque),
+                here.state_by_torque.copy(),
+            )
+            if feedback is not None:
+                by_error = here.state_by_torque @ torque_error_feedthrough(feedback.gain[k], momentum)
+                pulled = here.state_by_torque @ feedback.gain[k]
+                state[:, feedback.state_indices] -= pulled
+                angles = pulled[:, : angles.shape[1]] * errors.angle_std * np.sqrt(errors.encoder_noise_steps)
+            by_state.append(state)
+            by_torque.append(by_error)
+            by_angles.append(angles)
+        return _Motion(
+            np.array(by_state),
+            np.array(by_torque),
+            np.array(by_angles),
+            course.initial_state_by_angles * errors.angle_std,
+            course.initial_state_by_torque,
+            errors.torque_std,
+            errors.torque_bias_std,
+            np.unique(errors.sample_of_step, return_inverse=True)[1],
+        )
+
+    @property
+    def size(self) -> int:
+        """Number of errors."""
+        steps, _, nu = self.by_torque.shape
+        return nu * (2 + int(self.sample[-1]) + 1 + steps)
+
+    def _parts(self, errors: Array) -> tuple[Array, Array, Array, Array]:
+        """Errors of the start's angles, constant ones, those of samples and of steps, each (..., nu, c)."""
+        nu = len(self.torque_std)
+        parts = errors.reshape(-1, nu, errors.shape[1])
+        samples = int(self.sample[-1]) + 1
+        return parts[0], parts[1], parts[2 : 2 + samples], parts[2 + samples :]
+
+    def moved(self, errors: Array, slopes: Array) -> Array:
+        """Readings by errors, G e: (size, c) to (N + 1, k, c)."""
+        angles, constant, white, followed = self._parts(errors)
+        constant, white = self.bias_std[:, None] * constant, self.torque_std[:, None] * white
+        state = self.start_by_angles @ angles + self.start_by_torque @ (constant + white[0])
+        found = np.empty((*slopes.shape[:2], errors.shape[1]))
+        found[0] = slopes[0] @ state
+        for k, sample in enumerate(self.sample):
+            state = self.by_state[k] @ state + self.by_torque[k] @ (constant + white[sample])
+            state += self.by_angles[k] @ followed[k]
+            found[k + 1] = slopes[k + 1] @ state
+        return found
+
+    def pulled(self, readings: Array, slopes: Array) -> Array:
+        """The transposed map, G' y: (N + 1, k, c) to (size, c)."""
+        result = np.zeros((self.size, readings.shape[2]))
+        angles, constant, white, followed = self._parts(result)
+        costate = slopes[-1].T @ readings[-1]
+        for k in reversed(range(len(self.sample))):
+            torque = self.by_torque[k].T @ costate
+            constant += torque
+            white[self.sample[k]] += torque
+            followed[k] = self.by_angles[k].T @ costate
+            costate = self.by_state[k].T @ costate + slopes[k].T @ readings[k]
+        first = self.start_by_torque.T @ costate
+        angles += self.start_by_angles.T @ costate
+        constant += first
+        white[0] += first
+        constant *= self.bias_std[:, None]
+        white *= self.torque_std[:, None]
+        return result

@@ -1,0 +1,291 @@
+"""Checks of single channels of a recording: repeated values, quantization, noise and saturation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+import scipy.special
+from numpy.typing import NDArray
+
+from yid_ocp.data.issues import (
+    MIN_NOISE_DIFFERENCES,
+    QUALITY_LIMITS,
+    Array,
+    Issue,
+    SensorChoiceLookup,
+    group_name,
+    median_sample_period,
+)
+from yid_ocp.data.recording import Recording
+from yid_ocp.sensors.joints import EFFORT_GROUP, NOISE_DIFFERENCE_ORDER, POSITION_GROUP
+
+_MAX_REPEATED_FRACTION = 0.1
+"""Largest fraction of a channel's samples that may repeat the previous one."""
+_MIN_NOISE_FRACTION = 1e-2
+"""Noise below this fraction of the stated noise means that the channel was computed, not measured."""
+_MAX_SAMPLE_PERIOD = 0.02
+"""Longest sample period at which arm motion counts as slow [s]."""
+
+
+def _channels(recording: Recording, *wanted: str) -> Iterator[tuple[str, str, Array, Array]]:
+    """Group, channel, times and values (N,) or (N, 3) of what was measured."""
+    joints = recording.joints
+    if joints is not None:
+        for quantity, values in joints.channels.items():
+            for j, name in enumerate(joints.names):
+                if quantity in wanted:
+                    yield "joints", f"{quantity}.{name}", joints.t, values[:, j]
+    for group in recording.points:
+        for i, name in enumerate(group.names):
+            seen = np.isfinite(group.position[:, i]).all(axis=1)
+            if "points" in wanted:
+                yield group.name, name, group.t[seen], group.position[seen, i]
+
+
+def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
+    """Issues for channels that repeat one value although they are noisy elsewhere or their velocity is not zero."""
+    joints, found = recording.joints, []
+    for group, channel, t, values in _channels(recording, "position", "effort", "points"):
+        if len(t) <= QUALITY_LIMITS.min_stuck_samples:
+            continue
+        same = np.all(np.diff(values.reshape(len(t), -1), axis=0) == 0, axis=1)
+        begin, end = _longest_run(same)
+        count, length = end - begin, float(t[end] - t[begin])
+        if count < QUALITY_LIMITS.min_stuck_samples or length < QUALITY_LIMITS.min_stuck_time:
+            continue
+        rest = np.delete(same, slice(begin, end))
+        usual = float(np.mean(rest)) if len(rest) >= count // 4 else 1.0
+        quantity, _, name = channel.partition(".")
+        turned = 0.0
+        if joints is not None and quantity == "position" and joints.velocity is not None:
+            speed = joints.velocity[begin : end + 1, joints.names.index(name)]
+            area = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(t[begin : end + 1]))])
+            turned = float(np.ptp(area))
+        # of a channel that changes from sample to sample in nine of ten, so long a run is no chance
+        evidence = (count / QUALITY_LIMITS.min_stuck_samples) if usual < 0.1 else 0.0
+        stated = joints is not None and quantity == "position" and bool(np.all(joints.position_std or 0))
+        if not len(rest) and stated:
+            evidence = count / QUALITY_LIMITS.min_stuck_samples
+        evidence = max(
+            evidence,
+            turned / QUALITY_LIMITS.max_unseen_rotation if turned > QUALITY_LIMITS.max_unseen_rotation else 0.0,
+        )
+        if quantity == "effort" and values[begin] in (0.0, np.max(values), np.min(values)):
+            continue  # no effort was recorded, or it is cut off: other causes
+        if evidence >= 1:
+            also = (
+                f", while its velocity turns it by {turned:.2g} rad"
+                if turned > QUALITY_LIMITS.max_unseen_rotation
+                else ""
+            )
+            found.append((group, channel, float(t[begin]), float(t[end]), evidence, also))
+    for group, channel, start, stop, evidence, also in found:
+        yield Issue(
+            "stuck",
+            f"{channel} repeats one value for {stop - start:.3g} s{also}",
+            "not_trusted",
+            evidence,
+            "leave that stretch or that channel out, and look at the sensor",
+            "",
+            group,
+            channel,
+            start,
+            stop,
+        )
+
+
+def _longest_run(same: NDArray[np.bool_]) -> tuple[int, int]:
+    """First and last index of the longest stretch of samples that are all the same."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
+    if not len(edges):
+        return 0, 0
+    begins, ends = edges[::2], edges[1::2]
+    longest = int(np.argmax(ends - begins))
+    return int(begins[longest]), int(ends[longest])
+
+
+def white_noise_std(t: Array, values: Array) -> float:
+    """Robust standard deviation of a channel's white noise; zero for long rests or an uneven clock."""
+    even = np.abs(np.diff(t) / max(median_sample_period(t), 1e-12) - 1) < 0.2
+    if len(t) < NOISE_DIFFERENCE_ORDER + MIN_NOISE_DIFFERENCES:
+        return 0.0
+    together = np.lib.stride_tricks.sliding_window_view(even, NOISE_DIFFERENCE_ORDER).all(axis=1)
+    if together.sum() < MIN_NOISE_DIFFERENCES:
+        return 0.0
+    size = math.sqrt(float(scipy.special.comb(2 * NOISE_DIFFERENCE_ORDER, NOISE_DIFFERENCE_ORDER)))
+    return float(1.4826 * np.median(np.abs(np.diff(values, NOISE_DIFFERENCE_ORDER)[together])) / size)
+
+
+def quantization_step(values: Array) -> float:
+    """Quantization step of a channel, zero if it is not quantized."""
+    levels = np.unique(values)
+    if not 1 < len(levels) < 0.7 * values.size:
+        return 0.0
+    apart = np.diff(levels)
+    step = float(np.min(apart[apart > 1e-9 * np.ptp(levels)], initial=np.inf))
+    if not math.isfinite(step):
+        return 0.0
+    count = apart / step
+    return step if np.mean(np.abs(count - np.rint(count)) < 0.05 * np.maximum(count, 1)) > 0.95 else 0.0
+
+
+def _stated(recording: Recording, choice: SensorChoiceLookup, group: str, channel: str) -> float:
+    """Standard deviation that settings or recording give to a channel, zero where nobody says."""
+    joints = recording.joints
+    quantity, _, name = channel.partition(".")
+    if group == "joints" and joints is not None:
+        said = choice({"position": POSITION_GROUP, "effort": EFFORT_GROUP}[quantity]).std
+        if isinstance(said, Mapping):
+            return float(said.get(name, 0.0))
+        own = joints.position_std if quantity == "position" else joints.effort_std
+        given = said if said is not None else own
+        if given is None:
+            return 0.0
+        return float(np.broadcast_to(given, (len(joints.names),))[joints.names.index(name)])
+    said = choice(group).std
+    if isinstance(said, (int, float)):
+        return float(said)
+    own_group = next(entry for entry in recording.points if entry.name == group)
+    if own_group.std is None:
+        return 0.0
+    spread = own_group.std[:, own_group.names.index(channel)]
+    return float(np.nanmedian(spread)) if np.any(np.isfinite(spread)) else 0.0
+
+
+def excess_noise_issues(recording: Recording, choice: SensorChoiceLookup) -> Iterator[Issue]:
+    """Issues for channels whose quantization or noise exceeds the stated noise; slow frame rates are skipped."""
+    for group, channel, t, values in _channels(recording, "position", "effort", "points"):
+        if len(t) < 100 or median_sample_period(t) > 0.05:
+            continue
+        stated = _stated(recording, choice, group, channel)
+        columns = values.reshape(len(t), -1).T
+        step = max(quantization_step(column) for column in columns)
+        size, wide = step / math.sqrt(12), float(np.ptp(values))
+        # an angle that hardly moves has few levels by nature
+        few = step > wide / 16 and wide > (
+            5 * QUALITY_LIMITS.min_joint_motion if channel.startswith("position") else 0.0
+        )
+        setting = f"sensors.{'joints.' + channel.partition('.')[0] if group == 'joints' else group}.std"
+        if step > 0 and (size > QUALITY_LIMITS.max_noise_ratio * stated > 0 or (few and stated == 0)):
+            yield Issue(
+                "quantised",
+                f"{channel} moves in steps of {step:.3g}, which is noise of {size:.2g}"
+                + (f"; {stated:.2g} is stated" if stated else ""),
+                "not_trusted",
+                size / (QUALITY_LIMITS.max_noise_ratio * stated) if stated else 16 * step / wide,
+                "state the noise that the steps make, or record with more digits",
+                "",
+                group,
+                channel,
+                setting=f"{setting}: {size:.2g}",
+            )
+            continue
+        seen = max(white_noise_std(t, column) for column in columns)
+        if _clock(recording, group) == "nominal":
+            # when a sample was taken is known to half a period, which looks like noise wherever something moves
+            seen -= min(seen, 0.5 * max(float(np.mean(np.abs(np.diff(column)))) for column in columns))
+        if seen > QUALITY_LIMITS.max_noise_ratio * stated > 0:
+            yield Issue(
+                "noise",
+                f"{channel} has noise of {seen:.2g} from sample to sample; {stated:.2g} is stated",
+                "not_trusted",
+                seen / (QUALITY_LIMITS.max_noise_ratio * stated),
+                "state the noise that is there",
+                "",
+                group,
+                channel,
+                setting=f"{setting}: {seen:.2g}",
+            )
+
+
+def overstated_noise_issues(recording: Recording, choice: SensorChoiceLookup) -> Iterator[Issue]:
+    """Issues for channels far less noisy than the recording states; channels of equal stated noise are pooled.
+
+    What settings state may stand for what a model misses, and only a fit can say whether it is too much. Noise need not
+    be white: the largest of what all samples say, every other one, and so on up to `_MAX_SAMPLE_PERIOD` counts, and so do steps.
+    What has no noise at all was computed, as commands are.
+    """
+    found: dict[str, list[tuple[str, float, float]]] = {}
+    commanded = recording.joints is not None and recording.joints.effort_kind_or_default == "command"
+    for group, channel, t, values in _channels(recording, "position", "effort", "points"):
+        sensor = f"joints.{channel.partition('.')[0]}" if group == "joints" else group
+        said, step = choice(sensor), median_sample_period(t)
+        stated = _stated(recording, choice, group, channel)
+        if stated <= 0 or said.std is not None or said.use is False or (commanded and sensor == EFFORT_GROUP):
+            continue
+        if len(t) < 100 or not 0 < step <= _MAX_SAMPLE_PERIOD:
+            continue
+        columns = values.reshape(len(t), -1).T
+        if np.mean(np.diff(columns, axis=1) == 0) > _MAX_REPEATED_FRACTION:
+            continue  # it is cut off, coarse or stuck, and says too little of its noise
+        strides = [2**k for k in range(12) if 2**k * step <= _MAX_SAMPLE_PERIOD]
+        sizes = [white_noise_std(t[::k], column[::k]) for k in strides for column in columns]
+        seen = max([*sizes, *(quantization_step(column) / math.sqrt(12) for column in columns)])
+        found.setdefault(sensor, []).append((channel, stated, seen))
+    for sensor, entries in found.items():
+        seen_of = {name: max(s for _, also, s in entries if also == stated) for name, stated, _ in entries}
+        low = {
+            name
+            for name, stated, _ in entries
+            if _MIN_NOISE_FRACTION * stated < QUALITY_LIMITS.max_overstatement_ratio * seen_of[name] < stated
+        }
+        if not low:
+            continue
+        channel, stated = max(((name, s) for name, s, _ in entries if name in low), key=lambda e: e[1] / seen_of[e[0]])
+        own = {name.partition(".")[2] or name: seen_of[name] if name in low else s for name, s, _ in entries}
+        line = f"{{{', '.join(f'{name}: {size:.2g}' for name, size in own.items())}}}"
+        if len(set(own.values())) == 1 or not sensor.startswith("joints."):  # a group of points takes one number
+            line = f"{max(own.values()):.2g}"
+        yield Issue(
+            "noise_overstated",
+            f"{channel} has noise of {seen_of[channel]:.2g} or less; {stated:.2g} is stated"
+            + (f", and so for {len(low)} of {len(entries)} channels" if len(low) > 1 else ""),
+            "warning",
+            stated / (QUALITY_LIMITS.max_overstatement_ratio * seen_of[channel]),
+            "state the noise that is there: as stated every ± is too wide, and a small gap is not seen",
+            "",
+            sensor.partition(".")[0],
+            channel,
+            setting=f"sensors.{sensor}.std: {line}" if len(low) == len(entries) or line[0] == "{" else "",
+        )
+
+
+def _clock(recording: Recording, name: str) -> str:
+    return next(group.clock for group in recording.groups if group_name(group) == name)
+
+
+def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:
+    """Issues for efforts that repeatedly equal their extreme value exactly."""
+    if recording.joints is not None and recording.joints.effort_kind_or_default == "command":
+        return  # what a controller asks for ends at its own bound
+    for group, channel, t, values in _channels(recording, "effort"):
+        for sign in (1.0, -1.0):
+            levels, counts = np.unique(sign * values, return_counts=True)
+            near = (levels > levels[-1] - 0.05 * np.ptp(levels)) & (levels < levels[-1])
+            at = sign * values == levels[-1]
+            # a value that many samples share while none of its neighbours has a fifth as many, held again and again
+            held = int(np.sum(np.diff(np.flatnonzero(at)) == 1))
+            apart = int(np.sum(np.diff(np.flatnonzero(at)) > 1)) + 1
+            alone = at.sum() >= QUALITY_LIMITS.min_clipped_samples and at.sum() > 5 * np.max(counts[near], initial=0)
+            if (
+                alone
+                and len(levels) > MIN_NOISE_DIFFERENCES
+                and held >= QUALITY_LIMITS.min_clipped_samples / 2
+                and apart >= 2
+            ):
+                first, last = np.flatnonzero(at)[[0, -1]]
+                yield Issue(
+                    "saturated",
+                    f"{channel} is exactly {sign * levels[-1]:.4g} N m in {at.sum()} samples and never beyond",
+                    "not_trusted",
+                    at.sum() / QUALITY_LIMITS.min_clipped_samples,
+                    "leave what is cut off out, or record within the sensor's range; where it is what a controller "
+                    "asked for, say sensors.joints.effort.kind: command",
+                    "",
+                    group,
+                    channel,
+                    float(t[first]),
+                    float(t[last]),
+                )

@@ -1,0 +1,131 @@
+"""Safe HDF5 access: atomic writes, and reads only after another process has read the file without a crash.
+
+The HDF5 library ends the process that meets a full disk while it writes, or certain damage while it reads, and takes
+links into other files for its own. None of this can be caught, so it is kept away from the process that does the work.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import h5py
+
+from yid_ocp.data.readability_check import check_readable_in_fork
+from yid_ocp.errors import DataError
+from yid_ocp.files import atomic_write, os_error_reason
+
+_MAX_GROUP_DEPTH = 10
+"""Largest nesting depth of groups."""
+
+_MAX_UNPACKED_BYTES = 1 << 30
+"""Largest total size of a file's unpacked datasets [bytes]."""
+
+
+@contextlib.contextmanager
+def create_hdf5_atomically(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
+    """An HDF5 file in memory, written as a whole when the block ends without error.
+
+    Parameters
+    ----------
+    path : path-like
+        The file to make or replace.
+
+    Yields
+    ------
+    h5py.File
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written; one that was there before is left as it was.
+    """
+    with atomic_write(Path(path)) as temporary:
+        with h5py.File(str(temporary), "w", driver="core", backing_store=False) as file:
+            yield file
+            file.flush()
+            image = file.id.get_file_image()
+        temporary.write_bytes(image)
+
+
+@contextlib.contextmanager
+def open_checked_hdf5(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
+    """Open an HDF5 file after checking in another process that it can be read.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Yields
+    ------
+    h5py.File
+
+    Raises
+    ------
+    DataError
+        The file is damaged, holds more than `_MAX_UNPACKED_BYTES`, takes too long to read, or refers to other
+        files, whose contents no hash of this one covers; errors of the library in the block, too.
+    """
+    check_readable_in_fork(Path(path), _complaint, "HDF5")
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:  # all of them come from h5py
+        what = f"the HDF5 file is truncated or damaged ({os_error_reason(error)})"
+        raise DataError(what, where=str(path), hint="copy or record it again") from error
+
+
+def _complaint(path: Path) -> str:
+    """What stands against reading a file; nothing where all of it can be read."""
+    try:
+        with h5py.File(path, "r") as file:
+            complaint = _foreign(file) or _excess(file)
+            if not complaint:
+                dict(file.attrs)
+                file.visititems(_read)
+            return complaint
+    except Exception as error:  # whatever h5py says of damaged files
+        return f"the HDF5 file is truncated or damaged ({os_error_reason(error)})"
+
+
+def _read(name: str, item: h5py.Group | h5py.Dataset) -> None:
+    dict(item.attrs)
+    if isinstance(item, h5py.Dataset):
+        item[()]
+
+
+def _foreign(group: h5py.Group, depth: int = 0) -> str:
+    """Which entry stands in another file."""
+    for name in group:
+        link = group.get(name, getlink=True)
+        item = None if isinstance(link, h5py.ExternalLink) else group.get(name)
+        if item is None:
+            return f"'{name}' in the HDF5 file is a link into another file, or into nowhere"
+        if isinstance(item, h5py.Dataset) and (item.is_virtual or item.external):
+            return f"the values of '{name}' in the HDF5 file stand in another file"
+        if isinstance(item, h5py.Group):
+            found = (
+                _foreign(item, depth + 1)
+                if depth < _MAX_GROUP_DEPTH
+                else "groups in the HDF5 file stand in one another"
+            )
+            if found:
+                return found
+    return ""
+
+
+def _excess(file: h5py.File) -> str:
+    """Whether a file declares more than can be meant."""
+    size = 0
+
+    def count(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        nonlocal size
+        if isinstance(item, h5py.Dataset) and item.shape is not None:
+            size += item.dtype.itemsize * item.size
+
+    file.visititems(count)
+    return (
+        f"the HDF5 file declares {size / 2**30:.1f} GiB, more than can be meant" if size > _MAX_UNPACKED_BYTES else ""
+    )

@@ -1,0 +1,186 @@
+"""Data quality issues of a recording: cause, place and severity, and the limits of the checks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.data.recording import JointGroup, PointGroup
+from yid_ocp.sensors.base import SensorUsage
+
+Array = NDArray[np.float64]
+SampleGroup = JointGroup | PointGroup
+Severity = Literal["warning", "not_trusted", "refused"]
+
+MAX_LIMIT_RATIO = 1e3
+"""Largest value of `Issue.evidence`; larger ratios are clipped."""
+SECONDS_PER_CLOCK_UNIT: Mapping[str, float] = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
+MIN_EPOCH_SECONDS = 1e8
+"""Smallest time that is taken for a clock counting from 1970 instead of from power-on [s]."""
+DEGREES_PER_RADIAN = math.degrees(1.0)
+MIN_NOISE_DIFFERENCES = 30
+"""Fewest differences from which noise is estimated."""
+
+
+@dataclass(frozen=True)
+class QualityLimits:
+    """Limits beyond which a check of a recording reports an issue.
+
+    Attributes
+    ----------
+    max_joint_period, max_point_period : float
+        Longest period of a robot's joints and of frames [s].
+    max_missing_fraction : float
+        Part of a clock's samples that may be missing.
+    max_clock_mismatch_fraction : float
+        Part of the joints' time by which points may start late and end late.
+    max_rate_ratio : float
+        Factor by which angles may turn faster or more slowly than the recorded velocity says.
+    max_noise_ratio : float
+        Factor by which noise may exceed what is stated.
+    max_overstatement_ratio : float
+        Factor by which it may stay below.
+    min_stuck_time : float
+        How long a channel that is noisy elsewhere may repeat one value [s].
+    min_stuck_samples : int
+        How often it may.
+    max_unseen_rotation : float
+        By how much the recorded velocity may turn a joint whose angle stays the same [rad].
+    min_clipped_samples : int
+        How often a noisy effort may hit its extreme exactly.
+    min_joint_motion, min_point_travel : float
+        Less is no motion, of any joint [rad], of any point [m].
+    min_shared_samples : int
+        Samples that two recordings may share.
+    """
+
+    max_joint_period: float = 0.5
+    max_point_period: float = 30.0
+    max_missing_fraction: float = 0.2
+    max_clock_mismatch_fraction: float = 0.2
+    max_rate_ratio: float = 1.3
+    max_noise_ratio: float = 3.0
+    max_overstatement_ratio: float = 5.0
+    min_stuck_time: float = 0.3
+    min_stuck_samples: int = 12
+    max_unseen_rotation: float = 0.03
+    min_clipped_samples: int = 8
+    min_joint_motion: float = 0.01
+    min_point_travel: float = 0.002
+    min_shared_samples: int = 50
+
+
+QUALITY_LIMITS = QualityLimits()
+
+
+@dataclass(frozen=True)
+class Issue:
+    """One data quality issue of a recording.
+
+    Attributes
+    ----------
+    cause : str
+        What is wrong, in one word of `ISSUE_CAUSES`.
+    what : str
+        The same in one sentence, with numbers.
+    weight : {'warning', 'not_trusted', 'refused'}
+        Whether a run goes on as it would (and says so), goes on but says of no number that it is found, or stops.
+    evidence : float
+        How many times what was seen exceeds the limit from which on it counts, 1 to `MAX_LIMIT_RATIO`.
+    advice : str
+        What to do.
+    recording, group, channel : str
+        Where; empty for all of them.
+    begin, end : float, optional
+        Stretch of time on the group's clock [s]; all of it when absent.
+    setting : str
+        Line of configuration that repairs or describes it, where there is one.
+    """
+
+    cause: str
+    what: str
+    weight: Severity
+    evidence: float
+    advice: str
+    recording: str
+    group: str = ""
+    channel: str = ""
+    begin: float | None = None
+    end: float | None = None
+    setting: str = ""
+
+    def __post_init__(self) -> None:
+        if self.cause not in ISSUE_CAUSES:
+            raise ValueError(f"there is no cause '{self.cause}'")
+        object.__setattr__(self, "evidence", float(min(max(self.evidence, 1.0), MAX_LIMIT_RATIO)))
+
+    @property
+    def certainty_word(self) -> str:
+        """Certainty in one word: perhaps, likely or certain."""
+        return "perhaps" if self.evidence < 1.5 else "likely" if self.evidence < 3 else "certain"
+
+    @property
+    def where(self) -> str:
+        """Recording, group, channel and time in one text."""
+        place = "/".join(part for part in (self.recording, self.group, self.channel) if part)
+        span = "" if self.begin is None or self.end is None else f", {self.begin:.4g} to {self.end:.4g} s"
+        return place + span
+
+
+ISSUE_CAUSES: Mapping[str, str] = {
+    "time_unit": "times are not in seconds",
+    "time_scale": "the clock runs too fast or too slowly",
+    "clock_base": "clocks of two groups have nothing in common",
+    "clock_offset": "the clock of one group is late or early",
+    "clock_drift": "the clocks of two groups run apart",
+    "clock_jump": "the clock jumps",
+    "gap": "a gap in what drives the model",
+    "dropped_samples": "many samples are missing",
+    "standstill": "nothing moves",
+    "stuck": "a channel repeats one value",
+    "quantised": "a channel has steps larger than its noise",
+    "saturated": "a channel is cut off at its extreme",
+    "noise": "more noise than stated",
+    "noise_overstated": "less noise than stated",
+    "same_data": "the same data twice",
+    "degrees": "angles are in degrees",
+    "angle_scale": "an angle is multiplied by something",
+    "angle_sign": "an angle has the wrong sign",
+    "swapped_joints": "two joints are exchanged",
+    "angle_limits": "angles are beyond the joint's limits",
+    "speed_limits": "joints turn faster than they can",
+    "effort_zero": "efforts are zero",
+    "effort_sign": "an effort has the wrong sign",
+    "effort_gain": "an effort is multiplied by something",
+    "effort_offset": "an effort's zero is off",
+    "effort_lag": "efforts are late",
+    "effort_limits": "efforts are larger than the joint can bear",
+    "effort_unlike": "efforts are not those of this robot",
+    "point_scale": "lengths are not in metres",
+    "point_mirrored": "points are mirrored or their axes exchanged",
+    "point_frame": "points are in another frame",
+    "point_swapped": "two points are exchanged",
+    "point_reach": "points are where the object cannot be",
+    "encoder_offset": "an encoder's zero is off",
+    "point_unlike": "points are not where the robot holds them",
+    "weak_excitation": "the motion is too weak to tell what is asked",
+    "worse_than_guess": "a prediction without a model is nearer",
+}
+"""Description of every cause of an issue, as shown in tables."""
+
+SensorChoiceLookup = Callable[[str], SensorUsage]
+
+
+def median_sample_period(t: Array) -> float:
+    """Median time between samples [s]; zero for fewer than two."""
+    return float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+
+
+def group_name(group: SampleGroup) -> str:
+    """Name of a group; `joints` for the joints."""
+    return group.name if isinstance(group, PointGroup) else "joints"

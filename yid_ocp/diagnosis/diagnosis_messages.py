@@ -1,0 +1,359 @@
+"""Sentences that describe a diagnosis, and the recommended next experiment."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from yid_ocp.diagnosis.baseline_comparison import BaselineComparison
+from yid_ocp.diagnosis.counterfactual import CounterfactualTest
+from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
+from yid_ocp.diagnosis.events import DisturbanceEvent, EventSet
+from yid_ocp.diagnosis.hypotheses import TruncatedRecording
+from yid_ocp.diagnosis.localise import GapLocation, main_gap_locations
+from yid_ocp.diagnosis.refit import RefitModel
+from yid_ocp.diagnosis.screening import CandidateDetectability
+from yid_ocp.diagnosis.select import SelectedEffect
+from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.diagnosis.transfer_check import failed_transfer_checks
+from yid_ocp.diagnosis.verdict import assumption_count, required_explained_fraction
+from yid_ocp.effects import EffectBase
+from yid_ocp.effects.base import EXCITATIONS
+from yid_ocp.problem.null_test import NullTestResult
+
+_MIN_RELATIVE_CHANGE = 0.1
+"""Relative change from which a nominal parameter is named."""
+_PRIOR_RANGE_TOLERANCE = 0.25
+"""Part of its range by which an amplitude may leave it unnoticed."""
+_GAP_ORIGIN_PHRASES = {
+    "plant": ", in the mechanics rather than in what sensors read",
+    "sensor": ", in what sensors read",
+    "either": ", in the mechanics or in what the effort sensor reads, which efforts alone do not tell apart",
+}
+_RUNS_DIFFER_LEVEL = 0.01
+"""Significance below which several runs of a baseline differ."""
+_IMMOVABLE_LOCATIONS = ("world", "clock", "camera", "object", "base")
+"""Locations that cannot be moved by themselves."""
+_NEXT_EXPERIMENT_TEXTS = {
+    "insufficient_data": "Record longer and larger motions; more of the object has to be seen.",
+    "separate": "Vary {aspects} independently of each other, over a wide range, in one recording.",
+    "places": "Move so that {places} work one at a time, or measure a point between them.",
+    "vary": "Vary {aspects} over a wider range.",
+    "other": "Record other motions, faster and larger.",
+    "unknown": "Move {place} alone, slowly and fast, and hold it still in several postures.",
+    "unseen": "None is needed; these motions could not have shown {unseen}.",
+    "no_gap": "None is needed.",
+    "effect": "Repeat with other motions to see whether the effect's parameters stay.",
+}
+"""Texts of the recommended next experiment, by situation."""
+
+
+_UNKNOWN_REASON_TEXTS = {
+    "nothing": "No known effect explains it.",
+    "none": "No known effect explains it (the best, {best}, is not sure to be there and to close a part).",
+    "unsure": "{names} close{s} {closure:.3g} % of it, but not surely: at least {low:.3g} %, where {least:.3g} % are "
+    "asked.",
+    "little": "{names} explain{s} {explained:.3g} % of what unknown forces, offsets and biases explain, and surely "
+    "close{s} {low:.3g} % on held-out motions; {enough:.3g} % {asked}.",
+    "stand_in": "{names} imitate{s} it (closing {closure:.3g} % on held-out motions) and {are} not its cause: {apart}.",
+}
+"""Sentences on why the verdict is unknown, by `verdict.UnknownReason`."""
+
+
+def _separating_experiment(rivals: Sequence[EffectBase]) -> str:
+    """Return the experiment that separates indistinguishable effects, from what their equations depend on."""
+    said = list(dict.fromkeys(effect.required_excitation for effect in rivals if effect.required_excitation))
+    aspects = sorted(said, key=lambda aspect: EXCITATIONS.index(aspect) if aspect in EXCITATIONS else len(EXCITATIONS))
+    places = list(dict.fromkeys(effect.location for effect in rivals))
+    if len(aspects) > 1:
+        return _NEXT_EXPERIMENT_TEXTS["separate"].format(aspects=" and ".join(aspects))
+    if len(places) > 1:
+        return _NEXT_EXPERIMENT_TEXTS["places"].format(places=" and ".join(places))
+    return _NEXT_EXPERIMENT_TEXTS["vary"].format(aspects=aspects[0]) if aspects else _NEXT_EXPERIMENT_TEXTS["other"]
+
+
+def next_experiment_text(
+    verdict: str, added: Sequence[SelectedEffect], where: Sequence[GapLocation], unseen: Sequence[str]
+) -> str:
+    """Return the recommended next recording as text."""
+    if verdict == "insufficient_data":
+        return _NEXT_EXPERIMENT_TEXTS["insufficient_data"]
+    rivals = next((entry.equivalent_effects for entry in added if len(entry.equivalent_effects) > 1), ())
+    if rivals:
+        return _separating_experiment(rivals)
+    if verdict == "unknown" and where and where[0].gap_share > 0 and where[0].location not in _IMMOVABLE_LOCATIONS:
+        return _NEXT_EXPERIMENT_TEXTS["unknown"].format(place=where[0].location)
+    if verdict == "unknown":
+        return _NEXT_EXPERIMENT_TEXTS["other"]
+    if verdict == "no_gap" and unseen:
+        return _NEXT_EXPERIMENT_TEXTS["unseen"].format(
+            unseen=", ".join(unseen[:4]) + (", ..." if len(unseen) > 4 else "")
+        )
+    return _NEXT_EXPERIMENT_TEXTS["no_gap"] if verdict == "no_gap" else _NEXT_EXPERIMENT_TEXTS["effect"]
+
+
+def insufficient_data_message(
+    verdict: str, before: NullTestResult, unknowns: int, seen: Sequence[CandidateDetectability], limits: Thresholds
+) -> str:
+    """Return why the data are insufficient; empty if they suffice.
+
+    Parameters
+    ----------
+    verdict : str
+    before : NullTest
+        Of the nominal model, on the recordings to estimate on.
+    unknowns : int
+    seen : sequence of Visibility
+    limits : Thresholds
+    """
+    if verdict != "insufficient_data":
+        return ""
+    if not any(entry.is_detectable for entry in seen):
+        return "no candidate of the size that one would expect would show in these recordings."
+    return (
+        f"{before.degrees_of_freedom:.0f} effective samples for {unknowns} unknowns, at least "
+        f"{limits.min_samples_per_unknown * unknowns:.0f} are needed; record longer or free fewer parameters."
+    )
+
+
+def truncation_message(cut: TruncatedRecording) -> str:
+    """Return the sentence on how far the nominal model follows a held-out recording."""
+    if cut.kept_duration == 0:
+        return f"The nominal model cannot follow {cut.recording} at all, which is left out."
+    return f"The nominal model follows {cut.recording} for {cut.kept_duration:.3g} of {cut.full_duration:.3g} s only; the rest is left out."
+
+
+def diagnosis_summary_text(finding: DiagnosisResult) -> str:
+    """Return the summary text of a diagnosis."""
+    text = [_gap(finding)]
+    if finding.verdict not in ("insufficient_data", "no_gap"):
+        text.append(_places(finding))
+    if finding.accepted_effects:
+        text += _effects(finding)
+    elif finding.verdict == "unknown":
+        text.append(_nameless(finding))
+    text += [truncation_message(cut) for cut in finding.truncated_recordings]
+    if finding.baseline_comparison is not None:
+        text.append(_since(finding.baseline_comparison, bool(finding.accepted_effects)))
+    if finding.counterfactual is not None:
+        text += _counterfactual(finding.counterfactual)
+    if finding.is_split_in_blocks:
+        why = (
+            "No held-out recording is left" if finding.truncated_recordings else "Only one set of recordings was given"
+        )
+        text.append(f"{why}: alternate blocks of what is estimated on were held out.")
+    text.append(_event_sentences(finding.events))
+    text.append(f"Next experiment: {finding.next_experiment}")
+    return " ".join(part for part in text if part)
+
+
+def _gap(finding: DiagnosisResult) -> str:
+    """Whether there is one."""
+    held, first = finding.nominal_held_out_test, finding.nominal_test
+    p = min(first.p_value, held.p_value)
+    if finding.verdict == "insufficient_data":
+        return f"The data do not suffice: {finding.message}"
+    if finding.verdict == "no_gap":
+        return (
+            f"There is no gap to speak of (chi2 per degree of freedom {first.chi2_per_dof:.3g}, held out "
+            f"{held.chi2_per_dof:.3g}; p = {p:.2g})."
+        )
+    best = min(finding.candidate_scores, key=lambda score: score.p_value, default=None)
+    along = ""
+    if p >= finding.thresholds.significance_level and best is not None:
+        p, along = min(1.0, best.p_value * len(finding.candidate_scores)), f" along what {best.effect.label} would do"
+    small = f"= {p:.2g}" if p > 1e-12 else "< 1e-12"
+    return f"The gap is real (held-out chi2 per degree of freedom {held.chi2_per_dof:.3g}, p {small}{along})."
+
+
+def _places(finding: DiagnosisResult) -> str:
+    """Where it lies; empty where nothing says so."""
+    shares = [(_one_of(p), round(100 * p.gap_share)) for p in main_gap_locations(finding.gap_locations)]
+    named = " and ".join(f"{place} ({percent} %)" for place, percent in shares if percent)
+    side = "" if finding.smoother_result is None else _GAP_ORIGIN_PHRASES.get(finding.smoother_result.gap_origin, "")
+    if named:
+        return f"It lies in {named}{side}."
+    return "These data do not tell where it lies." if shares else ""
+
+
+def _nameless(finding: DiagnosisResult) -> str:
+    """Why no effect is named, with the numbers that say so."""
+    if finding.unknown_reason == "none":
+        best = finding.single_effect_models[0] if finding.single_effect_models else None
+        return (
+            _UNKNOWN_REASON_TEXTS["nothing"]
+            if best is None
+            else _UNKNOWN_REASON_TEXTS["none"].format(best=best.effects[0].label)
+        )
+    names = " and ".join(entry.effect.label for entry in finding.selected_effects)
+    apart = [
+        f"{entry.effect_label}.{entry.parameter} is {entry.estimation_value:.3g} ± {entry.estimation_std:.2g} {entry.unit} on the recordings to "
+        f"estimate on and {entry.held_out_value:.3g} ± {entry.held_out_std:.2g} on the held-out ones"
+        for entry in failed_transfer_checks(finding.transfer_checks)
+    ]
+    count = assumption_count(finding.selected_effects)
+    return _UNKNOWN_REASON_TEXTS[finding.unknown_reason].format(
+        names=names,
+        s="s" if len(finding.selected_effects) == 1 else "",
+        are="is" if len(finding.selected_effects) == 1 else "are",
+        closure=100 * finding.gap_closure.fraction,
+        low=100 * finding.gap_closure.ci_low,
+        least=100 * finding.thresholds.min_gap_closed,
+        explained=100 * finding.explained_fraction,
+        asked=f"of the former are asked of {count} assumptions" if count > 1 else "of either are asked",
+        enough=100 * required_explained_fraction(finding.selected_effects, finding.thresholds),
+        apart="; ".join(apart[:2]),
+    )
+
+
+def _one_of(place: GapLocation) -> str:
+    """A place and those that the data cannot tell from it."""
+    return " or ".join([place.location, *place.indistinguishable_from])
+
+
+def _effects(finding: DiagnosisResult) -> list[str]:
+    """What was added, what it closes, what it cannot be told from, and what remains."""
+    last, total = finding.final_model, finding.gap_closure
+    names = "; ".join(f"{e.label} with {_figures(e, last)}" for e in finding.accepted_effects)
+    verb = "closes" if len(finding.accepted_effects) == 1 else "together close"
+    text = [
+        f"{names} {verb} {100 * total.fraction:.3g} % of it on held-out motions "
+        f"(95 % interval {100 * total.ci_low:.3g} to {100 * total.ci_high:.3g} %)."
+        if total.ci_low > finding.thresholds.min_gap_closed
+        else f"With {names} the held-out motions are far more likely (more than {math.exp(finding.thresholds.min_log_bayes_factor):.0f} "
+        "times), although so little of chi2 tells of it that no part of the gap can be given."
+    ]
+    for entry in finding.selected_effects:
+        others = [r.label for r in entry.equivalent_effects if r.label != entry.effect.label]
+        if others:
+            text.append(f"Not separable from {entry.effect.label}: {', '.join(others)}.")
+    odd = [said for effect in finding.accepted_effects for said in _out_of_range(effect, last)]
+    if odd:
+        text.append(f"Beyond what one would expect, and so perhaps standing in for something else: {', '.join(odd)}.")
+    text.append(_remains(finding))
+    moved = [
+        a
+        for a in finding.nominal_changes
+        if abs(a.value_after - a.value_before) > _MIN_RELATIVE_CHANGE * max(abs(a.value_before), 1e-9)
+    ]
+    if moved:
+        steps = (f"{a.name} goes from {a.value_before:.3g} to {a.value_after:.3g}" for a in moved[:6])
+        text.append(f"With it {', '.join(steps)}.")
+    return text
+
+
+def _since(found: BaselineComparison, effects: bool) -> str:
+    """What has moved since the baseline, and what a baseline that explained little is worth."""
+    several = len(found.baseline_runs) > 1
+    said = "Against the baseline" + (f" of {len(found.baseline_runs)} runs" if several else "")
+    if found.changed_parameters:
+        moved = (
+            f"{e.name} is {e.current_value:.3g} ± {e.current_std:.2g} {e.unit} where it was {e.baseline_value:.3g} ± {e.baseline_std:.2g}"
+            for e in found.changed_parameters[:4]
+        )
+        text = f"{said}, {'even with that ' if effects else ''}{', '.join(moved)}."
+    else:
+        seen = [entry for entry in found.parameter_shifts if entry.z_score is not None]
+        text = f"{said}, " + (
+            "no parameter has changed." if seen else "these recordings say nothing of the parameters."
+        )
+    if several and found.between_runs_p_value < _RUNS_DIFFER_LEVEL:
+        text += f" The runs of the baseline differ among themselves (p = {found.between_runs_p_value:.2g}); their ± is wider for it."
+    if not found.is_baseline_explained:
+        text += (
+            " The model did not explain the baseline's recordings, so its ± counts that misfit and may be too small."
+        )
+    return text
+
+
+def _counterfactual(found: CounterfactualTest) -> list[str]:
+    """Whether taking the effects away predicts the world without them, and adding them the world with them."""
+    text = []
+    parts = (
+        (
+            "Taken away again, it predicts",
+            found.effects_removed,
+            "made without it",
+            "as it was fitted without a diagnosis",
+        ),
+        ("Added to what was known without it, it predicts", found.effects_added, "made with it", "without it"),
+    )
+    for begin, part, made, rival in parts:
+        if part.failure_message:
+            text.append(f"What was {made} could not be predicted ({part.failure_message}).")
+            continue
+        names = " and ".join(name.removesuffix(" (without)") for name in part.recordings[:2]) + (
+            " and others" if len(part.recordings) > 2 else ""
+        )
+        errors = ", ".join(f"{after:.2g} {unit}" for unit, (_, after) in part.rmse_by_unit.items())
+        plain = ", ".join(f"{before:.2g} {unit}" for unit, (before, _) in part.rmse_by_unit.items())
+        text.append(f"{begin} {names}, {made}, to {errors} (rms), where the model {rival} has {plain}.")
+        if not part.is_improved:
+            text.append("That is no better, so it may stand in for something else.")
+    return text
+
+
+def _remains(finding: DiagnosisResult) -> str:
+    rest = finding.remaining_test
+    if rest.chi2_per_dof > 1 and rest.p_value < finding.thresholds.significance_level:
+        place = (
+            f", most of it in {finding.remaining_gap_locations[0].location}" if finding.remaining_gap_locations else ""
+        )
+        return f"What remains: held-out chi2 per degree of freedom {rest.chi2_per_dof:.3g}{place}."
+    return "What remains is noise."
+
+
+def _figures(effect: EffectBase, fit: RefitModel) -> str:
+    parts = []
+    for name, r in fit.reported_parameters(effect).items():
+        known = f"{name} = {r.value:.3g} ± {r.std:.2g} {r.unit}".strip().removesuffix(" 1")
+        parts.append(known if math.isfinite(r.std) else f"{name} unknown")
+    return ", ".join(parts)
+
+
+def _out_of_range(effect: EffectBase, fit: RefitModel) -> list[str]:
+    """Amplitudes beyond the range that an engineer would expect."""
+    found = []
+    for name in effect.amplitude_names:
+        low, high = effect.prior_ranges[name]
+        room = _PRIOR_RANGE_TOLERANCE * (high - low)
+        if not low - room <= fit.values[name] <= high + room and effect.neutral_values[name] != fit.values[name]:
+            found.append(f"{name} = {fit.values[name]:.3g} (range {low:.3g} to {high:.3g})")
+    return found
+
+
+# -- events ---------------------------------------------------------------------------------------------------------
+
+_MAX_EVENTS_LISTED = 8
+"""Maximum number of events listed one by one."""
+
+
+def _event_sentences(events: EventSet) -> str:
+    """Return the sentences on all events: what, where, when; empty if there are none."""
+    text = []
+    if events.disturbances:
+        count = len(events.disturbances)
+        told = "; ".join(_said(event) for event in events.disturbances[:_MAX_EVENTS_LISTED])
+        more = f"; and {count - _MAX_EVENTS_LISTED} more" if count > _MAX_EVENTS_LISTED else ""
+        first = "One event stands" if count == 1 else f"{count} events stand"
+        text.append(f"{first} beside all this, short and in one place: {told}{more}.")
+    return " ".join([*text, *overspeed_messages(events)])
+
+
+def overspeed_messages(events: EventSet) -> list[str]:
+    """Return one sentence for each recording whose end is ignored because a joint moves too fast."""
+    why = "moves too fast for the model to follow."
+    return [
+        f"From {fall.start_time:.3g} s on nothing is judged in {fall.recording}, where {fall.joint} {why}"
+        for fall in events.overspeeds
+    ]
+
+
+def _said(event: DisturbanceEvent) -> str:
+    if event.kind == "sample":
+        when = f"at {0.5 * (event.start_time + event.end_time):.3f} s in {event.recording}"
+        return f"{event.channel} is off by {event.peak_value:+.3g} {event.unit} {when}"
+    return (
+        f"{event.channel} is pushed by up to {event.peak_value:+.2g} {event.unit} from {event.start_time:.2f} to {event.end_time:.2f} "
+        f"s in {event.recording} ({event.impulse:+.2g} ± {event.impulse_std:.1g} {event.unit} s)"
+    )

@@ -1,0 +1,449 @@
+"""Pulses in the history of an unknown force: short, of one sign, beside a rest that varies slowly or follows the load.
+
+At one place the data say of the values f of an unknown force at points of time, up to a constant,
+
+    log p(data | f) = g'f - f'L f / 2.
+
+f is a sum of pulses and a rest, which is Gaussian with a standard deviation that grows with the torques at work:
+
+    cov f(s), f(t) = e(s) e(t) (delta(s, t) + exp(-|s - t|/a))/2 + s^2 exp(-|s - t|/b),   e^2 = (c m)^2 + w^2 + h^2/3,
+
+m the error that a model of these torques is allowed anyway, h what friction may hold. c >= 1, w and s are those of the
+largest evidence, with a pulse as without it, so that a model that errs everywhere makes no events. Pulses are taken in
+one after the other, that which raises the evidence most first; this is the search for shocks by auxiliary residuals
+(de Jong and Penzer 1998, doi:10.1080/01621459.1998.10473717) with pulses in place of impulses.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import product
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+from numpy.typing import NDArray
+
+from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
+from yid_ocp.problem.low_pass_filter import effort_filter
+
+Array = NDArray[np.float64]
+_SparseMatrix = Any  # scipy.sparse.csc_array or, of few profiles, ndarray; the former has no types
+
+_MODEL_ERROR_TIME, _SLOW_FORCE_TIME = 0.3, 2.0
+"""Times in which the error of a model and the rest forget their values, a and b [s]."""
+_MODEL_ERROR_FACTORS, _NOISE_FLOOR_FACTORS, _SLOW_FORCE_FACTORS = (1.0, 2.0, 4.0), (0.0, 0.5, 1.0), (0.25, 1.0)
+"""c, w in units of the robust spread of the history, s in units of its root mean square."""
+_MIN_PULSE_POINTS = 2.5
+"""Points that the shortest pulse covers."""
+_WINDOW_GROWTH = 1.25
+"""From one length of a window to the next."""
+_FLAT_RAMP_FRACTION = 0.5
+"""Part of a flat pulse in which it rises and falls."""
+_MAX_PROFILES = 12
+"""Pulses and what is like them in one history."""
+MAX_EVENT_TIME_FRACTION = 1 / 3
+"""Part of the time from which forces in short windows are none of events: the model errs everywhere."""
+_MIN_PROMINENCE_RATIO = 1.5
+"""Times the median size of a pulse of the same length anywhere in the history that one must have: more than the
+largest value of a sine over its median."""
+_MAX_PULSE_RANGE_RATIO = 1.5
+"""Times the range of the history about it that a pulse may have at most: a larger one is made up by the rest."""
+
+
+@dataclass(frozen=True)
+class ForceEstimate:
+    """Gaussian log likelihood of an unknown force at one location over time, g'f - f'L f / 2.
+
+    Attributes
+    ----------
+    recording, location, coordinate, unit : str
+        `coordinate` is the coordinate.
+    t : ndarray, shape (M,)
+        Since the start of the recording, evenly spaced [s].
+    score : ndarray, shape (M,)
+        g
+    information : ndarray, shape (M, M)
+        L
+    model_error_std : ndarray, shape (M,)
+        m, in `unit`.
+    friction_limit : ndarray, shape (M,)
+        h, in `unit`.
+    filter_cutoff : float
+        Of the filter through which a force at these points is seen [Hz]; infinite for none.
+    """
+
+    recording: str
+    location: str
+    coordinate: str
+    unit: str
+    t: Array
+    score: Array
+    information: Array
+    model_error_std: Array
+    friction_limit: Array
+    filter_cutoff: float = math.inf
+
+    @property
+    def sample_spacing(self) -> float:
+        """From point to point [s]."""
+        return float(np.median(np.diff(self.t)))
+
+    def subset_at(self, keep: NDArray[np.int64]) -> ForceEstimate:
+        """Return the estimate restricted to some time points."""
+        information = self.information[np.ix_(keep, keep)]
+        parts = {name: getattr(self, name)[keep] for name in ("t", "score", "model_error_std", "friction_limit")}
+        return replace(self, information=information, **parts)
+
+    @property
+    def force_values(self) -> Array:
+        """Maximum-likelihood force at every time point, shape (M,)."""
+        least = 1e-6 * max(float(np.mean(np.diag(self.information))), 1e-300)
+        return np.asarray(np.linalg.solve(self.information + least * np.eye(len(self.t)), self.score))
+
+
+@dataclass(frozen=True)
+class DetectedPulse:
+    """A force pulse that rises and falls within a time window.
+
+    Attributes
+    ----------
+    start_time, end_time : float
+        [s]
+    peak_value : float
+        Largest value, with its sign, in the history's unit.
+    is_flat_topped : bool
+        Whether it stays at its size for half of the time; else it is a sine squared.
+    peak_std : float
+        Standard deviation of the size, counting the rest.
+    p_value : float
+        Of an evidence raised so far by chance in one window.
+    """
+
+    start_time: float
+    end_time: float
+    peak_value: float
+    is_flat_topped: bool
+    peak_std: float
+    p_value: float
+
+    @property
+    def unit_impulse(self) -> float:
+        """Integral of the pulse shape for unit peak [s]."""
+        return (self.end_time - self.start_time) * (1 - _FLAT_RAMP_FRACTION / 2 if self.is_flat_topped else 0.5)
+
+    @property
+    def impulse(self) -> float:
+        """Integral over time."""
+        return self.peak_value * self.unit_impulse
+
+    def evaluate_at(self, t: Array, cutoff: float = math.inf) -> Array:
+        """Return the low-pass filtered pulse at times `t`."""
+        return (
+            self.peak_value
+            * _Filter.of(cutoff)(_Windows.one(self.start_time, self.end_time, self.is_flat_topped), t)[:, 0]
+        )
+
+
+@dataclass(frozen=True)
+class _Windows:
+    """Profiles of size one: beginnings, ends, and whether they are flat, shape (k,) each."""
+
+    begin: Array
+    end: Array
+    flat: NDArray[np.bool_]
+
+    @staticmethod
+    def one(begin: float, end: float, flat: bool) -> _Windows:
+        return _Windows(np.array([begin]), np.array([end]), np.array([flat]))
+
+    def at(self, t: Array) -> Array:
+        """At times (M, 1) shape (M, k); at one time for each, (k,), shape (k,)."""
+        part = np.clip((t - self.begin) / (self.end - self.begin), 0.0, 1.0)
+        ramp = np.where(self.flat, _FLAT_RAMP_FRACTION / 2, 0.5)
+        return np.asarray(np.sin(np.pi / 2 * np.minimum(np.minimum(part, 1 - part) / ramp, 1.0)) ** 2)
+
+    def of(self, chosen: NDArray[np.int64]) -> _Windows:
+        """Some of them."""
+        return _Windows(self.begin[chosen], self.end[chosen], self.flat[chosen])
+
+
+@dataclass(frozen=True)
+class _Filter:
+    """A zero-phase filter as weights at delays, shape (L,) each."""
+
+    delay: Array
+    weight: Array
+
+    @staticmethod
+    def of(cutoff: float) -> _Filter:
+        if not math.isfinite(cutoff):
+            return _Filter(np.zeros(1), np.ones(1))
+        step = 0.1 / cutoff
+        length = 30
+        delay = np.asarray(step * np.arange(-length, length + 1), float)
+        impulse = np.zeros((len(delay), 1))
+        impulse[length] = 1.0
+        weight = effort_filter(cutoff)(delay, impulse)[:, 0]
+        return _Filter(delay, weight / weight.sum())
+
+    def __call__(self, windows: _Windows, t: Array) -> Array:
+        """Profiles of windows as they are seen at times (M,), shape (M, k)."""
+        return self._seen(windows, t[:, None])
+
+    def of_many(self, windows: _Windows, t: Array) -> _SparseMatrix:
+        """The same of windows that are short beside the history."""
+        reach = float(self.delay[-1])
+        first, last = (np.searchsorted(t, ends) for ends in (windows.begin - reach, windows.end + reach))
+        count = last - first
+        column = np.repeat(np.arange(len(count)), count)
+        row = np.arange(len(column)) - np.repeat(np.cumsum(count) - count - first, count)
+        values = self._seen(windows.of(column), t[row])
+        return scipy.sparse.csc_array((values, (row, column)), shape=(len(t), len(count)))
+
+    def _seen(self, windows: _Windows, t: Array) -> Array:
+        return sum((w * windows.at(t - d) for d, w in zip(self.delay, self.weight, strict=True)), np.zeros(()))
+
+
+@dataclass(frozen=True)
+class _Rest:
+    """The data less a rest of known covariance: Sigma^-1 (M, M), Sigma^-1 y (M,), log evidence without pulses.
+
+    Beside `taken`, Sigma^-1 is less `lost` lost' than without, shape (M, k).
+    """
+
+    precision: Array
+    scored: Array
+    evidence: float
+    lost: Array
+
+    @staticmethod
+    def of(history: ForceEstimate, error: float, floor: float, slow: float) -> _Rest:
+        apart = np.abs(history.t[:, None] - history.t)
+        quick = np.sqrt((error * history.model_error_std) ** 2 + floor**2 + history.friction_limit**2 / 3)
+        covariance = np.outer(quick, quick) * (np.eye(len(apart)) + np.exp(-apart / _MODEL_ERROR_TIME)) / 2
+        covariance += slow**2 * np.exp(-apart / _SLOW_FORCE_TIME)
+        covariance[np.diag_indices_from(covariance)] += 1e-9 * np.trace(covariance) / len(covariance)
+        factor = np.linalg.cholesky(covariance)
+        seen = history.information @ factor
+        inner = np.linalg.cholesky(np.eye(len(factor)) + factor.T @ seen)
+        half = scipy.linalg.solve_triangular(inner, seen.T, lower=True)
+        told = scipy.linalg.solve_triangular(inner, factor.T @ history.score, lower=True)
+        evidence = 0.5 * float(told @ told) - float(np.sum(np.log(np.diag(inner))))
+        none = np.zeros((len(factor), 0))
+        return _Rest(history.information - half.T @ half, history.score - half.T @ told, evidence, none)
+
+    def beside(self, taken: Array) -> _Rest:
+        """The same with profiles (M, k) of any size taken in."""
+        if not taken.shape[1]:
+            return self
+        seen = self.precision @ taken
+        inner = np.linalg.cholesky(taken.T @ seen + 1e-12 * np.eye(taken.shape[1]))
+        lost = scipy.linalg.solve_triangular(inner, seen.T, lower=True).T
+        told = scipy.linalg.solve_triangular(inner, taken.T @ self.scored, lower=True)
+        evidence = self.evidence + 0.5 * float(told @ told)
+        return _Rest(self.precision - lost @ lost.T, self.scored - lost @ told, evidence, lost)
+
+    def gains(self, profiles: _SparseMatrix, bare: Array | None = None) -> Array:
+        """By how much the evidence rises with each of some profiles (M, k) of its best size, shape (k,).
+
+        `bare` is what `information` says of them with nothing taken in, where that is known already.
+        """
+        told, sure = self._sizes(profiles, bare)
+        return np.where(sure > 0, 0.5 * told**2 / np.where(sure > 0, sure, 1.0), 0.0)
+
+    def information(self, profiles: _SparseMatrix) -> Array:
+        """u' Sigma^-1 u of profiles u (M, k), shape (k,)."""
+        product = self.precision @ profiles
+        if scipy.sparse.issparse(profiles):
+            return np.asarray(profiles.multiply(product).sum(axis=0)).ravel()
+        return np.asarray(np.sum(profiles * product, axis=0))
+
+    def sizes(self, profiles: Array) -> Array:
+        """Best size of each profile, shape (k,), zero where the data say nothing."""
+        told, sure = self._sizes(profiles)
+        return np.where(sure > 0, told / np.where(sure > 0, sure, 1.0), 0.0)
+
+    def _sizes(self, profiles: _SparseMatrix, bare: Array | None = None) -> tuple[Array, Array]:
+        sure = self.information(profiles) if bare is None else bare - np.sum((profiles.T @ self.lost) ** 2, axis=1)
+        squares = profiles.power(2).sum(axis=0) if scipy.sparse.issparse(profiles) else np.sum(profiles**2, axis=0)
+        seen = np.asarray(squares).ravel() * max(float(np.trace(self.precision)) / len(self.scored), 1e-300)
+        return np.asarray(profiles.T @ self.scored), np.where(sure > 1e-6 * seen, sure, 0.0)
+
+
+def detect_pulses(history: ForceEstimate, limits: Thresholds = DEFAULT_THRESHOLDS) -> tuple[list[DetectedPulse], float]:
+    """Return the pulses of one force history, largest evidence first, and the number of windows searched.
+
+    Parameters
+    ----------
+    history : History
+    limits : Thresholds
+        `worth` is the rise of the log evidence from which a pulse is looked at, `pulse` the length of the longest.
+
+    Returns
+    -------
+    list of Pulse
+        With p-values of single windows; see `run_null_test.benjamini_hochberg_mask`.
+    float
+        Windows that do not overlap, of lengths a factor of two apart.
+    """
+    windows, tries, profiles = _looked_at(history.t.tobytes(), history.filter_cutoff, limits.max_event_duration)
+    if not len(windows.begin):
+        return [], 0.0
+    seen = _Filter.of(history.filter_cutoff)
+    rests = _rests(history)
+    bare = [rest.information(profiles) for rest in rests]
+    taken = np.zeros((len(history.t), 0))
+    found: list[tuple[_Windows, float]] = []
+    free = np.ones(len(windows.begin), bool)
+    while taken.shape[1] < _MAX_PROFILES and np.any(free):
+        beside = [rest.beside(taken) for rest in rests]
+        gains = [free * rest.gains(profiles, known) for rest, known in zip(beside, bare, strict=True)]
+        totals = [rest.evidence + float(gain.max()) for rest, gain in zip(beside, gains, strict=True)]
+        best = int(np.argmax(totals))
+        rest, gain = beside[best], gains[best]
+        rise = max(totals) - max(rest.evidence for rest in beside)
+        if rise < limits.min_log_bayes_factor:
+            break
+        window = _refined(history, rest, windows, int(gain.argmax()), seen, limits)
+        own = seen(window, history.t)
+        rise += float(rest.gains(own)[0] - gain.max())
+        other = _other(history, rest, window, seen)
+        if other is None and not _stands_out(history, rests[best], rest, window, seen, limits.max_event_duration):
+            other = own
+        taken = np.column_stack([taken, own if other is None else other])
+        if other is None:
+            found.append((window, rise))
+        free &= (windows.end <= window.begin[0]) | (windows.begin >= window.end[0])
+    covered = sum(float(window.end[0] - window.begin[0]) for window, _ in found)
+    if covered > MAX_EVENT_TIME_FRACTION * float(history.t[-1] - history.t[0]):
+        return [], tries
+    return _sized(history, rests, found, taken, seen), tries
+
+
+@lru_cache(maxsize=8)
+def _looked_at(times: bytes, cutoff: float, longest: float) -> tuple[_Windows, float, _SparseMatrix]:
+    """Windows to look at, how many do not overlap, and their profiles; the same for all joints of a recording."""
+    t = np.frombuffer(times)
+    spacing, first, last = float(np.median(np.diff(t))), float(t[0]), float(t[-1])
+    lengths = [_MIN_PULSE_POINTS * spacing]
+    while lengths[-1] * _WINDOW_GROWTH <= longest:
+        lengths.append(lengths[-1] * _WINDOW_GROWTH)
+    begins = [np.arange(first + spacing, last - spacing - length + 1e-9, spacing) for length in lengths]
+    begin = np.concatenate(begins)
+    end = begin + np.repeat(lengths, [len(b) for b in begins])
+    windows = _Windows(np.tile(begin, 2), np.tile(end, 2), np.repeat([False, True], len(begin)))
+    # windows of nearly the same length tell the same: those within a factor of two count as one
+    tries = math.log2(_WINDOW_GROWTH) * sum((last - first) / length for length in lengths if length <= last - first)
+    return windows, tries, _Filter.of(cutoff).of_many(windows, t)
+
+
+def _rests(history: ForceEstimate) -> list[_Rest]:
+    values = history.force_values
+    spread = max(
+        1.4826 * float(np.median(np.abs(values - np.median(values)))), 1e-9 + float(np.median(history.model_error_std))
+    )
+    slowest = max(float(np.sqrt(np.mean(values**2))), spread)
+    grid = product(_MODEL_ERROR_FACTORS, _NOISE_FLOOR_FACTORS, _SLOW_FORCE_FACTORS)
+    return [_Rest.of(history, error, floor * spread, slow * slowest) for error, floor, slow in grid]
+
+
+def _refined(
+    history: ForceEstimate, rest: _Rest, windows: _Windows, best: int, seen: _Filter, limits: Thresholds
+) -> _Windows:
+    """The best window among many, its ends moved to where the evidence is largest."""
+    first, last = float(history.t[0]), float(history.t[-1])
+    shortest = _MIN_PULSE_POINTS * history.sample_spacing
+    begin, end, flat = float(windows.begin[best]), float(windows.end[best]), bool(windows.flat[best])
+    gain = float(rest.gains(seen(_Windows.one(begin, end, flat), history.t))[0])
+    for step in history.sample_spacing / np.array([2.0, 4.0, 8.0]):
+        moves = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]) * step
+        while True:
+            ends = np.array([begin, end]) + moves
+            length = ends[:, 1] - ends[:, 0]
+            inside = (ends[:, 0] >= first + history.sample_spacing) & (ends[:, 1] <= last - history.sample_spacing)
+            ends = ends[inside & (length >= shortest) & (length <= limits.max_event_duration)]
+            both = np.tile(ends, (2, 1))
+            tried = _Windows(both[:, 0], both[:, 1], np.repeat([False, True], len(ends)))
+            gains = rest.gains(seen(tried, history.t)) if len(ends) else np.zeros(1)
+            if not float(gains.max()) > gain + 1e-3:
+                break
+            at = int(gains.argmax())
+            gain, begin, end, flat = (
+                float(gains[at]),
+                float(tried.begin[at]),
+                float(tried.end[at]),
+                bool(tried.flat[at]),
+            )
+    return _Windows.one(begin, end, flat)
+
+
+def _other(history: ForceEstimate, rest: _Rest, window: _Windows, seen: _Filter) -> Array | None:
+    """A step or a swing to both sides that explains as much as a pulse does, so that it is none; shape (M,)."""
+    t, begin, end = history.t, float(window.begin[0]), float(window.end[0])
+    length, gain = end - begin, float(rest.gains(seen(window, t))[0])
+    steps = np.arange(begin - length / 2, end + length / 2, history.sample_spacing)
+    rising = [np.asarray(t > at, float) for at in steps]
+    rising = [step for step in rising if 1 < step.sum() < len(t) - 1]
+    swings = []
+    for wide in length * np.array([0.75, 1.0]):
+        for middle in (begin, begin + length / 4, (begin + end) / 2, end - length / 4, end):
+            part = np.clip((t - middle) / wide, -0.5, 0.5)
+            swings.append(np.sin(2 * np.pi * part))
+    profiles = np.stack([*rising, *swings], axis=1)
+    gains = rest.gains(profiles)
+    best = int(gains.argmax())
+    return profiles[:, best] if gains[best] >= gain else None
+
+
+def _stands_out(
+    history: ForceEstimate, bare: _Rest, rest: _Rest, window: _Windows, seen: _Filter, longest: float
+) -> bool:
+    """Whether a pulse is shorter than the longest, larger than what the history holds everywhere, and there to be seen.
+
+    `bare` is the rest with nothing taken in, `rest` that beside what was.
+    """
+    begin, end = float(window.begin[0]), float(window.end[0])
+    length, own = end - begin, seen(window, history.t)
+    # at either bound its length is not found but cut off: jumps of friction are shorter, errors of the model longer
+    if not 1.02 * _MIN_PULSE_POINTS * history.sample_spacing < length < 0.98 * longest:
+        return False
+    size = abs(float(rest.sizes(own)[0]))
+    near = history.force_values[(history.t > begin - length) & (history.t < end + length)]
+    if size * float(np.abs(own).max()) > _MAX_PULSE_RANGE_RATIO * float(np.ptp(near)):
+        return False
+    begins = np.arange(float(history.t[0]), float(history.t[-1]) - length, history.sample_spacing)
+    everywhere = _Windows(begins, begins + length, np.repeat(window.flat, len(begins)))
+    return size > _MIN_PROMINENCE_RATIO * float(np.median(np.abs(bare.sizes(seen(everywhere, history.t)))))
+
+
+def _sized(
+    history: ForceEstimate, rests: Sequence[_Rest], found: Sequence[tuple[_Windows, float]], taken: Array, seen: _Filter
+) -> list[DetectedPulse]:
+    """The pulses with their sizes, all together, beside the rest of the largest evidence."""
+    if not found:
+        return []
+    rest = max(rests, key=lambda one: one.beside(taken).evidence)
+    spread = np.linalg.pinv(taken.T @ rest.precision @ taken, hermitian=True)
+    size = spread @ (taken.T @ rest.scored)
+    result = []
+    for window, rise in found:
+        own = seen(window, history.t)[:, 0]
+        at = int(np.argmin(np.sum((taken - own[:, None]) ** 2, axis=0)))
+        p_value = math.erfc(math.sqrt(max(rise, 0.0)))
+        std = math.sqrt(max(float(spread[at, at]), 0.0))
+        result.append(
+            DetectedPulse(
+                float(window.begin[0]), float(window.end[0]), float(size[at]), bool(window.flat[0]), std, p_value
+            )
+        )
+    # friction can change by twice what it slides with wherever the joint stands still, whatever moves it
+    stuck = [
+        float(np.max(history.friction_limit[(history.t >= p.start_time) & (history.t <= p.end_time)], initial=0.0))
+        for p in result
+    ]
+    return [pulse for pulse, friction in zip(result, stuck, strict=True) if abs(pulse.peak_value) > 2 * friction]

@@ -1,0 +1,57 @@
+"""Short text and notebook representations of objects, without printing their arrays."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+_MAX_TABLE_ROWS = 30
+"""Largest number of table rows in a notebook; further rows are only counted."""
+
+
+@dataclass(frozen=True)
+class ReprSummary:
+    """The representation of an object: one line and an optional table.
+
+    Attributes
+    ----------
+    one_line : str
+        In one line, without the name of its class.
+    table_rows : sequence of sequence of str
+        The table of a notebook; its first row is the head.
+    """
+
+    one_line: str
+    table_rows: Sequence[Sequence[str]] = ()
+
+
+class ReprMixin:
+    """Mixin for `__repr__` and a notebook table from `_summary`; a dataclass needs `repr=False`."""
+
+    def _summary(self) -> ReprSummary:
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {self._summary().one_line}>"
+
+    def _repr_html_(self) -> str:
+        """HTML for notebooks."""
+        said = self._summary()
+        text = f"<p><b>{type(self).__name__}</b>: {html.escape(said.one_line)}</p>"
+        if len(said.table_rows) < 2:
+            return text
+        head, *rows = said.table_rows
+        lines = [_row(head, "th"), *(_row(row, "td") for row in rows[:_MAX_TABLE_ROWS])]
+        if len(rows) > _MAX_TABLE_ROWS:
+            lines.append(_row([f"and {len(rows) - _MAX_TABLE_ROWS} more", *[""] * (len(head) - 1)], "td"))
+        return f"{text}<table>{''.join(lines)}</table>"
+
+
+def _row(cells: Sequence[str], kind: str) -> str:
+    return "<tr>" + "".join(f"<{kind}>{html.escape(cell)}</{kind}>" for cell in cells) + "</tr>"
+
+
+def count_with_noun(number: int, noun: str) -> str:
+    """A number with its noun, such as `1 joint` and `2 joints`."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

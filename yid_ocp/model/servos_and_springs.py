@@ -1,0 +1,160 @@
+"""Springs, dampers and position servos on the joints of a robot."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import casadi as ca
+
+from yid_ocp.model.mechanism import Joint, Mechanism
+from yid_ocp.model.parameters import Parameter
+
+CommandInterpolation = Literal["held", "interpolated"]
+TORQUE_LIMIT_POWER = 16
+"""Exponent p of a servo's smooth torque limit, demand / (1 + |demand/limit|^p)^(1/p)."""
+UNLIMITED_EFFORT = 2e4
+"""Effort limits from this value on mean that there is none [N m or N]."""
+_DEFAULT_FULL_TORQUE_ERROR = 0.05
+"""Position error at which a servo of unknown gain reaches its torque limit [rad or m]."""
+_DEFAULT_DAMPING_TIME = 0.1
+"""Default ratio of a servo's damping to its gain [s]."""
+_DEFAULT_GAIN = 50.0
+"""Default gain of a servo without an effort limit [N m/rad or N/m]."""
+_MAX_COMMAND_DELAY = 0.5
+"""Upper bound of a servo's command delay [s]."""
+
+
+@dataclass(frozen=True)
+class RobotJointSpring:
+    """A spring 1/2 stiffness (q - rest)^2 on one robot joint [N m/rad, rad; N/m, m for a prismatic joint]."""
+
+    stiffness: float
+    rest_position: float = 0.0
+
+
+@dataclass(frozen=True)
+class PositionServoOptions:
+    """How an arm's controller follows commanded positions.
+
+    Attributes
+    ----------
+    command_interpolation : "held" or "interpolated"
+        What servos follow between two commands.
+    has_gravity_compensation : bool
+        Whether the controller carries the robot's own weight.
+    """
+
+    command_interpolation: CommandInterpolation = "held"
+    has_gravity_compensation: bool = False
+
+
+@dataclass(frozen=True)
+class PositionServo:
+    """A position servo on one joint, whose input is the commanded coordinate u.
+
+        demand = gain (u(t - delay) - q) - damping dq/dt       torque = demand / (1 + tightness demand^p)^(1/p)
+
+    with p = `TORQUE_LIMIT_POWER` and tightness = limit^-p, to which further limits add.
+
+    Attributes
+    ----------
+    gain : casadi.SX
+        [N m/rad or N/m]
+    damping : casadi.SX
+        [N m s/rad or N s/m]
+    command_delay : casadi.SX
+        [s]
+    torque_limit_tightness : casadi.SX
+        [(N m)^-p]
+    command_interpolation : "held" or "interpolated"
+        What it follows between two commands.
+    """
+
+    gain: ca.SX
+    damping: ca.SX
+    command_delay: ca.SX
+    torque_limit_tightness: ca.SX
+    command_interpolation: CommandInterpolation = "held"
+
+    def torque(self, command: ca.SX, q: ca.SX, v: ca.SX) -> ca.SX:
+        """The servo's torque for a command, a coordinate and its rate [N m or N]."""
+        demand = self.gain * (command - q) - self.damping * v
+        return demand / (1 + self.torque_limit_tightness * demand**TORQUE_LIMIT_POWER) ** (1 / TORQUE_LIMIT_POWER)
+
+    @property
+    def coefficients(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+        """Gain, damping, delay and tightness."""
+        return self.gain, self.damping, self.command_delay, self.torque_limit_tightness
+
+    def map_expressions(self, change: Callable[[ca.SX], ca.SX]) -> PositionServo:
+        """The servo with `change` applied to every expression."""
+        gain, damping, delay, tightness = map(change, self.coefficients)
+        return PositionServo(gain, damping, delay, tightness, self.command_interpolation)
+
+
+def joint_damping_parameters(tree: Mechanism, wanted: Mapping[str, float]) -> dict[str, Parameter]:
+    """Parameters `JOINT.damping` of the named joints, by joint."""
+    found = {}
+    for joint, value in wanted.items():
+        tree.joint_index(joint)
+        text = f"viscous damping of {joint}"
+        found[joint] = Parameter(f"{joint}.damping", value, "N m s/rad", 0.0, math.inf, text)
+    return found
+
+
+def joint_spring_parameters(tree: Mechanism, joint: str, spring: RobotJointSpring) -> tuple[Parameter, Parameter]:
+    """Stiffness and rest position parameters of a spring on a robot joint."""
+    unit = tree.joints[tree.joint_index(joint)].coordinate_unit
+    per = "N m/rad" if unit == "rad" else "N/m"
+    return (
+        Parameter(f"{joint}.stiffness", spring.stiffness, per, 0.0, math.inf, f"spring on {joint}"),
+        Parameter(f"{joint}.rest", spring.rest_position, unit, description=f"where the spring on {joint} is relaxed"),
+    )
+
+
+def build_joint_servos(
+    tree: Mechanism, joints: Sequence[str], commands: CommandInterpolation = "held"
+) -> tuple[dict[str, PositionServo], list[Parameter]]:
+    """A servo on every named joint, and their parameters `JOINT.servo_gain`, `servo_damping`, ...
+
+    Values are those of a servo that gives its joint's effort limit at an error of `_DEFAULT_FULL_TORQUE_ERROR`.
+    """
+    servos, entries = {}, []
+    for joint in joints:
+        at = tree.joints[tree.joint_index(joint)]
+        own = _servo_parameters(at)
+        gain, damping, delay, limit = (entry.symbol for entry in own)
+        servos[joint] = PositionServo(gain, damping, delay, limit**-TORQUE_LIMIT_POWER, commands)
+        entries += own
+    return servos, entries
+
+
+def _servo_parameters(joint: Joint) -> list[Parameter]:
+    known = 0 < joint.effort_limit < UNLIMITED_EFFORT
+    limit = joint.effort_limit if known else UNLIMITED_EFFORT
+    gain = limit / _DEFAULT_FULL_TORQUE_ERROR if known else _DEFAULT_GAIN
+    torque, per = ("N m", "N m/rad") if joint.coordinate_unit == "rad" else ("N", "N/m")
+    rate = per.replace("/", " s/")
+    rows: tuple[tuple[str, float, str, float, float, str], ...] = (
+        ("gain", gain, per, 0.0, math.inf, "torque per error of the angle"),
+        ("damping", _DEFAULT_DAMPING_TIME * gain, rate, 0.0, math.inf, "torque against the rate"),
+        ("delay", 0.0, "s", 0.0, _MAX_COMMAND_DELAY, "from a command to its torque"),
+        ("torque_limit", limit, torque, 1e-3, math.inf, "largest torque"),
+    )
+    return [
+        Parameter(f"{joint.name}.servo_{name}", value, unit, lower, upper, f"{text}, servo of {joint.name}")
+        for name, value, unit, lower, upper, text in rows
+    ]
+
+
+def without_gravity(tree: Mechanism) -> Mechanism:
+    """The robot without gravity on its bodies, as when its controller compensates its own weight."""
+    none = ca.SX(0)
+    joints = tuple(
+        replace(joint, bodies=tuple(replace(body, gravity_fraction=none) for body in joint.bodies))
+        for joint in tree.joints
+    )
+    return replace(tree, joints=joints)

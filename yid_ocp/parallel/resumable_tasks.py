@@ -1,0 +1,440 @@
+"""Tasks with stored results, run by processes on this machine or by a scheduler's workers.
+
+A task is a function at the top of a module with plain data and paths. Its result is one JSON file, written whole by
+whoever worked it out, under a name that is the hash of the function's name, the sources it depends on and the
+arguments; a path counts by its file's name and content, wherever it stands. So a task that is done is never done again,
+whatever became of the run that did it, and any `concurrent.futures.Executor` whose workers see the same files will do:
+what one of them did twice, because the first was given up as lost, is the same file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import gc
+import json
+import logging
+import multiprocessing
+import os
+import socket
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    wait,
+)
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from yid_ocp.errors import ConfigError, OutputError, WorkerError, YidError
+from yid_ocp.files import file_sha256, json_sha256, os_error_reason, write_json
+from yid_ocp.parallel.dask_cluster import dask_executor, version_mismatch_message
+from yid_ocp.parallel.processes import InlineExecutor, process_pool
+from yid_ocp.parallel.threads import processor_count
+from yid_ocp.version import fingerprint_differences, package_source_hash, software_fingerprint
+
+_TASK_FORMAT = "yid-task/1"
+_RESULT_FILE_TIMEOUT = 60.0
+"""Timeout until a result file written by another machine is visible, as on network file systems [s]."""
+_WORKER_CHECK_INTERVAL = 60.0
+"""Time without a finished task after which it is checked that there are workers [s]."""
+log = logging.getLogger(__name__)
+_TaskFunction = Callable[..., Any]
+_TaskProgressCallback = Callable[[int, int, str], None]
+"""Callback with the number of finished tasks, the number of all tasks, and the name of the last one."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One function call.
+
+    Attributes
+    ----------
+    name : str
+        For people; it does not count for what is resumed.
+    arguments : mapping of str to Any
+        By keyword: text, numbers, None, lists and mappings of them, and `Path` for files and folders that are read.
+    """
+
+    name: str
+    arguments: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class TaskResult:
+    """The result of a task.
+
+    Attributes
+    ----------
+    name : str
+        The task's.
+    value : Any
+        What the function returned, as read back from its file; None where it failed.
+    error : str
+        Why it failed, empty where it did not.
+    seconds : float
+        Time that the function took.
+    was_resumed : bool
+        Whether an earlier run did it.
+    """
+
+    name: str
+    value: Any = None
+    error: str = ""
+    seconds: float = 0.0
+    was_resumed: bool = False
+
+
+@dataclass(frozen=True)
+class WorkerConfig:
+    """The workers of a run: processes on this machine or a scheduler.
+
+    Attributes
+    ----------
+    n_processes : int, optional
+        Processes on this machine; as many as there are processors when absent.
+    scheduler_address : str
+        Address of a Dask scheduler, or its scheduler file, whose workers do the tasks instead.
+
+    Raises
+    ------
+    ConfigError
+        No process at all, or both.
+    """
+
+    n_processes: int | None = None
+    scheduler_address: str = ""
+
+    def __post_init__(self) -> None:
+        if self.n_processes is not None and self.n_processes < 1:
+            raise ConfigError(f"{self.n_processes} workers", where="--workers", allowed="a whole number from 1")
+        if self.n_processes is not None and self.scheduler_address:
+            raise ConfigError(
+                "workers are asked for here and of a scheduler",
+                where="--workers and --scheduler",
+                allowed="one of the two",
+                hint="leave --workers out: the scheduler knows how many workers it has",
+            )
+
+    def check_available(self) -> None:
+        """Check before long work that the workers are available.
+
+        Raises
+        ------
+        WorkerError
+            Dask is not installed, no scheduler answers, or a worker is not fit for the work.
+        """
+        if self.scheduler_address:
+            with dask_executor(self.scheduler_address):
+                pass
+
+
+LOCAL_WORKERS = WorkerConfig()
+"""One process per processor of this machine."""
+
+
+def run_tasks(
+    function: _TaskFunction,
+    tasks: Sequence[Task],
+    folder: Path,
+    workers: WorkerConfig | Executor = LOCAL_WORKERS,
+    progress: _TaskProgressCallback | None = None,
+    code: str | None = None,
+) -> list[TaskResult]:
+    """Results of a function for all tasks; those already stored in the folder are not computed again.
+
+    A task that raises leaves `HASH.error.json` and a warning, and the others go on; the next run tries it again. An
+    interruption leaves the results that are finished. A worker of other sources than these does nothing.
+
+    Parameters
+    ----------
+    function : callable
+        At the top of an importable module; returns what JSON can hold.
+    tasks : sequence of Task
+    folder : Path
+        Of results; made where absent.
+    workers : Workers or concurrent.futures.Executor
+        Processes of this machine stop at once when the run is interrupted, and one that dies takes no task with it but
+        the one that killed it. Workers of a scheduler end the task that they are at.
+    progress : callable, optional
+    code : str, optional
+        Hash of the sources that results depend on, where that is not the whole package; see `version.source_hash`.
+
+    Returns
+    -------
+    list of TaskResult
+        In the order of the tasks.
+
+    Raises
+    ------
+    DataError
+        A task's file cannot be read.
+    OutputError
+        The folder cannot be made.
+    WorkerError
+        As `WorkerConfig.check_available`.
+    """
+    own, maker = package_source_hash() if code is None else code, software_fingerprint()
+    jobs = [
+        _Job(function, _anywhere(task), _task_input(function, task, own), folder.absolute(), maker) for task in tasks
+    ]
+    unique = {job.key: job for job in reversed(jobs)}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"the folder of results cannot be made ({os_error_reason(error)})", where=str(folder)
+        ) from error
+    kept = {key: job.kept() for key, job in unique.items()}
+    found = {key: replace(result, was_resumed=True) for key, result in kept.items() if result is not None}
+    if found and progress is not None:
+        progress(len(found), len(unique), f"{len(found)} done before")
+
+    def finished(job: _Job, result: TaskResult) -> None:
+        found[job.key] = result
+        if result.error:
+            log.warning("%s failed: %s", result.name, result.error)
+        if progress is not None:
+            progress(len(found), len(unique), result.name)
+
+    waiting = list(dict.fromkeys(unique[job.key] for job in jobs if job.key not in found))
+    if waiting:
+        _done_by(workers, waiting, finished)
+    return [replace(found[job.key], name=job.task.name) for job in jobs]
+
+
+def require_task_values(results: Sequence[TaskResult]) -> list[Any]:
+    """Values of tasks that must all have succeeded.
+
+    Raises
+    ------
+    WorkerError
+        One failed for a reason that its reader can mend.
+    RuntimeError
+        One failed for another reason.
+    """
+    failed = [entry for entry in results if entry.error]
+    if not failed:
+        return [entry.value for entry in results]
+    first, _, rest = failed[0].error.partition("\n")
+    what = f"{len(failed)} of {len(results)} tasks failed, {failed[0].name} with {first}"
+    ours = {kind.__name__ for kind in YidError.__subclasses__()}
+    if first.partition(":")[0] in ours:
+        told = "; ".join(line.strip() for line in rest.splitlines())
+        raise WorkerError(f"{what}; {told}" if told else what, hint="mend it: the same command does what failed again")
+    raise RuntimeError(f"{what}; the same command tries them again")
+
+
+def _done_by(workers: WorkerConfig | Executor, jobs: Sequence[_Job], finished: _TaskFinishedCallback) -> None:
+    if isinstance(workers, WorkerConfig) and not workers.scheduler_address:
+        _in_own_processes(jobs, finished, workers.n_processes or processor_count())
+        return
+    with contextlib.ExitStack() as held:
+        executor, look = workers, None
+        if isinstance(executor, WorkerConfig):
+            executor, look = held.enter_context(
+                dask_executor(executor.scheduler_address, jobs[0].function, jobs[0].folder)
+            )
+        at_once = 1 if isinstance(executor, InlineExecutor) else len(jobs)
+        lost, never = _drain(executor, jobs, at_once, finished, look)
+        for job in (*lost, *never):
+            finished(job, job.kept() or TaskResult(job.task.name, error="the executor broke"))
+
+
+def _task_input(function: _TaskFunction, task: Task, code: str) -> dict[str, Any]:
+    """All inputs of a task as plain data: function, source hash, arguments and file hashes; its hash is the key.
+
+    Raises
+    ------
+    ValueError, TypeError
+        A function that another process could not import, an argument that is neither plain data nor a path.
+    DataError
+        A file that cannot be read.
+    """
+    if "<" in function.__qualname__:
+        raise ValueError(f"{function.__qualname__} does not stand at the top of a module")
+    name = f"{function.__module__}.{function.__qualname__}"
+    return {"function": name, "code": code, "arguments": _described(task.arguments)}
+
+
+def _anywhere(task: Task) -> Task:
+    """The task with absolute paths, because a worker may run in another folder."""
+
+    def absolute(value: Any) -> Any:
+        if isinstance(value, Path):
+            return value.absolute()
+        if isinstance(value, Mapping):
+            return {key: absolute(entry) for key, entry in value.items()}
+        return [absolute(entry) for entry in value] if isinstance(value, (list, tuple)) else value
+
+    return replace(task, arguments=absolute(task.arguments))
+
+
+def _described(value: Any) -> Any:
+    if isinstance(value, Path):
+        return {"file": value.name, "sha256": file_sha256(value)}
+    if isinstance(value, Mapping):
+        return {str(key): _described(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_described(entry) for entry in value]
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    raise TypeError(f"a task takes plain data and paths, not {type(value).__name__}")
+
+
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """A task with its result file and the required fingerprint of its worker."""
+
+    function: _TaskFunction
+    task: Task
+    input: Mapping[str, Any]
+    folder: Path
+    maker: Mapping[str, str]
+
+    @property
+    def key(self) -> str:
+        return json_sha256(self.input)
+
+    @property
+    def file(self) -> Path:
+        return self.folder / f"{self.key}.json"
+
+    def kept(self) -> TaskResult | None:
+        """The result stored in the file; None where there is no complete result of this task."""
+        try:
+            held = json.loads(self.file.read_text(encoding="utf-8"))
+            if held["format"] == _TASK_FORMAT and json_sha256(held["input"]) == self.key:
+                return TaskResult(self.task.name, held["value"], seconds=float(held["seconds"]))
+        except (OSError, ValueError, LookupError, TypeError):
+            pass
+        return None
+
+
+_TaskFinishedCallback = Callable[[_Job, TaskResult], None]
+
+
+def _perform(job: _Job) -> str:
+    """Run a task and write its result file; returns the error message, empty on success."""
+    unlike = fingerprint_differences(job.maker, software_fingerprint())
+    if unlike:
+        return f"WorkerError: {version_mismatch_message(socket.gethostname(), unlike)}"
+    begun = time.perf_counter()
+    entry = {"format": _TASK_FORMAT, "name": job.task.name, "input": job.input}
+    failed = job.file.with_suffix(".error.json")
+    try:
+        value = job.function(**job.task.arguments)
+        write_json(job.file, {**entry, "seconds": time.perf_counter() - begun, "value": value})
+    except Exception as error:
+        text = f"{type(error).__name__}: {error}"
+        with contextlib.suppress(OutputError):
+            write_json(failed, {**entry, "error": text})
+        return text
+    finally:
+        _give_back()
+    with contextlib.suppress(OSError):
+        failed.unlink(missing_ok=True)
+    return ""
+
+
+def _give_back() -> None:
+    """Return freed memory to the system; Linux's C library keeps it, half a gigabyte after a solve."""
+    gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
+    if trim is not None:
+        trim(0)
+
+
+def _drain(
+    executor: Executor,
+    jobs: Sequence[_Job],
+    at_once: int,
+    finished: _TaskFinishedCallback,
+    look: Callable[[], None] | None = None,
+) -> tuple[list[_Job], list[_Job]]:
+    """Run jobs, at most `at_once` concurrently; returns jobs lost with a broken executor, and jobs never started.
+
+    `look` is called now and then while nothing happens.
+    """
+    queue, running, lost = deque(jobs), dict[Future[str], _Job](), list[_Job]()
+    try:
+        while (queue and not lost) or running:
+            while queue and not lost and len(running) < at_once:
+                job = queue[0]
+                try:
+                    future = executor.submit(_perform, job)
+                except BrokenExecutor:
+                    lost.append(queue.popleft())
+                else:
+                    running[future] = queue.popleft()
+            done = wait(running, None if look is None else _WORKER_CHECK_INTERVAL, FIRST_COMPLETED).done
+            if not done and look is not None:
+                look()
+            for future in done:
+                job = running.pop(future)
+                try:
+                    text = future.result()
+                except (BrokenExecutor, CancelledError):  # so says Dask where its scheduler went away
+                    lost.append(job)
+                    continue
+                except Exception as error:
+                    text = _words_of_executor(error)
+                result = None if text else _arrived(job, look is not None)
+                finished(job, result or TaskResult(job.task.name, error=text or "it left no result"))
+    except BaseException:
+        for future in running:
+            future.cancel()
+        raise
+    return lost, list(queue)
+
+
+def _words_of_executor(error: Exception) -> str:
+    """Error message of an executor that gave up a task."""
+    if type(error).__name__ == "KilledWorker":
+        return "every worker that tried it ended abruptly"
+    return f"{type(error).__name__}: {error}"
+
+
+def _arrived(job: _Job, elsewhere: bool) -> TaskResult | None:
+    """The stored result; waits for it where another machine may have written it."""
+    until = time.monotonic() + (_RESULT_FILE_TIMEOUT if elsewhere else 0.0)
+    while (found := job.kept()) is None and time.monotonic() < until:
+        os.listdir(job.folder)  # makes a network's file system look again
+        time.sleep(0.5)
+    return found
+
+
+# -- processes --------------------------------------------------------------------------------------------------------
+
+
+def _in_own_processes(jobs: Sequence[_Job], finished: _TaskFinishedCallback, count: int) -> None:
+    """Run jobs in processes, and repeat those that were lost when a process crashed."""
+    rest = list(jobs)
+    while rest:
+        suspects, rest = _with_pool(min(len(rest), count), rest, finished)
+        # one of those that ran together ended its process; alone, each shows whether it is the one
+        for job in suspects:
+            kept = job.kept()
+            if kept is not None:
+                finished(job, kept)
+            elif _with_pool(1, [job], finished)[0]:
+                finished(job, TaskResult(job.task.name, error="its process ended abruptly"))
+
+
+def _with_pool(workers: int, jobs: Sequence[_Job], finished: _TaskFinishedCallback) -> tuple[list[_Job], list[_Job]]:
+    others = set(multiprocessing.active_children())
+    pool = process_pool(workers)
+    try:
+        return _drain(pool, jobs, workers, finished)
+    except BaseException:
+        for child in set(multiprocessing.active_children()) - others:
+            child.terminate()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)

@@ -1,0 +1,552 @@
+"""Planning of informative motions: to identify parameters, or to discriminate effects that look alike."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.analysis.experiment_design import observable_frames, with_added_frames
+from yid_ocp.analysis.identifiability import identifiability
+from yid_ocp.effects import EffectBase, make_effect
+from yid_ocp.errors import ConfigError, SolverError, nearest_name_hint
+from yid_ocp.integrator.step import compile_step_like
+from yid_ocp.integrator.step_model import Rollout
+from yid_ocp.options import check_option_bounds
+from yid_ocp.planning.end_equilibria import joint_position_limits
+from yid_ocp.planning.frame_positions import FramePositions
+from yid_ocp.planning.informative_motion_search import InformativeMotionSearch, MotionSearchResult
+from yid_ocp.planning.optimality_criteria import DOptimality, EffectDiscrimination, OptimalityCriterion
+from yid_ocp.planning.options import PlanOptions
+from yid_ocp.planning.path_simulator import PathSimulator
+from yid_ocp.planning.plan_constraints import PlanResidualsAndLimits
+from yid_ocp.planning.planned_experiment import PlannedExperiment
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.progress import NULL_PROGRESS, Progress
+from yid_ocp.solvers.uncertainty import MAX_WEAK_RELATIVE_STD, MIN_UNINFORMED_RELATIVE_STD
+
+Array = NDArray[np.float64]
+
+_UNOBSERVABLE_STDS = 1e-2
+"""Standard deviations by which no reading moves when a parameter changes by its whole value: nothing sees it."""
+_RANDOM_COEFFICIENT_STD = 0.3
+"""Size of the random motions from which a search begins, before limits make them smaller [rad or m]."""
+_MAX_RELATIVE_SENSITIVITY_CHANGE = 0.05
+"""Part of itself by which a sensitivity may change with a ten-thousandth of the motion, or the object snaps."""
+_ACTIVE_LIMIT_FRACTION = 0.98
+"""Part of a limit from which it counts as reached."""
+_PROBE_AMPLITUDE = 0.05
+"""Largest unknown of a motion in which it is asked what else could see a parameter [rad or m]."""
+_MIN_VISIBLE_MOTION = 1e-4
+"""Motion of a point that a camera may see, for a change of a parameter by its whole value [m]."""
+
+
+@dataclass(frozen=True)
+class SearchStartResult:
+    """Result of the search from one random initial motion.
+
+    Attributes
+    ----------
+    initial_criterion, final_criterion : float
+        Search criterion of the initial and of the final motion [nat].
+    configured_criterion : float
+        Criterion of the final motion in the configured problem [nat]; minus infinity where it cannot be simulated.
+    is_converged : bool
+        Whether no round would gain more.
+    n_iterations : int
+    """
+
+    initial_criterion: float
+    final_criterion: float
+    configured_criterion: float
+    is_converged: bool
+    n_iterations: int
+
+
+@dataclass(frozen=True)
+class ParameterPrecision:
+    """Relative standard deviations of a parameter before and after a planned recording; infinite without information.
+
+    Attributes
+    ----------
+    std_recorded : float
+        From the existing recordings.
+    std_planned : float
+        From the planned recording alone.
+    std_combined : float
+        From both.
+    verdict : str
+        From the planned recording alone.
+    """
+
+    std_recorded: float
+    std_planned: float
+    std_combined: float
+    verdict: str
+
+
+@dataclass(frozen=True, eq=False)
+class InformativeMotionPlan:
+    """The most informative motion that was found, with predicted parameter precisions.
+
+    Attributes
+    ----------
+    simulator : Mover
+    spline_coefficients : ndarray, shape (K, nc)
+    rollout : Rollout
+        By the mover.
+    is_successful : bool
+        Whether the search converged.
+    message : str
+    parameter_precisions : mapping of str to Knowledge
+    effect_distances : mapping of (str, str) to (float, float)
+        For each pair of effects, distance of the change by the first from what the second and all free unknowns can
+        imitate, in standard deviations of the data: in the recordings and in the plan. Empty without effects.
+    start_results : tuple of Start
+        Results of the random initial motions, in the order drawn.
+    best_start_index : int
+        Index of the best one.
+    active_limits : mapping of str to tuple of str
+        Names of the joints, springs or frames that reach a limit, by kind of limit.
+    unobservable_parameters : mapping of str to str
+        Parameters that no motion informs, each with a sentence on which measurement would.
+    unidentifiable_directions : tuple of str
+        Sentences on directions that the planned recording would leave unidentifiable.
+    """
+
+    simulator: PathSimulator
+    spline_coefficients: Array
+    rollout: Rollout
+    is_successful: bool
+    message: str
+    parameter_precisions: Mapping[str, ParameterPrecision]
+    effect_distances: Mapping[tuple[str, str], tuple[float, float]]
+    start_results: tuple[SearchStartResult, ...]
+    best_start_index: int
+    active_limits: Mapping[str, tuple[str, ...]]
+    unobservable_parameters: Mapping[str, str]
+    unidentifiable_directions: tuple[str, ...]
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the moved joints."""
+        return self.simulator.step.system.prescribed
+
+    @property
+    def t(self) -> Array:
+        """Times of the nodes, shape (N + 1,) [s]."""
+        return self.simulator.node_times
+
+    @property
+    def joint_positions(self) -> Array:
+        """Joint positions, shape (N + 1, nc) [rad or m]."""
+        return self.simulator.joint_positions(self.spline_coefficients)
+
+    @property
+    def joint_velocities(self) -> Array:
+        """Joint velocities, shape (N + 1, nc) [rad/s or m/s]."""
+        return self.simulator.path.basis_values(self.t, 1) @ self.spline_coefficients
+
+    @property
+    def joint_accelerations(self) -> Array:
+        """Joint accelerations, shape (N + 1, nc) [rad/s^2 or m/s^2]."""
+        return self.simulator.path.basis_values(self.t, 2) @ self.spline_coefficients
+
+    @property
+    def joint_efforts(self) -> Array:
+        """Required joint efforts, the last row repeated, shape (N + 1, nc) [N m or N]."""
+        return np.vstack([self.rollout.effort, self.rollout.effort[-1:]])
+
+    @cached_property
+    def point_trajectories(self) -> dict[str, Array]:
+        """Trajectories of the system's points by name, each of shape (N + 1, 3) [m]."""
+        system = self.simulator.step.system
+        at = FramePositions(system, system.point_frames).positions_and_jacobian(
+            self.rollout.state[:, : system.n_coordinates], self.simulator.theta
+        )[0]
+        return {name: at[:, 3 * i : 3 * i + 3] for i, name in enumerate(system.point_frames)}
+
+
+def plan_informative_motion(
+    problem: EstimationProblem,
+    options: PlanOptions,
+    values: Mapping[str, float] | None = None,
+    effects: Mapping[str, Mapping[str, float]] | None = None,
+    progress: Progress = NULL_PROGRESS,
+) -> InformativeMotionPlan:
+    """Plan the motion of the arms that best identifies parameters or discriminates effects, within limits.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        As configured: its sensors with their noise and rates are those of its first recording, its free parameters are
+        those that a recording of the motion would be fitted by.
+    options : PlanOptions
+        Of goal `information`.
+    values : mapping of str to float, optional
+        Parameters at which to judge; the problem's when absent.
+    effects : mapping of label to mapping of quantity to value, optional
+        Sizes of effects that are to be separated, where they are known; typical ones otherwise.
+    progress : Progress, optional
+
+    Returns
+    -------
+    InformationPlan
+
+    Raises
+    ------
+    ConfigError
+        Parameters or effects that do not exist, that no sensor sees in any motion, limits that leave no motion.
+    ModelError, DataError, SolverError
+        No rest to begin from; sensors without a noise level; a motion that its torques do not follow.
+    """
+    check_option_bounds(options, "plan")
+    known = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True)) | dict(values or {})
+    progress.begin_stage("building the experiment")
+    chosen, rivals = _chosen(problem, options, effects or {})
+    composed = problem if not rivals else _composed(problem, rivals, known)
+    names = (*problem.free, *(name for effect in rivals for name in effect.amplitude_names))
+    shapes = {
+        entry.name: entry.value for effect in rivals for entry in effect.parameters if entry.name in effect.shape_names
+    }
+    experiment = PlannedExperiment.from_options(composed, known | shapes, options, names)
+    limits = _limits(experiment, options)
+    criterion = _criterion(experiment, chosen, rivals)
+    lower, upper = (
+        side - experiment.simulator.start_positions for side in joint_position_limits(experiment.simulator.step.system)
+    )
+    search = InformativeMotionSearch(experiment, limits, criterion, lower, upper)
+    _check_room(search, limits)
+    begins = [
+        _smooth(experiment, search.shrink_to_limits(_random(experiment, options.seed + i)))
+        for i in range(options.n_random_starts)
+    ]
+    if not any(np.any(begin) for begin in begins):
+        raise ConfigError("the limits leave no motion", where="plan.limits", hint="widen plan.limits")
+    unseen = _unseen(experiment, begins)
+    _check_seen(chosen, rivals, unseen, experiment)
+    found = []
+    for i, begin in enumerate(begins):
+        progress.begin_stage(f"improving the motion, start {i + 1} of {len(begins)}")
+        found.append(search.improve_motion(begin, options.max_iterations, progress))
+    return _plan(experiment, limits, search, criterion, found, rivals, unseen)
+
+
+# -- what is asked ----------------------------------------------------------------------------------------------------
+
+
+def _chosen(
+    problem: EstimationProblem, options: PlanOptions, sizes: Mapping[str, Mapping[str, float]]
+) -> tuple[tuple[str, ...], tuple[EffectBase, ...]]:
+    """Parameters that are to be told, or effects that are to be separated."""
+    if options.identify is not None and options.discriminate is not None:
+        raise ConfigError(
+            "parameters are to be told and effects to be separated", where="plan.discriminate", allowed="one of the two"
+        )
+    if options.discriminate is not None:
+        return (), _effects(problem, options.discriminate, sizes)
+    wanted = problem.free if options.identify is None else options.identify
+    if not wanted:
+        raise ConfigError("no parameter is to be told", where="plan.identify", allowed=", ".join(problem.free))
+    for name in wanted:
+        if name not in problem.system.parameters:
+            raise ConfigError(
+                f"there is no parameter '{name}'",
+                where="plan.identify",
+                hint=nearest_name_hint(name, problem.system.parameters.names),
+            )
+        if name not in problem.free:
+            raise ConfigError(
+                f"'{name}' is not free: a recording would say nothing of it",
+                where="plan.identify",
+                allowed=", ".join(problem.free),
+                hint=f"set parameters.{name}.free: true",
+            )
+    return wanted, ()
+
+
+def _effects(
+    problem: EstimationProblem, labels: Sequence[str], sizes: Mapping[str, Mapping[str, float]]
+) -> tuple[EffectBase, ...]:
+    if len(set(labels)) < 2:
+        raise ConfigError(
+            f"{len(set(labels))} effect is to be separated from others" if labels else "no effect is to be separated",
+            where="plan.discriminate",
+            allowed="two effects or more, kind@location each",
+        )
+    there = {f"{effect.kind}@{effect.location}" for effect in problem.system.effects}
+    found = []
+    for label in dict.fromkeys(labels):
+        kind, _, place = label.partition("@")
+        if not place:
+            raise ConfigError(
+                f"'{label}' says nothing of where the effect is",
+                where="plan.discriminate",
+                allowed=f"kind@location, such as {label}@PLACE",
+            )
+        if label in there:
+            raise ConfigError(
+                f"{label} is part of the model", where="plan.discriminate", hint="free its parameters instead"
+            )
+        found.append(make_effect(kind, place, problem.system, sizes.get(label)))
+    return tuple(found)
+
+
+def _composed(
+    problem: EstimationProblem, effects: Sequence[EffectBase], values: Mapping[str, float]
+) -> EstimationProblem:
+    """The problem of the system with all effects, neutral."""
+    system = problem.system.with_effects([make_effect(e.kind, e.location, problem.system) for e in effects])
+    recordings = [episode.recording for episode in problem.episodes]
+    extra = [name for effect in effects for name in effect.parameters.names]
+    step = compile_step_like(problem.step, system)
+    return EstimationProblem(step, recordings, problem.free, problem.options, values, (), extra)
+
+
+def _criterion(
+    experiment: PlannedExperiment, chosen: Sequence[str], rivals: Sequence[EffectBase]
+) -> OptimalityCriterion:
+    columns = [name.split("[")[0] for name in experiment.column_names]
+    parameters = tuple(i for i, name in enumerate(columns) if name in experiment.free_parameters)
+    if not rivals:
+        return DOptimality(tuple(i for i, name in enumerate(columns) if name in chosen), parameters)
+    places, sizes = [], []
+    for effect in rivals:
+        own = tuple(columns.index(name) for name in effect.amplitude_names)
+        places.append(own)
+        sizes.append(_size(effect) / experiment.unknown_scales[list(own)][:, None])
+    return EffectDiscrimination(tuple(places), tuple(sizes), parameters)
+
+
+def _size(effect: EffectBase) -> Array:
+    """Amplitudes of an effect beside neutral: the known ones together, else half of its range, one after the other."""
+    neutral = effect.neutral_values
+    known = np.array([effect.parameters[name].value - neutral[name] for name in effect.amplitude_names])
+    if np.any(known):
+        return known[:, None]
+    half = [(effect.prior_ranges[name][1] - effect.prior_ranges[name][0]) / 2 for name in effect.amplitude_names]
+    return np.diag(half)
+
+
+# -- within which limits ----------------------------------------------------------------------------------------------
+
+
+def _limits(experiment: PlannedExperiment, options: PlanOptions) -> PlanResidualsAndLimits:
+    system, still = experiment.simulator.step.system, experiment.zero_coefficients
+    return PlanResidualsAndLimits(
+        experiment.simulator, options, FramePositions(system, system.point_frames), np.zeros(3), still
+    )
+
+
+def _check_room(search: InformativeMotionSearch, limits: PlanResidualsAndLimits) -> None:
+    """Refuse limits that the arms pass where they begin."""
+    mover, still = search.experiment.simulator, search.experiment.zero_coefficients
+    for name, low, high in zip(mover.step.system.prescribed, search.lower, search.upper, strict=False):
+        if not low <= 0.0 <= high:
+            raise ConfigError(
+                f"{name} begins {max(low, -high):.3g} beyond the limit of the joint",
+                where="plan.start_joint_positions",
+                hint="give a plan.start_joint_positions within the limits",
+            )
+    broken = limits.violated_limits(limits.limit_values(mover.simulate_path(still), still).value)
+    if broken:
+        said = "; ".join(
+            f"{name}: {value:.4g} where {bound:.4g} is allowed, {what}" for what, (name, value, bound) in broken.items()
+        )
+        raise ConfigError(
+            f"the arms pass their limits before they move: {said}",
+            where="plan.limits",
+            hint="widen plan.limits where the machine allows it, or give another plan.start_joint_positions",
+        )
+
+
+def _random(experiment: PlannedExperiment, seed: int) -> Array:
+    return _RANDOM_COEFFICIENT_STD * np.random.default_rng(seed).normal(size=experiment.zero_coefficients.shape)
+
+
+def _smooth(experiment: PlannedExperiment, w: Array) -> Array:
+    """The motion, made smaller until what it tells changes smoothly with it."""
+    for _ in range(10):
+        rows, there = experiment.search_sensitivities(w), experiment.search_sensitivities((1.0 + 1e-4) * w)
+        if (
+            rows is not None
+            and there is not None
+            and np.linalg.norm(there - rows) <= _MAX_RELATIVE_SENSITIVITY_CHANGE * np.linalg.norm(rows)
+        ):
+            return w
+        w = 0.5 * w
+    return w
+
+
+# -- what nothing sees ------------------------------------------------------------------------------------------------
+
+
+def _unseen(experiment: PlannedExperiment, motions: Sequence[Array]) -> dict[str, float]:
+    """Parameters of which no reading tells in any of the motions: how far one moves at most [standard deviations]."""
+    largest = np.zeros(len(experiment.column_names))
+    for w in motions:
+        rows = experiment.search_sensitivities(w)
+        if rows is not None:
+            largest = np.maximum(largest, np.linalg.norm(rows, axis=0))
+    named = zip(experiment.column_names, largest, strict=True)
+    return {
+        name: float(size)
+        for name, size in named
+        if name.split("[")[0] in experiment.free_parameters and size < _UNOBSERVABLE_STDS
+    }
+
+
+def _check_seen(
+    chosen: Sequence[str], rivals: Sequence[EffectBase], unseen: Mapping[str, float], experiment: PlannedExperiment
+) -> None:
+    lost = [name for name in chosen if name in unseen]
+    if chosen and len(lost) == len(chosen):
+        worst = max(unseen[name] for name in lost)
+        raise ConfigError(
+            f"no motion informs {', '.join(lost)}: no sensor sees it to first order, a change by its whole value moves "
+            f"all readings together by {worst:.1g} standard deviations",
+            where="plan.identify",
+            allowed="a parameter that a sensor sees",
+            hint="; ".join(_would_see(experiment, name, _random(experiment, 0)) for name in lost),
+        )
+    for effect in rivals:
+        if all(name in unseen for name in effect.amplitude_names):
+            raise ConfigError(
+                f"no motion tells {effect.label} from anything: no sensor sees it to first order",
+                where="plan.discriminate",
+                hint="add a sensor that sees it",
+            )
+
+
+def _would_see(experiment: PlannedExperiment, name: str, w: Array) -> str:
+    """What would see a parameter, in words."""
+    mover = experiment.simulator
+    seen = observable_frames(mover.step.system)
+    wide = with_added_frames(
+        mover.step, {sight.name: sight.added_frame for sight in seen if sight.added_frame is not None}
+    ).system
+    w = _PROBE_AMPLITUDE * w / max(float(np.abs(w).max()), _PROBE_AMPLITUDE)
+    rolled, n = mover.simulate_path(w, names=[name]), wide.n_coordinates
+    if rolled.state_sensitivity is None or not rolled.status.is_converged:
+        return f"{name} needs another sensor"
+    _, by_q = FramePositions(wide, [sight.name for sight in seen]).positions_and_jacobian(
+        rolled.state[:, :n], mover.theta
+    )
+    size = abs(mover.theta[wide.parameters.index(name)]) or 1.0
+    moved = size * np.einsum("tiq,tq->ti", by_q, rolled.state_sensitivity[:, :n, 0]).reshape(len(by_q), -1, 3)
+    farthest = np.linalg.norm(moved, axis=2).max(0)
+    best = int(np.argmax(farthest))
+    moved_by = f"{1e3 * farthest[best]:.2g} mm in a random motion of {_PROBE_AMPLITUDE:g} rad, with {name} changed by its whole value"
+    if farthest[best] > _MIN_VISIBLE_MOTION:
+        return f"let a camera see {seen[best].description}: it moves by {moved_by}"
+    return (
+        f"no point of the object moves by more than {moved_by}: take another grasp, which loads it "
+        "(`identifiability --what-if` tries some), or fix it"
+    )
+
+
+# -- what was found ---------------------------------------------------------------------------------------------------
+
+
+def _plan(
+    experiment: PlannedExperiment,
+    limits: PlanResidualsAndLimits,
+    search: InformativeMotionSearch,
+    criterion: OptimalityCriterion,
+    found: Sequence[MotionSearchResult],
+    rivals: Sequence[EffectBase],
+    unseen: Mapping[str, float],
+) -> InformativeMotionPlan:
+    judged = [_judged(experiment, criterion, one) for one in found]
+    best = int(np.argmax(judged))
+    if not np.isfinite(judged[best]):
+        raise SolverError(
+            "no motion that was found can be followed by its torques",
+            where="plan",
+            hint="lower plan.limits.max_acceleration",
+        )
+    w = found[best].w
+    starts = tuple(
+        SearchStartResult(one.initial_criterion, one.final_criterion, value, one.is_converged, one.n_iterations)
+        for one, value in zip(found, judged, strict=True)
+    )
+    parameters, open_words = _parameters(experiment, w)
+    distances = {} if not isinstance(criterion, EffectDiscrimination) else _distances(experiment, criterion, rivals, w)
+    message = "the motion was found"
+    if found[best].final_criterion == found[best].initial_criterion and not found[best].is_converged:
+        message = (
+            "the motions are too rough to be improved; lower plan.limits, or give another plan.start_joint_positions"
+        )
+    elif not found[best].is_converged:
+        message = f"the search was stopped after {found[best].n_iterations} rounds; raise plan.max_iterations"
+    lost = {name: _would_see(experiment, name, w) for name in unseen if name in experiment.configured_problem.free}
+    return InformativeMotionPlan(
+        experiment.simulator, w, experiment.simulator.simulate_path(w), found[best].is_converged, message, parameters, distances,
+        starts, best, _active(search, limits, w), lost, open_words,
+    )  # fmt: skip
+
+
+def _judged(experiment: PlannedExperiment, criterion: OptimalityCriterion, found: MotionSearchResult) -> float:
+    try:
+        return criterion.value_and_gradient(experiment.configured_sensitivities(found.w), False)[0]
+    except SolverError:
+        return -math.inf
+
+
+def _parameters(experiment: PlannedExperiment, w: Array) -> tuple[dict[str, ParameterPrecision], tuple[str, ...]]:
+    """Parameters of the nominal problem before, after and with both, and what the planned recording leaves open."""
+    problem = experiment.configured_problem
+    before = identifiability(problem.with_parameter_values(experiment.parameter_values))
+    after = identifiability(experiment.estimation_problem(w).with_free_subset(problem.free))
+    shared = [name for name in problem.free if name not in problem.options.local_parameters]
+    at = [[entry.parameter_names.index(name) for name in shared] for entry in (before, after)]
+    both = sum(entry.fisher_information[np.ix_(i, i)] for entry, i in zip((before, after), at, strict=True))
+    values, vectors = np.linalg.eigh(np.atleast_2d(both))
+    together = np.sqrt(np.sum(vectors**2 / np.maximum(values, MIN_UNINFORMED_RELATIVE_STD**-2), axis=1))
+    found = {}
+    for name, std in zip(shared, together, strict=True):
+        first, last = before.parameters[name].std_relative, after.parameters[name].std_relative
+        least = min(first, last, float(std) if std < MAX_WEAK_RELATIVE_STD else math.inf)
+        found[name] = ParameterPrecision(first, last, least, after.parameters[name].verdict)
+    return found, tuple(entry.words for entry in after.unidentifiable_directions)
+
+
+def _distances(
+    experiment: PlannedExperiment, criterion: EffectDiscrimination, rivals: Sequence[EffectBase], w: Array
+) -> dict[tuple[str, str], tuple[float, float]]:
+    """Distances of effects in the recordings that there are, and in the planned one."""
+    before, after = (
+        criterion.effect_distances(rows)
+        for rows in (experiment.recorded_sensitivities, experiment.configured_sensitivities(w))
+    )
+    labels = [effect.label for effect in rivals]
+    return {
+        (a, b): (float(before[i, j]), float(after[i, j]))
+        for i, a in enumerate(labels)
+        for j, b in enumerate(labels)
+        if i != j
+    }
+
+
+def _active(search: InformativeMotionSearch, limits: PlanResidualsAndLimits, w: Array) -> dict[str, tuple[str, ...]]:
+    """Limits that a motion reaches."""
+    mover = search.experiment.simulator
+    value, at = limits.limit_values(mover.simulate_path(w), w).value, 0
+    found: dict[str, tuple[str, ...]] = {}
+    for rows in limits.limit_rows:
+        own = value[at : at + len(rows.row_names)]
+        at += len(rows.row_names)
+        near = (own > _ACTIVE_LIMIT_FRACTION * rows.upper) | (own < _ACTIVE_LIMIT_FRACTION * rows.lower)
+        found[rows.description] = tuple(
+            dict.fromkeys(name for name, one in zip(rows.row_names, near, strict=True) if one)
+        )
+    flat = w.ravel()
+    room = np.minimum(search.upper - flat, flat - search.lower).reshape(w.shape).min(0)
+    found["position [rad or m]"] = tuple(
+        name for name, left in zip(mover.step.system.prescribed, room, strict=True) if left < 1e-3
+    )
+    return {what: names for what, names in found.items() if names}

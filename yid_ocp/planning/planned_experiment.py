@@ -1,0 +1,431 @@
+"""Predicted recording and sensitivities of a planned motion of the arms with the configured sensors.
+
+Two forms of one experiment. In the first the arms are moved and the torques that this needs are measured, with a
+constant error each: one rollout tells all, so that it serves to search. Where arms are driven their motion is known as
+far as sensors tell of it only; what an error of the motion does to all readings is taken at rest, once, and eliminated
+(Golub and Pereyra 1973, doi:10.1137/0710036). The second form is the estimation problem as it is configured, driven by
+these torques; it judges what was found.
+
+A camera's frames come when they come. What is counted is the information of its mean rate over the recording, spread
+evenly over the motion, so that no plan relies on a frame at a certain moment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+
+from yid_ocp.analysis.experiment_design import DEFAULT_TORQUE_STD
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.errors import ConfigError, DataError, SolverError
+from yid_ocp.integrator.step import Step, compile_step_like
+from yid_ocp.parallel import map_with_batched_calls
+from yid_ocp.planning.end_equilibria import ordered_start_positions, solve_start_equilibrium
+from yid_ocp.planning.frame_positions import FramePositions
+from yid_ocp.planning.options import PlanOptions
+from yid_ocp.planning.path_simulator import PathSimulator
+from yid_ocp.planning.spline_path import SplinePath
+from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.problem.evaluation import Evaluation
+from yid_ocp.problem.low_pass_filter import effort_filter
+from yid_ocp.problem.measurements import Measurements
+from yid_ocp.sensors.joints import EFFORT_GROUP, POSITION_GROUP
+
+Array = NDArray[np.float64]
+
+_PLANNED_RECORDING_NAME = "planned"
+_MIN_POINT_RATE = 20.0  # at least so often a slow sensor's information is spread over the motion [Hz]
+_MAX_SEARCH_POINT_RATE = (
+    40.0  # samples of a point while a motion is searched: twice the band in which the motion may be wrong [Hz]
+)
+_PATH_ERROR_BANDWIDTH = 12.0  # up to which the motion may be wrong: beyond it efforts are smoothed away [Hz]
+_PATH_DIFFERENCE_STEP = 1e-6  # of the arms' motion, by which its errors' effect is differenced [rad or m]
+_SPLINE_DIFFERENCE_STEP = 1e-5  # of an unknown of the motion [rad or m]
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedExperiment:
+    """A planned experiment: predicted recording and parameter sensitivities as functions of spline coefficients.
+
+    Attributes
+    ----------
+    configured_problem : EstimationProblem
+        The problem of the settings; its first recording defines sensors, noise and rates.
+    parameter_values : mapping of str to float
+        Parameters at which the sensitivities are taken.
+    simulator : Mover
+        Of the same system with its arms prescribed.
+    free_parameters : tuple of str
+        Free parameters: those of the problem, and amplitudes of effects that are to be discriminated.
+    """
+
+    configured_problem: EstimationProblem
+    parameter_values: Mapping[str, float]
+    simulator: PathSimulator
+    free_parameters: tuple[str, ...]
+
+    @staticmethod
+    def from_options(
+        problem: EstimationProblem, values: Mapping[str, float], options: PlanOptions, names: Sequence[str] = ()
+    ) -> PlannedExperiment:
+        """The experiment described by a plan's options.
+
+        Parameters
+        ----------
+        problem : EstimationProblem
+        values : mapping of str to float
+            Of any parameters; the others as the problem has them.
+        options : PlanOptions
+            Duration, spline, posture at the start: the first of the recording when absent.
+        names : sequence of str
+            Parameters that are free; those of the problem when empty.
+
+        Raises
+        ------
+        ConfigError
+            No joint moves, or clamps follow measured points.
+        ModelError
+            There is no rest to begin from.
+        """
+        system, episode = problem.system, problem.episodes[0]
+        if problem.options.clamp_paths or not (system.driven or system.prescribed):
+            raise ConfigError(
+                "no joint moves whose motion could be planned"
+                if not problem.options.clamp_paths
+                else "the ends of a cable follow measured points: there is no joint whose motion could be planned",
+                where="plan",
+                allowed="a robot whose arms move",
+                hint="set model.robot and model.arms",
+            )
+        if system.servos:
+            raise ConfigError(
+                "motions are not planned for arms of servos, whose commands are not their motion",
+                where="model.arms.mode",
+                allowed="driven, prescribed",
+                hint="set model.arms.mode: prescribed for the plan",
+            )
+        moved = replace(system, driven=(), prescribed=(*system.driven, *system.prescribed))
+        step = problem.step if not system.driven else compile_step_like(problem.step, moved)
+        known = dict(zip(system.parameters.names, map(float, problem.theta), strict=True)) | dict(values)
+        theta = step.system.parameters.vector(known)
+        first = (
+            np.array(episode.initial_known_coordinates)
+            if options.start_joint_positions is None
+            else ordered_start_positions(step.system, options.start_joint_positions)
+        )
+        path = SplinePath(options.duration, options.n_spline_coefficients)
+        mover = PathSimulator(step, theta, solve_start_equilibrium(step, theta, first), path, options.hold_duration)
+        _check_long_enough(problem, float(mover.node_times[-1]))
+        return PlannedExperiment(problem, known, mover, tuple(names) or problem.free)
+
+    # -- what the sensors would record --------------------------------------------------------------------------------
+
+    def noise_free_recording(self, w: Array, fastest: float = np.inf) -> Recording:
+        """Noise-free predicted recording of a motion; it states the standard deviations of its sensors.
+
+        Parameters
+        ----------
+        w : ndarray, shape (K, nc)
+            Unknowns of the motion.
+        fastest : float
+            Highest sample rate of points; those of a faster sensor are thinned, their information per second kept [Hz].
+        """
+        mover, base = self.simulator, self.configured_problem.episodes[0]
+        rollout, system = mover.simulate_path(w), mover.step.system
+        if not rollout.status.is_converged:
+            raise DataError(f"the motion cannot be carried out: {rollout.status.message}", where="plan")
+        joints, duration = base.recording.joints, float(mover.node_times[-1])
+        assert joints is not None
+        period = float(np.median(np.diff(joints.t)))
+        t = np.asarray(period * np.arange(int(np.floor(duration / period + 1e-9)) + 1), float)
+        sums = (
+            np.vstack([np.zeros((1, len(mover.joint_indices))), np.cumsum(rollout.effort, axis=0)])
+            * mover.step.time_step
+        )
+        edges = [
+            np.stack([np.interp(at, mover.node_times, total) for total in sums.T], axis=1) for at in (t, t + period)
+        ]
+        effort = (edges[1] - edges[0]) / period
+        # nothing is known of what comes after
+        effort[t + period > duration + 1e-9] = rollout.effort[-1]
+        columns = [joints.names.index(name) for name in system.prescribed]
+        errors = base.input_errors
+        known = (joints.position_std, joints.effort_std, joints.effort_bias_std)
+        stds = [None if std is None else np.broadcast_to(std, (len(joints.names),))[columns] for std in known]
+        if errors is not None:
+            per_sample = errors.torque_std / min(1.0, np.sqrt(period / mover.step.time_step))
+            stds = [errors.angle_std, per_sample, errors.torque_bias_std]
+        group = JointGroup(
+            system.prescribed, t, mover.start_positions + mover.path.basis_values(t) @ w,
+            effort=None if joints.effort is None else effort, effort_kind="mean",
+            position_std=stds[0], effort_std=stds[1], effort_bias_std=stds[2],
+        )  # fmt: skip
+        q = rollout.state[:, : system.n_coordinates]
+        groups = [
+            self._seen(samples, q, fastest) for samples in base.measurements if samples.sensor.outputs_per_channel == 3
+        ]
+        return Recording(group, tuple(groups), "a planned motion", "yid_ocp plan", _PLANNED_RECORDING_NAME)
+
+    def _seen(self, samples: Measurements, q: Array, fastest: float) -> PointGroup:
+        """Points of one sensor along the motion, their information per second as in the recording."""
+        mover, base = self.simulator, self.configured_problem.episodes[0]
+        sensor, spent = samples.sensor, base.grid.steps * base.grid.time_step
+        inverse = np.sum(np.where(samples.is_used, samples.weight**2, 0.0), axis=0)
+        rate = float(np.max(np.count_nonzero(samples.is_used, axis=0))) / spent
+        stride = max(1, round(1.0 / (mover.step.time_step * min(max(rate, _MIN_POINT_RATE), fastest))))
+        at = np.arange(0, len(mover.node_times), stride)
+        dense = 1.0 / (stride * mover.step.time_step)
+        with np.errstate(divide="ignore"):
+            std = np.sqrt(dense * spent / inverse)
+        places = self._frames[sensor.frame_names].positions_and_jacobian(q[at], mover.theta)[0]
+        places = np.where(np.isfinite(std), places, np.nan).reshape(len(at), -1, 3)
+        std = np.broadcast_to(np.where(np.isfinite(std), std, 1.0).reshape(-1, 3), places.shape)
+        group = next(g for g in base.recording.points if g.name == sensor.group_name)
+        return PointGroup(
+            sensor.group_name,
+            sensor.point_names,
+            mover.node_times[at],
+            places,
+            std.copy(),
+            group.sensor,
+            pose=group.pose,
+        )
+
+    @cached_property
+    def _frames(self) -> dict[tuple[str, ...], FramePositions]:
+        found = {
+            s.sensor.frame_names
+            for s in self.configured_problem.episodes[0].measurements
+            if s.sensor.outputs_per_channel == 3
+        }
+        return {frames: FramePositions(self.simulator.step.system, frames) for frames in found}
+
+    def _options(self, **changes: object) -> ProblemOptions:
+        """The problem's options for the planned recording alone, which states its points' noise itself."""
+        options, base = self.configured_problem.options, self.configured_problem.episodes[0]
+        own = dict(options.sensors)
+        for samples in base.measurements:
+            if samples.sensor.outputs_per_channel == 3 and samples.sensor.group_name in own:
+                own[samples.sensor.group_name] = replace(own[samples.sensor.group_name], std=None)
+        named = (
+            {_PLANNED_RECORDING_NAME: dict(options.parameters_by_recording[base.name])}
+            if base.name in options.parameters_by_recording
+            else {}
+        )
+        same = {"sensors": own, "duration": None, "known_initial_states": {}, "parameters_by_recording": named}
+        return replace(options, **{**same, **changes})  # type: ignore[arg-type]
+
+    @property
+    def zero_coefficients(self) -> Array:
+        """Spline coefficients of no motion, shape (K, nc)."""
+        return np.zeros((self.simulator.path.n_coefficients, len(self.simulator.joint_indices)))
+
+    def estimation_problem(self, w: Array) -> EstimationProblem:
+        """The configured estimation problem with the planned recording in place of its own, at `parameter_values`."""
+        return self._problem(self.configured_problem.step, self.noise_free_recording(w), self._options())
+
+    def _problem(self, step: Step, recording: Recording, options: ProblemOptions) -> EstimationProblem:
+        free = [name for name in self.free_parameters if name in self.configured_problem.free]
+        extra = [name for name in self.free_parameters if name not in free]
+        return EstimationProblem(step, [recording], free, options, self.parameter_values, (), extra).with_free_subset(
+            self.free_parameters
+        )
+
+    def configured_sensitivities(self, w: Array) -> Array:
+        """Sensitivities of the planned recording in the configured problem, without columns of torque offsets.
+
+        Raises
+        ------
+        SolverError
+            The motion cannot be followed by its torques.
+        """
+        return self._weighted(self.estimation_problem(w))
+
+    @property
+    def recorded_sensitivities(self) -> Array:
+        """Sensitivities of the existing recordings in the configured problem."""
+        return self._weighted(
+            self.configured_problem.with_parameter_values(self.parameter_values).with_free_subset(self.free_parameters)
+        )
+
+    def _weighted(self, problem: EstimationProblem) -> Array:
+        problem = problem.whitened_at(problem.initial_unknowns)
+        evaluation = problem.evaluate(problem.initial_unknowns)
+        if not evaluation.ok:
+            raise SolverError(f"the motion cannot be followed by its torques: {evaluation.message}")
+        return self._relative(problem, evaluation)
+
+    def _relative(self, problem: EstimationProblem, evaluation: Evaluation) -> Array:
+        """Sensitivities to relative changes, without what is known beforehand of the parameters themselves.
+
+        That is not something that a sensor sees.
+        """
+        jacobian = problem.residual_without_weak_priors(evaluation)[1] * _sizes(problem)
+        own = np.array([name.split("[")[0] in self.free_parameters for name in problem.unknown_names])
+        jacobian[problem.residual_rows.stated_priors] = np.where(
+            own, 0.0, jacobian[problem.residual_rows.stated_priors]
+        )
+        return jacobian
+
+    # -- sensitivities with a known motion ----------------------------------------------------------------------------
+
+    @cached_property
+    def _known(self) -> EstimationProblem:
+        """The problem in which the motion is known and torques are measured."""
+        recording = self.noise_free_recording(self.zero_coefficients, _MAX_SEARCH_POINT_RATE)
+        joints = recording.joints
+        assert joints is not None
+        sensors = dict(self._options().sensors)
+        if joints.effort is not None:
+            std = np.zeros(len(joints.names)) if joints.effort_std is None else np.asarray(joints.effort_std)
+            joints = replace(joints, effort_std=np.where(std > 0, std, DEFAULT_TORQUE_STD))
+        if self.configured_problem.system.driven:
+            # how wrong the motion may be is said by `_blur`
+            joints = replace(joints, position_std=None)
+            sensors.pop(POSITION_GROUP, None)
+        options = self._options(huber_threshold=np.inf, weak_prior_factor=0.0, weighting="whitened", sensors=sensors)
+        return self._problem(self.simulator.step, replace(recording, joints=joints), options)
+
+    @cached_property
+    def unknown_scales(self) -> Array:
+        """Size to which relative changes of each of the problem's unknowns refer, in the order of `column_names`."""
+        return _sizes(self._known)
+
+    @cached_property
+    def column_names(self) -> tuple[str, ...]:
+        """Names of the columns of `search_sensitivities`: parameters, other unknowns, constant errors of torques."""
+        return (*self._known.unknown_names, *(f"offset of {name}" for name in self._offset_std))
+
+    @cached_property
+    def _offset_std(self) -> dict[str, float]:
+        errors = self.configured_problem.episodes[0].input_errors
+        if errors is None:
+            return {}
+        known = zip(self.configured_problem.system.driven, errors.torque_bias_std, strict=True)
+        return {name: float(std) for name, std in known if std > 0}
+
+    @cached_property
+    def _offsets(self) -> Array:
+        """Columns of the constant errors, in units of their standard deviations, priors below, (nr + no, no)."""
+        problem, std = self._known, self._offset_std
+        found = np.zeros((problem.residual_rows.without_weak_priors.stop, len(std)))
+        for samples, rows in zip(problem.episodes[0].measurements, problem.residual_rows.measurements[0], strict=True):
+            if samples.sensor.group_name != EFFORT_GROUP:
+                continue
+            joint = np.broadcast_to(np.arange(samples.value.shape[1]), samples.value.shape)[samples.is_used]
+            for i, (name, size) in enumerate(std.items()):
+                own = joint == samples.sensor.effort_joints.index(name)
+                found[rows, i] = samples.decorrelate(np.where(own, size * samples.weight[samples.is_used], 0.0))
+        return np.vstack([found, np.eye(len(std))])
+
+    def search_sensitivities(self, w: Array) -> Array | None:
+        """Whitened sensitivities of all measurements to relative changes of the unknowns, (nr, columns).
+
+        With rows for the priors of nuisances; None where the motion cannot be simulated.
+        """
+        problem = self._known
+        episode = replace(problem.episodes[0], prescribed_path=np.asarray(self.simulator.joint_positions(w)))
+        moved = problem.with_episodes([episode], ())
+        evaluation = moved.evaluate(
+            moved.initial_unknowns,
+            equilibrium_guesses=(self.simulator.start_equilibrium.state[: self.simulator.step.system.n_coordinates],),
+        )
+        if not evaluation.ok:
+            return None
+        jacobian = self._relative(moved, evaluation)
+        offsets = self._offsets
+        whole = np.zeros((len(offsets), jacobian.shape[1] + offsets.shape[1]))
+        whole[: len(jacobian), : jacobian.shape[1]] = jacobian
+        whole[:, jacobian.shape[1] :] = offsets
+        vectors, taken = self._blur
+        data = len(vectors)
+        whole[:data] -= vectors @ (taken[:, None] * (vectors.T @ whole[:data]))
+        return whole
+
+    @cached_property
+    def _blur(self) -> tuple[Array, Array]:
+        """Directions of the data that errors of a driven arm's motion blur, and how much of each is lost, 0 to 1."""
+        problem, mover, errors = self._known, self.simulator, self.configured_problem.episodes[0].input_errors
+        data = problem.residual_rows.data.stop
+        if not self.configured_problem.system.driven:
+            return np.zeros((data, 0)), np.zeros(0)
+        nc = len(mover.joint_indices)
+        waves = _splines(mover.node_times, _PATH_ERROR_BANDWIDTH)
+        path = np.asarray(mover.joint_positions(self.zero_coefficients))
+
+        def residual(i: int) -> Array:
+            moved = path.copy()
+            if i >= 0:
+                moved[:, i % nc] += _PATH_DIFFERENCE_STEP * waves[:, i // nc]
+            found = problem.with_episodes([replace(problem.episodes[0], prescribed_path=moved)], ())
+            evaluation = found.evaluate(
+                found.initial_unknowns, False, (mover.start_equilibrium.state[: mover.step.system.n_coordinates],)
+            )
+            if not evaluation.ok:
+                raise DataError(f"the motion cannot be carried out: {evaluation.message}", where="plan")
+            return evaluation.residual[problem.residual_rows.data]
+
+        still = residual(-1)
+        blur = np.stack(
+            [
+                (found - still) / _PATH_DIFFERENCE_STEP
+                for found in map_with_batched_calls(residual, range(nc * waves.shape[1]))
+            ],
+            axis=1,
+        )
+        known = blur.T @ blur
+        if errors is not None and errors.has_encoder_measurements:
+            told = (waves.T @ waves)[:, None, :, None] * np.diag(errors.angle_std**-2 * errors.encoder_noise_steps**-1)[
+                None, :, None, :
+            ]
+            known += told.reshape(known.shape)
+        values, vectors = scipy.linalg.eigh(known)
+        kept = values > 1e-10 * values[-1]
+        u, s, _ = np.linalg.svd(blur @ (vectors[:, kept] / np.sqrt(values[kept])), full_matrices=False)
+        return u, 1.0 - np.sqrt(np.clip(1.0 - s**2, 0.0, 1.0))
+
+    def sensitivity_derivatives(self, w: Array, rows: Array) -> Array | None:
+        """Derivative of `search_sensitivities` by the spline coefficients, by forward differences, (w.size, nr, columns)."""
+
+        def one(i: int) -> Array | None:
+            moved = w.ravel().copy()
+            moved[i] += _SPLINE_DIFFERENCE_STEP
+            there = self.search_sensitivities(moved.reshape(w.shape))
+            return None if there is None else (there - rows) / _SPLINE_DIFFERENCE_STEP
+
+        found = map_with_batched_calls(one, range(w.size))
+        return None if any(part is None for part in found) else np.array(found)
+
+
+def _check_long_enough(problem: EstimationProblem, duration: float) -> None:
+    """Refuse a motion of whose efforts the low-pass filter leaves nothing."""
+    joints, low_pass = problem.episodes[0].recording.joints, effort_filter(problem.options.path_cutoff)
+    least = (
+        2.0 * low_pass.settling_time + low_pass.decorrelation_stride(problem.step.time_step) * problem.step.time_step
+    )
+    if joints is not None and joints.effort is not None and duration <= least:
+        raise ConfigError(
+            f"{duration:g} s are too short to measure efforts that are smoothed at {low_pass.cutoff:g} Hz",
+            where="plan.duration",
+            allowed=f"more than {least:.2g} s together with plan.hold_duration",
+            hint="take a longer plan.duration, or raise problem.path_cutoff",
+        )
+
+
+def _sizes(problem: EstimationProblem) -> Array:
+    """Value of every unknown, its typical size where that is zero."""
+    return np.where(problem.initial_unknowns != 0, np.abs(problem.initial_unknowns), problem.unknown_scales)
+
+
+def _splines(times: Array, band: float) -> Array:
+    """Cubic splines from rest up to a frequency, shape (N + 1, count)."""
+    inner = np.linspace(times[0], times[-1], max(2, round((times[-1] - times[0]) * 2 * band)))
+    knots = np.concatenate([np.full(3, inner[0]), inner, np.full(3, inner[-1])])
+    # the first posture is known
+    return np.asarray(BSpline.design_matrix(np.clip(times, inner[0], inner[-1]), knots, 3).toarray()[:, 1:])

@@ -1,0 +1,631 @@
+"""Prediction of an episode: initial state, rollout, sensor readings and their derivatives."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.integrator.momentum_shift import DrivenJointMotion
+from yid_ocp.integrator.rollout import adjoint_gradient, rollout_inputs, simulate_batch
+from yid_ocp.integrator.statics import Equilibrium
+from yid_ocp.integrator.step import Rollout, SensitivityDirections, Step
+from yid_ocp.integrator.step_model import RolloutInputs
+from yid_ocp.model.system import System
+from yid_ocp.parallel import map_in_threads
+from yid_ocp.problem.constant_sensor_errors import subtract_estimated_biases
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.first_order_lag import FirstOrderLag
+from yid_ocp.problem.input_corrections import CorrectedInputs
+from yid_ocp.problem.input_noise import InputErrors, NominalTrajectory, WhiteningFilter, build_whitening_filter
+from yid_ocp.problem.low_pass_filter import LowPassFilter, NodeSmoother
+from yid_ocp.problem.measurements import Measurements
+from yid_ocp.problem.model_functions import ModelFunctions
+from yid_ocp.problem.options import ProblemOptions
+from yid_ocp.problem.prediction_result import EpisodePrediction, InitialState
+from yid_ocp.problem.recorded_inputs import mean_step_inputs, mean_step_inputs_by_delay
+from yid_ocp.problem.unknown_vector import UnknownVectorLayout
+
+Array = NDArray[np.float64]
+_MAX_PARALLEL_ROLLOUTS, _MAX_ROLLOUT_MEMORY = 16, 2.0**28
+"""Largest number of episodes rolled out at once, and largest memory of their states and derivatives [bytes]."""
+
+_MIN_TORQUE_GAIN = 0.1
+"""Smallest ratio of acting to recorded torque at which errors of one are converted into errors of the other."""
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    """An episode whose rollout can begin."""
+
+    episode: Episode
+    start: InitialState
+    inputs: CorrectedInputs
+    member: RolloutInputs
+    wanted: tuple[str, ...]
+    derivatives: bool
+
+
+@dataclass(frozen=True)
+class EpisodePredictor:
+    """Predicts episodes: initial state, rollout, sensor readings and derivatives; stateless.
+
+    Attributes
+    ----------
+    model_functions : ModelFunctions
+    options : ProblemOptions
+    unknowns : Unknowns
+    """
+
+    model_functions: ModelFunctions
+    options: ProblemOptions
+    unknowns: UnknownVectorLayout
+
+    @property
+    def step(self) -> Step:
+        """The compiled step."""
+        return self.model_functions.step
+
+    @property
+    def system(self) -> System:
+        """The step's system."""
+        return self.model_functions.step.system
+
+    # -- the start ----------------------------------------------------------------------------------------------------
+
+    @property
+    def estimated_state_indices(self) -> tuple[int, ...]:
+        """Indices of the estimated components of the initial state, in the order of `UnknownVectorLayout.initial_state_names`."""
+        joints, n = self.system.mechanism.joint_index, self.system.n_coordinates
+        hidden = list(self.system.internal_coordinates)
+        split = (name.split(".", 1) for name in self.unknowns.initial_state_names)
+        return tuple(
+            2 * n + hidden.index(name) if kind == "z" else joints(name) + (n if kind == "p" else 0)
+            for kind, name in split
+        )
+
+    def with_fitted_initial_state(self, episode: Episode, theta: Array) -> Episode:
+        """Episode with its initial state fitted to the first measured points, where the options ask for it."""
+        if episode.fixed_initial_state is not None or self.options.initial_state != "fitted_to_points":
+            return episode
+        samples = episode.measurements
+        if self.options.start_point_noise_std is not None:
+            weight = 1.0 / self.options.start_point_noise_std
+            samples = tuple(replace(s, weight=np.where(s.is_used, weight, 0.0)) for s in samples)
+        own, window = self._with(theta, episode.known_parameters), self.options.start_fit_window
+        start = self.model_functions.initial_state_fitter.fit_to_points(
+            episode.initial_known_coordinates, samples, own, window, episode.prescribed_path
+        )
+        return replace(episode, fixed_initial_state=start)
+
+    def episode_theta(self, episode: Episode, theta: Array) -> Array:
+        """theta with the episode's own values: known ones, and those fitted along with its initial state."""
+        fitted: Mapping[str, float] = (
+            {} if episode.fixed_initial_state is None else episode.fixed_initial_state.fitted_parameters
+        )
+        return self._with(theta, {**episode.known_parameters, **fitted})
+
+    def _with(self, theta: Array, values: Mapping[str, float]) -> Array:
+        own = theta.copy()
+        for name, value in values.items():
+            own[self.system.parameters.index(name)] = value
+        return own
+
+    def initial_state(
+        self, episode: Episode, theta: Array, offset: Array, wanted: tuple[str, ...], guess: Array | None = None
+    ) -> InitialState:
+        """Initial state of an episode's rollout and its derivative by (wanted parameters, offset).
+
+        Parameters
+        ----------
+        episode : Episode
+        theta : ndarray, shape (ntheta,)
+            From `episode_theta`.
+        offset : ndarray, shape (number of estimated rows,)
+            Of an estimated initial state from equilibrium.
+        wanted : tuple of str
+            Parameters by which to differentiate.
+        guess : ndarray, optional, shape (n,)
+            Configuration near the equilibrium; `Episode.equilibrium_guess`, else a search for least energy, when absent.
+        """
+        nx, rows = self.step.sizes["nx"], list(self.estimated_state_indices)
+        by_offset = np.zeros((nx, len(rows)))
+        by_offset[rows, np.arange(len(rows))] = 1.0
+        rest: Equilibrium | None = None
+        if episode.fixed_initial_state is not None:
+            state, by_theta = episode.fixed_initial_state.state.copy(), np.zeros((nx, len(wanted)))
+        else:
+            inputs = self.corrected_inputs(episode, theta, wanted)
+            first = inputs.first_torque if self.system.driven else None
+            near = episode.equilibrium_guess if guess is None else guess
+            rest = self.model_functions.find_equilibrium(inputs.initial_known_coordinates, theta, first, near, wanted)
+            if not rest.is_converged:
+                none = np.zeros((nx, len(wanted) + len(rows)))
+                return InitialState(rest.state, none, rest, f"{episode.name}: {rest.message}")
+            state = rest.state.copy()
+            by_theta = (
+                rest.state_by_theta
+                + rest.state_by_known_coordinates @ inputs.initial_known_coordinates_sensitivity(len(wanted))
+            )
+            if inputs.first_torque_sensitivity is not None:
+                by_theta += rest.state_by_torque @ inputs.first_torque_sensitivity
+        state[rows] += offset
+        return InitialState(state, np.hstack([by_theta, by_offset]), rest, "")
+
+    def has_uncorrected_inputs(self, episode: Episode, theta: Array) -> bool:
+        """Whether no effect corrects the episode's inputs, times or tracked reference: none is free or non-neutral."""
+        wanted = self.unknowns.free_parameters
+        inputs = self.corrected_inputs(episode, theta, wanted)
+        pairs = (
+            (inputs.torque, episode.torque),
+            (inputs.prescribed_path, episode.prescribed_path),
+            (inputs.driven_angles, episode.measured_driven_angles),
+        )
+        slopes = [
+            x
+            for x in (inputs.torque_sensitivity, inputs.prescribed_path_sensitivity, inputs.driven_angles_sensitivity)
+            if x is not None
+        ]
+        if self._follows_momenta and self.model_functions.momentum_shift.is_active(theta, wanted):
+            return False
+        slopes += self.model_functions.input_corrections.effort_time_constants(theta, wanted) or ()
+        for samples in episode.measurements:
+            slopes += self._delay_in_steps(samples, theta, wanted) or ()
+        return not any(np.any(x) for x in slopes) and all(np.array_equal(a, b) for a, b in pairs)
+
+    @property
+    def _follows_momenta(self) -> bool:
+        """Whether a filter keeps the driven joints on their measured motion by their momenta too."""
+        return bool(self.system.driven) and not self.system.servos and self.options.feedback == "lqr"
+
+    # -- what drives the rollout --------------------------------------------------------------------------------------
+
+    def tracking_inputs(
+        self, episode: Episode, theta: Array, wanted: tuple[str, ...], state: Array, by_unknowns: Array | None = None
+    ) -> CorrectedInputs:
+        """Corrected inputs of an episode, with the momentum shift of its tracking filter's reference.
+
+        Parameters
+        ----------
+        episode : Episode
+        theta : ndarray, shape (ntheta,)
+        wanted : tuple of str
+        state : ndarray, shape (nx,)
+            Initial state.
+        by_unknowns : ndarray, optional, shape (nx, d)
+            Derivative of the initial state by the parameters and its estimated components.
+        """
+        inputs = self.corrected_inputs(episode, theta, wanted)
+        if not self._follows_momenta:
+            return inputs
+        rows = slice(2 * self.system.n_coordinates, None)
+        recorded = DrivenJointMotion(episode.smoothed_driven_angles, episode.torque, state[rows])
+        by_internal = None if by_unknowns is None else by_unknowns[rows]
+        return inputs.with_momentum_shift(
+            self.model_functions.momentum_shift, recorded, episode.measured_driven_angles, theta, wanted, by_internal
+        )
+
+    def corrected_inputs(self, episode: Episode, theta: Array, wanted: tuple[str, ...]) -> CorrectedInputs:
+        """True torques, angles and paths of an episode by the model's input effects, with derivatives by `wanted`."""
+        corrections = self.model_functions.input_corrections
+        torque, arm, path = episode.torque, episode.measured_driven_angles, episode.prescribed_path
+        nu, nc, errors = torque.shape[1], path.shape[1], episode.input_errors
+        first = torque[0] if nu else np.zeros(0)
+        by_torque = by_first = by_arm = by_path = by_recorded = None
+        if nu and corrections.delays_torque:
+            joints = episode.recording.joints
+            assert joints is not None
+            where = (joints, self.system.driven, episode.grid, episode.name)
+            delay, by_delay = corrections.torque_delay(theta, wanted)
+            torque = mean_step_inputs(*where, delay, self.system.servos)
+            by_recorded = mean_step_inputs_by_delay(*where, delay, self.system.servos)[:, :, None] * by_delay
+        if errors is not None:
+            # what multiplies or follows a reading would else take its noise for torque, and shrink to be rid of it
+            torque, first = torque - errors.recorded_torque_noise, first - errors.recorded_torque_noise[0]
+        if nu and (corrections.delays_torque or corrections.corrects_efforts):
+            readings = np.pad(np.vstack([torque, first]), ((0, 0), (0, nc)))
+            _, true, _, by_theta, by_reading = corrections.true_angles_and_efforts(
+                np.zeros_like(readings), readings, theta, wanted
+            )
+            by_theta = by_theta[:, :nu].copy()
+            if by_recorded is not None and wanted:
+                by_theta[:-1] += by_reading[:-1, :nu, None] * by_recorded
+            torque, first, by_torque, by_first = true[:-1, :nu], true[-1, :nu], by_theta[:-1], by_theta[-1]
+        lag = corrections.torque_time_constants(theta, wanted)
+        if lag is not None:
+            torque, by_torque = FirstOrderLag(*lag, self.step.time_step).filter_step_means(torque, by_torque)
+        if errors is not None:
+            torque, first = torque - errors.remaining_torque_error, first - errors.remaining_torque_error[0]
+        if corrections.corrects_angles:
+            true, _, by_angle, _, _ = corrections.true_angles_and_efforts(
+                np.hstack([arm, path]), episode.joint_loads, theta, wanted
+            )
+            arm, path, by_arm, by_path = true[:, :nu], true[:, nu:], by_angle[:, :nu], by_angle[:, nu:]
+        return CorrectedInputs(torque, first, path, arm, by_torque, by_first, by_path, by_arm)
+
+    # -- the rollout and its readings ---------------------------------------------------------------------------------
+
+    def predict_episode(
+        self, episode: Episode, theta: Array, offset: Array, derivatives: bool, guess: Array | None = None
+    ) -> EpisodePrediction | str:
+        """Roll out one episode and predict its samples; returns an error message where that fails."""
+        return self.predict_episodes([(episode, theta, offset, guess)], derivatives)[0]
+
+    def predict_episodes(
+        self, asked: Sequence[tuple[Episode, Array, Array, Array | None]], derivatives: bool
+    ) -> list[EpisodePrediction | str]:
+        """Roll out several episodes, each given as (episode, theta, offset, guess), and predict their samples."""
+
+        def part(some: Sequence[tuple[Episode, Array, Array, Array | None]]) -> list[EpisodePrediction | str]:
+            prepared = map_in_threads(lambda one: self._prepared(*one, derivatives), some)
+            rollouts = iter(simulate_batch(self.step, [p.member for p in prepared if not isinstance(p, str)]))
+            pairs = [(p, None if isinstance(p, str) else next(rollouts)) for p in prepared]
+            return map_in_threads(lambda pair: self._told(*pair), pairs)
+
+        width = len(self.unknowns.free_parameters) + len(self.estimated_state_indices) if derivatives else 0
+        each = [8 * (episode.grid.steps + 1) * self.step.sizes["nx"] * (width + 1) for episode, *_ in asked]
+        found: list[EpisodePrediction | str] = []
+        while len(found) < len(asked):
+            held = np.cumsum(each[len(found) :][:_MAX_PARALLEL_ROLLOUTS])
+            count = max(int(np.searchsorted(held, _MAX_ROLLOUT_MEMORY, "right")), 1)
+            found += part(asked[len(found) : len(found) + count])
+        return found
+
+    def _prepared(
+        self, episode: Episode, theta: Array, offset: Array, guess: Array | None, derivatives: bool
+    ) -> _Prepared | str:
+        """What an episode's rollout starts from and is driven by."""
+        wanted = self.unknowns.free_parameters if derivatives else ()
+        theta = self.episode_theta(episode, theta)
+        start = self.initial_state(episode, theta, offset, wanted, guess)
+        if start.failure_message:
+            return start.failure_message
+        by_start = start.state_sensitivity
+        inputs = self.tracking_inputs(episode, theta, wanted, start.state, by_start)
+        feedback, driven = episode.feedback_about_smoothed_motion, self.system.driven_indices
+        directions = None
+        if derivatives and by_start.shape[1]:
+            width, by_path = by_start.shape[1], inputs.prescribed_path_sensitivity
+            by_torque = inputs.nominal_torque_tangents(feedback, driven, width)
+            by_path = None if by_path is None else np.pad(by_path, ((0, 0), (0, 0), (0, width - len(wanted))))
+            directions = SensitivityDirections(wanted, by_start, by_torque, by_path)
+        feedback = inputs.corrected_feedback(feedback, driven, episode.measured_driven_angles)
+        member = rollout_inputs(
+            self.step,
+            theta,
+            start.state,
+            episode.grid.steps,
+            inputs.torque,
+            inputs.prescribed_path,
+            feedback,
+            directions,
+        )
+        return _Prepared(episode, start, inputs, member, wanted, derivatives)
+
+    def _told(self, prepared: _Prepared | str, rollout: Rollout | None) -> EpisodePrediction | str:
+        """The samples of a rollout."""
+        if isinstance(prepared, str) or rollout is None:
+            return str(prepared)
+        episode, start, inputs, wanted = prepared.episode, prepared.start, prepared.inputs, prepared.wanted
+        theta, feedback, directions = prepared.member.theta, prepared.member.feedback, prepared.member.directions
+        driven = self.system.driven_indices
+        if not rollout.status.is_converged:
+            return f"{episode.name}: {rollout.status.message}"
+        by_applied = None
+        if directions is not None and rollout.state_sensitivity is not None and driven:
+            by_applied = np.zeros((*rollout.torque.shape, directions.count))
+            if directions.torque_tangents is not None:
+                by_applied += directions.torque_tangents
+            if feedback is not None:
+                by_applied -= feedback.gain @ rollout.state_sensitivity[:-1, feedback.state_indices]
+        predicted, sensitivities, read = [], [], self._recorded(episode, rollout, theta, wanted)
+        for samples in episode.measurements:
+            values, by_all = self._predict(samples, read, by_applied, theta, wanted)
+            predicted.append(values)
+            sensitivities.append(by_all)
+        correction = by_correction = None
+        if episode.input_errors is not None and episode.input_errors.has_encoder_measurements and feedback is not None:
+            correction = rollout.torque - inputs.torque
+            by_correction = by_applied
+            if by_applied is not None and inputs.torque_sensitivity is not None:
+                by_correction = by_applied.copy()
+                by_correction[:, :, : len(wanted)] -= inputs.torque_sensitivity
+        # states by all directions are the largest arrays of all, and what samples need of them has been taken
+        rollout = replace(rollout, state_sensitivity=None, multipliers_sensitivity=None, effort_sensitivity=None)
+        return EpisodePrediction(
+            rollout,
+            start.equilibrium,
+            tuple(predicted),
+            tuple(sensitivities) if prepared.derivatives else None,
+            None if start.equilibrium is None else start.equilibrium.state[: self.system.n_coordinates],
+            correction,
+            by_correction,
+        )
+
+    def episode_and_whitening_filter(
+        self, episode: Episode, theta: Array, offset: Array, guess: Array | None, before: WhiteningFilter | None
+    ) -> tuple[Episode, WhiteningFilter | None]:
+        """Return the episode with its estimated input errors, and the filter that whitens its residual here.
+
+        The filter is None without process noise, or where the rollout fails.
+
+        Parameters
+        ----------
+        episode : Episode
+        theta : ndarray, shape (ntheta,)
+        offset : ndarray
+            Of an estimated start.
+        guess : ndarray, shape (n,), or None
+            Configuration near the equilibrium.
+        before : Innovations or None
+            Filter that the episode has already; the new one is linearized about the motion that it smooths.
+        """
+        if episode.input_errors is None:
+            return episode, None
+        result = self.predict_episode(episode, theta, offset, False, guess)
+        if before is not None and not isinstance(result, str):
+            episode = self._about_smoothed(episode, theta, result, before)
+            result = self.predict_episode(episode, theta, offset, False, guess)
+        if isinstance(result, str) or episode.input_errors is None:
+            return episode, None
+        return episode, build_whitening_filter(self.nominal_trajectory(episode, result, theta), episode.input_errors)
+
+    def _about_smoothed(
+        self, episode: Episode, theta: Array, result: EpisodePrediction, before: WhiteningFilter
+    ) -> Episode:
+        """The episode about what all measurements say of its torques and, where encoders are among them, its motion."""
+        errors, feedback = episode.input_errors, episode.tracking_feedback
+        assert errors is not None
+        found = before.smooth(_plain(episode, result), result.torque_correction_columns)
+        own = self.episode_theta(episode, theta)
+        errors = self._behind_effects(
+            episode, own, replace(errors, torque_bias=found.torque_bias, torque_noise=found.torque_noise)
+        )
+        if errors.has_encoder_measurements and feedback is not None:
+            inputs = self.tracking_inputs(episode, own, (), result.rollout.state[0])
+            guided = inputs.corrected_feedback(feedback, self.system.driven_indices, episode.measured_driven_angles)
+            assert guided is not None
+            shift = guided.reference - feedback.reference
+            true = (result.rollout.state - found.state_error)[:-1, feedback.state_indices]
+            errors = replace(errors, smoothed_reference=true - shift)
+        return replace(episode, input_errors=errors)
+
+    def _behind_effects(self, episode: Episode, theta: Array, errors: InputErrors) -> InputErrors:
+        """The same errors with what of the readings is noise: by which readings are multiplied, w is divided."""
+        corrections, nu = self.model_functions.input_corrections, errors.torque_noise.shape[1]
+        read = errors.torque_noise
+        if corrections.corrects_efforts:
+            readings = np.pad(episode.torque, ((0, 0), (0, episode.prescribed_path.shape[1])))
+            by_reading = corrections.true_angles_and_efforts(np.zeros_like(readings), readings, theta, ())[4][:, :nu]
+            # a reading of which hardly anything acts says nothing of what is wrong with it
+            seen = np.abs(by_reading) > _MIN_TORQUE_GAIN
+            read = np.where(seen, read, 0.0) / np.where(seen, by_reading, 1.0)
+        none = replace(episode, input_errors=errors.with_bias_only)
+        without = replace(episode, input_errors=replace(errors.with_bias_only, recorded_torque_noise=read))
+        through = self.corrected_inputs(none, theta, ()).torque - self.corrected_inputs(without, theta, ()).torque
+        return replace(errors, recorded_torque_noise=read, transmitted_torque_noise=through)
+
+    def estimate_torque_bias(self, episode: Episode, result: EpisodePrediction, whitening: WhiteningFilter) -> Array:
+        """Constant torque error of each driven joint, estimated from all measurements of an episode, (nu,) [N m]."""
+        return whitening.whiten(_plain(episode, result)[:, None], result.torque_correction_columns)[1][:, 0]
+
+    def nominal_trajectory(self, episode: Episode, result: EpisodePrediction, theta: Array) -> NominalTrajectory:
+        """Trajectory of an episode about which its input errors are linearized."""
+        own, rollout = self.episode_theta(episode, theta), result.rollout
+        nx, nu = self.step.sizes["nx"], self.step.sizes["nu"]
+        by_angles, by_torque = np.zeros((nx, nu)), np.zeros((nx, nu))
+        if result.equilibrium is not None:
+            by_angles, by_torque = (
+                result.equilibrium.state_by_known_coordinates[:, :nu],
+                result.equilibrium.state_by_torque,
+            )
+        return NominalTrajectory(
+            self.model_functions,
+            own,
+            rollout,
+            [self.measurements_at_true_times(samples, own) for samples in episode.measurements],
+            episode.tracking_feedback,
+            self.joint_efforts(rollout),
+            by_angles,
+            by_torque,
+        )
+
+    def readings_along_trajectory(
+        self, samples: Measurements, state: Array, by_state: Array, theta: Array
+    ) -> tuple[Array, Array]:
+        """Sensor readings along a given trajectory and their derivatives.
+
+        Parameters
+        ----------
+        samples : Measurements
+        state : ndarray, shape (N + 1, nx)
+        by_state : ndarray, shape (N + 1, nx, d)
+            The first of the d directions are the free parameters.
+        theta : ndarray, shape (ntheta,)
+
+        Returns
+        -------
+        predicted : ndarray, shape (M, k)
+        sensitivities : ndarray, shape (M, k, d)
+        """
+        effort = np.zeros((len(samples.evaluation_nodes), self.system.n_coordinates))
+        read = _Trajectory(state, by_state, effort, None, None)
+        y, total = self._read(samples, read, theta, self.unknowns.free_parameters)
+        return samples.interpolate(y), samples.interpolate(total)
+
+    def joint_efforts(self, rollout: Rollout) -> Array:
+        """Effort of prescribed joints and torque of driven ones along a rollout, zero elsewhere, shape (N + 1, n)."""
+        steps = len(rollout.multipliers)
+        effort = np.zeros((steps + 1, self.system.n_coordinates))
+        effort[:-1, list(self.system.prescribed_indices)] = rollout.effort
+        effort[:-1, list(self.system.driven_indices)] = rollout.torque
+        effort[-1] = effort[-2]
+        return effort
+
+    def _delay_in_steps(
+        self, samples: Measurements, theta: Array, wanted: tuple[str, ...]
+    ) -> tuple[Array, Array] | None:
+        """Delay of each output in steps, shape (k,), and its derivative, (k, d); None without delays."""
+        found = self.model_functions.input_corrections.sensor_delay(samples.sensor, theta, wanted)
+        return None if found is None else (found[0] / self.step.time_step, found[1] / self.step.time_step)
+
+    def measurements_at_true_times(self, samples: Measurements, theta: Array) -> Measurements:
+        """Measurements shifted to the times at which their readings were true."""
+        late = self._delay_in_steps(samples, theta, ())
+        return samples if late is None else samples.delayed_by(late[0])
+
+    def _recorded(self, episode: Episode, rollout: Rollout, theta: Array, wanted: tuple[str, ...]) -> Rollout:
+        """The rollout with efforts of prescribed joints as they are compared: as sensors follow them, and smoothed."""
+        effort, slope = rollout.effort, rollout.effort_sensitivity
+        if (lag := self.model_functions.input_corrections.effort_time_constants(theta, wanted)) is not None:
+            effort, slope = FirstOrderLag(*lag, self.step.time_step).filter_node_values(effort, slope)
+        if (smooth := self.effort_smoother(episode, theta)) is not None:
+            effort, slope = smooth.smooth(effort), None if slope is None else smooth.smooth(slope)
+        return replace(rollout, effort=effort, effort_sensitivity=slope)
+
+    def effort_smoother(self, episode: Episode, theta: Array) -> NodeSmoother | None:
+        """Smoother of predicted efforts of prescribed joints, the filter of the measured ones; None if not compared."""
+        compared = [samples for samples in episode.measurements if samples.sensor.effort_joints]
+        if not math.isfinite(self.options.path_cutoff) or not compared:
+            return None
+        nodes = np.unique(
+            np.concatenate([self.measurements_at_true_times(samples, theta).evaluation_nodes for samples in compared])
+        )
+        return LowPassFilter(self.options.path_cutoff).node_smoother(nodes, episode.grid.steps, self.step.time_step)
+
+    def _predict(
+        self, samples: Measurements, rollout: Rollout, by_applied: Array | None, theta: Array, wanted: tuple[str, ...]
+    ) -> tuple[Array, Array]:
+        unmoved, late = samples, self._delay_in_steps(samples, theta, wanted)
+        if late is not None:
+            samples = samples.delayed_by(late[0])
+        effort = self.joint_efforts(rollout)[samples.evaluation_nodes]
+        along = _Trajectory(rollout.state, rollout.state_sensitivity, effort, rollout.effort_sensitivity, by_applied)
+        y, total = self._read(samples, along, theta, wanted)
+        predicted, slopes = samples.interpolate(y), samples.interpolate(total)
+        if late is not None and rollout.state_sensitivity is not None:
+            slopes[:, :, : len(wanted)] -= samples.prediction_rate(y, unmoved, late[0])[:, :, None] * late[1]
+        return predicted, slopes
+
+    def _read(
+        self, samples: Measurements, along: _Trajectory, theta: Array, wanted: tuple[str, ...]
+    ) -> tuple[Array, Array]:
+        """Readings at the samples' nodes, (nodes, k), and their derivatives by d directions, (nodes, k, d)."""
+        n, nodes = self.system.n_coordinates, samples.evaluation_nodes
+        q, z = along.state[nodes, :n], along.state[nodes, 2 * n :]
+        y, by_q, by_z, by_load, by_theta = self.model_functions.compiled_sensor(samples.sensor, wanted)(
+            q, z, along.effort, theta
+        )
+        if along.by_state is None:
+            return y[:, :, 0], np.zeros((*y.shape[:2], 0))
+        total = by_q @ along.by_state[nodes, :n]
+        if z.shape[1]:
+            total += by_z @ along.by_state[nodes, 2 * n :]
+        loads = ((self.system.prescribed_indices, along.by_effort), (self.system.driven_indices, along.by_torque))
+        for index, by_load_there in loads:
+            if index and by_load_there is not None and np.any(by_load[:, :, list(index)]):
+                total += by_load[:, :, list(index)] @ by_load_there[np.minimum(nodes, len(by_load_there) - 1)]
+        total[:, :, : len(wanted)] += by_theta
+        return y[:, :, 0], total
+
+    # -- the adjoint --------------------------------------------------------------------------------------------------
+
+    def gradient_by_adjoint(
+        self, episode: Episode, result: EpisodePrediction, theta: Array, offset: Array, pulls: list[Array]
+    ) -> Array:
+        """Gradient of a cost of an episode's predictions by its (shared, local, start) unknowns, by the adjoint.
+
+        Parameters
+        ----------
+        episode : Episode
+        result : EpisodeResult
+            At the same unknowns.
+        theta : ndarray, shape (ntheta,)
+        offset : ndarray
+            Of an estimated start.
+        pulls : list of ndarray, shape (M, k) each
+            Derivative of the cost by every prediction.
+        """
+        wanted, rollout = self.unknowns.free_parameters, result.rollout
+        theta = self.episode_theta(episode, theta)
+        by_state = np.zeros((episode.grid.steps + 1, self.step.sizes["nx"]))
+        by_effort, by_applied = np.zeros_like(rollout.effort), np.zeros_like(rollout.torque)
+        total, read = np.zeros(len(wanted)), self._recorded(episode, rollout, theta, ())
+        for samples, pull in zip(episode.measurements, pulls, strict=True):
+            total += self._pull(samples, pull, read, theta, _Pulls(by_state, by_effort, by_applied))
+        if (smooth := self.effort_smoother(episode, theta)) is not None:
+            by_effort = smooth.smoothing_adjoint(by_effort)
+        if (lag := self.model_functions.input_corrections.effort_time_constants(theta, wanted)) is not None:
+            by_effort, by_lag = FirstOrderLag(*lag, self.step.time_step).node_values_adjoint(rollout.effort, by_effort)
+            total += by_lag
+        feedback = episode.tracking_feedback
+        if feedback is not None:
+            by_state[:-1, feedback.state_indices] -= np.einsum("kub,ku->kb", feedback.gain, by_applied)
+        by_inputs = adjoint_gradient(self.step, theta, rollout, wanted, by_state, None, by_effort, feedback)
+        start = self.initial_state(episode, theta, offset, wanted, result.equilibrium_guess)
+        inputs = self.tracking_inputs(episode, theta, wanted, start.state, start.state_sensitivity)
+        own = np.concatenate([total + by_inputs.by_theta, np.zeros(len(self.unknowns.initial_state_names))])
+        by_torque = inputs.nominal_torque_tangents(feedback, self.system.driven_indices, len(own))
+        if by_torque is not None:
+            own += np.einsum("ku,kuw->w", by_inputs.by_torque + by_applied, by_torque)
+        if inputs.prescribed_path_sensitivity is not None:
+            # node 0 is part of the start state
+            own[: len(total)] += np.einsum(
+                "kc,kcw->w", by_inputs.by_prescribed_path[1:], inputs.prescribed_path_sensitivity[1:]
+            )
+        return np.asarray(own + by_inputs.by_initial_state @ start.state_sensitivity)
+
+    def _pull(self, samples: Measurements, pull: Array, rollout: Rollout, theta: Array, pulls: _Pulls) -> Array:
+        """Spread the pull at one group's samples over states and efforts; the direct part by the parameters."""
+        n, wanted = self.system.n_coordinates, self.unknowns.free_parameters
+        unmoved, late = samples, self._delay_in_steps(samples, theta, wanted)
+        if late is not None:
+            samples = samples.delayed_by(late[0])
+        at_nodes, nodes = samples.interpolation_adjoint(pull), samples.evaluation_nodes
+        q, z = rollout.state[nodes, :n], rollout.state[nodes, 2 * n :]
+        effort = self.joint_efforts(rollout)[nodes]
+        y, by_q, by_z, by_load, by_theta = self.model_functions.compiled_sensor(samples.sensor, wanted)(
+            q, z, effort, theta
+        )
+        direct = np.einsum("mk,mkq->q", at_nodes, by_theta)
+        if late is not None:
+            direct -= np.sum(pull * samples.prediction_rate(y[:, :, 0], unmoved, late[0]), axis=0) @ late[1]
+        pulls.by_state[nodes, :n] += np.einsum("mk,mkq->mq", at_nodes, by_q)
+        pulls.by_state[nodes, 2 * n :] += np.einsum("mk,mkq->mq", at_nodes, by_z)
+        last = np.minimum(nodes, len(rollout.effort) - 1)
+        loads = ((self.system.prescribed_indices, pulls.by_effort), (self.system.driven_indices, pulls.by_torque))
+        for index, by_load_there in loads:
+            if index:
+                np.add.at(by_load_there, last, np.einsum("mk,mkq->mq", at_nodes, by_load[:, :, list(index)]))
+        return np.asarray(direct)
+
+
+@dataclass(frozen=True)
+class _Trajectory:
+    """States at all nodes, efforts at the nodes that are read, and derivatives of states, efforts, applied torques."""
+
+    state: Array
+    by_state: Array | None
+    effort: Array
+    by_effort: Array | None
+    by_torque: Array | None
+
+
+@dataclass(frozen=True)
+class _Pulls:
+    """Derivatives of a cost by states, efforts of prescribed joints and applied torques, added up."""
+
+    by_state: Array
+    by_effort: Array
+    by_torque: Array
+
+
+def _plain(episode: Episode, result: EpisodePrediction) -> Array:
+    """Residual of an episode in units of the sensors' noise, their constant errors taken off."""
+    samples = subtract_estimated_biases(episode.measurements, result.predicted_outputs)
+    return np.concatenate(
+        [s.residual_block(y).residual for s, y in zip(samples, result.predicted_outputs, strict=True)]
+    )

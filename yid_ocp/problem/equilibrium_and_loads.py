@@ -1,0 +1,111 @@
+"""Preparation of episodes before estimation: the observed initial equilibrium and the gear loads."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.errors import DataError
+from yid_ocp.problem.episode_prediction import EpisodePredictor
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.measurements import Measurements
+from yid_ocp.problem.prediction_result import InitialState
+from yid_ocp.problem.recorded_inputs import denoised_gear_loads
+
+Array = NDArray[np.float64]
+
+_MAX_FIRST_SAMPLE_TIME = 1.0
+"""Latest time at which a point's first sample still shows the initial equilibrium [s]."""
+_POOR_EQUILIBRIUM_RMSE = 5.0
+"""Root mean square error of first points above which another equilibrium is sought [standard deviations]."""
+_MAX_REMAINING_ERROR_FRACTION = 0.5
+"""Largest fraction of that error that may remain at another equilibrium."""
+
+
+def with_observed_equilibrium(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:
+    """Episode with the initial equilibrium that its points show and with gear loads free of effort noise.
+
+    Parameters
+    ----------
+    predictor : Predictor
+    episode : Episode
+    theta : ndarray, shape (ntheta,)
+        Nominal parameters.
+    """
+    return _loaded(predictor, _at_rest(predictor, episode, theta), theta)
+
+
+def _at_rest(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:
+    """Episode with the equilibrium near its first points, where that of least energy is far from them."""
+    fitted = episode.fixed_initial_state is not None or predictor.options.initial_state == "fitted_to_points"
+    if fitted or not predictor.system.grasps:
+        return episode
+    seen = [found for samples in episode.measurements if (found := _first(samples, episode.grid.time_step)) is not None]
+    if not seen:
+        return episode
+    own, n = predictor.episode_theta(episode, theta), predictor.system.n_coordinates
+    offset = np.zeros(len(predictor.unknowns.initial_state_names))
+    least = predictor.initial_state(episode, own, offset, ())
+    error = _error(predictor, seen, least, own)
+    if not error > _POOR_EQUILIBRIUM_RMSE:
+        return episode
+    try:
+        shape = predictor.model_functions.initial_state_fitter.fit_to_points(
+            episode.initial_known_coordinates, seen, own, _MAX_FIRST_SAMPLE_TIME, episode.prescribed_path
+        ).state[:n]
+    except DataError:
+        return episode
+    other = predictor.initial_state(episode, own, offset, (), shape)
+    if not _error(predictor, seen, other, own) < _MAX_REMAINING_ERROR_FRACTION * error:
+        return episode
+    return replace(episode, equilibrium_guess=other.state[:n])
+
+
+def _first(samples: Measurements, time_step: float) -> Measurements | None:
+    """The first sample of points, as if it were taken at node 0; None where it comes too late."""
+    rows = np.flatnonzero(samples.is_used.any(axis=1))[:1]
+    if (
+        not samples.sensor.point_names
+        or not len(rows)
+        or np.max(samples.node[rows]) * time_step > _MAX_FIRST_SAMPLE_TIME
+    ):
+        return None
+    parts = {name: getattr(samples, name)[rows] for name in ("value", "weight", "std")}
+    return replace(samples, node=np.zeros(1, np.int64), fraction=np.zeros(1), noise_correlation=None, **parts)
+
+
+def _error(predictor: EpisodePredictor, seen: Sequence[Measurements], start: InitialState, theta: Array) -> float:
+    """Root mean square error of first points at a start [standard deviations]; infinite where it is not at rest."""
+    if start.failure_message:
+        return math.inf
+    n, state = predictor.system.n_coordinates, start.state[None]
+    squares: list[Array] = []
+    for samples in seen:
+        read = predictor.model_functions.compiled_sensor(samples.sensor, predictor.unknowns.free_parameters)
+        predicted = read(state[:, :n], state[:, 2 * n :], np.zeros((1, n)), theta)[0][:, :, 0]
+        squares.append(samples.whitened_residual(predicted)[samples.is_used] ** 2)
+    return float(np.sqrt(np.mean(np.concatenate(squares))))
+
+
+def _loaded(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:
+    """The episode with the model's own loads on the gears of joints whose efforts are compared; see `denoised_gear_loads`."""
+    compared, corrections = (
+        [s for s in episode.measurements if s.sensor.effort_joints],
+        predictor.model_functions.input_corrections,
+    )
+    if not compared or not corrections.angles_depend_on_effort:
+        return episode
+    result = predictor.predict_episode(episode, theta, np.zeros(len(predictor.unknowns.initial_state_names)), False)
+    if isinstance(result, str):
+        return episode
+    load, own = episode.joint_loads.copy(), predictor.joint_efforts(result.rollout)
+    for samples in compared:
+        at = [corrections.joint_names.index(joint) for joint in samples.sensor.effort_joints]
+        column = [predictor.system.mechanism.joint_index(joint) for joint in samples.sensor.effort_joints]
+        cutoff = predictor.options.path_cutoff
+        load[:, at] = denoised_gear_loads(load[:, at], own[:, column], samples.node, episode.grid.node_times, cutoff)
+    return replace(episode, joint_loads=load)

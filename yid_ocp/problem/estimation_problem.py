@@ -1,0 +1,626 @@
+"""The estimation problem: a model and recordings, its unknowns, and the residual with its derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from yid_ocp.data.recording import Recording
+from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
+from yid_ocp.errors import DataError
+from yid_ocp.integrator.step import Step
+from yid_ocp.model.system import System
+from yid_ocp.parallel import map_in_threads
+from yid_ocp.problem.episode_prediction import EpisodePredictor
+from yid_ocp.problem.episodes import Episode, mass_matrix_diagonal, prepare_episode
+from yid_ocp.problem.equilibrium_and_loads import with_observed_equilibrium
+from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation, ResidualRows, whitened_episode_residual
+from yid_ocp.problem.held_out_initial_state import estimate_initial_state_offset
+from yid_ocp.problem.input_noise import InputErrors, WhiteningFilter
+from yid_ocp.problem.measurements import ResidualBlock, huber_loss
+from yid_ocp.problem.model_functions import ModelFunctions
+from yid_ocp.problem.options import ProblemOptions
+from yid_ocp.problem.prediction_result import EpisodePrediction, InitialState
+from yid_ocp.problem.synthetic_recording import synthesize_recording
+from yid_ocp.problem.torque_bias_relinearization import relinearized_filters, with_filter_input_errors
+from yid_ocp.problem.unknown_vector import (
+    UnknownVectorLayout,
+    check_free_parameters,
+    check_parameter_bounds,
+    estimated_initial_state_names,
+    initial_state_limits,
+    soft_logarithm,
+    stated_prior_jacobian,
+    stated_prior_std,
+    with_named_entries,
+)
+
+Array = NDArray[np.float64]
+
+
+class EstimationProblem(ReprMixin):
+    """Estimation of free parameters from recordings: residual, cost and derivatives; immutable and thread-safe.
+
+    Methods evaluate the cost, predict held-out recordings, derive problems with other parameters, data or options,
+    whiten residuals, and pack and split the unknown vector.
+
+    Parameters
+    ----------
+    step : Step
+        Compiled step; its time step is the problem's.
+    recordings : sequence of Recording
+        To estimate on.
+    free : sequence of str
+        Names of free parameters.
+    options : ProblemOptions, optional
+    values : mapping of str to float, optional
+        Initial values, and values of fixed parameters, where they differ from the model's.
+    held_out : sequence of Recording
+        Not used by the fit, only predicted by `predict_held_out`.
+    may_free : sequence of str, optional
+        Further parameters that `with_free_subset` may be asked for; the model's functions are differentiated by them as well.
+
+    Attributes
+    ----------
+    free : tuple of str
+    theta : ndarray, shape (ntheta,)
+        Initial values of free parameters and values of fixed ones.
+    unknowns : Unknowns
+        Layout of the unknown vector.
+    episodes, held_out : tuple of Episode
+    residual_rows : ResidualRows
+        Layout of the residual.
+    whitening_filters : tuple of Innovations or None
+        Filter that whitens each recording's residual; None where sensor noise is the only noise, see `whitened_at`.
+    held_out_whitening_filters : tuple of Innovations or None
+        The same for held-out recordings, see `held_out_whitened_at`.
+
+    Raises
+    ------
+    ConfigError
+        Unknown or doubly named parameters, a value outside its bounds.
+    DataError
+        A recording that does not fit the model: missing joints or points, no noise level, too short.
+    """
+
+    model_functions: ModelFunctions
+    options: ProblemOptions
+    free: tuple[str, ...]
+    theta: Array
+    episodes: tuple[Episode, ...]
+    held_out: tuple[Episode, ...]
+    unknowns: UnknownVectorLayout
+    predictor: EpisodePredictor
+    residual_rows: ResidualRows
+    whitening_filters: tuple[WhiteningFilter | None, ...]
+    held_out_whitening_filters: tuple[WhiteningFilter | None, ...]
+
+    def __init__(
+        self,
+        step: Step,
+        recordings: Sequence[Recording],
+        free: Sequence[str],
+        options: ProblemOptions | None = None,
+        values: Mapping[str, float] | None = None,
+        held_out: Sequence[Recording] = (),
+        may_free: Sequence[str] = (),
+    ) -> None:
+        options = options or ProblemOptions()
+        check_free_parameters(step.system, free, options)
+        if not recordings:
+            raise DataError("there is no recording to estimate on", hint="give at least one under recordings.estimate")
+        theta = step.system.parameters.vector(values)
+        names = (*free, *(name for name in may_free if name not in free))
+        functions = ModelFunctions(step, names, options.start_fit_parameters)
+        check_parameter_bounds(step.system, free, theta)
+        episodes, others = (
+            tuple(prepare_episode(functions, recording, options, theta) for recording in group)
+            for group in (recordings, held_out)
+        )
+        self._set(functions, options, tuple(free), theta, episodes, others)
+        fitted = (self.predictor.with_fitted_initial_state(episode, theta) for episode in episodes)
+        ready, other = (
+            tuple(with_observed_equilibrium(self.predictor, e, theta) for e in group) for group in (fitted, others)
+        )
+        self._set(functions, options, tuple(free), theta, ready, other)
+
+    def _set(
+        self,
+        model_functions: ModelFunctions,
+        options: ProblemOptions,
+        free: tuple[str, ...],
+        theta: Array,
+        episodes: tuple[Episode, ...],
+        held_out: tuple[Episode, ...],
+        whitening_filters: tuple[WhiteningFilter | None, ...] = (),
+        held_out_whitening_filters: tuple[WhiteningFilter | None, ...] = (),
+    ) -> None:
+        theta.setflags(write=False)
+        self.whitening_filters = whitening_filters or (None,) * len(episodes)
+        self.held_out_whitening_filters = held_out_whitening_filters or (None,) * len(held_out)
+        self.model_functions, self.options, self.free, self.theta = model_functions, options, free, theta
+        self.episodes, self.held_out = episodes, held_out
+        self.unknowns = UnknownVectorLayout(
+            tuple(name for name in free if name not in options.local_parameters),
+            tuple(name for name in free if name in options.local_parameters),
+            estimated_initial_state_names(model_functions.step.system, options, free, theta),
+            tuple(episode.name for episode in episodes),
+        )
+        self.predictor = EpisodePredictor(model_functions, options, self.unknowns)
+        inertia = partial(mass_matrix_diagonal, model_functions.step, theta)
+        self._prior_std = stated_prior_std(self.unknowns, options, model_functions.step.system, inertia)
+        bare = options.weighting == "paper" or options.weak_prior_factor <= 1
+        weak = np.zeros(len(self.unknown_names), bool) if bare else self.is_positive & ~np.isfinite(self._prior_std)
+        self._weak: NDArray[np.int64] = np.flatnonzero(weak)
+        self._stated = stated_prior_jacobian(self.unknowns, options, self._prior_std)
+        self.residual_rows = ResidualRows.from_episodes(episodes, len(self._stated), len(self._weak))
+
+    def _changed(self, **changes: Any) -> EstimationProblem:
+        """Changed problem that shares the compiled functions; episodes are not prepared again."""
+        made = object.__new__(EstimationProblem)
+        kept = ("model_functions", "options", "free", "theta", "episodes", "held_out")
+        same = {name: getattr(self, name) for name in (*kept, "whitening_filters", "held_out_whitening_filters")}
+        made._set(**{**same, **changes})
+        return made
+
+    def _summary(self) -> ReprSummary:
+        free = f"{len(self.free)} of {count_with_noun(len(self.system.parameters), 'parameter')} free"
+        seen = sum(int(samples.is_used.sum()) for episode in self.episodes for samples in episode.measurements)
+        used, held = (count_with_noun(len(entries), "recording") for entries in (self.episodes, self.held_out))
+        rows: list[tuple[str, ...]] = [("unknown", "start", "lower", "upper")]
+        rows += [
+            (n, *(f"{v:.4g}" for v in own))
+            for n, *own in zip(self.unknown_names, self.initial_unknowns, *self.bounds, strict=True)
+        ]
+        return ReprSummary(f"{self.system.mechanism.name}, {free}, {seen} values of {used}, {held} held out", rows)
+
+    # -- what it is made of -------------------------------------------------------------------------------------------
+
+    @property
+    def step(self) -> Step:
+        """The compiled step."""
+        return self.model_functions.step
+
+    @property
+    def system(self) -> System:
+        """The step's system."""
+        return self.model_functions.step.system
+
+    @property
+    def unknown_names(self) -> tuple[str, ...]:
+        """Names of all unknowns; local ones and initial states carry their recording's name."""
+        return self.unknowns.unknown_names
+
+    @property
+    def shared_parameters(self) -> tuple[str, ...]:
+        """Free parameters with one value for all recordings."""
+        return self.unknowns.shared_parameters
+
+    @property
+    def local_parameters(self) -> tuple[str, ...]:
+        """Free parameters with a value of their own in every recording."""
+        return self.unknowns.local_parameters
+
+    @property
+    def initial_unknowns(self) -> Array:
+        """Initial guess of the unknown vector, shape (nx,)."""
+        index = self.system.parameters.index
+        shared, local = (
+            [self.theta[index(name)] for name in part] for part in (self.shared_parameters, self.local_parameters)
+        )
+        return self.unknowns.pack(shared, local, np.zeros(len(self.unknowns.initial_state_names)))
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper bounds of the unknown vector."""
+        shared, local = (
+            self.system.parameters.bounds(part) for part in (self.shared_parameters, self.local_parameters)
+        )
+        wide = initial_state_limits(self.system, self.unknowns.initial_state_names)
+        lower, upper = (
+            self.unknowns.pack(shared[side], local[side], wide * (-1 if side == 0 else 1)) for side in (0, 1)
+        )
+        return lower, upper
+
+    @property
+    def unknown_scales(self) -> Array:
+        """Typical size of each unknown: its initial value, its prior's standard deviation, or a tenth of its range."""
+        lower, upper = self.bounds
+        size = np.abs(self.initial_unknowns)
+        width = np.where(np.isfinite(upper - lower), upper - lower, 10.0)
+        fallback = np.where(np.isfinite(self._prior_std), self._prior_std, 0.1 * width)
+        return np.where(size > 0, size, fallback)
+
+    @property
+    def is_positive(self) -> NDArray[np.bool_]:
+        """Mask of unknowns that must be positive and have a positive initial value, shape (nx,)."""
+        return (self.bounds[0] >= 0) & (self.initial_unknowns > 0)
+
+    @property
+    def data_noise_unit(self) -> float:
+        """Noise unit of the data residuals: 1 where they are whitened, else the points' root mean square noise [m]."""
+        if self.options.weighting != "paper":
+            return 1.0
+        found = [s.std[np.isfinite(s.std)] for episode in self.episodes for s in episode.measurements]
+        return float(np.sqrt(np.mean(np.concatenate(found) ** 2)))
+
+    @property
+    def initial_state_prior_std(self) -> Array:
+        """Prior standard deviation of each estimated component of an initial state."""
+        at = len(self.unknowns.free_parameters)
+        return self._prior_std[at : at + len(self.unknowns.initial_state_names)]
+
+    @property
+    def has_uncorrected_inputs(self) -> bool:
+        """Whether no effect corrects recorded inputs, times or the tracked reference: none is free or non-neutral."""
+        return all(self.predictor.has_uncorrected_inputs(episode, self.theta) for episode in self.episodes)
+
+    # -- the unknown vector -------------------------------------------------------------------------------------------
+
+    def split(self, x: ArrayLike, episode: int) -> tuple[Array, Array]:
+        """Return theta and the initial state offset of one episode from the unknown vector."""
+        return self.unknowns.split(x, episode, self.theta, self.system)
+
+    def vector(self, values: Mapping[str, float]) -> Array:
+        """Initial unknown vector with named entries replaced, clipped to the bounds, shape (nx,)."""
+        return np.clip(with_named_entries(self.initial_unknowns, self.unknown_names, values), *self.bounds)
+
+    def named_values(self, x: Array) -> dict[str, float]:
+        """Unknown vector as a dictionary of name to value."""
+        return dict(zip(self.unknown_names, map(float, x), strict=True))
+
+    # -- evaluation ---------------------------------------------------------------------------------------------------
+
+    def evaluate(
+        self, x: ArrayLike, derivatives: bool = True, equilibrium_guesses: EquilibriumGuesses | None = None
+    ) -> Evaluation:
+        """Residual, cost and, where asked for, Jacobian at an unknown vector.
+
+        Parameters
+        ----------
+        x : array_like, shape (nx,)
+        derivatives : bool
+        equilibrium_guesses : WarmStart, optional
+            `Evaluation.equilibrium_guesses` of a nearby point; without it the equilibrium of least energy is searched, which takes
+            longer.
+
+        Returns
+        -------
+        Evaluation
+            `ok` is False, with the reason, where an equilibrium or a rollout failed.
+        """
+        x = np.asarray(x, float)
+        pairs = zip(self.episodes, equilibrium_guesses or (None,) * len(self.episodes), strict=True)
+        asked = [(e, *self.split(x, i), guess) for i, (e, guess) in enumerate(pairs)]
+        results = self.predictor.predict_episodes(asked, derivatives)
+        failures = [result for result in results if isinstance(result, str)]
+        if failures:
+            return Evaluation(np.inf, np.zeros(0), None, False, failures[0], ())
+        done = tuple(result for result in results if isinstance(result, EpisodePrediction))
+        cost, residuals, jacobians = 0.0, [], []
+        for i, result in enumerate(done):
+            part = whitened_episode_residual(
+                self.episodes[i], self.whitening_filters[i], result, self.options.huber_threshold
+            )
+            cost += part.cost
+            residuals.append(part.residual)
+            if part.jacobian is not None:
+                jacobians.append(self.unknowns.scatter_columns(part.jacobian, i))
+        done = tuple(replace(result, output_sensitivities=None, torque_correction_sensitivity=None) for result in done)
+        prior_residual, prior_jacobian = self.prior_residual(x)
+        residual = np.concatenate([*residuals, prior_residual])
+        cost += 0.5 * float(prior_residual @ prior_residual)
+        jacobian = np.vstack([*jacobians, prior_jacobian]) if derivatives else None
+        if not np.isfinite(cost):
+            return Evaluation(np.inf, residual, None, False, "the cost is not finite", done)
+        return Evaluation(cost, residual, jacobian, True, "", done)
+
+    def estimate_torque_biases(self, x: ArrayLike) -> list[tuple[Array, Array] | None]:
+        """Estimate each recording's constant torque errors at `x`: values and standard deviations (nu,) [N m].
+
+        None where torques are taken as exact, or where no whitening filter is set (`whitened_at`).
+        """
+        x = np.asarray(x, float)
+        found: list[tuple[Array, Array] | None] = []
+        for i, (episode, whitening) in enumerate(zip(self.episodes, self.whitening_filters, strict=True)):
+            result = "" if whitening is None else self.predictor.predict_episode(episode, *self.split(x, i), False)
+            if whitening is None or isinstance(result, str):
+                found.append(None)
+            else:
+                found.append(
+                    (self.predictor.estimate_torque_bias(episode, result, whitening), whitening.torque_bias_std)
+                )
+        return found
+
+    def cost_and_gradient(
+        self, x: ArrayLike, evaluation: Evaluation | None = None, equilibrium_guesses: EquilibriumGuesses | None = None
+    ) -> tuple[float, Array, Evaluation]:
+        """Return the cost and its gradient by the adjoint; with process noise by forward sensitivities.
+
+        Parameters
+        ----------
+        x : array_like, shape (nx,)
+        evaluation : Evaluation, optional
+            At `x`, where it is known already: the rollout is most of the work.
+        equilibrium_guesses : WarmStart, optional
+            As in `evaluate`.
+
+        Returns
+        -------
+        cost : float
+        gradient : ndarray, shape (nx,)
+        evaluation : Evaluation
+            Without a Jacobian.
+        """
+        x = np.asarray(x, float)
+        weighted = any(own is not None for own in self.whitening_filters)
+        weighted |= any(episode.has_constant_sensor_errors for episode in self.episodes)
+        if evaluation is None or (weighted and evaluation.jacobian is None):
+            evaluation = self.evaluate(x, weighted, equilibrium_guesses)
+        gradient = np.zeros(len(x))
+        if not evaluation.ok:
+            return evaluation.cost, gradient, evaluation
+        if weighted and evaluation.jacobian is not None:
+            return evaluation.cost, evaluation.jacobian.T @ evaluation.residual, replace(evaluation, jacobian=None)
+        for i, result in enumerate(evaluation.episode_predictions):
+            pulls = []
+            for k, samples in enumerate(self.episodes[i].measurements):
+                raw = samples.whitened_residual(result.predicted_outputs[k])
+                _, factor = huber_loss(raw, self.options.huber_threshold)
+                pulls.append(samples.whitening_adjoint(factor**2 * raw))
+            own = self.predictor.gradient_by_adjoint(self.episodes[i], result, *self.split(x, i), pulls)
+            gradient += self.unknowns.scatter_columns(own[None, :], i)[0]
+        prior_residual, prior_jacobian = self.prior_residual(x)
+        return evaluation.cost, gradient + prior_jacobian.T @ prior_residual, evaluation
+
+    def prior_residual(self, x: Array) -> tuple[Array, Array]:
+        """Return the residual of the stated and weak priors, and its Jacobian by the unknowns."""
+        stated, weak, start = self._stated, self._weak, self.initial_unknowns
+        rows = np.vstack([stated, np.zeros((len(weak), len(x)))])
+        spread = np.log(max(self.options.weak_prior_factor, 1.0 + 1e-9))
+        value, slope = soft_logarithm(x[weak] / start[weak])
+        rows[len(stated) + np.arange(len(weak)), weak] = slope / (spread * start[weak])
+        return np.concatenate([stated @ (x - start), value / spread]), rows
+
+    def residual_without_weak_priors(self, evaluation: Evaluation) -> tuple[Array, Array]:
+        """Return the noise-scaled residual (r,) and Jacobian (r, nx) of data and stated priors, without weak priors."""
+        assert evaluation.jacobian is not None
+        residual, jacobian = (
+            evaluation.residual[self.residual_rows.without_weak_priors],
+            evaluation.jacobian[self.residual_rows.without_weak_priors],
+        )
+        if self.data_noise_unit == 1.0:
+            return residual, jacobian
+        unit = np.ones(len(residual))
+        unit[self.residual_rows.data] = self.data_noise_unit
+        return residual / unit, jacobian / unit[:, None]
+
+    def initial_state(
+        self, episode: Episode, theta: Array, offset: Array | None = None, guess: Array | None = None
+    ) -> InitialState:
+        """Initial state of an episode with its derivative by (free parameters, offset).
+
+        Parameters
+        ----------
+        episode : Episode
+        theta : ndarray, shape (ntheta,)
+        offset : ndarray, optional
+            Of an estimated start from rest.
+        guess : ndarray, optional, shape (n,)
+            Configuration near the equilibrium.
+        """
+        own = self.predictor.episode_theta(episode, theta)
+        none = np.zeros(len(self.unknowns.initial_state_names)) if offset is None else offset
+        return self.predictor.initial_state(episode, own, none, self.unknowns.free_parameters, guess)
+
+    # -- held-out recordings ------------------------------------------------------------------------------------------
+
+    def predict_held_out(
+        self, x: ArrayLike, derivatives: bool = False
+    ) -> list[tuple[Episode, EpisodePrediction | str]]:
+        """Predict the held-out recordings with the shared parameters of `x`; local ones keep their initial value.
+
+        Returns each episode, with its fitted initial state where it has one, and its prediction or an error message.
+        An `estimate_errors` initial state is found from the first `_HELD_OUT_START_WINDOW` seconds and its prior. Derivatives are by
+        (free parameters, initial state offset), the initial state held.
+        """
+        x = np.asarray(x, float)
+        theta = self._held_out_theta(x)
+
+        def one(held: Episode) -> tuple[Episode, EpisodePrediction | str]:
+            episode = self._held_out_episode(held, theta)
+            return episode, self.predictor.predict_episode(
+                episode, theta, self._held_out_offset(episode, theta, x), derivatives
+            )
+
+        return [one(episode) for episode in self.held_out]
+
+    def _held_out_episode(self, held: Episode, theta: Array) -> Episode:
+        if held.initial_state_shared_with is not None:
+            return replace(held, fixed_initial_state=self.episodes[held.initial_state_shared_with].fixed_initial_state)
+        return self.predictor.with_fitted_initial_state(held, theta)
+
+    def held_out_initial_state_offset(self, i: int, x: ArrayLike) -> Array:
+        """Offset of a held-out recording's initial state from equilibrium at `x`, shape (number of estimated rows,)."""
+        x = np.asarray(x, float)
+        theta = self._held_out_theta(x)
+        return self._held_out_offset(self._held_out_episode(self.held_out[i], theta), theta, x)
+
+    def _held_out_theta(self, x: Array) -> Array:
+        """theta with the shared parameters of `x`, local ones at their initial value."""
+        theta, _ = self.split(x, 0)
+        for name in self.local_parameters:
+            theta[self.system.parameters.index(name)] = self.theta[self.system.parameters.index(name)]
+        return theta
+
+    def _held_out_offset(self, episode: Episode, theta: Array, x: Array) -> Array:
+        if episode.initial_state_shared_with is not None:
+            return self.split(x, episode.initial_state_shared_with)[1]
+        return estimate_initial_state_offset(self.predictor, episode, theta, self.initial_state_prior_std)
+
+    # -- without data -------------------------------------------------------------------------------------------------
+
+    def simulate_recording(
+        self, values: Mapping[str, float] | None = None, recording: int = 0, seed: int | None = None
+    ) -> Recording:
+        """Simulate a synthetic recording with other parameters and the inputs of one of the recordings.
+
+        Parameters
+        ----------
+        values : mapping of str to float, optional
+            Parameters that differ from the problem's own values (`theta`), free or not, such as `{"cable.bend": 0.09}`.
+        recording : int
+            Which recording's start, motion or torques and times of samples are taken.
+        seed : int, optional
+            Of noise with the standard deviations of the sensors; none when absent.
+
+        Raises
+        ------
+        ConfigError, SolverError
+            There is no such parameter; the model cannot be rolled out.
+        """
+        return synthesize_recording(
+            self.predictor, self.episodes[recording], self.with_parameter_values(values or {}).theta, seed
+        )
+
+    # -- problems like this one ---------------------------------------------------------------------------------------
+
+    def with_free_subset(self, names: Sequence[str]) -> EstimationProblem:
+        """The same problem with other free parameters among `free` and `may_free`; shares the compiled functions."""
+        return self._changed(free=tuple(names))
+
+    def with_parameter_values(self, values: Mapping[str, float]) -> EstimationProblem:
+        """The same problem with other parameter values; filters and initial states are unchanged."""
+        theta = self.theta.copy()
+        for name, value in values.items():
+            theta[self.system.parameters.index(name)] = value
+        return self._changed(theta=theta)
+
+    def with_episodes(self, episodes: Sequence[Episode], held_out: Sequence[Episode]) -> EstimationProblem:
+        """The same problem on other episodes of its model, whitened by sensor noise alone."""
+        return self._changed(
+            episodes=tuple(episodes), held_out=tuple(held_out), whitening_filters=(), held_out_whitening_filters=()
+        )
+
+    @property
+    def has_process_noise(self) -> bool:
+        """Whether errors of recorded torques or angles act as process noise in any recording."""
+        return any(episode.input_errors is not None for episode in self.episodes)
+
+    def whitened_at(
+        self, x: ArrayLike, equilibrium_guesses: EquilibriumGuesses | None = None, rounds: int = 1
+    ) -> EstimationProblem:
+        """The same problem with residuals whitened by sensor and process noise, linearized at `x`.
+
+        Returns the problem itself without process noise, or where the rollout fails at `x`. Where it is whitened
+        already, the new filter is linearized about the smoothed motion and torques of the old one.
+
+        Parameters
+        ----------
+        x : array_like, shape (nx,)
+        equilibrium_guesses : WarmStart, optional
+            As in `evaluate`.
+        rounds : int
+            Number of relinearizations; 2 at a fit.
+        """
+        x = np.asarray(x, float)
+        guesses = equilibrium_guesses or (None,) * len(self.episodes)
+
+        def one(i: int) -> tuple[Episode, WhiteningFilter | None]:
+            return self.predictor.episode_and_whitening_filter(
+                self.episodes[i], *self.split(x, i), guesses[i], self.whitening_filters[i]
+            )
+
+        if not self.has_process_noise:
+            return self
+        episodes, made = zip(*map_in_threads(one, range(len(self.episodes))), strict=True)
+        if any(m is None and e.errors is not None for m, e in zip(made, episodes, strict=True)):
+            return self
+        made_of = self._changed(episodes=episodes, whitening_filters=made, held_out_whitening_filters=())
+        return made_of if rounds < 2 else made_of.whitened_at(x, equilibrium_guesses, rounds - 1)
+
+    def whitened_by_sensor_noise(self) -> EstimationProblem:
+        """The same problem whitened by sensor noise alone, with the torque offsets estimated so far."""
+        return self._with_errors(lambda errors: errors.with_bias_only)
+
+    def without_input_errors(self) -> EstimationProblem:
+        """The same problem with the recorded torques and angles taken as exact."""
+        return self._with_errors(lambda errors: None)
+
+    def _with_errors(self, changed: Callable[[InputErrors], InputErrors | None]) -> EstimationProblem:
+        groups = (self.episodes, self.held_out)
+        return self.with_episodes(
+            *([replace(e, input_errors=e.input_errors and changed(e.input_errors)) for e in group] for group in groups)
+        )
+
+    def held_out_whitened_at(self, x: ArrayLike) -> EstimationProblem:
+        """The same problem with held-out residuals whitened by all noise at `x` as well, for `held_out_residual`.
+
+        A recording whose rollout fails is whitened by sensor noise alone.
+        """
+        x, episodes, made = np.asarray(x, float), [], []
+        theta = self._held_out_theta(x)
+        for held in self.held_out:
+            episode, whitening = self._held_out_episode(held, theta), None
+            offset = self._held_out_offset(episode, theta, x)
+            for _ in range(2):
+                episode, whitening = self.predictor.episode_and_whitening_filter(
+                    episode, theta, offset, None, whitening
+                )
+            episodes.append(replace(held, input_errors=episode.input_errors))
+            made.append(whitening)
+        return self._changed(held_out=tuple(episodes), held_out_whitening_filters=tuple(made))
+
+    def relinearized_at_torque_bias(self, x: Array, frozen: Array) -> EstimationProblem:
+        """The same problem, its filters relinearized from the torque offsets estimated at `frozen` to those at `x`."""
+        at = [(e, *self.split(x, i), self.split(frozen, i)[0]) for i, e in enumerate(self.episodes)]
+        made = relinearized_filters(self.predictor, self.whitening_filters, at)
+        return self._changed(episodes=with_filter_input_errors(self.episodes, made), whitening_filters=made)
+
+    def held_out_relinearized_at_torque_bias(self, x: Array, frozen: Array) -> EstimationProblem:
+        """The same problem with held-out filters relinearized from the torque offsets at `frozen` to those at `x`."""
+        theta, before = self._held_out_theta(x), self._held_out_theta(frozen)
+        own = (self._held_out_episode(e, theta) for e in self.held_out)
+        at = [(e, theta, self._held_out_offset(e, theta, x), before) for e in own]
+        made = relinearized_filters(self.predictor, self.held_out_whitening_filters, at)
+        return self._changed(held_out=with_filter_input_errors(self.held_out, made), held_out_whitening_filters=made)
+
+    def held_out_residual(self, i: int, episode: Episode, result: EpisodePrediction) -> ResidualBlock:
+        """Whitened residual of held-out recording `i` from its prediction by `predict_held_out`, without a robust loss."""
+        return whitened_episode_residual(episode, self.held_out_whitening_filters[i], result, np.inf)
+
+    def truncated_to(self, duration: float) -> EstimationProblem:
+        """The same problem on the first `duration` seconds of each recording, rebuilt without held-out recordings."""
+        return self._prepared(options=replace(self.options, duration=duration), held_out=())
+
+    def with_options(self, options: ProblemOptions) -> EstimationProblem:
+        """The same problem rebuilt with other options."""
+        return self._prepared(options=options)
+
+    def with_free_parameters(self, free: Sequence[str], values: Mapping[str, float] | None = None) -> EstimationProblem:
+        """The same problem rebuilt with other free parameters and values."""
+        keep = set(free)
+        options = replace(
+            self.options,
+            local_parameters=tuple(name for name in self.options.local_parameters if name in keep),
+            prior_stds={name: std for name, std in self.options.prior_stds.items() if name in keep},
+            multivariate_prior=self.options.multivariate_prior.restricted_to(free),
+        )
+        nominal = dict(zip(self.system.parameters.names, self.theta, strict=True))
+        return self._prepared(free=free, options=options, values=nominal | dict(values or {}))
+
+    def _prepared(self, **changes: Any) -> EstimationProblem:
+        same = {
+            "step": self.step,
+            "recordings": [episode.recording for episode in self.episodes],
+            "free": self.free,
+            "options": self.options,
+            "values": dict(zip(self.system.parameters.names, self.theta, strict=True)),
+            "held_out": [episode.recording for episode in self.held_out],
+        }
+        return EstimationProblem(**{**same, **changes})

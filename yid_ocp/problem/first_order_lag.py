@@ -1,0 +1,162 @@
+"""First-order lag T dz/dt = x - z, solved exactly from node to node."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import scipy.signal
+import scipy.sparse
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FirstOrderLag:
+    """First-order lags of k channels, with derivatives by their time constants.
+
+    With E = exp(-h/T) and f = T/h (1 - E), both zero at T = 0, where a value is followed at once. At nodes T may be
+    negative: then the value follows z with the time constant -T, so that z = x - T dx/dt.
+
+    Attributes
+    ----------
+    time_constant : ndarray, shape (k,)
+        T [s]
+    time_constant_sensitivity : ndarray, shape (k, d)
+    time_step : float
+        h [s]
+    """
+
+    time_constant: Array
+    time_constant_sensitivity: Array
+    time_step: float
+
+    def filter_step_means(self, value: Array, slope: Array | None) -> tuple[Array, Array]:
+        """Mean over each step of the lagged output for inputs held over steps; output and input start equal.
+
+        Parameters
+        ----------
+        value : ndarray, shape (N, k)
+        slope : ndarray, shape (N, k, d), or None
+
+        Returns
+        -------
+        mean : ndarray, shape (N, k)
+            x + (z - x) f, with z_{k+1} = x + (z - x) E.
+        by_parameters : ndarray, shape (N, k, d)
+        """
+        decay, share, decay_slope, share_slope = self._factors()
+        held = self._following(value, np.zeros(value.shape), decay)
+        gap = held - value
+        by_value = np.zeros((*value.shape, self.time_constant_sensitivity.shape[1])) if slope is None else slope
+        by_time = self._following(np.zeros(value.shape), decay_slope * gap, decay)
+        mean_by_time = (gap * share_slope + share * by_time)[:, :, None] * self.time_constant_sensitivity
+        followed = self._following(by_value, np.zeros(by_value.shape), decay[:, None])
+        through = by_value + share[:, None] * (followed - by_value)
+        return value + share * gap, through + mean_by_time
+
+    def filter_node_values(self, value: Array, slope: Array | None) -> tuple[Array, Array | None]:
+        """Lagged output at nodes for an input that is linear between nodes, starting at node 1.
+
+        Parameters
+        ----------
+        value : ndarray, shape (N, k)
+        slope : ndarray, shape (N, k, d), or None
+            By all directions, the first ones of which are the parameters of `time_constant_sensitivity`.
+
+        Returns
+        -------
+        followed : ndarray, shape (N, k)
+            z_{k+1} = E z_k + (f - E) x_k + (1 - f) x_{k+1}, or x - T dx/dt by central differences.
+        slope : ndarray, shape (N, k, d), or None
+        """
+        decay, share, _, _ = self._factors()
+        lead, rates = np.minimum(self.time_constant, 0.0), _rates(len(value), self.time_step)
+        followed = self._straight(value, decay, share) - lead * (rates @ value)
+        if slope is None:
+            return followed, None
+        total = self._straight(slope, decay[:, None], share[:, None])
+        if np.any(lead):
+            total -= lead[:, None] * (rates @ slope.reshape(len(slope), -1)).reshape(slope.shape)
+        width = self.time_constant_sensitivity.shape[1]
+        total[:, :, :width] += self._by_time(value, followed)[:, :, None] * self.time_constant_sensitivity
+        return followed, total
+
+    def node_values_adjoint(self, value: Array, pull: Array) -> tuple[Array, Array]:
+        """Adjoint of `filter_node_values`: cost derivatives by the input and by the parameters from those by the output.
+
+        Parameters
+        ----------
+        value, pull : ndarray, shape (N, k)
+
+        Returns
+        -------
+        pull : ndarray, shape (N, k)
+        by_parameters : ndarray, shape (d,)
+        """
+        decay, share, _, _ = self._factors()
+        lead, rates = np.minimum(self.time_constant, 0.0), _rates(len(value), self.time_step)
+        direct = (
+            np.sum(pull * self._by_time(value, self._straight(value, decay, share)), axis=0)
+            @ self.time_constant_sensitivity
+        )
+        back = pull.copy()
+        for k in range(len(back) - 2, 0, -1):
+            back[k] += decay * back[k + 1]
+        passed = back.copy()
+        passed[2:] *= 1 - share
+        passed[1:-1] += (share - decay) * back[2:]
+        return passed - rates.T @ (lead * pull), direct
+
+    def _factors(self) -> tuple[Array, Array, Array, Array]:
+        """E, f and their derivatives by T."""
+        ratio = np.maximum(self.time_constant, 0.0) / self.time_step
+        inverse = 1.0 / np.maximum(ratio, 1e-3)  # beyond it exp(-1/ratio) is zero
+        decay = np.where(ratio > 1e-3, np.exp(-inverse), 0.0)
+        decay_slope = decay * inverse**2 / self.time_step
+        return decay, ratio * (1 - decay), decay_slope, (1 - decay - decay * inverse) / self.time_step
+
+    def _by_time(self, value: Array, followed: Array) -> Array:
+        """Derivative of `filter_node_values` by each channel's time constant, shape (N, k)."""
+        decay, _, decay_slope, share_slope = self._factors()
+        driven = np.zeros_like(value)
+        driven[2:] = decay_slope * (followed[1:-1] - value[1:-1]) - share_slope * (value[2:] - value[1:-1])
+        return np.where(self.time_constant < 0, -(_rates(len(value), self.time_step) @ value), _filtered(driven, decay))
+
+    @staticmethod
+    def _following(value: Array, extra: Array, decay: Array) -> Array:
+        """z_k with z_{k+1} = x_k + (z_k - x_k) E + extra_k, z_0 = x_0."""
+        driven = np.empty_like(value)
+        driven[0] = value[0]
+        driven[1:] = (1 - decay) * value[:-1] + extra[:-1]
+        return _filtered(driven, decay)
+
+    @staticmethod
+    def _straight(value: Array, decay: Array, share: Array) -> Array:
+        driven = value.copy()
+        driven[2:] = (share - decay) * value[1:-1] + (1 - share) * value[2:]
+        driven[1:] = _filtered(driven[1:], decay)
+        return driven
+
+
+def _filtered(driven: Array, decay: Array) -> Array:
+    """z_k = E z_{k-1} + driven_k along the first axis, with each channel's E."""
+    result = np.empty_like(driven)
+    for i, factor in enumerate(np.ravel(decay)):
+        result[:, i] = scipy.signal.lfilter([1.0], [1.0, -factor], driven[:, i], axis=0)
+    return result
+
+
+@lru_cache(maxsize=16)
+def _rates(count: int, time_step: float) -> scipy.sparse.csr_array:
+    """Central differences of values at nodes, from node 1 on, one-sided there and at the last one, (N, N)."""
+    before, after = np.arange(count) - 1, np.arange(count) + 1
+    before, after = np.clip(before, 1, count - 1), np.clip(after, 1, count - 1)
+    width = np.maximum(after - before, 1) * time_step
+    width[0] = np.inf
+    node = np.arange(count)
+    entries = np.concatenate([-1 / width, 1 / width])
+    at = (np.tile(node, 2), np.concatenate([before, after]))
+    return scipy.sparse.coo_array((entries, at), shape=(count, count)).tocsr()

@@ -1,0 +1,298 @@
+"""Fit of an initial state to the first measured points, for recordings that do not start at equilibrium."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.errors import DataError
+from yid_ocp.integrator.rollout import generalized_momentum
+from yid_ocp.integrator.statics import relaxed_internal_coordinates
+from yid_ocp.integrator.step import Step
+from yid_ocp.least_squares import levenberg_marquardt
+from yid_ocp.model import forward_kinematics
+from yid_ocp.model.cable import START_SHAPE_SUFFIXES, START_SPEED_PARAMETER
+from yid_ocp.parallel import LockedCache
+from yid_ocp.problem.measurements import Measurements
+from yid_ocp.sensors import Sensor, sensor_function
+
+Array = NDArray[np.float64]
+
+# Width of the elastic prior: a bend of this size at a joint of mean stiffness costs as much as one standard
+# deviation of a measured point [rad]; other joints in proportion to their stiffness.
+_BEND_STD = 0.5
+# Joints without a spring, or with one far softer than the rest, are still held a little.
+_MIN_STIFFNESS_RATIO = 1e-4
+# Standard deviation of a coordinate's rate where the points leave it open [rad/s].
+_RATE_STD = 3.0
+_CONSTRAINT_STD = 1e-5
+# The object is first pulled into place softly, by measurements with so many times their noise: pulled hard at once,
+# it ends in knots.
+_NOISE_FACTORS = (1000.0, 100.0, 10.0, 1.0)
+# The stage before which the best of all trials is chosen: there the object has its place and hardly its details.
+_SELECTION_STAGE = 2
+# A parameter fitted along with the start is tried from so many values across its bounds.
+_TRIALS_PER_PARAMETER = 4
+
+
+@dataclass(frozen=True)
+class FixedInitialState:
+    """Initial state that is given or fitted to the first measured points, independent of the unknowns.
+
+    Attributes
+    ----------
+    state : ndarray, shape (nx,)
+        (q, p, z) at node 0.
+    fitted_parameters : mapping of str to float
+        Parameters fitted along with it, by name, in their units.
+    """
+
+    state: Array
+    fitted_parameters: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Task:
+    """One fit: measured rows, theta, configuration and weights of the prior, number of parameters sought, softness."""
+
+    measured: list[tuple[Measurements, int]]
+    theta: Array
+    rest: Array
+    prior: Array
+    wanted: int
+    softness: float
+
+
+class InitialStateFitter:
+    """Fits an initial state, and optionally parameters, to the first measured points of an episode.
+
+    Minimises, by Gauss-Newton over q (and the parameters asked for) at the first frame,
+
+        |(w(q) - wbar)/std|^2 + sum kappa_i/kappa_mean (q_i - q_rest,i)^2/BEND_STD^2 + |phi(q)/CONSTRAINT_STD|^2,
+
+    so that among all shapes through the measured points it is the one of least elastic energy: that is what tells
+    apart turns which no point sees, such as the roll of a clamp. At the last frame of the window the prior is that the
+    rate between the two is small. The momentum is that of this rate.
+
+    Parameters
+    ----------
+    step : Step
+    fitted_parameters : sequence of str
+        Parameters fitted along with every start; their bounds must be finite.
+    """
+
+    def __init__(self, step: Step, fitted_parameters: Sequence[str] = ()) -> None:
+        self.step = step
+        self.fitted_parameters = tuple(fitted_parameters)
+        system, e = step.system, step.equations
+        self._known = [*system.driven_indices, *system.prescribed_indices]
+        # what follows its load at once has no start of its own
+        idle = {system.mechanism.joint_index(joint) for joint in system.joint_compliances}
+        self._free = [i for i in range(system.n_coordinates) if i not in set(self._known) | idle]
+        self._sensor: LockedCache[Sensor, ca.Function] = LockedCache(
+            lambda sensor: sensor_function(step.system, sensor, self.fitted_parameters)
+        )
+        chosen = (
+            ca.vertcat(*(system.parameters[name].symbol for name in self.fitted_parameters))
+            if self.fitted_parameters
+            else ca.SX(0, 1)
+        )
+        kinematics = forward_kinematics(system.mechanism, e.q1)
+        aligned = ca.vertcat(ca.SX(0, 1), *(grasp.axis_misalignment(kinematics) for grasp in system.grasps))
+        held = ca.vertcat(
+            e.constraint_violation,
+            ca.substitute(aligned, ca.vertcat(ca.SX(0, 1), *system.internal_coordinates.values()), e.z1),
+        )
+        outputs = [held, ca.jacobian(held, e.q1), ca.jacobian(held, chosen)]
+        self._phi = ca.Function("phi", [e.q1, e.z1, e.lam, e.theta, e.time_step], outputs)
+        at = [system.mechanism.joint_index(spring.joint_name) for spring in system.elastic_joints]
+        stiffness, rest = ca.SX(system.n_coordinates, 1), ca.SX(system.n_coordinates, 1)
+        for index, spring in zip(at, system.elastic_joints, strict=True):
+            stiffness[index] += spring.stiffness
+            rest[index] = spring.rest_angle
+        self._elastic = ca.Function("elastic", [e.theta], [ca.densify(stiffness), ca.densify(rest)])
+        self._presets = tuple(
+            (index, spring.joint_name)
+            for index, spring in zip(at, system.elastic_joints, strict=True)
+            if f"{spring.joint_name}.{START_SHAPE_SUFFIXES[0]}" in system.parameters
+        )
+        self._load = ca.Function(
+            "load", e.arguments, [e.rigid_body_terms.lagrangian_by_q, e.constraint_impulses.before_jacobian]
+        )
+
+    def fit_to_points(
+        self, posture: Array, samples: Sequence[Measurements], theta: Array, window: float, path: Array
+    ) -> FixedInitialState:
+        """Fit the configuration to the points of the first frame and the momentum to their change within the window.
+
+        Parameters
+        ----------
+        posture : ndarray, shape (nk,)
+            Driven, then prescribed coordinates at node 0.
+        samples : sequence of Measurements
+            Only points are used.
+        theta : ndarray, shape (ntheta,)
+        window : float
+            How far from the start frames may be used [s].
+        path : ndarray, shape (N + 1, nc)
+            Prescribed coordinates.
+
+        Returns
+        -------
+        FittedStart
+
+        Raises
+        ------
+        DataError
+            No point is seen within the window.
+        """
+        step, system = self.step, self.step.system
+        last = max(round(window / step.time_step), 1)
+        frames: dict[int, list[tuple[Measurements, int]]] = {}
+        for group in samples:
+            if group.sensor.point_names:
+                for row, (node, fraction) in enumerate(zip(group.node, group.fraction, strict=True)):
+                    near = int(node + round(float(fraction)))
+                    if near <= last and np.any(group.weight[row] > 0):
+                        frames.setdefault(near, []).append((group, row))
+        if not frames:
+            raise DataError(
+                f"no point is seen in the first {window:g} s, so the start state cannot be fitted",
+                hint="widen problem.start_fit_window, or start from equilibrium",
+            )
+        nodes = sorted(frames)
+        first, then = nodes[0], nodes[-1]
+        index = [system.parameters.index(name) for name in self.fitted_parameters]
+        stiffness, rest = (np.array(x).ravel() for x in self._elastic(theta))
+        typical = float(np.mean(stiffness[stiffness > 0])) if np.any(stiffness > 0) else 1.0
+        weight = (
+            np.sqrt(np.where(stiffness > 0, np.maximum(stiffness / typical, _MIN_STIFFNESS_RATIO), 1.0)) / _BEND_STD
+        )
+        guess = rest.copy()
+        guess[self._known] = posture
+        guess[list(system.prescribed_indices)] = path[first]
+        found = [(guess, trial, np.inf) for trial in self._trials(theta[index])]
+        for stage, softness in enumerate(_NOISE_FACTORS):
+            if stage == _SELECTION_STAGE:
+                found = [min(found, key=lambda entry: entry[2])]
+            task = _Task(frames[first], theta, rest, weight, len(index), softness)
+            found = [self._fit(q, v, task) for q, v, _ in found]
+        q, values, _ = found[0]
+        theta = theta.copy()
+        theta[index] = values
+        velocity = np.zeros(system.n_coordinates)
+        if then > first:
+            guess = q.copy()
+            guess[list(system.prescribed_indices)] = path[then]
+            span = (then - first) * step.time_step
+            slow = np.full(system.n_coordinates, 1 / (_RATE_STD * span))
+            task = _Task(frames[then], theta, guess, slow, 0, 1.0)
+            velocity = (self._fit(guess, values, task)[0] - q) / span
+        q0 = q - velocity * first * step.time_step
+        q0[list(system.prescribed_indices)] = path[0]
+        momentum = generalized_momentum(step, q0, velocity, theta)
+        state = np.concatenate([q0, momentum, relaxed_internal_coordinates(step, q0, theta)])
+        own = dict(zip(self.fitted_parameters, values.tolist(), strict=True)) | self._preset(q, theta, stiffness)
+        if START_SPEED_PARAMETER in system.parameters:
+            own[START_SPEED_PARAMETER] = _speed(frames[first], frames[then], (then - first) * step.time_step)
+        return FixedInitialState(state, own)
+
+    def _preset(self, q: Array, theta: Array, stiffness: Array) -> dict[str, float]:
+        """Angle of every joint with a preset, and the torque that its spring holds there if the object is at rest.
+
+        The clamps' unknown reactions f are those of least elastic energy: min_f sum (kappa q - g - G' f)^2/kappa.
+        """
+        if not self._presets:
+            return {}
+        s = self.step.sizes
+        zero = np.zeros
+        by_q, pull = self._load(
+            q, q, zero(s["n"]), zero(s["nz"]), zero(s["nz"]), zero(s["m"]), zero(s["nu"]), theta, self.step.time_step
+        )
+        at = [index for index, _ in self._presets]
+        weight = 1 / np.sqrt(np.maximum(stiffness[at], 1e-12))
+        free = np.array(by_q).ravel()[at]
+        columns = np.array(ca.densify(pull))[:, at].T
+        reaction = np.linalg.lstsq(weight[:, None] * columns, weight * (stiffness[at] * q[at] - free), rcond=None)[0]
+        load = free + columns @ reaction
+        angles = {f"{joint}.{START_SHAPE_SUFFIXES[0]}": float(q[index]) for index, joint in self._presets}
+        return angles | {
+            f"{j}.{START_SHAPE_SUFFIXES[1]}": float(v) for (_, j), v in zip(self._presets, load, strict=True)
+        }
+
+    def _trials(self, values: Array) -> list[Array]:
+        if not self.fitted_parameters:
+            return [values]
+        lower, upper = self.step.system.parameters.bounds(self.fitted_parameters)
+        shares = (np.arange(_TRIALS_PER_PARAMETER) + 0.5) / _TRIALS_PER_PARAMETER
+        grids = [low + (high - low) * shares for low, high in zip(lower, upper, strict=True)]
+        return [values, *(np.array(entry) for entry in itertools.product(*grids))]
+
+    def _fit(self, guess: Array, values: Array, task: _Task) -> tuple[Array, Array, float]:
+        """Configuration, values of the parameters sought, and the sum of squares there."""
+        free = self._free
+        index = [self.step.system.parameters.index(name) for name in self.fitted_parameters]
+        lower, upper = self.step.system.parameters.bounds(self.fitted_parameters)
+        q, theta = guess.copy(), task.theta.copy()
+        theta[index] = values
+        wanted = index[: task.wanted]
+        span = (upper - lower)[: task.wanted]
+        # an angle goes round, anything else stops at its bound
+        turns = np.abs(span - 2 * np.pi) < 1e-9
+
+        def spread(x: Array) -> tuple[Array, Array]:
+            whole, moved = q.copy(), theta.copy()
+            whole[free], moved[wanted] = x[: len(free)], x[len(free) :]
+            return whole, moved
+
+        def allowed(x: Array) -> Array:
+            own = x[len(free) :]
+            low, high = lower[: task.wanted], upper[: task.wanted]
+            own = np.where(turns, low + (own - low) % np.where(turns, span, 1.0), np.clip(own, low, high))
+            return np.concatenate([x[: len(free)], own])
+
+        def rows(x: Array) -> tuple[Array, Array]:
+            return self._rows(*spread(x), task)
+
+        found = levenberg_marquardt(rows, np.concatenate([q[free], theta[wanted]]), projection=allowed)
+        q, theta = spread(found.x)
+        return q, theta[index], found.sum_of_squares
+
+    def _rows(self, q: Array, theta: Array, task: _Task) -> tuple[Array, Array]:
+        """Residual of a fit and its derivative by the free coordinates and the parameters sought."""
+        step, free, wanted = self.step, self._free, task.wanted
+        nz, m = step.sizes["nz"], step.sizes["m"]
+        residuals, jacobians = [], []
+        for group, row in task.measured:
+            y, by_q, _, _, by_theta = self._sensor(group.sensor)(
+                q, np.zeros(nz), np.zeros(step.system.n_coordinates), theta
+            )
+            weight = group.weight[row] / task.softness
+            value = np.where(weight > 0, group.value[row], 0.0)
+            wide = np.hstack([np.array(ca.densify(by_q))[:, free], np.array(ca.densify(by_theta[:, :wanted]))])
+            residuals.append(weight * (np.array(y).ravel() - value))
+            jacobians.append(weight[:, None] * wide)
+        if m:
+            gap, by_q, by_theta = self._phi(q, np.zeros(nz), np.zeros(m), theta, step.time_step)
+            wide = np.hstack([np.array(ca.densify(by_q))[:, free], np.array(ca.densify(by_theta[:, :wanted]))])
+            residuals.append(np.array(gap).ravel() / (_CONSTRAINT_STD * task.softness))
+            jacobians.append(wide / (_CONSTRAINT_STD * task.softness))
+        residuals.append(((q - task.rest) * task.prior)[free])
+        jacobians.append(np.hstack([np.diag(task.prior[free]), np.zeros((len(free), wanted))]))
+        return np.concatenate(residuals), np.vstack(jacobians)
+
+
+def _speed(before: Sequence[tuple[Measurements, int]], after: Sequence[tuple[Measurements, int]], span: float) -> float:
+    """Root mean square speed of the points seen in both frames, zero where there is one frame only [m/s]."""
+    squares = []
+    for samples, row in before:
+        for other, later in after:
+            if other is samples and span > 0:
+                moved = (samples.value[later] - samples.value[row]).reshape(-1, samples.sensor.outputs_per_channel)
+                squares += np.sum(moved**2, axis=1).tolist()
+    return float(np.sqrt(np.nanmean(squares))) / span if np.any(np.isfinite(squares)) else 0.0

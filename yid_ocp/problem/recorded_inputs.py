@@ -1,0 +1,255 @@
+"""Inputs of a rollout from a recording: torques or commands of every step, prescribed paths, joint angles."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import scipy.interpolate
+import scipy.signal
+from numpy.typing import NDArray
+
+from yid_ocp.data.recording import JointGroup, Recording
+from yid_ocp.errors import DataError, nearest_name_hint
+from yid_ocp.model.cable import ClampPath
+from yid_ocp.model.servos_and_springs import PositionServo
+from yid_ocp.model.system import System
+from yid_ocp.problem.low_pass_filter import LowPassFilter
+from yid_ocp.problem.time_grid import TimeGrid
+from yid_ocp.sensors import recorded_camera_pose, recorded_joint_columns
+
+Array = NDArray[np.float64]
+_SLOW_LOAD_CUTOFF_FRACTION = 0.1
+"""Fraction of the filter's cutoff below which measured loads are used on gears whose efforts are compared."""
+
+
+def mean_step_inputs(
+    joints: JointGroup,
+    driven: tuple[str, ...],
+    grid: TimeGrid,
+    where: str,
+    delay: Array | None = None,
+    servos: Mapping[str, PositionServo] | None = None,
+) -> Array:
+    """Mean input of driven joints over every step, shape (steps, nu): torques [N m], or commands [rad or m].
+
+    An effort that is held from sample to sample (`command`) jumps, and so do commands that are held; through samples of
+    efforts goes a cubic spline, and where means over the recorded intervals are given, the derivative of one through
+    their sums, which keeps every mean.
+
+    Parameters
+    ----------
+    joints : JointGroup
+    driven : tuple of str
+    grid : Grid
+    where : str
+        Name of the recording.
+    delay : ndarray, shape (nu,), optional
+        How much later than recorded each of them acts [s].
+    servos : mapping of joint to Servo, optional
+        Of all driven joints, which then follow commands.
+
+    Raises
+    ------
+    DataError
+        No effort recorded, or no commands where servos move the arms, or a joint that is missing.
+    """
+    if not driven:
+        return np.zeros((grid.steps, 0))
+    late = np.zeros(len(driven)) if delay is None else delay
+    courses = _courses(joints, driven, where, servos or {})
+    total = [_summed(course, grid.node_times - shift) for course, shift in zip(courses, late, strict=True)]
+    return np.asarray(np.diff(np.stack(total, axis=1), axis=0) / grid.time_step)
+
+
+def mean_step_inputs_by_delay(
+    joints: JointGroup,
+    driven: tuple[str, ...],
+    grid: TimeGrid,
+    where: str,
+    delay: Array,
+    servos: Mapping[str, PositionServo] | None = None,
+) -> Array:
+    """Derivative of `mean_step_inputs` by each joint's delay, shape (steps, nu); at a jump the mean of both sides."""
+    result = []
+    for course, shift in zip(_courses(joints, driven, where, servos or {}), delay, strict=True):
+        sides = (course(np.clip(grid.node_times - shift + near, *course.x[[0, -1]])) for near in (-1e-9, 1e-9))
+        result.append(-np.diff(sum(sides)) / 2 / grid.time_step)
+    return np.stack(result, axis=1)
+
+
+def _courses(
+    joints: JointGroup, driven: tuple[str, ...], where: str, servos: Mapping[str, PositionServo]
+) -> list[scipy.interpolate.PPoly]:
+    """What moves each joint over time, between the first sample and the end of what the last one stands for."""
+    t = joints.t
+    # the last sample stands for as long as the one before it
+    edges = np.append(t, 2 * t[-1] - t[-2])
+    if servos:
+        if joints.position_command is None:
+            raise DataError(
+                "the recording has no commanded positions, which the arms' servos follow",
+                where=f"{where}: joints/position_command",
+                allowed="the commanded position of every joint beside the measured one",
+                hint="import them (the action of a LeRobot dataset, --command-topic of a bag), "
+                "or prescribe the arms' motion instead (model.arms.mode: prescribed)",
+            )
+        rows = joints.position_command[:, recorded_joint_columns(joints, driven, where)].T
+        held = [servos[name].command_interpolation == "held" for name in driven]
+        return [_held(row, edges) if jumps else _straight(row, t) for row, jumps in zip(rows, held, strict=True)]
+    if joints.effort is None:
+        raise DataError(
+            "the recording has no joint effort, which drives the model",
+            where=f"{where}: joints/effort",
+            hint="prescribe the arms' motion instead (model.arms.mode: prescribed)",
+        )
+    effort = joints.effort[:, recorded_joint_columns(joints, driven, where)]
+    if joints.effort_kind_or_default == "sample":
+        return [scipy.interpolate.CubicSpline(t, column) for column in effort.T]
+    if joints.effort_kind_or_default == "command":
+        return [_held(column, edges) for column in effort.T]
+    sums = np.vstack([np.zeros((1, len(driven))), np.cumsum(effort * np.diff(edges)[:, None], axis=0)])
+    return [scipy.interpolate.CubicSpline(edges, column).derivative() for column in sums.T]
+
+
+def _held(values: Array, edges: Array) -> scipy.interpolate.PPoly:
+    return scipy.interpolate.PPoly(values[None, :], edges)
+
+
+def _straight(values: Array, t: Array) -> scipy.interpolate.PPoly:
+    """Straight lines between samples."""
+    return scipy.interpolate.PPoly(np.stack([np.diff(values) / np.diff(t), values[:-1]]), t)
+
+
+def _summed(course: scipy.interpolate.PPoly, t: Array) -> Array:
+    """Integral of an input up to times, shape of t; before its first moment and after its last it is held."""
+    inside = np.clip(t, *course.x[[0, -1]])
+    return np.asarray(course.antiderivative()(inside) + course(inside) * (t - inside))
+
+
+def smoothed_joint_angles(
+    joints: JointGroup, names: tuple[str, ...], grid: TimeGrid, where: str, low_pass: LowPassFilter
+) -> Array:
+    """Smoothed joint angles at every node by a cubic spline, shape (steps + 1, len(names)) [rad]."""
+    values = low_pass(joints.t, joints.position[:, recorded_joint_columns(joints, names, where)])
+    spline = scipy.interpolate.CubicSpline(joints.t, values, axis=0)
+    return np.asarray(spline(np.clip(grid.node_times, *joints.t[[0, -1]])))
+
+
+def smoothed_joint_efforts(
+    recording: Recording, names: tuple[str, ...], grid: TimeGrid, low_pass: LowPassFilter
+) -> Array:
+    """Smoothed recorded joint efforts at every node, shape (steps + 1, len(names)) [N m].
+
+    Raises
+    ------
+    DataError
+        No effort recorded, or a joint that is missing.
+    """
+    joints = recording.joints
+    if joints is None or joints.effort is None:
+        raise DataError(
+            "the model's gears give way under an effort that the recording does not have",
+            where=f"{recording.name}: joints/effort",
+            hint="leave series_elasticity and backlash out",
+        )
+    effort = low_pass(joints.t, joints.effort[:, recorded_joint_columns(joints, names, recording.name)])
+    return np.stack([np.interp(grid.node_times, joints.t, column) for column in effort.T], axis=1)
+
+
+def denoised_gear_loads(measured: Array, own: Array, nodes: NDArray[np.int64], times: Array, cutoff: float) -> Array:
+    """Gear loads: the model's own plus the slow part of measured minus own, so that effort noise is not fed back.
+
+    Parameters
+    ----------
+    measured, own : ndarray, shape (N + 1, k)
+        Smoothed.
+    nodes : ndarray of int, shape (M,)
+        At which they are compared; beyond the first and the last neither side is right.
+    times : ndarray, shape (N + 1,)
+    cutoff : float
+        Of the filter of paths and efforts [Hz].
+    """
+    gap = (measured - own)[np.clip(np.arange(len(own)), nodes.min(), nodes.max())]
+    return measured - gap + LowPassFilter(_SLOW_LOAD_CUTOFF_FRACTION * cutoff)(times, gap)
+
+
+def recorded_sensors(recordings: Sequence[Recording]) -> frozenset[str]:
+    """Sensors that the recordings contain, in the words of `effects.candidate_effects`."""
+    found = set()
+    for recording in recordings:
+        if recording.joints is not None:
+            found.add("joints.position")
+            if recording.joints.effort is not None:
+                found.add("joints.effort")
+        if any(recorded_camera_pose(group) is not None for group in recording.points):
+            found.add("camera")
+        if any(group.clock == "nominal" for group in recording.groups):
+            found.add("nominal_clock")
+    return frozenset(found)
+
+
+def prescribed_path(
+    recording: Recording, system: System, grid: TimeGrid, low_pass: LowPassFilter, clamps: tuple[ClampPath, ...] = ()
+) -> Array:
+    """Prescribed coordinates at every node, shape (steps + 1, nc).
+
+    Joints follow the smoothed recorded positions, clamps their smoothed points.
+
+    Raises
+    ------
+    DataError
+        A prescribed joint or a clamp's point is not recorded, or is seen too seldom.
+    """
+    if not system.prescribed:
+        return np.zeros((grid.steps + 1, 0))
+    course: dict[str, Array] = {}
+    for clamp in clamps:
+        course.update(_clamp_course(recording, clamp, grid, low_pass))
+    remaining = tuple(name for name in system.prescribed if name not in course)
+    if remaining:
+        if recording.joints is None:
+            raise DataError(
+                f"joint '{remaining[0]}' is prescribed but the recording has no joints", where=recording.name
+            )
+        joints = recording.joints
+        sampled = smoothed_joint_angles(joints, remaining, grid, recording.name, low_pass)
+        course.update({name: sampled[:, i] for i, name in enumerate(remaining)})
+    return np.stack([course[name] for name in system.prescribed], axis=1)
+
+
+def _clamp_course(
+    recording: Recording, clamp: ClampPath, grid: TimeGrid, low_pass: LowPassFilter
+) -> Mapping[str, Array]:
+    origin = _smoothed_point_path(recording, clamp.origin_point, grid, low_pass)
+    direction = _smoothed_point_path(recording, clamp.z_axis_point, grid, low_pass) - origin
+    length = np.linalg.norm(direction, axis=1, keepdims=True)
+    if np.any(length < 1e-6):
+        raise DataError(f"points '{clamp.origin_point}' and '{clamp.z_axis_point}' coincide", where=recording.name)
+    d = direction / length
+    about_y = np.arcsin(np.clip(d[:, 0], -1, 1))
+    about_x = np.unwrap(np.arctan2(-d[:, 1], d[:, 2]))
+    result = {f"{clamp.clamp_name}_{axis}": origin[:, i] for i, axis in enumerate("xyz")}
+    about_z = np.zeros(len(d))
+    if clamp.roll_convention == "transported":
+        # the angular velocity about z of Rx(a) Ry(b) Rz(c) is c' + a' sin b
+        about_z[1:] = -np.cumsum(np.diff(about_x) * np.sin((about_y[1:] + about_y[:-1]) / 2))
+    result |= {f"{clamp.clamp_name}_rx": about_x, f"{clamp.clamp_name}_ry": about_y, f"{clamp.clamp_name}_rz": about_z}
+    return result
+
+
+def _smoothed_point_path(recording: Recording, point: str, grid: TimeGrid, low_pass: LowPassFilter) -> Array:
+    """Smoothed position of a recorded point at every node, shape (steps + 1, 3) [m]."""
+    for group in recording.points:
+        if point in group.names:
+            seen = group.position[:, group.names.index(point)]
+            good = np.all(np.isfinite(seen), axis=1)
+            if good.sum() < 4:
+                what = f"point '{point}' is seen {good.sum()} times"
+                raise DataError(what, where=recording.name, allowed="4 or more")
+            values = low_pass(group.t[good], seen[good])
+            spline = scipy.interpolate.CubicSpline(group.t[good], values, axis=0)
+            return np.asarray(spline(np.clip(grid.node_times, group.t[good][0], group.t[good][-1])))
+    raise DataError(
+        f"point '{point}' is not recorded", where=recording.name, hint=nearest_name_hint(point, recording.point_names)
+    )

@@ -1,0 +1,207 @@
+"""Synthetic recordings: a problem's rollout at given parameters as its sensors would record it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate_recording
+from yid_ocp.errors import SolverError
+from yid_ocp.problem.episode_prediction import EpisodePredictor
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.options import SensorOptions
+from yid_ocp.problem.prediction_result import EpisodePrediction
+from yid_ocp.sensors.joints import (
+    EFFORT_GROUP,
+    POSITION_GROUP,
+    joint_angle_noise_std,
+    joint_torque_bias_std,
+    joint_torque_noise_std,
+    values_by_joint,
+)
+
+Array = NDArray[np.float64]
+
+
+def recording_from_prediction(
+    predictor: EpisodePredictor,
+    episode: Episode,
+    outcome: EpisodePrediction,
+    theta: Array,
+    seed: int | None = None,
+    description: str = "",
+) -> Recording:
+    """Convert an episode's predicted rollout into a recording with its sensors' clocks and noise levels.
+
+    Parameters
+    ----------
+    predictor : Predictor
+    episode : Episode
+    outcome : EpisodeResult
+        Of this predictor.
+    theta : ndarray, shape (ntheta,)
+        At which it was predicted.
+    seed : int, optional
+        Of the noise that the estimation assumes, constant torque offsets included; no noise when absent.
+    """
+    rng = None if seed is None else np.random.default_rng(seed)
+    system, source = predictor.system, episode.recording
+    groups = []
+    for samples, predicted in zip(episode.measurements, outcome.predicted_outputs, strict=True):
+        if samples.sensor.point_names:
+            t = episode.grid.start_time + predictor.step.time_step * (samples.node + samples.fraction)
+            shape = (len(t), len(samples.sensor.point_names), 3)
+            std = np.where(np.isfinite(samples.std), samples.std, np.nanmedian(samples.std)).reshape(shape)
+            position = np.where(samples.weight > 0, predicted, np.nan).reshape(shape)
+            original = next(group for group in source.points if group.name == samples.sensor.group_name)
+            groups.append(
+                PointGroup(
+                    original.name, samples.sensor.point_names, t, _noisy(position, std, rng), std,
+                    original.sensor, original.frame, original.pose,
+                )
+            )  # fmt: skip
+    groups = [_with_clamps(group, predictor, source) for group in groups]
+    own = predictor.episode_theta(episode, theta)
+    truth = dict(zip(system.parameters.names, map(float, own), strict=True))
+    text = f"{description} Simulated with the inputs of {episode.name}.".strip()
+    joints = _joints(predictor, episode, outcome, rng)
+    made = Recording(
+        joints, tuple(groups), text, "yid_ocp simulate", f"{episode.name}_simulated", true_parameters=truth
+    )
+    return validate_recording(replace(made, marker_reference_pose=_straight(made, source)))
+
+
+def synthesize_recording(
+    predictor: EpisodePredictor, episode: Episode, theta: Array, seed: int | None = None
+) -> Recording:
+    """Roll out an episode at theta and return it as a synthetic recording."""
+    refit = predictor.options.initial_state == "fitted_to_points"
+    fresh = predictor.with_fitted_initial_state(replace(episode, fixed_initial_state=None), theta) if refit else episode
+    found = predictor.predict_episode(fresh, theta, np.zeros(len(predictor.unknowns.initial_state_names)), False)
+    if isinstance(found, str):
+        raise SolverError(f"the model cannot be rolled out: {found}", where=episode.name, hint="take other values")
+    return recording_from_prediction(predictor, fresh, found, theta, seed)
+
+
+def _with_clamps(group: PointGroup, predictor: EpisodePredictor, source: Recording) -> PointGroup:
+    """A group with the points that clamps follow, as they were recorded: what moves the object, not what it does."""
+    original = next(entry for entry in source.points if entry.name == group.name)
+    followed = dict.fromkeys(
+        point for path in predictor.options.clamp_paths for point in (path.origin_point, path.z_axis_point)
+    )
+    names = tuple(name for name in followed if name in original.names and name not in group.names)
+    if not names:
+        return group
+    at = [original.names.index(name) for name in names]
+    near = np.searchsorted(original.t, group.t - 1e-9).clip(0, len(original.t) - 1)
+    position = np.concatenate([group.position, original.position[near][:, at]], axis=1)
+    assert group.std is not None
+    std = np.concatenate([group.std, np.full((len(group.t), len(at), 3), np.median(group.std))], axis=1)
+    return replace(group, names=(*group.names, *names), position=position, std=std)
+
+
+def _straight(made: Recording, source: Recording) -> Array | None:
+    """Where the points of the first group were while the object was held straight, where the source says it."""
+    if source.marker_reference_pose is None or not made.points or made.points[0].name != source.points[0].name:
+        return None
+    return source.marker_reference_pose[[source.points[0].names.index(name) for name in made.points[0].names]]
+
+
+def _joints(
+    predictor: EpisodePredictor, episode: Episode, outcome: EpisodePrediction, rng: np.random.Generator | None
+) -> JointGroup | None:
+    system, source = predictor.system, episode.recording.joints
+    if source is None or not (system.driven or system.prescribed):
+        return None
+    names = tuple(name for name in (*system.driven, *system.prescribed) if name in source.names)
+    at = [system.mechanism.joint_index(name) for name in names]
+    position = outcome.rollout.state[:, at]
+    if system.servos:
+        return _commanded(predictor, episode, position, names, rng)
+    held = {name: outcome.rollout.torque[:, i] for i, name in enumerate(system.driven)}
+    held |= {name: outcome.rollout.effort[:, i] for i, name in enumerate(system.prescribed)}
+    effort = np.stack([np.append(held[name], held[name][-1]) for name in names], axis=1)
+    levels = _levels(predictor, episode, names)
+    position, effort = (
+        _noisy(values, np.broadcast_to(0.0 if std is None else std, values.shape), rng)
+        for values, std in ((position, levels.angle), (effort, levels.torque))
+    )
+    # constant over the recording, for every joint one draw
+    bias = np.zeros(len(names)) if levels.bias is None else np.asarray(levels.bias)
+    return JointGroup(
+        names,
+        episode.grid.node_times,
+        position,
+        effort=effort + _noisy(np.zeros(len(names)), bias, rng),
+        position_std=levels.angle,
+        effort_std=levels.torque,
+        effort_bias_std=levels.bias,
+        # of prescribed joints it is the effort at the nodes
+        effort_kind="command" if system.driven else "sample",
+    )
+
+
+def _commanded(
+    predictor: EpisodePredictor,
+    episode: Episode,
+    position: Array,
+    names: tuple[str, ...],
+    rng: np.random.Generator | None,
+) -> JointGroup:
+    """Joints of servos at every node, with what they were commanded there."""
+    source, times = episode.recording.joints, episode.grid.node_times
+    assert source is not None
+    assert source.position_command is not None
+    commands = source.position_command[:, [source.names.index(name) for name in names]]
+    rows = np.clip(np.searchsorted(source.t, times + 1e-9) - 1, 0, len(source.t) - 1)
+    between = np.stack([np.interp(times, source.t, column) for column in commands.T], axis=1)
+    held = [predictor.system.servos[name].command_interpolation == "held" for name in names]
+    std = joint_angle_noise_std(
+        source, names, predictor.options.sensors.get(POSITION_GROUP, SensorOptions()), episode.name
+    )
+    noisy = _noisy(position, np.broadcast_to(std, position.shape), rng)
+    given = np.where(held, commands[rows], between)
+    return JointGroup(names, times, noisy, position_command=given, position_std=std)
+
+
+@dataclass(frozen=True)
+class _Levels:
+    """Standard deviations of what joints record, (nj,) each [rad], [N m]; None where nothing says so."""
+
+    angle: Array | None
+    torque: Array | None
+    bias: Array | None
+
+
+def _levels(predictor: EpisodePredictor, episode: Episode, names: tuple[str, ...]) -> _Levels:
+    """Noise as the estimation takes it: of driven joints that of what drives the motion, else what is stated."""
+    joints, driven = episode.recording.joints, predictor.system.driven
+    assert joints is not None
+    effort, position = (
+        predictor.options.sensors.get(group, SensorOptions()) for group in (EFFORT_GROUP, POSITION_GROUP)
+    )
+    joint_angles = joints.position_std if position.std is None else position.std
+    torques = joints.effort_std if effort.std is None else effort.std
+    if episode.input_errors is None:
+        angle, torque = (
+            None if given is None else values_by_joint(given, joints.names, names, f"sensors.{group}.std")
+            for group, given in ((POSITION_GROUP, joint_angles), (EFFORT_GROUP, torques))
+        )
+        return _Levels(angle, torque, None)
+    at, rest = [names.index(name) for name in driven], [i for i, name in enumerate(names) if name not in driven]
+    other = tuple(names[i] for i in rest)
+    angle, torque, bias = np.zeros((3, len(names)))
+    angle[at] = joint_angle_noise_std(joints, driven, position, episode.name)
+    torque[at] = joint_torque_noise_std(joints, driven, effort, episode.name)
+    bias[at] = joint_torque_bias_std(joints, driven, effort)
+    if other:
+        stated = ((angle, joint_angles, POSITION_GROUP), (torque, torques, EFFORT_GROUP))
+        for target, std, group in stated:
+            target[rest] = values_by_joint(0.0 if std is None else std, joints.names, other, f"sensors.{group}.std")
+    return _Levels(angle, torque, bias)
+
+
+def _noisy(values: Array, std: Array, rng: np.random.Generator | None) -> Array:
+    return values if rng is None else values + np.where(np.isfinite(std), std, 0.0) * rng.standard_normal(values.shape)

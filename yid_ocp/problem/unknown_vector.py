@@ -1,0 +1,211 @@
+"""Layout of an estimation problem's unknown vector, its priors and its bounds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from yid_ocp.effects import EffectBase
+from yid_ocp.errors import ConfigError, nearest_name_hint
+from yid_ocp.model.system import System
+from yid_ocp.problem.options import ProblemOptions
+
+Array = NDArray[np.float64]
+INITIAL_STATE_PREFIX = "start."
+MIN_LOG_RATIO = 1e-3
+"""Ratio of an unknown to its initial value below which the weak prior's logarithm is replaced by a parabola."""
+
+
+@dataclass(frozen=True)
+class UnknownVectorLayout:
+    """Layout of the unknown vector: (shared | recording 1: local, initial state offset | recording 2: ...).
+
+    Attributes
+    ----------
+    shared_parameters, local_parameters : tuple of str
+        Free parameters with one value for all recordings, and with a value in each.
+    initial_state_names : tuple of str
+        Estimated components of the initial state: `q.JOINT`, `p.JOINT` and, of unobserved internal ones, `z.NAME`.
+    recording_names : tuple of str
+    """
+
+    shared_parameters: tuple[str, ...]
+    local_parameters: tuple[str, ...]
+    initial_state_names: tuple[str, ...]
+    recording_names: tuple[str, ...]
+
+    @cached_property
+    def unknown_names(self) -> tuple[str, ...]:
+        """Names of all unknowns; local ones and initial states carry their recording's name."""
+        own = [*self.local_parameters, *(f"{INITIAL_STATE_PREFIX}{name}" for name in self.initial_state_names)]
+        return (
+            *self.shared_parameters,
+            *(f"{name}[{recording}]" for recording in self.recording_names for name in own),
+        )
+
+    @property
+    def free_parameters(self) -> tuple[str, ...]:
+        """Free parameters, shared then local, in the order of one recording's derivative columns."""
+        return (*self.shared_parameters, *self.local_parameters)
+
+    def recording_columns(self, recording: int) -> NDArray[np.int64]:
+        """Indices of one recording's (shared, local, start) unknowns in the vector."""
+        shared, own = len(self.shared_parameters), len(self.local_parameters) + len(self.initial_state_names)
+        return np.concatenate([np.arange(shared), shared + recording * own + np.arange(own)])
+
+    def scatter_columns(self, block: Array, recording: int) -> Array:
+        """Scatter derivative columns of one recording, (r, d), to the columns of the unknown vector, (r, nx)."""
+        wide = np.zeros((len(block), len(self.unknown_names)))
+        wide[:, self.recording_columns(recording)] = block
+        return wide
+
+    def split(self, x: ArrayLike, recording: int, theta: Array, system: System) -> tuple[Array, Array]:
+        """Return theta with one recording's values, and its initial state offset, from the unknown vector."""
+        own = np.asarray(x, float)[self.recording_columns(recording)]
+        result = theta.copy()
+        for name, value in zip(self.free_parameters, own, strict=False):
+            result[system.parameters.index(name)] = value
+        return result, own[len(self.free_parameters) :]
+
+    def pack(self, shared: ArrayLike, local: ArrayLike, start: ArrayLike) -> Array:
+        """Pack shared values, and local values and an initial state offset equal in all recordings, into a vector."""
+        parts = [np.asarray(shared, float)]
+        parts += [np.asarray(local, float), np.asarray(start, float)] * len(self.recording_names)
+        return np.concatenate(parts)
+
+
+def with_named_entries(x: Array, names: Sequence[str], values: Mapping[str, float]) -> Array:
+    """Copy of an unknown vector with named entries replaced."""
+    return np.array([values.get(name, value) for name, value in zip(names, x, strict=True)], float)
+
+
+def stated_prior_std(
+    unknowns: UnknownVectorLayout, options: ProblemOptions, system: System, inertia: Callable[[tuple[str, ...]], Array]
+) -> Array:
+    """Standard deviation of each unknown's stated Gaussian prior, infinite where there is none, shape (nx,).
+
+    `joint_mass_matrices` gives the diagonal of the mass matrix for named joints, by which a start's velocity becomes a momentum. An
+    internal coordinate may begin anywhere within its limits; the standard deviation is that of such a uniform prior.
+    """
+    limits = _unobserved_state_limits(system)
+    stds = []
+    joint = options.multivariate_prior.restricted_to(unknowns.shared_parameters)
+    known = dict(zip(joint.parameter_names, np.sqrt(np.diag(joint.covariance)).tolist(), strict=True))
+    for name in unknowns.unknown_names:
+        base = name.split("[")[0]
+        if base.startswith(f"{INITIAL_STATE_PREFIX}q."):
+            stds.append(options.start_configuration_std)
+        elif base.startswith(f"{INITIAL_STATE_PREFIX}p."):
+            mass = float(inertia((base.removeprefix(f"{INITIAL_STATE_PREFIX}p."),))[0])
+            stds.append(options.start_velocity_std * max(mass, 1e-9))
+        elif base.startswith(f"{INITIAL_STATE_PREFIX}z."):
+            stds.append(limits[base.removeprefix(f"{INITIAL_STATE_PREFIX}z.")] / math.sqrt(3))
+        else:
+            stds.append(known.get(name, float(options.prior_stds.get(base, np.inf))))
+    return np.array(stds)
+
+
+def stated_prior_jacobian(unknowns: UnknownVectorLayout, options: ProblemOptions, std: Array) -> Array:
+    """Jacobian of the stated priors' whitened residual, which is this matrix (k, nx) times (x - initial x).
+
+    Parameters
+    ----------
+    unknowns : Unknowns
+    options : ProblemOptions
+    std : ndarray, shape (nx,)
+        From `stated_prior_std`.
+    """
+    joint = options.multivariate_prior.restricted_to(unknowns.shared_parameters)
+    at = [unknowns.unknown_names.index(name) for name in joint.parameter_names]
+    alone = [i for i in np.flatnonzero(np.isfinite(std)) if i not in at]
+    rows = np.zeros((len(alone) + len(at), len(std)))
+    rows[np.arange(len(alone)), alone] = 1.0 / std[alone]
+    if at:
+        # C = L L', so that L^-1 d has unit covariance
+        rows[len(alone) :, at] = np.linalg.inv(np.linalg.cholesky(joint.covariance))
+    return rows
+
+
+def estimated_initial_state_names(
+    system: System, options: ProblemOptions, free: Sequence[str], theta: Array
+) -> tuple[str, ...]:
+    """Names of the estimated components of an initial state.
+
+    Where starts are estimated, q and p of the coordinates that are neither driven by torques, nor prescribed, nor
+    follow their load at once; in any case the unobserved internal coordinates of effects that are free or not neutral.
+    """
+    found: list[str] = []
+    if options.initial_state == "estimated":
+        known = {*(() if system.servos else system.driven_indices), *system.prescribed_indices}
+        known |= {system.mechanism.joint_index(joint) for joint in system.joint_compliances}
+        coordinates = [name for i, name in enumerate(system.mechanism.joint_names) if i not in known]
+        found = [*(f"q.{name}" for name in coordinates), *(f"p.{name}" for name in coordinates)]
+    for effect in system.effects:
+        if isinstance(effect, EffectBase) and effect.unknown_initial_state_bounds:
+            index = system.parameters.index
+            names = effect.amplitude_names
+            if any(name in free or theta[index(name)] != effect.neutral_values[name] for name in names):
+                found += [f"z.{name}" for name in effect.unknown_initial_state_bounds]
+    return tuple(found)
+
+
+def _unobserved_state_limits(system: System) -> dict[str, float]:
+    """Unobserved initial internal coordinates of the effects, each with its largest magnitude."""
+    effects = [effect for effect in system.effects if isinstance(effect, EffectBase)]
+    return {name: size for effect in effects for name, size in effect.unknown_initial_state_bounds.items()}
+
+
+def initial_state_limits(system: System, names: Sequence[str]) -> Array:
+    """Largest offset of each estimated component of an initial state, infinite for coordinates and momenta."""
+    limits = _unobserved_state_limits(system)
+    return np.array([limits[name.removeprefix("z.")] if name.startswith("z.") else np.inf for name in names])
+
+
+def check_free_parameters(system: System, free: Sequence[str], options: ProblemOptions) -> None:
+    """Raise `ConfigError` where free parameters are unknown or repeated, or local ones or priors are not free."""
+    for name in [*free, *options.local_parameters, *options.prior_stds, *options.multivariate_prior.parameter_names]:
+        system.parameters.index(name)
+    if len(set(free)) != len(free):
+        raise ConfigError("a free parameter is named twice", where=", ".join(free))
+    for name in (*options.local_parameters, *options.prior_stds):
+        if name not in free:
+            raise ConfigError(f"'{name}' is not free", hint=nearest_name_hint(name, free), where="local or priors")
+
+
+def check_parameter_bounds(system: System, free: Sequence[str], theta: Array) -> None:
+    """Raise `ConfigError` where an initial value lies outside its bounds, or the bounds coincide."""
+    for name in free:
+        entry, value = system.parameters[name], theta[system.parameters.index(name)]
+        if not entry.lower <= value <= entry.upper:
+            raise ConfigError(
+                f"initial value {value:g} {entry.unit} of {name} lies outside its bounds",
+                where=f"parameters.{name}",
+                allowed=f"{entry.lower:g} to {entry.upper:g} {entry.unit}",
+            )
+        if not entry.lower < entry.upper:
+            raise ConfigError(
+                f"the bounds of {name} leave no room",
+                where=f"parameters.{name}",
+                allowed="lower below upper",
+                hint="fix the parameter instead of closing its bounds",
+            )
+
+
+def soft_logarithm(ratio: Array) -> tuple[Array, Array]:
+    """Return log(ratio) and its slope, below `MIN_LOG_RATIO` those of the parabola of equal value and derivatives there.
+
+    Parameters
+    ----------
+    ratio : ndarray, shape (k,)
+        Zero or above.
+    """
+    below = (ratio - MIN_LOG_RATIO) / MIN_LOG_RATIO
+    small = below < 0
+    kept = np.where(small, MIN_LOG_RATIO, ratio)
+    value = np.log(kept) + np.where(small, below - below**2 / 2, 0.0)
+    return value, np.where(small, (1 - below) / MIN_LOG_RATIO, 1 / kept)

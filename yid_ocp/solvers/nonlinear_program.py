@@ -1,0 +1,437 @@
+"""Nonlinear program in CasADi, composed of residual and constraint terms.
+
+    min f(w, p)   subject to   lower <= w <= upper,   g_lower <= g(w, p) <= g_upper
+
+f is half the sum of squares (or Huber's loss) of residuals, g the values of constraint terms. Nothing here knows
+mechanics or recordings.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
+from yid_ocp.errors import SolverError, nearest_name_hint
+from yid_ocp.parallel import CASADI_LOCK
+from yid_ocp.solvers.program_terms import (
+    IndexArray,
+    ProgramTerm,
+    ResidualTerm,
+    RidgeRegularization,
+    assemble_sparse,
+    sum_duplicate_entries,
+)
+
+Array = NDArray[np.float64]
+HessianKind = Literal["gauss_newton", "exact"]
+# Measured with IPOPT and MUMPS on 40 to 50 coordinates and 500 to 2000 steps [bytes an entry of Jacobian and Hessian].
+_BYTES_PER_ENTRY = 250.0
+
+# A trial point that cannot be worked out is the solver's to reject, not for the screen; multipliers of the parameters,
+# which are thousands, are for whoever asks.
+QUIET_OPTIONS = {"show_eval_warnings": False, "error_on_fail": False, "print_time": False, "calc_lam_p": False}
+
+# Options that fit programs of one size only.
+_SIZE_DEPENDENT_OPTIONS = ("iteration_callback", "discrete", "equality", "structure_detection", "N", "nx", "nu", "ng")
+
+
+@dataclass(frozen=True)
+class VectorBlock:
+    """Named block of a program's variables or parameters.
+
+    Attributes
+    ----------
+    index : ndarray of int, shape (rows, columns)
+        Indices in the vector.
+    row_names : tuple of str
+        Name of every row.
+    unit : str
+    """
+
+    index: IndexArray
+    row_names: tuple[str, ...]
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class _UserTerms:
+    """User-defined objective term and constraint rows of a program."""
+
+    objective: ca.MX
+    constraints: ca.MX
+    lower: Array
+    upper: Array
+
+
+def available_memory() -> float:
+    """Available memory [bytes]; infinite where the system does not report it."""
+    told = Path("/proc/meminfo")
+    lines = told.read_text(encoding="ascii", errors="replace").splitlines() if told.is_file() else []
+    found = [float(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
+    return found[0] if found else math.inf
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class NonlinearProgram(ReprMixin):
+    """Nonlinear program min f(w, p) subject to bounds and constraints, in CasADi.
+
+    `nlp[name]` is a block of `variables` or `parameters` as MX of its shape; where there is one recording, `nlp["q"]`
+    stands for `nlp["q[NAME]"]`.
+
+    Attributes
+    ----------
+    variables, parameters : mapping of str to Block
+        What `w` and `p` are made of.
+    constraint_terms : tuple of Term
+        Equalities, one below the other in `g`.
+    residual_terms : tuple of Residual
+        Their losses make the objective.
+    lower, upper : ndarray, shape (nw,)
+        Bounds of `w`.
+    initial_guess : ndarray, shape (nw,)
+        Guess of `w`.
+    parameter_values : ndarray, shape (np,)
+        Of `p`.
+    ridge : Ridge or None
+    w, p : casadi.MX
+        Unknowns and parameters, columns.
+    user_terms : tuple of Extra
+        What `with_user_terms` added.
+    """
+
+    variables: Mapping[str, VectorBlock]
+    parameters: Mapping[str, VectorBlock]
+    constraint_terms: tuple[ProgramTerm, ...]
+    residual_terms: tuple[ResidualTerm, ...]
+    lower: Array
+    upper: Array
+    initial_guess: Array
+    parameter_values: Array
+    ridge: RidgeRegularization | None
+    w: ca.MX
+    p: ca.MX
+    user_terms: tuple[_UserTerms, ...] = ()
+    _kept: dict[str, Any] = field(default_factory=dict, repr=False)
+
+    def _summary(self) -> ReprSummary:
+        rows = [("block", "entries"), *((name, str(block.index.size)) for name, block in self.variables.items())]
+        equalities = count_with_noun(sum(term.n_values for term in self.constraint_terms), "equation")
+        return ReprSummary(f"{count_with_noun(len(self.initial_guess), 'variable')}, {equalities}", rows)
+
+    # -- what it is made of -------------------------------------------------------------------------------------------
+
+    def block(self, name: str) -> VectorBlock:
+        """Return a block by its name; with one recording, `[NAME]` may be left out.
+
+        Raises
+        ------
+        SolverError
+            There is none, or more than one.
+        """
+        blocks = {**self.variables, **self.parameters}
+        if name in blocks:
+            return blocks[name]
+        alike = [key for key in blocks if key.startswith(f"{name}[")]
+        if len(alike) == 1:
+            return blocks[alike[0]]
+        raise SolverError(
+            f"the program has {len(alike)} blocks '{name}'", hint=nearest_name_hint(name, alike or blocks)
+        )
+
+    def __getitem__(self, name: str) -> ca.MX:
+        """Block of variables or parameters as an MX matrix of its shape."""
+        block = self.block(name)
+        vector = self.w if any(block is own for own in self.variables.values()) else self.p
+        return ca.reshape(vector[block.index.T.ravel().tolist()], *block.index.shape)
+
+    def variable_names(self) -> tuple[str, ...]:
+        """Names of all unknowns: block, row and column."""
+        named = np.full(self.w.numel(), "", dtype=object)
+        for name, block in self.variables.items():
+            for row, places in zip(block.row_names, block.index, strict=True):
+                several = len(places) > 1
+                named[places] = [f"{name}.{row}.{k}" if several else f"{name}.{row}" for k in range(len(places))]
+        return tuple(named)
+
+    def constraint_names(self) -> tuple[str, ...]:
+        """Names of all rows of `g`: term, row and place; `added.I` for those of `with_user_terms`."""
+        terms = [
+            f"{t.name}.{row}.{k}"
+            for t in self.constraint_terms
+            for k in range(len(t.variable_indices))
+            for row in t.row_names
+        ]
+        return (*terms, *(f"added.{i}" for i in range(sum(len(extra.lower) for extra in self.user_terms))))
+
+    @property
+    def f(self) -> ca.MX:
+        """Objective."""
+        return self._once(
+            "f", lambda: sum((self._loss(i) for i in range(len(self.residual_terms))), ca.MX(0)) + self._own()
+        )
+
+    @property
+    def g(self) -> ca.MX:
+        """Constraints, shape (ng, 1)."""
+
+        def made() -> ca.MX:
+            terms = (term.values(self.w, self.p) for term in self.constraint_terms)
+            return ca.vertcat(ca.MX(0, 1), *terms, *(extra.constraints for extra in self.user_terms))
+
+        return self._once("g", made)
+
+    @property
+    def nlp(self) -> dict[str, ca.MX]:
+        """The program as `casadi.nlpsol` takes it."""
+        return {"x": self.w, "p": self.p, "f": self.f, "g": self.g}
+
+    @property
+    def solver_arguments(self) -> dict[str, Array]:
+        """Arguments for calling a solver: initial guess, parameter values and bounds."""
+        zero = np.zeros(sum(term.n_values for term in self.constraint_terms))
+        low, high = ([zero, *(getattr(extra, side) for extra in self.user_terms)] for side in ("lower", "upper"))
+        bounds = {"lbx": self.lower, "ubx": self.upper, "lbg": np.concatenate(low), "ubg": np.concatenate(high)}
+        return {"x0": self.initial_guess, "p": self.parameter_values, **bounds}
+
+    # -- derivatives --------------------------------------------------------------------------------------------------
+
+    @property
+    def residual(self) -> ca.MX:
+        """All residuals, shape (nr, 1)."""
+        parts = (self._residual(i) for i in range(len(self.residual_terms)))
+        return self._once("r", lambda: ca.vertcat(ca.MX(0, 1), *parts))
+
+    @property
+    def jac_r(self) -> ca.MX:
+        """dr/dw, sparse."""
+        parts = (self._slope(i) for i in range(len(self.residual_terms)))
+        return self._once("jac_r", lambda: ca.vertcat(ca.MX(0, self.w.numel()), *parts))
+
+    @property
+    def jac_g(self) -> ca.MX:
+        """dg/dw, sparse."""
+        return self._once("jac_g", self._jacobian)
+
+    @property
+    def grad_f(self) -> ca.MX:
+        """df/dw, shape (nw, 1)."""
+        return self._once("grad_f", self._gradient)
+
+    @property
+    def lam_f(self) -> ca.MX:
+        """Factor on the objective in the Lagrangian, of which `hessian` is an expression."""
+        return self._once("lam_f", lambda: ca.MX.sym("lam_f"))
+
+    @property
+    def lam_g(self) -> ca.MX:
+        """Multipliers of the constraints in the Lagrangian, shape (ng, 1)."""
+        return self._once("lam_g", lambda: ca.MX.sym("lam_g", self.g.numel()))
+
+    def hessian(self, kind: HessianKind = "gauss_newton") -> ca.MX:
+        """Hessian of lam_f f + lam_g . g, exact or Gauss-Newton, sparse and symmetric.
+
+        Gauss-Newton leaves out the curvature of residuals and of the terms of `constraint_terms`, not of what was added.
+        """
+        return self._once(kind, lambda: self._data_curvature(kind) + self._other_curvature(kind))
+
+    def _data_curvature(self, kind: HessianKind) -> ca.MX:
+        size = self.w.numel()
+        total = ca.MX(size, size)
+        for i, residual in enumerate(self.residual_terms):
+            r, slope = self._residual(i), self._slope(i)
+            weight = residual.hessian_weight(r, kind == "exact")
+            weighted = slope if weight is None else ca.mtimes(ca.diag(weight), slope)
+            total += self.lam_f * ca.mtimes(slope.T, weighted)
+            if kind == "exact":
+                matrix, pull = residual.jacobian_by_values(self.p), residual.loss_gradient(r)
+                pull = pull if matrix is None else ca.mtimes(matrix.T, pull)
+                curved = residual.term.hessian_entries(self.w, self.p, self.lam_f * pull)
+                total += 0 if curved is None else sum_duplicate_entries(*curved, size)
+        return total
+
+    def _other_curvature(self, kind: HessianKind) -> ca.MX:
+        size, at = self.w.numel(), 0
+        total = ca.MX(size, size)
+        if kind == "gauss_newton" and self.ridge is not None:
+            total += self.lam_f * self._ridge(self.ridge)
+        for term in self.constraint_terms:
+            weight = self.lam_g[at : at + term.n_values]
+            at += term.n_values
+            curved = term.hessian_entries(self.w, self.p, weight) if kind == "exact" else None
+            total += 0 if curved is None else sum_duplicate_entries(*curved, size)
+        for extra in self.user_terms:
+            weight = self.lam_g[at : at + len(extra.lower)]
+            at += len(extra.lower)
+            total += ca.hessian(self.lam_f * extra.objective + ca.dot(weight, extra.constraints), self.w)[0]
+        return total
+
+    def _once(self, name: str, make: Any) -> Any:
+        with CASADI_LOCK:
+            if name not in self._kept:
+                self._kept[name] = make()
+            return self._kept[name]
+
+    def _own(self) -> ca.MX:
+        return sum((extra.objective for extra in self.user_terms), ca.MX(0))
+
+    def _residual(self, i: int) -> ca.MX:
+        return self._once(f"r{i}", lambda: self.residual_terms[i].values(self.w, self.p))
+
+    def _slope(self, i: int) -> ca.MX:
+        return self._once(f"jac_r{i}", lambda: self.residual_terms[i].jacobian(self.w, self.p))
+
+    def _loss(self, i: int) -> ca.MX:
+        return self.residual_terms[i].evaluate_loss(self._residual(i))
+
+    def _jacobian(self) -> ca.MX:
+        entries, rows, columns, at = [], [], [], 0
+        for term in self.constraint_terms:
+            row, column = term.jacobian_indices()
+            entries.append(term.jacobian_entries(self.w, self.p))
+            rows.append(at + row)
+            columns.append(column)
+            at += term.n_values
+        if not entries:
+            placed = ca.MX(0, self.w.numel())
+        else:
+            where = np.concatenate(rows), np.concatenate(columns)
+            placed = assemble_sparse(ca.vertcat(*entries), *where, (at, self.w.numel()))
+        return ca.vertcat(placed, *(ca.jacobian(extra.constraints, self.w) for extra in self.user_terms))
+
+    def _gradient(self) -> ca.MX:
+        total = ca.gradient(self._own(), self.w) if self.user_terms else ca.MX.zeros(self.w.numel(), 1)
+        for i, residual in enumerate(self.residual_terms):
+            total += ca.mtimes(self._slope(i).T, residual.loss_gradient(self._residual(i)))
+        return total
+
+    def _ridge(self, ridge: RidgeRegularization) -> ca.MX:
+        count = sum(residual.n_residuals for residual in self.residual_terms)
+        cost = sum((self._loss(i) for i in range(len(self.residual_terms))), ca.MX(0))
+        at = ridge.index.tolist()
+        size = ca.fmax(ca.fabs(self.w[at]), ca.DM(ridge.scale))
+        pattern = ca.Sparsity.triplet(self.w.numel(), self.w.numel(), at, at)
+        factor = ridge.factor(self.w) if isinstance(ridge.factor, ca.Function) else ridge.factor
+        return ca.MX(pattern, factor * 2 * cost / count / size**2)
+
+    def estimated_memory(self, hessian: HessianKind = "gauss_newton") -> float:
+        """Estimated additional memory of an interior-point method with a direct linear solver [bytes]."""
+        return _BYTES_PER_ENTRY * float(self.jac_g.nnz() + self.hessian(hessian).nnz())
+
+    # -- use ----------------------------------------------------------------------------------------------------------
+
+    def with_user_terms(
+        self,
+        objective: ca.MX | float = 0.0,
+        constraints: ca.MX | Sequence[ca.MX] = (),
+        lower: ArrayLike = 0.0,
+        upper: ArrayLike = 0.0,
+    ) -> NonlinearProgram:
+        """The program with a further objective term and further constraint rows.
+
+        Parameters
+        ----------
+        objective : casadi.MX
+            Scalar expression of `w` and `p`.
+        constraints : casadi.MX or sequence of them
+            Expressions of `w` and `p`.
+        lower, upper : array_like
+            Bounds of these rows; equalities to zero when absent.
+
+        Raises
+        ------
+        SolverError
+            An expression of other symbols, or bounds of another number than rows.
+        """
+        rows = [constraints] if isinstance(constraints, ca.MX) else list(constraints)
+        column = ca.vertcat(ca.MX(0, 1), *(ca.vec(ca.densify(row)) for row in rows))
+        scalar = ca.MX(objective)
+        strange = [s.name() for s in ca.symvar(ca.vertcat(scalar, column)) if not _is_of(s, self.w, self.p)]
+        if strange:
+            raise SolverError(
+                f"the symbol '{strange[0]}' is neither an unknown nor a parameter of the program",
+                where="NonlinearProgram.adding",
+                allowed="expressions of nlp.w, nlp.p and of nlp[NAME]",
+            )
+        bounds = []
+        for name, side in (("lower", lower), ("upper", upper)):
+            given = np.asarray(side, float).ravel()
+            if given.size not in (1, column.numel()):
+                raise SolverError(
+                    f"{given.size} {name} bounds for {column.numel()} constraints",
+                    where="NonlinearProgram.adding",
+                    allowed=f"one for all, or {column.numel()}",
+                )
+            bounds.append(np.broadcast_to(given, (column.numel(),)).copy())
+        return replace(self, user_terms=(*self.user_terms, _UserTerms(scalar, column, *bounds)), _kept={})
+
+    def make_solver(self, plugin: str = "ipopt", hessian: HessianKind = "gauss_newton", **options: Any) -> ca.Function:
+        """Make a `casadi.nlpsol` solver of the program that uses its assembled derivatives.
+
+        Parameters
+        ----------
+        plugin : str
+            Any of CasADi's.
+        hessian : "gauss_newton" or "exact"
+        **options
+            Of `casadi.nlpsol`.
+
+        Returns
+        -------
+        casadi.Function
+            To be called with `solver_arguments`.
+
+        Raises
+        ------
+        SolverError
+            CasADi does not have the plug-in, or refuses the options.
+        """
+        with CASADI_LOCK:
+            options = {**QUIET_OPTIONS, **options}
+            try:
+                asked = _asked_for(plugin, options)
+                made = {name: self._derivatives(name, *ends, hessian) for name, ends in asked.items()}
+                cache = {name: function for name, function in made.items() if function is not None}
+                return ca.nlpsol("program", plugin, self.nlp, {**options, "cache": cache})
+            except RuntimeError as error:
+                raise SolverError(
+                    f"CasADi cannot make the solver '{plugin}': {str(error).strip().splitlines()[-1]}",
+                    hint="see casadi.doc_nlpsol for its options",
+                ) from error
+
+    def _derivatives(
+        self, name: str, inputs: list[str], outputs: list[str], hessian: HessianKind
+    ) -> ca.Function | None:
+        symbols = {"x": self.w, "p": self.p, "lam_f": self.lam_f, "lam_g": self.lam_g}
+        known = {
+            "f": lambda: self.f,
+            "g": lambda: self.g,
+            "grad_f_x": lambda: self.grad_f,
+            "jac_g_x": lambda: self.jac_g,
+            "grad_gamma_x": lambda: self.lam_f * self.grad_f + ca.mtimes(self.jac_g.T, self.lam_g),
+            "hess_gamma_x_x": lambda: self.hessian(hessian),
+            "triu_hess_gamma_x_x": lambda: ca.triu(self.hessian(hessian)),
+        }
+        if not set(outputs) <= set(known) or not set(inputs) <= set(symbols):
+            return None
+        return ca.Function(name, [symbols[i] for i in inputs], [known[o]() for o in outputs], inputs, outputs)
+
+
+def _is_of(symbol: ca.MX, *vectors: ca.MX) -> bool:
+    return any(ca.is_equal(symbol, vector) for vector in vectors)
+
+
+def _asked_for(plugin: str, options: Mapping[str, Any]) -> dict[str, tuple[list[str], list[str]]]:
+    """Inputs and outputs of the functions that a plug-in asks for, learnt on a program of one unknown."""
+    x, p = ca.MX.sym("x"), ca.MX.sym("p")
+    fitting = {name: value for name, value in options.items() if name not in _SIZE_DEPENDENT_OPTIONS}
+    tiny = ca.nlpsol("tiny", plugin, {"x": x, "p": p, "f": x**2, "g": x}, fitting)
+    functions = {name: tiny.get_function(name) for name in tiny.get_function()}
+    return {name: (f.name_in(), f.name_out()) for name, f in functions.items()}

@@ -1,0 +1,265 @@
+"""Terms of a nonlinear program: one local function at many places, with directly assembled derivatives.
+
+CasADi would find the same derivatives by colouring the whole Jacobian, many times more slowly.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.integrator.compiler import compiled_function
+from yid_ocp.parallel import LockedCache
+
+Array = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
+
+
+class LocalFunction:
+    """Function y(v; d, s) of local variables v, data d and shared data s, with its derivatives.
+
+    Parameters
+    ----------
+    name : str
+    inputs : sequence of casadi.SX
+        (v, d, s), columns.
+    value : casadi.SX, shape (ny, 1)
+    jacobian : casadi.SX, shape (ny, nv), optional
+        dy/dv; differentiated from the value when absent.
+    use_compiler : bool
+        Whether the derivatives are compiled where that is possible; the value stays CasADi's own, so that whoever
+        builds upon it can differentiate it.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        inputs: Sequence[ca.SX],
+        value: ca.SX,
+        jacobian: ca.SX | None = None,
+        use_compiler: bool = False,
+    ) -> None:
+        self.name, self._inputs, self._expression, self._use_compiler = name, list(inputs), value, use_compiler
+        self.value = ca.Function(name, self._inputs, [value])
+        slopes = ca.jacobian(value, inputs[0]) if jacobian is None else jacobian
+        self.jacobian = self._compiled(ca.Function(f"{name}_slope", self._inputs, ca.cse([ca.sparsify(slopes)])))
+        self._curvature: LockedCache[None, ca.Function | None] = LockedCache(lambda _: self._curved())
+
+    @property
+    def curvature(self) -> ca.Function | None:
+        """Second derivative of weight . y by v at (v, d, s, weight), sparse; None where y is linear."""
+        return self._curvature(None)
+
+    def _compiled(self, function: ca.Function) -> ca.Function:
+        return compiled_function(function) if self._use_compiler else function
+
+    def _curved(self) -> ca.Function | None:
+        """One product with a direction, for each colour of the pattern: the whole would be millions of operations."""
+        v, weight = self._inputs[0], ca.SX.sym("weight", self._expression.numel())
+        gradient = ca.gradient(ca.dot(weight, self._expression), v)
+        pattern = ca.jacobian_sparsity(gradient, v)
+        if not pattern.nnz():
+            return None
+        direction = ca.SX.sym("direction", v.numel())
+        product = ca.cse([ca.densify(ca.jtimes(gradient, v, direction))])
+        times = self._compiled(ca.Function(f"{self.name}_product", [*self._inputs, weight, direction], product))
+        group = pattern.uni_coloring()
+        colour = np.zeros(v.numel(), int)
+        members, column = group.get_triplet()
+        colour[members] = column
+        row, at = (np.array(x) for x in pattern.get_triplet())
+        symbols = [ca.MX.sym(f"a{i}", times.sparsity_in(i)) for i in range(4)]
+        columns = times.map(f"{self.name}_products", "serial", group.size2(), [0, 1, 2, 3], [])
+        products = ca.vec(columns(*symbols, ca.DM(group, 1.0)))
+        entries = products[(row + v.numel() * colour[at]).tolist()]
+        return ca.Function(f"{self.name}_curvature", symbols, [ca.MX(pattern, entries)])
+
+
+@dataclass(frozen=True)
+class ProgramTerm:
+    """One local function applied at K places of a program.
+
+    Attributes
+    ----------
+    name : str
+    row_names : tuple of str
+        Names of the ny outputs.
+    local_function : Local
+    variable_indices : ndarray of int, shape (K, nv)
+        Indices of each place's local variables among the unknowns; none twice in a row.
+    data_indices : ndarray of int, shape (K, nd)
+        Indices of each place's data among the parameters.
+    shared_data_indices : ndarray of int, shape (ns,)
+        Indices of the data that all places share.
+    """
+
+    name: str
+    row_names: tuple[str, ...]
+    local_function: LocalFunction
+    variable_indices: IndexArray
+    data_indices: IndexArray
+    shared_data_indices: IndexArray
+
+    @property
+    def n_values(self) -> int:
+        """Number of values at all places."""
+        return len(self.row_names) * len(self.variable_indices)
+
+    def gather_arguments(self, w: ca.MX, p: ca.MX) -> tuple[ca.MX, ca.MX, ca.MX]:
+        """Gather local variables (nv, K), data (nd, K) and shared data (ns, 1)."""
+
+        def gathered(vector: ca.MX, index: IndexArray) -> ca.MX:
+            return ca.reshape(vector[index.ravel().tolist()], index.shape[1], index.shape[0])
+
+        return gathered(w, self.variable_indices), gathered(p, self.data_indices), p[self.shared_data_indices.tolist()]
+
+    def map_over_places(self, function: ca.Function, *arguments: ca.MX) -> ca.MX:
+        """Map a local function over all places, its results side by side."""
+        return function.map(
+            f"{function.name()}_{len(self.variable_indices)}", "serial", len(self.variable_indices), [2], []
+        )(*arguments)
+
+    def values(self, w: ca.MX, p: ca.MX) -> ca.MX:
+        """Values place by place, shape (ny K, 1)."""
+        return ca.vec(self.map_over_places(self.local_function.value, *self.gather_arguments(w, p)))
+
+    def jacobian_entries(self, w: ca.MX, p: ca.MX) -> ca.MX:
+        """Nonzero entries of the Jacobian, in the order of `jacobian_indices`."""
+        return _nonzero_values(self.map_over_places(self.local_function.jacobian, *self.gather_arguments(w, p)))
+
+    def jacobian_indices(self) -> tuple[IndexArray, IndexArray]:
+        """Row and column indices of the Jacobian's entries."""
+        row, column = (np.array(x, np.int64) for x in self.local_function.jacobian.sparsity_out(0).get_triplet())
+        first = len(self.row_names) * np.arange(len(self.variable_indices))[:, None]
+        return (first + row).ravel(), self.variable_indices[:, column].ravel()
+
+    def hessian_entries(self, w: ca.MX, p: ca.MX, weight: ca.MX) -> tuple[ca.MX, IndexArray, IndexArray] | None:
+        """Hessian of weight . values as entries, rows and columns, which may repeat; None where it is zero."""
+        function = self.local_function.curvature
+        if function is None:
+            return None
+        weights = ca.reshape(weight, len(self.row_names), len(self.variable_indices))
+        entries = _nonzero_values(self.map_over_places(function, *self.gather_arguments(w, p), weights))
+        row, column = (np.array(x, np.int64) for x in function.sparsity_out(0).get_triplet())
+        return entries, self.variable_indices[:, row].ravel(), self.variable_indices[:, column].ravel()
+
+
+@dataclass(frozen=True)
+class ResidualTerm:
+    """Residual term of a program's objective: r = weight (combination values - target).
+
+    Attributes
+    ----------
+    term : Term
+    combination : casadi.DM, shape (nr, ny K), or None
+        None takes the values as they are.
+    weight_indices, target_indices : ndarray of int, shape (nr,), or None
+        Indices among the parameters; None for weights of one and targets of zero.
+    huber_threshold : float
+        Residual beyond which Huber's loss is linear.
+    """
+
+    term: ProgramTerm
+    combination: ca.DM | None = None
+    weight_indices: IndexArray | None = None
+    target_indices: IndexArray | None = None
+    huber_threshold: float = math.inf
+
+    @property
+    def n_residuals(self) -> int:
+        """Number of residuals."""
+        return self.term.n_values if self.combination is None else self.combination.size1()
+
+    def jacobian_by_values(self, p: ca.MX) -> ca.MX | None:
+        """Jacobian dr/dvalues, sparse; None for the identity."""
+        if self.combination is None and self.weight_indices is None:
+            return None
+        combination = ca.DM.eye(self.n_residuals) if self.combination is None else self.combination
+        if self.weight_indices is None:
+            return ca.MX(combination)
+        row, _ = combination.sparsity().get_triplet()
+        factors = p[self.weight_indices[np.array(row, int)].tolist()]
+        return ca.MX(combination.sparsity(), factors * ca.MX(ca.DM(combination.nonzeros())))
+
+    def values(self, w: ca.MX, p: ca.MX) -> ca.MX:
+        """r, shape (nr, 1)."""
+        matrix, value = self.jacobian_by_values(p), self.term.values(w, p)
+        result = value if matrix is None else ca.mtimes(matrix, value)
+        if self.target_indices is None:
+            return result
+        target = p[self.target_indices.tolist()]
+        return result - (target if self.weight_indices is None else p[self.weight_indices.tolist()] * target)
+
+    def jacobian(self, w: ca.MX, p: ca.MX) -> ca.MX:
+        """dr/dw, shape (nr, nw), sparse."""
+        placed = assemble_sparse(
+            self.term.jacobian_entries(w, p), *self.term.jacobian_indices(), (self.term.n_values, w.numel())
+        )
+        matrix = self.jacobian_by_values(p)
+        return placed if matrix is None else ca.mtimes(matrix, placed)
+
+    def evaluate_loss(self, r: ca.MX) -> ca.MX:
+        """Loss of residuals r: half the sum of squares, or Huber's loss."""
+        if math.isinf(self.huber_threshold):
+            return ca.sumsqr(r) / 2
+        size, limit = ca.fabs(r), self.huber_threshold
+        return ca.sum1(ca.if_else(size <= limit, r**2 / 2, limit * (size - limit / 2)))
+
+    def loss_gradient(self, r: ca.MX) -> ca.MX:
+        """Gradient of the loss by r."""
+        return (
+            r if math.isinf(self.huber_threshold) else ca.fmax(ca.fmin(r, self.huber_threshold), -self.huber_threshold)
+        )
+
+    def hessian_weight(self, r: ca.MX, exact: bool) -> ca.MX | None:
+        """Weight of each residual in the Hessian of the loss; None for ones.
+
+        Exactly it is one or zero; Gauss-Newton's, that of weighted squares with the same gradient, is never zero.
+        """
+        if math.isinf(self.huber_threshold):
+            return None
+        size = ca.fabs(r)
+        if exact:
+            return ca.if_else(size <= self.huber_threshold, 1.0, 0.0)
+        return ca.fmin(1.0, self.huber_threshold / ca.fmax(size, 1e-300))
+
+
+@dataclass(frozen=True)
+class RidgeRegularization:
+    """Regularization of the Gauss-Newton Hessian by factor * mean square residual / max(|w_i|, scale_i)^2.
+
+    Along unknowns that the data hardly inform the curvature that Gauss-Newton leaves out may be as large as its own.
+    The factor is a number, or a function of the unknowns that gives one, which may change from iterate to iterate.
+    """
+
+    index: IndexArray
+    scale: Array
+    factor: float | ca.Function
+
+
+def _nonzero_values(matrix: ca.MX) -> ca.MX:
+    """Nonzero entries of a sparse expression as a column."""
+    return ca.MX(ca.Sparsity.dense(matrix.nnz(), 1), matrix.nz[:])
+
+
+def assemble_sparse(entries: ca.MX, row: IndexArray, column: IndexArray, shape: tuple[int, int]) -> ca.MX:
+    """Assemble a sparse matrix from entries at distinct positions."""
+    order = np.lexsort((row, column))
+    start = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=shape[1]))])
+    sparsity = ca.Sparsity(*shape, start.tolist(), row[order].tolist())
+    return ca.MX(sparsity, entries[order.tolist()])
+
+
+def sum_duplicate_entries(entries: ca.MX, row: IndexArray, column: IndexArray, size: int) -> ca.MX:
+    """Assemble a sparse square matrix from entries, summing those at the same position."""
+    keys, place = np.unique(column * size + row, return_inverse=True)
+    start = np.concatenate([[0], np.cumsum(np.bincount(keys // size, minlength=size))])
+    sparsity = ca.Sparsity(size, size, start.tolist(), (keys % size).tolist())
+    # one column for every entry, its only row being where it goes
+    columns = ca.Sparsity(len(keys), len(place), list(range(len(place) + 1)), place.ravel().tolist())
+    return ca.MX(sparsity, ca.mtimes(ca.MX(ca.DM(columns, 1.0)), entries))

@@ -1,0 +1,572 @@
+"""Symbolic transcription of an estimation problem into a CasADi program with the equations of every step.
+
+The unknowns are, in this order,
+
+    (shared parameters | recording 1: local parameters, its rest, x_0, lam_0, x_1, lam_1, ... x_N | recording 2: ... )
+
+with x = (q, p, z). `rest` is the equilibrium at the first posture (coordinates sought, internal ones, forces of the
+grasps), of which x_0 is a function; it is absent where a start is given. The constraints are the equations of that
+equilibrium and the rows of every `Stage`; the objective has the whitened samples, interpolated between nodes, and the
+priors. What was recorded are parameters. Where noise drives the motion its errors are unknowns too, after
+the states of their recording, with their standard deviations as priors: at the optimum this is the likelihood of
+`problem.noise`, but for what that linearises.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import casadi as ca
+import numpy as np
+import scipy.sparse
+from numpy.typing import ArrayLike, NDArray
+
+from yid_ocp.errors import SolverError
+from yid_ocp.integrator.nlp_stage import nlp_stage
+from yid_ocp.integrator.statics import holding_spring_stiffness
+from yid_ocp.parallel import CASADI_LOCK
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.estimation_problem import EstimationProblem
+from yid_ocp.problem.measurements import Measurements
+from yid_ocp.problem.unknown_vector import MIN_LOG_RATIO
+from yid_ocp.sensors import Sensor, sensor_function
+from yid_ocp.solvers.driven_stage import DrivenStage, FreeParameterSymbols, make_driven_stage
+from yid_ocp.solvers.initial_guess import NodeStateGuess, guess_node_states
+from yid_ocp.solvers.nonlinear_program import NonlinearProgram, VectorBlock
+from yid_ocp.solvers.program_terms import IndexArray, LocalFunction, ProgramTerm, ResidualTerm, RidgeRegularization
+
+Array = NDArray[np.float64]
+
+# Least curvature for a change of a parameter by its size, over the mean square of the whitened residuals.
+MIN_RIDGE_FACTOR = 0.1
+
+
+def transcribe(
+    problem: EstimationProblem, initial_unknowns: ArrayLike | None = None, use_compiler: bool | None = None
+) -> NonlinearProgram:
+    """Transcribe an estimation problem into a nonlinear program with a node at every step.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    initial_unknowns : array_like, optional, shape (nx,)
+        Unknown vector of the problem near which the guess of the program's unknowns is made; the problem's when absent.
+    use_compiler : bool, optional
+        Whether the derivatives of a stage are compiled where that is possible; as the problem's step when absent.
+
+    Returns
+    -------
+    NonlinearProgram
+        With the variables `theta`, and of every recording `local[NAME]`, `rest[NAME]`, `q[NAME]`, `p[NAME]`, `z[NAME]`
+        and `lam[NAME]`; with the parameters `theta[NAME]`, `torque[NAME]`, `gain[NAME]`, `reference[NAME]`,
+        `value.GROUP[NAME]`, `weight.GROUP[NAME]`, `start[NAME]` and others where there are such, see docs/program.md.
+
+    Raises
+    ------
+    SolverError
+        An effect on recorded inputs or times is at work, a free parameter has a known value in a recording, or two
+        recordings have one name.
+
+    References
+    ----------
+    Johnson and Murphey (2009), IEEE Trans. Robotics 25(6):1249, doi:10.1109/TRO.2009.2032955.
+    """
+    problem = _about_zero(problem)
+    _check_transcribable(problem, "transcribe")
+    compiled = problem.step.is_compiled if use_compiler is None else use_compiler
+    with CASADI_LOCK:
+        return _Maker(problem, compiled).program(
+            problem.initial_unknowns if initial_unknowns is None else np.asarray(initial_unknowns, float)
+        )
+
+
+def _about_zero(problem: EstimationProblem) -> EstimationProblem:
+    """The problem with torques as recorded: no offset of theirs is known yet, as it is an unknown."""
+    if not any(
+        episode.input_errors is not None and np.any(episode.input_errors.torque_bias) for episode in problem.episodes
+    ):
+        return problem
+    episodes = [
+        episode
+        if (e := episode.input_errors) is None
+        else replace(episode, input_errors=replace(e, torque_bias=0.0 * e.torque_bias))
+        for episode in problem.episodes
+    ]
+    return problem.with_episodes(episodes, problem.held_out)
+
+
+def _check_transcribable(problem: EstimationProblem, where: str) -> None:
+    """Raise `SolverError` for problems that no transcription with nodes supports."""
+    if not problem.has_uncorrected_inputs:
+        raise SolverError(
+            "an effect changes recorded inputs, times or what the tracking filter follows",
+            where=where,
+            allowed="effects of the mechanics and of what sensors read",
+            hint="use gauss_newton",
+        )
+    names = [episode.name for episode in problem.episodes]
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise SolverError(
+            f"two recordings are called '{twice[0]}'",
+            where=where,
+            hint="rename one of the files: blocks have their names",
+        )
+    for episode in problem.episodes:
+        known = {
+            **episode.known_parameters,
+            **({} if episode.fixed_initial_state is None else episode.fixed_initial_state.fitted_parameters),
+        }
+        both = [name for name in problem.free if name in known]
+        if both:
+            raise SolverError(
+                f"{both[0]} is free and has a known value in a recording", where=f"{where}: {episode.name}"
+            )
+
+
+def unknowns_from_program(problem: EstimationProblem, program: NonlinearProgram, w: Array) -> Array:
+    """Problem's unknown vector at a point `w` of its program, shape (nx,)."""
+    x = problem.initial_unknowns.copy()
+    shared, own = len(problem.shared_parameters), len(problem.local_parameters)
+    x[:shared] = w[program.variables["theta"].index.ravel()] if shared else 0.0
+    rows = list(problem.predictor.estimated_state_indices)
+    for i, episode in enumerate(problem.episodes):
+        columns = problem.unknowns.recording_columns(i)[shared:]
+        if own:
+            x[columns[:own]] = w[program.variables[f"local[{episode.name}]"].index.ravel()]
+        if rows:
+            blocks = (program.variables.get(f"{part}[{episode.name}]") for part in "qpz")
+            first = w[np.concatenate([block.index[:, 0] for block in blocks if block is not None])]
+            begin = problem.initial_state(episode, problem.split(x, i)[0], guess=first[: problem.step.sizes["n"]])
+            x[columns[own:]] = (first - begin.state)[rows]
+    return x
+
+
+@dataclass
+class _Vector:
+    """Blocks laid one after the other, with values and bounds."""
+
+    size: int = 0
+    blocks: dict[str, VectorBlock] = field(default_factory=dict)
+    values: list[Array] = field(default_factory=list)
+    lower: list[Array] = field(default_factory=list)
+    upper: list[Array] = field(default_factory=list)
+
+    def extend(self, values: Array, lower: float | Array = -math.inf, upper: float | Array = math.inf) -> IndexArray:
+        """Lay values down; their places."""
+        self.values.append(values)
+        self.lower.append(np.broadcast_to(lower, values.shape).astype(float))
+        self.upper.append(np.broadcast_to(upper, values.shape).astype(float))
+        self.size += len(values)
+        return np.arange(self.size - len(values), self.size)
+
+    def name(self, name: str, index: IndexArray, rows: Sequence[str], unit: str = "") -> None:
+        """Name places, unless there are none."""
+        if index.size:
+            self.blocks[name] = VectorBlock(index, tuple(rows), unit)
+
+    def add(self, name: str, values: Array, rows: Sequence[str], unit: str = "") -> IndexArray:
+        """Lay a block down, column by column; its places, (rows, columns)."""
+        table = np.asarray(values, float)
+        table = table[:, None] if table.ndim == 1 else table
+        index = self.extend(table.ravel(order="F")).reshape(table.shape, order="F")
+        self.name(name, index, rows, unit)
+        return index
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Where the unknowns of one recording stand, and the parameters that drive it.
+
+    `errors` are those of the torque of every step, (N, ne), `first` those of the first angles, as `DrivenStage` wants.
+    """
+
+    free: IndexArray
+    rest: IndexArray
+    state: IndexArray
+    multipliers: IndexArray
+    errors: IndexArray
+    first: IndexArray
+    theta: IndexArray
+    torque: IndexArray
+    gain: IndexArray
+    reference: IndexArray
+
+    def stages(self) -> IndexArray:
+        """(free, x_k, x_{k+1}, lam_k, errors) of every step, (N, nv)."""
+        steps = len(self.multipliers)
+        free = np.broadcast_to(self.free, (steps, len(self.free)))
+        return np.hstack([free, self.state[:-1], self.state[1:], self.multipliers, self.errors])
+
+    def inputs(self) -> IndexArray:
+        """(torque, gain, reference) of every step, (N, nd)."""
+        return np.hstack([self.torque.T, self.gain.T, self.reference.T])
+
+
+class _Maker:
+    """Lays out unknowns and parameters of a problem, and makes the terms about them."""
+
+    def __init__(self, problem: EstimationProblem, compiled: bool) -> None:
+        self._problem, self._compiled = problem, compiled
+        self._step, self._sizes = problem.step, problem.step.sizes
+        self._names = problem.unknowns.free_parameters
+        self._w, self._p = _Vector(), _Vector()
+        system = problem.system
+        free, fixed = ca.SX.sym("free", len(self._names)), ca.SX.sym("theta", len(system.parameters))
+        theta = ca.SX(fixed)
+        for k, name in enumerate(self._names):
+            theta[system.parameters.index(name)] = free[k]
+        self._freed = FreeParameterSymbols(self._names, free, fixed, theta)
+        self._stage = nlp_stage(self._step.equations, self._step.time_step)
+        self._stages: dict[tuple[bool, bool], DrivenStage] = {}
+        self._sensors: dict[tuple[Sensor, bool, bool], tuple[LocalFunction, bool]] = {}
+
+    def program(self, x: Array) -> NonlinearProgram:
+        """The program, its guess made near the problem's unknown vector `x`."""
+        problem, low, high = self._problem, *self._problem.bounds
+        nodes = [np.arange(episode.grid.steps + 1) for episode in problem.episodes]
+        found = guess_node_states(problem, nodes, x, self._misfit)
+        x = found.x
+        shared = len(problem.shared_parameters)
+        theta = self._w.extend(x[:shared], low[:shared], high[:shared])
+        self._w.name("theta", theta[:, None], problem.shared_parameters)
+        constraints: list[ProgramTerm] = []
+        residuals: list[ResidualTerm] = []
+        ridge, columns = [theta], {k: int(place) for k, place in enumerate(theta)}
+        for i, episode in enumerate(problem.episodes):
+            at = problem.unknowns.recording_columns(i)[shared : shared + len(problem.local_parameters)]
+            local = self._w.extend(x[at], low[at], high[at])
+            self._w.name(f"local[{episode.name}]", local[:, None], problem.local_parameters)
+            columns |= {int(k): int(place) for k, place in zip(at, local, strict=True)}
+            ridge.append(local)
+            places, errors = self._laid_out(i, found, np.concatenate([theta, local]))
+            begun, prior = self._begun(episode, places)
+            constraints += [begun, self._moved(episode, places)]
+            residuals += [
+                self._sampled(episode, samples, places) for samples in episode.measurements if samples.n_residuals
+            ]
+            residuals += [*prior, *errors]
+        residuals += self._priors(columns)
+        index = np.concatenate(ridge)
+        order = [k for k, _ in sorted(columns.items(), key=lambda entry: entry[1])]
+        lower, upper, start = (np.concatenate(part) for part in (self._w.lower, self._w.upper, self._w.values))
+        return NonlinearProgram(
+            self._w.blocks,
+            self._p.blocks,
+            tuple(constraints),
+            tuple(residuals),
+            lower,
+            upper,
+            start,
+            np.concatenate([np.zeros(0), *self._p.values]),
+            RidgeRegularization(index, problem.unknown_scales[order], MIN_RIDGE_FACTOR),
+            ca.MX.sym("w", self._w.size),
+            ca.MX.sym("p", self._p.size),
+        )
+
+    # -- layout -------------------------------------------------------------------------------------------------------
+
+    def _laid_out(self, i: int, found: NodeStateGuess, free: IndexArray) -> tuple[_Places, list[ResidualTerm]]:
+        """The unknowns of a recording at their guess and what drives it; priors of errors."""
+        problem, episode = self._problem, self._problem.episodes[i]
+        system, name, n, nx, m = problem.system, episode.name, *(self._sizes[key] for key in ("n", "nx", "m"))
+        begin, state, pull = found.initial_states[i], found.node_states[i], found.multipliers[i]
+        theta = problem.predictor.episode_theta(episode, problem.split(found.x, i)[0])
+        rest = np.zeros(0)
+        if begin.equilibrium is not None:
+            sought = list(problem.model_functions.equilibrium_solver.free_coordinates)
+            rest = np.concatenate(
+                [
+                    begin.equilibrium.state[sought],
+                    begin.equilibrium.state[2 * n :],
+                    begin.equilibrium.constraint_reactions,
+                ]
+            )
+        joints = system.mechanism.joint_names
+        grasped = [name for grasp in system.grasps for name in grasp.equation_names]
+        at_rest = [
+            *(joints[k] for k in problem.model_functions.equilibrium_solver.free_coordinates),
+            *system.internal_coordinates,
+            *grasped,
+        ]
+        rest_at = self._w.extend(rest)
+        self._w.name(f"rest[{name}]", rest_at[:, None], at_rest if len(rest) else ())
+        table = np.zeros((3, len(state), nx + m))
+        table[0, :, :nx], table[0, :-1, nx:] = state, pull
+        table[1], table[2] = -np.inf, np.inf
+        for column, joint in enumerate(system.prescribed_indices):
+            table[:, :, joint] = episode.prescribed_path[:, column]
+        # the last node has no multipliers
+        at = self._w.extend(*(part.ravel()[: part.size - m] for part in table))
+        index = np.append(at, np.zeros(m, np.int64)).reshape(len(state), nx + m)
+        states, multipliers = index[:, :nx], index[:-1, nx:]
+        for label, part, rows in (("q", states[:, :n], joints), ("p", states[:, n : 2 * n], joints)):
+            self._w.name(f"{label}[{name}]", part.T, rows)
+        self._w.name(f"z[{name}]", states[:, 2 * n :].T, tuple(system.internal_coordinates))
+        self._w.name(f"lam[{name}]", multipliers.T, grasped)
+        known = self._p.add(f"theta[{name}]", theta, system.parameters.names)
+        torque = self._p.add(f"torque[{name}]", episode.torque.T, system.driven, "N m")
+        gain, reference = self._followed(episode)
+        errors, first, priors = self._erring(episode)
+        return _Places(free, rest_at, states, multipliers, errors, first, known[:, 0], torque, gain, reference), priors
+
+    def _followed(self, episode: Episode) -> tuple[IndexArray, IndexArray]:
+        """Gains (row by row) and reference of the tracking filter at every step."""
+        feedback, steps = episode.tracking_feedback, episode.grid.steps
+        if feedback is None or not _kind(episode)[0]:
+            return np.zeros((0, steps), np.int64), np.zeros((0, steps), np.int64)
+        driven, joints, n = self._problem.system.driven, self._problem.system.mechanism.joint_names, self._sizes["n"]
+        followed = [f"{'q' if row < n else 'p'}.{joints[row % n]}" for row in feedback.state_indices]
+        pairs = [f"{joint}, {other}" for joint in driven for other in followed]
+        gain = self._p.add(f"gain[{episode.name}]", feedback.gain.reshape(steps, -1).T, pairs)
+        return gain, self._p.add(f"reference[{episode.name}]", feedback.reference.T, followed)
+
+    def _misfit(self, i: int, state: Array, _: Array, x: Array) -> float:
+        """Mean square whitened residual of what node states alone predict."""
+        problem, episode = self._problem, self._problem.episodes[i]
+        theta = problem.predictor.episode_theta(episode, problem.split(x, i)[0])
+        flat, parts = np.zeros((*state.shape, len(self._names))), [np.zeros(1)]
+        for samples in episode.measurements:
+            if not samples.sensor.effort_joints:
+                predicted, _ = problem.predictor.readings_along_trajectory(samples, state, flat, theta)
+                parts.append(samples.residual_block(predicted, threshold=problem.options.huber_threshold).residual)
+        return float(np.mean(np.concatenate(parts) ** 2))
+
+    def _driven(self, episode: Episode) -> DrivenStage:
+        """The stage as a recording drives it."""
+        key = _kind(episode)
+        if key not in self._stages:
+            followed = (
+                episode.tracking_feedback.state_indices if key[0] and episode.tracking_feedback is not None else None
+            )
+            momentum = self._problem.model_functions.momentum_shift.momentum_by_torque(self._problem.theta)
+            self._stages[key] = make_driven_stage(self._stage, self._freed, followed, momentum, key[1], self._compiled)
+        return self._stages[key]
+
+    def _erring(self, episode: Episode) -> tuple[IndexArray, IndexArray, list[ResidualTerm]]:
+        """Places of the torque's errors at every step and of the first angles', and their priors."""
+        errors, steps, name = episode.input_errors, episode.grid.steps, episode.name
+        if errors is None:
+            return np.zeros((steps, 0), np.int64), np.zeros(0, np.int64), []
+        driven, nu = self._problem.system.driven, self._sizes["nu"]
+        sample, of_step = np.unique(errors.sample_of_step, return_inverse=True)
+        spread = errors.angle_std * np.sqrt(errors.encoder_noise_steps)
+        wanted = [("torque_error", errors.torque_std, len(sample)), ("torque_offset", errors.torque_bias_std, 1)]
+        wanted += [("angle_error", spread, steps)] if _kind(episode)[0] else []
+        wanted += [("first_angle_error", errors.angle_std, 1)] if episode.fixed_initial_state is None else []
+        places, priors = {}, []
+        for label, std, count in wanted:
+            none = np.tile(std <= 0, count)
+            zero = np.zeros(nu * count)
+            at = self._w.extend(zero, np.where(none, 0.0, -np.inf), np.where(none, 0.0, np.inf))
+            places[label] = at.reshape(count, nu)
+            self._w.name(f"{label}[{name}]", places[label].T, driven)
+            weight = self._p.add(f"weight.{label}[{name}]", 1.0 / np.where(std > 0, std, 1.0), driven)
+            term = ProgramTerm(
+                f"{label}[{name}]", driven, _itself(nu), places[label], np.zeros((count, 0), np.int64), weight[:0, 0]
+            )
+            priors.append(ResidualTerm(term, ca.DM.eye(nu * count), np.tile(weight[:, 0], count)))
+        offset = np.broadcast_to(places["torque_offset"], (steps, nu))
+        per_step = [places["torque_error"][of_step.ravel()], offset]
+        per_step += [places["angle_error"]] if "angle_error" in places else []
+        first = places.get("first_angle_error", np.zeros((1, 0), np.int64))[0]
+        return np.hstack(per_step), first, priors
+
+    # -- terms --------------------------------------------------------------------------------------------------------
+
+    def _moved(self, episode: Episode, places: _Places) -> ProgramTerm:
+        """Every step's equations."""
+        local = self._driven(episode).stage_function
+        return ProgramTerm(
+            f"step[{episode.name}]", self._stage.residual_names, local, places.stages(), places.inputs(), places.theta
+        )
+
+    def _begun(self, episode: Episode, places: _Places) -> tuple[ProgramTerm, list[ResidualTerm]]:
+        """What fixes the first state, and the prior of what is free of it."""
+        problem, name, nx = self._problem, episode.name, self._sizes["nx"]
+        loose = list(problem.predictor.estimated_state_indices)
+        fixed = [k for k in range(nx) if k not in {*problem.system.prescribed_indices, *loose}]
+        joints = problem.system.mechanism.joint_names
+        rows = [
+            *(f"q.{joint}" for joint in joints),
+            *(f"p.{joint}" for joint in joints),
+            *problem.system.internal_coordinates,
+        ]
+        first = ca.SX.sym("x0", nx)
+        if episode.fixed_initial_state is not None:
+            given = self._p.add(f"start[{name}]", episode.fixed_initial_state.state, rows)
+            state, balance = ca.SX.sym("given", nx), ca.SX(0, 1)
+            inputs = [first, state, ca.SX(0, 1)]
+            at, data, shared = places.state[:1], given.T, np.zeros(0, np.int64)
+        else:
+            statics = problem.model_functions.equilibrium_solver
+            rest = statics.equations
+            sought, held = rest.inputs[0], rest.inputs[2]
+            stiffness = holding_spring_stiffness(problem.system, bool(problem.system.driven))
+            symbols = rest.inputs[3:]
+            values = [ca.SX(stiffness), self._freed.theta, ca.SX(self._step.time_step)]
+            balance, state = ca.substitute([rest.residual, rest.state], symbols, values)
+            posture, nu = rest.inputs[1], held.numel()
+            errors = ca.SX.sym("errors", 3 * len(places.first))
+            if len(places.first):
+                # (of the first angles, w of the first step, b)
+                moved = posture - ca.vertcat(errors[:nu], ca.SX(ca.DM.zeros(posture.numel() - nu)))
+                true = held - errors[nu : 2 * nu] - errors[2 * nu :]
+                balance, state = ca.substitute([balance, state], [posture, held], [moved, true])
+            inputs = [
+                ca.vertcat(self._freed.free_symbols, sought, first, errors),
+                ca.vertcat(posture, held),
+                self._freed.nominal_symbols,
+            ]
+            known = [problem.system.mechanism.joint_names[k] for k in statics.known_coordinates]
+            given = self._p.add(f"posture[{name}]", episode.initial_known_coordinates, known)
+            wrong = [places.first, places.errors[0, : 2 * nu]] if len(places.first) else []
+            at = np.concatenate([places.free, places.rest, places.state[0], *wrong])[None, :]
+            data, shared = np.concatenate([given[:, 0], places.torque[:, 0]])[None, :], places.theta
+        labels = [f"rest.{k}" for k in range(balance.numel())] + [f"start.{rows[k]}" for k in fixed]
+        value = ca.densify(ca.vertcat(balance, (first - state)[fixed]))
+        term = ProgramTerm(f"start[{name}]", tuple(labels), LocalFunction("start", inputs, value), at, data, shared)
+        if not loose:
+            return term, []
+        offset = LocalFunction("offset", inputs, ca.densify((first - state)[loose]))
+        weight = self._p.add(f"weight.start[{name}]", 1.0 / problem.initial_state_prior_std, [rows[k] for k in loose])
+        named = tuple(f"offset.{rows[k]}" for k in loose)
+        free = ProgramTerm(f"offset[{name}]", named, offset, at, data, shared)
+        return term, [ResidualTerm(free, ca.DM.eye(len(loose)), weight[:, 0])]
+
+    def _sampled(self, episode: Episode, samples: Measurements, places: _Places) -> ResidualTerm:
+        """Samples of one sensor, predicted linearly between the two nodes beside them."""
+        sensor, nodes, n = samples.sensor, samples.evaluation_nodes, self._sizes["n"]
+        read, loaded = self._reading(sensor, episode)
+        smooth = self._problem.predictor.effort_smoother(episode, self._problem.theta) if sensor.effort_joints else None
+        if smooth is not None:
+            nodes = np.arange(episode.grid.steps)
+        if loaded:
+            # after the last step the effort is that of this step
+            step = np.minimum(nodes, len(places.multipliers) - 1)
+            ends = self._p.add(
+                f"last.{sensor.group_name}[{episode.name}]", (nodes > step).astype(float)[None, :], ["last"]
+            )
+            at, data = places.stages()[step], np.hstack([places.inputs()[step], ends.T])
+        else:
+            free = np.broadcast_to(places.free, (len(nodes), len(places.free)))
+            states = places.state[nodes]
+            at, data = np.hstack([free, states[:, :n], states[:, 2 * n :]]), np.zeros((len(nodes), 0), np.int64)
+        parts = [f".{axis}" for axis in "xyz"] if sensor.outputs_per_channel == 3 else [""] * sensor.outputs_per_channel
+        rows = tuple(f"{channel}{part}" for channel in sensor.channel_names for part in parts)
+        term = ProgramTerm(f"{sensor.group_name}[{episode.name}]", rows, read, at, data, places.theta)
+        seen, between = samples.is_used, _between(samples, nodes if smooth is None else smooth.nodes)
+        if smooth is not None:
+            between = between @ scipy.sparse.kron(smooth.matrix, scipy.sparse.eye_array(seen.shape[1]))
+        threshold = self._problem.options.huber_threshold
+        if samples.noise_correlation is not None:
+            mixed = np.zeros(seen.shape)
+            mixed[seen] = samples.decorrelate(samples.weight[seen] * samples.value[seen])
+            target = self._p.add(f"value.{term.name}", mixed.T, rows, "")
+            combination = samples.decorrelate(scipy.sparse.diags_array(samples.weight[seen]) @ between)
+            return ResidualTerm(term, _constant(combination), None, target.T[seen], threshold)
+        value = self._p.add(f"value.{term.name}", np.where(seen, samples.value, 0.0).T, rows, sensor.unit)
+        weight = self._p.add(f"weight.{term.name}", samples.weight.T, rows)
+        return ResidualTerm(term, _constant(between), weight.T[seen], value.T[seen], threshold)
+
+    def _reading(self, sensor: Sensor, episode: Episode) -> tuple[LocalFunction, bool]:
+        """What a sensor reads at a node, and whether it depends on efforts, that is, on the step from there."""
+        key = (sensor, *_kind(episode))
+        if key not in self._sensors:
+            n, nz = self._sizes["n"], self._sizes["nz"]
+            function = sensor_function(self._problem.system, sensor, self._names)
+            loaded = function.nnz_out(3) > 0
+            made = self._loaded(function, self._driven(episode)) if loaded else self._unloaded(function, n, nz)
+            self._sensors[key] = made, loaded
+        return self._sensors[key]
+
+    def _unloaded(self, function: ca.Function, n: int, nz: int) -> LocalFunction:
+        q, z = ca.SX.sym("q", n), ca.SX.sym("z", nz)
+        y, by_q, by_z, _, by_free = function(q, z, ca.SX(ca.DM.zeros(n)), self._freed.theta)
+        inputs = [ca.vertcat(self._freed.free_symbols, q, z), ca.SX(0, 1), self._freed.nominal_symbols]
+        return LocalFunction("reading", inputs, y, ca.horzcat(by_free, by_q, by_z))
+
+    def _loaded(self, function: ca.Function, step: DrivenStage) -> LocalFunction:
+        system, n, nx = self._problem.system, self._sizes["n"], self._sizes["nx"]
+        last, size = ca.SX.sym("last"), step.v.numel()
+        node = (1 - last) * step.state_before + last * step.state_after
+        load, by_v = ca.SX(ca.DM.zeros(n)), ca.SX(n, size)
+        pairs = ((system.prescribed_indices, *step.effort), (system.driven_indices, *step.torque))
+        for index, values, by_these in pairs:
+            for k, row in enumerate(index):
+                load[row], by_v[row, :] = values[k], by_these[k, :]
+        y, by_q, by_z, by_load, by_free = function(node[:n], node[2 * n :], load, self._freed.theta)
+        at_node = ca.horzcat(by_q, ca.SX(y.numel(), n), by_z)
+        rest = ca.SX(y.numel(), size - len(self._names) - 2 * nx)
+        slopes = ca.mtimes(by_load, by_v) + ca.horzcat(by_free, (1 - last) * at_node, last * at_node, rest)
+        return LocalFunction(
+            "reading_under_load", [step.v, ca.vertcat(step.data, last), self._freed.nominal_symbols], y, slopes
+        )
+
+    def _priors(self, columns: dict[int, int]) -> list[ResidualTerm]:
+        """Stated priors of parameters, and the weak ones."""
+        problem = self._problem
+        _, slopes = problem.prior_residual(problem.initial_unknowns)
+        v, about = ca.SX.sym("v"), ca.SX.sym("about")
+        ratio = v / about
+        below = (ratio - MIN_LOG_RATIO) / MIN_LOG_RATIO
+        soft = ca.log(ca.fmax(ratio, MIN_LOG_RATIO)) + ca.if_else(ratio < MIN_LOG_RATIO, below - below**2 / 2, 0)
+        stated = problem.residual_rows.stated_priors.stop - problem.residual_rows.stated_priors.start
+        found = []
+        kinds = (("prior", slice(0, stated), v - about), ("weak_prior", slice(stated, None), soft))
+        for name, part, value in kinds:
+            own = slopes[part]
+            unknown = np.array([k for k in np.flatnonzero(own.any(axis=0)) if int(k) in columns], int)
+            own = own[own[:, unknown].any(axis=1)][:, unknown]
+            if not len(unknown):
+                continue
+            # rows of a joint prior mix their own unknown, the last one, with those before it
+            last = own.shape[1] - 1 - np.argmax(own[:, ::-1] != 0, axis=1)
+            weight = own[np.arange(len(own)), last]
+            mixed = ca.sparsify(ca.DM(own / weight[:, None]))
+            if name == "weak_prior":
+                weight = weight * problem.initial_unknowns[unknown[last]]
+            names = [problem.unknown_names[k] for k in unknown]
+            start = self._p.add(f"{name}.start", problem.initial_unknowns[unknown], names)
+            rows = [names[k] for k in last]
+            weights = self._p.add(f"{name}.weight", weight, rows)
+            local = LocalFunction(name, [v, about, ca.SX(0, 1)], value)
+            at = np.array([[columns[int(k)]] for k in unknown])
+            term = ProgramTerm(name, (name,), local, at, start, np.zeros(0, np.int64))
+            found.append(ResidualTerm(term, mixed, weights[:, 0]))
+        return found
+
+
+def _kind(episode: Episode) -> tuple[bool, bool]:
+    """Whether a recording's stage is under the tracking filter, and whether errors of torques are unknowns."""
+    errors = episode.input_errors
+    return episode.tracking_feedback is not None and (
+        errors is None or not errors.has_encoder_measurements
+    ), errors is not None
+
+
+def _itself(size: int) -> LocalFunction:
+    v = ca.SX.sym("v", size)
+    return LocalFunction("itself", [v, ca.SX(0, 1), ca.SX(0, 1)], v)
+
+
+def _constant(matrix: scipy.sparse.sparray | scipy.sparse.spmatrix) -> ca.DM:
+    columns = scipy.sparse.csc_matrix(matrix)
+    columns.sum_duplicates()  # which also sorts
+    return ca.DM(columns)
+
+
+def _between(samples: Measurements, nodes: NDArray[np.int64]) -> scipy.sparse.csc_matrix:
+    """What makes predictions of samples, those that count, from readings at nodes, node by node."""
+    width = samples.value.shape[1]
+    sample, column = np.nonzero(samples.is_used)
+    row, before = np.arange(len(sample)), np.searchsorted(nodes, samples.node[sample])
+    fraction = samples.fraction[sample]
+    after = np.minimum(before + 1, len(nodes) - 1)
+    entries = np.concatenate([1 - fraction, fraction])
+    at = np.concatenate([before * width + column, after * width + column])
+    matrix = scipy.sparse.csc_matrix((entries, (np.tile(row, 2), at)), shape=(len(sample), width * len(nodes)))
+    matrix.eliminate_zeros()
+    return matrix

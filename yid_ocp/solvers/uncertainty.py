@@ -1,0 +1,517 @@
+"""Uncertainty of a fit: covariance, intervals and verdicts of parameters, and goodness of fit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.problem.estimation_problem import EstimationProblem
+from yid_ocp.problem.evaluation import Evaluation
+from yid_ocp.problem.null_test import DEFAULT_GAP_CRITERIA, GapCriteria, exceeds_noise, residual_channels, run_null_test
+
+Array = NDArray[np.float64]
+ConfidenceInterval = tuple[float | None, float | None]
+
+MAX_IDENTIFIABLE_RELATIVE_STD = 0.1
+MAX_WEAK_RELATIVE_STD = 4.0
+# A standard deviation of so many times the value, or its typical size, stands for none at all.
+MIN_UNINFORMED_RELATIVE_STD = 1e6
+# A value so near its bound, in units of the unknown's typical size, lies at it.
+_AT_BOUND_FRACTION = 1e-4
+# 95 % quantiles of chi2 with one degree of freedom, for an interval with one end and with two.
+_CHI2_95_ONE_SIDED, CHI2_95_TWO_SIDED = 2.705543454095404, 3.841458820694124
+# Blocks of time into which all recordings are cut where the misfit counts, and their shortest and longest length [s].
+_N_TIME_BLOCKS, _MIN_BLOCK_LENGTH, _MAX_BLOCK_LENGTH = 24, 0.25, 2.0
+# So many recordings, or channels of single recordings, tell by themselves how far what they say scatters.
+_MIN_CLUSTER_RECORDINGS, _MIN_CLUSTER_CHANNELS = 4, 8
+# A parabola whose end the cost reaches with a smaller part of the promised height is no likelihood's.
+_MIN_COST_RISE_RATIO = 0.5
+# With more parameters two rollouts for each take longer than the search itself.
+_MAX_CHECKED_PARAMETERS = 12
+
+
+@dataclass(frozen=True)
+class GoodnessOfFit:
+    """Whether the model explains the recordings on which it was fitted.
+
+    Attributes
+    ----------
+    chi2_per_dof : float
+        Mean square of the residual in standard deviations of the noise; NaN where there is none.
+    p_value : float
+        Probability of a residual this large under noise alone.
+    explains : bool
+        By the null test of a diagnosis, at its level and relevance; see `run_null_test.exceeds_noise`.
+    believed : bool
+        Whether the data have no grave quality issue; see `ProblemOptions.data_issues`.
+    """
+
+    chi2_per_dof: float
+    p_value: float
+    explains: bool
+    believed: bool = True
+
+
+_UNKNOWN_FIT = GoodnessOfFit(math.nan, math.nan, False)
+"""Goodness of fit of a run without a result."""
+
+
+@dataclass(frozen=True)
+class ParameterEstimate:
+    """Estimate of one parameter with standard deviation, bounds and verdict.
+
+    Attributes
+    ----------
+    value, std : float
+        In `unit`; `std` is infinite where the data do not inform the parameter.
+    unit : str
+    initial, lower, upper : float
+    free : bool
+    verdict : str
+        See `verdict`; `fixed` where it was not free.
+    interval : (float or None, float or None), or None
+        95 % interval where a standard deviation does not tell it: one-sided at a bound, by profile likelihood where the
+        cost is no parabola; None for an open end.
+    """
+
+    value: float
+    std: float
+    unit: str
+    initial: float
+    lower: float
+    upper: float
+    free: bool
+    verdict: str
+    interval: ConfidenceInterval | None = None
+
+    @property
+    def interval_ends(self) -> tuple[float, float]:
+        """Both ends of the 95 % interval, infinite where there is none."""
+        if self.interval is None:
+            return self.value - 1.96 * self.std, self.value + 1.96 * self.std
+        lower, upper = self.interval
+        return -math.inf if lower is None else lower, math.inf if upper is None else upper
+
+
+# -- does the model explain the data ----------------------------------------------------------------------------------
+
+
+def assess_goodness_of_fit(
+    problem: EstimationProblem, evaluation: Evaluation, limits: GapCriteria = DEFAULT_GAP_CRITERIA
+) -> GoodnessOfFit:
+    """Null test of a fit on its own recordings, with residuals in noise units whatever the weighting."""
+    if not evaluation.ok:
+        return _UNKNOWN_FIT
+    residual = evaluation.residual
+    if problem.options.weighting == "paper":
+        parts = [
+            ((predicted - samples.value) / samples.std)[samples.is_used]
+            for episode, result in zip(problem.episodes, evaluation.episode_predictions, strict=True)
+            for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True)
+        ]
+        residual = np.concatenate(parts) if parts else np.zeros(0)
+    found = run_null_test(residual_channels(problem), residual / limits.noise_fraction, len(problem.unknown_names))
+    return GoodnessOfFit(
+        found.chi2_per_dof, found.p_value, not exceeds_noise((found,), limits), problem.options.has_trusted_data
+    )
+
+
+# -- how sure ---------------------------------------------------------------------------------------------------------
+
+
+def covariance_and_chi2(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, float]:
+    """Return the covariance of the unknowns, from data and stated priors, and chi2 per degree of freedom.
+
+    Directions that the data do not inform get a variance of (1e8 x scale)^2 rather than an infinite one.
+    """
+    if evaluation.jacobian is None or not evaluation.ok:
+        return np.full((len(problem.initial_unknowns), len(problem.initial_unknowns)), np.nan), math.nan
+    spread, chi2 = noise_covariance_factor(problem, evaluation), _chi2_per_dof(problem, evaluation)
+    return spread @ spread.T * max(1.0, chi2), chi2
+
+
+def noise_covariance_factor(problem: EstimationProblem, evaluation: Evaluation) -> Array:
+    """Factor F of the covariance F F' of the unknowns under noise alone, shape (nx, nx).
+
+    The factor keeps the digits that a covariance with uninformed directions loses.
+    """
+    count, scale = len(problem.initial_unknowns), problem.unknown_scales
+    _, jacobian = problem.residual_without_weak_priors(evaluation)
+    _, singular, vectors = np.linalg.svd(jacobian * scale, full_matrices=False)
+    inverse = np.zeros(count)
+    inverse[: len(singular)] = singular
+    basis = np.eye(count) if len(vectors) == 0 else _completed(vectors, count)
+    return scale[:, None] * basis.T / np.maximum(inverse, 1e-8)
+
+
+def _chi2_per_dof(problem: EstimationProblem, evaluation: Evaluation) -> float:
+    """Of the data, stated priors counting as observations."""
+    residual, _ = problem.residual_without_weak_priors(evaluation)
+    data = residual[problem.residual_rows.data]
+    return float(data @ data) / max(len(residual) - len(problem.initial_unknowns), 1)
+
+
+def _completed(vectors: Array, count: int) -> Array:
+    if len(vectors) == count:
+        return vectors
+    rest = np.linalg.svd(np.eye(count) - vectors.T @ vectors)[0][:, : count - len(vectors)]
+    return np.vstack([vectors, rest.T])
+
+
+def _misfit_sandwich_covariance(problem: EstimationProblem, evaluation: Evaluation, covariance: Array) -> Array:
+    """Covariance widened for model misfit, at least as large as the block-wise sandwich estimate.
+
+    What a model leaves out repeats itself from sample to sample and shows in all channels at once. The sandwich
+    A^-1 S A^-1 therefore takes S from the scores J' r summed over blocks of time of one recording, all channels
+    together, and where there are enough from those of single channels of whole recordings (a zero that moves, friction
+    that holds) and of whole recordings; the largest variance of each unknown counts.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    evaluation : Evaluation
+        With its Jacobian.
+    covariance : ndarray, shape (nx, nx)
+        From `covariance_and_chi2`.
+
+    Returns
+    -------
+    ndarray, shape (nx, nx)
+
+    References
+    ----------
+    White (1982), Econometrica 50:1, doi:10.2307/1912526; Cameron, Gelbach, Miller (2011), J. Business and Economic
+    Statistics 29:238, doi:10.1198/jbes.2010.07136 (clusters).
+    """
+    if evaluation.jacobian is None or not len(covariance):
+        return covariance
+    scale = problem.unknown_scales
+    residual, jacobian = problem.residual_without_weak_priors(evaluation)
+    jacobian = jacobian * scale
+    inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-10, hermitian=True)
+    scores = jacobian * residual[:, None]
+    plain = np.maximum(np.diag(covariance), 1e-300)
+    widest = plain
+    for labels in _clusters(problem):
+        sums = np.array([scores[rows].sum(axis=0) for rows in labels])
+        sums = sums - sums.mean(axis=0)
+        middle = sums.T @ sums * len(sums) / (len(sums) - 1)
+        widest = np.maximum(widest, np.diag(inverse @ middle @ inverse) * scale**2)
+    factor = np.sqrt(widest / plain)
+    return covariance * np.outer(factor, factor)
+
+
+def _clusters(problem: EstimationProblem) -> list[list[NDArray[np.int64]]]:
+    """Rows of the data cut into blocks of time, and where there are enough into recordings and channels of these."""
+    total = sum(episode.grid.steps for episode in problem.episodes) * problem.step.time_step
+    length = float(np.clip(total / _N_TIME_BLOCKS, _MIN_BLOCK_LENGTH, _MAX_BLOCK_LENGTH))
+    blocks: dict[tuple[str, int], list[NDArray[np.int64]]] = {}
+    recordings: dict[str, list[NDArray[np.int64]]] = {}
+    channels: list[list[NDArray[np.int64]]] = []
+    for series in residual_channels(problem):
+        channels.append([series.residual_indices])
+        recordings.setdefault(series.recording, []).append(series.residual_indices)
+        at = (series.t / length).astype(int)
+        for block in np.unique(at):
+            blocks.setdefault((series.recording, int(block)), []).append(series.residual_indices[at == block])
+    found: list[list[NDArray[np.int64]]] = []
+    if len(blocks) > 1:
+        found.append([np.concatenate(parts) for parts in blocks.values()])
+    if len(recordings) > 1 and len(channels) >= _MIN_CLUSTER_CHANNELS:
+        found.append([np.concatenate(parts) for parts in channels])
+    if len(recordings) >= _MIN_CLUSTER_RECORDINGS:
+        found.append([np.concatenate(parts) for parts in recordings.values()])
+    return found
+
+
+def covariance_of_fit(problem: EstimationProblem, evaluation: Evaluation, fit: GoodnessOfFit) -> Array:
+    """Covariance of the unknowns at a fit, widened for misfit where the model does not explain the data."""
+    covariance, _ = covariance_and_chi2(problem, evaluation)
+    return covariance if fit.explains else _misfit_sandwich_covariance(problem, evaluation, covariance)
+
+
+def _cost_checked_std(problem: EstimationProblem, x: Array, evaluation: Evaluation, covariance: Array) -> Array:
+    """Standard deviation of each unknown, shape (nx,), that of parameters checked against the cost.
+
+    The covariance is that of a parabola at the fit. Where it does not fix a parameter well, the cost is worked out at
+    the end of its 95 % interval, the others moved along; where it rises less than the parabola promised, the
+    standard deviation is that of a parabola through there, infinite where the cost does not rise at all. Stiffnesses
+    that are small by chance look informed at the fit and are not. Of more than `_MAX_CHECKED_PARAMETERS` parameters none is asked.
+    """
+    spread = std_from_covariance(covariance, x)
+    lower, upper = problem.bounds
+    scale = max(1.0, _chi2_per_dof(problem, evaluation))
+    parameters = parameter_unknown_names(problem)
+    for name in parameters if len(parameters) <= _MAX_CHECKED_PARAMETERS else ():
+        i = problem.unknown_names.index(name)
+        size = max(abs(float(x[i])), float(problem.unknown_scales[i]))
+        if (
+            not math.isfinite(spread[i])
+            or not MAX_IDENTIFIABLE_RELATIVE_STD * abs(x[i]) < spread[i] < MIN_UNINFORMED_RELATIVE_STD * size
+        ):
+            continue
+        heights = []
+        for sign in (-1.0, 1.0):
+            room = float(upper[i] - x[i]) if sign > 0 else float(x[i] - lower[i])
+            # farther than this off its typical size a parabola has nothing to say
+            step = min(math.sqrt(CHI2_95_TWO_SIDED) * spread[i], room, 10 * size)
+            if step < MAX_IDENTIFIABLE_RELATIVE_STD * spread[i]:
+                continue
+            moved = np.clip(x + sign * step * covariance[:, i] / covariance[i, i], lower, upper)
+            trial = problem.evaluate(moved, False, evaluation.equilibrium_guesses)
+            if trial.ok:
+                rise = _informed_cost(problem, trial) - _informed_cost(problem, evaluation)
+                heights.append(max(2.0 * rise / scale, 1e-12) / (step / spread[i]) ** 2)
+        if heights and min(heights) < _MIN_COST_RISE_RATIO:
+            spread[i] /= math.sqrt(min(heights))
+    return spread
+
+
+def parameter_unknown_names(problem: EstimationProblem) -> tuple[str, ...]:
+    """Unknowns that are parameters, local ones with their recording's name; initial states are left out."""
+    parameters = {*problem.shared_parameters, *problem.local_parameters}
+    return tuple(name for name in problem.unknown_names if name.split("[")[0] in parameters)
+
+
+def std_from_covariance(covariance: Array, x: Array) -> Array:
+    """Standard deviations from a covariance, shape (nx,); infinite where it holds no numbers."""
+    if not len(covariance):
+        return np.zeros(len(x))
+    diagonal = np.diag(covariance)
+    return np.where(np.isnan(diagonal), np.inf, np.sqrt(np.maximum(diagonal, 0.0)))
+
+
+def covariance_to_dict(names: Sequence[str], matrix: Array, std: Sequence[float]) -> dict[str, Any]:
+    """Names and covariance of parameters for result.json: correlations of a matrix, scaled to given deviations.
+
+    Parameters
+    ----------
+    names : sequence of str, length n
+    matrix : ndarray, shape (n, n)
+    std : sequence of float, length n
+        Those that are not finite and positive are left out: nothing is known of their parameters.
+    """
+    at = [i for i, value in enumerate(std) if math.isfinite(value) and value > 0 and matrix[i, i] > 0]
+    factor = np.array([std[i] for i in at]) / np.sqrt(np.array([matrix[i, i] for i in at]))
+    kept = matrix[np.ix_(at, at)] * np.outer(factor, factor)
+    return {"names": [names[i] for i in at], "matrix": kept.tolist()}
+
+
+def _informed_cost(problem: EstimationProblem, evaluation: Evaluation) -> float:
+    """Cost in units of the noise without the weak priors."""
+    weak, stated = (
+        0.5 * float(np.sum(evaluation.residual[rows] ** 2))
+        for rows in (problem.residual_rows.weak_priors, problem.residual_rows.stated_priors)
+    )
+    return (evaluation.cost - weak - stated) / problem.data_noise_unit**2 + stated
+
+
+# -- what may be said -------------------------------------------------------------------------------------------------
+
+
+def parameter_verdict(
+    value: float, std: float, *, scale: float = 0.0, explains: bool = True, at_bound: bool = False
+) -> str:
+    """Verdict on a free parameter from its value and standard deviation.
+
+    ==================  ================================================================================================
+    not_identifiable    the standard deviation is above 400 % of the value
+    not_trusted         the model does not explain the data, or the data are in grave doubt
+    at_bound            the value lies at one of its bounds
+    identifiable        the standard deviation is up to 10 % of the value
+    weak                anything else
+    ==================  ================================================================================================
+
+    The first that holds is returned. A value that may be zero is judged by `scale` as well: identifiable where value
+    and two standard deviations stay below a tenth of it, weak where they stay below all of it.
+
+    Parameters
+    ----------
+    value, std : float
+        In the same unit.
+    scale : float
+        Plausible size of the parameter, zero where unknown.
+    explains, at_bound : bool
+    """
+    found = verdict_by_relative_std(value, std, scale)
+    if found == "not_identifiable":
+        return found
+    if not explains:
+        return "not_trusted"
+    return "at_bound" if at_bound else found
+
+
+def verdict_by_relative_std(value: float, std: float, scale: float = 0.0) -> str:
+    """Verdict by relative standard deviation alone: identifiable, weak or not_identifiable."""
+    if not math.isfinite(std):
+        return "not_identifiable"
+    relative, reach = std / max(abs(value), 1e-12), abs(value) + 2 * std
+    near_zero = abs(value) <= 2 * std
+    if relative <= MAX_IDENTIFIABLE_RELATIVE_STD or (near_zero and reach <= MAX_IDENTIFIABLE_RELATIVE_STD * scale):
+        return "identifiable"
+    return "weak" if relative <= MAX_WEAK_RELATIVE_STD or (near_zero and reach <= scale) else "not_identifiable"
+
+
+def with_profile_interval(entry: ParameterEstimate, interval: ConfidenceInterval, scale: float) -> ParameterEstimate:
+    """Estimate with its profile-likelihood interval, and standard deviation and verdict consistent with it.
+
+    Open on both sides it is not_identifiable, on one side at best weak and without a ±. An end that is not met before
+    a bound within `scale` is that bound. Else the wider side stands for two standard deviations (`verdict_by_relative_std`), and is
+    the ± where a parabola's would be less than half of it.
+
+    Parameters
+    ----------
+    entry : Estimate
+    interval : (float or None, float or None)
+        95 %.
+    scale : float
+        See `parameter_verdict`.
+    """
+    low, high = interval
+    if low is None and entry.value - entry.lower <= scale:
+        low = entry.lower
+    if high is None and entry.upper - entry.value <= scale:
+        high = entry.upper
+    if interval == (None, None):
+        std, found = math.inf, "not_identifiable"
+    elif low is None or high is None:
+        std, found = math.inf, "weak"
+    else:
+        wide = max(entry.value - low, high - entry.value) / math.sqrt(CHI2_95_TWO_SIDED)
+        std = wide if _MIN_COST_RISE_RATIO * wide > entry.std else entry.std
+        found = verdict_by_relative_std(entry.value, wide, scale)
+        found = "weak" if found == "not_identifiable" else found
+    order = ("identifiable", "weak", "not_identifiable")
+    said = max(entry.verdict, found, key=order.index) if entry.verdict in order else entry.verdict
+    return replace(entry, std=std, verdict=said, interval=interval)
+
+
+def is_std_sufficient(entry: ParameterEstimate) -> bool:
+    """Whether the standard deviation describes the uncertainty, so that no profile likelihood is needed."""
+    return entry.verdict == "identifiable" and entry.std <= MAX_IDENTIFIABLE_RELATIVE_STD * abs(entry.value)
+
+
+def typical_parameter_sizes(problem: EstimationProblem, x: Array) -> Mapping[str, float]:
+    """Plausible size of each free parameter: by its prior, its bounds, similar parameters, or its initial value.
+
+    A prior counts with its standard deviation, finite bounds with half of what lies between them, the others of the
+    same kind (`bend`, say, or else of the same unit) with the median of their sizes.
+    """
+    theta, _ = problem.split(x, 0)
+    entries = list(problem.system.parameters)
+    scales = {
+        name.split("[")[0]: float(scale)
+        for name, scale in zip(problem.unknown_names, problem.unknown_scales, strict=True)
+    }
+    sizes = dict(zip((entry.name for entry in entries), np.abs(theta), strict=True))
+    joint = problem.options.multivariate_prior
+    known = {
+        **problem.options.prior_stds,
+        **dict(zip(joint.parameter_names, np.sqrt(np.diag(joint.covariance)), strict=True)),
+    }
+    found = {}
+    for entry in entries:
+        if entry.name not in (*problem.shared_parameters, *problem.local_parameters):
+            continue
+        width = entry.upper - entry.lower
+        alike = [o for o in entries if o.name != entry.name and o.unit == entry.unit and "@" not in o.name]
+        own = [o for o in alike if _kind(o.name) == _kind(entry.name)]
+        others = [float(sizes[o.name]) for o in own or alike if sizes[o.name] > 0]
+        if entry.name in known:
+            found[entry.name] = float(known[entry.name])
+        elif math.isfinite(width):
+            found[entry.name] = width / 2
+        else:
+            found[entry.name] = float(np.median(others)) if others and "@" not in entry.name else scales[entry.name]
+    return found
+
+
+def _kind(name: str) -> str:
+    return name.rpartition(".")[2]
+
+
+def parameter_estimates(
+    problem: EstimationProblem, x: Array, evaluation: Evaluation, covariance: Array, fit: GoodnessOfFit | None
+) -> dict[str, ParameterEstimate]:
+    """Estimates of all parameters, local ones by recording, with value, standard deviation and verdict.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    x : ndarray, shape (nx,)
+    evaluation : Evaluation
+        At `x`, with its Jacobian.
+    covariance : ndarray, shape (nx, nx)
+    fit : Fit, optional
+        None where the point is not a fit; misfit and bounds are then ignored.
+    """
+    known = fit is not None and evaluation.ok and evaluation.jacobian is not None
+    spread = _cost_checked_std(problem, x, evaluation, covariance) if known else std_from_covariance(covariance, x)
+    sizes, theta = typical_parameter_sizes(problem, x), problem.split(x, 0)[0]
+    scales, (lower, upper) = problem.unknown_scales, problem.bounds
+    result: dict[str, ParameterEstimate] = {}
+    free = {name: problem.unknown_names.index(name) for name in parameter_unknown_names(problem)}
+    for i, entry in enumerate(problem.system.parameters):
+        if entry.name not in problem.local_parameters:
+            value, bounds = float(theta[i]), (entry.lower, entry.upper)
+            result[entry.name] = ParameterEstimate(
+                value, 0.0, entry.unit, float(problem.theta[i]), *bounds, False, "fixed"
+            )
+    for name, at in free.items():
+        entry = problem.system.parameters[name.split("[")[0]]
+        value, initial = float(x[at]), float(problem.initial_unknowns[at])
+        std = float(spread[at])
+        std = std if std < MIN_UNINFORMED_RELATIVE_STD * max(abs(value), float(scales[at])) else math.inf
+        side = _bound_side(value, float(lower[at]), float(upper[at]), float(scales[at])) if known else 0
+        explains = fit is None or (fit.explains and fit.believed)
+        said = parameter_verdict(value, std, scale=sizes[entry.name], explains=explains, at_bound=side != 0)
+        interval = None
+        if said == "not_identifiable":
+            std = math.inf
+        elif side:
+            interval = _one_sided_interval(value, std, side, _pull(problem, evaluation, at))
+        bounds = (float(lower[at]), float(upper[at]))
+        result[name] = ParameterEstimate(value, std, entry.unit, initial, *bounds, True, said, interval)
+    return result
+
+
+def mark_not_trusted(known: Mapping[str, ParameterEstimate]) -> dict[str, ParameterEstimate]:
+    """Estimates with the verdict not_trusted in place of any but fixed and not_identifiable."""
+    return {
+        name: replace(entry, verdict="not_trusted") if entry.free and entry.verdict != "not_identifiable" else entry
+        for name, entry in known.items()
+    }
+
+
+def _bound_side(value: float, lower: float, upper: float, size: float) -> int:
+    """-1 where a value lies at its lower bound, 1 at its upper one, 0 elsewhere."""
+    near = _AT_BOUND_FRACTION * size
+    return -1 if value - lower <= near else 1 if upper - value <= near else 0
+
+
+def _one_sided_interval(value: float, std: float, side: int, slope: float) -> ConfidenceInterval:
+    """95 % interval of a parameter at its bound: slope d + d^2/(2 std^2) = 2.71/2 at a distance d from it.
+
+    Parameters
+    ----------
+    value, std : float
+    side : -1 or 1
+        Whether the bound is the lower or the upper one.
+    slope : float
+        Rise of the cost, over the factor by which the noise is larger than stated, away from the bound.
+    """
+    pull = max(slope, 0.0)
+    reach = std * (math.sqrt((pull * std) ** 2 + _CHI2_95_ONE_SIDED) - pull * std)
+    return (value, value - side * reach) if side < 0 else (value - side * reach, value)
+
+
+def _pull(problem: EstimationProblem, evaluation: Evaluation, at: int) -> float:
+    """Size of the gradient of the cost by one unknown, in units of the noise that the misfit makes."""
+    residual, jacobian = problem.residual_without_weak_priors(evaluation)
+    scale = max(1.0, _chi2_per_dof(problem, evaluation))
+    return abs(float(jacobian[:, at] @ residual)) / scale

@@ -1,0 +1,477 @@
+"""Simulation in MuJoCo: a controller moves the driven joints along a motion, from static equilibrium.
+
+The simulator shares the description of the system with the estimator and nothing else: its equations, its integrator
+and its treatment of the grasps are MuJoCo's own, so that an estimate is never checked against its own mistakes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any, Protocol, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from yid_ocp.errors import ConfigError, ModelError
+from yid_ocp.model.system import System
+from yid_ocp.sensors.base import EffortKind
+from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
+from yid_ocp.virtual.mjcf import compile_mjcf, import_mujoco, mujoco_xml
+from yid_ocp.virtual.multisine_motion import JointMotion
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+DEFAULT_SIMULATOR_STEP = 1e-4
+"""Default time step of the simulator [s]."""
+
+_BANDWIDTH = 25.0  # of the joint controller [rad/s]; a 10 ms hold leaves it well damped
+_HOLD_STIFFNESS = 2e3  # [N m/rad] while settling; stable explicitly on the lightest wrist
+_HOLD_DAMPING = 60.0  # [N m s/rad]
+_SETTLING_FACTOR = 10.0  # on the object's damping: equilibrium does not depend on it, time to get there does
+_SETTLING_LIMIT = 60.0  # [s]
+_POSTURE_TOLERANCE = 1e-6  # [rad]
+_REST = 1e-7  # [rad/s]
+_LOST = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
+"""Warnings after which MuJoCo resets its state and goes on; their numbers differ between its versions."""
+
+
+class SimulatorTerms(Protocol):
+    """Forces and model changes in the simulator that are not in the system's description."""
+
+    def edit_model(self, model: Any) -> None:
+        """Edit the compiled `mujoco.MjModel`."""
+        ...
+
+    def start_motion(self, data: Any) -> None:
+        """Called once when the motion begins, at rest."""
+        ...
+
+    def add_forces(self, model: Any, data: Any) -> None:
+        """Add generalized forces to `data.qfrc_passive`; called at every inner step."""
+        ...
+
+
+@dataclass(frozen=True)
+class SimulationOptions:
+    """Duration, rates and time step of a simulation.
+
+    Attributes
+    ----------
+    duration : float
+        [s]
+    sample_rate : float
+        Rate of the recorded samples [Hz].
+    time_step : float
+        Of the simulator [s]; must divide the controller's period.
+    controller_rate : float, optional
+        Rate at which torques are computed, held in between [Hz], a multiple of `sample_rate`; `sample_rate` where absent.
+    effort_kind : {'sample', 'mean', 'command'}
+        What is recorded of the torque, as in `JointGroup`: a `command` is held from sample to sample, so it needs a
+        controller that is no faster than the recording.
+    """
+
+    duration: float = 5.0
+    sample_rate: float = 100.0
+    time_step: float = DEFAULT_SIMULATOR_STEP
+    controller_rate: float | None = None
+    effort_kind: EffortKind = "command"
+
+    def __post_init__(self) -> None:
+        controller, periods, inner = (
+            self._controller_rate,
+            self.controller_periods_per_sample,
+            self.simulator_steps_per_period,
+        )
+        if periods < 1 or abs(periods * self.sample_rate / controller - 1.0) > 1e-9:
+            raise ConfigError(
+                f"controller_rate = {controller:g} Hz is no multiple of the recording's {self.sample_rate:g} Hz",
+                allowed="rate k, k whole",
+            )
+        if inner < 1 or abs(inner * self.time_step * controller - 1.0) > 1e-9:
+            raise ConfigError(
+                f"time_step = {self.time_step:g} s does not divide the period of {controller:g} Hz",
+                allowed="1/(controller's rate k), k whole",
+            )
+        if self.effort_kind not in get_args(EffortKind):
+            raise ConfigError(f"effort_kind = '{self.effort_kind}'", allowed=", ".join(get_args(EffortKind)))
+        if self.effort_kind == "command" and periods > 1:
+            raise ConfigError(
+                f"a command of a controller at {controller:g} Hz is not held over a sample of {self.sample_rate:g} Hz",
+                where="effort_kind",
+                allowed="sample or mean, or a controller as fast as the recording",
+            )
+
+    @property
+    def _controller_rate(self) -> float:
+        return self.sample_rate if self.controller_rate is None else self.controller_rate
+
+    @property
+    def controller_periods_per_sample(self) -> int:
+        """Number of controller periods per recorded sample."""
+        return round(self._controller_rate / self.sample_rate)
+
+    @property
+    def simulator_steps_per_period(self) -> int:
+        """Number of simulator steps per controller period."""
+        return round(1.0 / (self._controller_rate * self.time_step))
+
+    @property
+    def sample_periods(self) -> int:
+        """Number N of sample periods; N + 1 samples are recorded."""
+        return round(self.duration * self.sample_rate)
+
+
+@dataclass(frozen=True)
+class SimulationResult:
+    """Noise-free trajectories of a simulation.
+
+    Attributes
+    ----------
+    t : ndarray, shape (N + 1,)
+        [s]
+    q, v : ndarray, shape (N + 1, n)
+        In configuration order [rad or m].
+    effort : ndarray, shape (N + 1, nu)
+        Torque at t_k, or its mean from t_k to t_{k+1}, as `effort_kind` says [N m], or what servos were commanded at
+        t_k; the last row was computed and not applied.
+    point_positions : ndarray, shape (N + 1, np, 3)
+        Positions of `system.points` in the world [m].
+    frame_times : ndarray, shape (M,)
+        Times of the camera's frames, rounded to the simulator's step [s].
+    frame_point_positions : ndarray, shape (M, np, 3)
+        Positions of the points at `frame_times` [m].
+    grasp_separation : ndarray, shape (N + 1, number of grasps)
+        Distance between the two ends of each grasp [m].
+    """
+
+    t: Array
+    q: Array
+    v: Array
+    effort: Array
+    point_positions: Array
+    frame_times: Array
+    frame_point_positions: Array
+    grasp_separation: Array
+
+
+def simulate_in_mujoco(
+    system: System,
+    values: Mapping[str, float] | None,
+    motion: JointMotion,
+    simulation: SimulationOptions | None = None,
+    *,
+    initial_joint_angles: Mapping[str, float] | None = None,
+    frame_times: ArrayLike = (),
+    injected: SimulatorTerms | None = None,
+    gear_play: Mapping[str, float] | None = None,
+) -> SimulationResult:
+    """Simulate the controller following a motion in MuJoCo, from static equilibrium at the initial joint angles.
+
+    Position servos are MuJoCo's own: they are commanded the motion about the posture, and rest where that leaves them.
+
+    Parameters
+    ----------
+    system : System
+    values : mapping of str to float or None
+        Parameter values; nominal where absent.
+    motion : Movement
+        Of exactly the driven joints.
+    simulation : Simulation, optional
+    initial_joint_angles : mapping of str to float, optional
+        Initial angles [rad or m]; `grasping_joint_angles` where absent.
+    frame_times : array_like, shape (M,)
+        When a camera looks [s], increasing, in [0, duration].
+    injected : EngineTerms, optional
+        What is at work beside the system's description. MuJoCo knows one such callback for the whole process: no other
+        simulation may run meanwhile in another thread.
+    gear_play : mapping of joint to float, optional
+        Width of the play of gears behind servos [rad].
+
+    Raises
+    ------
+    ModelError
+        The system cannot be expressed (`mujoco_xml`), has prescribed or no driven joints, does not come to rest, or
+        diverges.
+    DataError
+        MuJoCo is not installed.
+    """
+    chosen = simulation or SimulationOptions()
+    if tuple(motion.joints) != tuple(system.driven) or not system.driven or system.prescribed:
+        raise ModelError(
+            "the motion is not one of the driven joints",
+            where=f"motion of {', '.join(motion.joints) or 'nothing'}",
+            allowed=f"the driven joints ({', '.join(system.driven) or 'none'}), nothing prescribed",
+        )
+    mujoco = import_mujoco()
+    model = compile_mjcf(mujoco_xml(system, values, time_step=chosen.time_step, gear_play=gear_play))
+    nominal_damping = np.array(model.dof_damping)
+    with _at_work(mujoco, model, injected):
+        scene = MujocoScene.from_model(system, mujoco, model)
+        start = grasping_joint_angles(system, values) if initial_joint_angles is None else initial_joint_angles
+        scene.data.qpos[:] = model.qpos_spring
+        scene.data.qpos[[model.joint(name).id for name in start]] = list(start.values())
+        controller: TrackingController | _ServoCommander
+        if system.servos:
+            controller = _ServoCommander(scene, motion)
+            settle_under_servos(scene, nominal_damping, controller.initial_command)
+        else:
+            controller = TrackingController(scene, motion, settle_to_equilibrium(scene, nominal_damping))
+        if injected is not None:
+            injected.start_motion(scene.data)
+        frames = np.round(np.asarray(frame_times, float) / chosen.time_step).astype(int)
+        result = _play(scene, controller, chosen, frames)
+        lost = _lost(scene)
+    if lost or not (np.isfinite(result.q).all() and np.isfinite(result.effort).all()):
+        raise ModelError("the simulation diverged", where="MuJoCo", hint="take a shorter time_step or a calmer motion")
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class MujocoScene:
+    """A MuJoCo model with its state and the ids of joints, moved joints, points and grasp ends in it."""
+
+    mujoco: ModuleType
+    model: Any
+    data: Any
+    joint_ids: Integers
+    moved_joint_ids: Integers
+    point_site_ids: list[int]
+    grasp_site_ids: list[list[int]]
+
+    @staticmethod
+    def from_model(system: System, mujoco: ModuleType, model: Any) -> MujocoScene:
+        """The scene of a compiled model; its driven joints are moved, or its prescribed ones if none is driven."""
+        # Every joint has one coordinate, so positions, velocities and joints share their addresses.
+        order = np.array([model.joint(name).id for name in system.mechanism.joint_names])
+        sites = [model.site(name).id for name in system.point_frames]
+        ends = [[model.site(f"grasp_{g.name}_{end}").id for end in ("holder", "held")] for g in system.grasps]
+        moved = order[list(system.driven_indices or system.prescribed_indices)]
+        return MujocoScene(mujoco, model, mujoco.MjData(model), order, moved, sites, ends)
+
+
+@contextlib.contextmanager
+def _at_work(mujoco: ModuleType, model: Any, injected: SimulatorTerms | None) -> Iterator[None]:
+    """Let injected terms act inside MuJoCo while the block runs."""
+    if injected is None:
+        yield
+        return
+    injected.edit_model(model)
+    mujoco.set_mjcb_passive(injected.add_forces)
+    try:
+        yield
+    finally:
+        mujoco.set_mjcb_passive(None)
+
+
+def settle_to_equilibrium(scene: MujocoScene, damping: Array) -> Array:
+    """Bring the scene to static equilibrium with the driven joints held; return their torques [N m].
+
+    `damping` replaces the joints' own damping meanwhile, which could decide which of several equilibria is found.
+    """
+    model, data, driven = scene.model, scene.data, scene.moved_joint_ids
+    held = copy.copy(model)
+    target = data.qpos[driven].copy()
+    others = np.setdiff1d(np.arange(model.nv), driven)
+    held.dof_damping[:] = damping
+    held.dof_damping[others] *= _SETTLING_FACTOR
+    held.dof_damping[driven] += _HOLD_DAMPING
+    held.jnt_stiffness[driven] += _HOLD_STIFFNESS
+    held.qpos_spring[driven] = target
+    for calm in _calming(scene, held):
+        error = target - data.qpos[driven]
+        if np.abs(error).max() > _POSTURE_TOLERANCE:
+            held.qpos_spring[driven] += error
+        elif calm < _REST:
+            break
+    balance = _HOLD_STIFFNESS * (held.qpos_spring[driven] - data.qpos[driven])
+    data.qvel[:], data.qacc_warmstart[:], data.time = 0.0, 0.0, 0.0
+    return balance
+
+
+def _lost(scene: MujocoScene) -> bool:
+    """Whether MuJoCo lost the state at some time, and began again from its first one."""
+    kinds = scene.mujoco.mjtWarning
+    return any(scene.data.warning[int(getattr(kinds, name))].number > 0 for name in _LOST)
+
+
+def _refuse_lost(scene: MujocoScene) -> None:
+    if _lost(scene):
+        raise ModelError(
+            "the simulation diverged before the motion began",
+            where="MuJoCo",
+            hint="take a shorter time_step, or a posture whose grippers are nearer to what they hold",
+        )
+
+
+class TrackingController:
+    """Computed-torque controller: the arms' inverse dynamics along the motion, the grasps' load at rest, feedback.
+
+    Parameters
+    ----------
+    scene : Scene
+        At rest, before the motion.
+    motion : Movement
+    balance : ndarray, shape (nu,)
+        Torques that hold the scene at rest [N m].
+    """
+
+    def __init__(self, scene: MujocoScene, motion: JointMotion, balance: Array) -> None:
+        self._scene, self._motion = scene, motion
+        self._free = copy.copy(scene.model)
+        self._free.opt.disableflags |= int(scene.mujoco.mjtDisableBit.mjDSBL_EQUALITY)
+        self._shadow = scene.mujoco.MjData(self._free)
+        self._rest = scene.data.qpos.copy()
+        zero = np.zeros(len(scene.moved_joint_ids))
+        self._load = balance - self._arm_torque(self._rest[scene.moved_joint_ids], zero, zero)
+
+    def apply_input(self, t: float) -> Array:
+        """Apply the torques at time t [s] and return them, shape (nu,) [N m]."""
+        torque = self.compute_torque(t)
+        self._scene.data.qfrc_applied[self._scene.moved_joint_ids] = torque
+        return torque
+
+    def compute_torque(self, t: float) -> Array:
+        """Torques at time t [s] from the scene's state then, shape (nu,) [N m]."""
+        data, driven = self._scene.data, self._scene.moved_joint_ids
+        offset, velocity, acceleration = self._motion.offset_and_derivatives(t)
+        reference = self._rest[driven] + offset
+        demand = acceleration + 2 * _BANDWIDTH * (velocity - data.qvel[driven])
+        demand += _BANDWIDTH**2 * (reference - data.qpos[driven])
+        return np.asarray(self._load + self._arm_torque(reference, velocity, demand))
+
+    def _arm_torque(self, q: Array, v: Array, a: Array) -> Array:
+        shadow, driven = self._shadow, self._scene.moved_joint_ids
+        shadow.qpos[:], shadow.qvel[:], shadow.qacc[:] = self._rest, 0.0, 0.0
+        shadow.qpos[driven], shadow.qvel[driven], shadow.qacc[driven] = q, v, a
+        self._scene.mujoco.mj_inverse(self._free, shadow)
+        return np.array(shadow.qfrc_inverse[driven])
+
+
+class _ServoCommander:
+    """Controller that commands position servos along a motion about the scene's present joint angles.
+
+    Parameters
+    ----------
+    scene : Scene
+        In the posture that is commanded first.
+    motion : Movement
+    """
+
+    def __init__(self, scene: MujocoScene, motion: JointMotion) -> None:
+        self._scene, self._motion = scene, motion
+        self.initial_command = scene.data.qpos[scene.moved_joint_ids].copy()
+
+    def apply_input(self, t: float) -> Array:
+        """Apply the commands at time t [s] and return them, shape (nu,) [rad or m]."""
+        commands = np.asarray(self.initial_command + self._motion.offset_and_derivatives(t)[0])
+        self._scene.data.ctrl[:] = commands
+        return commands
+
+
+def initialize_actuator_history(scene: MujocoScene, commands: Array) -> None:
+    """Set the commands of all actuators and fill the history of delayed ones with them."""
+    model, data = scene.model, scene.data
+    data.ctrl[:] = commands
+    if hasattr(scene.mujoco, "mj_initCtrlHistory") and hasattr(model, "actuator_delay"):
+        for i in map(int, np.flatnonzero(np.asarray(model.actuator_delay))):
+            before = np.full((int(model.actuator_history[i, 0]), 1), commands[i])
+            scene.mujoco.mj_initCtrlHistory(model, data, i, None, before)
+
+
+def settle_under_servos(scene: MujocoScene, damping: Array, commands: Array) -> None:
+    """Bring the scene to rest under constant servo commands, with `damping` increased meanwhile."""
+    model, data = scene.model, scene.data
+    data.ctrl[:] = commands
+    held = copy.copy(model)
+    held.dof_damping[:] = damping
+    others = np.setdiff1d(np.arange(model.nv), scene.moved_joint_ids)
+    held.dof_damping[others] *= _SETTLING_FACTOR
+    if hasattr(held, "actuator_delay"):
+        held.actuator_delay[:] = 0.0
+    for calm in _calming(scene, held):
+        if calm < _REST:
+            break
+    posture = data.qpos.copy()
+    scene.mujoco.mj_resetData(model, data)
+    data.qpos[:] = posture
+    initialize_actuator_history(scene, commands)
+
+
+def _calming(scene: MujocoScene, held: Any) -> Iterator[float]:
+    """Let a scene settle as `held` says, and yield its largest velocity [rad/s] every tenth of a second.
+
+    A grasp's time constant is two steps: at a short one a gripper beside what it holds may throw a fine chain about.
+    Where that loses the state it begins again, and grasps close in the first of those tenths as with the usual step.
+    """
+    data, step = scene.data, scene.mujoco.mj_step
+    start, commands = data.qpos.copy(), data.ctrl.copy()
+    block = max(1, round(0.1 / held.opt.timestep))
+    step(held, data, nstep=block)
+    if _lost(scene):
+        scene.mujoco.mj_resetData(held, data)
+        data.qpos[:], data.ctrl[:] = start, commands
+        firm = held.eq_solref.copy()
+        held.eq_solref[:, 0] = np.maximum(firm[:, 0], 2 * DEFAULT_SIMULATOR_STEP)
+        step(held, data, nstep=block)
+        held.eq_solref[:] = firm
+    for _ in range(math.ceil(_SETTLING_LIMIT / (block * held.opt.timestep))):
+        _refuse_lost(scene)
+        yield (calm := float(np.abs(data.qvel).max()))
+        step(held, data, nstep=block)
+    raise ModelError(
+        f"the object does not come to rest in {_SETTLING_LIMIT:g} s (largest velocity {calm:.2g} rad/s)",
+        where="settling before the motion",
+        hint="give every coordinate some damping and enough stiffness to stand",
+    )
+
+
+def _play(
+    scene: MujocoScene,
+    controller: TrackingController | _ServoCommander,
+    simulation: SimulationOptions,
+    frames: Integers,
+) -> SimulationResult:
+    """Simulate period by period of the controller, the torque held in each; `frames` count the simulator's steps."""
+    mujoco, model, data = scene.mujoco, scene.model, scene.data
+    inner, steps, periods = (
+        simulation.simulator_steps_per_period,
+        simulation.sample_periods,
+        simulation.controller_periods_per_sample,
+    )
+    q, v, torques, points, error, seen = [], [], [], [], [], []
+    for tick in range(steps * periods + 1):
+        mujoco.mj_kinematics(model, data)
+        torques.append(controller.apply_input(tick / (simulation.sample_rate * periods)))
+        if tick % periods == 0:
+            q.append(data.qpos[scene.joint_ids])
+            v.append(data.qvel[scene.joint_ids])
+            points.append(data.site_xpos[scene.point_site_ids])
+            error.append([np.linalg.norm(data.site_xpos[a] - data.site_xpos[b]) for a, b in scene.grasp_site_ids])
+        done = tick * inner
+        for frame in frames[(frames >= done) & (frames < done + inner)]:
+            if frame > done:
+                mujoco.mj_step(model, data, nstep=int(frame - done))
+                mujoco.mj_kinematics(model, data)
+            seen.append(data.site_xpos[scene.point_site_ids])
+            done = int(frame)
+        if tick < steps * periods:
+            mujoco.mj_step(model, data, nstep=(tick + 1) * inner - done)
+    effort = np.array(torques[::periods])
+    if simulation.effort_kind == "mean":
+        effort[:-1] = np.array(torques[:-1]).reshape(steps, periods, -1).mean(1)
+    return SimulationResult(
+        np.arange(steps + 1) / simulation.sample_rate,
+        np.array(q),
+        np.array(v),
+        effort,
+        np.array(points),
+        np.asarray(frames[: len(seen)] * simulation.time_step),
+        np.array(seen).reshape(len(seen), len(scene.point_site_ids), 3),
+        np.array(error).reshape(steps + 1, len(scene.grasp_site_ids)),
+    )

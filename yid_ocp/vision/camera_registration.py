@@ -1,0 +1,556 @@
+"""Registration of a camera's pose, depth and clock to the robot that it sees.
+
+A point p that the camera measured at its time s should lie on the robot's surface at the joint angles of that time:
+
+    P = t + R (g + o/z) p,      e = n . (P - surface(q(s - tau0 - beta (s - s0)))),
+
+with the camera's pose (R, t), a factor g and an offset o on its depth z along the ray, and its clock, ahead by tau0 and
+by beta in every second. The surface's point is where the camera's ray through P meets the robot, so that depth's noise,
+which is along the ray, leaves e without bias; the nearest point of the surface instead (noise of 6 mm: 1 mm too near on
+Baxter's links) leads from further away. Steps are those of Gauss and Newton on a robust sum (Geman and McClure) of e,
+with what is told as the mean of a normal prior.
+
+The points' errors are alike, from pixel to pixel of a frame and, where a mesh is not quite the robot's surface, from
+frame to frame at one place of a link. The covariance is therefore the sandwich H^-1 B H^-1 with B summed over frames
+and over patches of the links as wholes, less what each patch has in each frame, which both hold, and not over points;
+data weigh against the prior by how much larger B is than H.
+
+References
+----------
+Chen and Medioni (1992), Image and Vision Computing 10:145, doi:10.1016/0262-8856(92)90066-C. Blais and Levine (1995),
+IEEE Trans. Pattern Analysis 17:820, doi:10.1109/34.400574, for points along the camera's rays. Cameron, Gelbach and
+Miller (2011), J. Business & Economic Statistics 29:238, doi:10.1198/jbes.2010.07136, for sums over two kinds of blocks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import eigh
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from yid_ocp.vision.frames import CameraIntrinsics
+from yid_ocp.vision.surface_meshes import ArticulatedSurfaces
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+ROTATION_SLICE, TRANSLATION_SLICE, DEPTH_SCALE_INDEX, DEPTH_OFFSET_INDEX, CLOCK_OFFSET_INDEX, CLOCK_DRIFT_INDEX = (
+    slice(0, 3),
+    slice(3, 6),
+    6,
+    7,
+    8,
+    9,
+)
+"""Positions of the parts of a `CameraState` change in its vector."""
+STATE_SIZE = 10
+MIN_ARM_POINTS = 40
+"""Fewest points of the arm in a usable frame."""
+
+_LOOK = CameraIntrinsics.from_field_of_view(
+    160, 120, math.radians(80.0)
+)  # through which the robot's visible surface is sampled
+_SAMPLES = 150  # of it, in every frame
+_CELL = 0.02  # of the field of distances in which starts are tried [m]
+_SIDEWAYS, _AHEAD, _EVERY = 12, 10, 2  # cells to either side of starts tried, and between them
+_CLOCK_STEP = 0.08  # between starts of the clock [s]
+_CAPTURE = 0.06  # how near to the cloud a start must bring the surface [m]
+_HIDDEN = 0.5  # cost of a sample out of view, of that of one without a point near it
+_APART = 0.08  # starts nearer together are one [m]
+_GRAZING = 0.3  # cosine of ray and normal below which a point says little
+_STEP = 0.01  # over which velocities are taken [s]
+_PATCH = 0.08  # of a link, over which its mesh is alike wrong [m]
+_TO_SIGMA = 1.4826
+_CUT = 2.5  # scale of the robust sum in standard deviations
+_LEAST_SIGMA = 1e-3  # [m]
+_LEAST_CURVATURE = 0.2  # of the robust sum, of that of its weights
+
+
+@dataclass(frozen=True, eq=False)
+class CameraState:
+    """Estimated camera state: pose, depth scale and offset, clock offset and drift.
+
+    Attributes
+    ----------
+    pose : ndarray, shape (4, 4)
+        Camera in the world, R and t.
+    depth_scale : float
+        On a measured depth, g.
+    depth_offset : float
+        Added to that, o [m].
+    clock_offset : float
+        Stamp minus joint time at the stamp `clock_reference_stamp`, tau0 [s].
+    clock_drift : float
+        Growth of that per second, beta.
+    clock_reference_stamp : float
+        s0 [s]
+    """
+
+    pose: Array
+    depth_scale: float = 1.0
+    depth_offset: float = 0.0
+    clock_offset: float = 0.0
+    clock_drift: float = 0.0
+    clock_reference_stamp: float = 0.0
+
+    def to_world(self, points: Array) -> Array:
+        """Measured points in the world, both shape (N, 3) [m]."""
+        placed = np.asarray(points @ self.pose[:3, :3].T)
+        if self.depth_scale != 1.0 or self.depth_offset != 0.0:
+            placed *= (self.depth_scale + self.depth_offset / points[:, 2])[:, None]
+        placed += self.pose[:3, 3]
+        return placed
+
+    def to_measured(self, points: Array) -> Array:
+        """World points as the camera would measure them, both shape (N, 3) [m]."""
+        own = (points - self.pose[:3, 3]) @ self.pose[:3, :3]
+        return np.asarray(own * ((1.0 - self.depth_offset / own[:, 2:3]) / self.depth_scale))
+
+    def to_joint_time(self, stamp: ArrayLike) -> Array:
+        """Time on the joints' clock of stamps [s]."""
+        at = np.asarray(stamp, float)
+        return np.asarray(at - self.clock_offset - self.clock_drift * (at - self.clock_reference_stamp))
+
+    def point_jacobian(self, points: Array) -> Array:
+        """Jacobian of world points, shape (N, 3), with respect to pose and depth, shape (N, 3, 8)."""
+        away = points - self.pose[:3, 3]
+        ahead = away @ self.pose[:3, 2]
+        result = np.zeros((len(points), 3, CLOCK_OFFSET_INDEX))
+        result[:, 0, 1], result[:, 0, 2] = away[:, 2], -away[:, 1]
+        result[:, 1, 0], result[:, 1, 2] = -away[:, 2], away[:, 0]
+        result[:, 2, 0], result[:, 2, 1] = away[:, 1], -away[:, 0]
+        result[:, :, TRANSLATION_SLICE] = np.eye(3)
+        result[:, :, DEPTH_SCALE_INDEX] = away
+        result[:, :, DEPTH_OFFSET_INDEX] = away / ahead[:, None]
+        return result
+
+    def with_change(self, change: Array) -> CameraState:
+        """State after a change: rotation (world axes), translation, log depth scale, depth and clock offset, drift."""
+        pose = self.pose.copy()
+        pose[:3, :3] = Rotation.from_rotvec(change[ROTATION_SLICE]).as_matrix() @ pose[:3, :3]
+        pose[:3, 3] += change[TRANSLATION_SLICE]
+        return CameraState(
+            pose,
+            self.depth_scale * math.exp(float(change[DEPTH_SCALE_INDEX])),
+            self.depth_offset + float(change[DEPTH_OFFSET_INDEX]),
+            self.clock_offset + float(change[CLOCK_OFFSET_INDEX]),
+            self.clock_drift + float(change[CLOCK_DRIFT_INDEX]),
+            self.clock_reference_stamp,
+        )
+
+    def difference_from(self, other: CameraState) -> Array:
+        """Difference from another state (this minus other), shape (10,)."""
+        turn = Rotation.from_matrix(self.pose[:3, :3] @ other.pose[:3, :3].T).as_rotvec()
+        rest = (
+            self.depth_offset - other.depth_offset,
+            self.clock_offset - other.clock_offset,
+            self.clock_drift - other.clock_drift,
+        )
+        return np.array(
+            [*turn, *(self.pose[:3, 3] - other.pose[:3, 3]), math.log(self.depth_scale / other.depth_scale), *rest]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationFrame:
+    """One frame: its stamp [s] and points in the camera's frame, shape (N, 3) [m]."""
+
+    stamp: float
+    points: Array
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationEquations:
+    """Linearised calibration equations of one frame's points near the arm.
+
+    Attributes
+    ----------
+    jacobian : ndarray, shape (N, 10)
+        Derivatives of `residuals`.
+    residuals : ndarray, shape (N,)
+        [m]
+    patch_indices : ndarray of int, shape (N, 4)
+        Part of the robot, and the patch of it.
+    """
+
+    jacobian: Array
+    residuals: Array
+    patch_indices: Integers
+
+
+class ArmSurface:
+    """Surface of the robot along its recorded motion.
+
+    Parameters
+    ----------
+    robot_surfaces : Surfaces
+    configuration_at : callable
+        From a time on the joints' clock to a configuration.
+    grasp_positions_at : callable
+        From a configuration to where the grippers hold the object, shape (G, 3) [m]: points near there may be the
+        object's.
+    grasp_exclusion_radius : float
+        How near [m].
+    """
+
+    def __init__(
+        self,
+        robot: ArticulatedSurfaces,
+        posture: Callable[[float], Array],
+        grasps: Callable[[Array], Array],
+        around: float,
+    ) -> None:
+        self.robot_surfaces, self.configuration_at, self.grasp_positions_at, self.grasp_exclusion_radius = (
+            robot,
+            posture,
+            grasps,
+            around,
+        )
+        self._moving = np.array([joint >= 0 for joint in robot.part_joints])
+
+    def part_poses_at(self, t: float) -> Array:
+        """Poses of the parts, shape (parts, 4, 4)."""
+        return self.robot_surfaces.part_poses_at(self.configuration_at(t))
+
+    def visible_points(self, state: CameraState, stamp: float) -> tuple[Array, Integers]:
+        """Points of moving surfaces that the camera sees if nothing is before the robot, in the world; their parts."""
+        depth, cosine, part = self.robot_surfaces.render_depth_image(
+            _LOOK, state.pose, self.configuration_at(float(state.to_joint_time(stamp)))
+        )
+        seen = np.isfinite(depth) & (cosine > _GRAZING) & (part >= 0) & self._moving[part]
+        points = _LOOK.pixel_rays[seen] * depth[seen][:, None]
+        return points @ state.pose[:3, :3].T + state.pose[:3, 3], part[seen]
+
+    def is_near_surface(self, points: Array, t: float, within: float) -> Mask:
+        """Whether world points are near a moving surface and not near a grasp."""
+        q = self.configuration_at(t)
+        result = np.isfinite(self.robot_surfaces.distance_to_surface(points, q, within, moving_only=True))
+        for held in self.grasp_positions_at(q):
+            result &= np.linalg.norm(points - held, axis=1) > self.grasp_exclusion_radius
+        return np.asarray(result)
+
+    def match_points(self, points: Array, origin: Array, t: float, reach: float, along: bool) -> SurfaceMatches:
+        """Matches of world points to the arm's surface, along camera rays or at the nearest surface."""
+        q = self.configuration_at(t)
+        if along:
+            ahead = points - origin
+            distance, normal, part = self.robot_surfaces.intersect_rays(origin, ahead, q)
+            chosen = np.flatnonzero((part >= 0) & self._moving[part])
+            square = -np.einsum("ij,ij->i", normal[chosen], ahead[chosen])
+            error = (distance[chosen] - 1.0) * square  # n . (P - (origin + d (P - origin)))
+            clear = square > _GRAZING * np.linalg.norm(ahead[chosen], axis=1)
+            kept = clear & (np.abs(error) < reach)
+            chosen, error = chosen[kept], error[kept]
+        else:
+            distance, normal, part = self.robot_surfaces.nearest_moving_surface(points, q, reach)
+            chosen = np.flatnonzero((part >= 0) & self._moving[part])
+            error = distance[chosen]
+        behind, now, later = (self.part_poses_at(t + d)[part[chosen]] for d in (-_STEP, 0.0, _STEP))
+        local = np.einsum("nji,nj->ni", now[:, :3, :3], points[chosen] - now[:, :3, 3])
+        moved = np.einsum("nij,nj->ni", later[:, :3, :3] - behind[:, :3, :3], local)
+        velocity = (moved + later[:, :3, 3] - behind[:, :3, 3]) / (2 * _STEP)
+        rate = np.einsum("ni,ni->n", normal[chosen], velocity)
+        return SurfaceMatches(chosen, error, normal[chosen], rate, part[chosen], local)
+
+    def calibration_equations(
+        self, state: CameraState, glimpse: CalibrationFrame, reach: float, along: bool
+    ) -> CalibrationEquations:
+        """Linearised equations of a frame's points within reach of the arm."""
+        points = state.to_world(glimpse.points)
+        met = self.match_points(points, state.pose[:3, 3], float(state.to_joint_time(glimpse.stamp)), reach, along)
+        slope = np.empty((len(met.point_indices), STATE_SIZE))
+        slope[:, :CLOCK_OFFSET_INDEX] = np.einsum(
+            "ni,nij->nj", met.normal, state.point_jacobian(points[met.point_indices])
+        )
+        # a later offset takes the surface back along its velocity, away from the point
+        slope[:, CLOCK_OFFSET_INDEX] = met.normal_velocity
+        slope[:, CLOCK_DRIFT_INDEX] = met.normal_velocity * (glimpse.stamp - state.clock_reference_stamp)
+        return CalibrationEquations(
+            slope,
+            met.normal_distance,
+            np.column_stack([met.part, np.floor(met.part_coordinates / _PATCH).astype(np.int64)]),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceMatches:
+    """Points matched to the arm: indices, normal distance e [m], normal, normal velocity [m/s], part, local place."""
+
+    point_indices: Integers
+    normal_distance: Array
+    normal: Array
+    normal_velocity: Array
+    part: Integers
+    part_coordinates: Array
+
+
+# -- the robust sum ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class RobustCost:
+    """Quadratic model of the robust cost at a camera state.
+
+    Attributes
+    ----------
+    gradient : ndarray, shape (10,)
+    hessian : ndarray, shape (10, 10)
+        Of Gauss and Newton.
+    curvature_ratio : float
+        Of the sum, as a share of that.
+    score_covariance : ndarray, shape (10, 10)
+        Outer products of gradients summed over frames and over patches, less those of each patch in each frame, which
+        both have, and no less than these (two-way clusters of Cameron, Gelbach and Miller 2011).
+    point_error_std : float
+        Standard deviation of a point's error [m].
+    n_points : int
+        Points.
+    """
+
+    gradient: Array
+    hessian: Array
+    curvature_ratio: float
+    score_covariance: Array
+    point_error_std: float
+    n_points: int
+
+    def weighted_normal_equations(self, precision: Array) -> tuple[Array, Array, float]:
+        """Weighted Hessian and gradient of the data, and the weight; `precision`: inverse covariance of the prior."""
+        scale = 1.0 / np.sqrt(np.diag(self.hessian) + np.diag(precision))
+        whole = (self.hessian + 1e-6 * precision) * np.outer(scale, scale)
+        excess = np.linalg.solve(whole, self.score_covariance * np.outer(scale, scale))
+        weight = 1.0 / max(1.0, float(np.trace(excess)) / STATE_SIZE)
+        return weight * self.hessian, weight * self.gradient, weight
+
+    def state_covariance(self, precision: Array) -> Array:
+        """Covariance of the minimum of data and prior, shape (10, 10)."""
+        hessian, _, weight = self.weighted_normal_equations(precision)
+        bread = np.linalg.inv(self.curvature_ratio * hessian + precision)
+        return np.asarray(bread @ (weight**2 * self.score_covariance + precision) @ bread)
+
+
+def evaluate_robust_cost(rows: Sequence[CalibrationEquations], reach: float) -> RobustCost:
+    """Robust cost over all points of all frames, scaled by their median error."""
+    size = np.abs(np.concatenate([r.residuals for r in rows]))
+    sigma = max(_TO_SIGMA * float(np.median(size)) if len(size) else reach, _LEAST_SIGMA)
+    scale = min(_CUT * sigma, reach)
+    gradient, hessian, blocks = (
+        np.zeros(STATE_SIZE),
+        np.zeros((STATE_SIZE, STATE_SIZE)),
+        np.zeros((STATE_SIZE, STATE_SIZE)),
+    )
+    scores = []
+    bent, straight = 0.0, 0.0
+    for r in rows:
+        square = (r.residuals / scale) ** 2
+        weight = 1 / (1 + square) ** 2 / sigma**2
+        score = r.jacobian * (weight * r.residuals)[:, None]
+        hessian += r.jacobian.T @ (weight[:, None] * r.jacobian)
+        gradient += score.sum(axis=0)
+        straight += float(weight.sum())
+        bent += float((weight * (1 - 3 * square) / (1 + square)).sum())
+        scores.append(score)
+    if len(size):
+        stacked = np.concatenate(scores)
+        frame = np.repeat(np.arange(len(rows)), [len(r.residuals) for r in rows])
+        patch = np.unique(np.concatenate([r.patch_indices for r in rows]), axis=0, return_inverse=True)[1].ravel()
+
+        def summed(group: Integers) -> Array:
+            totals = np.stack([np.bincount(group, stacked[:, k]) for k in range(STATE_SIZE)], axis=1)
+            return np.asarray(totals.T @ totals)
+
+        both = summed(frame * (patch.max() + 1) + patch)
+        blocks = _at_least(both, summed(frame) + summed(patch) - both)
+    curvature = max(bent / max(straight, 1e-12), _LEAST_CURVATURE)
+    return RobustCost(gradient, hessian, curvature, blocks, sigma, len(size))
+
+
+def _at_least(least: Array, matrix: Array) -> Array:
+    """A symmetric matrix that is in no direction below another one, which is positive."""
+    base = least + 1e-12 * np.diag(np.diag(least)) + 1e-300 * np.eye(len(least))
+    values, vectors = eigh(matrix, base)
+    back = vectors.T @ base  # the inverse of the vectors, which are orthonormal in the base
+    return np.asarray(back.T @ (np.maximum(values, 1.0)[:, None] * back))
+
+
+def gauss_newton_step(
+    state: CameraState, found: RobustCost, told: CameraState, precision: Array
+) -> tuple[CameraState, Array]:
+    """Camera state after one Gauss-Newton step, and the step; `precision`: of the prior, shape (10, 10)."""
+    hessian, gradient, _ = found.weighted_normal_equations(precision)
+    step = np.asarray(-np.linalg.solve(hessian + precision, gradient + precision @ state.difference_from(told)), float)
+    return state.with_change(step), step
+
+
+# -- where to begin ---------------------------------------------------------------------------------------------------
+
+
+def initial_camera_states(
+    arm: ArmSurface, glimpses: Sequence[CalibrationFrame], told: CameraState, search: float, most: int
+) -> list[CameraState]:
+    """Candidate camera states at which the arm's visible surface lies on the clouds, best first.
+
+    Parameters
+    ----------
+    arm : Arm
+    glimpses : sequence of Glimpse
+    told : CameraState
+    search : float
+        How far from its offset others are tried [s].
+    most : int
+        Of starts, at least `_APART` from one another, best first.
+    """
+    steps = math.ceil(search / _CLOCK_STEP) if search > 0 else 0
+    delays = np.linspace(-search, search, 2 * steps + 1) if steps else np.zeros(1)
+    sides, ahead = (np.arange(-n, n + 1, _EVERY) for n in (_SIDEWAYS, _AHEAD))
+    cells = np.stack(np.meshgrid(sides, sides, ahead, indexing="ij"), axis=-1).reshape(-1, 3)
+    total = np.zeros((len(delays), len(cells)))
+    for glimpse in glimpses:
+        field = _Field.of(arm, glimpse, told)
+        if field is None:
+            continue
+        for k, delay in enumerate(delays):
+            total[k] += field.costs(arm, told, glimpse.stamp, delay, cells)
+    result: list[CameraState] = []
+    for index in np.argsort(total, axis=None):
+        delay, cell = np.unravel_index(index, total.shape)
+        change = np.zeros(STATE_SIZE)
+        # the cloud has to go where the surface was, and the surface went along the cells
+        change[TRANSLATION_SLICE] = -told.pose[:3, :3] @ (_CELL * cells[cell])
+        change[CLOCK_OFFSET_INDEX] = delays[delay]
+        trial = told.with_change(change)
+        apart = [
+            np.linalg.norm(trial.difference_from(other)[TRANSLATION_SLICE])
+            + 0.5 * abs(trial.clock_offset - other.clock_offset)
+            for other in result
+        ]
+        if min(apart, default=math.inf) >= _APART:
+            result.append(trial)
+        if len(result) == most:
+            break
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class _Field:
+    """Cost of a surface's point by its place in the camera's frame, and the arm's visible points.
+
+    Attributes
+    ----------
+    cost : ndarray, shape (cells,)
+        min(distance to the cloud, capture)^2, of capture^2; `_HIDDEN` out of the cloud's view.
+    low : ndarray, shape (3,)
+        Corner of the grid [m].
+    shape : tuple of int
+    points : ndarray, shape (N, 3)
+        In the world at the told state [m].
+    part : ndarray of int, shape (N,)
+    """
+
+    cost: NDArray[np.float32]
+    low: Array
+    shape: tuple[int, ...]
+    points: Array
+    part: Integers
+
+    @staticmethod
+    def of(arm: ArmSurface, glimpse: CalibrationFrame, told: CameraState) -> _Field | None:
+        """The field about one frame; None where the camera would see too little of the arm."""
+        points, part = arm.visible_points(told, glimpse.stamp)
+        own = told.to_measured(points)
+        at = glimpse.points[:, :2] / glimpse.points[:, 2:]
+        view = np.array([at.min(axis=0), at.max(axis=0)])
+        towards = own[:, :2] / own[:, 2:]
+        seen = ((towards >= view[0]) & (towards <= view[1])).all(axis=1)
+        if np.count_nonzero(seen) < MIN_ARM_POINTS:
+            return None
+        chosen = np.flatnonzero(seen)
+        chosen = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), _SAMPLES)).astype(np.int64)]
+        points, part, own = points[chosen], part[chosen], own[chosen]
+        # room for the shifts, and for the arm's own way
+        margin = _CELL * (np.array([_SIDEWAYS, _SIDEWAYS, _AHEAD]) + 2) + 0.2
+        low = own.min(axis=0) - margin
+        shape = np.ceil((own.max(axis=0) + margin - low) / _CELL).astype(int) + 1
+        cell = np.floor((glimpse.points - low) / _CELL).astype(int)
+        cell = cell[((cell >= 0) & (cell < shape)).all(axis=1)]
+        empty = np.ones(shape, bool)
+        empty[tuple(cell.T)] = False
+        if empty.all():
+            return None
+        distance = distance_transform_edt(empty, sampling=_CELL)
+        centre = [low[axis] + _CELL * (np.arange(shape[axis]) + 0.5) for axis in range(3)]
+        outside = np.zeros(shape, bool)
+        for axis in (0, 1):
+            at = centre[axis][:, None] / np.maximum(centre[2], _CELL)
+            beyond = (at < view[0, axis]) | (at > view[1, axis])
+            outside |= beyond[:, None] if axis == 0 else beyond
+        cost = np.where(outside, _HIDDEN, (np.minimum(distance, _CAPTURE) / _CAPTURE) ** 2)
+        return _Field(cost.astype(np.float32).ravel(), low, tuple(int(n) for n in shape), points, part)
+
+    def costs(self, arm: ArmSurface, told: CameraState, stamp: float, delay: float, cells: Integers) -> Array:
+        """Mean cost of the arm as it was `delay` [s] earlier, shifted by cells of the camera's frame."""
+        t = float(told.to_joint_time(stamp))
+        before, after = arm.part_poses_at(t)[self.part], arm.part_poses_at(t - delay)[self.part]
+        local = np.einsum("nji,nj->ni", before[:, :3, :3], self.points - before[:, :3, 3])
+        own = told.to_measured(np.einsum("nij,nj->ni", after[:, :3, :3], local) + after[:, :3, 3])
+        index = np.floor((own - self.low) / _CELL).astype(np.int64)
+        limit = np.array(self.shape)
+        index = np.clip(index, [_SIDEWAYS, _SIDEWAYS, _AHEAD], limit - 1 - [_SIDEWAYS, _SIDEWAYS, _AHEAD])
+        strides = np.array([self.shape[1] * self.shape[2], self.shape[2], 1])
+        cost = self.cost[(index @ strides)[None, :] + (cells @ strides)[:, None]]
+        return np.asarray(cost.mean(axis=1), float)
+
+
+# -- how much of the arm is there -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SurfaceVisibility:
+    """Of the arm's surface that should be seen: shares where a cloud has it, where something is before it, and where
+    the camera saw through it; in how many samples."""
+
+    there: float
+    covered: float
+    through: float
+    samples: int
+
+
+class CloudSearchTrees:
+    """Search trees of some frames, to measure how much of the arm they show.
+
+    Parameters
+    ----------
+    glimpses : sequence of Glimpse
+    """
+
+    def __init__(self, glimpses: Sequence[CalibrationFrame]) -> None:
+        self._glimpses = glimpses
+        self._places = [cKDTree(g.points) for g in glimpses]
+        self._rays = [cKDTree(g.points[:, :2] / g.points[:, 2:]) for g in glimpses]
+
+    def surface_visibility(self, arm: ArmSurface, state: CameraState, within: float) -> SurfaceVisibility:
+        """Fractions of the arm's visible surface that have a point within a distance [m], or have none."""
+        counts = np.zeros(4)
+        for glimpse, places, rays in zip(self._glimpses, self._places, self._rays, strict=True):
+            points, _ = arm.visible_points(state, glimpse.stamp)
+            own = state.to_measured(points)
+            away, _ = places.query(own, distance_upper_bound=within)
+            # as wide as the gaps between points of a cloud that was thinned
+            apart, index = rays.query(own[:, :2] / own[:, 2:], distance_upper_bound=0.015)
+            near = np.isfinite(away)
+            known = np.isfinite(apart)
+            depth = glimpse.points[np.minimum(index, len(glimpse.points) - 1), 2]
+            through = known & ~near & (depth > own[:, 2] + within)
+            covered = known & ~near & (depth < own[:, 2] - within)
+            counts += [np.count_nonzero(x) for x in (near, covered, through, known | near)]
+        samples = max(int(counts[3]), 1)
+        there, covered, through = (float(share) for share in counts[:3] / samples)
+        return SurfaceVisibility(there, covered, through, int(counts[3]))

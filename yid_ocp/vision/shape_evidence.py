@@ -1,0 +1,449 @@
+"""Assessment of a shape by a frame's cloud: own points, foreign points, and links without points.
+
+Points within three standard deviations of the tubes' surface lie on the shape. Of the others, those that hang together
+and are as many as a piece of tube as long as it is wide would have are a thing. Where a thing's surface goes on from
+the shape's, nobody can tell whose the points are: within two tubes' reach of there they are contested and say nothing.
+A station of a tube that no own point lies on is hidden, or it is empty although the camera sees it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from yid_ocp.vision.filters import weighted_median
+from yid_ocp.vision.initial_shapes import EndAnchor
+from yid_ocp.vision.occlusion import OcclusionMap
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+_FilteredOutTest = Callable[[Array], Mask]
+
+_AWAY = -0.5  # cosine of normal and sight beyond which a point cannot be on the side that the camera sees
+_STATIONS = 6  # per link at least, where it is asked whether points are near
+_SIGMAS = 3.0  # from the surface, within which a point lies on it
+_TO_SIGMA = 1.4826  # from the median absolute deviation of a normal distribution to its standard deviation
+_LINKED = 3.0  # times the usual distance of neighbours, within which two points hang together
+_FEWEST = 12  # points of a thing
+_MATCH = 0.5  # of a piece of surface about a point that must be foreign for it to go on there
+_MOST_THINGS = 8  # of a frame, that are remembered
+_FILLED = 0.3  # of the usual number of points, with which a slice of a tube counts as filled
+_SURROUNDINGS = 3.0  # radii about a node, in which it is asked how wide the surface is there
+_AHEAD = 0.5  # of its length, by which a tube may be too short and its end still be found
+
+
+@dataclass(frozen=True, eq=False)
+class TubeLinks:
+    """Links of a shape as cylinders in the world.
+
+    Attributes
+    ----------
+    link_ends : ndarray, shape (K, 2, 3)
+        Start and end of every link's centre line [m].
+    radius : ndarray, shape (K,)
+        [m]
+    free_end_links : tuple of int
+        Links whose end nothing holds and nothing grows on.
+    tube_lengths : ndarray, shape (K,)
+        Length of the whole tube that a link belongs to [m].
+    """
+
+    link_ends: Array
+    radius: Array
+    free_end_links: tuple[int, ...]
+    tube_lengths: Array
+
+    @property
+    def link_lengths(self) -> Array:
+        """Length of each link, shape (K,) [m]."""
+        return np.asarray(np.linalg.norm(self.link_ends[:, 1] - self.link_ends[:, 0], axis=1))
+
+
+def nearest_on_tubes(
+    corners: Array, radius: Array, points: Array, share: float = 1.0
+) -> tuple[Integers, Array, Array, Array]:
+    """Nearest place on tubes for each point.
+
+    Parameters
+    ----------
+    corners : ndarray, shape (K, 2, 3)
+        Start and end of every link [m].
+    radius : ndarray, shape (K,)
+        [m]
+    points : ndarray, shape (N, 3)
+        [m]
+    share : float
+        Of the radius, at which points lie from the centre line.
+
+    Returns
+    -------
+    link : ndarray of int, shape (N,)
+    along : ndarray, shape (N,)
+        From the link's start, 0, to its end, 1.
+    normal : ndarray, shape (N, 3)
+        Unit vector from the centre line to the point.
+    distance : ndarray, shape (N,)
+        From the centre line [m].
+    """
+    start, edge = corners[:, 0], corners[:, 1] - corners[:, 0]
+    square = np.einsum("ij,ij->i", edge, edge)
+    # (p - a).d and |p - a|^2 for all points and links at once, by products of matrices
+    ahead = points @ edge.T - np.einsum("ij,ij->i", start, edge)
+    t = np.clip(ahead / square, 0.0, 1.0)
+    own = np.einsum("ij,ij->i", points, points)[:, None] + np.einsum("ij,ij->i", start, start)
+    apart = own - 2.0 * (points @ start.T) + t * (t * square - 2.0 * ahead)
+    link = np.argmin(np.sqrt(np.maximum(apart, 0.0)) - share * radius, axis=1)
+    along = t[np.arange(len(points)), link]
+    normal = points - start[link] - along[:, None] * edge[link]
+    distance = np.sqrt(np.einsum("ij,ij->i", normal, normal))
+    return link, along, normal / np.maximum(distance, 1e-9)[:, None], distance
+
+
+def faces_away_from_camera(normal: Array, sight: Array) -> Mask:
+    """Whether surface normals (N, 3) face away from the camera, by lines of sight (N, 3)."""
+    return np.asarray(np.einsum("ij,ij->i", normal, sight) > -_AWAY * np.linalg.norm(sight, axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class ForeignCluster:
+    """Cluster of points that belong to no tube.
+
+    Attributes
+    ----------
+    centre : ndarray, shape (3,)
+        Median of its points in the world [m].
+    extent : ndarray, shape (3,)
+        Extents along the world's axes [m].
+    n_points : int
+    """
+
+    centre: Array
+    extent: Array
+    n_points: int
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeEvidence:
+    """Classification of a frame's points by a shape, and how much of the shape they cover.
+
+    Attributes
+    ----------
+    is_own, is_contested, is_foreign : ndarray of bool, shape (N,)
+        Points on the shape that are surely its own; points there that may be a thing's; points of things.
+    noise_std : float
+        Standard deviation of their distances from the surface [m].
+    mean_distance : float
+        Mean distance from the surface of points near it that are no thing's [m].
+    covered_fraction, visibly_empty_fraction : ndarray, shape (K,)
+        Share of each link's length on which there are own points, and on which the camera sees that there are none.
+    end_offsets : ndarray, shape (E,)
+        By how much each free tube's end lies further along than the shape has it, NaN where that cannot be seen [m].
+    excess_variance : ndarray, shape (K,)
+        Variance across each link beyond that of its tube [m^2].
+    foreign_clusters : tuple of Thing
+        The largest first.
+    """
+
+    is_own: Mask
+    is_contested: Mask
+    is_foreign: Mask
+    noise_std: float
+    mean_distance: float
+    covered_fraction: Array
+    visibly_empty_fraction: Array
+    end_offsets: Array
+    excess_variance: Array
+    foreign_clusters: tuple[ForeignCluster, ...]
+
+    @property
+    def visible_coverage(self) -> Array:
+        """Share of each link's visible length that has own points, shape (K,); 0 where nothing of it is visible."""
+        return np.asarray(
+            self.covered_fraction / np.maximum(self.covered_fraction + self.visibly_empty_fraction, 1e-12)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class CloudObservation:
+    """Processed points of one frame with the camera and occlusion that they were seen with.
+
+    Attributes
+    ----------
+    points : ndarray, shape (N, 3)
+        Surface points in the world [m].
+    point_weights : ndarray, shape (N,)
+    skeleton_nodes : ndarray, shape (K, 3)
+        Of their skeleton [m].
+    camera_position : ndarray, shape (3,)
+        [m]
+    occlusion_map : View, optional
+        Everything that the camera saw; without it no place counts as hidden.
+    is_filtered_out : callable, optional
+        Which places, shape (S, 3), lie where filters leave no points.
+    end_anchors : sequence of Anchor
+        Ends of the object that were seen.
+    """
+
+    points: Array
+    point_weights: Array
+    skeleton_nodes: Array
+    camera_position: Array
+    occlusion_map: OcclusionMap | None = None
+    is_filtered_out: _FilteredOutTest | None = None
+    end_anchors: Sequence[EndAnchor] = ()
+
+    @cached_property
+    def point_tree(self) -> cKDTree:
+        """Search tree of the points."""
+        return cKDTree(self.points)
+
+    @cached_property
+    def point_spacing(self) -> float:
+        """Usual distance of a point from its nearest neighbour [m]."""
+        if len(self.points) < 2:
+            return math.inf
+        return max(float(np.median(self.point_tree.query(self.points, k=2)[0][:, 1])), 1e-4)
+
+    def is_hidden(self, places: Array, radius: Array, margin: float) -> Mask:
+        """Whether places are hidden from the camera or removed by filters, shape (S,)."""
+        hidden = np.zeros(len(places), bool)
+        if self.occlusion_map is not None:
+            hidden |= self.occlusion_map.is_hidden(places, radius, margin)
+        if self.is_filtered_out is not None:
+            hidden |= self.is_filtered_out(places)
+        return hidden
+
+
+def assess_shape(tubes: TubeLinks, seen: CloudObservation, near: float) -> ShapeEvidence:
+    """Assess a shape by a frame's points.
+
+    Parameters
+    ----------
+    tubes : Tubes
+    seen : Seen
+    near : float
+        Distance from the surface beyond which a point says nothing of the shape [m].
+
+    Returns
+    -------
+    Evidence
+    """
+    link, along, normal, distance = nearest_on_tubes(tubes.link_ends, tubes.radius, seen.points)
+    away = faces_away_from_camera(normal, seen.points - seen.camera_position)
+    error = np.where(away, -distance, distance) - tubes.radius[link]
+    size = np.abs(error)
+    close = size < near
+    tree, spacing = seen.point_tree, seen.point_spacing
+    noise = _TO_SIGMA * weighted_median(size[close], seen.point_weights[close]) if close.any() else near / _SIGMAS
+    # where points lie in between others is not known better than from one to the next
+    noise = max(noise, spacing / math.sqrt(12.0))
+    gate = min(_SIGMAS * noise, near)
+    on_shape = size < gate
+    slices = [_Slices.of(tubes, k, spacing) for k in tubes.free_end_links]
+    beyond = np.zeros(len(on_shape), bool)
+    ends = np.full(len(slices), np.nan)
+    for i, cut in enumerate(slices):
+        ends[i] = cut.end(seen, gate)
+        if ends[i] > 0:
+            beyond |= cut.within(seen.points, gate, 0.0, ends[i])
+    part = _parts(tree, ~on_shape & ~beyond, _LINKED * spacing)
+    part = _large(part, 4 * float(tubes.radius.min()) ** 2 / spacing**2)
+    foreign = part >= 0
+    contact = _contacts(tree, seen, on_shape | beyond, foreign, _LINKED * spacing)
+    widest = 2 * (tubes.radius[link] + gate)
+    contested = np.zeros(len(on_shape), bool)
+    if contact.any():
+        apart, _ = cKDTree(seen.points[contact]).query(seen.points)
+        contested = (on_shape | beyond) & (apart < widest)
+        for i, cut in enumerate(slices):
+            # whose the points at the end are is not known, so neither is where it is
+            if np.isfinite(ends[i]) and cKDTree(seen.points[contact]).query(cut.place(ends[i]))[0] < 2 * (
+                cut.radius + gate
+            ):
+                ends[i] = np.nan
+    own = on_shape & ~contested
+    filled, empty = _coverage(tubes, seen, own, link, along, gate)
+    counted = close & ~foreign
+    mean = float(np.average(size[counted], weights=seen.point_weights[counted])) if counted.any() else math.inf
+    return ShapeEvidence(
+        own,
+        contested,
+        foreign,
+        noise,
+        mean,
+        filled,
+        empty,
+        ends,
+        _swath(tubes, seen, counted & ~contested, link, normal * distance[:, None]),
+        _things(part, seen),
+    )
+
+
+def tube_like_nodes_and_points(sight: CloudObservation, radius: float) -> tuple[Mask, Mask]:
+    """Whether nodes and points lie where the surface is as narrow as a tube.
+
+    About a tube points spread by its length in one direction and by r/sqrt(3) across; on a table, a wall or a body they
+    spread as far in two.
+
+    Parameters
+    ----------
+    sight : Sight
+    radius : float
+        Of the thickest tube [m].
+
+    Returns
+    -------
+    nodes : ndarray of bool, shape (K,)
+    points : ndarray of bool, shape (N,)
+        Those whose nearest node is among them.
+    """
+    within = _SURROUNDINGS * radius
+    thin = np.zeros(len(sight.skeleton_nodes), bool)
+    for i, around in enumerate(sight.point_tree.query_ball_point(sight.skeleton_nodes, within)):
+        if len(around) > 3:
+            away = sight.points[around] - sight.points[around].mean(axis=0)
+            second = float(np.linalg.eigvalsh(away.T @ away / len(around))[1])
+            # halfway between a tube, r/sqrt(3), and a disc, within/2
+            thin[i] = math.sqrt(max(second, 0.0)) < 0.5 * (radius / math.sqrt(3.0) + 0.5 * within)
+    return thin, thin[cKDTree(sight.skeleton_nodes).query(sight.points)[1]]
+
+
+def _parts(tree: cKDTree, chosen: Mask, within: float) -> Integers:
+    """Connected parts of some of the points, -1 for the others."""
+    part = np.full(len(chosen), -1)
+    index = np.flatnonzero(chosen)
+    if not len(index):
+        return part
+    pairs = cKDTree(tree.data[index]).query_pairs(within, output_type="ndarray")
+    graph = coo_matrix((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(index),) * 2)
+    part[index] = connected_components(graph, directed=False)[1]
+    return part
+
+
+def _large(part: Integers, least: float) -> Integers:
+    """Parts with so many points, numbered by their size, the largest first; -1 for the others."""
+    if (part < 0).all():
+        return part
+    count = np.bincount(part[part >= 0])
+    order = np.argsort(-count, kind="stable")
+    number = np.full(len(count), -1)
+    kept = order[count[order] >= max(least, _FEWEST)]
+    number[kept] = np.arange(len(kept))
+    return np.where(part >= 0, number[np.maximum(part, 0)], -1)
+
+
+def _contacts(tree: cKDTree, seen: CloudObservation, shape: Mask, foreign: Mask, within: float) -> Mask:
+    """Points of the shape from which a thing's surface goes on: about them it is nearly as much there as the shape's.
+
+    A few pixels that mix a tube's edge with what stands behind it do not make the two touch.
+    """
+    contact = np.zeros(len(shape), bool)
+    if not foreign.any():
+        return contact
+    close = cKDTree(seen.points[foreign]).query(seen.points[shape], distance_upper_bound=within)[0]
+    for i in np.flatnonzero(shape)[np.isfinite(close)]:
+        around = np.asarray(tree.query_ball_point(seen.points[i], within), dtype=np.int64)
+        theirs = float(seen.point_weights[around[foreign[around]]].sum())
+        contact[i] = theirs >= _MATCH * float(seen.point_weights[around[shape[around]]].sum())
+    return contact
+
+
+def _coverage(
+    tubes: TubeLinks, seen: CloudObservation, own: Mask, link: Integers, along: Array, gate: float
+) -> tuple[Array, Array]:
+    """Shares of each link that have own points, and that visibly have none."""
+    lengths = tubes.link_lengths
+    count = np.maximum(_STATIONS, np.ceil(lengths / (2 * tubes.radius))).astype(np.int64)
+    first = np.concatenate([[0], np.cumsum(count)[:-1]])
+    station = first[link] + np.minimum((along * count[link]).astype(np.int64), count[link] - 1)
+    filled = np.bincount(station[own], minlength=int(count.sum())) > 0
+    owner = np.repeat(np.arange(len(count)), count)
+    bare = np.flatnonzero(~filled)
+    share = (bare - first[owner[bare]] + 0.5) / count[owner[bare]]
+    places = tubes.link_ends[owner[bare], 0] + share[:, None] * (
+        tubes.link_ends[owner[bare], 1] - tubes.link_ends[owner[bare], 0]
+    )
+    empty = np.zeros(len(filled), bool)
+    empty[bare] = ~seen.is_hidden(places, tubes.radius[owner[bare]], gate)
+    return np.bincount(owner, filled) / count, np.bincount(owner, empty) / count
+
+
+def _swath(tubes: TubeLinks, seen: CloudObservation, counted: Mask, link: Integers, offset: Array) -> Array:
+    """Variance of points across each link, seen from the camera, beyond that of a tube of its radius."""
+    edge = tubes.link_ends[:, 1] - tubes.link_ends[:, 0]
+    across = np.cross(edge, tubes.link_ends.mean(axis=1) - seen.camera_position)
+    across /= np.maximum(np.linalg.norm(across, axis=1), 1e-12)[:, None]
+    square = np.einsum("ij,ij->i", offset, across[link]) ** 2
+    weight = np.bincount(link[counted], seen.point_weights[counted], minlength=len(edge))
+    total = np.bincount(link[counted], (seen.point_weights * square)[counted], minlength=len(edge))
+    # the picture of a tube is evenly filled from one side to the other
+    return np.maximum(total / np.maximum(weight, 1e-12) - tubes.radius**2 / 3, 0.0)
+
+
+def _things(part: Integers, seen: CloudObservation) -> tuple[ForeignCluster, ...]:
+    found = []
+    for number in range(min(_MOST_THINGS, int(part.max(initial=-1)) + 1)):
+        mine = part == number
+        points = seen.points[mine]
+        found.append(ForeignCluster(np.median(points, axis=0), np.ptp(points, axis=0), int(mine.sum())))
+    return tuple(found)
+
+
+@dataclass(frozen=True, eq=False)
+class _Slices:
+    """A free tube's last link and where it would go on, cut across."""
+
+    tip: Array
+    axis: Array
+    radius: float
+    edges: Array
+
+    @staticmethod
+    def of(tubes: TubeLinks, link: int, spacing: float) -> _Slices:
+        start, tip = tubes.link_ends[link]
+        length = float(np.linalg.norm(tip - start))
+        thick = max(float(tubes.radius[link]), 2 * spacing)
+        behind, ahead = max(3, int(length / thick)), max(3, int(_AHEAD * tubes.tube_lengths[link] / thick))
+        return _Slices(tip, (tip - start) / length, float(tubes.radius[link]), thick * np.arange(-behind, ahead + 1.0))
+
+    def place(self, along: float) -> Array:
+        return np.asarray(self.tip + along * self.axis)
+
+    def within(self, points: Array, gate: float, low: float, high: float) -> Mask:
+        """Points about the axis, between two places along it from the tip."""
+        away = points - self.tip
+        along = away @ self.axis
+        across = np.einsum("ij,ij->i", away, away) - along**2
+        return np.asarray((along > low) & (along <= high) & (across < (self.radius + gate) ** 2))
+
+    def end(self, seen: CloudObservation, gate: float) -> float:
+        """Where the points end along the axis, from the tip [m]; NaN where that cannot be seen.
+
+        Of all places it is the one with the least empty slices before it and filled ones beyond.
+        """
+        edges = self.edges
+        mine = self.within(seen.points, gate, edges[0], edges[-1])
+        along = (seen.points[mine] - self.tip) @ self.axis
+        count, _ = np.histogram(along, edges, weights=seen.point_weights[mine])
+        behind = count[edges[1:] <= 0]
+        usual = float(np.median(count[count > 0])) if (behind > 0).any() else 0.0
+        if not usual:
+            return math.nan
+        filled = count > _FILLED * usual
+        middles = self.tip + 0.5 * (edges[1:] + edges[:-1])[:, None] * self.axis
+        hidden = seen.is_hidden(middles, np.full(len(middles), self.radius), gate) & ~filled
+        score = np.concatenate([[0.0], np.cumsum(np.where(hidden, 0.0, np.where(filled, 0.5, -0.5)))])
+        last = int(np.argmax(score))
+        if last == 0 or last == len(count) or hidden[last]:
+            return math.nan
+        inside = along[(along > edges[last - 1]) & (along <= edges[last])]
+        return float(inside.max()) if len(inside) else float(edges[last])

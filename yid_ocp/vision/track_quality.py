@@ -1,0 +1,187 @@
+"""Selection of good frames and uncertainty of their points, from the fit results of all frames."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from yid_ocp.errors import DataError
+from yid_ocp.vision.clutter import ForeignObject
+from yid_ocp.vision.dimension_check import DimensionCheck
+from yid_ocp.vision.fit import ShapeFitter
+from yid_ocp.vision.options import TrackOptions
+from yid_ocp.vision.sequence_calibration import SequenceCalibration
+from yid_ocp.vision.shape_fit_result import FrameShapeFit
+from yid_ocp.vision.track_result import FrameReport
+
+Array = NDArray[np.float64]
+
+_NO_FIT, _END_ELSEWHERE = "the shape does not fit", "an end is not where its gripper is"
+_MISFITS = (_NO_FIT, _END_ELSEWHERE)
+_MOST_NOTES = 4  # in a hint
+_MEAN_ABS = math.sqrt(2.0 / math.pi)  # of a normal variable, in standard deviations
+
+
+def rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: TrackOptions) -> str:
+    """Reason why a frame's fit is rejected on its own; empty for a good one."""
+    if not np.isfinite(fit.q).all():
+        return "the fit failed"
+    # a mean distance of normal noise is 0.8 of its standard deviation
+    limit = math.hypot(
+        options.max_distance_in_radii * float(shape.link_radii.mean()), _MEAN_ABS * shape.options.surface_noise_std
+    )
+    if not math.isfinite(fit.mean_distance):
+        return f"{_NO_FIT}: no point of the cloud is near it"
+    if fit.mean_distance > limit:
+        off = f"{1e3 * fit.mean_distance:.1f} mm off on average, d_max allows {1e3 * limit:.1f} mm"
+        return f"{_NO_FIT}: {off}"
+    bend = float(np.abs((fit.q - shape.rest_configuration)[list(shape.bend_joints)]).max())
+    if bend > options.max_bend_angle:
+        return f"the shape is folded: a joint is bent by {math.degrees(bend):.0f} degrees"
+    if fit.visible_coverage < options.min_visible_coverage:
+        share = 100 * fit.visible_coverage
+        return f"{_NO_FIT}: only {share:.0f} % of its visible length has points of its own"
+    return ""
+
+
+def reject_outlying_frames(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameReport]:
+    """Frames, with those that deviate from the other good frames marked as dropped."""
+    fits = [frame.shape_fit for frame in frames if frame.is_good and frame.shape_fit is not None]
+    if not fits:
+        return list(frames)
+    usual = float(np.median([fit.mean_distance for fit in fits]))
+    gap = np.median([fit.grasp_gaps for fit in fits], axis=0)
+    return [_compared(frame, usual, gap, options) for frame in frames]
+
+
+def _compared(frame: FrameReport, usual: float, gap: Array, options: TrackOptions) -> FrameReport:
+    if not frame.is_good or frame.shape_fit is None:
+        return frame
+    if frame.shape_fit.mean_distance > options.max_distance_ratio * usual:
+        off = f"{1e3 * frame.shape_fit.mean_distance:.1f} mm off on average, {1e3 * usual:.1f} mm are usual"
+        return replace(frame, drop_reason=f"the shape fits worse than in other frames: {off}")
+    apart = float(np.linalg.norm(frame.shape_fit.grasp_gaps - gap, axis=1).max(initial=0.0))
+    if apart > options.max_grasp_gap_change:
+        off = f"{1e3 * apart:.0f} mm more than usual (a late stamp?)"
+        return replace(frame, drop_reason=f"{_END_ELSEWHERE}: {off}")
+    return frame
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedPoints:
+    """Tracked points of the good frames.
+
+    Attributes
+    ----------
+    t : ndarray, shape (M,)
+        [s]
+    q : ndarray, shape (M, n)
+    position, std, shared_std : ndarray, shape (M, np, 3)
+        [m]; NaN where a point was not seen well enough.
+    """
+
+    t: Array
+    q: Array
+    position: Array
+    std: Array
+    shared_std: Array
+
+
+def tracked_points(
+    frames: Sequence[FrameReport],
+    columns: Sequence[int],
+    common: SequenceCalibration,
+    things: Sequence[ForeignObject],
+    options: TrackOptions,
+    source: str,
+) -> TrackedPoints:
+    """Tracked points of the good frames with standard deviations.
+
+    Parameters
+    ----------
+    frames : sequence of FrameReport
+        All of them, judged.
+    columns : sequence of int
+        Of the system's points, those that are wanted.
+    common : Common
+    things : sequence of Foreign
+        That stood about the object.
+    options : TrackOptions
+    source : str
+        Where the frames come from.
+
+    Raises
+    ------
+    DataError
+        No good frame, or no point that is known well enough in any.
+    """
+    good = [frame for frame in frames if frame.is_good]
+    if not good:
+        raise _none_good(frames, common.dimensions, things, source)
+    fits = [frame.shape_fit for frame in good if frame.shape_fit is not None]
+    t = np.array([frame.joint_time for frame in good])
+    position = np.array([fit.point_positions[list(columns)] for fit in fits])
+    std = np.hypot(np.array([fit.point_std[list(columns)] for fit in fits]), options.min_point_std)
+    sizes = common.dimensions
+    by_sizes = np.array([sizes.point_std(fit.dimension_equations.point_jacobian[list(columns)]) for fit in fits])
+    std = np.hypot(std, by_sizes)
+    velocity = np.zeros_like(position)
+    if len(t) > 1:
+        velocity = np.asarray(CubicSpline(t, position, axis=0)(t, 1))
+    # a point is where it was at some time of the exposure, which is uniform over that
+    std = np.hypot(std, np.abs(velocity) * math.hypot(options.stamp_std, options.exposure_time / math.sqrt(12.0)))
+    stamps = np.repeat([frame.stamp for frame in good], len(columns))
+    calibration = common.camera_calibration
+    shared = calibration.shared_point_std(position.reshape(-1, 3), velocity.reshape(-1, 3), stamps).reshape(std.shape)
+    std = np.hypot(std, shared)
+    unseen = np.linalg.norm(std, axis=2) > math.sqrt(3.0) * options.max_point_std
+    unseen |= ~np.array([fit.is_point_seen[list(columns)] for fit in fits])
+    if unseen.all():
+        best = 1e3 * float(np.sqrt((std**2).mean(axis=2)).min())
+        wrong_sizes = bool((np.linalg.norm(by_sizes, axis=2) > math.sqrt(3.0) * options.max_point_std).all())
+        raise DataError(
+            f"{_because(sizes, wrong_sizes)}no point is known well enough in any frame: the best within {best:.0f} mm,"
+            f" point_std_max is {1e3 * options.max_point_std:g} mm",
+            where=source,
+            hint=_hint(
+                sizes,
+                things,
+                f"check the camera's pose and clock ({calibration.message}), or look at the pictures of a frame",
+            ),
+        )
+    hidden = unseen[..., None]
+    q = np.array([fit.q for fit in fits])
+    return TrackedPoints(t, q, *(np.where(hidden, np.nan, entry) for entry in (position, std, shared)))
+
+
+def _none_good(
+    frames: Sequence[FrameReport], sizes: DimensionCheck, things: Sequence[ForeignObject], source: str
+) -> DataError:
+    kinds: dict[str, list[str]] = {}
+    for frame in frames:
+        kinds.setdefault(frame.drop_reason.partition(":")[0], []).append(frame.drop_reason)
+    often = sorted(kinds.values(), key=len, reverse=True)[:3]
+    listed = "; ".join(
+        f"{'for example ' if len(set(reasons)) > 1 else ''}{reasons[0]} ({len(reasons)} of {len(frames)})"
+        for reasons in often
+    )
+    cause = _because(sizes, bool(often) and often[0][0].startswith(_MISFITS))
+    hint = "check the camera's pose, the unit of the clouds and the filters, and look at the pictures of a frame"
+    hint = "say in camera.json that the unit is mm" if "metres" in listed else _hint(sizes, things, hint)
+    return DataError(f"{cause}not one frame could be used: {listed}", where=source, hint=hint)
+
+
+def _because(sizes: DimensionCheck, matters: bool) -> str:
+    """What begins a refusal where the sizes of the object are the likely cause."""
+    return f"{sizes.contradiction_message}: " if matters and sizes.contradiction_message else ""
+
+
+def _hint(sizes: DimensionCheck, things: Sequence[ForeignObject], otherwise: str) -> str:
+    """What is known to be wrong with the object or stands about it comes before general advice."""
+    notes = [*sizes.messages, *(thing.text for thing in things)]
+    return "; ".join([*notes[:_MOST_NOTES], otherwise])

@@ -1,0 +1,272 @@
+"""Baseline of a run: estimates, effects and recordings read from earlier run folders."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from yid_ocp.analysis.estimate_history import RunEstimates, pool_estimates
+from yid_ocp.config.reader import load_config
+from yid_ocp.config.settings import CableSettings, EffectSettings, ParameterSettings, RunSettings
+from yid_ocp.data.recording import Recording
+from yid_ocp.data.recording_hdf5 import read_recording
+from yid_ocp.errors import ConfigError, DataError, YidError
+from yid_ocp.files import is_file
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.workflow.build import recording_path
+
+_RUN_FORMATS = ("yid-solve/1", "yid-diagnosis/1")
+_COMPARED_MODEL_SECTIONS = ("robot", "arms", "clamps", "object", "grasp", "springs", "gravity")
+"""Sections of `model` in which a baseline's settings must be the same, so that parameters mean the same thing."""
+
+
+def read_estimates(folder: str | Path) -> RunEstimates:
+    """Estimates and covariance of the free parameters, read from a run folder of `solve` or `diagnose`.
+
+    Parameters
+    ----------
+    folder : str or Path
+
+    Returns
+    -------
+    Estimates
+        Parameters that were not found at all are left out.
+
+    Raises
+    ------
+    DataError
+        There is no finished run, its result cannot be read, is one of another command or of an older format, or its
+        solve failed.
+    """
+    file, result = Path(folder) / "result.json", read_run_result(folder)
+    try:
+        said = result.get("model", result)  # of a diagnosis, the model that it ended with
+        known, parameters = said["covariance"], said["parameters"]
+        names = tuple(str(name) for name in known["names"])
+        values = np.array([float(parameters[name]["value"]) for name in names])
+        matrix = np.array(known["matrix"], float).reshape(len(names), len(names))
+        units = {name: str(parameters[name]["unit"]) for name in names}
+        explains = bool(result["fit"]["explains"]) if "fit" in result else result["verdict"] == "no_gap"
+        effects: dict[str, dict[str, float]] = {}
+        for name, entry in parameters.items():
+            label, _, quantity = name.rpartition(".")
+            if "@" in label:
+                effects.setdefault(label, {})[quantity] = float(entry["value"])
+    except (LookupError, TypeError, ValueError) as error:
+        raise DataError(
+            "the result does not say how sure its parameters are together",
+            where=str(file),
+            allowed="keys parameters and covariance, as this version writes them",
+            hint="run it again",
+        ) from error
+    if not names:
+        raise DataError(
+            "the run found no parameter", where=str(file), hint="give a run in which some parameter was found"
+        )
+    if not np.all(np.isfinite(matrix)) or not np.all(np.diag(matrix) > 0):
+        raise DataError("its covariance is none", where=str(file), allowed="finite, with a positive diagonal")
+    return RunEstimates(str(folder), names, values, matrix, units, explains, effects)
+
+
+def read_run_result(folder: str | Path) -> dict[str, Any]:
+    """Contents of result.json of a successful `solve` or `diagnose`; errors as `read_estimates`."""
+    file = Path(folder) / "result.json"
+    result = _result(file)
+    if result.get("format") not in _RUN_FORMATS:
+        raise DataError(
+            f"the run folder is one of another command ({result.get('format')})",
+            where=str(file),
+            allowed=" or ".join(_RUN_FORMATS),
+            hint="give a run folder of `solve` or `diagnose`",
+        )
+    if result.get("status") == "failed":
+        raise DataError(f"the run failed: {result.get('message')}", where=str(file), hint="give one that converged")
+    return result
+
+
+def _result(file: Path) -> dict[str, Any]:
+    if not is_file(file):
+        raise DataError(
+            f"there is no finished run in {file.parent}",
+            where=str(file),
+            hint="give the run folder that `solve` or `diagnose` printed",
+        )
+    try:
+        result = json.loads(file.read_text(encoding="utf-8"))
+        return dict(result)
+    except (OSError, ValueError, TypeError, RecursionError) as error:
+        raise DataError(f"the result cannot be read ({error})", where=str(file), hint="run it again") from error
+
+
+def baseline_estimates(run: RunSettings) -> tuple[RunEstimates, ...]:
+    """Estimates of the runs listed in `diagnosis.baseline`, in that order.
+
+    Raises
+    ------
+    ConfigError, DataError
+        As `read_estimates`; a run of another model, or one that is given twice.
+    """
+    found: list[RunEstimates] = []
+    for i, folder in enumerate(run.diagnosis.baseline):
+        where = ("diagnosis", "baseline", i)
+        try:
+            own = read_estimates(folder)
+        except DataError as error:
+            raise run.config_error(error.what, *where, allowed=error.allowed, hint=error.hint) from error
+        if any(Path(folder).resolve() == Path(other.run_name).resolve() for other in found):
+            raise run.config_error(
+                f"{folder} is given twice, and would count twice", *where, hint="list every run once"
+            )
+        there = _settings(folder)
+        differing = "" if there is None else _different(run, there)
+        if differing:
+            raise run.config_error(
+                f"{folder} is a run of another model: model.{differing} differs",
+                *where,
+                allowed=f"the same {', '.join(_COMPARED_MODEL_SECTIONS)} under `model`",
+                hint=f"compare model.{differing} with {Path(folder) / 'config.yaml'}",
+            )
+        found.append(own)
+    dependent = _dependent(run.diagnosis.baseline)
+    if dependent:
+        raise run.config_error(dependent, "diagnosis", "baseline", hint="give the later one alone")
+    return tuple(found)
+
+
+def _dependent(folders: Sequence[str | Path]) -> str:
+    """Says which run has another one of them as its baseline, so that one would count twice; empty where none has."""
+    known = [Path(folder).resolve() for folder in folders]
+    for folder in known:
+        said = _result(folder / "result.json").get("baseline") or {}
+        twice = [own for own in said.get("runs", ()) if Path(own).resolve() in known]
+        if twice:
+            return f"{folder} has {twice[0]} as its baseline already, which would count twice"
+    return ""
+
+
+def require_same_model(folders: Sequence[Path]) -> None:
+    """Raise an error unless all run folders have the same model and none is the baseline of another.
+
+    Raises
+    ------
+    ConfigError
+    """
+    dependent = _dependent(folders)
+    if dependent:
+        raise ConfigError(dependent, where="report", hint="diagnose without --baseline for a history, or leave one out")
+    known = [(folder, settings) for folder in folders if (settings := _settings(folder)) is not None]
+    for folder, settings in known[1:]:
+        differing = _different(known[0][1], settings)
+        if differing:
+            raise ConfigError(
+                f"the runs are of different models: model.{differing} differs",
+                where=str(folder / "config.yaml"),
+                allowed=f"the same {', '.join(_COMPARED_MODEL_SECTIONS)} under `model` as in {known[0][0]}",
+            )
+
+
+def _different(run: RunSettings, there: RunSettings) -> str:
+    """The first section of the model in which two runs differ, empty where none does."""
+    for key in _COMPARED_MODEL_SECTIONS:
+        here, other = getattr(run.model, key), getattr(there.model, key)
+        if key == "robot" and here is not None and other is not None:
+            here, other = Path(here).name, Path(other).name  # a folder may have moved
+        if isinstance(here, CableSettings) and isinstance(other, CableSettings):
+            here, other = (
+                replace(item, undeformed_shape_file=Path(item.undeformed_shape_file).name) for item in (here, other)
+            )
+        if here != other:
+            return key
+    return ""
+
+
+def _settings(folder: str | Path) -> RunSettings | None:
+    try:
+        return load_config(Path(folder) / "config.yaml")
+    except YidError:
+        return None
+
+
+def with_baseline_effects(run: RunSettings, runs: Sequence[RunEstimates]) -> RunSettings:
+    """The run with the effects of its baseline at their estimated values; their estimated parameters are free."""
+    if not runs:
+        return run
+    known, _, _ = pool_estimates(runs)
+    present = {f"{effect.kind}@{effect.location}" for effect in run.model.effects}
+    values = dict(zip(known.parameter_names, map(float, known.values), strict=True))
+    added = []
+    for label, said in known.effects.items():
+        if label not in present:
+            kind, _, location = label.partition("@")
+            own = {quantity: values.get(f"{label}.{quantity}", value) for quantity, value in said.items()}
+            added.append(EffectSettings(kind=kind, location=location, values=own))
+    freed: Mapping[str, ParameterSettings] = {
+        name: ParameterSettings(free=True) for name in known.parameter_names if name.rpartition(".")[0] not in present
+    }
+    # of an effect that is added here only what was estimated is free
+    freed = {name: said for name, said in freed.items() if name.rpartition(".")[0] in known.effects}
+    model = replace(run.model, effects=(*run.model.effects, *added))
+    return replace(run, model=model, parameters={**run.parameters, **freed})
+
+
+def load_reference_recordings(run: RunSettings) -> tuple[tuple[Recording, ...], str]:
+    """Reference recordings made without the sought effect, and a message where there are none.
+
+    Those of `recordings.reference_recordings`, else those on which the baseline was estimated and which it held out.
+
+    Raises
+    ------
+    ConfigError, DataError
+        As `read_recordings`, of those that the settings name.
+    """
+    said = run.recordings.reference_recordings
+    if said:
+        return _named([_read(run, i, path) for i, path in enumerate(said)]), ""
+    found: list[Recording] = []
+    for folder in run.diagnosis.baseline:
+        there = _settings(folder)
+        for path in () if there is None else (*there.recordings.estimate, *there.recordings.held_out):
+            try:
+                found.append(read_recording(recording_path(path)))
+            except YidError as error:
+                return (), f"a recording of {folder} cannot be read: {error.what}"
+    return _named(found), ""
+
+
+def _read(run: RunSettings, i: int, path: str) -> Recording:
+    file = recording_path(path)
+    if not is_file(file):
+        raise run.config_error(f"there is no such recording: {file}", "recordings", "without", i, hint="check the path")
+    return read_recording(file)
+
+
+def _named(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
+    """Names of their own, that no recording of today has."""
+    return tuple(replace(recording, name=f"{recording.name} (without)") for recording in recordings)
+
+
+def require_distinct_recordings(
+    run: RunSettings, problem: EstimationProblem, runs: Sequence[RunEstimates], without: Sequence[Recording]
+) -> None:
+    """Raise an error where a recording of the run is also a baseline or reference recording.
+
+    Raises
+    ------
+    ConfigError
+    """
+    for episode in (*problem.episodes, *problem.held_out):
+        for other in without:
+            if episode.recording.sha256 is not None and episode.recording.sha256 == other.sha256:
+                of_baseline = bool(runs) and not run.recordings.reference_recordings
+                raise run.config_error(
+                    f"{episode.name} is a recording of the baseline too, and would count twice"
+                    if of_baseline
+                    else f"{episode.name} is among the recordings made without what is looked for",
+                    *(("diagnosis", "baseline") if of_baseline else ("recordings", "without")),
+                    allowed="recordings of another time",
+                )

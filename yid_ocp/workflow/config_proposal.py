@@ -1,0 +1,534 @@
+"""Proposes a configuration from robot and recordings: arms, mode, marker positions, noise, rates."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+
+from yid_ocp.data.channel_checks import quantization_step, white_noise_std
+from yid_ocp.data.readers import mean_sample_rate
+from yid_ocp.data.recording import Array, JointGroup, PointGroup, Recording
+from yid_ocp.errors import ConfigError, nearest_name_hint
+from yid_ocp.model import Mechanism
+from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.rotations import rotation_from_rpy
+from yid_ocp.model.urdf import read_urdf
+
+_TOOL_FRAME_NAMES = ("tool0", "tcp", "gripper", "tool", "end_effector", "ee_link", "flange", "hand", "link8")
+"""What the frame at the end of an arm is called, the likeliest first."""
+_MAX_TIME_STEP = 0.01
+"""Of the integrator, where nobody has looked yet [s]."""
+_SLOW_SAMPLE_PERIOD = 0.05
+"""Samples farther apart than this say nothing of their noise: the motion is as fast [s]."""
+_CAMERA_STD, _MARKER_STD = 5e-3, 1e-3
+"""Of points whose noise cannot be seen in the data: of slow and of fast sensors [m]."""
+_JOINT_REST_SPEED, _POINT_REST_SPEED = 0.02, 0.03
+"""A joint [rad/s] or a point [m/s] slower than this is at rest."""
+_REST_WINDOW = 0.1
+"""Over which speeds are taken [s]; up to twice that of slow sensors."""
+_MIN_FRICTION_TRAVEL = 0.02
+"""A joint that turns less than this says nothing of its own friction [rad]."""
+_COPIED_COMMAND_RATIO = 1e-6
+"""Commands nearer to the measured angles than this part of the motion are a copy of them."""
+_MIN_ARM_TRAVEL = 0.1
+"""Joints that turn less than this together do not move [rad]."""
+STANDARD_GRAVITY = 9.81
+_Y_TUBES = ("T1", "T2", "T3")
+_POSITION_STEP_PERCENT = 5
+"""Places along a segment are told apart in so many percent."""
+
+
+@dataclass(frozen=True)
+class BranchDescription:
+    """User's description of one segment of an object, in m, kg and rad."""
+
+    name: str
+    length: float
+    mass: float
+    radius: float | None
+    cross_section: tuple[float, float] | None = None
+    rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    parent: str | None = None
+
+
+@dataclass(frozen=True)
+class ArmChain:
+    """A chain of recorded joints, base to tip, and the frames at its end, most likely tool first."""
+
+    joints: tuple[str, ...]
+    tool_frames: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class PointPlacement:
+    """Assignment of a recorded point to a model frame (empty for none), with the reason."""
+
+    point: str
+    frame: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class GroupNoise:
+    """Noise standard deviation of a group (None where the recording states it), unit and source."""
+
+    std: float | None
+    unit: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class ConfigProposal:
+    """Proposed contents of a generated configuration.
+
+    Attributes
+    ----------
+    joints : tuple of str
+        Recorded joints that move the object, in the URDF's order.
+    unused_joints, unrecorded_joints : tuple of str
+        Recorded joints that the model does not need or know, and movable ones of the URDF that were not recorded.
+    arms : tuple of Arm
+        That hold the object, the first one its root.
+    holder_frame : str
+        Frame that carries the object's root.
+    grasps : mapping of frame to point
+        Frames that hold another point of it.
+    arm_mode, arm_mode_reason, initial_state, initial_state_reason : str
+    point_placements : mapping of group to tuple of Place
+    noise_by_group : mapping of group to Noise
+    time_step, path_cutoff : float
+        [s], [Hz]
+    clock_descriptions : mapping of group to text
+    still_joints : tuple of str
+        Joints that hardly turn in any recording.
+    """
+
+    joints: tuple[str, ...]
+    unused_joints: tuple[str, ...]
+    unrecorded_joints: tuple[str, ...]
+    arms: tuple[ArmChain, ...]
+    holder_frame: str
+    grasps: Mapping[str, str]
+    arm_mode: str
+    arm_mode_reason: str
+    initial_state: str
+    initial_state_reason: str
+    point_placements: Mapping[str, tuple[PointPlacement, ...]]
+    noise_by_group: Mapping[str, GroupNoise]
+    time_step: float
+    path_cutoff: float
+    clock_descriptions: Mapping[str, str] = field(default_factory=dict)
+    still_joints: tuple[str, ...] = ()
+
+    @property
+    def marked_frames(self) -> tuple[str, ...]:
+        """Model frames marked by recorded points, without duplicates."""
+        return tuple(dict.fromkeys(p.frame for places in self.point_placements.values() for p in places if p.frame))
+
+
+def propose_config(
+    robot: str,
+    recordings: Sequence[Recording],
+    branches: Sequence[BranchDescription],
+    *,
+    holder: str | None = None,
+    grasps: Mapping[str, str] | None = None,
+    standing: bool = False,
+) -> ConfigProposal:
+    """Propose a configuration from a robot and its recordings.
+
+    Parameters
+    ----------
+    robot : str
+        URDF file, or `package:NAME`.
+    recordings : sequence of Recording
+        At least one, with joints.
+    branches : sequence of Branch
+        Segments of the object, parents first.
+    holder : str, optional
+        Frame that carries the object's root; the tool of the arm that moves most when absent.
+    grasps : mapping of frame to point, optional
+        What else holds the object; where it stands on the ground or two arms were recorded, ends of it when absent.
+    standing : bool
+        Whether the object stands on the ground, and arms hold its ends.
+
+    Raises
+    ------
+    ConfigError
+        No recorded joint is in the URDF, or there is no such frame.
+    ModelError
+        As `read_urdf`.
+    """
+    first = recordings[0]
+    if first.joints is None:
+        allowed = "joint states of the robot, which say how the object was moved"
+        raise ConfigError("the recording has no joints", where=first.name, allowed=allowed)
+    whole = read_urdf(robot)
+    known = [name for name in whole.joint_names if name in first.joints.names]
+    if not known:
+        raise ConfigError(
+            f"none of the recorded joints is in the URDF: {', '.join(first.joints.names)}",
+            where=robot,
+            allowed=", ".join(whole.joint_names),
+            hint=f"rename them: --joints {first.joints.names[0]}={whole.joint_names[0]},...",
+        )
+    tree = read_urdf(robot, joints=known)
+    arms = _arms(tree)
+    arms = tuple(sorted(arms, key=lambda arm: -_travel(first, arm.joints)))
+    holder, own = _holder(tree, arms, holder, standing)
+    held = dict(grasps or {}) or _held(arms, own, branches, standing)
+    for name in held:
+        tree.frame(name)
+    carrying = [tree.frame(name).joint_index for name in (*((holder,) if not standing else ()), *held)]
+    needed = {j for end in carrying for j in tree.ancestor_joints(end)}
+    joints = tuple(tree.joint_names[j] for j in sorted(needed))
+    used = tuple(arm for arm in arms if set(arm.joints) & set(joints))
+    mode, why = _mode(first, bool(held))
+    start, start_why = _start(recordings, joints)
+    period = float(np.median(np.diff(first.joints.t))) if len(first.joints.t) > 1 else _MAX_TIME_STEP
+    return ConfigProposal(
+        joints,
+        tuple(name for name in first.joints.names if name not in joints),
+        tuple(name for name in whole.joint_names if name not in first.joints.names),
+        used or arms,
+        holder,
+        held,
+        mode,
+        why,
+        start,
+        start_why,
+        _places(tree, first, branches, holder, standing),
+        _noise(recordings, joints),
+        _time_step(period),
+        min(10.0, 0.2 / period),
+        {name: _clock(group.t, group.clock) for name, group in _groups(first)},
+        tuple(name for name in joints if max(_travel(r, [name]) for r in recordings) < _MIN_FRICTION_TRAVEL),
+    )
+
+
+def _groups(recording: Recording) -> list[tuple[str, JointGroup | PointGroup]]:
+    return [(getattr(group, "name", "joints"), group) for group in recording.groups]
+
+
+# -- arms -------------------------------------------------------------------------------------------------------------
+
+
+def _arms(tree: Mechanism) -> tuple[ArmChain, ...]:
+    """Chains of joints from the base to joints that carry no other, and the frames there."""
+    arms = []
+    for j in range(len(tree.joints)):
+        if j in tree.parent_indices:
+            continue
+        own = [name for name, frame in tree.frames.items() if frame.joint_index == j]
+        arms.append(
+            ArmChain(tuple(tree.joint_names[i] for i in tree.ancestor_joints(j)), tuple(sorted(own, key=_tool_rank)))
+        )
+    return tuple(arms)
+
+
+def _tool_rank(frame: str) -> tuple[int, bool]:
+    """How unlikely a frame is the one that holds something."""
+    name = frame.lower()
+    rank = next((i for i, word in enumerate(_TOOL_FRAME_NAMES) if word in name), len(_TOOL_FRAME_NAMES))
+    return rank, rank < len(_TOOL_FRAME_NAMES) and not name.endswith(_TOOL_FRAME_NAMES[rank])
+
+
+def _travel(recording: Recording, joints: Sequence[str]) -> float:
+    """How far the joints of an arm turn together [rad]."""
+    group = recording.joints
+    if group is None:
+        return 0.0
+    return float(sum(np.ptp(group.position[:, group.names.index(name)]) for name in joints if name in group.names))
+
+
+def _holder(tree: Mechanism, arms: Sequence[ArmChain], frame: str | None, standing: bool) -> tuple[str, ArmChain]:
+    if frame is None or standing:
+        return arms[0].tool_frames[0], arms[0]
+    if frame not in tree.frames:
+        hint, allowed = (
+            nearest_name_hint(frame, tree.frames),
+            ", ".join(name for arm in arms for name in arm.tool_frames),
+        )
+        raise ConfigError(f"there is no frame '{frame}'", where="--holder", allowed=allowed, hint=hint)
+    carried = tree.frames[frame].joint_index
+    own = next((arm for arm in arms if carried >= 0 and tree.joint_names[carried] in arm.joints), arms[0])
+    return frame, own
+
+
+def _held(
+    arms: Sequence[ArmChain], own: ArmChain, branches: Sequence[BranchDescription], standing: bool
+) -> dict[str, str]:
+    """Frames of the arms that probably hold ends of the object."""
+    if standing:
+        return {arm.tool_frames[0]: end for arm, end in zip(arms, ("w_T2", "w_T3"), strict=False)}
+    others = [arm for arm in arms if arm is not own]
+    return {others[0].tool_frames[0]: f"w_{branches[-1].name}"} if others and branches else {}
+
+
+def _mode(recording: Recording, closed: bool) -> tuple[str, str]:
+    joints = recording.joints
+    assert joints is not None
+    seen = ", ".join(group.name for group in recording.points)
+    if joints.effort is None and not seen:
+        raise ConfigError(
+            "nothing in the recording shows what the object does",
+            where=recording.name,
+            allowed="points on the object, or efforts of the joints that move it",
+            hint="import points too (`yid-ocp import FILE --preview` lists what there is)",
+        )
+    if joints.effort is None and _commanded(joints):
+        return "servo", "commanded positions were recorded and no efforts: the arm's servos follow them"
+    if joints.effort is None:
+        return "prescribed", "no efforts were recorded, so the arm moves as its encoders say"
+    if closed:
+        return "driven", "efforts were recorded, and grasps close loops, which exact encoder angles would overstrain"
+    if seen:
+        return "prescribed", f"the object hangs on the arm and {seen} see it, so the arm moves as its encoders say"
+    return "prescribed", "nothing sees the object, so what it does is read from the efforts that moving the arm takes"
+
+
+def _commanded(joints: JointGroup) -> bool:
+    """Whether commanded positions were recorded, and are not the measured ones once more."""
+    commands = joints.position_command
+    if commands is None:
+        return False
+    apart = np.sqrt(np.mean((commands - joints.position) ** 2))
+    return bool(apart > _COPIED_COMMAND_RATIO * np.std(joints.position - joints.position.mean(axis=0)))
+
+
+def _start(recordings: Sequence[Recording], joints: Sequence[str]) -> tuple[str, str]:
+    """Whether every recording begins at rest."""
+    for recording in recordings:
+        moving = _moving_joint_or_point(recording, joints, min(group.t[0] for group in recording.groups))
+        if moving:
+            return "estimated", f"{moving} of {recording.name} moves at the start, which is estimated along"
+    return "equilibrium", "all recordings begin at rest"
+
+
+def _moving_joint_or_point(recording: Recording, joints: Sequence[str], time: float) -> str:
+    """Name of a joint or point that moves just after a time, from a line fit; empty where all rest."""
+    group = recording.joints
+    if group is not None:
+        values = group.position[:, [group.names.index(name) for name in joints]]
+        speeds, noise = _speeds(group.t, values, time, _REST_WINDOW)
+        fast = speeds > _JOINT_REST_SPEED + 4 * noise
+        if fast.any():
+            return f"joint {joints[int(np.argmax(fast))]}"
+    for seen in recording.points:
+        speeds, noise = _speeds(seen.t, seen.position.reshape(len(seen.t), -1), time, _REST_WINDOW)
+        fast = speeds > _POINT_REST_SPEED + 4 * noise
+        if fast.any():
+            return f"point {seen.names[int(np.argmax(fast)) // 3]}"
+    return ""
+
+
+def _speeds(t: Array, values: Array, time: float, window: float) -> tuple[Array, Array]:
+    """Slope of each channel over a window, and its standard deviation by what the line leaves; zeros where unknown."""
+    period = float(np.median(np.diff(t))) if len(t) > 1 else math.inf
+    # a slow camera says nothing: what moves within five of its frames may well have rested at the first
+    window = max(window, min(5 * period, 2 * window))
+    rows = (t >= time - 1e-9) & (t <= time + window)
+    zeros = np.zeros(values.shape[1])
+    if rows.sum() < 4:
+        return zeros, zeros
+    centred = t[rows] - t[rows].mean()
+    slope = centred @ (values[rows] - values[rows].mean(axis=0)) / (centred @ centred)
+    left = values[rows] - values[rows].mean(axis=0) - np.outer(centred, slope)
+    return np.nan_to_num(np.abs(slope)), np.nan_to_num(left.std(axis=0) / math.sqrt(centred @ centred))
+
+
+def rest_split_time(recording: Recording, joints: Sequence[str]) -> float | None:
+    """Time in the later part of a recording at which everything is at rest; None if there is none [s].
+
+    What comes after it can be predicted from rest, so that it shows, held out, whether a model is right.
+    """
+    first, duration = min(group.t[0] for group in recording.groups), recording.duration
+    for part in np.arange(0.75, 0.5, -0.01):
+        time = first + float(part) * duration
+        if not _moving_joint_or_point(recording, joints, time) and not _moving_joint_or_point(
+            recording, joints, time + _REST_WINDOW
+        ):
+            later = recording.time_slice(time, first + duration)
+            if later.joints is not None and _travel(later, joints) > _MIN_ARM_TRAVEL:
+                return time
+    return None
+
+
+# -- points -----------------------------------------------------------------------------------------------------------
+
+
+def _places(
+    tree: Mechanism, recording: Recording, branches: Sequence[BranchDescription], holder: str, standing: bool
+) -> dict[str, tuple[PointPlacement, ...]]:
+    """Where on the object every recorded point probably sits."""
+    frames = [f"w_{name}" for name in (_Y_TUBES if standing else [branch.name for branch in branches])]
+    return {
+        group.name: tuple(
+            _named(point, frames, branches, tree)
+            or (
+                PointPlacement(point, "", "its place is not known")
+                if standing
+                else _near(tree, recording, group, i, branches, holder)
+            )
+            for i, point in enumerate(group.names)
+        )
+        for group in recording.points
+    }
+
+
+def _named(
+    point: str, frames: Sequence[str], branches: Sequence[BranchDescription], tree: Mechanism
+) -> PointPlacement | None:
+    """The place that the name of a point says."""
+    owner, colon, part = point.partition(":")
+    names = [branch.name for branch in branches]
+    if point in frames or point in tree.frames or (colon and owner in names and part.endswith("%")):
+        return PointPlacement(point, point, "a frame of the model by its name")
+    if point in names:
+        return PointPlacement(point, f"w_{point}", "the end of the segment of its name")
+    return None
+
+
+def _near(
+    tree: Mechanism,
+    recording: Recording,
+    group: PointGroup,
+    column: int,
+    branches: Sequence[BranchDescription],
+    holder: str,
+) -> PointPlacement:
+    """The place at which a point probably sits, by where it was seen from what holds the object."""
+    point = group.names[column]
+    seen = np.isfinite(group.position[:, column]).all(axis=1)
+    if not seen.any():
+        return PointPlacement(point, "", "it was never seen")
+    poses = _poses(tree, recording, holder, group.t[seen])
+    position = group.position[seen, column]
+    from_holder = position - poses[:, :3, 3]
+    if len(branches) == 1:
+        # an object that bends brings its points nearer, never farther: the farthest is the nearest to its arc length
+        branch = branches[0]
+        part = float(np.linalg.norm(from_holder, axis=1).max()) / branch.length
+        if part > 1.2:
+            return PointPlacement(
+                point, "", f"it is {part:.1f} times the length away from {holder}: is it in the same frame?"
+            )
+        percent = min(100, _POSITION_STEP_PERCENT * round(100 * part / _POSITION_STEP_PERCENT))
+        return PointPlacement(point, _along(branch.name, percent), f"up to {part:.0%} of the length away from {holder}")
+    local = poses[0, :3, :3].T @ from_holder[0]
+    spots = _straight(branches)
+    name, distance = min(
+        ((name, float(np.linalg.norm(local - spot))) for name, spot in spots.items()), key=lambda entry: entry[1]
+    )
+    longest = max(branch.length for branch in branches)
+    if distance > 0.5 * longest:
+        return PointPlacement(
+            point, "", f"{distance:.2g} m away from all of the straight object: is it in the same frame?"
+        )
+    return PointPlacement(point, name, f"{1e3 * distance:.0f} mm from there when the object is straight")
+
+
+def _along(name: str, percent: int) -> str:
+    return f"w_{name}" if percent == 100 else f"{name}:{percent}%"
+
+
+def _straight(branches: Sequence[BranchDescription]) -> dict[str, Array]:
+    """Places along the straight object in the frame of what holds it: name to position (3,) [m]."""
+    spots: dict[str, Array] = {}
+    ends: dict[str | None, tuple[Array, Array]] = {None: (np.eye(3), np.zeros(3))}
+    for branch in branches:
+        turn, base = ends[branch.parent]
+        turn = turn @ np.array(rotation_from_rpy(*branch.rpy))
+        along = branch.length * turn[:, 2]
+        ends[branch.name] = (turn, base + along)
+        for percent in range(_POSITION_STEP_PERCENT, 101, _POSITION_STEP_PERCENT):
+            spots[_along(branch.name, percent)] = base + percent / 100 * along
+    return spots
+
+
+def _poses(tree: Mechanism, recording: Recording, frame: str, t: Array) -> Array:
+    """Poses of a frame at times, by the recorded angles, shape (N, 4, 4)."""
+    group = recording.joints
+    assert group is not None
+    q = ca.SX.sym("q", len(tree.joints))
+    numeric = tree.with_numeric_values()
+    pose = ca.Function("pose", [q], [forward_kinematics(numeric, q).frame_pose(frame).homogeneous_matrix()])
+    columns = [group.names.index(name) for name in tree.joint_names]
+    angles = np.stack([np.interp(t, group.t, group.position[:, j]) for j in columns])
+    flat = np.array(pose.map(len(t))(angles))
+    return flat.reshape(4, len(t), 4).transpose(1, 0, 2)
+
+
+# -- noise and rates --------------------------------------------------------------------------------------------------
+
+
+def _noise(recordings: Sequence[Recording], joints: Sequence[str]) -> dict[str, GroupNoise]:
+    """Noise of every group, from the first recording that has it."""
+    found: dict[str, GroupNoise] = {}
+    first = recordings[0].joints
+    if first is not None:
+        at = [first.names.index(name) for name in joints]
+        for channel, unit in (("position", "rad"), ("effort", "N m")):
+            values = first.channels.get(channel)
+            if values is None:
+                continue
+            if getattr(first, f"{channel}_std") is not None:
+                found[f"joints.{channel}"] = GroupNoise(None, unit, "the recording states it")
+            else:
+                size = max(_size(first.t, values[:, j]) for j in at)
+                least = 1e-6 if channel == "position" else 1e-3
+                found[f"joints.{channel}"] = GroupNoise(
+                    max(size, least), unit, "from sample to sample in the recording"
+                )
+    for group in recordings[0].points:
+        found[group.name] = _point_noise(group)
+    return found
+
+
+def _point_noise(group: PointGroup) -> GroupNoise:
+    if group.std is not None:
+        return GroupNoise(None, "m", "the recording states it")
+    slow = len(group.t) < 2 or 1.0 / mean_sample_rate(group.t) > _SLOW_SAMPLE_PERIOD
+    sizes = []
+    for i in range(len(group.names)):
+        seen = np.isfinite(group.position[:, i]).all(axis=1)
+        sizes += [_size(group.t[seen], column) for column in group.position[seen, i].T]
+    if slow or max(sizes, default=0.0) <= 0:
+        std = _CAMERA_STD if slow else _MARKER_STD
+        return GroupNoise(std, "m", "a guess: the data are too slow or too clean to show it")
+    return GroupNoise(max(sizes), "m", "from sample to sample in the recording")
+
+
+def _size(t: Array, values: Array) -> float:
+    """White noise of a channel, at least that of its steps."""
+    return max(white_noise_std(t, values), quantization_step(values) / math.sqrt(12))
+
+
+def _time_step(period: float) -> float:
+    """A step of at most `_MAX_TIME_STEP` that meets the samples of a clock, or divides its period."""
+    if period <= _MAX_TIME_STEP:
+        step = period * max(1, math.floor(_MAX_TIME_STEP / period + 1e-3))
+    else:
+        step = period / math.ceil(period / _MAX_TIME_STEP - 1e-3)
+    return float(f"{step:.3g}")
+
+
+def _clock(t: Array, clock: str) -> str:
+    """Rate of a clock, and how uneven it is, in words."""
+    steps = np.diff(t)
+    if not len(steps):
+        return "one sample"
+    uneven = float(np.std(steps) / np.mean(steps))
+    said = f"{mean_sample_rate(t):.4g} Hz, a {clock} clock"
+    return said if uneven < 0.01 else f"{said}, uneven by {uneven:.0%}"
+
+
+def relative_posix_path(path: str | Path, folder: Path) -> str:
+    """POSIX path relative to a folder."""
+    return Path(os.path.relpath(Path(path).resolve(), folder.resolve())).as_posix()
