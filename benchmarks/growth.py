@@ -121,7 +121,7 @@ def case(settings: list[str], seed: int) -> dict[str, float]:
     rng = np.random.default_rng(seed)
     values = {
         name: float(x * math.exp(rng.uniform(-0.3, 0.3)))
-        for name, x in zip(problem.unknown_names, problem.initial_unknowns)
+        for name, x in zip(problem.unknown_names, problem.initial_unknowns, strict=True)
     }
     solution = solve(
         problem, GaussNewton(max_iterations=6), initial_unknowns=problem.vector(values).tolist(), restarts=False
