@@ -40,9 +40,11 @@ def judged(problem):
     """By parameter: its dependence about the rest at the first posture; the rest besides."""
     step, episode = problem.step, problem.episodes[0]
     system = step.system
-    rest = EquilibriumSolver(step).solve(episode.posture, problem.theta, episode.torque[0] if system.driven else None)
+    rest = EquilibriumSolver(step).solve(
+        episode.initial_known_coordinates, problem.theta, episode.torque[0] if system.driven else None
+    )
     assert rest.is_converged
-    path = episode.posture[len(system.driven) :]
+    path = episode.initial_known_coordinates[len(system.driven) :]
     rows = linearise_step_equations(step, rest.state, rest.holding_torque, problem.theta, path)
     symbols = StepSymbols.from_equations(step.equations)
     found = parameter_dependences(step, symbols, episode, rest.state, problem.theta, rows)
@@ -149,25 +151,25 @@ def rolled_out(problem, rest, theta, kick=None):
     """Whitened readings along a rollout from the rest under the filter's first gain, shape (sensor, node, output)."""
     step, episode = problem.step, problem.episodes[0]
     system, n = step.system, step.sizes["n"]
-    torque = np.tile(rest.torque, (STEPS + 1, 1))
+    torque = np.tile(rest.holding_torque, (STEPS + 1, 1))
     if kick is not None:
         torque[0] += kick
-    path = np.tile(episode.posture[len(system.driven) :], (STEPS + 2, 1))
-    feedback = episode.feedback
+    path = np.tile(episode.initial_known_coordinates[len(system.driven) :], (STEPS + 2, 1))
+    feedback = episode.tracking_feedback
     if feedback is not None:
         feedback = replace(
             feedback,
             gain=np.tile(feedback.gain[:1], (STEPS + 1, 1, 1)),
-            reference=np.tile(rest.state[feedback.index], (STEPS + 1, 1)),
+            reference=np.tile(rest.state[feedback.state_indices], (STEPS + 1, 1)),
         )
     rollout = step.kernel.rollout(theta, rest.state, torque, path, feedback, None)
-    assert rollout.status.ok
+    assert rollout.status.is_converged
     found = []
-    for samples in episode.samples:
+    for samples in episode.measurements:
         std = np.nanmedian(samples.std, axis=0)
         effort = np.zeros((STEPS + 1, n))
         effort[:, list(system.prescribed_indices)] = rollout.effort
-        function = problem.functions.sensor(samples.sensor, ())
+        function = problem.model_functions.compiled_sensor(samples.compiled_sensor, ())
         state = rollout.state[:-1]
         found.append(function(state[:, :n], state[:, 2 * n :], effort, theta)[0][:, :, 0] / std)
     return found
@@ -198,7 +200,7 @@ def test_a_push_on_rows_is_a_kick_of_the_motor(swinging):
     push = np.zeros((len(symbols.row_names), 1))
     push[[symbols.row_index("del[shoulder]"), symbols.row_index("p1[shoulder]")]] = step.time_step / 2
     sensors = _readings(step, episode, rest.state, swinging.theta)
-    answers = _Linear.of(step, rows, episode.feedback).answers(push, sensors, STEPS, held=False)
+    answers = _Linear.of(step, rows, episode.tracking_feedback).answers(push, sensors, STEPS, held=False)
     size = 1e-4
     ends = [rolled_out(swinging, rest, swinging.theta, sign * size) for sign in (1, -1)]
     moved = [np.max(np.abs(up - down)) / (2 * size) for up, down in zip(*ends, strict=True)]

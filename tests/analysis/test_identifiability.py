@@ -65,7 +65,7 @@ def test_a_start_that_nothing_is_known_of(golden_problem):
     An independent computation of the same motion gave 254 to 345 %; the difference is not explained.
     """
     problem = golden_problem("single", False)
-    problem.options = replace(problem.options, configuration_std=10.0, velocity_std=50.0)
+    problem.options = replace(problem.options, start_configuration_std=10.0, start_velocity_std=50.0)
     assert identifiability(problem, start="unknown").parameters["T3.bend"].std_relative == pytest.approx(2.28, rel=0.05)
 
 
@@ -143,7 +143,7 @@ def test_two_torsional_springs_under_a_known_torque(springs, points, verdict):
 
 def test_profile_is_the_parabola_where_the_model_is_nearly_linear(pendulum, twin):
     empty = pendulum()
-    problem = pendulum(twin(empty, empty.start, 3))
+    problem = pendulum(twin(empty, empty.initial_unknowns, 3))
     solution = solve(problem, GaussNewton())
     info = identifiability(problem, solution, start="known", intervals=["elbow.rest", "elbow.stiffness"])
     assert set(info.profiles) == {"elbow.rest", "elbow.stiffness"}
@@ -159,7 +159,7 @@ def test_profile_is_the_parabola_where_the_model_is_nearly_linear(pendulum, twin
 
 def test_intervals_of_weak_parameters_are_lopsided_and_agree_with_chi2(golden_problem):
     problem = golden_problem("single", True)
-    info = identifiability(problem, problem.start, start="known", intervals=["T3.bend", "T3.twist"])
+    info = identifiability(problem, problem.initial_unknowns, start="known", intervals=["T3.bend", "T3.twist"])
     entry = info.parameters["T3.bend"]
     lower, upper = entry.interval
     assert 5.5 < lower < 7.5
@@ -212,9 +212,9 @@ def test_an_estimated_start_can_be_judged_as_known(held_tube):
 
 def test_a_start_fitted_to_points_becomes_the_centre_of_a_prior(pendulum, twin):
     empty = pendulum()
-    made = pendulum(twin(empty, empty.start, 3))
+    made = pendulum(twin(empty, empty.initial_unknowns, 3))
     recordings = [episode.recording for episode in made.episodes]
-    options = replace(made.options, initial_state="fitted_to_points", start_window=0.05)
+    options = replace(made.options, initial_state="fitted_to_points", start_fit_window=0.05)
     given = EstimationProblem(made.step, recordings, made.free, options)
     known, unknown = identifiability(given, start="known"), identifiability(given, start="unknown")
     assert known.nuisance_names == ()

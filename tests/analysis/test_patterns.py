@@ -123,7 +123,7 @@ def test_a_stiffness_enters_the_rows_of_its_joints_alone(step):
     found = step_sparsity_patterns(StepSymbols.from_equations(step.equations))["dR_dtheta"]
     column = found.column_labels.index("T1.twist")
     rows = {found.row_labels[i] for i in np.flatnonzero(found.nonzero_mask[:, column])}
-    relaxing = {name for name in step.system.internal if name.endswith("_z")}
+    relaxing = {name for name in step.system.internal_coordinates if name.endswith("_z")}
     assert rows - relaxing == {"T1_0_z", "T1_1_z", "T1_2_z"}
 
 
@@ -153,12 +153,14 @@ def test_the_nlp_has_the_pattern_that_is_shown(urdf_folder, feedback, start):
     transcription = CompiledTranscription(problem, 1)
     episode = problem.episodes[0]
     symbols = StepSymbols.from_equations(problem.step.equations)
-    followed = () if episode.feedback is None else tuple(episode.feedback.index)
-    sensors = [samples.sensor for samples in episode.samples]
-    stage = nlp_stage_sparsity(symbols, problem.shared, sensors, followed, problem.predictor.estimated_state_indices)
+    followed = () if episode.tracking_feedback is None else tuple(episode.tracking_feedback.state_indices)
+    sensors = [samples.sensor for samples in episode.measurements]
+    stage = nlp_stage_sparsity(
+        symbols, problem.shared_parameters, sensors, followed, problem.predictor.estimated_state_indices
+    )
     jacobian, hessian, measured = _nlp_sparsity_masks(stage, episode.grid.steps)
     rng = np.random.default_rng(0)
-    w = transcription.initial_guess(problem.start)
+    w = transcription.initial_guess(problem.initial_unknowns)
     w = w + 1e-3 * rng.normal(size=w.shape)
     exact = transcription.constraints(w, True)[1].toarray()
     assert exact.shape == jacobian.shape
@@ -200,16 +202,16 @@ def test_the_size_of_many_steps_is_that_of_the_masks(urdf_folder):
 def test_the_kkt_matrix_is_symmetric_and_its_blocks_are_named(urdf_folder):
     problem = made_problem(urdf_folder, "lqr", "equilibrium")
     symbols = StepSymbols.from_equations(problem.step.equations)
-    sensors = [samples.sensor for samples in problem.episodes[0].samples]
-    stage = nlp_stage_sparsity(symbols, problem.shared, sensors, ())
-    kkt = kkt_pattern(stage, problem.shared, 2)
+    sensors = [samples.sensor for samples in problem.episodes[0].measurements]
+    stage = nlp_stage_sparsity(symbols, problem.shared_parameters, sensors, ())
+    kkt = kkt_pattern(stage, problem.shared_parameters, 2)
     np.testing.assert_array_equal(kkt.nonzero_mask, kkt.nonzero_mask.T)
     assert [span.name for span in kkt.row_blocks] == [
         "theta", "q0", "p0", "lam0", "q1", "p1", "lam1", "q2", "p2",
         "start", "del0", "constraint0", "p1 rule", "del1", "constraint1", "p2 rule",
     ]  # fmt: skip
     assert kkt.row_blocks[-1].stop == len(kkt.nonzero_mask) == len(kkt.row_labels)
-    assert kkt.row_labels[:2] == problem.shared
+    assert kkt.row_labels[:2] == problem.shared_parameters
     at = {span.name: span for span in kkt.row_blocks}
 
     def block(row, column):

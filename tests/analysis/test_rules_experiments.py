@@ -457,7 +457,7 @@ def swung(urdf_folder):
 
 
 def informed(problem, mechanics=(), **settings):
-    made = BaseExperiment(problem, problem.start, "known", None, **settings)
+    made = BaseExperiment(problem, problem.initial_unknowns, "known", None, **settings)
     built = CandidateExperimentBuilder(made).build_experiment(frozenset(mechanics))
     assert not isinstance(built, str), built
     return built, built.fisher_information([made.recorded_observations(episode) for episode in problem.episodes])
@@ -478,11 +478,11 @@ def informed(problem, mechanics=(), **settings):
 def test_information_is_of_the_sensors_alone(swung, options):
     """Neither robust costs nor weights nor priors of the parameters themselves change what sensors would tell."""
     problem = swung()
-    evaluation = problem.evaluate(problem.start)
-    rows = evaluation.jacobian[problem.rows.data]
+    evaluation = problem.evaluate(problem.initial_unknowns)
+    rows = evaluation.jacobian[problem.residual_rows.data]
     built, found = informed(swung(**options))
-    assert built.names == ("elbow.stiffness", "elbow.rest")
-    assert not np.any(built.fixed)
+    assert built.free_parameters == ("elbow.stiffness", "elbow.rest")
+    assert not np.any(built.prior_information)
     np.testing.assert_allclose(found, rows.T @ rows, rtol=1e-9)
 
 
@@ -508,7 +508,7 @@ def test_the_same_mechanics_need_no_other_step(swung):
 )
 def test_starts_are_unknown_or_stay_where_the_fit_has_them(swung, initial, start, becomes, given):
     problem = swung(initial_state=initial)
-    x = problem.start
+    x = problem.initial_unknowns
     made = with_nuisance_unknowns(problem, x, start, None)
     assert made.options.initial_state == becomes
     assert (made is problem) == (becomes == initial)
@@ -519,7 +519,9 @@ def test_starts_are_unknown_or_stay_where_the_fit_has_them(swung, initial, start
         episode = problem.episodes[0]
         before = problem.initial_state(episode, *problem.split(x, 0)).state
         np.testing.assert_allclose(made.options.known_initial_states["swing"], before)
-        after = made.initial_state(made.episodes[0], *made.split(transfer_unknowns(x, problem.names, made), 0)).state
+        after = made.initial_state(
+            made.episodes[0], *made.split(transfer_unknowns(x, problem.unknown_names, made), 0)
+        ).state
         np.testing.assert_allclose(after, before)
 
 
@@ -546,9 +548,9 @@ def test_shorter_recordings_tell_less(swung):
 def test_torques_as_a_measurement_are_fixed_information(swung):
     built, _ = informed(swung(), ["torque"])
     finer, _ = informed(swung(), ["torque"], torque_std=0.05)
-    blind = built.information([[]])
+    blind = built.fisher_information([[]])
     assert np.all(np.linalg.eigvalsh(blind) > 0)
-    np.testing.assert_allclose(finer.information([[]]), 4 * blind, rtol=1e-9)
+    np.testing.assert_allclose(finer.fisher_information([[]]), 4 * blind, rtol=1e-9)
     assert built.problem.system.prescribed == ("shoulder",)
 
 
@@ -557,12 +559,12 @@ def test_what_cannot_be_rolled_out_is_no_layout(swung, monkeypatch):
     monkeypatch.setattr(
         EstimationProblem, "evaluate", lambda self, x: SimpleNamespace(ok=False, jacobian=None, message="it snaps")
     )
-    made = CandidateExperimentBuilder(BaseExperiment(problem, problem.start, "known", None))
+    made = CandidateExperimentBuilder(BaseExperiment(problem, problem.initial_unknowns, "known", None))
     assert made.build_experiment(frozenset()) == "the model cannot be rolled out: it snaps"
 
 
 def test_welds_keep_the_orientation_at_the_start(held_tube):
-    builder = CandidateExperimentBuilder(BaseExperiment(held_tube, held_tube.start, "known", None))
+    builder = CandidateExperimentBuilder(BaseExperiment(held_tube, held_tube.initial_unknowns, "known", None))
     system = builder._welded(held_tube.system, frozenset())
     layout = builder.build_experiment(frozenset())
     (grasp,) = system.grasps
@@ -579,7 +581,7 @@ def test_welds_keep_the_orientation_at_the_start(held_tube):
 
 @pytest.mark.parametrize("how", ["layout", "start"])
 def test_welds_need_a_start(held_tube, monkeypatch, how):
-    builder = CandidateExperimentBuilder(BaseExperiment(held_tube, held_tube.start, "known", None))
+    builder = CandidateExperimentBuilder(BaseExperiment(held_tube, held_tube.initial_unknowns, "known", None))
     if how == "layout":
         monkeypatch.setattr(builder, "layout", lambda others: "it snaps")
     else:

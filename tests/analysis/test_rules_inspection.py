@@ -56,8 +56,8 @@ def test_a_step_is_counted(swing):
     assert found.dimensions | {"n": 2, "nu": 1, "nz": 0, "m": 0, "nc": 0, "nx": 4} == found.dimensions
     assert found.n_unknowns == 2
     assert found.jacobian_nonzeros == 4
-    assert [entry.name for entry in found.function_sizes] == [f.name() for f in swing.functions.all]
-    for entry, f in zip(found.function_sizes, swing.functions.all, strict=True):
+    assert [entry.name for entry in found.function_sizes] == [f.name() for f in swing.functions.all_functions]
+    for entry, f in zip(found.function_sizes, swing.functions.all_functions, strict=True):
         assert entry.n_operations == f.n_instructions()
         assert entry.n_nonzeros == sum(f.sparsity_out(i).nnz() for i in range(f.n_out()))
     assert max(entry.n_operations for entry in found.function_sizes) > 100

@@ -25,9 +25,9 @@ def symbols(urdf_folder):
 def point(symbols):
     rng = np.random.default_rng(3)
     values = rng.uniform(0.2, 0.6, len(symbols.column_names))
-    span = symbols.span("theta")
+    span = symbols.block_slice("theta")
     values[span] = symbols.equations.system.parameters.vector() + 0.1
-    values[symbols.column("h")] = 0.02
+    values[symbols.column_index("h")] = 0.02
     return values
 
 
@@ -37,13 +37,15 @@ def value(symbols, expression, at):
 
 def test_blocks_have_the_names_of_the_project(symbols):
     joints = ["shoulder", "elbow", *(f"T1_{i}_{axis}" for i in (0, 1) for axis in "xyz")]
-    assert list(symbols.rows[0].names) == [f"del[{name}]" for name in joints]
-    assert [block.name for block in symbols.rows] == ["del", "internal", "constraint", "p1"]
-    assert symbols.rows[2].names == tuple(f"constraint[hand.{part}]" for part in ("x", "y", "z", "tilt_x", "tilt_y"))
-    assert list(symbols.rows[1].labels) == list(symbols.equations.system.internal)
-    assert symbols.columns[3].names == ("u[shoulder]",)
+    assert list(symbols.row_blocks[0].full_names) == [f"del[{name}]" for name in joints]
+    assert [block.name for block in symbols.row_blocks] == ["del", "internal", "constraint", "p1"]
+    assert symbols.row_blocks[2].full_names == tuple(
+        f"constraint[hand.{part}]" for part in ("x", "y", "z", "tilt_x", "tilt_y")
+    )
+    assert list(symbols.row_blocks[1].labels) == list(symbols.equations.system.internal_coordinates)
+    assert symbols.column_blocks[3].full_names == ("u[shoulder]",)
     # parameters are called as everywhere, without a block
-    assert symbols.columns[4].names == symbols.equations.system.parameters.names
+    assert symbols.column_blocks[4].full_names == symbols.equations.system.parameters.full_names
     assert len(set(symbols.row_names)) == len(symbols.row_names)
     assert len(set(symbols.column_names)) == len(symbols.column_names)
 
@@ -51,15 +53,15 @@ def test_blocks_have_the_names_of_the_project(symbols):
 def test_rows_and_columns_stand_where_the_equations_have_them(symbols):
     e = symbols.equations
     at = point(symbols)
-    expected = value(symbols, ca.vertcat(e.momentum_balance, e.internal, e.constraint, e.p1), at)
+    expected = value(symbols, ca.vertcat(e.momentum_balance, e.internal_residual, e.constraint_residual, e.p1), at)
     np.testing.assert_array_equal(value(symbols, symbols.row_expressions, at), expected)
-    for block in (*symbols.rows, *symbols.columns):
-        span = symbols.span(block.name)
-        assert span.stop - span.start == len(block.labels) == block.values.numel()
-    assert symbols.column("q1[T1_0_x]") == symbols.span("q1").start + 2
-    assert symbols.row("p1[elbow]") == symbols.span("p1").start + 1
+    for block in (*symbols.row_blocks, *symbols.column_blocks):
+        span = symbols.block_slice(block.name)
+        assert span.stop - span.start == len(block.labels) == block.expressions.numel()
+    assert symbols.column_index("q1[T1_0_x]") == symbols.block_slice("q1").start + 2
+    assert symbols.row_index("p1[elbow]") == symbols.block_slice("p1").start + 1
     for name in ("lam[hand.tilt_y]", "T1.bend", "h", "u[shoulder]"):
-        assert symbols.column_names[symbols.column(name)] == name
+        assert symbols.column_names[symbols.column_index(name)] == name
 
 
 @pytest.mark.parametrize("kind", ["point", "axis", "weld"])
@@ -73,13 +75,13 @@ def test_every_equation_of_a_grasp_has_a_name(kind):
 @pytest.mark.parametrize("row", ["del[T1_0_x]", "del[elbow]", "constraint[hand.tilt_x]", "p1[T1_1_z]"])
 def test_an_entry_is_the_row_as_text(symbols, row):
     """The printed lines are all that is needed to work the row out."""
-    at, entry = point(symbols), symbols.entry(row)
-    expected = value(symbols, symbols.row_expressions, at)[symbols.row(row)]
+    at, entry = point(symbols), symbols.equation_entry(row)
+    expected = value(symbols, symbols.row_expressions, at)[symbols.row_index(row)]
     assert worked_out(symbols, entry, at) == pytest.approx(expected, rel=1e-9)
-    assert entry.value(symbols.column_symbols, at) == pytest.approx(expected, rel=1e-12)
+    assert entry.numeric_value(symbols.column_symbols, at) == pytest.approx(expected, rel=1e-12)
     assert entry.title == row
-    assert entry.lines[0].startswith(f"{row}: {entry.formula.operations} operations, depends on ")
-    assert entry.lines[-1] == f"  {row} = {entry.formula.values[0]}"
+    assert entry.text_lines[0].startswith(f"{row}: {entry.formula.n_operations} operations, depends on ")
+    assert entry.text_lines[-1] == f"  {row} = {entry.formula.expression_texts[0]}"
 
 
 def worked_out(symbols, entry, at):
@@ -94,10 +96,10 @@ def worked_out(symbols, entry, at):
             text = text.replace(name, f"v[{i}]") if name != "h" else text
         return read(text)
 
-    known |= {"v": at, "h": at[symbols.column("h")]}
-    for name, text in entry.formula.shared:
+    known |= {"v": at, "h": at[symbols.column_index("h")]}
+    for name, text in entry.formula.shared_subexpressions:
         known[name] = eval(numbers(text), {"__builtins__": {}}, known)
-    return eval(numbers(entry.formula.values[0]), {"__builtins__": {}}, known)
+    return eval(numbers(entry.formula.expression_texts[0]), {"__builtins__": {}}, known)
 
 
 @pytest.mark.parametrize(
@@ -112,29 +114,29 @@ def worked_out(symbols, entry, at):
     ],
 )
 def test_an_entry_with_a_column_is_the_slope(symbols, row, column):
-    at, i, j = point(symbols), symbols.row(row), symbols.column(column)
+    at, i, j = point(symbols), symbols.row_index(row), symbols.column_index(column)
     width = 1e-6 * max(1.0, abs(at[j]))
     ends = []
     for sign in (1, -1):
         moved = at.copy()
         moved[j] += sign * width
         ends.append(value(symbols, symbols.row_expressions, moved)[i])
-    entry = symbols.entry(f" {row},{column} ")
+    entry = symbols.equation_entry(f" {row},{column} ")
     assert entry.title == f"d {row} / d {column}"
     assert not entry.is_zero
     assert worked_out(symbols, entry, at) == pytest.approx((ends[0] - ends[1]) / (2 * width), rel=1e-6, abs=1e-9)
 
 
 def test_an_entry_that_vanishes_says_so(symbols):
-    entry = symbols.entry("constraint[hand.x], T1.bend")
+    entry = symbols.equation_entry("constraint[hand.x], T1.bend")
     assert entry.is_zero
-    assert entry.lines == ["d constraint[hand.x] / d T1.bend = 0 whatever the state"]
+    assert entry.text_lines == ["d constraint[hand.x] / d T1.bend = 0 whatever the state"]
 
 
 def test_the_variables_of_an_entry_are_named_or_counted(symbols):
-    stiffness = symbols.entry("del[elbow], elbow.stiffness")
-    assert stiffness.variables == ("q0[elbow]", "elbow.rest", "h", "q1[elbow]")
-    assert "8 of q0" in symbols.entry("del[T1_0_z]").variables
+    stiffness = symbols.equation_entry("del[elbow], elbow.stiffness")
+    assert stiffness.variable_names == ("q0[elbow]", "elbow.rest", "h", "q1[elbow]")
+    assert "8 of q0" in symbols.equation_entry("del[T1_0_z]").variable_names
 
 
 @pytest.mark.parametrize(
@@ -149,7 +151,7 @@ def test_the_variables_of_an_entry_are_named_or_counted(symbols):
 )
 def test_a_wrong_name_gets_the_nearest(symbols, text, what, hint):
     with pytest.raises(ConfigError) as caught:
-        symbols.entry(text)
+        symbols.equation_entry(text)
     assert what in caught.value.what
     assert hint in caught.value.hint
     assert caught.value.where == "--entry"
@@ -159,17 +161,17 @@ def test_a_wrong_name_gets_the_nearest(symbols, text, what, hint):
 @pytest.mark.parametrize("text", ["", "del[elbow],", "del[elbow], h, h"])
 def test_neither_one_name_nor_two_is_refused(symbols, text):
     with pytest.raises(ConfigError, match="is no entry"):
-        symbols.entry(text)
+        symbols.equation_entry(text)
 
 
 def test_all_rows_are_listed_the_short_ones_whole(symbols):
-    lines = symbols.lines()
+    lines = symbols.text_lines()
     text = "\n".join(lines)
     for name in symbols.row_names:
         assert any(line.startswith(f"{name}: ") for line in lines), name
-    long = symbols.entry("del[T1_0_z]")
-    assert long.lines[0] in lines
-    inner = symbols.rows[1].names[0]
+    long = symbols.equation_entry("del[T1_0_z]")
+    assert long.text_lines[0] in lines
+    inner = symbols.row_blocks[1].full_names[0]
     assert f"  {inner} = " in text
     assert "  del[T1_0_z] = " not in text
     for name in symbols.column_names:

@@ -122,10 +122,15 @@ def test_a_predicted_camera_tells_beside_wrong_torques_what_it_tells_when_it_is_
             group = PointGroup(group.name, group.names, times, position, std=std, sensor=group.sensor, pose=group.pose)
         groups.append(group)
     # what is there tells of errors of torques too: those that the real recording tells of
-    effort, errors = recording.joints.effort.copy(), noisy.whitened_at(noisy.start, rounds=2).episodes[0].errors
-    effort[: len(errors.white)] -= errors.total_torque_error
+    effort, errors = (
+        recording.joints.effort.copy(),
+        noisy.whitened_at(noisy.initial_unknowns, rounds=2).episodes[0].input_errors,
+    )
+    effort[: len(errors.torque_noise)] -= errors.total_torque_error
     faster = replace(recording, points=tuple(groups), joints=replace(recording.joints, effort=effort))
-    problem = EstimationProblem(noisy.step, [faster], noisy.free, noisy.options, noisy.named(noisy.start))
+    problem = EstimationProblem(
+        noisy.step, [faster], noisy.free, noisy.options, noisy.named_values(noisy.initial_unknowns)
+    )
     weighted = problem.whitened_at(problem.initial_unknowns)
     jacobian = weighted.residual_without_weak_priors(weighted.evaluate(problem.initial_unknowns))[1]
     std = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian))) / problem.initial_unknowns
@@ -134,14 +139,14 @@ def test_a_predicted_camera_tells_beside_wrong_torques_what_it_tells_when_it_is_
 
 
 def test_made_motions_are_as_noisy_as_the_recorded_one(noisy, monkeypatch):
-    builder = CandidateExperimentBuilder(BaseExperiment(noisy, noisy.start))
+    builder = CandidateExperimentBuilder(BaseExperiment(noisy, noisy.initial_unknowns))
     made = builder.build_experiment(frozenset({"motion"}))
     assert not isinstance(made, str), made
-    own, recorded = made.problem.episodes[0].input_errors, noisy.episodes[0].errors
-    for name in ("torque_std", "bias_std", "angle_std"):
+    own, recorded = made.problem.episodes[0].input_errors, noisy.episodes[0].input_errors
+    for name in ("torque_std", "torque_bias_std", "angle_std"):
         np.testing.assert_allclose(getattr(own, name), getattr(recorded, name))
     second = SimpleNamespace(driven=(*noisy.system.driven, "other"))
     angle, torque, bias = experiment_design._noise_as_recorded(noisy.system, second, noisy.episodes[0])
     assert torque[-1] == np.median(recorded.torque_std)
-    assert bias[-1] == np.median(recorded.bias_std)
+    assert bias[-1] == np.median(recorded.torque_bias_std)
     np.testing.assert_array_equal(angle[:-1], recorded.angle_std)

@@ -124,7 +124,7 @@ def test_another_motion_comes_from_held_out_recordings_without_mujoco(short_run,
         raise DataError("MuJoCo is not installed")
 
     monkeypatch.setattr(experiment_design, "simulate_in_mujoco", missing)
-    builder = CandidateExperimentBuilder(BaseExperiment(short_run, short_run.start))
+    builder = CandidateExperimentBuilder(BaseExperiment(short_run, short_run.initial_unknowns))
     other = builder.build_experiment(frozenset({"motion"}))
     assert not isinstance(other, str), other
     held_out = short_run.held_out[0].measured_driven_angles[:20]

@@ -82,16 +82,16 @@ def pushed(twin) -> Recording:
 
 
 def test_pushes_are_found_at_their_joints_in_their_windows_with_their_impulses(twin, pushed):
-    found = twin.events(pushed).found
+    found = twin.events(pushed).disturbances
     assert [(event.kind, event.location, event.unit) for event in found] == [
         ("force", "shoulder", "N m"),
         ("force", "elbow", "N m"),
     ]
     for event, push in zip(found, PUSHES, strict=True):
-        assert event.begin == pytest.approx(push.start_time, abs=0.1)
-        assert event.end == pytest.approx(push.end_time, abs=0.1)
+        assert event.start_time == pytest.approx(push.start_time, abs=0.1)
+        assert event.end_time == pytest.approx(push.end_time, abs=0.1)
         assert event.impulse == pytest.approx(push.impulse, rel=0.15)
-        assert abs(event.impulse - push.impulse) < 3 * event.std
+        assert abs(event.impulse - push.impulse) < 3 * event.impulse_std
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -100,18 +100,23 @@ def test_nothing_happens_in_a_clean_run(twin, seed):
 
 
 def test_a_snag_is_an_event_of_its_joint(twin):
-    found = twin.events(twin.recording(DisturbanceTerms((), (SnagSpring("elbow", 2.0, 2.3, 30.0),)))).found
+    found = twin.events(twin.recording(DisturbanceTerms((), (SnagSpring("elbow", 2.0, 2.3, 30.0),)))).disturbances
     assert found
     assert {event.location for event in found} == {"elbow"}
-    assert all(event.begin > 1.8 and event.end < 2.5 for event in found)
+    assert all(event.start_time > 1.8 and event.end_time < 2.5 for event in found)
 
 
 def test_forces_that_mostly_recur_are_the_motions_own(twin, pushed):
     """What is there at the same times of another recording comes with the motion; one that does is still an event."""
     other = (replace(PUSHES[0], start_time=3.2, end_time=3.7), *PUSHES[1:])
     again, partly = (twin.recording(DisturbanceTerms(pushes), seed=1) for pushes in (PUSHES, other))
-    assert not twin.events(pushed, again).found
-    assert [event.location for event in twin.events(pushed, partly).found] == ["shoulder", "elbow", "elbow", "shoulder"]
+    assert not twin.events(pushed, again).disturbances
+    assert [event.location for event in twin.events(pushed, partly).disturbances] == [
+        "shoulder",
+        "elbow",
+        "elbow",
+        "shoulder",
+    ]
 
 
 def test_a_wrong_encoder_sample_is_named_as_such_and_makes_no_push(twin):
@@ -119,11 +124,11 @@ def test_a_wrong_encoder_sample_is_named_as_such_and_makes_no_push(twin):
     position = clean.joints.position.copy()
     position[500:502, 1] += 0.05
     wrong = replace(clean, joints=replace(clean.joints, position=position))
-    (event,) = twin.events(wrong).found
+    (event,) = twin.events(wrong).disturbances
     assert (event.kind, event.channel, event.unit) == ("sample", "joints.position.elbow", "rad")
-    assert event.peak == pytest.approx(0.05, abs=2e-3)
-    assert event.begin == pytest.approx(wrong.joints.t[500], abs=0.006)
-    assert event.end == pytest.approx(wrong.joints.t[501], abs=0.006)
+    assert event.peak_value == pytest.approx(0.05, abs=2e-3)
+    assert event.start_time == pytest.approx(wrong.joints.t[500], abs=0.006)
+    assert event.end_time == pytest.approx(wrong.joints.t[501], abs=0.006)
 
 
 def test_a_gap_that_lives_in_events_alone_is_none_and_the_words_tell_of_them(bench):
@@ -172,12 +177,12 @@ def test_samples_of_an_events_joint_in_its_window_do_not_count(twin, pushed):
     problem = twin.problem(pushed)
     event = DisturbanceEvent("run_0", "elbow", "elbow", "force", 3.0, 3.4, -0.8, -0.16, 0.01, "N m")
     cleaned = problem_without_events(problem, EventSet((event,)))
-    (before,), (after,) = problem.episodes[0].samples, cleaned.episodes[0].measurements
+    (before,), (after,) = problem.episodes[0].measurements, cleaned.episodes[0].measurements
     t = sample_times(problem.episodes[0], before)
-    hidden = before.seen & ~after.is_used
+    hidden = before.is_used & ~after.is_used
     smear = 1 / problem.options.path_cutoff
     assert not hidden[:, 0].any()
-    assert np.array_equal(hidden[:, 1], before.seen[:, 1] & (t > 3.0 - smear) & (t < 3.4 + smear))
+    assert np.array_equal(hidden[:, 1], before.is_used[:, 1] & (t > 3.0 - smear) & (t < 3.4 + smear))
     assert (
         problem_without_events(problem, EventSet((replace(event, recording="another"),))).episodes[0].measurements[0]
         is before

@@ -103,10 +103,10 @@ def diagnosed(side: str, extra):
 def test_a_spring_is_found_at_any_joint_of_either_arm(side, joint, stiffness):
     finding = diagnosed(side, spring(joint, stiffness, -0.4))
     assert finding.verdict in ("effect", "confusable")
-    assert finding.effects[0].label == f"joint_spring@{joint}"
-    assert finding.where[0].location == joint
-    assert finding.closure.value > 0.95
-    found = finding.last.reported(finding.effects[0])
+    assert finding.accepted_effects[0].label == f"joint_spring@{joint}"
+    assert finding.gap_locations[0].location == joint
+    assert finding.gap_closure.fraction > 0.95
+    found = finding.final_model.reported_parameters(finding.accepted_effects[0])
     assert found["stiffness"].value == pytest.approx(stiffness, rel=0.05)
 
 

@@ -389,7 +389,9 @@ def _constraint_pulls(system: System, at: _Symbols, middle: Kinematics, share_m:
     parts: dict[str, ca.SX] = {}
     for name, q, z in (("before", at.q0, at.z0), ("after", at.q1, at.z1)):
         found = _constraint_derivatives(system, forward_kinematics(system.mechanism, q), q, at.lam)
-        parts[f"{name}_jacobian"], parts[f"{name}_force_by_q"] = (ca.substitute(expression, at.internal, z) for expression in found)
+        parts[f"{name}_jacobian"], parts[f"{name}_force_by_q"] = (
+            ca.substitute(expression, at.internal, z) for expression in found
+        )
     found = _constraint_derivatives(system, middle, at.qm, at.lam)
     parts["middle_jacobian"], parts["middle_force_by_q"] = (at.placed(expression, dense=False) for expression in found)
     jacobians = ("before_jacobian", "middle_jacobian", "after_jacobian")

@@ -127,7 +127,9 @@ def run_diagnose(
         }
         written = folder.write_result(told | own)
         more = {"finding": finding, "predictions": predicted}
-        folder.write_report_page(run, written, progress, problem=problem, animations=_scenes(finding, predicted), section_data=more)
+        folder.write_report_page(
+            run, written, progress, problem=problem, animations=_scenes(finding, predicted), section_data=more
+        )
     refits.delete_file()
     return DiagnoseCommandResult(folder.path, written, finding)
 
