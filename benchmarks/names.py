@@ -19,7 +19,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.config.schema import schema
+from yid_ocp.config.schema import config_json_schema
 
 PACKAGE = Path(__file__).parents[1] / "yid_ocp"
 Documented = ast.FunctionDef | ast.ClassDef
@@ -102,10 +102,10 @@ def main() -> int:
         rooms = collections.Counter(where.split("/")[1].removesuffix(".py") for where, _ in names)
         for room, number in rooms.most_common():
             print(f"{number:6d} {room}")
-        print(f"{len(names):6d} in all, and {len(settings(schema()))} settings")
+        print(f"{len(names):6d} in all, and {len(settings(config_json_schema()))} settings")
         return 0
     generator = random.Random(arguments.seed)
-    pool = [f"{where}: {name}" for where, name in names] + [f"setting {key}" for key in sorted(settings(schema()))]
+    pool = [f"{where}: {name}" for where, name in names] + [f"setting {key}" for key in sorted(settings(config_json_schema()))]
     print(*generator.sample(sorted(pool), arguments.names), sep="\n")
     print()
     print(*generator.sample(sorted(sentences()), arguments.sentences), sep="\n")
