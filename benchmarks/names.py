@@ -105,7 +105,9 @@ def main() -> int:
         print(f"{len(names):6d} in all, and {len(settings(config_json_schema()))} settings")
         return 0
     generator = random.Random(arguments.seed)
-    pool = [f"{where}: {name}" for where, name in names] + [f"setting {key}" for key in sorted(settings(config_json_schema()))]
+    pool = [f"{where}: {name}" for where, name in names] + [
+        f"setting {key}" for key in sorted(settings(config_json_schema()))
+    ]
     print(*generator.sample(sorted(pool), arguments.names), sep="\n")
     print()
     print(*generator.sample(sorted(sentences()), arguments.sentences), sep="\n")

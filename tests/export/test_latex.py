@@ -60,7 +60,7 @@ def check(text):
 def test_the_sheet_is_sound_and_names_every_row(symbols, tmp_path):
     text = sheet(symbols, tmp_path)
     check(text)
-    for block in symbols.rows:
+    for block in symbols.row_blocks:
         for label in block.labels:
             assert rf"\mathrm{{{label.replace('_', chr(92) + '_')}}}" in text, label
     for title in ("Letters that stay", "Joints", "Bodies", "Rows"):

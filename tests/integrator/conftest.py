@@ -33,22 +33,22 @@ from yid_ocp.model.urdf import read_urdf
 
 @dataclass(frozen=True)
 class Added:
-    """An effect made of functions; `internal` names its coordinates without momentum."""
+    """An effect made of functions; `internal_coordinates` names its coordinates without momentum."""
 
     kind: str
     location: str
     parameters: Parameters
-    internal: Mapping[str, ca.SX] = field(default_factory=dict)
+    internal_coordinates: Mapping[str, ca.SX] = field(default_factory=dict)
     change: Callable = lambda effect, system: system
     add: Callable = lambda effect, state: StepTerms()
 
-    def modify(self, system):
+    def apply_to_system(self, system):
         return self.change(self, system)
 
-    def terms(self, state):
+    def step_terms(self, state):
         return self.add(self, state)
 
-    def measure(self, channel, output, state):
+    def distorted_reading(self, channel, output, state):
         return output
 
 
@@ -63,7 +63,7 @@ def maxwell_branch(joint: str, stiffness: float, relaxation_time: float) -> Adde
 
     def add(effect, state):
         k1, tau = effect.parameters.symbols[0], effect.parameters.symbols[1]
-        row = state.internal[name]
+        row = state.internal_rows[name]
         stretch = state.q[state.system.mechanism.joint_index(joint)] - state.z[row]
         return StepTerms(
             lagrangian=-0.5 * k1 * stretch**2, internal_equations={name: stretch - tau * state.z_rate[row]}
@@ -77,9 +77,9 @@ def soft_joint(joint: str, compliance: float) -> Added:
     parameters = _parameters("soft", joint, compliance=compliance)
 
     def change(effect, system):
-        elastic = tuple(spring for spring in system.elastic if spring.joint != joint)
+        elastic = tuple(spring for spring in system.elastic_joints if spring.joint_name != joint)
         compliant = {**system.joint_compliances, joint: effect.parameters.symbols[0]}
-        return replace(system, elastic=elastic, compliant=compliant)
+        return replace(system, elastic_joints=elastic, joint_compliances=compliant)
 
     return Added("soft", joint, parameters, change=change)
 
@@ -90,7 +90,9 @@ def soft_grasp(grasp: str, compliance: float, relaxation: float | None = None) -
     parameters = _parameters("soft_grasp", grasp, **values)
 
     def change(effect, system):
-        values = {name.split(".")[-1]: effect.parameters[name].symbol for name in effect.parameters.names}
+        names = {"compliance": "compliance", "relaxation": "relaxation_time"}
+        symbols = {p.name.rpartition(".")[2]: p.symbol for p in effect.parameters}
+        values = {names[name]: symbol for name, symbol in symbols.items()}
         changed = [replace(g, **values) if g.name == grasp else g for g in system.grasps]
         return replace(system, grasps=tuple(changed))
 
@@ -104,13 +106,15 @@ def creeping_grasp(grasp: str, rate: float) -> Added:
     internal = {name: ca.SX.sym(name)}
 
     def change(effect, system):
-        changed = [replace(g, slip=effect.internal[name]) if g.name == grasp else g for g in system.grasps]
+        changed = [
+            replace(g, axial_slip=effect.internal_coordinates[name]) if g.name == grasp else g for g in system.grasps
+        ]
         return replace(system, grasps=tuple(changed))
 
     def add(effect, state):
-        held = next(g.held for g in state.system.grasps if g.name == grasp)
-        load = ca.dot(state.kinematics.pose(held).rotation[:, 2], state.constraint_force[:3])
-        row, rate = state.internal[name], effect.parameters.symbols[0]
+        held = next(g.held_frame for g in state.system.grasps if g.name == grasp)
+        load = ca.dot(state.kinematics.frame_pose(held).rotation[:, 2], state.constraint_force[:3])
+        row, rate = state.internal_rows[name], effect.parameters.symbols[0]
         # where it has long stood, as far as the load would have it creep in a second
         at_rest = {name: state.z[row] - rate * load}
         return StepTerms(internal_equations={name: state.z_rate[row] - rate * load}, static_equations=at_rest)
@@ -127,13 +131,13 @@ def growing_link(joint: str, length: float, time: float) -> Added:
     def change(effect, system):
         joints = list(system.mechanism.joints)
         index = system.mechanism.joint_index(joint)
-        shift = Placement(ca.SX(ca.DM.eye(3)), ca.vertcat(effect.internal[name], 0, 0))
+        shift = Placement(ca.SX(ca.DM.eye(3)), ca.vertcat(effect.internal_coordinates[name], 0, 0))
         joints[index] = replace(joints[index], placement=joints[index].placement @ shift)
         return replace(system, mechanism=replace(system.mechanism, joints=tuple(joints)))
 
     def add(effect, state):
         target, tau = effect.parameters.symbols[0], effect.parameters.symbols[1]
-        row = state.internal[name]
+        row = state.internal_rows[name]
         return StepTerms(internal_equations={name: target - state.z[row] - tau * state.z_rate[row]})
 
     return Added("growth", joint, parameters, internal, change, add)
@@ -155,19 +159,22 @@ def thick_air(joint: str, coefficient: float, viscosity: float, buoyancy: float)
     def add(effect, state):
         c, b, v = effect.parameters.symbols[0], effect.parameters.symbols[1], state.v
         tree, kinematics = state.system.mechanism, state.kinematics
-        chain, screws = tree.ancestors(tree.joint_index(joint)), kinematics.screws
+        chain, screws = tree.ancestor_joints(tree.joint_index(joint)), kinematics.joint_screws
         along = {-1: ca.SX(ca.DM.zeros(6))}
         for j in chain:
-            along[j] = along[tree.joints[j].parent] + screws[j] * v[j]
+            along[j] = along[tree.joints[j].parent_index] + screws[j] * v[j]
         link = chain[-1]
-        com = kinematics.rotations[link] @ tree.joints[link].bodies[0].com + kinematics.origins[link]
+        com = (
+            kinematics.joint_rotations[link] @ tree.joints[link].bodies[0].center_of_mass
+            + kinematics.joint_origins[link]
+        )
         reach = ca.horzcat(-ca.skew(com), ca.SX.eye(3))
         speed = reach @ along[link]
         wrench = reach.T @ (-c * ca.sumsqr(speed) * speed)
         slope = reach.T @ (-c * (ca.sumsqr(speed) * ca.SX.eye(3) + 2 * speed @ speed.T)) @ reach
         force, by_rate, by_turn = ca.SX(len(screws), 1), ca.SX(6, len(screws)), ca.SX(6, len(screws))
         for j in chain:
-            added = motion_cross_motion_product(along[tree.joints[j].parent], screws[j])
+            added = motion_cross_motion_product(along[tree.joints[j].parent_index], screws[j])
             force[j] = ca.dot(screws[j], wrench)
             by_rate[:, j] = slope @ screws[j]
             by_turn[:, j] = slope @ added + motion_cross_force_product(screws[j], wrench)

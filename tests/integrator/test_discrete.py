@@ -45,7 +45,7 @@ def test_equations_are_slot_derivatives_of_the_discrete_lagrangian(
     push = FORCE_LEFT[force_split] * e.h * force
 
     def closed(q: ca.SX) -> ca.SX:
-        return system.constraints(forward_kinematics(system.mechanism, q))
+        return system.constraint_residual(forward_kinematics(system.mechanism, q))
 
     # lam times the constraint at node k, its share s moved to the mean of the ends less half of both
     s, middle = PULL_MIDDLE[constraint_force], (e.q0 + e.q1) / 2
@@ -64,8 +64,8 @@ def test_equations_are_slot_derivatives_of_the_discrete_lagrangian(
     rng = np.random.default_rng(4)
     theta = system.parameters.vector()
     for _ in range(3):
-        q0 = rng.uniform(-1, 1, system.size)
-        point = [q0, q0 + 0.05 * rng.normal(size=system.size)]
+        q0 = rng.uniform(-1, 1, system.n_coordinates)
+        point = [q0, q0 + 0.05 * rng.normal(size=system.n_coordinates)]
         point += [rng.normal(size=x.numel()) for x in (e.p0, e.z0, e.z1, e.lam, e.u)]
         values = [np.array(x) for x in function.call([*point, theta, 0.01])]
         for actual, wanted in zip(values[::2], values[1::2], strict=True):

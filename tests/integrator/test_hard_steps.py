@@ -176,10 +176,10 @@ def first_correction(hard: Hard) -> float:
     step, (theta, start, torque, path) = hard.step(use_compiler=False), hard.inputs()
     after = start.copy()
     after[list(hard.system.prescribed_indices)] = path[1]
-    sizes, unknown = step.sizes, step.model.structure.unknown_rows
+    sizes, unknown = step.sizes, step.model.index_tables.unknown_rows
     pair = np.stack([start, after])
     found = step.kernel.linearize(theta, pair, np.zeros((1, sizes["m"])), torque[:1], (), True)
-    change = np.linalg.solve(found.residual_by_new[0][np.ix_(unknown, unknown)], found.rows[0][unknown])
+    change = np.linalg.solve(found.residual_by_new[0][np.ix_(unknown, unknown)], found.residual[0][unknown])
     return float(np.max(np.abs(change[: len(unknown) - sizes["m"]])))
 
 
@@ -199,17 +199,19 @@ def test_both_kernels_agree(hard):
     directions.initial_state_tangents[list(hard.system.prescribed_indices)] = 0.0
     one, two = (step.kernel.rollout(theta, start, torque, path, None, directions) for step in steps)
     assert (one.status.code, two.status.code) == (hard.code, hard.code)
-    assert one.status.step == two.status.step == (hard.steps if hard.code == NewtonStatus.OK else 0)
+    assert (
+        one.status.completed_steps == two.status.completed_steps == (hard.steps if hard.code == NewtonStatus.OK else 0)
+    )
     assert one.status.message.partition("(")[0] == two.status.message.partition("(")[0]
     if hard.code != NewtonStatus.OK:
-        assert all(np.all(np.isnan(r.by_state[1:])) and np.all(np.isnan(r.multipliers)) for r in (one, two))
+        assert all(np.all(np.isnan(r.state_sensitivity[1:])) and np.all(np.isnan(r.multipliers)) for r in (one, two))
         return
     if hard.damped:
         assert first_correction(hard) > 0.5
     close(one.state, two.state, 1e-10)
     close(one.multipliers, two.multipliers, 1e-10 * hard.conditioning)
     close(one.effort, two.effort, 1e-9 * hard.conditioning)
-    for key in ("by_state", "by_multipliers", "by_effort"):
+    for key in ("state_sensitivity", "multipliers_sensitivity", "effort_sensitivity"):
         close(getattr(one, key), getattr(two, key), 1e-9 * hard.conditioning)
     by_state = np.random.default_rng(2).normal(size=one.state.shape)
     back = [step.kernel.adjoint_gradient(theta, one, None, names, by_state, None, None) for step in steps]

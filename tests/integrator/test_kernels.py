@@ -37,12 +37,12 @@ def sizes_of(theta):
 
 def after_one(case, theta=None, start=None, torque=None, path=None):
     rollout = case.rollout(theta, start, case.torque[:1] if torque is None else torque[None, :], case.path[:2])
-    assert rollout.status.ok, rollout.status.message
+    assert rollout.status.is_converged, rollout.status.message
     return rollout.state[1]
 
 
 def test_step_jacobians_against_differences(case):
-    step, n = case.step, case.step.system.size
+    step, n = case.step, case.step.system.n_coordinates
     q0, p0, z0 = case.start[:n], case.start[n : 2 * n], case.start[2 * n :]
     prescribed = (case.path[0], case.path[1]) if step.sizes["nc"] else None
     A, B_u, B_theta = step.jacobians(q0, p0, case.torque[0], case.theta, prescribed, z0)
@@ -57,12 +57,12 @@ def test_step_jacobians_against_differences(case):
 
 def test_step_jacobians_of_the_grasped_y(golden, single_step, theta_golden):
     trep, theta, step = golden("single"), theta_golden("single"), single_step
-    q, p, u, n = trep.q[40], trep.p[40], trep.u[40], step.system.size
+    q, p, u, n = trep.q[40], trep.p[40], trep.u[40], step.system.n_coordinates
     A, B_u, B_theta = step.jacobians(q, p, u, theta)
 
     def move(x):
         q1, p1, _, status = step(x[:n], x[n : 2 * n], x[2 * n : 2 * n + 7], x[2 * n + 7 :])
-        assert status.ok, status.message
+        assert status.is_converged, status.message
         return np.concatenate([q1, p1])
 
     expected = central(move, np.concatenate([q, p, u, theta]))
@@ -73,7 +73,7 @@ def test_step_jacobians_of_the_grasped_y(golden, single_step, theta_golden):
 
 def test_chosen_parameters_only(case):
     names = case.step.system.parameters.names
-    n = case.step.system.size
+    n = case.step.system.n_coordinates
     prescribed = (case.path[0], case.path[1]) if case.step.sizes["nc"] else None
     arguments = (case.start[:n], case.start[n : 2 * n], case.torque[0], case.theta, prescribed, case.start[2 * n :])
     everything = case.step.jacobians(*arguments)[2]
@@ -107,7 +107,7 @@ def test_forward_equals_adjoint_equals_differences(case, fed_back):
     rng = np.random.default_rng(12)
 
     rollout = case.rollout(feedback=feedback)
-    assert rollout.status.ok, rollout.status.message
+    assert rollout.status.is_converged, rollout.status.message
     gradient = case.step.kernel.adjoint_gradient(
         theta, rollout, feedback, names, weights.state, weights.multipliers, weights.effort
     )
@@ -122,9 +122,9 @@ def test_forward_equals_adjoint_equals_differences(case, fed_back):
     start[fixed] = path[0]
     forward = case.rollout(feedback=feedback, directions=SensitivityDirections(names, start, torque, path))
     slopes = (
-        np.tensordot(weights.state, forward.by_state, 2)
+        np.tensordot(weights.state, forward.state_sensitivity, 2)
         + np.tensordot(weights.multipliers, forward.multipliers_sensitivity, 2)
-        + np.tensordot(weights.effort, forward.by_effort, 2)
+        + np.tensordot(weights.effort, forward.effort_sensitivity, 2)
     )
 
     np.testing.assert_allclose(forward.state, rollout.state, rtol=0, atol=1e-9 * scale_of(rollout.state))
@@ -141,7 +141,7 @@ def test_forward_equals_adjoint_equals_differences(case, fed_back):
             case.path + epsilon * direction[3],
             feedback,
         )
-        assert moved.status.ok, moved.status.message
+        assert moved.status.is_converged, moved.status.message
         return weights.value(weights, moved)
 
     def difference(direction, epsilon=3e-6):
@@ -176,14 +176,22 @@ def test_interpreter_equals_compiled(case):
     partial = (weights.state, weights.multipliers, weights.effort)
     back = [s.kernel.adjoint_gradient(case.theta, one, feedback, names, *partial) for s in (case.step, plain)]
     pairs = [(getattr(one, key), getattr(two, key)) for key in ("state", "multipliers", "effort", "torque")]
-    pairs += [(getattr(one, key), getattr(two, key)) for key in ("by_state", "by_multipliers", "by_effort")]
-    pairs += [(getattr(back[0], key), getattr(back[1], key)) for key in ("by_theta", "by_start", "by_torque")]
+    pairs += [
+        (getattr(one, key), getattr(two, key))
+        for key in ("state_sensitivity", "multipliers_sensitivity", "effort_sensitivity")
+    ]
+    pairs += [(getattr(back[0], key), getattr(back[1], key)) for key in ("by_theta", "by_initial_state", "by_torque")]
     for actual, expected in pairs:
         assert np.all(np.isfinite(actual))
         scale = max(1.0, np.max(np.abs(expected), initial=0.0))
         np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-9 * scale)
     np.testing.assert_allclose(one.status.internal, two.status.internal, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(one.status.effort, two.status.effort, rtol=0, atol=1e-9 * scale_of(two.status.effort))
+    np.testing.assert_allclose(
+        one.status.prescribed_effort,
+        two.status.prescribed_effort,
+        rtol=0,
+        atol=1e-9 * scale_of(two.status.prescribed_effort),
+    )
 
 
 def scale_of(array):
@@ -191,17 +199,19 @@ def scale_of(array):
 
 
 def test_a_rollout_is_its_steps(case):
-    n, s = case.step.system.size, case.step.sizes
+    n, s = case.step.system.n_coordinates, case.step.sizes
     rollout = case.rollout()
     for k, u in enumerate(case.torque):
         x = rollout.state[k]
         pair = (case.path[k], case.path[k + 1]) if s["nc"] else None
         q1, p1, lam, status = case.step(x[:n], x[n : 2 * n], u, case.theta, pair, x[2 * n :])
-        assert status.ok, status.message
+        assert status.is_converged, status.message
         after = np.concatenate([q1, p1, status.internal])
         np.testing.assert_allclose(after, rollout.state[k + 1], rtol=0, atol=1e-9 * scale_of(after))
         np.testing.assert_allclose(lam, rollout.multipliers[k], rtol=0, atol=1e-9)
-        np.testing.assert_allclose(status.effort, rollout.effort[k], rtol=0, atol=1e-7 * scale_of(status.effort))
+        np.testing.assert_allclose(
+            status.prescribed_effort, rollout.effort[k], rtol=0, atol=1e-7 * scale_of(status.prescribed_effort)
+        )
 
 
 def test_linearized_steps_are_the_equations_along_any_trajectory(case):
@@ -209,7 +219,7 @@ def test_linearized_steps_are_the_equations_along_any_trajectory(case):
     n, h = s["n"], step.time_step
     rollout = case.rollout()
     exact = step.kernel.linearize(case.theta, rollout.state, rollout.multipliers, rollout.torque, (), False)
-    assert np.max(np.abs(exact.rows[:, step.model.structure.unknown_rows])) < 1e-9 * scale_of(rollout.multipliers)
+    assert np.max(np.abs(exact.rows[:, step.model.index_tables.unknown_rows])) < 1e-9 * scale_of(rollout.multipliers)
     np.testing.assert_allclose(exact.p1, rollout.state[1:, n : 2 * n], rtol=0, atol=1e-9)
     fixed = list(step.system.prescribed_indices)
     np.testing.assert_allclose(-exact.rows[:, fixed] / h, rollout.effort, rtol=0, atol=1e-7 * scale_of(rollout.effort))
@@ -252,7 +262,7 @@ def test_single_steps_are_differentiated_alike_by_both_kernels(case):
     """By state, torque and loads that act on every step alike."""
     sizes, slow = case.step.sizes, compile_step_like(case.step, case.step.system, use_compiler=False)
     rollout = case.rollout()
-    assert rollout.status.ok, rollout.status.message
+    assert rollout.status.is_converged, rollout.status.message
     rng = np.random.default_rng(3)
     rows = rng.normal(size=(sizes["n"] + sizes["nz"] + sizes["m"], 2))
     momentum = rng.normal(size=(sizes["n"], 2))

@@ -47,14 +47,14 @@ def test_gains_far_from_the_end_solve_the_riccati_equation(step, robot):
     """About a posture that is held still, the weights being those that the filter promises, in angles and rates."""
     posture = np.array([0.3, -0.2])
     q, v = ca.SX.sym("q", 2), ca.SX.sym("v", 2)
-    tree = robot.numeric()
+    tree = robot.with_numeric_values()
     rigid = rigid_body_derivatives(forward_kinematics(tree, q), v, ca.SX(ca.DM([0, 0, -9.81])))
     function = ca.Function("arm", [q, v], [mass_matrix(rigid, tree), rigid.lagrangian_by_q])
     inertia, by_q = (np.array(ca.densify(x)) for x in function(posture, [0, 0]))
     torque = np.tile(-by_q.ravel(), (STEPS, 1))
     theta = step.system.parameters.vector()
     loop = lqr_feedback(step, np.tile(posture, (STEPS + 1, 1)), torque, theta, ANGLE, RATE, TORQUE)
-    n = step.system.size
+    n = step.system.n_coordinates
     np.testing.assert_array_equal(loop.state_indices, [0, 1, n, n + 1])
 
     arm = compile_step(System.build(robot, driven=robot.joint_names, damping=0.1), TIME_STEP, use_compiler=False)

@@ -20,7 +20,7 @@ def inputs_of(made):
 
 def test_a_rollout_makes_all_rows_zero_and_needs_its_effort(case, made):
     rollout = case.rollout()
-    function = ca.Function("stage", inputs_of(made), [made.rows, made.effort])
+    function = ca.Function("stage", inputs_of(made), [made.residual, made.prescribed_effort])
     for k, u in enumerate(rollout.torque):
         x0, x1 = rollout.state[k : k + 2]
         rows, effort = function(x0, x1, rollout.multipliers[k], u, case.theta)
@@ -39,7 +39,7 @@ def test_slopes_in_closed_form_are_those_that_casadi_finds(case, made):
     point = [rng.normal(scale=0.2, size=symbol.numel()) for symbol in inputs_of(made)]
     point[1] = point[0] + 0.01 * point[1]
     point[-1] = case.theta * (1 + 0.1 * rng.random(len(case.theta)))
-    for value, slopes in ((made.rows, made.slopes), (made.effort, made.effort_jacobians)):
+    for value, slopes in ((made.residual, made.residual_jacobians), (made.prescribed_effort, made.effort_jacobians)):
         for name, found in slopes.items():
             symbol = getattr(made, name)
             function = ca.Function(
@@ -50,17 +50,19 @@ def test_slopes_in_closed_form_are_those_that_casadi_finds(case, made):
             np.testing.assert_allclose(
                 actual, expected, rtol=0, atol=1e-11 * max(1.0, np.max(np.abs(expected), initial=0.0))
             )
-    assert not np.any(np.array(ca.DM(made.slopes["x1"].sparsity(), 1))[: len(made.names) - n, n : 2 * n])
+    assert not np.any(
+        np.array(ca.DM(made.residual_jacobians["x1"].sparsity(), 1))[: len(made.residual_names) - n, n : 2 * n]
+    )
 
 
 def test_every_row_and_every_slope_has_its_name(case, made):
     system, s = case.step.system, case.step.sizes
-    kinds = [name.partition("[")[0] for name in made.names]
+    kinds = [name.partition("[")[0] for name in made.residual_names]
     counts = {"del": s["n"] - s["nc"], "internal": s["nz"], "constraint": s["m"], "p1": s["n"]}
     assert {kind: kinds.count(kind) for kind in counts} == counts
     assert kinds == [kind for kind, count in counts.items() for _ in range(count)]
-    assert made.names[0] == f"del[{system.mechanism.joint_names[system.free_indices[0]]}]"
-    assert made.rows.numel() == len(made.names)
-    by_rows, by_effort = made.by_theta(system.parameters.names[:2])
-    assert by_rows.shape == (len(made.names), 2)
+    assert made.residual_names[0] == f"del[{system.mechanism.joint_names[system.free_indices[0]]}]"
+    assert made.residual.numel() == len(made.residual_names)
+    by_rows, by_effort = made.parameter_jacobians(system.parameters.names[:2])
+    assert by_rows.shape == (len(made.residual_names), 2)
     assert by_effort.shape == (s["nc"], 2)

@@ -38,7 +38,7 @@ def hung_cable(span: float, **options):
 
 
 def height(system, frame, q) -> float:
-    kinematics = forward_kinematics(system.mechanism.numeric(), ca.SX(ca.DM(q)))
+    kinematics = forward_kinematics(system.mechanism.with_numeric_values(), ca.SX(ca.DM(q)))
     return float(kinematics.frame_position(frame)[2])
 
 
@@ -47,8 +47,8 @@ def test_of_several_equilibria_the_one_of_least_energy():
     statics, posture = hung_cable(0.95)
     system, theta = statics.step.system, statics.step.system.parameters.vector()
     rest = statics.solve(posture, theta)
-    assert rest.converged, rest.message
-    assert height(system, "C_1_tip", rest.state[: system.size]) < -0.05
+    assert rest.is_converged, rest.message
+    assert height(system, "C_1_tip", rest.state[: system.n_coordinates]) < -0.05
 
 
 def test_a_cable_held_far_from_its_undeformed_shape_hangs_at_rest():
@@ -56,10 +56,10 @@ def test_a_cable_held_far_from_its_undeformed_shape_hangs_at_rest():
     system, theta = statics.step.system, statics.step.system.parameters.vector()
     # on the other side of where it begins, where Newton's iteration from the undeformed shape leads nowhere
     rest = statics.solve([-0.3, 0.2, 0.2, 0.0, 0.0, 0.0], theta)
-    assert rest.converged, rest.message
+    assert rest.is_converged, rest.message
     held = simulate(statics.step, theta, rest.state, 50).state[-1]
     np.testing.assert_allclose(held, rest.state, atol=1e-8)
-    assert height(system, "w_C", rest.state[: system.size]) == pytest.approx(0.2)
+    assert height(system, "w_C", rest.state[: system.n_coordinates]) == pytest.approx(0.2)
 
 
 @pytest.fixture(scope="module")
@@ -75,8 +75,8 @@ def arm(urdf_folder):
 def test_a_system_at_rest_stays_there(arm):
     theta = arm.step.system.parameters.vector()
     rest = arm.solve([0.4], theta)
-    assert rest.converged, rest.message
-    stayed = simulate(arm.step, theta, rest.state, 20, torque=np.tile(rest.torque, (20, 1)))
+    assert rest.is_converged, rest.message
+    stayed = simulate(arm.step, theta, rest.state, 20, torque=np.tile(rest.holding_torque, (20, 1)))
     np.testing.assert_allclose(stayed.state, np.tile(rest.state, (21, 1)), rtol=0, atol=1e-9)
 
 
@@ -85,7 +85,7 @@ def test_derivatives_of_an_equilibrium(arm):
     parameters = arm.step.system.parameters
     theta, posture, torque = parameters.vector(), np.array([0.4]), np.array([0.3])
     rest = arm.solve(posture, theta, torque, names=names)
-    assert rest.converged, rest.message
+    assert rest.is_converged, rest.message
 
     def slope(change, size=1e-5):
         plus, minus = (arm.solve(*change(sign * size), guess=rest.state[:2]).state for sign in (1, -1))
@@ -94,18 +94,20 @@ def test_derivatives_of_an_equilibrium(arm):
     for column, name in enumerate(names):
         unit = np.eye(len(theta))[parameters.index(name)]
         expected = slope(lambda e, unit=unit: (posture, theta + e * unit, torque))
-        np.testing.assert_allclose(rest.by_theta[:, column], expected, rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(rest.state_by_theta[:, column], expected, rtol=1e-6, atol=1e-8)
         assert np.max(np.abs(expected)) > 1e-3
-    np.testing.assert_allclose(rest.by_posture[:, 0], slope(lambda e: (posture + e, theta, torque)), atol=1e-8)
-    np.testing.assert_allclose(rest.by_torque[:, 0], slope(lambda e: (posture, theta, torque + e)), atol=1e-8)
+    np.testing.assert_allclose(
+        rest.state_by_known_coordinates[:, 0], slope(lambda e: (posture + e, theta, torque)), atol=1e-8
+    )
+    np.testing.assert_allclose(rest.state_by_torque[:, 0], slope(lambda e: (posture, theta, torque + e)), atol=1e-8)
 
 
 def derivatives(step, rest, given, held, stiffness, theta):
     """Of the state by theta and by the known coordinates, by CasADi from the equations of rest as a whole."""
-    e, n = equilibrium_equations(step.equations), step.system.size
+    e, n = equilibrium_equations(step.equations), step.system.n_coordinates
     others = ca.vertcat(e.inputs[4], e.inputs[1])
     outputs = [ca.densify(ca.jacobian(f, x)) for f in (e.residual, e.state) for x in (e.inputs[0], others)]
-    w = np.concatenate([rest.state[list(step.system.free_indices)], rest.state[2 * n :], rest.constraint_force])
+    w = np.concatenate([rest.state[list(step.system.free_indices)], rest.state[2 * n :], rest.constraint_reactions])
     at = (w, given, held, stiffness, theta, step.time_step)
     by_w, by_others, state_by_w, state_by_others = (np.array(x) for x in ca.Function("by", e.inputs, outputs)(*at))
     return state_by_others - state_by_w @ np.linalg.lstsq(by_w, by_others, rcond=None)[0]
@@ -117,12 +119,12 @@ def test_compiled_and_interpreted_equilibria_are_one(case):
     fixed = list(system.prescribed_indices)
     given = np.concatenate([case.start[list(system.driven_indices)], case.path[0]])
     torque = 0.3 * case.torque[0] if len(system.driven) else None
-    guess = case.start[: system.size].copy()
+    guess = case.start[: system.n_coordinates].copy()
     guess[fixed] = case.path[0]
     steps = case.step, compile_step_like(case.step, system, use_compiler=False)
     fast, slow = (EquilibriumSolver(step).solve(given, case.theta, torque, guess, names) for step in steps)
-    assert fast.is_converged == slow.is_converged == bool(system.elastic), fast.message
-    for name in ("state", "torque", "constraint_force"):
+    assert fast.is_converged == slow.is_converged == bool(system.elastic_joints), fast.message
+    for name in ("state", "holding_torque", "constraint_reactions"):
         np.testing.assert_allclose(getattr(fast, name), getattr(slow, name), rtol=1e-7, atol=1e-8, err_msg=name)
     if not fast.is_converged:
         return
@@ -142,24 +144,24 @@ def test_a_measured_torque_that_fits_takes_the_load_off_the_holding_spring(arm):
     theta = arm.step.system.parameters.vector()
     elbow = arm.step.system.mechanism.joint_index("elbow")
     rest = arm.solve([0.4], theta)
-    given = rest.torque[0] / _HOLD_STIFFNESS
+    given = rest.holding_torque[0] / _HOLD_STIFFNESS
     assert abs(given) > 1e-6
     assert rest.state[elbow] == pytest.approx(0.4 - given, abs=1e-12)
-    again = arm.solve([0.4], theta, torque=rest.torque)
-    assert again.converged, again.message
+    again = arm.solve([0.4], theta, torque=rest.holding_torque)
+    assert again.is_converged, again.message
     assert abs(again.state[elbow] - 0.4) < 0.05 * abs(given)
 
 
 def test_a_torque_that_does_not_fit_the_posture_is_said(arm):
     rest = arm.solve([0.4], arm.step.system.parameters.vector(), torque=[100.0])
-    assert not rest.converged
+    assert not rest.is_converged
     assert "elbow would have to move by" in rest.message
 
 
 def test_a_grasp_out_of_reach_is_said():
     statics, posture = hung_cable(1.5)
     rest = statics.solve(posture, statics.step.system.parameters.vector())
-    assert not rest.converged
+    assert not rest.is_converged
     assert "grasp 'end' is out of reach by" in rest.message
 
 

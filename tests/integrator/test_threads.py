@@ -68,7 +68,7 @@ def test_rollouts_adjoints_and_linearizations(parts, urdf_folder, monkeypatch, t
     def everything(step):
         def run(theta):
             rollout = step.kernel.rollout(theta, case.start, case.torque, case.path, case.feedback, directions)
-            assert rollout.status.ok, rollout.status.message
+            assert rollout.status.is_converged, rollout.status.message
             back = step.kernel.adjoint_gradient(
                 theta, rollout, case.feedback, names, np.ones_like(rollout.state), None, None
             )
@@ -77,7 +77,7 @@ def test_rollouts_adjoints_and_linearizations(parts, urdf_folder, monkeypatch, t
                 rollout.state,
                 rollout.multipliers,
                 rollout.effort,
-                rollout.by_state,
+                rollout.state_sensitivity,
                 rollout.multipliers_sensitivity,
             )
             return *found, *vars(back).values(), *vars(along).values()
@@ -86,9 +86,9 @@ def test_rollouts_adjoints_and_linearizations(parts, urdf_folder, monkeypatch, t
 
     # neither step has its derivatives by these parameters yet
     shared, plain = (compile_step(system, case.step.time_step, use_compiler=use_compiler) for _ in range(2))
-    built = slowed(monkeypatch, codegen, "theta_function")
+    built = slowed(monkeypatch, codegen, "parameter_jacobian_function")
     together = at_once(everything(shared), thetas)
-    assert built == (["theta_function"] if use_compiler else [])
+    assert built == (["parameter_jacobian_function"] if use_compiler else [])
     assert_same(together, [everything(plain)(theta) for theta in thetas])
 
 
@@ -112,8 +112,8 @@ def test_equilibria(parts, monkeypatch):
     def rest(statics):
         def run(theta):
             found = statics.solve([], theta, names=("C.bend", "C.mass"))
-            assert found.converged, found.message
-            return found.state, found.by_theta
+            assert found.is_converged, found.message
+            return found.state, found.state_by_theta
 
         return run
 

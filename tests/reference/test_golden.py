@@ -23,7 +23,7 @@ def case(request, golden, paper_systems, theta_golden, single_step, dual_step):
 
 def compare_step(trep, step, theta, k):
     q1, p1, lam, status = step(trep.q[k], trep.p[k], trep.u[k], theta)
-    assert status.ok, status.message
+    assert status.is_converged, status.message
     np.testing.assert_allclose(q1, trep.q[k + 1], rtol=0, atol=1e-9)
     np.testing.assert_allclose(p1, trep.p[k + 1], rtol=0, atol=1e-9)
     # trep was given pi as the URDF rounds it (to 5e-12), which shows in small multipliers: relative to the largest one
@@ -34,14 +34,14 @@ def compare_derivatives(trep, step, theta, k):
     A, B_u, B_theta = step.jacobians(trep.q[k], trep.p[k], trep.u[k], theta, names=())
     for actual, expected in ((A, getattr(trep, f"A_{k}")), (B_u, getattr(trep, f"Bu_{k}"))):
         np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-8 * np.max(np.abs(expected)))
-    assert B_theta.shape == (2 * step.system.size, 0)
+    assert B_theta.shape == (2 * step.system.n_coordinates, 0)
 
 
 def test_sizes(case):
     trep, system, step, _ = case
     assert step.is_compiled == (compiler._compiler_path() is not None)
     assert step.time_step == float(trep.dt)
-    assert (system.size, system.n_constraints) == (trep.q.shape[1], trep.lam.shape[1])
+    assert (system.n_coordinates, system.n_constraints) == (trep.q.shape[1], trep.lam.shape[1])
 
 
 def test_every_step(case):
@@ -59,7 +59,7 @@ def test_first_derivatives(case, k):
 def test_start_of_the_rollout(case, roll):
     trep, _, step, theta = case
     rollout = roll(step, theta, trep.q[0], trep.p[0], 50, torque=trep.u[:50])
-    assert rollout.status.ok, rollout.status.message
+    assert rollout.status.is_converged, rollout.status.message
     np.testing.assert_allclose(rollout.state[:, : trep.q.shape[1]], trep.q[:51], rtol=0, atol=1e-8)
 
 
@@ -75,7 +75,7 @@ def test_interpreter(name, golden, paper_systems, theta_golden):
 
 def test_measured_points(case):
     trep, system, _, theta = case
-    q = ca.SX.sym("q", system.size)
+    q = ca.SX.sym("q", system.n_coordinates)
     kinematics = forward_kinematics(system.mechanism, q)
     points = ca.horzcat(*(kinematics.frame_position(name) for name in ("w_T1", "w_T2", "w_T3")))
     function = ca.Function("points", [q, system.parameters.symbols], [points])
@@ -90,8 +90,8 @@ def number(mechanism_expression) -> np.ndarray:
 def test_model_numbers(case):
     trep, system, _, theta = case
     values = dict(zip(system.parameters.names, theta, strict=True))
-    mechanism = system.mechanism.numeric({name: values[name] for name in system.mechanism.parameters.names})
-    springs = {spring.joint: spring.stiffness for spring in system.elastic}
+    mechanism = system.mechanism.with_numeric_values({name: values[name] for name in system.mechanism.parameters.names})
+    springs = {spring.joint: spring.stiffness for spring in system.elastic_joints}
     assert len(mechanism.joints) == len(trep.model["nodes"])
     for joint, node in zip(mechanism.joints, trep.model["nodes"], strict=True):
         assert joint.parent == node["parent"]
@@ -113,7 +113,7 @@ def test_model_numbers(case):
 
 def test_model_tips_and_grasps(case):
     trep, system, _, _ = case
-    mechanism = system.mechanism.numeric()
+    mechanism = system.mechanism.with_numeric_values()
     for name, tip in trep.model["tips"].items():
         frame = mechanism.frame(TIPS[name])
         assert frame.joint == tip["node"]

@@ -49,7 +49,7 @@ def test_recording_has_what_the_sensors_saw(runs: Runs) -> None:
     assert np.diff(camera.t).max() > 1.0
     assert 0.2 < np.diff(camera.t).min() < 0.45
     for column, point in enumerate(camera.names):
-        truth = run.point_frames[:, system.point_frames.index(point)]
+        truth = run.point_positions[:, system.point_frames.index(point)]
         path = np.column_stack([np.interp(camera.t, run.t, truth[:, axis]) for axis in range(3)])
         assert np.nanmax(np.abs(camera.position[:, column] - path)) < 5 * 5e-3
     assert camera.pose is not None
@@ -168,7 +168,7 @@ def test_recordings_are_reproducible(kind: str, clean: Path) -> None:
     made = recipe()
     torques, system = getattr(made, kind), SYSTEMS[2]
     posture = grasping_joint_angles(system, made.TRUTH, offsets=made.OFFSETS[2])
-    excitation = MultisineOptions(gripper_travel=torques.travel[2], shake_torque_rms=torques.shake_torque_rms)
+    excitation = MultisineOptions(gripper_travel=torques.travel[2], shake_torque_rms=torques.shake)
     motion = random_multisine(
         system,
         made.TRUTH,
@@ -197,7 +197,7 @@ def test_rough_recordings_are_as_rough_as_a_real_arm_and_within_its_limits(arms:
     made, system = recipe(), SYSTEMS[arms]
     rough = made.ROUGH
     posture = grasping_joint_angles(system, made.TRUTH, offsets=made.OFFSETS[arms])
-    excitation = MultisineOptions(gripper_travel=rough.travel[arms], shake_torque_rms=rough.shake_torque_rms)
+    excitation = MultisineOptions(gripper_travel=rough.travel[arms], shake_torque_rms=rough.shake)
     motion = random_multisine(
         system, made.TRUTH, seed=rough.motion_seeds[arms, purpose], initial_joint_angles=posture, excitation=excitation
     )

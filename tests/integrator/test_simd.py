@@ -21,7 +21,15 @@ pytestmark = pytest.mark.skipif(compiler._compiler_path() is None, reason="this 
 
 # Newton stops at 1e-14 in these cases; the rest is rounding of sums in another order
 TOLERANCE = 1e-9
-RESULTS = ("state", "multipliers", "effort", "torque", "by_state", "by_multipliers", "by_effort")
+RESULTS = (
+    "state",
+    "multipliers",
+    "effort",
+    "torque",
+    "state_sensitivity",
+    "multipliers_sensitivity",
+    "effort_sensitivity",
+)
 
 
 @pytest.fixture(autouse=True)
@@ -58,7 +66,9 @@ def members_of(case, count=8):
         directions = SensitivityDirections(chosen, 0.1 * rng.normal(size=(sizes["nx"], width)), *given)
         theta = case.theta * np.exp(0.02 * rng.normal(size=len(case.theta)))
         feedback = case.feedback
-        feedback = TrackingFeedback(feedback.index, feedback.gain[:steps] * (1 + 0.02 * i), feedback.reference[:steps])
+        feedback = TrackingFeedback(
+            feedback.state_indices, feedback.gain[:steps] * (1 + 0.02 * i), feedback.reference[:steps]
+        )
         torque = case.torque[:steps] * (1 + 0.02 * i)
         made.append(RolloutInputs(theta, case.start, torque, case.path[: steps + 1], feedback, directions))
     return made
@@ -66,11 +76,11 @@ def members_of(case, count=8):
 
 def alone(case, member):
     m = member
-    return case.step.kernel.rollout(m.theta, m.start, m.torque, m.path, m.feedback, m.wanted)
+    return case.step.kernel.rollout(m.theta, m.initial_state, m.torque, m.prescribed_path, m.feedback, m.directions)
 
 
 def assert_same(one, other, tolerance=0.0):
-    assert (one.status.code, one.status.step) == (other.status.code, other.status.step)
+    assert (one.status.code, one.status.completed_steps) == (other.status.code, other.status.completed_steps)
     for name in RESULTS:
         first, second = getattr(one, name), getattr(other, name)
         if second is None or not second.size:
@@ -85,23 +95,27 @@ def test_a_batch_is_its_members_one_by_one(parts, urdf_folder, monkeypatch, name
     case = parts.builders[name](urdf_folder)
     members = members_of(case)
     single = [alone(case, member) for member in members]
-    assert all(rollout.status.ok for rollout in single)
+    assert all(rollout.status.is_converged for rollout in single)
     calls = watched(monkeypatch, case.step.kernel)
-    for some in (members, [replace(member, wanted=None) for member in members]):
+    for some in (members, [replace(member, directions=None) for member in members]):
         together = case.step.kernel.rollout_batch(some)
         for one, member, other in zip(together, some, single, strict=True):
-            expected = other if member.wanted is not None else alone(case, member)
+            expected = other if member.directions is not None else alone(case, member)
             assert_same(one, expected, TOLERANCE)
             # at a tolerance of 1e-14 rounding decides about the last iteration
-            assert abs(one.status.iterations - expected.status.iterations) <= 3
+            assert abs(one.status.newton_iterations - expected.status.newton_iterations) <= 3
     lanes = case.step.kernel._batched(None)[1]
     assert calls[: 8 // lanes] == [lanes] * (8 // lanes)
 
 
 def test_companions_do_not_matter(parts, urdf_folder):
     case = parts.builders["closed_loop"](urdf_folder)
-    members = [replace(member, wanted=None) for member in members_of(case)]
-    others = [members[0], *(replace(m, theta=m.theta * 1.01, start=m.start + 1e-3) for m in members[1:4]), members[7]]
+    members = [replace(member, directions=None) for member in members_of(case)]
+    others = [
+        members[0],
+        *(replace(m, theta=m.theta * 1.01, initial_state=m.initial_state + 1e-3) for m in members[1:4]),
+        members[7],
+    ]
     first, second = case.step.kernel.rollout_batch(members), case.step.kernel.rollout_batch(others)
     if case.step.kernel._batched(None)[1] == 8:
         assert_same(first[0], second[0])
@@ -110,7 +124,7 @@ def test_companions_do_not_matter(parts, urdf_folder):
 
 def test_a_member_that_fails_fails_as_alone_and_leaves_the_others(parts, urdf_folder, monkeypatch):
     case = parts.builders["closed_loop"](urdf_folder)
-    good = [replace(member, wanted=None) for member in members_of(case)]
+    good = [replace(member, directions=None) for member in members_of(case)]
     expected = case.step.kernel.rollout_batch(good)
     wild = good[2].torque.copy()
     wild[4] = np.inf
@@ -120,9 +134,9 @@ def test_a_member_that_fails_fails_as_alone_and_leaves_the_others(parts, urdf_fo
     found = case.step.kernel.rollout_batch(members)
     assert calls.count(1) == 2  # the two that failed were asked again
     for i in (2, 5):
-        assert not found[i].status.ok
+        assert not found[i].status.is_converged
         assert_same(found[i], alone(case, members[i]))
-    assert found[2].status.step == 4
+    assert found[2].status.completed_steps == 4
     for i in set(range(8)) - {2, 5}:
         assert_same(found[i], expected[i])
 
@@ -141,7 +155,7 @@ def test_without_vectors_members_are_done_one_by_one(parts, urdf_folder, monkeyp
 def test_few_members_do_not_ask_for_a_batch(parts, urdf_folder, monkeypatch):
     case = parts.builders["closed_loop"](urdf_folder)
     monkeypatch.setattr(compiled, "_batched_library", lambda model: pytest.fail("compiled for nothing"))
-    plain = [replace(member, wanted=None) for member in members_of(case)]
+    plain = [replace(member, directions=None) for member in members_of(case)]
     assert len(case.step.kernel.rollout_batch(plain[:2])) == 2
     monkeypatch.setattr(compiled, "MIN_STEPS_TO_COMPILE_BATCH", 10**9)
     assert len(case.step.kernel.rollout_batch(plain)) == 8
@@ -250,7 +264,7 @@ def test_a_step_of_long_functions_is_the_same(parts, urdf_folder, monkeypatch, n
     monkeypatch.setattr(simd_codegen, "_LONG_INSTRUCTION_COUNT", 100)
     monkeypatch.setattr(simd_codegen, "_PART_INSTRUCTION_COUNT", 30)
     model = case.step.model
-    text = codegen.kernel_source(model.functions, model.structure)
+    text = codegen.kernel_source(model.functions, model.index_tables)
     assert "linear_3(" in text
     assert "casadi_f0" in text, "short ones are as CasADi writes them"
     kernel = compiled.CompiledKernel(model, compiler.compile_library(text))
