@@ -290,6 +290,7 @@ def test_a_failure_leaves_the_old_file_alone(file: Path, monkeypatch: pytest.Mon
 
 # joints and points of the recordings in each folder
 REAL_SIZES = {"baxter": (7, 0), "deft": (0, 20), "double_pendulum": (2, 0), "panda_beam": (7, 0), "soft_beam": (0, 6)}
+REAL_SIZES["servo_pendulum"] = (1, 0)
 
 
 @pytest.mark.skipif(
@@ -314,7 +315,7 @@ def test_real_recordings_read(path: Path, tmp_path: Path) -> None:
     recording = read_recording(path)
     assert (len(recording.joint_names), len(recording.point_names)) == REAL_SIZES[path.parent.name]
     assert (recording.marker_reference_pose is not None) == (path.parent.name == "soft_beam")
-    assert 4.0 < recording.duration < 60.0
+    assert 1.9 < recording.duration < 60.0
     assert recording.source
     write_recording(recording, tmp_path / "copy.h5")
     assert_same(read_recording(tmp_path / "copy.h5"), recording)

@@ -223,7 +223,7 @@ class Recording(ReprMixin):
         object.__setattr__(self, "truth", dict(self.true_parameters))
         object.__setattr__(self, "notes", tuple(self.notes))
         if self.marker_reference_pose is not None:
-            object.__setattr__(self, "straight", read_only_array(self.marker_reference_pose, "straight"))
+            object.__setattr__(self, "marker_reference_pose", read_only_array(self.marker_reference_pose, "straight"))
 
     def _summary(self) -> ReprSummary:
         joints, points = (
