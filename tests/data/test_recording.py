@@ -212,7 +212,7 @@ INVALID: dict[str, tuple[Callable[[], Recording], str]] = {
         "belong to 'points_camera', but a file would list 'points_arm' first",
     ),
     "truth not finite": (lambda: dataclasses.replace(BASE, true_parameters={"T1.bend": np.inf}), "'T1.bend' is inf"),
-    "truth not a number": (lambda: dataclasses.replace(BASE, true_parameters={"T1.bend": "3"}), "'T1.bend' is '3'"),  # type: ignore[dict-item]
+    "truth not a number": (lambda: dataclasses.replace(BASE, true_parameters={"T1.bend": "3"}), "is '3'"),  # type: ignore[dict-item]
 }
 
 

@@ -101,12 +101,12 @@ def tracked(system, run, recording, shape):
     """tracked(options, **camera and timing): frames, their track, the errors of all points in the good ones [m]."""
 
     def make(options=None, outliers=0.0, seed=0, frames=None, stages=(), **timing):
-        when = FrameTiming(**{"rate": 4.0, "latency": LATENCY, **timing})
+        when = FrameTiming(**{"mean_rate": 4.0, "latency": LATENCY, **timing})
         scene = CameraScene(system, "package:baxter")
         camera = VirtualCamera(POSE, replace(COARSE, outlier_probability=outliers), when, seed=seed)
         made = render_virtual_frames(scene, run.t, run.q, camera)
         seen = made.sequence if frames is None else made.sequence.select_frames(frames)
-        chosen = replace(options or TrackOptions(), tracked_points=system.points)
+        chosen = replace(options or TrackOptions(), tracked_points=system.point_frames)
         found = track_object(scene, recording, seen, chosen, stages=stages)
         were = np.array([shape.place(made.true_configuration_at(t)) for t in found.t])
         errors = np.linalg.norm(found.position - were, axis=2)

@@ -88,10 +88,10 @@ def test_every_remedy_takes_the_table_away(alone):
     sequence, truth = filmed(SmoothY(), FRAMES, lambda k: [box(*TABLE)])
     empty = emptied(lambda k: [box(*TABLE)])
     mesh = ExtraMesh(box=TABLE[1], xyz=TABLE[0])
-    for how in ({"background": "frames"}, {"extra": [mesh]}, {"empty": empty}):
+    for how in ({"background_estimation": "frames"}, {"extra": [mesh]}, {"empty": empty}):
         found, error = measured(alone, sequence, truth, **how)
         assert np.nanmax(np.linalg.norm(error, axis=2)) < 0.02
-        assert all(np.linalg.norm(thing.size) < 0.6 for thing in found.things)
+        assert all(np.linalg.norm(thing.size) < 0.6 for thing in found.foreign_objects)
 
 
 def test_an_empty_scene_is_a_background():
@@ -129,7 +129,7 @@ def test_what_moves_with_a_link_is_told_from_what_moves_by_itself():
         (lambda t: [0.5, 0.5, 0.5], False, "", "background"),
         (lambda t: [t + 0.1, 0.0, 0.2], True, "hand", "extra_meshes"),
         (lambda t: [0.5, 0.3 * t, 0.5], True, "", "take it out of view"),
-        (lambda t: [3.0, 0.3 * t, 0.5], True, "", "lower and upper"),
+        (lambda t: [3.0, 0.3 * t, 0.5], True, "", "box_lower and box_upper"),
     ):
         [thing] = group_foreign_objects(looked(place), 6, 0.006, box_, links.__getitem__, False)
         assert (thing.moving, thing.link, thing.frames) == (moving, link, 6)
@@ -139,7 +139,7 @@ def test_what_moves_with_a_link_is_told_from_what_moves_by_itself():
     still = looked(lambda t: [0.5, 0.5, 0.5])
     for left_out in (False, True):  # what is done already is no advice
         [thing] = group_foreign_objects(still, 6, 0.006, box_, links.__getitem__, False, left_out)
-        assert ("background: frames" in thing.text) != left_out
+        assert ("background_estimation: frames" in thing.text) != left_out
         assert "film the scene without object and robot" in thing.text
 
 

@@ -21,13 +21,13 @@ model:
     joints: [left_s0, left_s1, left_e0, left_e1, left_w0, left_w1, left_w2]
   object: {{kind: foam_y}}
   grasp:
-    left: {{holder: left_gripper, held: w_T2}}
+    left: {{holder_frame: left_gripper, held_frame: w_T2}}
 recordings:
   estimate: [{data}/joints.h5]
 track:
-  frames: {data}/frames
-  pictures: 1
-  options: {{calibration: {{fix_pose: true}}, clock: {{search: 0}}}}
+  frames_path: {data}/frames
+  n_drawn_frames: 1
+  options: {{calibration: {{fix_pose: true}}, clock: {{search_half_width: 0}}}}
 """
 
 
@@ -65,7 +65,7 @@ def test_track_makes_a_recording_that_solve_reads(whole, small, system):
     made = read_recording(whole.folder / "recording.h5")
     group = next(group for group in made.points if group.name == "points_camera")
     assert group.names == ("w_T1", "w_T3")
-    truth = small.truth[:, [system.points.index(name) for name in group.names]]
+    truth = small.truth[:, [system.point_frames.index(name) for name in group.names]]
     assert np.linalg.norm(group.position - truth, axis=2).max() < 0.008
     assert made.joints is not None
     result = json.loads((whole.folder / "result.json").read_text())
@@ -85,8 +85,8 @@ def test_track_makes_a_recording_that_solve_reads(whole, small, system):
         (["recordings.estimate=[]"], "no recording with the joint angles"),
         (["track.options.clock.initial_offset=50"], "their clocks are not the same"),
         (["track.camera_pose=[[1,0,0,0],[0,1,0,0],[0,0,2,0],[0,0,0,1]]"], "not a rigid transform"),
-        (["track.options.d_mix=0.02"], "did you mean 'd_max'"),
-        (["track.options.filters.robot_padding=-1"], "padding = -1"),
+        (["track.options.max_distance_in_radi=0.02"], "did you mean 'max_distance_in_radii'"),
+        (["track.options.filters.robot_padding=-1"], "robot_padding = -1"),
     ],
 )
 def test_wrong_input_is_said_and_leaves_nothing(cli, config, tmp_path, settings, message):
@@ -163,7 +163,7 @@ def test_several_workers_find_the_same(cli, config, whole, tmp_path):
 def test_the_examples_run(cli, repository, tmp_path, name):
     pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo")
     file = repository / "configs" / f"{name}.yaml"
-    short = ("duration=1.2", "rate=4.0", "dropped=0.0")
+    short = ("duration=1.2", "frame_rate=4.0", "dropped_fraction=0.0")
     arguments = [part for setting in short for part in ("--set", f"track.virtual_frames.{setting}")]
     quick = ("--quiet", "--set", "track.n_drawn_frames=0", "--set", "track.keep_frames=true")
     done = cli("track", file, "--out", tmp_path / "run", *arguments, *quick)

@@ -63,19 +63,19 @@ def test_a_wrong_length_is_said_and_its_point_is_not_written(measured, factor, v
     [message] = found.dimensions.messages
     assert "T3.length seems to be wrong" in message
     assert "the model says 737 mm" in message
-    assert "estimate: [length]" in message
+    assert "estimated_dimensions: [length]" in message
     # the interval holds the truth
-    i = found.sizes.names.index("T3.length")
-    assert abs(found.sizes.change[i] - np.log(factor)) < 2 * found.sizes.std[i]
-    assert np.isnan(error[:, found.names.index("w_T3")]).all()
+    i = found.dimensions.names.index("T3.length")
+    assert abs(found.dimensions.log_ratio[i] - np.log(factor)) < 2 * found.dimensions.log_ratio_std[i]
+    assert np.isnan(error[:, found.point_names.index("w_T3")]).all()
     assert np.nanmax(np.abs(error)) < 0.006
 
 
 def test_a_wrong_length_further_up_moves_everything_and_is_found(measured):
-    found, error = measured({"T1": 1.1 * Y_LENGTHS["T1"]}, frames=3, estimate=("length",))
+    found, error = measured({"T1": 1.1 * Y_LENGTHS["T1"]}, frames=3, estimated_dimensions=("length",))
     assert ratio(found, "T1.length") == pytest.approx(1.1, abs=0.02)
     assert np.nanmax(np.linalg.norm(error, axis=2)) < 0.012
-    assert "T1.length is estimated: " in found.sizes.messages[0]
+    assert "T1.length is estimated: " in found.dimensions.messages[0]
     with pytest.raises(DataError, match=r"no point is known|not one frame") as caught:
         measured({"T1": 1.1 * Y_LENGTHS["T1"]}, frames=3)
     assert caught.value.what.startswith("the object seems to be other than the model says (T1.length")
@@ -94,8 +94,10 @@ def test_radii_wrong_by_a_third_are_said_and_enter_the_standard_deviation(measur
 
 
 def test_estimated_radii_are_used(measured):
-    found, error = measured(radii={name: 0.7 * radius for name, radius in Y_RADII.items()}, estimate=("radius",))
-    assert np.exp(found.sizes.change[3:]) == pytest.approx(0.7, abs=0.06)
+    found, error = measured(
+        radii={name: 0.7 * radius for name, radius in Y_RADII.items()}, estimated_dimensions=("radius",)
+    )
+    assert np.exp(found.dimensions.log_ratio[3:]) == pytest.approx(0.7, abs=0.06)
     assert np.nanmax(np.linalg.norm(error, axis=2)) < 0.012
 
 

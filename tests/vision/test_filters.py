@@ -59,7 +59,7 @@ def test_the_robot_goes_with_its_padding(system, run):
         assert not is_not_robot(WeightedCloud(surface, np.ones(len(surface))), robot, q, 0.01).any()
         away = surface + np.array([0.0, 0.0, 3.0])
         assert is_not_robot(WeightedCloud(away, np.ones(len(away))), robot, q, 0.01).all()
-    tip = run.point_frames[0][system.point_frames.index("w_T1")][None]
+    tip = run.point_positions[0][system.point_frames.index("w_T1")][None]
     assert is_not_robot(WeightedCloud(tip, np.ones(1)), robot, run.q[0], 0.03).all()
 
 

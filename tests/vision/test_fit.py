@@ -199,7 +199,7 @@ def test_what_cannot_be_fitted_is_said(alone, urdf_folder):
     sight = CloudObservation(nothing, np.empty(0), nothing, CAMERA)
     with pytest.raises(DataError, match="no point"):
         ShapeFitter(alone).fit_frame(sight, np.zeros(alone.n_coordinates))
-    with pytest.raises(ConfigError, match="noise = 0"):
+    with pytest.raises(ConfigError, match="surface_noise_std = 0"):
         ShapeFitOptions(surface_noise_std=0.0)
     with pytest.raises(ConfigError, match="no pass"):
         ShapeFitOptions(node_loss_scales=(), surface_loss_scales=())

@@ -36,7 +36,10 @@ model:
     kind: segments
     segments: {rope: {length: 1.0, mass: 0.1, radius: 0.006, links: 16}}
   points: ["rope:0%", w_rope]
-track: {frames_path: FRAMES, n_drawn_frames: 1, options: {root_placement: free, approximate_root_position: [-0.5, 0, 0], filters: {voxel_size: 0.004}}}
+track:
+  frames_path: FRAMES
+  n_drawn_frames: 1
+  options: {root_placement: free, approximate_root_position: [-0.5, 0, 0], filters: {voxel_size: 0.004}}
 """
 
 

@@ -37,14 +37,14 @@ def test_points_at_two_metres(clean, system):
 
 
 def test_a_third_of_the_frames_lost_and_a_fifth_of_the_points_wrong(tracked):
-    hard = tracked(outliers=0.2, dropped=1 / 3, seed=2, latency_std=0.003)
+    hard = tracked(outliers=0.2, dropped_fraction=1 / 3, seed=2, latency_std=0.003)
     assert np.isfinite(hard.errors).mean() > 0.9
     assert (np.nanmedian(hard.errors, axis=0) < 5 * MILLIMETRE).all()
     assert np.nanmax(hard.errors) < 40 * MILLIMETRE
 
 
 def test_errors_are_within_the_stated_standard_deviations(clean, system):
-    truth = np.array([clean.track._place(clean.made.course(t)) for t in clean.track.t])
+    truth = np.array([clean.track._place(clean.made.true_configuration_at(t)) for t in clean.track.t])
     relative = (clean.track.position - truth) / clean.track.std
     assert np.mean(relative**2) < 1.5
     assert np.abs(relative).max() < 4
@@ -53,16 +53,19 @@ def test_errors_are_within_the_stated_standard_deviations(clean, system):
 
 def test_the_seed_hardly_matters(system, recording, clean):
     """The same frame sequence, other random points in the walk: within the noise."""
-    chosen = clean.made.sequence.select([2, 6])
-    clouds = [chosen.load(i) for i in range(2)]
-    seen = replace(chosen, load=clouds.__getitem__)
-    known = {
-        "clock": CameraClockOptions(initial_offset=clean.latency, search_half_width=0.0),
-        "calibration": CameraCalibrationOptions(fix_pose=True),
-    }
+    chosen = clean.made.sequence.select_frames([2, 6])
+    clouds = [chosen.load_cloud(i) for i in range(2)]
+    seen = replace(chosen, load_cloud=clouds.__getitem__)
+    known = TrackOptions(
+        clock=CameraClockOptions(initial_offset=clean.latency, search_half_width=0.0),
+        calibration=CameraCalibrationOptions(fix_pose=True),
+        tracked_points=system.point_frames,
+    )
     scene = CameraScene(system, "package:baxter")
     first, other, again = (
-        track_object(scene, recording, seen, TrackOptions(seed=seed, tracked_points=system.points, **known)).position
+        track_object(
+            scene, recording, seen, TrackOptions(seed=seed, tracked_points=system.point_frames, **known)
+        ).position
         for seed in (1, 2, 1)
     )
     assert np.abs(first - other).max() < 2 * MILLIMETRE
@@ -70,41 +73,43 @@ def test_the_seed_hardly_matters(system, recording, clean):
 
 
 def test_frames_that_were_fitted_say_how_long_it_took(clean):
-    for frame in clean.track.frames:
-        assert (frame.seconds > 0) == (frame.fit is not None)
+    for frame in clean.track.frame_reports:
+        assert (frame.cpu_seconds > 0) == (frame.shape_fit is not None)
 
 
 # -- the clock --------------------------------------------------------------------------------------------------------
 
 
 def test_the_camera_and_its_clock_are_found(clean):
-    camera, made = clean.track.calibration, clean.made.sequence
-    assert camera.frames == len(made)
-    std = np.sqrt(np.diag(camera.covariance))
-    true = CameraState(made.pose, clock_offset=clean.latency, clock_reference_stamp=camera.state.clock_reference_stamp)
-    assert (np.abs(camera.state.minus(true)) < 4 * std).all()
+    camera, made = clean.track.camera_calibration, clean.made.sequence
+    assert camera.n_frames == len(made)
+    std = np.sqrt(np.diag(camera.state_covariance))
+    true = CameraState(
+        made.camera_pose, clock_offset=clean.latency, clock_reference_stamp=camera.camera_state.clock_reference_stamp
+    )
+    assert (np.abs(camera.camera_state.difference_from(true)) < 4 * std).all()
     assert std[CLOCK_OFFSET_INDEX] < 0.01
     assert "clock offset" in camera.message
-    assert camera.presence.there > 0.9
-    assert (clean.track.common <= clean.track.std).all()
-    assert clean.track.common.max() > 0
+    assert camera.arm_visibility.there > 0.9
+    assert (clean.track.shared_std <= clean.track.std).all()
+    assert clean.track.shared_std.max() > 0
 
 
 def test_late_stamps_are_dropped(tracked):
     chosen = range(2, 10)
-    made = tracked(late=0.25, seed=3, frames=chosen)
-    stamped = made.made.sequence.t - made.made.taken
+    made = tracked(late_fraction=0.25, seed=3, frames=chosen)
+    stamped = made.made.sequence.stamps - made.made.capture_times
     late = {i for i, k in enumerate(chosen) if stamped[k] - made.latency > 0.1}
-    dropped = {frame.index for frame in made.track.frames if not frame.good}
+    dropped = {frame.index for frame in made.track.frame_reports if not frame.is_good}
     assert len(late) == 2
     assert dropped == late
-    assert "late" in made.track.frames[min(late)].reason
+    assert "late" in made.track.frame_reports[min(late)].drop_reason
     assert np.nanmax(made.errors) < 15 * MILLIMETRE
 
 
 def test_a_displaced_camera_is_put_right_or_said(system, recording, clean):
-    sequence = clean.made.sequence.select([1, 4, 6, 9])
-    pose = sequence.pose.copy()
+    sequence = clean.made.sequence.select_frames([1, 4, 6, 9])
+    pose = sequence.camera_pose.copy()
     pose[:3, 3] += [0.03, -0.025, 0.02]
     pose[:3, :3] = Rotation.from_rotvec([0.02, -0.01, 0.03]).as_matrix() @ pose[:3, :3]
     stds = []
@@ -119,14 +124,16 @@ def test_a_displaced_camera_is_put_right_or_said(system, recording, clean):
             max_grasp_gap_change=0.2,
             min_visible_coverage=0.0,
         )
-        found = track_object(CameraScene(system, "package:baxter"), recording, replace(sequence, pose=pose), options)
+        found = track_object(
+            CameraScene(system, "package:baxter"), recording, replace(sequence, camera_pose=pose), options
+        )
         assert "sees the arm" in found.camera_calibration.message or "contradicts" in found.camera_calibration.message
-        truth = np.array([found._place(clean.made.course(t)) for t in found.t])[:, [0, 2]]
+        truth = np.array([found._place(clean.made.true_configuration_at(t)) for t in found.t])[:, [0, 2]]
         errors = found.position - truth
         assert np.nanmean((errors / found.std) ** 2) < 1.5
         if not stds:
             assert np.nanmax(np.linalg.norm(errors, axis=2)) < 15 * MILLIMETRE
-            assert np.allclose(found.to_point_group().pose, sequence.pose, atol=0.02)
+            assert np.allclose(found.to_point_group().pose, sequence.camera_pose, atol=0.02)
             assert "one error of all frames" in found.to_point_group().sensor
         stds.append(np.nanmedian(found.std))
     assert stds[1] > 2 * stds[0]
@@ -135,7 +142,7 @@ def test_a_displaced_camera_is_put_right_or_said(system, recording, clean):
 def test_without_motion_the_clock_has_to_be_given(system, clean, small):
     joints = small.recording.joints
     still = Recording(replace(joints, position=np.tile(joints.position[:1], (len(joints.t), 1))))
-    sequence = clean.made.sequence.select([0, 1, 2])
+    sequence = clean.made.sequence.select_frames([0, 1, 2])
     with pytest.raises(DataError, match="cannot be calibrated by the arm"):
         track_object(CameraScene(system, "package:baxter"), still, sequence)
 
@@ -147,16 +154,16 @@ def test_a_recording_that_solve_reads(tmp_path, clean, recording, system):
     joints = recording.joints
     old = PointGroup("points_camera", ("w_T1",), [0.0], np.zeros((1, 1, 3)), 0.01)
     arm = PointGroup("points_arm", ("w_T2",), joints.t, np.zeros((len(joints.t), 1, 3)), 0.001)
-    made = clean.track.recording(replace(recording, points=(old, arm), description="Before."))
+    made = clean.track.to_recording(replace(recording, points=(old, arm), description="Before."))
     write_recording(made, tmp_path / "tracked.h5")
     again = read_recording(tmp_path / "tracked.h5")
     assert [group.name for group in again.points] == ["points_arm", "points_camera"]
     group = again.points[1]
-    assert group.names == system.points
+    assert group.names == system.point_frames
     assert np.array_equal(group.t, clean.track.t)
     assert np.array_equal(group.position, clean.track.position)
     assert (group.std >= TrackOptions().min_point_std).all()
-    assert np.array_equal(group.pose, clean.track.calibration.state.pose)
+    assert np.array_equal(group.pose, clean.track.camera_calibration.camera_state.pose)
     assert again.description.startswith("Before.")
     assert "clock offset" in again.description
 
@@ -165,11 +172,16 @@ def test_positions_of_a_straight_object_stay_with_their_points(clean, recording)
     groups = {name: PointGroup(name, ("w_T1",), [0.0], np.zeros((1, 1, 3))) for name in ("points_arm", "points_camera")}
     straight = np.ones((1, 3))
     for name, kept in (("points_arm", True), ("points_camera", False)):
-        before = replace(recording, points=(groups[name],), straight=straight)
-        assert (clean.track.recording(before).straight is not None) is kept
-    assert clean.track.recording(recording).straight is None
+        before = replace(recording, points=(groups[name],), marker_reference_pose=straight)
+        assert (clean.track.to_recording(before).marker_reference_pose is not None) is kept
+    assert clean.track.to_recording(recording).marker_reference_pose is None
     mocap = replace(groups["points_arm"], name="points_mocap")
-    assert clean.track.recording(replace(recording, points=(mocap,), straight=straight)).straight is None
+    assert (
+        clean.track.to_recording(
+            replace(recording, points=(mocap,), marker_reference_pose=straight)
+        ).marker_reference_pose
+        is None
+    )
 
 
 def test_the_points_are_those_that_no_arm_holds(system, small):
@@ -182,16 +194,16 @@ def test_the_points_are_those_that_no_arm_holds(system, small):
 def test_the_spline_passes_through_the_good_frames(clean, system):
     found = clean.track
     for k, t in enumerate(found.t):
-        assert np.allclose(found.points(t), found.position[k], atol=1e-9)
+        assert np.allclose(found.points_at(t), found.position[k], atol=1e-9)
     between = 0.5 * (found.t[4] + found.t[5])
-    truth = found._place(clean.made.course(between))
-    assert np.linalg.norm(found.points(between) - truth, axis=1).max() < 0.05
-    assert np.array_equal(found.shape(found.t[-1] + 5.0), found.shape(found.t[-1]))
+    truth = found._place(clean.made.true_configuration_at(between))
+    assert np.linalg.norm(found.points_at(between) - truth, axis=1).max() < 0.05
+    assert np.array_equal(found.configuration_at(found.t[-1] + 5.0), found.configuration_at(found.t[-1]))
 
 
 def test_pictures_of_every_stage(clean, tmp_path):
-    [stages] = clean.track.stages
-    assert stages.name == "frame 3"
+    [stages] = clean.track.frame_stages
+    assert stages.frame_name == "frame 3"
     files = draw_frame_stages(stages, tmp_path / "pictures")
     assert [file.stem.rpartition("_")[2] for file in files] == list(_STAGE_NAMES)
     draw_track(clean.track, tmp_path / "track.png")
@@ -307,7 +319,7 @@ def test_the_time_of_another_clock(system, small):
         len(
             track_object(
                 CameraScene(system), small.recording, spoilt(small, t=small.sequence.stamps + 1.7e9), options
-            ).stamps
+            ).t
         )
         == 3
     )
@@ -340,7 +352,7 @@ def test_a_recording_that_does_not_fit(system, small, urdf_folder):
         track_object(CameraScene(system, urdf_folder / "double_pendulum.urdf"), small.recording, small.sequence)
     with pytest.raises(DataError, match="pose of the camera is missing"):
         FrameSequence.from_clouds([0.0], [small.clouds[0]], None)
-    with pytest.raises(ConfigError, match="d_max = 0"):
+    with pytest.raises(ConfigError, match="max_distance_in_radii = 0"):
         TrackOptions(max_distance_in_radii=0.0)
 
 
@@ -359,12 +371,12 @@ def test_solve_finds_the_truth_from_tracked_points(tracked, system, run, truth):
         position_std=2e-4,
         effort_std=0.0,
     )
-    tip = run.points[:, [system.points.index("w_T2")]]
+    tip = run.point_positions[:, [system.point_frames.index("w_T2")]]
     arm = PointGroup("points_arm", ("w_T2",), run.t, tip + 1e-3 * rng.standard_normal(tip.shape), 1e-3, sensor="arm")
     made = tracked()
     names = ("w_T1", "w_T3")
-    camera = made.track.group()
-    columns = [system.points.index(name) for name in names]
+    camera = made.track.to_point_group()
+    columns = [system.point_frames.index(name) for name in names]
     camera = replace(camera, names=names, position=camera.position[:, columns], std=camera.std[:, columns])
     step = yid.compile_step(system, 0.01)
     problem = yid.EstimationProblem(step, [Recording(joints, (arm, camera))], free=list(truth))

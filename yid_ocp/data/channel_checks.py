@@ -204,7 +204,8 @@ def overstated_noise_issues(recording: Recording, choice: SensorChoiceLookup) ->
     """Issues for channels far less noisy than the recording states; channels of equal stated noise are pooled.
 
     What settings state may stand for what a model misses, and only a fit can say whether it is too much. Noise need not
-    be white: the largest of what all samples say, every other one, and so on up to `_MAX_SAMPLE_PERIOD` counts, and so do steps.
+    be white: the largest of what all samples say, every other one, and so on up to `_MAX_SAMPLE_PERIOD` counts, and so
+    do steps.
     What has no noise at all was computed, as commands are.
     """
     found: dict[str, list[tuple[str, float, float]]] = {}

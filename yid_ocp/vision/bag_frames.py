@@ -211,7 +211,8 @@ def _topic(bag: _Bag, wanted: str | None) -> str:
     raise DataError(
         "the bag has no clouds and no depth images",
         where=str(bag.path),
-        allowed=f"{_CLOUD_MESSAGE}, or {_IMAGE_MESSAGE} with the encoding {' or '.join(_DEPTH_ENCODINGS)}, not compressed",
+        allowed=f"{_CLOUD_MESSAGE}, or {_IMAGE_MESSAGE} with the encoding {' or '.join(_DEPTH_ENCODINGS)}, "
+        "not compressed",
         hint=f"it holds {held}",
     )
 

@@ -275,7 +275,8 @@ class _Calibrator:
         if self.clock.search_half_width > 0 and not std < self.clock.max_offset_std:
             raise _UntoldError(
                 f"it moves too little to tell the time: its clock is known to {1e3 * std:.0f} ms only",
-                "record a livelier motion, or give the clock's offset with track.options.clock.initial_offset and search: 0",
+                "record a livelier motion, or give the clock's offset with track.options.clock.initial_offset and "
+                "search_half_width: 0",
             )
         used_state, beside = state, np.zeros(STATE_SIZE)
         if self.options.fix_pose:

@@ -176,7 +176,8 @@ class FrameTiming:
         """Times of the pictures that arrive and their stamps, both shape (M,) [s]."""
         if not (self.mean_rate > 0 and 0 <= self.period_jitter < 1):
             raise ConfigError(
-                f"rate = {self.mean_rate}, spread = {self.period_jitter}", allowed="rate > 0, 0 <= spread < 1"
+                f"mean_rate = {self.mean_rate}, period_jitter = {self.period_jitter}",
+                allowed="mean_rate > 0, 0 <= period_jitter < 1",
             )
         count = math.ceil((stop - start) * self.mean_rate / (1 - self.period_jitter)) + 2
         taken = start + np.cumsum(rng.uniform(1 - self.period_jitter, 1 + self.period_jitter, count) / self.mean_rate)

@@ -261,13 +261,15 @@ def _named(
     how = f"moving with {link}" if link else "moving" if moving else "still"
     text = f"something of {big} m at ({where}) m is not the object, {how}, in {len(group)} of {total} frames: "
     if link:
-        text += f"give its shape under model.extra_meshes with frame: {link}"
+        text += f"give its shape under model.extra_meshes with parent_frame: {link}"
     elif moving:
-        text += "take it out of view" if not beside else "leave it out with track.options.filters.box_lower and upper"
+        text += (
+            "take it out of view" if not beside else "leave it out with track.options.filters.box_lower and box_upper"
+        )
         text += ", or give the object's colour under track.options.filters.object_colours" if coloured else ""
     else:
         text += "" if background else "set track.options.background_estimation: frames, or "
         text += "film the scene without object and robot for track.background_frames"
-        text += "; or leave it out with track.options.filters.box_lower and upper" if beside else ""
+        text += "; or leave it out with track.options.filters.box_lower and box_upper" if beside else ""
         text += "; if it is another arm, lock its joints (model.arms.locked_joints)" if links(group[0][0]) else ""
     return ForeignObject(centre, size, len(group), moving, link, text)

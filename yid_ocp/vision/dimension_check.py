@@ -84,9 +84,9 @@ class DimensionCheck:
     @property
     def contradiction_message(self) -> str:
         """Which of the model's values contradict the frames and have no estimate in their place; empty for none."""
+        values, fitting = 1e3 * self.model_values, 1e3 * self.model_values * np.exp(self.log_ratio)
         wrong = [
-            f"{self.names[i]} {1e3 * self.model_values[i]:.4g} mm where {1e3 * self.model_values[i] * math.exp(self.log_ratio[i]):.4g} mm"
-            " fits"
+            f"{self.names[i]} {values[i]:.4g} mm where {fitting[i]:.4g} mm fits"
             for i in np.flatnonzero(self.is_contradicted & ~np.array(self.is_estimated))
         ]
         return f"the object seems to be other than the model says ({', '.join(wrong)})" if wrong else ""
@@ -104,8 +104,8 @@ class DimensionCheck:
             elif self.is_contradicted[i]:
                 kind = name.rpartition(".")[2]
                 lines.append(
-                    f"{name} seems to be wrong: {found}, the model says {1e3 * self.model_values[i]:.4g} mm. Measure it again,"
-                    f" or estimate it: track.options.estimated_dimensions: [{kind}]"
+                    f"{name} seems to be wrong: {found}, the model says {1e3 * self.model_values[i]:.4g} mm. "
+                    f"Measure it again, or estimate it: track.options.estimated_dimensions: [{kind}]"
                 )
         return tuple(lines)
 

@@ -101,7 +101,7 @@ def read_frame_folder(
 def write_frame_folder(
     sequence: FrameSequence, folder: str | os.PathLike[str], *, depth: Sequence[ArrayLike] | None = None
 ) -> None:
-    """Write a frame sequence as a folder that `read_frame_folder` reads: binary PLY clouds, or depth images in millimetres.
+    """Write a frame sequence as a folder for `read_frame_folder`: binary PLY clouds, or depth images in millimetres.
 
     Parameters
     ----------

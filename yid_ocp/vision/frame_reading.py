@@ -34,9 +34,8 @@ def read_frames(
     Parameters
     ----------
     path : path-like
-        A folder as `yid_ocp.vision.frame_folder.read_frame_folder` describes it; a bag of ROS 1 or ROS 2, an MCAP file or a
-        RealSense file (`yid_ocp.vision.bag_frames.read_bag_frames`); or an Azure Kinect's `.mkv`, where the build of Open3D
-        reads it.
+        A folder (`read_frame_folder`); a bag of ROS 1 or ROS 2, an MCAP file or a RealSense file (`read_bag_frames`);
+        or an Azure Kinect's `.mkv`, where the build of Open3D reads it.
     pose : array_like, shape (4, 4), optional
         Camera in the world, instead of the folder's; others do not say it.
     unit : str, optional
@@ -69,7 +68,8 @@ def read_frames(
     if place.is_file() and ending == _AZURE_KINECT_SUFFIX:
         return _read_film(place, pose)
     if place.exists():
-        allowed = f"a folder with {STAMP_FILE}, a bag ({', '.join(_BAG_SUFFIXES)}) or an Azure Kinect's {_AZURE_KINECT_SUFFIX}"
+        bags = ", ".join(_BAG_SUFFIXES)
+        allowed = f"a folder with {STAMP_FILE}, a bag ({bags}) or an Azure Kinect's {_AZURE_KINECT_SUFFIX}"
         raise DataError("this is no sequence of frames", where=str(place), allowed=allowed)
     raise DataError("there is no such folder of frames, and no such file", where=str(place), hint="check the path")
 

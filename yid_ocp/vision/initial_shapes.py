@@ -186,7 +186,8 @@ class InitialShapeFinder:
             ways.append((float(off.max()), chosen))
         best, nearest = min(ways)
         if best > max(_WHOLE * float(self.root_to_tip_lengths.max()), trace.slice_width):
-            lengths = f"{along[nearest[0], nearest[1]]:.2f} m from end to end, the object has {self.end_distances[0, 1]:.2f} m"
+            own = self.end_distances[0, 1]
+            lengths = f"{along[nearest[0], nearest[1]]:.2f} m from end to end, the object has {own:.2f} m"
             raise DataError(f"the object cannot be followed from end to end: the cloud has {lengths}")
         limit = max(_ALIKE * best, trace.slice_width)
         kept = [chosen for off, chosen in sorted(ways) if off <= limit][: 2 * self.n_ends]

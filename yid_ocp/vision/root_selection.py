@@ -38,7 +38,7 @@ def choose_root_ends(frames: Sequence[FrameReport], options: TrackOptions) -> tu
     ]
     if not two:
         said = (
-            "it is the one nearest to root_near"
+            "it is the one nearest to approximate_root_position"
             if options.approximate_root_position is not None
             else "lengths and branches tell it"
         )
@@ -64,7 +64,7 @@ def choose_root_ends(frames: Sequence[FrameReport], options: TrackOptions) -> tu
     elif abs(above) > _HANGING * between:
         other, said = above < 0, "it is the higher end"
     else:
-        other, said = False, "either end may be it, one was taken: root_near says which"
+        other, said = False, "either end may be it, one was taken: approximate_root_position says which"
     if other:
         made = [_exchanged(frame) for frame in made]
     return _fixed(made, options), f"root: {said}"

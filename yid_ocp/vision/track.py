@@ -304,8 +304,8 @@ class FrameTracker:
                 f"the frames run from {first:.3f} s to {last:.3f} s, the joints from {self.joint_time_span[0]:.3f} s to"
                 f" {self.joint_time_span[1]:.3f} s: their clocks are not the same",
                 where=self.sequence.source,
-                hint=f"give the clock offset (stamp minus joint time): {first + options.initial_offset - self.joint_time_span[0]:.3f} s if"
-                " both started together",
+                hint="give the clock offset (stamp minus joint time): "
+                f"{first + options.initial_offset - self.joint_time_span[0]:.3f} s if both started together",
             )
 
     def _shape(self, sizes: DimensionCheck) -> ShapeFitter:

@@ -38,7 +38,7 @@ def rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: TrackOptio
     if not math.isfinite(fit.mean_distance):
         return f"{_NO_FIT}: no point of the cloud is near it"
     if fit.mean_distance > limit:
-        off = f"{1e3 * fit.mean_distance:.1f} mm off on average, d_max allows {1e3 * limit:.1f} mm"
+        off = f"{1e3 * fit.mean_distance:.1f} mm off on average, max_distance_in_radii allows {1e3 * limit:.1f} mm"
         return f"{_NO_FIT}: {off}"
     bend = float(np.abs((fit.q - shape.rest_configuration)[list(shape.bend_joints)]).max())
     if bend > options.max_bend_angle:
@@ -146,7 +146,7 @@ def tracked_points(
         wrong_sizes = bool((np.linalg.norm(by_sizes, axis=2) > math.sqrt(3.0) * options.max_point_std).all())
         raise DataError(
             f"{_because(sizes, wrong_sizes)}no point is known well enough in any frame: the best within {best:.0f} mm,"
-            f" point_std_max is {1e3 * options.max_point_std:g} mm",
+            f" max_point_std is {1e3 * options.max_point_std:g} mm",
             where=source,
             hint=_hint(
                 sizes,

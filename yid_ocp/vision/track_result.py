@@ -113,8 +113,8 @@ class TrackResult:
     configurations : ndarray, shape (M, n)
         Configurations, twists at rest.
     position, std, shared_std : ndarray, shape (M, np, 3)
-        [m]; NaN where a point was not seen well enough. `shared_std`: of `std`, what all frames have in common, from the
-        camera's pose, depth and clock.
+        [m]; NaN where a point was not seen well enough. `shared_std`: the part of `std` that all frames have in common,
+        from the camera's pose, depth and clock.
     frame_reports : tuple of FrameReport
         All of them, by time stamp.
     camera_calibration : Calibration
@@ -177,13 +177,14 @@ class TrackResult:
         return PointGroup(_CAMERA_POINT_GROUP, self.point_names, self.t, self.position, self.std, words, pose=pose)
 
     def to_recording(self, recording: Recording | None) -> Recording:
-        """A recording with these points in place of any `points_camera` that it had; `DataError` as `validate_recording`.
+        """A recording with these points as its `points_camera`; `DataError` as `validate_recording`.
 
         Without a recording, as of an object that no robot holds, one of these points alone.
         """
         recording = Recording(source="depth camera", name="camera") if recording is None else recording
         others = tuple(group for group in recording.points if group.name != _CAMERA_POINT_GROUP)
-        text = f"{recording.description} Points of {len(self.t)} of {len(self.frame_reports)} frames; {self.camera_calibration.message}."
+        count = f"Points of {len(self.t)} of {len(self.frame_reports)} frames"
+        text = f"{recording.description} {count}; {self.camera_calibration.message}."
         made = replace(recording, points=(*others, self.to_point_group()), description=text.strip(), sha256=None)
         # the positions of a straight object belong to the group that a file lists first
         if not others or others[0] is not recording.points[0] or others[0].name > _CAMERA_POINT_GROUP:

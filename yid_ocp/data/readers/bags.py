@@ -95,7 +95,7 @@ def read_bag(
 ) -> Recording:
     """Read a ROS 1 bag, a ROS 2 bag folder or an MCAP file.
 
-    `sensor_msgs/JointState` becomes the joints, of several topics on one clock (`yid_ocp.data.clock_merging`); stamped points,
+    `sensor_msgs/JointState` becomes the joints, of several topics on one clock; stamped points,
     poses and transforms of `geometry_msgs`, and frames of `/tf`, become points, one group per frame of reference. Times
     are the headers' stamps (the times of recording if a message has none), from the first message on. A joint channel
     that is empty, or NaN throughout, was not measured and is left out. Topics that are not used are in `notes`.

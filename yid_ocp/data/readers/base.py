@@ -187,7 +187,7 @@ def convert_to_si_and_validate(
     Raises
     ------
     DataError
-        A joint, point, quantity or unit that is not known, a current without torque constants, or as `validate_recording`.
+        A joint, point, quantity or unit that is not known, a current without torque constants, as `validate_recording`.
     """
     factors = _factors(units or {}, where)
     group = raw.joints
