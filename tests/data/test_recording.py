@@ -119,8 +119,8 @@ def test_positions_of_the_straight_object_follow_their_points() -> None:
     assert recording.select_points([]).marker_reference_pose is None
     assert np.array_equal(validate_recording(recording.time_slice(0.0, 0.2)).marker_reference_pose, straight)
     assert recording.time_slice(0.4, 0.45).marker_reference_pose is None, "no frame of the points lies in between"
-    both = dataclasses.replace(example(), straight=np.zeros((1, 3)))
-    assert both.select_points(["w_T1"]).straight is None, "the group that it belongs to is gone"
+    both = dataclasses.replace(example(), marker_reference_pose=np.zeros((1, 3)))
+    assert both.select_points(["w_T1"]).marker_reference_pose is None, "the group that it belongs to is gone"
 
 
 @given(st.lists(finite(1e6), min_size=2, max_size=20, unique=True), finite(1e6), finite(1e6))

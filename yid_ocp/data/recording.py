@@ -220,7 +220,7 @@ class Recording(ReprMixin):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", tuple(self.points))
-        object.__setattr__(self, "truth", dict(self.true_parameters))
+        object.__setattr__(self, "true_parameters", dict(self.true_parameters))
         object.__setattr__(self, "notes", tuple(self.notes))
         if self.marker_reference_pose is not None:
             object.__setattr__(self, "marker_reference_pose", read_only_array(self.marker_reference_pose, "straight"))

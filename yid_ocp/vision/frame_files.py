@@ -79,10 +79,8 @@ def _read(path: Path) -> tuple[Array, Colours | None]:
 
 
 def _read_npz(path: Path) -> tuple[Array, Colours | None]:
-    allowed = (
-        f"the array `{_POINTS_ARRAY}` of numbers, shape (N, 3), and `{_COLOURS_ARRAY}` of whole numbers from 0 to "
-    )
-    allowed += "255 if wanted"
+    allowed = f"the array `{_POINTS_ARRAY}` of numbers, shape (N, 3), and `{_COLOURS_ARRAY}` of whole numbers"
+    allowed += " from 0 to 255 if wanted"
     try:
         with np.load(path, allow_pickle=False) as held:
             arrays: dict[str, Any] = {name: held[name] for name in (_POINTS_ARRAY, _COLOURS_ARRAY) if name in held}

@@ -332,8 +332,8 @@ def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> 
                 allowed="t, "
                 + ", ".join(f"{prefix}<joint>" for prefix in _PREFIXES)
                 + ", <point>_x, <point>_y, <point>_z",
-                hint=f"rename it, or say what it is: columns {name}=position:JOINT, or {name}={SKIP_COLUMN} to leave it "
-                "out",
+                hint=f"rename it, or say what it is: columns {name}=position:JOINT, or {name}={SKIP_COLUMN} to leave "
+                "it out",
             )
         if own and own in meanings:
             other = header[meanings.index(own)]
