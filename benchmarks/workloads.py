@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
+from yid_ocp.inference.linear_model import bounded_least_squares_step
 from yid_ocp.integrator import compiled
 from yid_ocp.integrator.lqr import lqr_feedback
 from yid_ocp.integrator.statics import EquilibriumSolver
@@ -29,7 +30,6 @@ from yid_ocp.model import System
 from yid_ocp.model.urdf import mechanism_to_urdf
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import EquilibriumGuesses
-from yid_ocp.solvers.linear_model import bounded_least_squares_step
 from yid_ocp.virtual.experiment import baxter_foam_y_system
 
 Array = NDArray[np.float64]

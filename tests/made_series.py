@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from yid_ocp.problem.null_test import ResidualChannel
+from yid_ocp.inference.null_test import ResidualChannel
 
 WHITE = (1.0,)
 

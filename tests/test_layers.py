@@ -25,6 +25,7 @@ LAYERS = (
     ("vision",),
     ("virtual",),
     ("problem",),
+    ("inference",),
     ("solvers",),
     ("analysis",),
     ("diagnosis",),

@@ -3,8 +3,8 @@
     python benchmarks/mutation [--mutants N] [--seed S] [--in PACKAGE] [--file NAME] [--jobs N] [--rules] [--again]
 
 First the named breaks of `breaks.yaml`, each against the tests named beside it; then so many mutants, drawn by the seed
-over diagnosis/, analysis/, problem/ and what all solvers share (see `PACKAGES` and `places.py`), each against those
-tests of its package's folder that run the changed statement, tests of rules first, then file by file, the quickest
+over diagnosis/, analysis/, problem/, inference/ and what all solvers share (see `PACKAGES` and `places.py`), each against
+those tests of its package's folder that run the changed statement, tests of rules first, then file by file, the quickest
 first, up to the first failure or three times the time that they take without a change. Tests marked `slow` stay out.
 
 What was found goes to a JSON file as it is found; an interrupted run goes on from there as long as sources and tests
@@ -34,8 +34,8 @@ from places import Mutant, drawn
 from ruamel.yaml import YAML
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGES: dict[str, tuple[str, ...]] = {name: (name,) for name in ("diagnosis", "analysis", "problem")} | {
-    "solvers": ("solvers.base", "solvers.judgement", "solvers.linear_model", "solvers.words"),
+PACKAGES: dict[str, tuple[str, ...]] = {name: (name,) for name in ("diagnosis", "analysis", "problem", "inference")} | {
+    "solvers": ("solvers.base", "solvers.fit_messages"),
 }
 """Package, whose tests stand in the folder of the same name, and what of it is broken."""
 WANTED = 0.85

@@ -27,7 +27,19 @@ from typing import Any
 
 import pytest
 
-LAYERS = ("model", "effects", "sensors", "integrator", "data", "vision", "virtual", "problem", "solvers", "analysis")
+LAYERS = (
+    "model",
+    "effects",
+    "sensors",
+    "integrator",
+    "data",
+    "vision",
+    "virtual",
+    "problem",
+    "inference",
+    "solvers",
+    "analysis",
+)
 LAYERS = (*LAYERS, "diagnosis", "report", "config", "workflow")
 """Packages from left to right; those to the left of the changed one are imported once."""
 LIBRARIES = (

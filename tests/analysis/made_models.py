@@ -9,11 +9,11 @@ import casadi as ca
 import numpy as np
 from made_series import samples
 
+from yid_ocp.inference.uncertainty import GoodnessOfFit, ParameterEstimate
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem.evaluation import Evaluation, ResidualRows
 from yid_ocp.problem.options import MultivariateGaussianPrior
 from yid_ocp.solvers.base import Solution, Status
-from yid_ocp.solvers.uncertainty import GoodnessOfFit, ParameterEstimate
 
 
 class Formula:

@@ -14,6 +14,8 @@ from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.analysis.torque_error_propagation import _NEGLIGIBLE_STD, _low_rank_error_sensitivity
 from yid_ocp.analysis.what_if import WhatIfOptions, what_if
 from yid_ocp.data.recording import PointGroup
+from yid_ocp.inference.linear_model import residual_without_weak_priors
+from yid_ocp.inference.whitening import whitened_at, without_input_errors
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.workflow.build import load_problem
 
@@ -89,7 +91,7 @@ def relative(problem):
 
 def test_the_experiment_as_it_is_knows_the_noise_of_its_torques(noisy):
     ranking = what_if(noisy, options=WhatIfOptions(considered_changes=("rate:30",), max_set_size=1))
-    told, exact = relative(noisy), relative(noisy.without_input_errors())
+    told, exact = relative(noisy), relative(without_input_errors(noisy))
     for name, std in told.items():
         assert ranking.unchanged_experiment.std_relative[name] == pytest.approx(std, rel=0.02)
         assert std > 1.2 * exact[name]
@@ -124,15 +126,15 @@ def test_a_predicted_camera_tells_beside_wrong_torques_what_it_tells_when_it_is_
     # what is there tells of errors of torques too: those that the real recording tells of
     effort, errors = (
         recording.joints.effort.copy(),
-        noisy.whitened_at(noisy.initial_unknowns, rounds=2).episodes[0].input_errors,
+        whitened_at(noisy, noisy.initial_unknowns, rounds=2).episodes[0].input_errors,
     )
     effort[: len(errors.torque_noise)] -= errors.total_torque_error
     faster = replace(recording, points=tuple(groups), joints=replace(recording.joints, effort=effort))
     problem = EstimationProblem(
         noisy.step, [faster], noisy.free, noisy.options, noisy.named_values(noisy.initial_unknowns)
     )
-    weighted = problem.whitened_at(problem.initial_unknowns)
-    jacobian = weighted.residual_without_weak_priors(weighted.evaluate(problem.initial_unknowns))[1]
+    weighted = whitened_at(problem, problem.initial_unknowns)
+    jacobian = residual_without_weak_priors(weighted, weighted.evaluate(problem.initial_unknowns))[1]
     std = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian))) / problem.initial_unknowns
     for name, value in zip(problem.unknown_names, std, strict=True):
         assert predicted.std_relative[name] == pytest.approx(value, rel=0.02)

@@ -14,11 +14,11 @@ from yid_ocp.diagnosis.diagnosis_messages import _event_sentences
 from yid_ocp.diagnosis.events import DisturbanceEvent, EventSet, Overspeed, find_events, problem_without_events
 from yid_ocp.diagnosis.pulse_detection import DetectedPulse
 from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.inference.null_test import sample_times
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.null_test import sample_times
 from yid_ocp.solvers import GaussNewton, solve
 from yid_ocp.virtual.disturbances import DisturbanceTerms, ForcePulse, SnagSpring
 from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperiment, run_virtual_experiment

@@ -27,9 +27,14 @@ from yid_ocp.diagnosis.select import (
     held_out_improvement,
 )
 from yid_ocp.effects import make_effect
+from yid_ocp.inference.null_test import (
+    ResidualChannel,
+    _filtered_noise_autocorrelation,
+    residual_channels,
+    run_null_test,
+)
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.low_pass_filter import LowPassFilter
-from yid_ocp.problem.null_test import ResidualChannel, _filtered_noise_autocorrelation, residual_channels, run_null_test
 
 
 def white(rows, colour=None):

@@ -11,10 +11,10 @@ from jsonschema import validate
 
 from yid_ocp.diagnosis import Thresholds, diagnose
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
-from yid_ocp.diagnosis.smoother import run_smoother
 from yid_ocp.diagnosis.verdict import is_chance_excess
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import YidError
+from yid_ocp.inference.smoother import run_smoother
 from yid_ocp.problem import ProblemOptions, SensorOptions
 
 NUMBER, TEXT = {"type": "number"}, {"type": "string"}

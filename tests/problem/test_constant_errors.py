@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from small_problems import pendulum_step, taken
 
+from yid_ocp.inference.whitening import whitened_at
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.constant_sensor_errors import (
     ConstantErrorModel,
@@ -86,7 +87,7 @@ def test_beside_noise_that_drives_other_joints_too(urdf_folder):
     spelt = EstimationProblem(step, recorded, ("elbow.mass", name), replace(bare, prior_stds={name: 0.5}))
     assert stated.episodes[0].has_constant_sensor_errors
     assert not spelt.episodes[0].has_constant_sensor_errors
-    weighted, beside = stated.whitened_at(stated.initial_unknowns), spelt.whitened_at(spelt.initial_unknowns)
+    weighted, beside = whitened_at(stated, stated.initial_unknowns), whitened_at(spelt, spelt.initial_unknowns)
     assert weighted.whitening_filters[0] is not None
     assert weighted.evaluate(stated.initial_unknowns).cost == pytest.approx(
         least(beside, spelt.initial_unknowns)[0], rel=1e-6

@@ -12,6 +12,7 @@ from small_problems import PENDULUM, STEPS, pendulum_step, taken
 
 import yid_ocp
 from yid_ocp.errors import SolverError
+from yid_ocp.inference.whitening import whitened_at, whitened_by_sensor_noise, without_input_errors
 from yid_ocp.integrator.nlp_stage import nlp_stage
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.statics import EquilibriumSolver
@@ -48,7 +49,7 @@ def problem_of(folder, case, seeds=(1, 2), **more):
     names = ("elbow.damping", *springs, *(n for e in step.system.effects for n in e.parameters.names))
     recordings = [taken(step, seed) for seed in seeds]
     settings = ProblemOptions(path_cutoff=math.inf, **options | more)
-    return EstimationProblem(step, recordings, names, settings).without_input_errors()
+    return without_input_errors(EstimationProblem(step, recordings, names, settings))
 
 
 @pytest.fixture(scope="module", params=CASES)
@@ -303,8 +304,8 @@ def test_errors_as_unknowns_have_the_likelihood_of_innovations(urdf_folder, enco
     )
     episode = replace(episode, measurements=samples, torque=episode.torque + wrong + 1.5 * errors.torque_bias_std)
     problem = first.with_episodes([episode], ())
-    expected = problem.whitened_at(x).evaluate(x).cost
-    assert problem.whitened_by_sensor_noise().evaluate(x).cost > 3 * expected
+    expected = whitened_at(problem, x).evaluate(x).cost
+    assert whitened_by_sensor_noise(problem).evaluate(x).cost > 3 * expected
     program = transcribe(problem)
     arguments = program.solver_arguments
     theta = program.block("theta").index.ravel()

@@ -64,7 +64,7 @@ def test_nothing_is_evaluated_where_nothing_is_doubtful(sure):
 
 def test_a_search_that_ends_in_the_wrong_valley_goes_on_from_the_other(monkeypatch):
     problem = disturbed(1.3)
-    problem.whitened_at = lambda x, warm=None, rounds=1: problem
+    monkeypatch.setattr(base, "whitened_at", lambda problem, x, warm=None, rounds=1: problem)
     # no other reason to start again
     monkeypatch.setattr(base, "_good_fit", lambda *_: True)
     monkeypatch.setattr(base, "_doubtful", lambda *_: np.zeros(1, bool))

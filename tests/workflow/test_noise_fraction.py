@@ -10,6 +10,7 @@ import pytest
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import ConfigError
+from yid_ocp.inference.whitening import estimate_torque_biases, whitened_at
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
 from yid_ocp.model.servos_and_springs import RobotJointSpring
@@ -85,13 +86,13 @@ def test_errors_of_torques_shrink_like_all_other_noise(driven, encoders):
     problem = driven(**STATED | use)
     shrunk = _with_noise_only_stds(problem, settings())
     x = problem.start * 1.1
-    one, other = (made.whitened_at(x, rounds=2) for made in (problem, shrunk))
+    one, other = (whitened_at(made, x, rounds=2) for made in (problem, shrunk))
     before, after = one.evaluate(x), other.evaluate(x)
     assert one.whitening_filters[0] is not None
     assert other.whitening_filters[0] is not None
     np.testing.assert_allclose(after.residual, before.residual / SHARE, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(after.jacobian, before.jacobian / SHARE, rtol=1e-6, atol=1e-6)
-    (value, std), (smaller_value, smaller_std) = one.estimate_torque_biases(x)[0], other.estimate_torque_biases(x)[0]
+    (value, std), (smaller_value, smaller_std) = estimate_torque_biases(one, x)[0], estimate_torque_biases(other, x)[0]
     np.testing.assert_allclose(smaller_value, value, rtol=1e-6)
     np.testing.assert_allclose(smaller_std, SHARE * std, rtol=1e-6)
 

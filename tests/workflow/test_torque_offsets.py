@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.data.recording import JointGroup, Recording
+from yid_ocp.inference.whitening import whitened_at, without_input_errors
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
 from yid_ocp.model.servos_and_springs import RobotJointSpring
@@ -56,7 +57,7 @@ def problem_of(step, *, bias=OFFSET, white=WHITE, held_out=True, options=None):
 def test_offsets_of_all_recordings_are_told_with_what_was_expected(step):
     problem = problem_of(step)
     assert estimated_torque_offsets(problem, problem.start) == {}
-    weighted = problem.whitened_at(problem.start, rounds=2)
+    weighted = whitened_at(problem, problem.start, rounds=2)
     found = estimated_torque_offsets(weighted, problem.start)
     assert list(found) == ["first", "second"]
     for entry in found.values():
@@ -65,13 +66,13 @@ def test_offsets_of_all_recordings_are_told_with_what_was_expected(step):
         assert own["std"] < 0.1 * OFFSET
         assert own["value"] == pytest.approx(0.3, abs=4 * own["std"])
     assert list(
-        estimated_torque_offsets(problem_of(step, held_out=False).whitened_at(problem.start), problem.start)
+        estimated_torque_offsets(whitened_at(problem_of(step, held_out=False), problem.start), problem.start)
     ) == ["first"]
 
 
 def test_where_offsets_are_no_part_of_the_model_nothing_is_said(step):
     problem = problem_of(step, bias=0.0)
-    assert estimated_torque_offsets(problem.whitened_at(problem.start), problem.start) == {}
+    assert estimated_torque_offsets(whitened_at(problem, problem.start), problem.start) == {}
     assert torque_offset_rows({"torque_offsets": {}}) == torque_offset_rows({}) == []
 
 
@@ -128,5 +129,5 @@ def test_check_lists_noise_that_drives_the_motion_and_whether_anybody_stated_it(
     assert ("(estimated)" in words) is estimated
     assert words.endswith("; 0.0001 rad")
     assert ", offset 0.2" in words
-    calm = problem.without_input_errors()
+    calm = without_input_errors(problem)
     assert _input_noise(calm, calm.episodes[0]) == {}

@@ -12,14 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.analysis.profile import with_profile_intervals
+from yid_ocp.inference.null_test import DEFAULT_GAP_CRITERIA, GapCriteria
+from yid_ocp.inference.uncertainty import MAX_IDENTIFIABLE_RELATIVE_STD, ParameterEstimate
+from yid_ocp.inference.whitening import without_input_errors
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.null_test import DEFAULT_GAP_CRITERIA, GapCriteria
 from yid_ocp.problem.prediction_result import EpisodePrediction
 from yid_ocp.solvers import GaussNewton, Iterate, Solution, Status, solve
 from yid_ocp.solvers.base import Solver, uses_process_noise_covariance
 from yid_ocp.solvers.fit_messages import VERDICT_PREDICATES, VERDICT_WORDS
-from yid_ocp.solvers.uncertainty import MAX_IDENTIFIABLE_RELATIVE_STD, ParameterEstimate
 
 Array = NDArray[np.float64]
 
@@ -120,7 +121,7 @@ def compare_methods(
     -------
     Comparison
     """
-    runs, whole, problem = [], problem, problem.without_input_errors()
+    runs, whole, problem = [], problem, without_input_errors(problem)
 
     def told(name: str, entry: Iterate) -> None:
         if callback is not None:

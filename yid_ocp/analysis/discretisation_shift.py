@@ -9,12 +9,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from yid_ocp.inference.linear_model import bounded_least_squares_step
+from yid_ocp.inference.uncertainty import ParameterEstimate, verdict_by_relative_std
+from yid_ocp.inference.whitening import whitened_at
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
 from yid_ocp.problem.unknown_vector import INITIAL_STATE_PREFIX
-from yid_ocp.solvers.linear_model import bounded_least_squares_step
-from yid_ocp.solvers.uncertainty import ParameterEstimate, verdict_by_relative_std
 
 Array = NDArray[np.float64]
 
@@ -145,7 +146,7 @@ def discretisation_shifts(
         refined.equilibrium_guesses_from_coarse(coarse.system, at_x.equilibrium_guesses),
     )
     weighted = any(own is not None for own in coarse.whitening_filters)
-    problem = refined.problem.whitened_at(point, warm, rounds=2) if weighted else refined.problem
+    problem = whitened_at(refined.problem, point, warm, rounds=2) if weighted else refined.problem
     evaluation = problem.evaluate(point, equilibrium_guesses=warm)
     if not evaluation.ok or evaluation.jacobian is None:
         return evaluation.message
@@ -175,7 +176,7 @@ def inflate_estimates(
     estimates : mapping of str to Estimate
     found : mapping of str to Moves
     sizes : mapping of str to float, optional
-        Typical size of each parameter, as in `solvers.judgement.parameter_verdict`.
+        Typical size of each parameter, as in `inference.uncertainty.parameter_verdict`.
     """
     counted = dict(estimates)
     for name, own in found.items():

@@ -16,6 +16,7 @@ from yid_ocp.analysis.identifiability import InitialStateKnowledge, transfer_unk
 from yid_ocp.analysis.torque_error_propagation import episode_sensitivities
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError, SolverError, YidError
+from yid_ocp.inference.whitening import whitened_at
 from yid_ocp.integrator.step import Step, compile_step_like
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Frame, Placement
@@ -424,7 +425,7 @@ class CandidateExperimentBuilder:
     @cached_property
     def _corrected(self) -> EstimationProblem:
         """The problem with the errors of torques known that its measurements tell of."""
-        return self.setting.problem.whitened_at(self.setting.x, rounds=2)
+        return whitened_at(self.setting.problem, self.setting.x, rounds=2)
 
     def _cut(self, episode: Episode) -> Recording:
         """The part of a recording that the problem uses, its torques without the errors that are known."""

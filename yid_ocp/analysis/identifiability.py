@@ -16,15 +16,9 @@ from yid_ocp.analysis.profile import ParameterProfile, check_small_estimate, nea
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError, SolverError, nearest_name_hint
-from yid_ocp.model.system import System
-from yid_ocp.parallel import map_with_batched_calls
-from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.null_test import DEFAULT_GAP_CRITERIA, GapCriteria
-from yid_ocp.progress import NULL_PROGRESS, ParallelProgress, Progress
-from yid_ocp.solvers.base import Solution
-from yid_ocp.solvers.fit_messages import VERDICT_WORDS, finite_or_none, parameter_text, percent_text
-from yid_ocp.solvers.uncertainty import (
+from yid_ocp.inference.linear_model import residual_without_weak_priors
+from yid_ocp.inference.null_test import DEFAULT_GAP_CRITERIA, GapCriteria
+from yid_ocp.inference.uncertainty import (
     MAX_IDENTIFIABLE_RELATIVE_STD,
     MAX_WEAK_RELATIVE_STD,
     MIN_UNINFORMED_RELATIVE_STD,
@@ -38,6 +32,14 @@ from yid_ocp.solvers.uncertainty import (
     typical_parameter_sizes,
     with_profile_interval,
 )
+from yid_ocp.inference.whitening import whitened_at
+from yid_ocp.model.system import System
+from yid_ocp.parallel import map_with_batched_calls
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.evaluation import Evaluation
+from yid_ocp.progress import NULL_PROGRESS, ParallelProgress, Progress
+from yid_ocp.solvers.base import Solution
+from yid_ocp.solvers.fit_messages import VERDICT_WORDS, finite_or_none, parameter_text, percent_text
 
 Array = NDArray[np.float64]
 InitialStateKnowledge = Literal["assumed", "known", "unknown"]
@@ -65,8 +67,8 @@ class ParameterInformation:
     std_alone : float
         Relative standard deviation if all other unknowns were known.
     verdict : str
-        That of a solution at the same point (`solvers.judgement.parameter_verdict`), made consistent with a requested interval
-        (`solvers.judgement.with_profile_interval`).
+        That of a solution at the same point (`inference.uncertainty.parameter_verdict`), made consistent with a requested interval
+        (`inference.uncertainty.with_profile_interval`).
     interval : (float or None, float or None), or None
         95 % interval by profile likelihood about the best fit of all unknowns, None for an open end; None as a whole
         where not requested.
@@ -237,7 +239,7 @@ def _information(
     given = unknowns_from_solution(problem, solution)
     wide = with_nuisance_unknowns(problem, given, start, grasp_std)
     x = transfer_unknowns(given, problem.unknown_names, wide)
-    as_solved, wide = wide is problem, wide.whitened_at(x, rounds=2)
+    as_solved, wide = wide is problem, whitened_at(wide, x, rounds=2)
     evaluation = wide.evaluate(x)
     if not evaluation.ok or evaluation.jacobian is None:
         raise SolverError(
@@ -251,7 +253,7 @@ def _information(
         # far from the data chi2 says nothing of the noise
         covariance, inflation = covariance / inflation**2, 1.0
     else:
-        own = wide if as_solved else problem.whitened_at(given, rounds=2)
+        own = wide if as_solved else whitened_at(problem, given, rounds=2)
         fit = assess_goodness_of_fit(own, evaluation if as_solved else own.evaluate(given), limits)
         covariance = covariance_of_fit(wide, evaluation, fit)
     chosen = np.array([wide.unknown_names.index(name) for name in names], int)
@@ -447,7 +449,7 @@ def _split_sensitivities(
     problem: EstimationProblem, evaluation: Evaluation, chosen: NDArray[np.int64]
 ) -> _SensitivitySplit:
     """Sensitivities of chosen unknowns with all others, and their priors, projected out."""
-    _, jacobian = problem.residual_without_weak_priors(evaluation)
+    _, jacobian = residual_without_weak_priors(problem, evaluation)
     jacobian = jacobian.copy()
     others = np.setdiff1d(np.arange(jacobian.shape[1]), chosen)
     # what is known beforehand of the parameters themselves is not something that a sensor sees

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 
+from yid_ocp.inference.uncertainty import MAX_IDENTIFIABLE_RELATIVE_STD, ParameterEstimate
 from yid_ocp.solvers.fit_messages import VERDICT_PREDICATES, interval_text
-from yid_ocp.solvers.uncertainty import MAX_IDENTIFIABLE_RELATIVE_STD, ParameterEstimate
 
 _PAPER_PARAMETERS = ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twist")
 PAPER_ESTIMATES: dict[str, dict[str, float]] = {

@@ -9,14 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.parallel import map_with_batched_calls
-from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.progress import NULL_PROGRESS, ParallelProgress, Progress
-from yid_ocp.solvers import Solution
-from yid_ocp.solvers.gauss_newton import GaussNewton
-from yid_ocp.solvers.linear_model import bounded_least_squares_step
-from yid_ocp.solvers.uncertainty import (
+from yid_ocp.inference.linear_model import bounded_least_squares_step, residual_without_weak_priors
+from yid_ocp.inference.uncertainty import (
     ConfidenceInterval,
     ParameterEstimate,
     covariance_and_chi2,
@@ -25,6 +19,12 @@ from yid_ocp.solvers.uncertainty import (
     typical_parameter_sizes,
     with_profile_interval,
 )
+from yid_ocp.parallel import map_with_batched_calls
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.evaluation import Evaluation
+from yid_ocp.progress import NULL_PROGRESS, ParallelProgress, Progress
+from yid_ocp.solvers import Solution
+from yid_ocp.solvers.gauss_newton import GaussNewton
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
@@ -200,7 +200,7 @@ def check_small_estimate(
     entry : Estimate
         Of this unknown.
     size : float
-        Its typical size, as in `solvers.judgement.typical_parameter_sizes`.
+        Its typical size, as in `inference.uncertainty.typical_parameter_sizes`.
     evaluation : Evaluation
         At `x`, with the Jacobian.
     """
@@ -425,7 +425,7 @@ class _Walk:
 
     def _rows(self, evaluation: Evaluation, s: Array) -> tuple[Array, Array]:
         """Residual and Jacobian by the coordinates, with the anchors in place of the weak priors."""
-        residual, jacobian = self.problem.residual_without_weak_priors(evaluation)
+        residual, jacobian = residual_without_weak_priors(self.problem, evaluation)
         slope = np.where(self.positive, self.unknowns(s), 1.0)
         anchors = np.zeros((len(self.anchored), len(s)))
         anchors[np.arange(len(self.anchored)), self.anchored] = 1.0 / _LOG_PRIOR_STD

@@ -20,11 +20,12 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from yid_ocp.errors import SolverError
+from yid_ocp.inference.whitening import NominalTrajectory, nominal_trajectory
 from yid_ocp.integrator.linearized_steps import linearized_steps
 from yid_ocp.integrator.momentum_shift import torque_error_feedthrough
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.input_noise import InputErrors, NominalTrajectory
+from yid_ocp.problem.input_errors import InputErrors
 from yid_ocp.sensors import Sensor
 from yid_ocp.sensors.joints import PositionSensor
 
@@ -77,7 +78,7 @@ def episode_sensitivities(
             shown.append((samples.sensor, block.reshape(len(samples.value), -1, len(x))))
         else:
             told.append(block)
-    course = problem.predictor.nominal_trajectory(episode, result, problem.split(x, i)[0])
+    course = nominal_trajectory(problem.predictor, episode, result, problem.split(x, i)[0])
     units = [finest[sensor.group_name] for sensor, block in shown for _ in range(block.shape[1])]
     by_state = [_by_state(course, sensor) for sensor, _ in shown]
     if driving.input_errors is None:

@@ -25,12 +25,12 @@ from yid_ocp.analysis.experiment_design import (
 from yid_ocp.analysis.identifiability import InitialStateKnowledge, identifiability, unknowns_from_solution
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import SolverError
+from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD, parameter_verdict
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.solvers.base import Solution
-from yid_ocp.solvers.uncertainty import MAX_WEAK_RELATIVE_STD, parameter_verdict
 
 Array = NDArray[np.float64]
 

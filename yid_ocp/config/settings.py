@@ -19,12 +19,12 @@ from ruamel.yaml.comments import CommentedSeq
 from yid_ocp.data.recording import ClockKind
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import ConfigError
+from yid_ocp.inference.null_test import GapCriteria
 from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
 from yid_ocp.model.cable import CableOptions
 from yid_ocp.model.servos_and_springs import CommandInterpolation
 from yid_ocp.options import OptionInfo, RegistryChoice, dataclass_options, split_annotated
 from yid_ocp.planning.options import PlanOptions
-from yid_ocp.problem.null_test import GapCriteria
 from yid_ocp.problem.options import ProblemOptions, SensorOptions
 from yid_ocp.solvers import SOLVERS, GaussNewton, Lifted, MultipleShooting, SingleShooting, SteepestDescent
 from yid_ocp.solvers.base import Solver

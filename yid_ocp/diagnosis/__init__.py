@@ -13,6 +13,4 @@ from yid_ocp.diagnosis.screening import linearize_candidates as linearize_candid
 from yid_ocp.diagnosis.screening import score_candidates as score_candidates
 from yid_ocp.diagnosis.screening import score_jointly as score_jointly
 from yid_ocp.diagnosis.select import gap_closure as gap_closure
-from yid_ocp.diagnosis.smoother import SmootherResult as SmootherResult
-from yid_ocp.diagnosis.smoother import run_smoother as run_smoother
 from yid_ocp.diagnosis.thresholds import Thresholds as Thresholds

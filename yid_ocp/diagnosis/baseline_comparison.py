@@ -16,6 +16,7 @@ import scipy.stats
 from yid_ocp.analysis.estimate_history import RunEstimates, nearest_positive_definite
 from yid_ocp.diagnosis.refit import RefitModel
 from yid_ocp.errors import ConfigError, nearest_name_hint
+from yid_ocp.inference.linear_model import residual_without_weak_priors
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.options import MultivariateGaussianPrior
 
@@ -193,6 +194,6 @@ def _plain_variance(problem: EstimationProblem, fit: RefitModel) -> Mapping[str,
     evaluation = fit.evaluation
     if evaluation.jacobian is None:
         evaluation = problem.evaluate(problem.vector(fit.values), equilibrium_guesses=evaluation.equilibrium_guesses)
-    jacobian = problem.residual_without_weak_priors(evaluation)[1] * problem.unknown_scales
+    jacobian = residual_without_weak_priors(problem, evaluation)[1] * problem.unknown_scales
     variance = np.diag(np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-14, hermitian=True)) * problem.unknown_scales**2
     return dict(zip(problem.unknown_names, map(float, variance), strict=True))

@@ -12,6 +12,7 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.refit import REFIT_SOLVER, RefitModel
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError, YidError
+from yid_ocp.inference.whitening import whitened_by_sensor_noise
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.options import MultivariateGaussianPrior
 from yid_ocp.problem.prediction_errors import rmse_by_channel
@@ -155,7 +156,7 @@ def _errors(
 ) -> tuple[dict[str, float], dict[str, str]]:
     neutral = {name: value for effect in effects for name, value in effect.neutral_values.items()}
     if problem.has_process_noise:
-        problem = problem.whitened_by_sensor_noise()
+        problem = whitened_by_sensor_noise(problem)
     found = problem.predict_held_out(problem.vector({**neutral, **values}))
     failed = [result for _, result in found if isinstance(result, str)]
     if failed:

@@ -41,7 +41,6 @@ from yid_ocp.diagnosis.localise import (
 from yid_ocp.diagnosis.refit import RefitContext, RefitModel, RefitStore, load_stored_refit, refit_with_effects
 from yid_ocp.diagnosis.screening import ScreeningResult, screen_candidates
 from yid_ocp.diagnosis.select import GapClosure, SelectedEffect, gap_closure, select_effects
-from yid_ocp.diagnosis.smoother import SmootherResult, run_smoother
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.diagnosis.transfer_check import check_transfer, inflate_std_by_disagreement
 from yid_ocp.diagnosis.verdict import (
@@ -52,20 +51,22 @@ from yid_ocp.diagnosis.verdict import (
     is_chance_excess,
 )
 from yid_ocp.errors import DataError, SolverError
-from yid_ocp.parallel import map_with_batched_calls
-from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.constant_sensor_errors import subtract_estimated_biases
-from yid_ocp.problem.null_test import (
+from yid_ocp.inference.null_test import (
     NullTestResult,
     channel_noise_levels,
     residual_channels,
     run_null_test,
     whiten_with_extra_errors,
 )
+from yid_ocp.inference.smoother import SmootherResult, run_smoother
+from yid_ocp.inference.uncertainty import noise_covariance_factor
+from yid_ocp.inference.whitening import whitened_at, whitened_by_sensor_noise
+from yid_ocp.parallel import map_with_batched_calls
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.constant_sensor_errors import subtract_estimated_biases
 from yid_ocp.progress import LoggingProgress, Progress
 from yid_ocp.solvers import GaussNewton, Solution, solve
 from yid_ocp.solvers.base import RESTART_FACTORS
-from yid_ocp.solvers.uncertainty import noise_covariance_factor
 
 log = logging.getLogger(__name__)
 
@@ -264,7 +265,7 @@ def _happened(whole: EstimationProblem, fit: RefitModel, limits: Thresholds) -> 
     own, x = fit.problem.with_episodes(whole.episodes, whole.held_out), fit.problem.vector(fit.values)
     smoothed = None
     if own.system.free_indices:
-        judged = own.whitened_at(x, fit.evaluation.equilibrium_guesses) if own.has_process_noise else own
+        judged = whitened_at(own, x, fit.evaluation.equilibrium_guesses) if own.has_process_noise else own
         residual = judged.evaluate(x, False, fit.evaluation.equilibrium_guesses)
         if not residual.ok:
             return _Happened()
@@ -294,7 +295,7 @@ def _happened(whole: EstimationProblem, fit: RefitModel, limits: Thresholds) -> 
 def _excess(fit: RefitModel, problem: EstimationProblem) -> float:
     """r'r of a fit beyond the number of samples that count, in all of a problem's recordings that can be predicted."""
     x, warm = problem.vector(fit.values), fit.evaluation.equilibrium_guesses
-    judged = problem.whitened_at(x, warm) if problem.has_process_noise else problem
+    judged = whitened_at(problem, x, warm) if problem.has_process_noise else problem
     evaluation = judged.evaluate(x, False, warm)
     if not evaluation.ok:
         return math.inf
@@ -575,7 +576,7 @@ def _smooth_about_model(fit: RefitModel, limits: Thresholds = DEFAULT_THRESHOLDS
     """
     problem, evaluation, x = fit.problem, fit.evaluation, fit.problem.vector(fit.values)
     if problem.has_process_noise:
-        problem = problem.whitened_by_sensor_noise()
+        problem = whitened_by_sensor_noise(problem)
         evaluation = problem.evaluate(x, equilibrium_guesses=fit.evaluation.equilibrium_guesses)
     if any(episode.has_constant_sensor_errors for episode in problem.episodes):
         pairs = zip(problem.episodes, evaluation.episode_predictions, strict=True)

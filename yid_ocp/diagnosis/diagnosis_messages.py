@@ -19,7 +19,7 @@ from yid_ocp.diagnosis.transfer_check import failed_transfer_checks
 from yid_ocp.diagnosis.verdict import assumption_count, required_explained_fraction
 from yid_ocp.effects import EffectBase
 from yid_ocp.effects.base import EXCITATIONS
-from yid_ocp.problem.null_test import NullTestResult
+from yid_ocp.inference.null_test import NullTestResult
 
 _MIN_RELATIVE_CHANGE = 0.1
 """Relative change from which a nominal parameter is named."""

@@ -27,14 +27,14 @@ from yid_ocp.diagnosis.select import (
     penalized_chi2_difference,
     rmse_reduction,
 )
-from yid_ocp.diagnosis.smoother import SmootherResult
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.transfer_check import TransferCheck
 from yid_ocp.diagnosis.verdict import UnknownReason, assumption_count
 from yid_ocp.display import ReprMixin, ReprSummary
 from yid_ocp.effects import EffectBase
-from yid_ocp.problem.null_test import ChannelNoiseLevel, NullTestResult, bonferroni_p_value
-from yid_ocp.solvers.uncertainty import covariance_and_chi2, covariance_to_dict
+from yid_ocp.inference.null_test import ChannelNoiseLevel, NullTestResult, bonferroni_p_value
+from yid_ocp.inference.smoother import SmootherResult
+from yid_ocp.inference.uncertainty import covariance_and_chi2, covariance_to_dict
 
 _FORMAT = "yid-diagnosis/1"
 

@@ -13,6 +13,12 @@ from numpy.typing import NDArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import EFFECTS, EffectBase, candidate_effects, make_effect
 from yid_ocp.errors import ConfigError, DataError
+from yid_ocp.inference.whitening import (
+    held_out_relinearized_at_torque_bias,
+    held_out_whitened_at,
+    relinearized_at_torque_bias,
+    whitened_at,
+)
 from yid_ocp.integrator.step import Step, compile_step_like
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
@@ -186,7 +192,7 @@ class AllCandidatesProblem:
         Twice in a row, so that what is frozen is about the offsets that the torques have there.
         """
         x = self.problem.vector(values)
-        return replace(self, problem=self.problem.whitened_at(x, rounds=2).held_out_whitened_at(x))
+        return replace(self, problem=held_out_whitened_at(whitened_at(self.problem, x, rounds=2), x))
 
     def truncate_held_out(
         self, values: Mapping[str, float], margin: float
@@ -229,13 +235,13 @@ class AllCandidatesProblem:
         are left as they are: see `held_out_relinearized`.
         """
         own = self.with_free_effects(effects)
-        return own.relinearized_at_torque_bias(*_beside(own, effects, at)) if own.has_process_noise else own
+        return relinearized_at_torque_bias(own, *_beside(own, effects, at)) if own.has_process_noise else own
 
     def held_out_relinearized(
         self, own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]
     ) -> EstimationProblem:
         """Return a `relinearized_with_effects` problem with the held-out recordings relinearised too, once at the end of a fit."""
-        return own.held_out_relinearized_at_torque_bias(*_beside(own, effects, at)) if own.has_process_noise else own
+        return held_out_relinearized_at_torque_bias(own, *_beside(own, effects, at)) if own.has_process_noise else own
 
 
 def _beside(own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]) -> tuple[Array, Array]:

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.diagnosis.smoother import SmoothedUnknowns, SmootherResult
-from yid_ocp.diagnosis.smoother_model import UnknownGroup
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS
+from yid_ocp.inference.smoother import SmoothedUnknowns, SmootherResult
+from yid_ocp.inference.smoother_model import UnknownGroup
 from yid_ocp.model.system import System
 
 Array = NDArray[np.float64]

@@ -12,23 +12,27 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, join_effect_labels
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EffectBase, ReportedParameter
+from yid_ocp.inference.null_test import sample_times
+from yid_ocp.inference.uncertainty import assess_goodness_of_fit, covariance_of_fit, std_from_covariance
+from yid_ocp.inference.whitening import (
+    relinearized_at_torque_bias,
+    torque_bias_distance,
+    whitened_by_sensor_noise,
+)
 from yid_ocp.parallel import map_with_batched_calls
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
-from yid_ocp.problem.null_test import sample_times
 from yid_ocp.problem.prediction_errors import rmse_by_channel
-from yid_ocp.problem.torque_bias_relinearization import torque_bias_distance
 from yid_ocp.progress import ParallelProgress, Progress
 from yid_ocp.solvers import GaussNewton, Status
 from yid_ocp.solvers.base import SolverResult
-from yid_ocp.solvers.uncertainty import assess_goodness_of_fit, covariance_of_fit, std_from_covariance
 
 Array = NDArray[np.float64]
 
@@ -239,20 +243,17 @@ class _Attempt:
     finish: Evaluation
 
 
-class _Following(EstimationProblem):
-    """A problem whose filters are about the torques that are seen wherever it is evaluated, from the last place on."""
+@dataclass
+class _RelinearizedEvaluation:
+    """Evaluates a problem with filters about the torques that are seen at each point, from those of the last one on."""
 
-    def __init__(self, problem: EstimationProblem) -> None:
-        vars(self).update(vars(problem))
-        self._last = problem
+    problem: EstimationProblem
 
-    def evaluate(
-        self, x: ArrayLike, derivatives: bool = True, equilibrium_guesses: EquilibriumGuesses | None = None
+    def __call__(
+        self, x: Array, derivatives: bool = True, equilibrium_guesses: EquilibriumGuesses | None = None
     ) -> Evaluation:
-        """Evaluate residual and Jacobian about the torques estimated at `x`."""
-        x = np.asarray(x, float)
-        self._last = self._last.relinearized_at_torque_bias(x, x)
-        return self._last.evaluate(x, derivatives, equilibrium_guesses)
+        self.problem = relinearized_at_torque_bias(self.problem, x, x)
+        return self.problem.evaluate(x, derivatives, equilibrium_guesses)
 
 
 def _half_done(
@@ -296,7 +297,7 @@ def _attempt(
     ):
         return found
     # about fixed torques a run stops where the effect and an offset that it makes superfluous hold each other
-    outcome = REFIT_SOLVER.minimize_cost(_Following(found.problem), outcome.x, None)
+    outcome = REFIT_SOLVER.minimize_cost(found.problem, outcome.x, None, _RelinearizedEvaluation(found.problem))
     again = None if outcome.status == Status.FAILED else _seen(problem, effects, outcome)
     return again if again is not None and again.finish.cost < found.finish.cost else found
 
@@ -459,7 +460,7 @@ def _held_out_loss(problem: EstimationProblem, x: Array) -> HeldOutLoss:
         counts.append(count[keep])
     if problem.has_process_noise:
         # in metres and radians a prediction has its torques as they were recorded, less their offsets
-        found = problem.whitened_by_sensor_noise().predict_held_out(x)
+        found = whitened_by_sensor_noise(problem).predict_held_out(x)
     predicted = [(result, episode) for episode, result in found if not isinstance(result, str)]
     errors = rmse_by_channel(*map(list, zip(*predicted, strict=True))) if predicted else {}
     channels = {name: (float(entry["rmse"]), str(entry["unit"])) for name, entry in errors.items()}

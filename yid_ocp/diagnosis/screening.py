@@ -28,7 +28,8 @@ from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
-from yid_ocp.problem.null_test import ResidualChannel, residual_channels
+from yid_ocp.inference.linear_model import residual_without_weak_priors
+from yid_ocp.inference.null_test import ResidualChannel, residual_channels
 
 Array = NDArray[np.float64]
 
@@ -170,7 +171,7 @@ def linearize_candidates(
         names, warm = list(trial.unknown_names), evaluation.equilibrium_guesses
         places = [names.index(name) for name in amplitudes]
         rest = np.setdiff1d(np.arange(len(names)), places)
-        data, jacobian = trial.residual_without_weak_priors(evaluation)
+        data, jacobian = residual_without_weak_priors(trial, evaluation)
         if k == 0:
             basis = _basis(jacobian[:, rest])
             residual = data - basis @ (basis.T @ data)

@@ -32,7 +32,7 @@ from yid_ocp.diagnosis.screening import (
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
-from yid_ocp.solvers.uncertainty import CHI2_95_TWO_SIDED
+from yid_ocp.inference.uncertainty import CHI2_95_TWO_SIDED
 
 _N_BOOTSTRAP = 1000
 """Draws of held-out blocks for the interval of a closure."""

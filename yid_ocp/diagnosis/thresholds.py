@@ -7,12 +7,13 @@ from typing import Annotated
 
 from annotated_types import Ge, Gt, Le, Lt
 
+from yid_ocp.inference.null_test import DEFAULT_GAP_CRITERIA, RESIDUAL_WINDOW_LENGTH, GapCriteria
+from yid_ocp.inference.smoother_model import SmootherThresholds
 from yid_ocp.options import OptionInfo
-from yid_ocp.problem.null_test import DEFAULT_GAP_CRITERIA, RESIDUAL_WINDOW_LENGTH, GapCriteria
 
 
 @dataclass(frozen=True)
-class Thresholds:
+class Thresholds(SmootherThresholds):
     """Thresholds of every step of a diagnosis: null test, screening, refits, selection, localisation and events.
 
     Attributes
@@ -73,22 +74,8 @@ class Thresholds:
         Largest difference of the same amplitudes in standard deviations; smaller ones always agree.
     min_explained_fraction : float
         Fraction of the smoother's explained chi2 that the effects are required to explain.
-    min_log_bayes_factor : float
-        Smallest log Bayes factor for adding a group of unknowns; 5 means odds of 150 to 1.
-    max_unknown_groups : int
-        Maximum number of groups of unknowns.
-    detectable_chi2 : float
-        Rise of r'r at which unknowns of the reference size below are detectable.
-    force_prior_std : float
-        Prior standard deviation of an unknown force, relative to the load at its location.
-    grasp_offset_prior_std : float
-        Prior standard deviation of a grasp's unknown offset [m].
-    bias_prior_std : float
-        Prior standard deviation of a sensor's unknown bias, relative to its noise.
     location_z : float
         Distance of an unknown from zero, in standard deviations, at which a time interval belongs to the gap.
-    location_tie : float
-        Fraction of a location's log evidence that another must reach to be indistinguishable from it.
     informed_fraction : float
         1 - posterior/prior variance above which the data inform an unknown's value.
     inverse_dynamics_rtol : float
@@ -162,18 +149,7 @@ class Thresholds:
         float, Ge(0), Le(1), OptionInfo("part of the smoother's explanation that effects reach")
     ] = 0.75
     # where the gap lies
-    min_log_bayes_factor: Annotated[
-        float, Gt(0), OptionInfo("rise of the log evidence that a group of unknowns must bring")
-    ] = 5.0
-    max_unknown_groups: Annotated[int, Ge(1), OptionInfo("groups of unknowns taken in at most")] = 4
-    detectable_chi2: Annotated[float, Gt(0), OptionInfo("rise of r'r by which unknowns would be noticed")] = 10.0
-    force_prior_std: Annotated[float, Gt(0), OptionInfo("unknown force over the load that its place carries")] = 0.1
-    grasp_offset_prior_std: Annotated[float, Gt(0), OptionInfo("unknown offset of a grasp", "m")] = 2e-3
-    bias_prior_std: Annotated[float, Gt(0), OptionInfo("unknown bias over the noise of its sensor")] = 3.0
     location_z: Annotated[float, Gt(0), OptionInfo("standard deviations from zero at which the gap is there")] = 3.0
-    location_tie: Annotated[
-        float, Gt(0), Le(1), OptionInfo("part of a place's evidence at which another is named beside it")
-    ] = 0.9
     informed_fraction: Annotated[
         float, Ge(0), Lt(1), OptionInfo("1 - posterior/prior variance of an informed value")
     ] = 0.5

@@ -8,9 +8,9 @@ from typing import Literal
 from yid_ocp.diagnosis.refit import RefitModel
 from yid_ocp.diagnosis.screening import CandidateDetectability, CandidateScore, bonferroni_min_p_value
 from yid_ocp.diagnosis.select import GapClosure, SelectedEffect
-from yid_ocp.diagnosis.smoother import SmootherResult
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.problem.null_test import NullTestResult, exceeds_noise
+from yid_ocp.inference.null_test import NullTestResult, exceeds_noise
+from yid_ocp.inference.smoother import SmootherResult
 
 UnknownReason = Literal["", "none", "unsure", "little", "stand_in"]
 """Why the verdict is unknown: no candidate helps, closure not significant, too little explained, no transfer."""

@@ -14,6 +14,7 @@ from yid_ocp.analysis.experiment_design import observable_frames, with_added_fra
 from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.effects import EffectBase, make_effect
 from yid_ocp.errors import ConfigError, SolverError, nearest_name_hint
+from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD, MIN_UNINFORMED_RELATIVE_STD
 from yid_ocp.integrator.step import compile_step_like
 from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.options import check_option_bounds
@@ -27,7 +28,6 @@ from yid_ocp.planning.plan_constraints import PlanResidualsAndLimits
 from yid_ocp.planning.planned_experiment import PlannedExperiment
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import NULL_PROGRESS, Progress
-from yid_ocp.solvers.uncertainty import MAX_WEAK_RELATIVE_STD, MIN_UNINFORMED_RELATIVE_STD
 
 Array = NDArray[np.float64]
 

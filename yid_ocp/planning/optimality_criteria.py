@@ -14,7 +14,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from yid_ocp.solvers.uncertainty import MAX_WEAK_RELATIVE_STD
+from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD
 
 Array = NDArray[np.float64]
 

@@ -24,6 +24,8 @@ from scipy.interpolate import BSpline
 from yid_ocp.analysis.experiment_design import DEFAULT_TORQUE_STD
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import ConfigError, DataError, SolverError
+from yid_ocp.inference.linear_model import residual_without_weak_priors
+from yid_ocp.inference.whitening import whitened_at
 from yid_ocp.integrator.step import Step, compile_step_like
 from yid_ocp.parallel import map_with_batched_calls
 from yid_ocp.planning.end_equilibria import ordered_start_positions, solve_start_equilibrium
@@ -255,7 +257,7 @@ class PlannedExperiment:
         )
 
     def _weighted(self, problem: EstimationProblem) -> Array:
-        problem = problem.whitened_at(problem.initial_unknowns)
+        problem = whitened_at(problem, problem.initial_unknowns)
         evaluation = problem.evaluate(problem.initial_unknowns)
         if not evaluation.ok:
             raise SolverError(f"the motion cannot be followed by its torques: {evaluation.message}")
@@ -266,7 +268,7 @@ class PlannedExperiment:
 
         That is not something that a sensor sees.
         """
-        jacobian = problem.residual_without_weak_priors(evaluation)[1] * _sizes(problem)
+        jacobian = residual_without_weak_priors(problem, evaluation)[1] * _sizes(problem)
         own = np.array([name.split("[")[0] in self.free_parameters for name in problem.unknown_names])
         jacobian[problem.residual_rows.stated_priors] = np.where(
             own, 0.0, jacobian[problem.residual_rows.stated_priors]

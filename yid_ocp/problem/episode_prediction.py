@@ -16,11 +16,9 @@ from yid_ocp.integrator.step import Rollout, SensitivityDirections, Step
 from yid_ocp.integrator.step_model import RolloutInputs
 from yid_ocp.model.system import System
 from yid_ocp.parallel import map_in_threads
-from yid_ocp.problem.constant_sensor_errors import subtract_estimated_biases
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.first_order_lag import FirstOrderLag
 from yid_ocp.problem.input_corrections import CorrectedInputs
-from yid_ocp.problem.input_noise import InputErrors, NominalTrajectory, WhiteningFilter, build_whitening_filter
 from yid_ocp.problem.low_pass_filter import LowPassFilter, NodeSmoother
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.model_functions import ModelFunctions
@@ -32,9 +30,6 @@ from yid_ocp.problem.unknown_vector import UnknownVectorLayout
 Array = NDArray[np.float64]
 _MAX_PARALLEL_ROLLOUTS, _MAX_ROLLOUT_MEMORY = 16, 2.0**28
 """Largest number of episodes rolled out at once, and largest memory of their states and derivatives [bytes]."""
-
-_MIN_TORQUE_GAIN = 0.1
-"""Smallest ratio of acting to recorded torque at which errors of one are converted into errors of the other."""
 
 
 @dataclass(frozen=True)
@@ -345,94 +340,6 @@ class EpisodePredictor:
             by_correction,
         )
 
-    def episode_and_whitening_filter(
-        self, episode: Episode, theta: Array, offset: Array, guess: Array | None, before: WhiteningFilter | None
-    ) -> tuple[Episode, WhiteningFilter | None]:
-        """Return the episode with its estimated input errors, and the filter that whitens its residual here.
-
-        The filter is None without process noise, or where the rollout fails.
-
-        Parameters
-        ----------
-        episode : Episode
-        theta : ndarray, shape (ntheta,)
-        offset : ndarray
-            Of an estimated start.
-        guess : ndarray, shape (n,), or None
-            Configuration near the equilibrium.
-        before : Innovations or None
-            Filter that the episode has already; the new one is linearized about the motion that it smooths.
-        """
-        if episode.input_errors is None:
-            return episode, None
-        result = self.predict_episode(episode, theta, offset, False, guess)
-        if before is not None and not isinstance(result, str):
-            episode = self._about_smoothed(episode, theta, result, before)
-            result = self.predict_episode(episode, theta, offset, False, guess)
-        if isinstance(result, str) or episode.input_errors is None:
-            return episode, None
-        return episode, build_whitening_filter(self.nominal_trajectory(episode, result, theta), episode.input_errors)
-
-    def _about_smoothed(
-        self, episode: Episode, theta: Array, result: EpisodePrediction, before: WhiteningFilter
-    ) -> Episode:
-        """The episode about what all measurements say of its torques and, where encoders are among them, its motion."""
-        errors, feedback = episode.input_errors, episode.tracking_feedback
-        assert errors is not None
-        found = before.smooth(_plain(episode, result), result.torque_correction_columns)
-        own = self.episode_theta(episode, theta)
-        errors = self._behind_effects(
-            episode, own, replace(errors, torque_bias=found.torque_bias, torque_noise=found.torque_noise)
-        )
-        if errors.has_encoder_measurements and feedback is not None:
-            inputs = self.tracking_inputs(episode, own, (), result.rollout.state[0])
-            guided = inputs.corrected_feedback(feedback, self.system.driven_indices, episode.measured_driven_angles)
-            assert guided is not None
-            shift = guided.reference - feedback.reference
-            true = (result.rollout.state - found.state_error)[:-1, feedback.state_indices]
-            errors = replace(errors, smoothed_reference=true - shift)
-        return replace(episode, input_errors=errors)
-
-    def _behind_effects(self, episode: Episode, theta: Array, errors: InputErrors) -> InputErrors:
-        """The same errors with what of the readings is noise: by which readings are multiplied, w is divided."""
-        corrections, nu = self.model_functions.input_corrections, errors.torque_noise.shape[1]
-        read = errors.torque_noise
-        if corrections.corrects_efforts:
-            readings = np.pad(episode.torque, ((0, 0), (0, episode.prescribed_path.shape[1])))
-            by_reading = corrections.true_angles_and_efforts(np.zeros_like(readings), readings, theta, ())[4][:, :nu]
-            # a reading of which hardly anything acts says nothing of what is wrong with it
-            seen = np.abs(by_reading) > _MIN_TORQUE_GAIN
-            read = np.where(seen, read, 0.0) / np.where(seen, by_reading, 1.0)
-        none = replace(episode, input_errors=errors.with_bias_only)
-        without = replace(episode, input_errors=replace(errors.with_bias_only, recorded_torque_noise=read))
-        through = self.corrected_inputs(none, theta, ()).torque - self.corrected_inputs(without, theta, ()).torque
-        return replace(errors, recorded_torque_noise=read, transmitted_torque_noise=through)
-
-    def estimate_torque_bias(self, episode: Episode, result: EpisodePrediction, whitening: WhiteningFilter) -> Array:
-        """Constant torque error of each driven joint, estimated from all measurements of an episode, (nu,) [N m]."""
-        return whitening.whiten(_plain(episode, result)[:, None], result.torque_correction_columns)[1][:, 0]
-
-    def nominal_trajectory(self, episode: Episode, result: EpisodePrediction, theta: Array) -> NominalTrajectory:
-        """Trajectory of an episode about which its input errors are linearized."""
-        own, rollout = self.episode_theta(episode, theta), result.rollout
-        nx, nu = self.step.sizes["nx"], self.step.sizes["nu"]
-        by_angles, by_torque = np.zeros((nx, nu)), np.zeros((nx, nu))
-        if result.equilibrium is not None:
-            by_angles, by_torque = (
-                result.equilibrium.state_by_known_coordinates[:, :nu],
-                result.equilibrium.state_by_torque,
-            )
-        return NominalTrajectory(
-            self.model_functions,
-            own,
-            rollout,
-            [self.measurements_at_true_times(samples, own) for samples in episode.measurements],
-            episode.tracking_feedback,
-            self.joint_efforts(rollout),
-            by_angles,
-            by_torque,
-        )
-
     def readings_along_trajectory(
         self, samples: Measurements, state: Array, by_state: Array, theta: Array
     ) -> tuple[Array, Array]:
@@ -621,11 +528,3 @@ class _Pulls:
     by_state: Array
     by_effort: Array
     by_torque: Array
-
-
-def _plain(episode: Episode, result: EpisodePrediction) -> Array:
-    """Residual of an episode in units of the sensors' noise, their constant errors taken off."""
-    samples = subtract_estimated_biases(episode.measurements, result.predicted_outputs)
-    return np.concatenate(
-        [s.residual_block(y).residual for s, y in zip(samples, result.predicted_outputs, strict=True)]
-    )

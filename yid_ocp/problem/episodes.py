@@ -16,7 +16,7 @@ from yid_ocp.integrator.lqr import lqr_feedback, proportional_feedback
 from yid_ocp.integrator.rollout import generalized_momentum
 from yid_ocp.integrator.step import Step, TrackingFeedback, float_array_of_shape
 from yid_ocp.problem.initial_state_fit import FixedInitialState
-from yid_ocp.problem.input_noise import InputErrors, recorded_input_errors
+from yid_ocp.problem.input_errors import InputErrors, recorded_input_errors
 from yid_ocp.problem.low_pass_filter import LowPassFilter, effort_filter
 from yid_ocp.problem.measurements import Measurements, place_on_grid, with_paper_weights
 from yid_ocp.problem.model_functions import ModelFunctions

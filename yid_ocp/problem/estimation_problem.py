@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -15,19 +15,22 @@ from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.step import Step
 from yid_ocp.model.system import System
-from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.problem.episodes import Episode, mass_matrix_diagonal, prepare_episode
 from yid_ocp.problem.equilibrium_and_loads import with_observed_equilibrium
-from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation, ResidualRows, whitened_episode_residual
+from yid_ocp.problem.evaluation import (
+    EquilibriumGuesses,
+    Evaluation,
+    ResidualRows,
+    ResidualWhitener,
+    whitened_episode_residual,
+)
 from yid_ocp.problem.held_out_initial_state import estimate_initial_state_offset
-from yid_ocp.problem.input_noise import InputErrors, WhiteningFilter
 from yid_ocp.problem.measurements import ResidualBlock, huber_loss
 from yid_ocp.problem.model_functions import ModelFunctions
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.problem.prediction_result import EpisodePrediction, InitialState
 from yid_ocp.problem.synthetic_recording import synthesize_recording
-from yid_ocp.problem.torque_bias_relinearization import relinearized_filters, with_filter_input_errors
 from yid_ocp.problem.unknown_vector import (
     UnknownVectorLayout,
     check_free_parameters,
@@ -46,8 +49,8 @@ Array = NDArray[np.float64]
 class EstimationProblem(ReprMixin):
     """Estimation of free parameters from recordings: residual, cost and derivatives; immutable and thread-safe.
 
-    Methods evaluate the cost, predict held-out recordings, derive problems with other parameters, data or options,
-    whiten residuals, and pack and split the unknown vector.
+    It evaluates the cost, predicts held-out recordings, and derives problems with other parameters, data, options or
+    whitening filters; `inference.whitening` makes these filters.
 
     Parameters
     ----------
@@ -75,10 +78,8 @@ class EstimationProblem(ReprMixin):
     episodes, held_out : tuple of Episode
     residual_rows : ResidualRows
         Layout of the residual.
-    whitening_filters : tuple of Innovations or None
-        Filter that whitens each recording's residual; None where sensor noise is the only noise, see `whitened_at`.
-    held_out_whitening_filters : tuple of Innovations or None
-        The same for held-out recordings, see `held_out_whitened_at`.
+    whitening_filters, held_out_whitening_filters : tuple of ResidualWhitener or None
+        Filter that whitens each recording's residual; None where sensor noise is the only noise.
 
     Raises
     ------
@@ -97,8 +98,8 @@ class EstimationProblem(ReprMixin):
     unknowns: UnknownVectorLayout
     predictor: EpisodePredictor
     residual_rows: ResidualRows
-    whitening_filters: tuple[WhiteningFilter | None, ...]
-    held_out_whitening_filters: tuple[WhiteningFilter | None, ...]
+    whitening_filters: tuple[ResidualWhitener | None, ...]
+    held_out_whitening_filters: tuple[ResidualWhitener | None, ...]
 
     def __init__(
         self,
@@ -137,8 +138,8 @@ class EstimationProblem(ReprMixin):
         theta: Array,
         episodes: tuple[Episode, ...],
         held_out: tuple[Episode, ...],
-        whitening_filters: tuple[WhiteningFilter | None, ...] = (),
-        held_out_whitening_filters: tuple[WhiteningFilter | None, ...] = (),
+        whitening_filters: tuple[ResidualWhitener | None, ...] = (),
+        held_out_whitening_filters: tuple[ResidualWhitener | None, ...] = (),
     ) -> None:
         theta.setflags(write=False)
         self.whitening_filters = whitening_filters or (None,) * len(episodes)
@@ -320,23 +321,6 @@ class EstimationProblem(ReprMixin):
             return Evaluation(np.inf, residual, None, False, "the cost is not finite", done)
         return Evaluation(cost, residual, jacobian, True, "", done)
 
-    def estimate_torque_biases(self, x: ArrayLike) -> list[tuple[Array, Array] | None]:
-        """Estimate each recording's constant torque errors at `x`: values and standard deviations (nu,) [N m].
-
-        None where torques are taken as exact, or where no whitening filter is set (`whitened_at`).
-        """
-        x = np.asarray(x, float)
-        found: list[tuple[Array, Array] | None] = []
-        for i, (episode, whitening) in enumerate(zip(self.episodes, self.whitening_filters, strict=True)):
-            result = "" if whitening is None else self.predictor.predict_episode(episode, *self.split(x, i), False)
-            if whitening is None or isinstance(result, str):
-                found.append(None)
-            else:
-                found.append(
-                    (self.predictor.estimate_torque_bias(episode, result, whitening), whitening.torque_bias_std)
-                )
-        return found
-
     def cost_and_gradient(
         self, x: ArrayLike, evaluation: Evaluation | None = None, equilibrium_guesses: EquilibriumGuesses | None = None
     ) -> tuple[float, Array, Evaluation]:
@@ -387,19 +371,6 @@ class EstimationProblem(ReprMixin):
         rows[len(stated) + np.arange(len(weak)), weak] = slope / (spread * start[weak])
         return np.concatenate([stated @ (x - start), value / spread]), rows
 
-    def residual_without_weak_priors(self, evaluation: Evaluation) -> tuple[Array, Array]:
-        """Return the noise-scaled residual (r,) and Jacobian (r, nx) of data and stated priors, without weak priors."""
-        assert evaluation.jacobian is not None
-        residual, jacobian = (
-            evaluation.residual[self.residual_rows.without_weak_priors],
-            evaluation.jacobian[self.residual_rows.without_weak_priors],
-        )
-        if self.data_noise_unit == 1.0:
-            return residual, jacobian
-        unit = np.ones(len(residual))
-        unit[self.residual_rows.data] = self.data_noise_unit
-        return residual / unit, jacobian / unit[:, None]
-
     def initial_state(
         self, episode: Episode, theta: Array, offset: Array | None = None, guess: Array | None = None
     ) -> InitialState:
@@ -429,39 +400,32 @@ class EstimationProblem(ReprMixin):
         An `estimate_errors` initial state is found from the first `_HELD_OUT_START_WINDOW` seconds and its prior. Derivatives are by
         (free parameters, initial state offset), the initial state held.
         """
+        return [
+            (episode, self.predictor.predict_episode(episode, theta, offset, derivatives))
+            for episode, theta, offset in self.held_out_evaluation_points(x)
+        ]
+
+    def held_out_evaluation_points(self, x: ArrayLike) -> list[tuple[Episode, Array, Array]]:
+        """Each held-out episode with its fitted initial state, theta, and the offset of an estimated initial state."""
         x = np.asarray(x, float)
-        theta = self._held_out_theta(x)
+        theta, found = self.held_out_theta(x), []
+        for held in self.held_out:
+            shared = held.initial_state_shared_with
+            if shared is not None:
+                episode = replace(held, fixed_initial_state=self.episodes[shared].fixed_initial_state)
+                found.append((episode, theta, self.split(x, shared)[1]))
+                continue
+            episode = self.predictor.with_fitted_initial_state(held, theta)
+            std = self.initial_state_prior_std
+            found.append((episode, theta, estimate_initial_state_offset(self.predictor, episode, theta, std)))
+        return found
 
-        def one(held: Episode) -> tuple[Episode, EpisodePrediction | str]:
-            episode = self._held_out_episode(held, theta)
-            return episode, self.predictor.predict_episode(
-                episode, theta, self._held_out_offset(episode, theta, x), derivatives
-            )
-
-        return [one(episode) for episode in self.held_out]
-
-    def _held_out_episode(self, held: Episode, theta: Array) -> Episode:
-        if held.initial_state_shared_with is not None:
-            return replace(held, fixed_initial_state=self.episodes[held.initial_state_shared_with].fixed_initial_state)
-        return self.predictor.with_fitted_initial_state(held, theta)
-
-    def held_out_initial_state_offset(self, i: int, x: ArrayLike) -> Array:
-        """Offset of a held-out recording's initial state from equilibrium at `x`, shape (number of estimated rows,)."""
-        x = np.asarray(x, float)
-        theta = self._held_out_theta(x)
-        return self._held_out_offset(self._held_out_episode(self.held_out[i], theta), theta, x)
-
-    def _held_out_theta(self, x: Array) -> Array:
+    def held_out_theta(self, x: Array) -> Array:
         """theta with the shared parameters of `x`, local ones at their initial value."""
         theta, _ = self.split(x, 0)
         for name in self.local_parameters:
             theta[self.system.parameters.index(name)] = self.theta[self.system.parameters.index(name)]
         return theta
-
-    def _held_out_offset(self, episode: Episode, theta: Array, x: Array) -> Array:
-        if episode.initial_state_shared_with is not None:
-            return self.split(x, episode.initial_state_shared_with)[1]
-        return estimate_initial_state_offset(self.predictor, episode, theta, self.initial_state_prior_std)
 
     # -- without data -------------------------------------------------------------------------------------------------
 
@@ -501,94 +465,25 @@ class EstimationProblem(ReprMixin):
             theta[self.system.parameters.index(name)] = value
         return self._changed(theta=theta)
 
-    def with_episodes(self, episodes: Sequence[Episode], held_out: Sequence[Episode]) -> EstimationProblem:
-        """The same problem on other episodes of its model, whitened by sensor noise alone."""
+    def with_episodes(
+        self,
+        episodes: Sequence[Episode],
+        held_out: Sequence[Episode],
+        whitening_filters: Sequence[ResidualWhitener | None] = (),
+        held_out_whitening_filters: Sequence[ResidualWhitener | None] = (),
+    ) -> EstimationProblem:
+        """The same problem on other episodes of its model, whitened by sensor noise alone where no filters are given."""
         return self._changed(
-            episodes=tuple(episodes), held_out=tuple(held_out), whitening_filters=(), held_out_whitening_filters=()
+            episodes=tuple(episodes),
+            held_out=tuple(held_out),
+            whitening_filters=tuple(whitening_filters),
+            held_out_whitening_filters=tuple(held_out_whitening_filters),
         )
 
     @property
     def has_process_noise(self) -> bool:
         """Whether errors of recorded torques or angles act as process noise in any recording."""
         return any(episode.input_errors is not None for episode in self.episodes)
-
-    def whitened_at(
-        self, x: ArrayLike, equilibrium_guesses: EquilibriumGuesses | None = None, rounds: int = 1
-    ) -> EstimationProblem:
-        """The same problem with residuals whitened by sensor and process noise, linearized at `x`.
-
-        Returns the problem itself without process noise, or where the rollout fails at `x`. Where it is whitened
-        already, the new filter is linearized about the smoothed motion and torques of the old one.
-
-        Parameters
-        ----------
-        x : array_like, shape (nx,)
-        equilibrium_guesses : WarmStart, optional
-            As in `evaluate`.
-        rounds : int
-            Number of relinearizations; 2 at a fit.
-        """
-        x = np.asarray(x, float)
-        guesses = equilibrium_guesses or (None,) * len(self.episodes)
-
-        def one(i: int) -> tuple[Episode, WhiteningFilter | None]:
-            return self.predictor.episode_and_whitening_filter(
-                self.episodes[i], *self.split(x, i), guesses[i], self.whitening_filters[i]
-            )
-
-        if not self.has_process_noise:
-            return self
-        episodes, made = zip(*map_in_threads(one, range(len(self.episodes))), strict=True)
-        if any(m is None and e.errors is not None for m, e in zip(made, episodes, strict=True)):
-            return self
-        made_of = self._changed(episodes=episodes, whitening_filters=made, held_out_whitening_filters=())
-        return made_of if rounds < 2 else made_of.whitened_at(x, equilibrium_guesses, rounds - 1)
-
-    def whitened_by_sensor_noise(self) -> EstimationProblem:
-        """The same problem whitened by sensor noise alone, with the torque offsets estimated so far."""
-        return self._with_errors(lambda errors: errors.with_bias_only)
-
-    def without_input_errors(self) -> EstimationProblem:
-        """The same problem with the recorded torques and angles taken as exact."""
-        return self._with_errors(lambda errors: None)
-
-    def _with_errors(self, changed: Callable[[InputErrors], InputErrors | None]) -> EstimationProblem:
-        groups = (self.episodes, self.held_out)
-        return self.with_episodes(
-            *([replace(e, input_errors=e.input_errors and changed(e.input_errors)) for e in group] for group in groups)
-        )
-
-    def held_out_whitened_at(self, x: ArrayLike) -> EstimationProblem:
-        """The same problem with held-out residuals whitened by all noise at `x` as well, for `held_out_residual`.
-
-        A recording whose rollout fails is whitened by sensor noise alone.
-        """
-        x, episodes, made = np.asarray(x, float), [], []
-        theta = self._held_out_theta(x)
-        for held in self.held_out:
-            episode, whitening = self._held_out_episode(held, theta), None
-            offset = self._held_out_offset(episode, theta, x)
-            for _ in range(2):
-                episode, whitening = self.predictor.episode_and_whitening_filter(
-                    episode, theta, offset, None, whitening
-                )
-            episodes.append(replace(held, input_errors=episode.input_errors))
-            made.append(whitening)
-        return self._changed(held_out=tuple(episodes), held_out_whitening_filters=tuple(made))
-
-    def relinearized_at_torque_bias(self, x: Array, frozen: Array) -> EstimationProblem:
-        """The same problem, its filters relinearized from the torque offsets estimated at `frozen` to those at `x`."""
-        at = [(e, *self.split(x, i), self.split(frozen, i)[0]) for i, e in enumerate(self.episodes)]
-        made = relinearized_filters(self.predictor, self.whitening_filters, at)
-        return self._changed(episodes=with_filter_input_errors(self.episodes, made), whitening_filters=made)
-
-    def held_out_relinearized_at_torque_bias(self, x: Array, frozen: Array) -> EstimationProblem:
-        """The same problem with held-out filters relinearized from the torque offsets at `frozen` to those at `x`."""
-        theta, before = self._held_out_theta(x), self._held_out_theta(frozen)
-        own = (self._held_out_episode(e, theta) for e in self.held_out)
-        at = [(e, theta, self._held_out_offset(e, theta, x), before) for e in own]
-        made = relinearized_filters(self.predictor, self.held_out_whitening_filters, at)
-        return self._changed(held_out=with_filter_input_errors(self.held_out, made), held_out_whitening_filters=made)
 
     def held_out_residual(self, i: int, episode: Episode, result: EpisodePrediction) -> ResidualBlock:
         """Whitened residual of held-out recording `i` from its prediction by `predict_held_out`, without a robust loss."""

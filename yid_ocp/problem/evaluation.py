@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +13,44 @@ from numpy.typing import NDArray
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.problem.constant_sensor_errors import ConstantErrorModel, constant_error_sensitivities
 from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.input_noise import WhiteningFilter
+from yid_ocp.problem.input_errors import InputErrors
 from yid_ocp.problem.measurements import Measurements, ResidualBlock, huber_loss
 from yid_ocp.problem.prediction_result import EpisodePrediction
 
 Array = NDArray[np.float64]
 EquilibriumGuesses = tuple[Array | None, ...]
 """For each recording, a configuration near the equilibrium from which it starts; None where it is not known."""
+
+
+class ResidualWhitener(Protocol):
+    """What whitens the residual of one recording by process noise, frozen; `inference.whitening` makes it."""
+
+    @property
+    def input_errors(self) -> InputErrors:
+        """With the values of torque errors about which it is linearized."""
+        ...
+
+    def whiten(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
+        """Whitened residual and derivatives (r, c), and the estimated constant torque errors (nu, c) [N m].
+
+        Parameters
+        ----------
+        rows : ndarray, shape (r, c)
+            A residual in units of the sensors' noise, then columns of its derivative.
+        push : ndarray, shape (N, nu, c), or None
+            The tracking filter's correction of the torque, and its derivative [N m].
+        """
+        ...
+
+
+class EvaluateFunction(Protocol):
+    """Evaluates residual, cost and Jacobian at an unknown vector, as `EstimationProblem.evaluate` does."""
+
+    def __call__(
+        self, x: Array, derivatives: bool = True, equilibrium_guesses: EquilibriumGuesses | None = None
+    ) -> Evaluation:
+        """At `x`, shape (nx,)."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -107,7 +139,7 @@ def _sensor_whitened_residual(
 
 
 def whitened_episode_residual(
-    episode: Episode, whitening: WhiteningFilter | None, result: EpisodePrediction, threshold: float
+    episode: Episode, whitening: ResidualWhitener | None, result: EpisodePrediction, threshold: float
 ) -> ResidualBlock:
     """Whitened residual of one episode: by sensor noise, or by the frozen Kalman filter where one is given.
 
@@ -130,7 +162,7 @@ def whitened_episode_residual(
 
 
 def _innovations(
-    whitening: WhiteningFilter, columns: Array, by_constants: Array, push: Array | None
+    whitening: ResidualWhitener, columns: Array, by_constants: Array, push: Array | None
 ) -> tuple[Array, Array]:
     """Columns and slopes by constant errors of sensors, which drive nothing, turned into innovations."""
     kept, more = columns.shape[1], by_constants.shape[1]

@@ -10,4 +10,3 @@ from yid_ocp.solvers.lifted import Lifted as Lifted
 from yid_ocp.solvers.multiple_shooting import MultipleShooting as MultipleShooting
 from yid_ocp.solvers.single_shooting import SingleShooting as SingleShooting
 from yid_ocp.solvers.steepest_descent import SteepestDescent as SteepestDescent
-from yid_ocp.solvers.uncertainty import ParameterEstimate as ParameterEstimate

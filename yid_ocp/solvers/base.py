@@ -18,16 +18,9 @@ from numpy.typing import NDArray
 
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import ConfigError, YidError
-from yid_ocp.problem.estimation_problem import EstimationProblem
-from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
-from yid_ocp.problem.null_test import DEFAULT_GAP_CRITERIA, GapCriteria
-from yid_ocp.problem.prediction_errors import ChannelPrediction, channel_predictions
-from yid_ocp.problem.prediction_result import EpisodePrediction
-from yid_ocp.registry import Registry
-from yid_ocp.solvers.effect_initialization import initialize_free_effects
-from yid_ocp.solvers.fit_messages import VERDICT_WORDS, finite_or_none, parameter_text
-from yid_ocp.solvers.linear_model import is_stationary
-from yid_ocp.solvers.uncertainty import (
+from yid_ocp.inference.linear_model import is_stationary
+from yid_ocp.inference.null_test import DEFAULT_GAP_CRITERIA, GapCriteria
+from yid_ocp.inference.uncertainty import (
     GoodnessOfFit,
     ParameterEstimate,
     assess_goodness_of_fit,
@@ -35,6 +28,14 @@ from yid_ocp.solvers.uncertainty import (
     covariance_of_fit,
     parameter_estimates,
 )
+from yid_ocp.inference.whitening import whitened_at, whitened_by_sensor_noise
+from yid_ocp.problem.estimation_problem import EstimationProblem
+from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
+from yid_ocp.problem.prediction_errors import ChannelPrediction, channel_predictions
+from yid_ocp.problem.prediction_result import EpisodePrediction
+from yid_ocp.registry import Registry
+from yid_ocp.solvers.effect_initialization import initialize_free_effects
+from yid_ocp.solvers.fit_messages import VERDICT_WORDS, finite_or_none, parameter_text
 
 if TYPE_CHECKING:
     import pandas
@@ -152,7 +153,7 @@ class Solution(ReprMixin):
         """
         if self.evaluation is None or self.problem is None or not self.problem.has_process_noise:
             return () if self.evaluation is None else self.evaluation.episode_predictions
-        problem = self.problem.whitened_by_sensor_noise()
+        problem = whitened_by_sensor_noise(self.problem)
         found = problem.evaluate(self.x, False, self.evaluation.equilibrium_guesses)
         if found.ok:
             return found.episode_predictions
@@ -287,7 +288,7 @@ def solve(
     start (a soft object snaps, an arm falls), the problem is first solved over its first seconds only, and then over
     longer and longer horizons. A poor fit is started again from other initial values. Where noise drives the motion,
     methods that can weigh residuals by it do so in several passes, its covariance frozen in each
-    (`EstimationProblem.whitened_at`); the answer of one that has its errors as unknowns is judged in the same way.
+    (`whitened_at`); the answer of one that has its errors as unknowns is judged in the same way.
 
     Parameters
     ----------
@@ -451,7 +452,7 @@ def _attempt(
     passes = _MAX_WHITENING_PASSES if problem.has_process_noise and uses_process_noise_covariance(solver) else 1
     weighted, warm = problem, None
     for number in range(passes):
-        weighted = weighted.whitened_at(x, warm) if passes > 1 else problem
+        weighted = whitened_at(weighted, x, warm) if passes > 1 else problem
         which = f"pass {number + 1} of at most {passes}" if passes > 1 else ""
         outcome = solver.minimize_cost(weighted, x, _noting(callback, which) if which else callback)
         x, warm, evaluations = outcome.x, outcome.equilibrium_guesses, evaluations + outcome.n_evaluations
@@ -461,7 +462,7 @@ def _attempt(
             break
     if problem.has_process_noise and passes == 1 and _accounts_for_process_noise(solver):
         # it had the errors themselves as unknowns; what is judged is their likelihood about its answer
-        weighted = problem.whitened_at(x, warm, rounds=2)
+        weighted = whitened_at(problem, x, warm, rounds=2)
     return (
         (outcome, weighted.evaluate(outcome.x, equilibrium_guesses=outcome.equilibrium_guesses), weighted),
         evaluations,

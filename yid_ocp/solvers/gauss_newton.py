@@ -10,9 +10,16 @@ import numpy as np
 from annotated_types import Ge, Gt
 from numpy.typing import NDArray
 
+from yid_ocp.inference.linear_model import (
+    achievable_reduction,
+    bounded_least_squares_step,
+    is_stationary,
+    predicted_reduction,
+)
+from yid_ocp.inference.uncertainty import CHI2_95_TWO_SIDED, covariance_and_chi2
 from yid_ocp.options import OptionInfo, check_option_bounds
 from yid_ocp.problem.estimation_problem import EstimationProblem
-from yid_ocp.problem.evaluation import Evaluation
+from yid_ocp.problem.evaluation import EvaluateFunction, Evaluation
 from yid_ocp.solvers.base import (
     SOLVERS,
     Iterate,
@@ -22,13 +29,6 @@ from yid_ocp.solvers.base import (
     Status,
     projected_gradient_norm,
 )
-from yid_ocp.solvers.linear_model import (
-    achievable_reduction,
-    bounded_least_squares_step,
-    is_stationary,
-    predicted_reduction,
-)
-from yid_ocp.solvers.uncertainty import CHI2_95_TWO_SIDED, covariance_and_chi2
 
 Array = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ class GaussNewton:
 
     Every iteration solves  min |J d + r|^2 + mu |d/s|^2  with  lower <= x + d <= upper, and accepts d when the cost
     falls by a fair part of what the linear model promised. A short step, or one that damping keeps from promising
-    anything, is no end: see `linear_residual_models.is_stationary`. Many steps that are worth nothing beside the noise are one: where
+    anything, is no end: see `linear_model.is_stationary`. Many steps that are worth nothing beside the noise are one: where
     the valley is rough (friction that turns, fast waves over many seconds) the linear model promises what no step
     keeps.
 
@@ -75,14 +75,19 @@ class GaussNewton:
         check_option_bounds(self, f"solver {self.name}")
 
     def minimize_cost(
-        self, problem: EstimationProblem, start: Array, callback: IterationCallback | None
+        self,
+        problem: EstimationProblem,
+        start: Array,
+        callback: IterationCallback | None,
+        evaluate: EvaluateFunction | None = None,
     ) -> SolverResult:
-        """Minimize the problem's cost from `start` by Gauss-Newton steps."""
+        """Minimize the problem's cost from `start` by Gauss-Newton steps; `evaluate` may stand in for its evaluation."""
+        evaluate = evaluate or problem.evaluate
         lower, upper = problem.bounds
         scale = problem.unknown_scales
         recorder = IterationRecorder(callback)
         x = start.copy()
-        now = problem.evaluate(x)
+        now = evaluate(x)
         recorder.n_evaluations += 1
         if not now.ok or now.jacobian is None:
             return SolverResult(Status.FAILED, now.message, x, (), recorder.n_evaluations)
@@ -118,7 +123,7 @@ class GaussNewton:
             # damping makes any step promise little
             if fall <= self.cost_tolerance * max(now.cost, 1e-300) and is_stationary(problem, x, now):
                 return self._end(Status.CONVERGED, "the cost cannot be lowered any further", x, recorder, now)
-            trial = problem.evaluate(np.clip(x + step, lower, upper), equilibrium_guesses=now.equilibrium_guesses)
+            trial = evaluate(np.clip(x + step, lower, upper), equilibrium_guesses=now.equilibrium_guesses)
             recorder.n_evaluations += 1
             gain = (now.cost - trial.cost) / fall if trial.ok and fall > 0 else -1.0
             if gain > 1e-3:

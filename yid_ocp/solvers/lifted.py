@@ -9,6 +9,7 @@ import numpy as np
 from annotated_types import Ge, Gt
 from numpy.typing import NDArray
 
+from yid_ocp.inference.linear_model import bounded_least_squares_step
 from yid_ocp.integrator.step import SensitivityDirections
 from yid_ocp.options import OptionInfo, check_option_bounds
 from yid_ocp.problem.estimation_problem import EstimationProblem
@@ -22,7 +23,6 @@ from yid_ocp.solvers.base import (
     projected_gradient_norm,
 )
 from yid_ocp.solvers.compiled_transcription import CompiledTranscription
-from yid_ocp.solvers.linear_model import bounded_least_squares_step
 
 Array = NDArray[np.float64]
 

@@ -18,6 +18,7 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis import DiagnosisResult, diagnose
 from yid_ocp.diagnosis.baseline_comparison import with_baseline_prior
 from yid_ocp.diagnosis.diagnosis_result import final_model_to_dict
+from yid_ocp.inference.whitening import whitened_by_sensor_noise
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import NULL_PROGRESS, AcceptedIterate, Progress
 from yid_ocp.report.animation import Animation, ModelTrajectory, make_animation
@@ -258,7 +259,7 @@ def _times(share: float, std: float | Mapping[str, float]) -> float | Mapping[st
 def _held_out_predictions(finding: DiagnosisResult) -> list[HeldOutPrediction]:
     """Held-out episodes with predictions of the nominal and of the final model; failed ones are left out."""
     before, after = (
-        fit.problem.whitened_by_sensor_noise().predict_held_out(fit.problem.vector(fit.values))
+        whitened_by_sensor_noise(fit.problem).predict_held_out(fit.problem.vector(fit.values))
         for fit in (finding.nominal_model, finding.final_model)
     )
     return [

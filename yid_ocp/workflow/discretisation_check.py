@@ -20,12 +20,12 @@ from yid_ocp.analysis.discretisation_shift import (
 from yid_ocp.analysis.time_step_stability import largest_error_growth
 from yid_ocp.config.settings import FoamYSettings, RunSettings, SegmentedObjectSettings
 from yid_ocp.errors import YidError
+from yid_ocp.inference.uncertainty import typical_parameter_sizes
 from yid_ocp.integrator.step import with_time_step
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.solvers import Solution, Status
-from yid_ocp.solvers.uncertainty import typical_parameter_sizes
 from yid_ocp.workflow.build import build_step, build_system, link_division_factor
 
 Array = NDArray[np.float64]

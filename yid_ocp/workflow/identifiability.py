@@ -22,10 +22,10 @@ from yid_ocp.analysis.profile import is_small_problem
 from yid_ocp.analysis.what_if import ChangedExperimentResult, ExperimentRanking, what_if
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings
+from yid_ocp.inference.null_test import GapCriteria
 from yid_ocp.model.system import System
 from yid_ocp.parallel import WorkerConfig
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.null_test import GapCriteria
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.summaries import identifiability_summary
 from yid_ocp.solvers import Iterate, Solution, Status, solve

@@ -16,6 +16,7 @@ from yid_ocp.analysis.profile import with_profile_intervals
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.issues import Issue
+from yid_ocp.inference.uncertainty import covariance_to_dict, mark_not_trusted
 from yid_ocp.model.cable import CableTopology
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
@@ -24,7 +25,6 @@ from yid_ocp.problem.prediction_result import EpisodePrediction
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.summaries import solve_summary
 from yid_ocp.solvers import Iterate, Solution, Status, solve
-from yid_ocp.solvers.uncertainty import covariance_to_dict, mark_not_trusted
 from yid_ocp.workflow.build import build_cable, build_problem
 from yid_ocp.workflow.command_runner import EXIT_DONE, EXIT_FAILED, run_and_print
 from yid_ocp.workflow.discretisation_check import (

@@ -7,6 +7,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from yid_ocp.inference.whitening import (
+    WhiteningFilter,
+    estimate_torque_bias,
+    estimate_torque_biases,
+    held_out_whitened_at,
+)
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 
@@ -27,15 +33,19 @@ def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> _OffsetsBy
     found: _OffsetsByRecording = {}
     if all(whitening is None for whitening in problem.whitening_filters):
         return found
-    for episode, own in zip(problem.episodes, problem.estimate_torque_biases(x), strict=True):
+    for episode, own in zip(problem.episodes, estimate_torque_biases(problem, x), strict=True):
         found |= _entry(problem, episode, own)
     apart = [e for e in problem.held_out if e.input_errors is not None and e.initial_state_shared_with is None]
     if not any(np.any(e.input_errors.torque_bias_std > 0) for e in apart if e.input_errors is not None):
         return found
-    held = problem if any(problem.held_out_whitening_filters) else problem.held_out_whitened_at(x)
+    held = problem if any(problem.held_out_whitening_filters) else held_out_whitened_at(problem, x)
     for (episode, result), whitening in zip(held.predict_held_out(x), held.held_out_whitening_filters, strict=True):
-        if whitening is not None and not isinstance(result, str) and episode.initial_state_shared_with is None:
-            value = held.predictor.estimate_torque_bias(episode, result, whitening)
+        if (
+            isinstance(whitening, WhiteningFilter)
+            and not isinstance(result, str)
+            and episode.initial_state_shared_with is None
+        ):
+            value = estimate_torque_bias(episode, result, whitening)
             found |= _entry(held, episode, (value, whitening.torque_bias_std))
     return found
 

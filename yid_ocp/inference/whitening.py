@@ -30,161 +30,37 @@ Anderson and Moore (1979), Optimal Filtering, chapters 3 and 5. Ljung (1999), Sy
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 import scipy.linalg.lapack
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from yid_ocp.data.recording import Recording
 from yid_ocp.integrator.linearized_steps import LinearizedStep, active_state_mask, linearized_steps
 from yid_ocp.integrator.momentum_shift import torque_error_feedthrough
 from yid_ocp.integrator.step import Rollout, TrackingFeedback
-from yid_ocp.model.system import System
+from yid_ocp.parallel import map_in_threads
+from yid_ocp.problem import EquilibriumGuesses, EstimationProblem
+from yid_ocp.problem.constant_sensor_errors import subtract_estimated_biases
+from yid_ocp.problem.episode_prediction import EpisodePredictor
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.evaluation import ResidualWhitener
+from yid_ocp.problem.input_errors import InputErrors
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.model_functions import ModelFunctions
-from yid_ocp.problem.options import SensorOptions
-from yid_ocp.problem.time_grid import TimeGrid
-from yid_ocp.sensors.joints import (
-    EFFORT_GROUP,
-    POSITION_GROUP,
-    PositionSensor,
-    is_noise_std_stated,
-    joint_angle_noise_std,
-    joint_torque_bias_std,
-    joint_torque_noise_std,
-)
+from yid_ocp.problem.prediction_result import EpisodePrediction
 
-log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 _RowIndices = NDArray[np.int64]
 
-_MIN_TORQUE_ERROR_FRACTION = 1e-3
-"""Least error of a torque beside encoders, in parts of how far it varies: nothing that is computed follows them for
-seconds without correction."""
-
-
-@dataclass(frozen=True)
-class InputErrors:
-    """Noise levels and current estimates of the torque and angle errors that drive one recording's rollout.
-
-    Attributes
-    ----------
-    torque_std, torque_bias_std, angle_std : ndarray, shape (nu,)
-        Of w in a step and of b [N m], of v [rad].
-    sample_of_step : ndarray of int, shape (N,)
-        Recorded sample that each step's torque comes from: w is the same in all its steps.
-    encoder_noise_steps : float
-        Number of steps that share one encoder sample's noise through interpolation.
-    has_encoder_measurements : bool
-        Whether the encoders are measurements.
-    torque_bias : ndarray, shape (nu,)
-        Value of b that is subtracted from the recorded torque [N m].
-    torque_noise : ndarray, shape (N, nu)
-        Value of w that is subtracted in every step [N m].
-    recorded_torque_noise : ndarray, shape (N, nu)
-        Noise of the recorded torque that w implies, subtracted before effects on torques apply [N m].
-    transmitted_torque_noise : ndarray, shape (N, nu)
-        Part of w that subtracting `recorded_torque_noise` already removes from the acting torque [N m].
-    smoothed_reference : ndarray, shape (N, nb), or None
-        Smoothed reference of the tracking filter in place of the measured motion.
-    """
-
-    torque_std: Array
-    torque_bias_std: Array
-    angle_std: Array
-    sample_of_step: _RowIndices
-    encoder_noise_steps: float
-    has_encoder_measurements: bool
-    torque_bias: Array
-    torque_noise: Array
-    recorded_torque_noise: Array
-    transmitted_torque_noise: Array
-    smoothed_reference: Array | None = None
-
-    @property
-    def total_torque_error(self) -> Array:
-        """Total error subtracted from the torque of every step, b + w, shape (N, nu) [N m]."""
-        return self.torque_bias + self.torque_noise
-
-    @property
-    def remaining_torque_error(self) -> Array:
-        """Error still to be subtracted after effects on torques, shape (N, nu) [N m]."""
-        return self.total_torque_error - self.transmitted_torque_noise
-
-    @property
-    def with_bias_only(self) -> InputErrors:
-        """The same errors with the constant offset alone; torques and angles otherwise as recorded."""
-        none = np.zeros_like(self.torque_noise)
-        return replace(
-            self, torque_noise=none, recorded_torque_noise=none, transmitted_torque_noise=none, smoothed_reference=None
-        )
-
-    def first_steps(self, steps: int) -> InputErrors:
-        """The errors of the first `steps` steps."""
-        first = {
-            name: getattr(self, name)[:steps]
-            for name in ("sample_of_step", "torque_noise", "recorded_torque_noise", "transmitted_torque_noise")
-        }
-        return replace(
-            self,
-            **first,
-            smoothed_reference=None if self.smoothed_reference is None else self.smoothed_reference[:steps],
-        )
-
-
-def recorded_input_errors(
-    recording: Recording,
-    system: System,
-    grid: TimeGrid,
-    sensors: Mapping[str, SensorOptions],
-    samples: Sequence[Measurements],
-) -> InputErrors | None:
-    """Error levels of the torques and angles that drive a recording's rollout; None where there are none.
-
-    Parameters
-    ----------
-    recording : Recording
-    system : System
-    grid : Grid
-    sensors : mapping of group to SensorOptions
-    samples : sequence of Measurements
-        Of the recording.
-    """
-    joints, driven = recording.joints, system.driven
-    if joints is None or joints.effort is None or not driven or system.servos:
-        return None
-    effort, position = (sensors.get(group, SensorOptions()) for group in (EFFORT_GROUP, POSITION_GROUP))
-    std = joint_torque_noise_std(joints, driven, effort, recording.name)
-    bias = joint_torque_bias_std(joints, driven, effort)
-    encoders = any(isinstance(entry.sensor, PositionSensor) for entry in samples)
-    if not encoders and not np.any(std > 0) and not np.any(bias > 0):
-        return None
-    angle = joint_angle_noise_std(joints, driven, position, recording.name)
-    for group, choice, level, unit in ((EFFORT_GROUP, effort, std, "N m"), (POSITION_GROUP, position, angle, "rad")):
-        if not is_noise_std_stated(joints, group, choice):
-            words = "%s: the noise of %s is neither recorded nor configured; %.2g to %.2g %s estimated from its fastest"
-            log.warning(words + " changes", recording.name, group, level.min(), level.max(), unit)
-    if encoders:
-        columns = [joints.names.index(name) for name in driven]
-        std = np.maximum(std, _MIN_TORQUE_ERROR_FRACTION * np.maximum(np.std(joints.effort[:, columns], axis=0), 1e-3))
-    period = float(np.median(np.diff(joints.t)))
-    middle = grid.node_times[:-1] + grid.time_step / 2
-    sample = np.clip(np.searchsorted(joints.t, middle, "right") - 1, 0, len(joints.t) - 1)
-    return InputErrors(
-        # a step that spans several samples averages them
-        std * min(1.0, np.sqrt(period / grid.time_step)),
-        bias,
-        angle,
-        sample.astype(np.int64),
-        max(1.0, period / grid.time_step),
-        encoders,
-        np.zeros(len(driven)),
-        *(np.zeros((grid.steps, len(driven))) for _ in range(3)),
-    )
+_MIN_TORQUE_GAIN = 0.1
+"""Smallest ratio of acting to recorded torque at which errors of one are converted into errors of the other."""
+_MAX_ROLLOUTS = 6
+"""Largest number of rollouts, each about the torque offset estimated from the one before."""
+_TORQUE_BIAS_TOLERANCE = 0.05
+"""Change of the torque offset, in stated standard deviations, below which the iteration ends."""
 
 
 @dataclass(frozen=True)
@@ -586,3 +462,260 @@ class _Readings:
         if turn.effort is not None:
             observe += self.effort[rows] @ turn.effort
         return rows, observe, ahead
+
+
+# -- about an episode -------------------------------------------------------------------------------------------------
+
+
+def nominal_trajectory(
+    predictor: EpisodePredictor, episode: Episode, result: EpisodePrediction, theta: Array
+) -> NominalTrajectory:
+    """Trajectory of an episode about which its input errors are linearized."""
+    own, rest, sizes = predictor.episode_theta(episode, theta), result.equilibrium, predictor.step.sizes
+    by_angles = by_torque = np.zeros((sizes["nx"], sizes["nu"]))
+    if rest is not None:
+        by_angles, by_torque = rest.state_by_known_coordinates[:, : sizes["nu"]], rest.state_by_torque
+    return NominalTrajectory(
+        predictor.model_functions,
+        own,
+        result.rollout,
+        [predictor.measurements_at_true_times(samples, own) for samples in episode.measurements],
+        episode.tracking_feedback,
+        predictor.joint_efforts(result.rollout),
+        by_angles,
+        by_torque,
+    )
+
+
+def estimate_torque_bias(episode: Episode, result: EpisodePrediction, whitening: ResidualWhitener) -> Array:
+    """Constant torque error of each driven joint, estimated from all measurements of an episode, (nu,) [N m]."""
+    return whitening.whiten(_plain(episode, result)[:, None], result.torque_correction_columns)[1][:, 0]
+
+
+def _plain(episode: Episode, result: EpisodePrediction) -> Array:
+    """Residual of an episode in units of the sensors' noise, their constant errors taken off."""
+    samples = subtract_estimated_biases(episode.measurements, result.predicted_outputs)
+    pairs = zip(samples, result.predicted_outputs, strict=True)
+    return np.concatenate([own.residual_block(y).residual for own, y in pairs])
+
+
+def _whitened_episode(
+    predictor: EpisodePredictor,
+    episode: Episode,
+    at: tuple[Array, Array],
+    guess: Array | None,
+    before: WhiteningFilter | None,
+) -> tuple[Episode, WhiteningFilter | None]:
+    """The episode with its estimated input errors, and the filter that whitens its residual at (theta, offset).
+
+    The filter is None without process noise, or where the rollout fails; it is about the motion that `before` smooths.
+    """
+    if episode.input_errors is None:
+        return episode, None
+    result = predictor.predict_episode(episode, *at, False, guess)
+    if before is not None and not isinstance(result, str):
+        episode = _about_smoothed(predictor, episode, at[0], result, before)
+        result = predictor.predict_episode(episode, *at, False, guess)
+    if isinstance(result, str) or episode.input_errors is None:
+        return episode, None
+    course = nominal_trajectory(predictor, episode, result, at[0])
+    return episode, build_whitening_filter(course, episode.input_errors)
+
+
+def _about_smoothed(
+    predictor: EpisodePredictor, episode: Episode, theta: Array, result: EpisodePrediction, before: WhiteningFilter
+) -> Episode:
+    """The episode about what all measurements say of its torques and, where encoders are among them, its motion."""
+    errors, feedback = episode.input_errors, episode.tracking_feedback
+    assert errors is not None
+    found = before.smooth(_plain(episode, result), result.torque_correction_columns)
+    own = predictor.episode_theta(episode, theta)
+    errors = replace(errors, torque_bias=found.torque_bias, torque_noise=found.torque_noise)
+    errors = _behind_effects(predictor, episode, own, errors)
+    if errors.has_encoder_measurements and feedback is not None:
+        inputs = predictor.tracking_inputs(episode, own, (), result.rollout.state[0])
+        guided = inputs.corrected_feedback(feedback, predictor.system.driven_indices, episode.measured_driven_angles)
+        assert guided is not None
+        true = (result.rollout.state - found.state_error)[:-1, feedback.state_indices]
+        errors = replace(errors, smoothed_reference=true - (guided.reference - feedback.reference))
+    return replace(episode, input_errors=errors)
+
+
+def _behind_effects(predictor: EpisodePredictor, episode: Episode, theta: Array, errors: InputErrors) -> InputErrors:
+    """The same errors with what of the readings is noise: by which readings are multiplied, w is divided."""
+    corrections, nu = predictor.model_functions.input_corrections, errors.torque_noise.shape[1]
+    read = errors.torque_noise
+    if corrections.corrects_efforts:
+        readings = np.pad(episode.torque, ((0, 0), (0, episode.prescribed_path.shape[1])))
+        by_reading = corrections.true_angles_and_efforts(np.zeros_like(readings), readings, theta, ())[4][:, :nu]
+        # a reading of which hardly anything acts says nothing of what is wrong with it
+        seen = np.abs(by_reading) > _MIN_TORQUE_GAIN
+        read = np.where(seen, read, 0.0) / np.where(seen, by_reading, 1.0)
+    plain = errors.with_bias_only
+    none, without = (
+        predictor.corrected_inputs(replace(episode, input_errors=own), theta, ()).torque
+        for own in (plain, replace(plain, recorded_torque_noise=read))
+    )
+    return replace(errors, recorded_torque_noise=read, transmitted_torque_noise=none - without)
+
+
+# -- about a problem --------------------------------------------------------------------------------------------------
+
+
+def whitened_at(
+    problem: EstimationProblem, x: ArrayLike, equilibrium_guesses: EquilibriumGuesses | None = None, rounds: int = 1
+) -> EstimationProblem:
+    """The same problem with residuals whitened by sensor and process noise, linearized at `x`.
+
+    Returns the problem itself without process noise, or where the rollout fails at `x`. Where it is whitened
+    already, the new filter is linearized about the smoothed motion and torques of the old one.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    x : array_like, shape (nx,)
+    equilibrium_guesses : EquilibriumGuesses, optional
+        As in `EstimationProblem.evaluate`.
+    rounds : int
+        Number of relinearizations; 2 at a fit.
+    """
+    x = np.asarray(x, float)
+    guesses = equilibrium_guesses or (None,) * len(problem.episodes)
+
+    def one(i: int) -> tuple[Episode, WhiteningFilter | None]:
+        before = _own_filter(problem.whitening_filters[i])
+        return _whitened_episode(problem.predictor, problem.episodes[i], problem.split(x, i), guesses[i], before)
+
+    if not problem.has_process_noise:
+        return problem
+    episodes, made = zip(*map_in_threads(one, range(len(problem.episodes))), strict=True)
+    if any(m is None and e.input_errors is not None for m, e in zip(made, episodes, strict=True)):
+        return problem
+    found = problem.with_episodes(episodes, problem.held_out, made)
+    return found if rounds < 2 else whitened_at(found, x, equilibrium_guesses, rounds - 1)
+
+
+def held_out_whitened_at(problem: EstimationProblem, x: ArrayLike) -> EstimationProblem:
+    """The same problem with held-out residuals whitened by all noise at `x` as well, for `held_out_residual`.
+
+    A recording whose rollout fails is whitened by sensor noise alone.
+    """
+    x, episodes, made = np.asarray(x, float), [], []
+    for held, (episode, theta, offset) in zip(problem.held_out, problem.held_out_evaluation_points(x), strict=True):
+        own, whitening = _whitened_episode(problem.predictor, episode, (theta, offset), None, None)
+        own, whitening = _whitened_episode(problem.predictor, own, (theta, offset), None, whitening)
+        episodes.append(replace(held, input_errors=own.input_errors))
+        made.append(whitening)
+    return problem.with_episodes(problem.episodes, episodes, problem.whitening_filters, made)
+
+
+def relinearized_at_torque_bias(problem: EstimationProblem, x: Array, frozen: Array) -> EstimationProblem:
+    """The same problem, its filters relinearized from the torque offsets estimated at `frozen` to those at `x`.
+
+    Their weights are unchanged.
+    """
+    at = [(e, *problem.split(x, i), problem.split(frozen, i)[0]) for i, e in enumerate(problem.episodes)]
+    made = _relinearized_filters(problem.predictor, problem.whitening_filters, at)
+    episodes = _with_filter_errors(problem.episodes, made)
+    return problem.with_episodes(episodes, problem.held_out, made, problem.held_out_whitening_filters)
+
+
+def held_out_relinearized_at_torque_bias(problem: EstimationProblem, x: Array, frozen: Array) -> EstimationProblem:
+    """The same problem with held-out filters relinearized from the torque offsets at `frozen` to those at `x`."""
+    before = problem.held_out_theta(frozen)
+    at = [(*own, before) for own in problem.held_out_evaluation_points(x)]
+    made = _relinearized_filters(problem.predictor, problem.held_out_whitening_filters, at)
+    held_out = _with_filter_errors(problem.held_out, made)
+    return problem.with_episodes(problem.episodes, held_out, problem.whitening_filters, made)
+
+
+def whitened_by_sensor_noise(problem: EstimationProblem) -> EstimationProblem:
+    """The same problem whitened by sensor noise alone, with the torque offsets estimated so far."""
+    return _with_errors(problem, lambda errors: errors.with_bias_only)
+
+
+def without_input_errors(problem: EstimationProblem) -> EstimationProblem:
+    """The same problem with the recorded torques and angles taken as exact."""
+    return _with_errors(problem, lambda errors: None)
+
+
+def _with_errors(problem: EstimationProblem, changed: Callable[[InputErrors], InputErrors | None]) -> EstimationProblem:
+    own, held = (
+        [replace(e, input_errors=e.input_errors and changed(e.input_errors)) for e in group]
+        for group in (problem.episodes, problem.held_out)
+    )
+    return problem.with_episodes(own, held)
+
+
+def estimate_torque_biases(problem: EstimationProblem, x: ArrayLike) -> list[tuple[Array, Array] | None]:
+    """Estimate each recording's constant torque errors at `x`: values and standard deviations (nu,) [N m].
+
+    None where torques are taken as exact, or where no whitening filter is set (`whitened_at`).
+    """
+    x = np.asarray(x, float)
+    found: list[tuple[Array, Array] | None] = []
+    for i, (episode, own) in enumerate(zip(problem.episodes, problem.whitening_filters, strict=True)):
+        whitening = _own_filter(own)
+        result = "" if whitening is None else problem.predictor.predict_episode(episode, *problem.split(x, i), False)
+        if whitening is None or isinstance(result, str):
+            found.append(None)
+        else:
+            found.append((estimate_torque_bias(episode, result, whitening), whitening.torque_bias_std))
+    return found
+
+
+def _own_filter(whitening: ResidualWhitener | None) -> WhiteningFilter | None:
+    assert whitening is None or isinstance(whitening, WhiteningFilter)
+    return whitening
+
+
+def _relinearized_filters(
+    predictor: EpisodePredictor,
+    known: Sequence[ResidualWhitener | None],
+    at: Sequence[tuple[Episode, Array, Array, Array]],
+) -> tuple[WhiteningFilter | None, ...]:
+    """Filters about the torque offsets estimated at (episode, theta, offset), linearized at another theta so far."""
+    pairs = zip(map(_own_filter, known), at, strict=True)
+    return tuple(own and _settled(predictor, own, *told) for own, told in pairs)
+
+
+def _with_filter_errors(episodes: Sequence[Episode], known: Sequence[WhiteningFilter | None]) -> tuple[Episode, ...]:
+    """Episodes with the input errors about which their filters are linearized."""
+    pairs = zip(episodes, known, strict=True)
+    return tuple(episode if own is None else replace(episode, input_errors=own.input_errors) for episode, own in pairs)
+
+
+def _settled(
+    predictor: EpisodePredictor, whitening: WhiteningFilter, episode: Episode, theta: Array, start: Array, frozen: Array
+) -> WhiteningFilter:
+    # what an effect on inputs takes from a torque, its offset no longer has to: that is known without a rollout
+    now, before = (
+        predictor.corrected_inputs(episode, predictor.episode_theta(episode, t), ()).torque for t in (theta, frozen)
+    )
+    made = trial = _about(whitening, whitening.input_errors.torque_bias + np.mean(now - before, axis=0))
+    for _ in range(_MAX_ROLLOUTS if np.any(whitening.input_errors.torque_bias_std > 0) else 0):
+        own = replace(episode, input_errors=trial.input_errors)
+        result = predictor.predict_episode(own, theta, start, False)
+        if isinstance(result, str):
+            break
+        made, offset = trial, estimate_torque_bias(own, result, trial)
+        trial = _about(made, offset)
+        if _apart(trial, made) < _TORQUE_BIAS_TOLERANCE:
+            break
+    return made
+
+
+def torque_bias_distance(some: Sequence[ResidualWhitener | None], others: Sequence[ResidualWhitener | None]) -> float:
+    """Largest difference of the torque offsets of two sets of filters, in stated standard deviations."""
+    pairs = zip(some, others, strict=True)
+    return max((_apart(one, other) for one, other in pairs if one and other), default=0.0)
+
+
+def _apart(one: ResidualWhitener, other: ResidualWhitener) -> float:
+    stated = one.input_errors.torque_bias_std > 0
+    apart = np.abs(one.input_errors.torque_bias - other.input_errors.torque_bias)
+    return float(np.max(apart[stated] / one.input_errors.torque_bias_std[stated], initial=0.0))
+
+
+def _about(whitening: WhiteningFilter, offset: Array) -> WhiteningFilter:
+    return replace(whitening, input_errors=replace(whitening.input_errors, torque_bias=offset))

@@ -16,21 +16,22 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
+from typing import Annotated, Literal
 
 import casadi as ca
 import numpy as np
 import scipy.linalg
 import scipy.sparse
+from annotated_types import Ge, Gt, Le
 from numpy.typing import NDArray
 
-from yid_ocp.diagnosis.segment_forces import generalized_forces_per_newton, segment_weights
-from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects.base import grasp_names, robot_joints
+from yid_ocp.inference.segment_forces import generalized_forces_per_newton, segment_weights
 from yid_ocp.integrator.linearized_steps import AdditionalLoads, active_state_mask, linearized_steps
 from yid_ocp.integrator.rollout import applied_joint_torque
 from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.model.system import System
+from yid_ocp.options import OptionInfo
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, mass_matrix_diagonal
 from yid_ocp.problem.evaluation import Evaluation
@@ -46,6 +47,45 @@ _MIN_INTERVAL = 0.1
 """Shortest time over which unknowns are constant [s]."""
 _MAX_INTERVAL_COUNT = 150
 """Number of intervals of a long recording, beyond which they become longer."""
+
+
+@dataclass(frozen=True)
+class SmootherThresholds:
+    """How large unknowns may be, and what counts as evidence for a group of them.
+
+    Attributes
+    ----------
+    min_log_bayes_factor : float
+        Smallest log Bayes factor for adding a group of unknowns; 5 means odds of 150 to 1.
+    max_unknown_groups : int
+        Maximum number of groups of unknowns.
+    detectable_chi2 : float
+        Rise of r'r at which unknowns of the reference size below are detectable.
+    force_prior_std : float
+        Prior standard deviation of an unknown force, relative to the load at its location.
+    grasp_offset_prior_std : float
+        Prior standard deviation of a grasp's unknown offset [m].
+    bias_prior_std : float
+        Prior standard deviation of a sensor's unknown bias, relative to its noise.
+    location_tie : float
+        Fraction of a location's log evidence that another must reach to be indistinguishable from it.
+    """
+
+    min_log_bayes_factor: Annotated[
+        float, Gt(0), OptionInfo("rise of the log evidence that a group of unknowns must bring")
+    ] = 5.0
+    max_unknown_groups: Annotated[int, Ge(1), OptionInfo("groups of unknowns taken in at most")] = 4
+    detectable_chi2: Annotated[float, Gt(0), OptionInfo("rise of r'r by which unknowns would be noticed")] = 10.0
+    force_prior_std: Annotated[float, Gt(0), OptionInfo("unknown force over the load that its place carries")] = 0.1
+    grasp_offset_prior_std: Annotated[float, Gt(0), OptionInfo("unknown offset of a grasp", "m")] = 2e-3
+    bias_prior_std: Annotated[float, Gt(0), OptionInfo("unknown bias over the noise of its sensor")] = 3.0
+    location_tie: Annotated[
+        float, Gt(0), Le(1), OptionInfo("part of a place's evidence at which another is named beside it")
+    ] = 0.9
+
+
+DEFAULT_SMOOTHER_THRESHOLDS = SmootherThresholds()
+"""Default thresholds of the smoother."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +176,7 @@ def linear_residual_models(
     problem: EstimationProblem,
     x: Array,
     evaluation: Evaluation,
-    limits: Thresholds = DEFAULT_THRESHOLDS,
+    limits: SmootherThresholds = DEFAULT_SMOOTHER_THRESHOLDS,
     interval: float = _MIN_INTERVAL,
 ) -> tuple[LinearResidualModel, ...]:
     """Return the linear model of every recording about its rollout at `x`, with unknown forces, offsets and biases.
@@ -147,7 +187,7 @@ def linear_residual_models(
     x : ndarray, shape (nx,)
     evaluation : Evaluation
         At `x`, with its Jacobian.
-    limits : Thresholds
+    limits : SmootherThresholds
         For the reference size of unknowns.
     interval : float
         Shortest time over which unknowns are constant [s].
@@ -245,7 +285,7 @@ class _Unknowns:
         return self.loading + 3 * len(self.pushed)
 
 
-def _unknowns(course: _Course, limits: Thresholds) -> _Unknowns:
+def _unknowns(course: _Course, limits: SmootherThresholds) -> _Unknowns:
     names, sources, reference, forced = _unknown_forces(course, limits.force_prior_std)
     grasped, row = [], 0
     for grasp, name in zip(course.system.grasps, grasp_names(course.system), strict=True):
@@ -385,7 +425,7 @@ def _steps(
 # -- from steps to intervals ------------------------------------------------------------------------------------------
 
 
-def _recording(course: _Course, observed: Array, limits: Thresholds, shortest: float) -> LinearResidualModel:
+def _recording(course: _Course, observed: Array, limits: SmootherThresholds, shortest: float) -> LinearResidualModel:
     """The linear model of one recording from its whitened residuals and their slopes."""
     h, steps = course.problem.step.time_step, course.episode.grid.steps
     length = int(max(round(shortest / h), math.ceil(steps * _MIN_INTERVAL / (_MAX_INTERVAL_COUNT * shortest)), 1))

@@ -24,8 +24,13 @@ import scipy.optimize
 import threadpoolctl
 from numpy.typing import NDArray
 
-from yid_ocp.diagnosis.smoother_model import LinearResidualModel, UnknownGroup, linear_residual_models
-from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
+from yid_ocp.inference.smoother_model import (
+    DEFAULT_SMOOTHER_THRESHOLDS,
+    LinearResidualModel,
+    SmootherThresholds,
+    UnknownGroup,
+    linear_residual_models,
+)
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
@@ -102,7 +107,7 @@ class SmootherResult:
     dof_before: float
     dof_after: float
     log_evidence: dict[str, float]
-    min_log_bayes_factor: float = DEFAULT_THRESHOLDS.min_log_bayes_factor
+    min_log_bayes_factor: float = DEFAULT_SMOOTHER_THRESHOLDS.min_log_bayes_factor
     alternative_groups: Mapping[UnknownGroup, tuple[UnknownGroup, ...]] = field(default_factory=dict)
 
     @property
@@ -327,7 +332,7 @@ def _selected(
     sources: Sequence[UnknownGroup],
     variance: dict[UnknownGroup, float],
     state: _State,
-    limits: Thresholds,
+    limits: SmootherThresholds,
 ) -> tuple[dict[UnknownGroup, float], _State]:
     """Add group after group, that which raises the evidence most, while it rises by more than chance."""
     while sum(v > 0 for v in variance.values()) < limits.max_unknown_groups:
@@ -428,7 +433,10 @@ def _largest_evidence(bases: Sequence[_Base], source: UnknownGroup) -> tuple[flo
 
 
 def run_smoother(
-    problem: EstimationProblem, x: Array, evaluation: Evaluation, limits: Thresholds = DEFAULT_THRESHOLDS
+    problem: EstimationProblem,
+    x: Array,
+    evaluation: Evaluation,
+    limits: SmootherThresholds = DEFAULT_SMOOTHER_THRESHOLDS,
 ) -> SmootherResult:
     """Run the smoother: choose the groups of unknowns with the largest evidence and estimate them.
 
@@ -440,7 +448,7 @@ def run_smoother(
         Its fit.
     evaluation : Evaluation
         At `x`, with its Jacobian.
-    limits : Thresholds
+    limits : SmootherThresholds
 
     Returns
     -------
@@ -582,7 +590,7 @@ def _instead(
     variance: dict[UnknownGroup, float],
     evidence: float,
     weight: Mapping[UnknownGroup, float],
-    limits: Thresholds,
+    limits: SmootherThresholds,
 ) -> dict[UnknownGroup, tuple[UnknownGroup, ...]]:
     """Groups that would keep most of what each group at work raises the evidence by, or all but what is chance."""
     found: dict[UnknownGroup, tuple[UnknownGroup, ...]] = {}

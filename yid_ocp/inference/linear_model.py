@@ -18,6 +18,18 @@ Array = NDArray[np.float64]
 _MAX_RELATIVE_REDUCTION, _MAX_NOISE_UNIT_REDUCTION = 1e-3, 1e-2
 
 
+def residual_without_weak_priors(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, Array]:
+    """Return the noise-scaled residual (r,) and Jacobian (r, nx) of data and stated priors, without weak priors."""
+    assert evaluation.jacobian is not None
+    rows, unit = problem.residual_rows, problem.data_noise_unit
+    residual, jacobian = evaluation.residual[rows.without_weak_priors], evaluation.jacobian[rows.without_weak_priors]
+    if unit == 1.0:
+        return residual, jacobian
+    units = np.ones(len(residual))
+    units[rows.data] = unit
+    return residual / units, jacobian / units[:, None]
+
+
 def bounded_least_squares_step(jacobian: Array, residual: Array, mu: float, lower: Array, upper: Array) -> Array:
     """Solve min |J d + r|^2 + mu c |d|^2 with lower <= d <= upper, c the largest squared column norm."""
     count = jacobian.shape[1]

@@ -11,7 +11,7 @@ import pytest
 import scipy.stats
 from made_series import samples, series
 
-from yid_ocp.problem.null_test import (
+from yid_ocp.inference.null_test import (
     GapCriteria,
     NullTestResult,
     _variance_inflation,

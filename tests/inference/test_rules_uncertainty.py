@@ -11,9 +11,8 @@ import pytest
 from made_problems import MadeUp, linear
 from small_problems import PENDULUM, pendulum_step, taken
 
-from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.null_test import GapCriteria, residual_channels
-from yid_ocp.solvers.uncertainty import (
+from yid_ocp.inference.null_test import GapCriteria, residual_channels
+from yid_ocp.inference.uncertainty import (
     _MAX_CHECKED_PARAMETERS,
     _MIN_CLUSTER_CHANNELS,
     _UNKNOWN_FIT,
@@ -32,6 +31,7 @@ from yid_ocp.solvers.uncertainty import (
     typical_parameter_sizes,
     with_profile_interval,
 )
+from yid_ocp.problem import EstimationProblem, ProblemOptions
 
 GOOD, BAD = GoodnessOfFit(1.0, 0.5, True), GoodnessOfFit(9.0, 0.0, False)
 

@@ -10,9 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from yid_ocp.inference.linear_model import residual_without_weak_priors
+from yid_ocp.inference.null_test import (
+    DEFAULT_GAP_CRITERIA,
+    GapCriteria,
+    exceeds_noise,
+    residual_channels,
+    run_null_test,
+)
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.null_test import DEFAULT_GAP_CRITERIA, GapCriteria, exceeds_noise, residual_channels, run_null_test
 
 Array = NDArray[np.float64]
 ConfidenceInterval = tuple[float | None, float | None]
@@ -141,7 +148,7 @@ def noise_covariance_factor(problem: EstimationProblem, evaluation: Evaluation) 
     The factor keeps the digits that a covariance with uninformed directions loses.
     """
     count, scale = len(problem.initial_unknowns), problem.unknown_scales
-    _, jacobian = problem.residual_without_weak_priors(evaluation)
+    _, jacobian = residual_without_weak_priors(problem, evaluation)
     _, singular, vectors = np.linalg.svd(jacobian * scale, full_matrices=False)
     inverse = np.zeros(count)
     inverse[: len(singular)] = singular
@@ -151,7 +158,7 @@ def noise_covariance_factor(problem: EstimationProblem, evaluation: Evaluation) 
 
 def _chi2_per_dof(problem: EstimationProblem, evaluation: Evaluation) -> float:
     """Of the data, stated priors counting as observations."""
-    residual, _ = problem.residual_without_weak_priors(evaluation)
+    residual, _ = residual_without_weak_priors(problem, evaluation)
     data = residual[problem.residual_rows.data]
     return float(data @ data) / max(len(residual) - len(problem.initial_unknowns), 1)
 
@@ -191,7 +198,7 @@ def _misfit_sandwich_covariance(problem: EstimationProblem, evaluation: Evaluati
     if evaluation.jacobian is None or not len(covariance):
         return covariance
     scale = problem.unknown_scales
-    residual, jacobian = problem.residual_without_weak_priors(evaluation)
+    residual, jacobian = residual_without_weak_priors(problem, evaluation)
     jacobian = jacobian * scale
     inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-10, hermitian=True)
     scores = jacobian * residual[:, None]
@@ -512,6 +519,6 @@ def _one_sided_interval(value: float, std: float, side: int, slope: float) -> Co
 
 def _pull(problem: EstimationProblem, evaluation: Evaluation, at: int) -> float:
     """Size of the gradient of the cost by one unknown, in units of the noise that the misfit makes."""
-    residual, jacobian = problem.residual_without_weak_priors(evaluation)
+    residual, jacobian = residual_without_weak_priors(problem, evaluation)
     scale = max(1.0, _chi2_per_dof(problem, evaluation))
     return abs(float(jacobian[:, at] @ residual)) / scale

@@ -10,6 +10,7 @@ import pytest
 from small_problems import H, correlated, pendulum_step, taken
 
 from yid_ocp.errors import ConfigError
+from yid_ocp.inference.whitening import estimate_torque_biases, whitened_at
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.evaluation import _sensor_whitened_residual
 
@@ -97,7 +98,7 @@ def test_innovations_weigh_by_the_covariance_of_all_residuals(urdf_folder, how, 
     if together:
         problem = problem.on([correlated(episode) for episode in problem.episodes], ())
     x = problem.start * 1.1
-    plain, weighted = problem.evaluate(x), problem.whitened_at(x).evaluate(x)
+    plain, weighted = problem.evaluate(x), whitened_at(problem, x).evaluate(x)
     rows = problem.rows.data
     covariance = dense_covariance(problem, x, how.get("angle", ANGLE))
     solved = np.linalg.solve(covariance, np.column_stack([plain.residual[rows], plain.jacobian[rows]]))
@@ -114,7 +115,7 @@ def test_with_encoders_the_outcome_does_not_depend_on_the_tracking_filter(urdf_f
     for g in (9.0, gain):
         feedback = {"feedback": "proportional", "gains": (g,)}
         problem = small_gap(problem_of(urdf_folder, encoders=True, feedback=feedback, size=0.1), size=0.1)
-        weighted = problem.whitened_at(problem.start)
+        weighted = whitened_at(problem, problem.start)
         rows = problem.rows.data
         found = weighted.evaluate(problem.start)
         r, jacobian = found.residual[rows], found.jacobian[rows]
@@ -151,7 +152,7 @@ def test_without_errors_of_inputs_nothing_changes(urdf_folder):
     made = replace(made, joints=replace(made.joints, effort_std=0.0))
     problem = EstimationProblem(step, [made], ("elbow.stiffness",), ProblemOptions(**TRACKED))
     assert not problem.has_process_noise
-    assert problem.whitened_at(problem.initial_unknowns) is problem
+    assert whitened_at(problem, problem.initial_unknowns) is problem
 
 
 def test_the_papers_cost_knows_no_noise(urdf_folder):
@@ -164,15 +165,15 @@ def test_a_constant_error_is_seen_and_its_spread_said(urdf_folder):
     problem = small_gap(problem_of(urdf_folder, encoders=True))
     episode = problem.episodes[0]
     problem = problem.on([replace(episode, torque=episode.torque + 0.35)], [])
-    weighted = problem.whitened_at(problem.start)
-    ((value, std),) = weighted.estimate_torque_biases(problem.start)
+    weighted = whitened_at(problem, problem.start)
+    ((value, std),) = estimate_torque_biases(weighted, problem.start)
     assert std[0] < BIAS
     assert value[0] == pytest.approx(0.35, abs=4 * std[0])
-    again = weighted.whitened_at(problem.start)
+    again = whitened_at(weighted, problem.start)
     np.testing.assert_allclose(again.episodes[0].errors.offset, value)
-    ((settled, _),) = again.estimate_torque_biases(problem.start)
+    ((settled, _),) = estimate_torque_biases(again, problem.start)
     assert settled[0] == pytest.approx(value[0], abs=0.5 * std[0])
-    assert problem.estimate_torque_biases(problem.start) == [None]
+    assert estimate_torque_biases(problem, problem.start) == [None]
 
 
 @pytest.mark.parametrize("feedback", [TRACKED, {"feedback": "lqr"}], ids=["angles", "angles_and_momenta"])
@@ -180,7 +181,7 @@ def test_a_constant_error_counts_in_what_the_filter_follows_too(urdf_folder, fee
     """The momentum of the measured motion is worked out from recorded torques; weights know what their error does."""
     problem = problem_of(urdf_folder, encoders=False, feedback=feedback)
     x, error = problem.start, 1e-3
-    weighted = problem.whitened_at(x)
+    weighted = whitened_at(problem, x)
     [episode], [whitening] = weighted.episodes, weighted.whitening_filters
     group = episode.recording.joints
     wrong = replace(episode.recording, joints=replace(group, effort=group.effort + error))
@@ -197,15 +198,15 @@ def test_a_constant_error_counts_in_what_the_filter_follows_too(urdf_folder, fee
 
 def test_what_cannot_be_rolled_out_has_no_constant_error(point, monkeypatch):
     problem, x = point
-    weighted = problem.whitened_at(x)
-    assert len(weighted.estimate_torque_biases(x)[0]) == 2
+    weighted = whitened_at(problem, x)
+    assert len(estimate_torque_biases(weighted, x)[0]) == 2
     monkeypatch.setattr(type(weighted.predictor), "run", lambda *_: "it snaps")
-    assert weighted.estimate_torque_biases(x) == [None]
+    assert estimate_torque_biases(weighted, x) == [None]
 
 
 def test_weights_are_frozen_until_they_are_asked_for_again(point):
     problem, x = point
-    weighted = problem.whitened_at(x)
+    weighted = whitened_at(problem, x)
     there, back = weighted.evaluate(1.2 * x), weighted.evaluate(x)
     assert weighted.whitening_filters[0] is weighted.freeing(problem.free[:1]).whitening_filters[0]
     np.testing.assert_array_equal(back.residual, weighted.evaluate(x).residual)
@@ -215,7 +216,7 @@ def test_weights_are_frozen_until_they_are_asked_for_again(point):
 
 def test_jacobians_of_innovations_are_those_of_differences(urdf_folder):
     problem = small_gap(problem_of(urdf_folder, encoders=True))
-    weighted = problem.whitened_at(problem.start)
+    weighted = whitened_at(problem, problem.start)
     x = problem.start * 1.05
     found = weighted.evaluate(x)
     for i in range(len(x)):

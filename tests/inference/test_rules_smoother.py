@@ -11,9 +11,9 @@ import pytest
 import threadpoolctl
 from factories import BIAS, FORCE, OTHER_FORCE
 
-from yid_ocp.diagnosis import smoother, smoother_model
-from yid_ocp.diagnosis.smoother_model import IntervalModel, LinearResidualModel
 from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.inference import smoother, smoother_model
+from yid_ocp.inference.smoother_model import IntervalModel, LinearResidualModel
 
 SOURCES = (FORCE, OTHER_FORCE, BIAS)
 STATES, COUNT, ROWS, DECAY = 2, 8, 6, 0.7

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
-from yid_ocp.diagnosis import smoother_model
 from yid_ocp.diagnosis.localise import (
     GapLocation,
     attribute_gap_to_effects,
@@ -18,8 +17,9 @@ from yid_ocp.diagnosis.localise import (
     localise_gap,
     merge_intervals,
 )
-from yid_ocp.diagnosis.smoother import _filter, _run, _scores, force_likelihood_terms, run_smoother
-from yid_ocp.diagnosis.smoother_model import IntervalModel, LinearResidualModel, UnknownGroup, linear_residual_models
+from yid_ocp.inference import smoother_model
+from yid_ocp.inference.smoother import _filter, _run, _scores, force_likelihood_terms, run_smoother
+from yid_ocp.inference.smoother_model import IntervalModel, LinearResidualModel, UnknownGroup, linear_residual_models
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
