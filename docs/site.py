@@ -15,7 +15,7 @@ SECTIONS = {
     "Start": ("index.md", "tutorial.md", "choosing.md", "recordings.md", "settings.md", "real_data.md"),
     "Questions": ("diagnosis.md", "identifiability.md", "comparison.md", "plan.md", "vision.md", "servo.md"),
     "Tools": ("export.md", "extending.md", "inspection.md", "program.md", "reports.md", "workers.md"),
-    "Inside": ("theory.md", "architecture.md"),
+    "Inside": ("theory.md", "architecture.md", "glossary.md"),
 }
 
 

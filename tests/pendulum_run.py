@@ -20,7 +20,7 @@ model:
   robot: {urdf}
   arms: {{mode: prescribed}}
   springs:
-    shoulder: {{stiffness: 1.0, rest: 0.2}}
+    shoulder: {{stiffness: 1.0, rest_position: 0.2}}
 recordings:
   estimate: [{estimate}]
   held_out: [{held_out}]

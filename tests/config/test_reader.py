@@ -25,6 +25,8 @@ from yid_ocp.options import (
 )
 from yid_ocp.solvers import GaussNewton, SteepestDescent
 
+RENAMED = "names changed in this version: see the table in CHANGELOG.md"
+
 
 def test_the_embedded_default_is_the_one_in_configs(repository):
     embedded = repository / "yid_ocp" / "data" / "defaults" / DEFAULT_CONFIG
@@ -49,7 +51,7 @@ def test_numbers_as_in_yaml_1_2(written):
 def test_a_solver_has_the_settings_of_its_method(written):
     run = load_config(written("solver: {name: steepest_descent, max_iterations: 7, backtracking_factor: 0.3}\n"))
     assert run.solver == SteepestDescent(max_iterations=7, backtracking_factor=0.3)
-    with pytest.raises(ConfigError, match="there is no key 'shrink'"):
+    with pytest.raises(ConfigError, match="there is no key 'backtracking_factor'"):
         load_config(written("solver: {name: gauss_newton, backtracking_factor: 0.3}\n"))
 
 
@@ -77,7 +79,7 @@ def test_paths_are_relative_to_the_file(written, tmp_path):
         ("sensors.joints.effort.std=0.1", ("sensors", "joints.effort", "std", 0.1)),
         ("sensors.joints.effort.std={a: 0.1}", ("sensors", "joints.effort", "std", {"a": 0.1})),
         ("model.grasp.left.kind=weld", ("model", "grasp", "left", "kind", "weld")),
-        ("solver.max_iterations=3", ("solver", "iterations", 3)),
+        ("solver.max_iterations=3", ("solver", "max_iterations", 3)),
         ("model.object={kind: foam_y, links: 2}", ("model", "object", "links", 2)),
         ("model.object.links=6", ("model", "object", "links", 6)),
         ("model.damping=0.1", ("model", "damping", 0.1)),
@@ -111,7 +113,7 @@ def test_settings_over_the_file_keep_what_they_do_not_touch():
         ("model:\n  object: {kind: cube}\n", "there is no kind 'cube'"),
         ("model:\n  object: 3\n", "model.object = 3 is not a section"),
         ("model:\n  object:\n    kind: segments\n    segments: {a: {length: 1, radius: 0.1}}\n", "'mass' is missing"),
-        ("model:\n  grasp: {left: {holder_frame: x}}\n", "'held' is missing"),
+        ("model:\n  grasp: {left: {holder_frame: x}}\n", "'held_frame' is missing"),
         ("model:\n  grasp: [left]\n", "model.grasp"),
         ("model:\n  gravity: [0, 0]\n", "a list of 3"),
         ("model:\n  arms: {joints: left_s0}\n", "a list"),
@@ -131,7 +133,7 @@ def test_refusals(written, text, message):
 
 
 def test_old_or_misplaced_keys_are_told_their_section(written):
-    for key in ("time_step", "force_split", "compiler", "initial_state", "path_cutoff", "weighting", "huber_threshold"):
+    for key in ("time_step", "force_split", "use_compiler", "initial_state", "path_cutoff", "weighting", "huber_threshold"):
         with pytest.raises(ConfigError, match=f"there is no key '{key}' in solver") as caught:
             load_config(written(f"solver: {{{key}: 1}}\n"))
         assert f"'{key}' is a key of `problem`" in caught.value.hint
@@ -140,26 +142,26 @@ def test_old_or_misplaced_keys_are_told_their_section(written):
         assert f"'{key}' is a key of `problem`" in caught.value.hint
     with pytest.raises(ConfigError) as caught:
         load_config(written("problem: {iteration: 3}\n"))
-    assert caught.value.hint == "did you mean 'duration'?"
+    assert caught.value.hint == f"did you mean 'duration'?; {RENAMED}"
     with pytest.raises(ConfigError) as caught:
-        load_config(written("problem: {iterations: 3}\n"))
-    assert "'iterations' is a key of `solver`, `compare.methods.NAME`, `track.options.shape_fit`" in caught.value.hint
+        load_config(written("problem: {max_iterations: 3}\n"))
+    assert "'max_iterations' is a key of `solver`, `compare.methods.NAME`, `track.options.shape_fit`" in caught.value.hint
     with pytest.raises(ConfigError) as caught:
         load_config(written("solver: {name: steepest_descent, step_tolerance: 1}\n"))
     assert "'step_tolerance' is a key of `solver` with name: gauss_newton, lifted" in caught.value.hint
     with pytest.raises(ConfigError) as caught:
         load_config(written("solver: {held_out: []}\n"))
-    assert caught.value.hint == "'held_out' is a key of `recordings`"
+    assert caught.value.hint == f"'held_out' is a key of `recordings`; {RENAMED}"
     with pytest.raises(ConfigError) as caught:
         load_config(written("solver: {parameters: {}}\n"))
-    assert caught.value.hint == "'parameters' is a key of the file itself"
+    assert caught.value.hint == f"'parameters' is a key of the file itself; {RENAMED}"
     with pytest.raises(ConfigError) as caught:
         load_config(written("xyzzy: 3\n"))
-    assert (caught.value.hint, "solver" in caught.value.allowed) == ("", True)
+    assert (caught.value.hint, "solver" in caught.value.allowed) == (RENAMED, True)
 
 
 def test_what_only_code_sets_is_no_key(written):
-    for text in ("problem: {known_start: {}}\n", "problem: {priors: {a: 1}}\n", "places: {}\n", "name: a\n"):
+    for text in ("problem: {known_initial_states: {}}\n", "problem: {prior_stds: {a: 1}}\n", "key_locations: {}\n", "name: a\n"):
         with pytest.raises(ConfigError, match="there is no key"):
             load_config(written(text))
 
@@ -170,12 +172,12 @@ METHODS = "compare:\n  methods:\n    gauss_newton: {}\n    lifted:\n      VALUE\
 @pytest.mark.parametrize(
     ("value", "words"),
     [
-        ("iterations: abc", ("compare.methods.lifted.max_iterations", "a whole number from 1", "line 5")),
-        ("iterations: -3", ("compare.methods.lifted.max_iterations = -3", "a whole number from 1", "line 5")),
-        ("iterations: 3.0", ("a whole number from 1",)),
+        ("max_iterations: abc", ("compare.methods.lifted.max_iterations", "a whole number from 1", "line 5")),
+        ("max_iterations: -3", ("compare.methods.lifted.max_iterations = -3", "a whole number from 1", "line 5")),
+        ("max_iterations: 3.0", ("a whole number from 1",)),
         ("defect_tolerance: 0", ("a number above 0 [rad, m or N m s]",)),
-        ("iteration: 3", ("there is no key 'iteration' in compare.methods.lifted", "did you mean 'iterations'?")),
-        ("trial: last", ("there is no key 'trial'", "node_interval", "line 5")),
+        ("max_iteration: 3", ("there is no key 'max_iteration' in compare.methods.lifted", "did you mean 'max_iterations'?")),
+        ("first_trial_step: last", ("there is no key 'first_trial_step'", "node_interval", "line 5")),
         ("name: lifted", ("there is no key 'name'",)),
     ],
 )
@@ -187,9 +189,9 @@ def test_compared_methods_are_typed_like_the_solver(written, value, words):
 
 
 def test_compared_methods(written):
-    run = load_config(written(METHODS.replace("VALUE", "iterations: 7")))
+    run = load_config(written(METHODS.replace("VALUE", "max_iterations: 7")))
     assert list(run.compare.methods) == ["gauss_newton", "lifted"]
-    assert (run.compare.methods["lifted"].iterations, run.compare.methods["lifted"].name) == (7, "lifted")
+    assert (run.compare.methods["lifted"].max_iterations, run.compare.methods["lifted"].name) == (7, "lifted")
     with pytest.raises(ConfigError, match="there is no solver 'newton'") as caught:
         load_config(written("compare: {methods: {newton: {}}}\n"))
     assert caught.value.hint == "did you mean 'gauss_newton'?"
@@ -201,8 +203,8 @@ def test_compared_methods(written):
     [
         ("compare.methods.gauss_newton.max_iterations=abc", "a whole number from 1"),
         ("compare.methods.gauss_newton.max_iterations=0", "a whole number from 1"),
-        ("compare.methods.gauss_newton.iteration=3", "did you mean 'iterations'?"),
-        ("compare.methods.newton.iterations=3", "did you mean 'gauss_newton'?"),
+        ("compare.methods.gauss_newton.max_iteration=3", "did you mean 'max_iterations'?"),
+        ("compare.methods.newton.max_iterations=3", "did you mean 'gauss_newton'?"),
         ("solver.max_iterations=-3", "a whole number from 1"),
         ("solver.time_step=0.01", "'time_step' is a key of `problem`"),
     ],
@@ -390,5 +392,5 @@ def test_odd_yaml_is_refused_at_once(tmp_path, text, said):
 def test_merged_sections_have_their_lines(tmp_path):
     file = tmp_path / "merged.yaml"
     file.write_text("problem:\n  <<: {time_step: 0.02}\n  use_compiler: 3\n", encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"line 3: problem\.compiler"):
+    with pytest.raises(ConfigError, match=r"line 3: problem\.use_compiler"):
         load_config(file)

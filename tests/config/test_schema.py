@@ -31,7 +31,7 @@ def test_the_page_in_the_docs_is_current(repository):
         "| `mass` | mass of the whole segment | a number above 0 [kg] | needed |",
     ):
         assert f"\n{line}\n" in page
-    assert "known_start" not in page
+    assert "known_initial_states" not in page
 
 
 def test_every_section_of_the_page_has_an_example_that_can_be_read(repository, tmp_path):
@@ -62,22 +62,22 @@ def test_the_schema_accepts_every_configuration_and_refuses_typos(repository):
     for wrong in (
         {"sovler": {}},
         {"problem": {"time_step": "fast"}},
-        {"problem": {"known_start": {}}},
+        {"problem": {"known_initial_states": {}}},
         {"model": {"object": {"kind": "cube"}}},
         {"model": {"object": {"links": 4}}},
         {"model": {"effects": [{"kind": "density"}]}},
-        {"solver": {"iterations": -3}},
-        {"solver": {"shrink": 0.3}},
-        {"solver": {"name": "lifted", "trial": "last"}},
-        {"compare": {"methods": {"gauss_newton": {"iterations": "abc"}}}},
+        {"solver": {"max_iterations": -3}},
+        {"solver": {"backtracking_factor": 0.3}},
+        {"solver": {"name": "lifted", "first_trial_step": "last"}},
+        {"compare": {"methods": {"gauss_newton": {"max_iterations": "abc"}}}},
         {"compare": {"methods": {"newton": {}}}},
     ):
         with pytest.raises(jsonschema.ValidationError):
             jsonschema.validate(wrong, rules)
     for right in (
-        {"solver": {"name": "steepest_descent", "shrink": 0.3}},
-        {"solver": {"iterations": 3}},
-        {"compare": {"methods": {"gauss_newton": {"iterations": 3}, "lifted": {}}}},
+        {"solver": {"name": "steepest_descent", "backtracking_factor": 0.3}},
+        {"solver": {"max_iterations": 3}},
+        {"compare": {"methods": {"gauss_newton": {"max_iterations": 3}, "lifted": {}}}},
         {"model": {"object": None}},
     ):
         jsonschema.validate(right, rules)

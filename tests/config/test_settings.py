@@ -32,20 +32,20 @@ def test_written_back_every_setting_is_there(written):
     assert told["solver"] == {
         "name": "lifted",
         "node_interval": 3,
-        "iterations": 80,
+        "max_iterations": 80,
         "step_tolerance": 1e-5,
         "cost_tolerance": 1e-5,
         "defect_tolerance": 1e-7,
     }
     assert told["compare"]["methods"] == {
         "lifted": {name: value for name, value in told["solver"].items() if name != "name"}
-        | {"node_interval": 20, "iterations": 2}
+        | {"node_interval": 20, "max_iterations": 2}
     }
     assert told["problem"]["time_step"] == 0.01
-    assert told["track"]["options"]["filters"]["behind"] is None
+    assert told["track"]["options"]["filters"]["max_depth_behind_base"] is None
     assert "duration" not in told["problem"]
-    assert set(told) & {"name", "file", "places"} == set()
-    assert "known_start" not in told["problem"]
+    assert set(told) & {"name", "config_file", "key_locations"} == set()
+    assert "known_initial_states" not in told["problem"]
     assert load_config(written(dump_config(run))) == run
 
 

@@ -36,11 +36,11 @@ def test_its_commands_exist_and_its_entries_are_there(page, symbols, repository)
         said = build_argument_parser().parse_args(arguments)
         assert (repository / said.config).is_file()
         for entry in said.entries:
-            assert symbols.entry(entry).title.split(" / ")[0].removeprefix("d ") == entry.split(",")[0]
+            assert symbols.equation_entry(entry).title.split(" / ")[0].removeprefix("d ") == entry.split(",")[0]
 
 
 def test_the_entry_that_it_quotes_is_the_one_that_comes_out(page, symbols) -> None:
-    lines = symbols.entry("del[T2_3_z], T2.twist").lines
+    lines = symbols.equation_entry("del[T2_3_z], T2.twist").text_lines
     assert "\n".join(f"    {line}" for line in lines) in page
 
 

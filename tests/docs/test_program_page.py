@@ -10,11 +10,11 @@ CHECKS = """
 values = ca.Function("k", [mine.w], [k])(found["x"])
 assert solver.stats()["success"]
 assert abs(float(values[1] / values[0]) - 1.4) < 1e-6, values
-plain = nlp.solver("ipopt", hessian="exact", ipopt={"print_level": 0, "sb": "yes"})
-free = plain(**nlp.arguments)
+plain = nlp.make_solver("ipopt", hessian="exact", ipopt={"print_level": 0, "sb": "yes"})
+free = plain(**nlp.solver_arguments)
 assert abs(float(free["x"][0]) - 199.459) < 0.01
 assert float(found["f"]) > float(free["f"])
-assert local.jacobian.size_out(0) == (len(step.names), v.numel())
+assert local.jacobian.size_out(0) == (len(step.residual_names), v.numel())
 """
 
 
@@ -38,6 +38,6 @@ def test_what_it_names_exists(repository) -> None:
 
     text = (repository / "docs" / "program.md").read_text(encoding="utf-8")
     named = set(re.findall(r"`nlp\.(\w+)", text))
-    assert {"w", "p", "f", "g", "hessian", "arguments"} <= named
+    assert {"w", "p", "f", "g", "hessian", "solver_arguments"} <= named
     fields = {*NonlinearProgram.__dataclass_fields__, *vars(NonlinearProgram)}
     assert named <= fields

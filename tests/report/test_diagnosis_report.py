@@ -43,7 +43,7 @@ def found(tmp_path_factory, urdf_folder):
         f"model: {{robot: {urdf_folder / 'double_pendulum.urdf'}, arms: {{mode: prescribed}}}}\n"
         "recordings: {estimate: [a.h5], held_out: [b.h5]}\n"
         "parameters: {elbow.damping: {free: true}}\n"
-        "problem: {path_cutoff: .inf, compiler: false}\n"
+        "problem: {path_cutoff: .inf, use_compiler: false}\n"
     )
     nominal = load_problem(folder / "p.yaml")
     for rub in (0.0, 0.05):

@@ -57,7 +57,7 @@ def solved(tmp_path_factory, urdf_folder):
         f"model: {{robot: {urdf_folder / 'double_pendulum.urdf'}, arms: {{mode: prescribed}}}}\n"
         "recordings: {estimate: [a.h5]}\n"
         "parameters: {elbow.damping: {free: true}}\n"
-        "problem: {path_cutoff: .inf, compiler: false}\n"
+        "problem: {path_cutoff: .inf, use_compiler: false}\n"
     )
     problem = load_problem(folder / "p.yaml")
     return problem, solve(problem, GaussNewton())

@@ -66,11 +66,11 @@ def test_marked_entries_are_told_from_the_others(drawn, tmp_path):
     entry = pattern()
     marked = np.zeros_like(entry.nonzero_mask)
     marked[:2] = True
-    draw_sparsity_patterns(tmp_path / "p.png", [[pattern(marked=marked, marked_as="not zero at the rest")]])
+    draw_sparsity_patterns(tmp_path / "p.png", [[pattern(marked_mask=marked, mark_label="not zero at the rest")]])
     (axes,) = drawn[0].get_axes()
-    np.testing.assert_array_equal(shown(axes) == 2, entry.mask & marked)
-    np.testing.assert_array_equal(shown(axes) > 0, entry.mask)
-    assert axes.get_title().endswith(f"dark: {np.count_nonzero(entry.mask & marked)} not zero at the rest")
+    np.testing.assert_array_equal(shown(axes) == 2, entry.nonzero_mask & marked)
+    np.testing.assert_array_equal(shown(axes) > 0, entry.nonzero_mask)
+    assert axes.get_title().endswith(f"dark: {np.count_nonzero(entry.nonzero_mask & marked)} not zero at the rest")
 
 
 def test_many_rows_share_the_label_of_their_owner(drawn, tmp_path):

@@ -239,7 +239,7 @@ def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
     assert "tau = 0.05 s" in line_of(lines, "kelvin_voigt@T1")
     assert "tau unknown" in line_of(refitted, "kelvin_voigt@T1")
     assert not any("yid-ocp plan" in line for line in lines)
-    section = {"goal": "information", "separate": ["density@T3", "point_mass@w_T3"], "run": "runs/mine"}
+    section = {"goal": "information", "discriminate": ["density@T3", "point_mass@w_T3"], "parameter_run": "runs/mine"}
     said = told("diagnose_summary", result | {"next_plan": section})
     assert line_of([line.strip() for line in said], "yid-ocp plan").split() == [
         "yid-ocp", "plan", "runs/mine/config.yaml", "--set", "plan.goal=information", "--set",

@@ -37,7 +37,7 @@ model:
   damping: {{roll: 0.1, pitch: 0.1, object: 0.002}}
   object:
     kind: segments
-    mount: {{frame: hub}}
+    mount: {{parent_frame: hub}}
     segments:
 {segments}
   points: [{points}]
@@ -45,8 +45,8 @@ recordings:
   estimate: [{recording}]
 parameters:
 {parameters}
-problem: {{path_cutoff: .inf, compiler: false}}
-output: {{report: false}}
+problem: {{path_cutoff: .inf, use_compiler: false}}
+output: {{write_report: false}}
 """
 
 
@@ -62,7 +62,7 @@ def configuration(
     segments, parameters, points = [], [], []
     for name in branches:
         length, turn = BRANCHES[name]
-        shape = f"length: {length}, mass: {0.08 * length}, radius: 0.008, links: {links}, joint_order: xy"
+        shape = f"length: {length}, mass: {0.08 * length}, radius: 0.008, links: {links}, joint_axes: xy"
         segments.append(f"      {name}: {{{shape}, rpy: [{turn}, 0, 0]}}")
         seen = f"{name}.bend" in TRUTH
         value = links / 4 * TRUTH[f"{'north' if length == 0.5 else 'east'}.bend"]

@@ -24,9 +24,9 @@ model:
   arms: {{mode: driven}}
   object:
     kind: segments
-    mount: {{frame: tool0}}
+    mount: {{parent_frame: tool0}}
     segments:
-      cable: {{length: 1.0, mass: 0.1, radius: 0.005, links: {links}, joint_order: xy, rigidity: true, clamped: true}}
+      cable: {{length: 1.0, mass: 0.1, radius: 0.005, links: {links}, joint_axes: xy, stiffness_per_curvature: true, clamped_at_base: true}}
   damping: {{shoulder_pan_joint: 0.1, object: 5.0e-4}}
   points: [w_cable, "cable:50%"]
 parameters: {{cable.bend: {{initial: 0.03}}}}
@@ -47,7 +47,7 @@ model:
     exclude_links: [panda_hand]
   object:
     kind: segments
-    mount: {{frame: panda_link8}}
+    mount: {{parent_frame: panda_link8}}
     segments:
 {branches}
   damping: {{panda_joint1: 0.1, object: 2.0e-3}}
@@ -66,9 +66,9 @@ model:
   arms: {{mode: servo}}
   object:
     kind: segments
-    mount: {{frame: gripper}}
+    mount: {{parent_frame: gripper}}
     segments:
-      rod: {{length: 0.4, mass: 0.04, radius: 0.003, links: {links}, joint_order: xy, rigidity: true, clamped: true}}
+      rod: {{length: 0.4, mass: 0.04, radius: 0.003, links: {links}, joint_axes: xy, stiffness_per_curvature: true, clamped_at_base: true}}
   damping: {{pan: 0.05, object: 4.0e-4}}
   points: [w_rod, "rod:50%"]
   effects: [{effects}]
@@ -98,7 +98,7 @@ def ur5_text(links: int = 16) -> str:
 
 
 def panda_text(links: int = 10) -> str:
-    shape = f"length: 0.4, mass: 0.03, radius: 0.004, links: {links}, joint_order: xy, rigidity: true, clamped: true"
+    shape = f"length: 0.4, mass: 0.03, radius: 0.004, links: {links}, joint_axes: xy, stiffness_per_curvature: true, clamped_at_base: true"
     turns = [f"rpy: [0.0, {QUARTER}, {round(QUARTER * i, 7)}]" for i in range(4)]
     branches = [f"      {name}: {{{shape}, {turn}}}" for name, turn in zip(PANDA_BENDS, turns, strict=True)]
     parameters = ", ".join(f"{name}.bend: {{initial: {value}}}" for name, value in PANDA_BENDS.items())

@@ -61,9 +61,9 @@ def test_an_object_of_segments_on_a_robots_hand(written):
             "    mode: prescribed\n"
             "  object:\n"
             "    kind: segments\n"
-            "    mount: {frame: panda_hand, xyz: [0, 0, 0.1], rpy: [0, 1.5708, 0]}\n"
+            "    mount: {parent_frame: panda_hand, xyz: [0, 0, 0.1], rpy: [0, 1.5708, 0]}\n"
             "    segments:\n"
-            "      beam: {length: 0.5, mass: 0.3, radius: 0.01, links: 5, rigidity: true, clamped: true}\n"
+            "      beam: {length: 0.5, mass: 0.3, radius: 0.01, links: 5, stiffness_per_curvature: true, clamped_at_base: true}\n"
             "      tip: {link_lengths: [0.1, 0.05], mass: 0.01, radius: 0.01, parent: beam}\n"
             "parameters: {beam.bend: {initial: 1.3}, tip.damping: {initial: 0.001}}\n"
         )
@@ -114,7 +114,7 @@ def test_springs_on_joints(written, urdf_folder):
     run = load_config(
         written(
             f"model:\n  robot: {urdf_folder / 'mixed_joints.urdf'}\n  arms: {{mode: passive}}\n"
-            "  springs:\n    hinge: {stiffness: 2.0, rest: 0.1, damping: 0.3}\n    slide: {stiffness: 50.0}\n"
+            "  springs:\n    hinge: {stiffness: 2.0, rest_position: 0.1, damping: 0.3}\n    slide: {stiffness: 50.0}\n"
             "  damping: {spin: 0.2}\n"
         )
     )

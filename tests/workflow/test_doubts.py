@@ -151,10 +151,7 @@ def test_times_since_1970_give_the_same_problem(damaged):
     assert late.episodes[0].measurements[0].n_residuals == usual.episodes[0].measurements[0].n_residuals
 
 
-NAMED = {
-    "of the group": ("points: [w_T1, w_T4]", "'w_T4'"),
-    "of the model": ("frames: {w_T1: w_Tl}", "'w_Tl'"),
-}
+NAMED = {"of the group": ("points: [w_T1, w_T4]", "'w_T4'"), "of the model": ("frames: {w_T1: w_Tl}", "'w_Tl'")}
 
 
 @pytest.mark.parametrize("what", NAMED)

@@ -45,8 +45,8 @@ def said(problem):
 
 def test_a_recording_that_starts_at_rest(hanging):
     point, found = said(hanging("equilibrium"))
-    assert point.words == "rest at the first posture of aside"
-    assert point.resting
+    assert point.description == "rest at the first posture of aside"
+    assert point.is_equilibrium
     np.testing.assert_allclose(point.state[:6], 0.0, atol=1e-9)
     assert found["T1.bend"].seen == found["T1.bend"].rows
     assert found["T1.bend"].moved is not None
@@ -55,9 +55,9 @@ def test_a_recording_that_starts_at_rest(hanging):
 def test_a_recording_whose_start_is_fitted(hanging):
     problem = hanging("fitted_to_points")
     point, found = said(problem)
-    assert point.words == "the start that was fitted to the first points of aside"
-    assert not point.resting
-    np.testing.assert_allclose(point.state, problem.episodes[0].start.state)
+    assert point.description == "the start that was fitted to the first points of aside"
+    assert not point.is_equilibrium
+    np.testing.assert_allclose(point.state, problem.episodes[0].fixed_initial_state.state)
     assert abs(point.state[1]) == pytest.approx(0.125, abs=0.01)
     # about a motion nothing is said of what is seen, but the recordings tell
     assert found["T1.bend"].seen is None

@@ -43,7 +43,7 @@ def problem_of(step, position_std=None, **changed):
         "sensors": SENSORS,
         "path_cutoff": float("inf"),
         "initial_state": "estimated",
-        "priors": {"elbow.rest": 0.05},
+        "prior_stds": {"elbow.rest": 0.05},
         "weak_prior_factor": 7.0,
         "huber_threshold": 1.5,
     }
@@ -85,7 +85,7 @@ def test_errors_of_torques_shrink_like_all_other_noise(driven, encoders):
     use = {True: {"joints.position": replace(STATED["joints.position"], use=True)}, False: {}}[encoders]
     problem = driven(**STATED | use)
     shrunk = _with_noise_only_stds(problem, settings())
-    x = problem.start * 1.1
+    x = problem.initial_unknowns * 1.1
     one, other = (whitened_at(made, x, rounds=2) for made in (problem, shrunk))
     before, after = one.evaluate(x), other.evaluate(x)
     assert one.whitening_filters[0] is not None
@@ -114,17 +114,17 @@ def settings(share=SHARE):
     def refuse(what, *where, **more):
         return ConfigError(what, where=".".join(where), **more)
 
-    return SimpleNamespace(diagnosis=SimpleNamespace(noise_fraction=share), refuse=refuse)
+    return SimpleNamespace(diagnosis=SimpleNamespace(noise_fraction=share), config_error=refuse)
 
 
 def test_every_row_is_so_many_times_larger_and_the_fit_the_same(step):
     problem = problem_of(step)
     shrunk = _with_noise_only_stds(problem, settings())
-    assert shrunk.residual_rows == problem.rows
-    rows = problem.rows
+    assert shrunk.residual_rows == problem.residual_rows
+    rows = problem.residual_rows
     assert [part.stop - part.start for part in (rows.stated_priors, rows.weak_priors)] == [3, 1]
     for seed in range(3):
-        x = problem.start + problem.scales * np.random.default_rng(seed).uniform(-0.3, 0.3, len(problem.start))
+        x = problem.initial_unknowns + problem.unknown_scales * np.random.default_rng(seed).uniform(-0.3, 0.3, len(problem.initial_unknowns))
         one, other = problem.evaluate(x), shrunk.evaluate(x)
         np.testing.assert_allclose(other.residual, one.residual / SHARE, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(other.jacobian, one.jacobian / SHARE, rtol=1e-9, atol=1e-9)

@@ -44,7 +44,7 @@ def problem_of(step, *, bias=OFFSET, white=WHITE, held_out=True, options=None):
         (),
         name="first",
     )  # fmt: skip
-    made = EstimationProblem(step, [first], ("elbow.stiffness",), replace(options, feedback="none", gains=None))
+    made = EstimationProblem(step, [first], ("elbow.stiffness",), replace(options, feedback="none", proportional_gains=None))
     episode = made.episodes[0]
     swept = made.predictor.predict_episode(episode, *made.split(made.initial_unknowns, 0), False)
     joints = replace(first.joints, position=swept.rollout.state[:, :1], effort=torque + 0.3)
@@ -56,9 +56,9 @@ def problem_of(step, *, bias=OFFSET, white=WHITE, held_out=True, options=None):
 
 def test_offsets_of_all_recordings_are_told_with_what_was_expected(step):
     problem = problem_of(step)
-    assert estimated_torque_offsets(problem, problem.start) == {}
-    weighted = whitened_at(problem, problem.start, rounds=2)
-    found = estimated_torque_offsets(weighted, problem.start)
+    assert estimated_torque_offsets(problem, problem.initial_unknowns) == {}
+    weighted = whitened_at(problem, problem.initial_unknowns, rounds=2)
+    found = estimated_torque_offsets(weighted, problem.initial_unknowns)
     assert list(found) == ["first", "second"]
     for entry in found.values():
         own = entry["shoulder"]
@@ -66,13 +66,13 @@ def test_offsets_of_all_recordings_are_told_with_what_was_expected(step):
         assert own["std"] < 0.1 * OFFSET
         assert own["value"] == pytest.approx(0.3, abs=4 * own["std"])
     assert list(
-        estimated_torque_offsets(whitened_at(problem_of(step, held_out=False), problem.start), problem.start)
+        estimated_torque_offsets(whitened_at(problem_of(step, held_out=False), problem.initial_unknowns), problem.initial_unknowns)
     ) == ["first"]
 
 
 def test_where_offsets_are_no_part_of_the_model_nothing_is_said(step):
     problem = problem_of(step, bias=0.0)
-    assert estimated_torque_offsets(whitened_at(problem, problem.start), problem.start) == {}
+    assert estimated_torque_offsets(whitened_at(problem, problem.initial_unknowns), problem.initial_unknowns) == {}
     assert torque_offset_rows({"torque_offsets": {}}) == torque_offset_rows({}) == []
 
 
@@ -89,13 +89,13 @@ def test_the_table_has_a_row_for_a_joint_and_a_column_for_a_recording():
         ("e0", "-0.10 ± 0.01", "", "± 0.3"),
     ]
     many = {f"run {i}": {"s0": entry(0.1)} for i in range(6)}
-    assert torque_offset_rows({"estimated_torque_offsets": many})[-1][0] == "2 more recordings are in result.json"
+    assert torque_offset_rows({"torque_offsets": many})[-1][0] == "2 more recordings are in result.json"
     assert aligned_table_lines(rows)[0].split() == ["torque", "offset", "[N", "m]", "a", "b", "expected"]
 
 
 def simulated(problem, seed):
     episode = problem.episodes[0]
-    outcome = problem.predictor.run(episode, *problem.split(problem.start, 0), False)
+    outcome = problem.predictor.predict_episode(episode, *problem.split(problem.initial_unknowns, 0), False)
     return recording_from_prediction(problem.predictor, episode, outcome, problem.theta, seed).joints
 
 

@@ -58,10 +58,6 @@ def load_config(
     default : str
         Name of the embedded file.
 
-    Returns
-    -------
-    Run
-
     Raises
     ------
     ConfigError
@@ -137,11 +133,9 @@ def _loaded(text: str, origin: str) -> Any:
         line = f", line {error.problem_mark.line + 1}" if error.problem_mark is not None else ""
         problem = str(error.problem or error.context).split("\n")[0]
         twice = re.match(r'found duplicate key "(.*?)"', problem)
-        raise ConfigError(
-            f"the key '{twice[1]}' is duplicated" if twice else f"the file is not valid YAML: {problem}",
-            where=f"{origin}{line}",
-            hint="check indentation, brackets, colons and duplicated keys",
-        ) from error
+        what = f"the key '{twice[1]}' is duplicated" if twice else f"the file is not valid YAML: {problem}"
+        hint = "check indentation, brackets, colons and duplicated keys"
+        raise ConfigError(what, where=f"{origin}{line}", hint=hint) from error
     except (YAMLError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:
         # the reader's own mistakes on odd text: numbers of thousands of digits, keys that are lists
         problem = next(iter(str(error).splitlines()), type(error).__name__)
@@ -202,11 +196,8 @@ def _override(data: dict[str, Any], places: dict[_KeyPath, str], text: str) -> N
     try:
         value = _loaded(value_text, origin) if value_text.strip() else None
     except ConfigError as error:
-        raise ConfigError(
-            f"the value '{value_text[:80]}' is not valid YAML: {error.what}",
-            where=origin,
-            allowed="a number, text, [list], {key: value}",
-        ) from error
+        what = f"the value '{value_text[:80]}' is not valid YAML: {error.what}"
+        raise ConfigError(what, where=origin, allowed="a number, text, [list], {key: value}") from error
     parent = data
     for i, part in enumerate(path[:-1]):
         entry = parent.get(part)
@@ -220,10 +211,7 @@ def _override(data: dict[str, Any], places: dict[_KeyPath, str], text: str) -> N
 
 
 def _merged(hint: Any, before: Any, value: Any, path: _KeyPath, places: dict[_KeyPath, str]) -> Any:
-    """What stands at a key once a value is set there: sections of one kind merge, all else is replaced.
-
-    An empty section replaces too: nothing else would make room for other names than those that stand there.
-    """
+    """What stands at a key once a value is set there: sections of one kind merge, all else is replaced."""
     if not (value and isinstance(before, dict) and isinstance(value, dict)) or _another(hint, before, value):
         for known in [known for known in places if known[: len(path)] == path]:
             del places[known]
@@ -321,12 +309,9 @@ class _Reader:
         raw = {} if raw is None else raw
         if not isinstance(raw, dict):
             keys = list(sections.variant_options(sections.default_variant))
-            raise ConfigError(
-                f"{self._name(path)} = {_shown(raw)} is not a section",
-                where=self.where(path),
-                allowed="keys: " + ", ".join(keys),
-                hint=_key_meant(self._name(path), keys),
-            )
+            what = f"{self._name(path)} = {_shown(raw)} is not a section"
+            hint = _key_meant(self._name(path), keys)
+            raise ConfigError(what, where=self.where(path), allowed="keys: " + ", ".join(keys), hint=hint)
         word = sections.selected_variant(raw)
         if not isinstance(word, str) or word not in sections.classes:
             raise sections.unknown_variant_error(

@@ -28,7 +28,7 @@ _PAGE_HEAD = """\
 # Settings
 
 Every key of a configuration file. NAME stands for a name of yours or of the model. Units are SI and stand in brackets;
-`required_explained_fraction` keys have no default, and where none is shown it is nothing at all (`null`). Any key may be set on the command
+`needed` keys have no default, and where none is shown it is nothing at all (`null`). Any key may be set on the command
 line as well, `--set problem.time_step=0.005`; a section merges with what stands there, key by key, and an empty one
 empties it. How to choose links, time step and split: [choosing.md](choosing.md); recordings and their units:
 [recordings.md](recordings.md). This page is made from the code; CONTRIBUTING.md has the command.

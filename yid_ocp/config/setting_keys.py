@@ -102,6 +102,7 @@ def unknown_key_error(root: type, name: str, known: Iterable[str], where: str, w
     homes = list(dict.fromkeys(_sections_with_key(root, name)))
     hints = [said["hint"]] if said["hint"] else []
     hints += [f"'{name}' is a key of {', '.join(homes[:3])}"] if homes else []
+    hints.append("names changed in this version: see the table in CHANGELOG.md")
     if ":" in name:
         hints = ["put a space behind the colon, as in {" + name.replace(":", ": ") + "}"]
     return ConfigError(
@@ -119,7 +120,6 @@ def iter_settable_keys(hint: Any, prefix: str, raw: Any, at: str = "") -> Iterat
     ----------
     hint : Any
         Type of what stands at `at`.
-    prefix : str
     raw : Any
         What a file says there: its names count where users choose them.
     at : str

@@ -30,7 +30,6 @@ class Stick:
 
     Attributes
     ----------
-    end_indices : (int, int)
     radius : float
         [m]
     is_object_part : bool
@@ -50,7 +49,6 @@ class AnimatedMotion:
     ----------
     name : str
         `measured`, `predicted`, ...
-    sticks : tuple of Stick
     positions : ndarray, shape (F, K, 3)
         [m]; NaN where nothing is known.
     point_indices : mapping of str to int
@@ -72,10 +70,8 @@ class Animation:
 
     Attributes
     ----------
-    title : str
     t : ndarray, shape (F,)
         [s]
-    motions : tuple of Motion
     """
 
     title: str
@@ -111,7 +107,6 @@ class StickFigure:
 
     Parameters
     ----------
-    system : System
     theta : ndarray, shape (ntheta,)
     """
 
@@ -202,8 +197,7 @@ def make_animation(title: str, told: Sequence[ModelTrajectory], recording: Recor
 
     Parameters
     ----------
-    title : str
-    told : sequence of Told
+    told : sequence of ModelTrajectory
         At least one; the first fixes the clock and the joints.
     recording : Recording, optional
         Its points, and its arms where it recorded their angles.

@@ -121,15 +121,7 @@ def confusion_figure(
 
 @dataclass(frozen=True)
 class BeforeAfter:
-    """A value before and after a change, with standard deviations and an optional reference value.
-
-    Attributes
-    ----------
-    before : float
-    after : float or None
-    before_std, after_std : float
-    reference : float or None
-    """
+    """A value before and after a change, with standard deviations and an optional reference value."""
 
     before: float
     after: float | None = None
@@ -145,7 +137,6 @@ def before_after_figure(
 
     Parameters
     ----------
-    rows : mapping of name to Change
     axis : str
         What the numbers are, with their unit.
     words : (str, str, str)
@@ -217,7 +208,6 @@ def time_map_figure(edges: Array, rows: Sequence[TimeMapRow], axis: str) -> plot
     ----------
     edges : ndarray, shape (J + 1,)
         [s]
-    rows : sequence of Row
     axis : str
         What the colors are.
     """
@@ -269,10 +259,8 @@ class RankedCandidate:
 
     Attributes
     ----------
-    name : str
     closure_interval_percent : (float, float, float) or None
         What it was found to close, and its interval [%].
-    predicted_decrease : float
     """
 
     name: str
@@ -287,7 +275,6 @@ def candidate_ranking_figure(
 
     Parameters
     ----------
-    entries : sequence of Ranked
     closed, promised : str
         Titles of the two axes.
     """
@@ -334,7 +321,6 @@ def matrix_figure(names: Sequence[str], values: Array, row: str, column: str) ->
 
     Parameters
     ----------
-    names : sequence of str
     values : ndarray, shape (n, n)
         Between 0 and 1.
     row, column : str

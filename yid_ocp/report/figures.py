@@ -95,7 +95,6 @@ class TimePlot:
     axis_title : str
         Of its axis, with the unit.
     t, measured : ndarray, shape (M,)
-    lines : mapping of name to (t (K,), value (K,))
     band_half_height : float or None
         Half the height of what is shaded about zero.
     marked_intervals : sequence of (float, float)
@@ -126,7 +125,6 @@ def prediction_and_residual_plots(
 
     Parameters
     ----------
-    title, unit : str
     t, measured, std : ndarray, shape (M,)
     lines : mapping of name to ndarray, shape (M,)
         Predictions at the times of the measurements.
@@ -158,7 +156,6 @@ def time_plots_figure(
 
     Parameters
     ----------
-    curves : sequence of Curve
     dots : str
         Color of what is measured.
     lines : mapping of name to str, optional

@@ -33,11 +33,6 @@ def write_report(path: Path, findings: ReportData) -> bool:
     Plotly's script is packed into it, so that it can be sent alone and needs no network; or it refers to a copy that
     `write_shared_plotly_script` left in its folder, or up to two above.
 
-    Parameters
-    ----------
-    path : Path
-    findings : Findings
-
     Returns
     -------
     bool
@@ -66,11 +61,7 @@ def write_report(path: Path, findings: ReportData) -> bool:
     sections = render_sections(findings, environment)
     shared = _shared(path)
     page = environment.get_template("page.html").render(
-        findings=findings,
-        sections=sections,
-        dark=DARK_MODE_COLORS,
-        shared=shared,
-        packed="" if shared else _packed(),
+        findings=findings, sections=sections, dark=DARK_MODE_COLORS, shared=shared, packed="" if shared else _packed()
     )
     write_text(path, page)
     return True

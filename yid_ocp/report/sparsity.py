@@ -27,7 +27,7 @@ def draw_sparsity_patterns(path: Path, layout: Sequence[Sequence[SparsityPattern
     ----------
     path : Path
         PNG to write.
-    layout : sequence of sequence of Pattern
+    layout : sequence of sequence of SparsityPattern
         What stands beside what; patterns without rows or columns are left out.
 
     Raises

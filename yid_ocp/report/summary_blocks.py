@@ -16,7 +16,6 @@ class SummaryStatement:
 
     Attributes
     ----------
-    text : str
     kind : "note", "verdict" or "conclusion"
         Verdicts are what the command was asked for, a conclusion is what they come to: a page begins with conclusions,
         then has the verdicts.
@@ -32,7 +31,6 @@ class SummaryTable:
 
     Attributes
     ----------
-    rows : list of sequence of str
     title : str
         Stands above it on a page.
     is_key_table : bool

@@ -28,13 +28,9 @@ _COMPARED_MODEL_SECTIONS = ("robot", "arms", "clamps", "object", "grasp", "sprin
 def read_estimates(folder: str | Path) -> RunEstimates:
     """Estimates and covariance of the free parameters, read from a run folder of `solve` or `diagnose`.
 
-    Parameters
-    ----------
-    folder : str or Path
-
     Returns
     -------
-    Estimates
+    RunEstimates
         Parameters that were not found at all are left out.
 
     Raises
@@ -58,12 +54,9 @@ def read_estimates(folder: str | Path) -> RunEstimates:
             if "@" in label:
                 effects.setdefault(label, {})[quantity] = float(entry["value"])
     except (LookupError, TypeError, ValueError) as error:
-        raise DataError(
-            "the result does not say how sure its parameters are together",
-            where=str(file),
-            allowed="keys parameters and covariance, as this version writes them",
-            hint="run it again",
-        ) from error
+        what = "the result does not say how sure its parameters are together"
+        allowed = "keys parameters and covariance, as this version writes them"
+        raise DataError(what, where=str(file), allowed=allowed, hint="run it again") from error
     if not names:
         raise DataError(
             "the run found no parameter", where=str(file), hint="give a run in which some parameter was found"
@@ -78,11 +71,9 @@ def read_run_result(folder: str | Path) -> dict[str, Any]:
     file = Path(folder) / "result.json"
     result = _result(file)
     if result.get("format") not in _RUN_FORMATS:
+        what = f"the run folder is one of another command ({result.get('format')})"
         raise DataError(
-            f"the run folder is one of another command ({result.get('format')})",
-            where=str(file),
-            allowed=" or ".join(_RUN_FORMATS),
-            hint="give a run folder of `solve` or `diagnose`",
+            what, where=str(file), allowed=" or ".join(_RUN_FORMATS), hint="give a run folder of `solve` or `diagnose`"
         )
     if result.get("status") == "failed":
         raise DataError(f"the run failed: {result.get('message')}", where=str(file), hint="give one that converged")
@@ -91,11 +82,8 @@ def read_run_result(folder: str | Path) -> dict[str, Any]:
 
 def _result(file: Path) -> dict[str, Any]:
     if not is_file(file):
-        raise DataError(
-            f"there is no finished run in {file.parent}",
-            where=str(file),
-            hint="give the run folder that `solve` or `diagnose` printed",
-        )
+        hint = "give the run folder that `solve` or `diagnose` printed"
+        raise DataError(f"there is no finished run in {file.parent}", where=str(file), hint=hint)
     try:
         result = json.loads(file.read_text(encoding="utf-8"))
         return dict(result)
@@ -125,12 +113,10 @@ def baseline_estimates(run: RunSettings) -> tuple[RunEstimates, ...]:
         there = _settings(folder)
         differing = "" if there is None else _different(run, there)
         if differing:
-            raise run.config_error(
-                f"{folder} is a run of another model: model.{differing} differs",
-                *where,
-                allowed=f"the same {', '.join(_COMPARED_MODEL_SECTIONS)} under `model`",
-                hint=f"compare model.{differing} with {Path(folder) / 'config.yaml'}",
-            )
+            what = f"{folder} is a run of another model: model.{differing} differs"
+            hint = f"compare model.{differing} with {Path(folder) / 'config.yaml'}"
+            allowed = f"the same {', '.join(_COMPARED_MODEL_SECTIONS)} under `model`"
+            raise run.config_error(what, *where, allowed=allowed, hint=hint)
         found.append(own)
     dependent = _dependent(run.diagnosis.baseline)
     if dependent:
@@ -163,11 +149,9 @@ def require_same_model(folders: Sequence[Path]) -> None:
     for folder, settings in known[1:]:
         differing = _different(known[0][1], settings)
         if differing:
-            raise ConfigError(
-                f"the runs are of different models: model.{differing} differs",
-                where=str(folder / "config.yaml"),
-                allowed=f"the same {', '.join(_COMPARED_MODEL_SECTIONS)} under `model` as in {known[0][0]}",
-            )
+            allowed = f"the same {', '.join(_COMPARED_MODEL_SECTIONS)} under `model` as in {known[0][0]}"
+            what = f"the runs are of different models: model.{differing} differs"
+            raise ConfigError(what, where=str(folder / "config.yaml"), allowed=allowed)
 
 
 def _different(run: RunSettings, there: RunSettings) -> str:
@@ -241,7 +225,9 @@ def load_reference_recordings(run: RunSettings) -> tuple[tuple[Recording, ...], 
 def _read(run: RunSettings, i: int, path: str) -> Recording:
     file = recording_path(path)
     if not is_file(file):
-        raise run.config_error(f"there is no such recording: {file}", "recordings", "without", i, hint="check the path")
+        raise run.config_error(
+            f"there is no such recording: {file}", "recordings", "reference_recordings", i, hint="check the path"
+        )
     return read_recording(file)
 
 
@@ -267,6 +253,6 @@ def require_distinct_recordings(
                     f"{episode.name} is a recording of the baseline too, and would count twice"
                     if of_baseline
                     else f"{episode.name} is among the recordings made without what is looked for",
-                    *(("diagnosis", "baseline") if of_baseline else ("recordings", "without")),
+                    *(("diagnosis", "baseline") if of_baseline else ("recordings", "reference_recordings")),
                     allowed="recordings of another time",
                 )

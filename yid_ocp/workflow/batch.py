@@ -47,7 +47,6 @@ class BatchRun:
     ----------
     name : str
         Of its folder.
-    config_file : Path
     overrides : tuple of str
         `a.b=c` each, over those of the file.
     """
@@ -101,7 +100,6 @@ def list_batch_runs(
 
     Parameters
     ----------
-    configs : sequence of str or Path
     recordings : str, optional
         A pattern such as `fleet/*.h5`, `**` for any folders; a run then estimates on one recording and holds none out,
         unless the overrides say otherwise.
@@ -125,12 +123,9 @@ def list_batch_runs(
         return _named([(path.stem, path, tuple(overrides)) for path in paths])
     files = sorted(Path(match) for match in glob.glob(recordings, recursive=True) if Path(match).is_file())
     if not files:
-        raise ConfigError(
-            "no recording matches",
-            where=f"--recordings {recordings}",
-            allowed="a pattern such as 'fleet/*.h5' or 'fleet/**/*.h5', relative to the working folder",
-            hint="put the pattern in quotes, so that the shell leaves it alone, and check the folder",
-        )
+        advice = "put the pattern in quotes, so that the shell leaves it alone, and check the folder"
+        allowed = "a pattern such as 'fleet/*.h5' or 'fleet/**/*.h5', relative to the working folder"
+        raise ConfigError("no recording matches", where=f"--recordings {recordings}", allowed=allowed, hint=advice)
     entries = []
     for path in paths:
         for file in files:
@@ -170,14 +165,12 @@ def run_batch(
         Folder: `runs/NAME/` (a run folder each), `tasks/` (results of tasks, see `yid_ocp.parallel`), then `batch.json`
         (`yid-batch/1`) and `report.html`.
     command : {'solve', 'diagnose'}
-    workers : Workers or Executor, optional
-    progress : Progress, optional
     command_line : str
         The command line that does the same, for the report.
 
     Returns
     -------
-    BatchOutcome
+    BatchCommandResult
         Also where runs failed: each says why.
 
     Raises
@@ -291,12 +284,9 @@ def _folder(path: Path) -> Path:
     folder = path.expanduser().absolute()
     try:
         if folder.is_dir() and any(folder.iterdir()) and not (folder / _TASKS_FOLDER).is_dir():
-            raise OutputError(
-                "the folder holds something that is no batch",
-                where=str(folder),
-                allowed="a new name, an empty folder, or the folder of a batch, which goes on",
-                hint="choose another name with --out",
-            )
+            allowed = "a new name, an empty folder, or the folder of a batch, which goes on"
+            what = "the folder holds something that is no batch"
+            raise OutputError(what, where=str(folder), allowed=allowed, hint="choose another name with --out")
         (folder / _RUNS_FOLDER).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"the folder cannot be made: {os_error_reason(error)}", where=str(folder)) from error

@@ -112,7 +112,7 @@ def run_blind(
 
     Parameters
     ----------
-    runs : sequence of Run
+    runs : sequence of RunSettings
         Configurations: models, posture and sensors of their first recordings, `diagnosis.candidates`. Each is varied
         (`workflow.blind_experiments.EXPERIMENT_VARIATIONS`) as far as there are cases for it.
     out : str or Path
@@ -123,15 +123,8 @@ def run_blind(
         (`yid-calibration/1`).
     count : int
         Number of cases.
-    seed : int
-    progress : Progress, optional
-    workers : Workers or Executor, optional
     purpose : {'report', 'calibration'}
         The same seed draws other cases for each.
-
-    Returns
-    -------
-    BlindOutcome
 
     Raises
     ------
@@ -171,7 +164,7 @@ def run_blind(
         "code_of_cases": commitment["code"],
         "command": again,
         "date": local_time_text(),
-        "installed_versions": installed_versions(),
+        "versions": installed_versions(),
         "candidates": {entry.name: entry.diagnosis.candidates for entry in runs},
         "variations": {name: varied.description for name, varied in EXPERIMENT_VARIATIONS.items()},
     }
@@ -220,11 +213,9 @@ def _made(
         _make(configs, folder, count, seed, progress, workers, purpose)
     said = json.loads(commitment.read_text("utf-8"))
     if (said["cases"], said["seed"], said["purpose"], said["configs"]) != (count, seed, purpose, configs):
-        raise OutputError(
-            f"'{folder}' holds another ensemble ({said['cases']} cases, seed {said['seed']}, for {said['purpose']})",
-            where="--out",
-            hint="choose another folder, or the same configurations, --cases, --seed and --calibration",
-        )
+        what = f"'{folder}' holds another ensemble ({said['cases']} cases, seed {said['seed']}, for {said['purpose']})"
+        hint = "choose another folder, or the same configurations, --cases, --seed and --calibration"
+        raise OutputError(what, where="--out", hint=hint)
     tasks = []
     for entry in json.loads((folder / _CASES_FOLDER / "cases.json").read_text("utf-8")):
         name = str(entry["name"])

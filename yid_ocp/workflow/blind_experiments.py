@@ -41,7 +41,6 @@ class ExperimentVariation:
     ----------
     case_fraction : float
         Part of a configuration's cases.
-    description : str
     has_torque_noise : bool
         Torques with white noise and offsets, both stated.
     time_step_factor : float
@@ -99,15 +98,7 @@ EXPERIMENT_VARIATIONS: Mapping[str, ExperimentVariation] = {
 
 @dataclass(frozen=True)
 class BlindExperiment:
-    """One experiment of an ensemble, as plain data and paths.
-
-    Attributes
-    ----------
-    config_file : Path
-    variation : str
-    seed : int
-    purpose : str
-    """
+    """One experiment of an ensemble, as plain data and paths."""
 
     config_file: Path
     variation: str
@@ -161,11 +152,9 @@ class BlindExperiment:
                 continue  # the motion throws the object about; draw another
             write_recording(replace(made, name="first", description="", source="", true_parameters={}), file)
             return
-        raise ModelError(
-            f"none of {MAX_CASE_DRAWS} motions can be simulated",
-            where=f"{self.config_file.name}, {varied.description}",
-            hint="an object that is thrown about needs more damping, or a start of its arms in which it hangs calm",
-        )
+        hint = "an object that is thrown about needs more damping, or a start of its arms in which it hangs calm"
+        what = f"none of {MAX_CASE_DRAWS} motions can be simulated"
+        raise ModelError(what, where=f"{self.config_file.name}, {varied.description}", hint=hint)
 
     def build_ensemble(self, first: Path) -> tuple[RunSettings, CaseGenerator]:
         """Settings of the diagnosed model and the ensemble, built from the first recording.
@@ -206,18 +195,13 @@ def require_blind_compatible(run: RunSettings) -> None:
     ConfigError
     """
     if run.diagnosis.noise_fraction < 1 or any(entry.std is not None for entry in run.sensors.values()):
-        raise run.config_error(
-            "virtual recordings have the noise of `run_virtual_experiment`, not that of these settings",
-            "sensors",
-            hint="leave sensors.*.std and diagnosis.noise_fraction out",
-        )
+        what = "virtual recordings have the noise of `run_virtual_experiment`, not that of these settings"
+        raise run.config_error(what, "sensors", hint="leave sensors.*.std and diagnosis.noise_fraction out")
     system = build_system(run)
     if not system.driven or system.prescribed or system.servos:
-        raise ConfigError(
-            "a blind proof moves driven arms",
-            where=run.describe_location("model", "arms", "mode"),
-            allowed="a robot whose arms are driven by torques, nothing prescribed",
-        )
+        allowed = "a robot whose arms are driven by torques, nothing prescribed"
+        where = run.describe_location("model", "arms", "mode")
+        raise ConfigError("a blind proof moves driven arms", where=where, allowed=allowed)
 
 
 def list_experiments(

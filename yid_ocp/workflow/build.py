@@ -73,14 +73,9 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
 
     Parameters
     ----------
-    run : Run
     link_division : int
         Into how many links each of the object's is divided, the stiffness and damping of a tube kept; to see what the
         number of links does. A cable's edges stay as they are.
-
-    Returns
-    -------
-    System
 
     Raises
     ------
@@ -108,9 +103,8 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
     mode = "driven" if _arms_are_estimated_states(run) else model.arms.mode
     for i, name in enumerate(model.arms.passive_joints):
         if name not in joints:
-            raise run.config_error(
-                f"there is no joint '{name}'", "model", "arms", "passive", i, hint=nearest_name_hint(name, joints)
-            )
+            hint = nearest_name_hint(name, joints)
+            raise run.config_error(f"there is no joint '{name}'", "model", "arms", "passive_joints", i, hint=hint)
     moved = tuple(name for name in joints if name not in model.arms.passive_joints)
     grasps = [
         Grasp(name, grasp.holder_frame, grasp.held_frame, grasp.kind, ca.SX(ca.DM(rotation_from_rpy(*grasp.rpy))))
@@ -144,13 +138,7 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
 
 
 def _arms_are_estimated_states(run: RunSettings) -> bool:
-    """Whether prescribed arms become estimated states, driven by measured torques and corrected by encoders.
-
-    So it is where they hold an object and torques are recorded. The encoders' noise reaches the torques through the
-    arm's whole inertia, from joint to joint and from sample to sample, which a rollout that takes the angles as true
-    cannot say. Where several grasps close loops, such angles ask for what the object's geometry does not allow, and no
-    motion fits.
-    """
+    """Whether prescribed arms become estimated states, driven by measured torques and corrected by encoders."""
     if run.model.arms.mode != "prescribed" or not run.model.grasp:
         return False
     recordings = read_recordings(run, "estimate")
@@ -169,12 +157,10 @@ def _dampings(run: RunSettings, joints: Sequence[str]) -> tuple[dict[str, float]
                 f"there is no joint '{name}'", "model", "damping", name, hint=nearest_name_hint(name, known)
             )
     if run.model.object is not None and _OBJECT_DAMPING_KEY not in said:
+        allowed = f"joints of the robot and `{_OBJECT_DAMPING_KEY}`, for all joints of the object"
+        what = "the damping is given by joint, but not that of the object"
         raise run.config_error(
-            "the damping is given by joint, but not that of the object",
-            "model",
-            "damping",
-            allowed=f"joints of the robot and `{_OBJECT_DAMPING_KEY}`, for all joints of the object",
-            hint=f"set model.damping.{_OBJECT_DAMPING_KEY}",
+            what, "model", "damping", allowed=allowed, hint=f"set model.damping.{_OBJECT_DAMPING_KEY}"
         )
     return {name: said.get(name, _DEFAULT_JOINT_DAMPING) for name in joints}, said.get(
         _OBJECT_DAMPING_KEY, _DEFAULT_JOINT_DAMPING
@@ -198,14 +184,8 @@ def _cable_model(run: RunSettings) -> System:
             raise run.config_error(f"a cable takes no {key}: its clamps hold it", "model", key, hint=f"remove {key}")
     for name in item.branches:
         if name not in cable.branch_vertices:
-            raise run.config_error(
-                f"there is no branch '{name}'",
-                "model",
-                "object",
-                "branches",
-                name,
-                hint=nearest_name_hint(name, cable.branch_vertices),
-            )
+            hint = nearest_name_hint(name, cable.branch_vertices)
+            raise run.config_error(f"there is no branch '{name}'", "model", "object", "branches", name, hint=hint)
     recordings = read_recordings(run, "estimate")
     if not recordings:
         raise run.config_error(
@@ -223,7 +203,7 @@ def build_cable(run: RunSettings) -> CableTopology | None:
     item = run.model.object
     if not isinstance(item, CableSettings):
         return None
-    with locate_errors(run, "model", "object", "undeformed"):
+    with locate_errors(run, "model", "object", "undeformed_shape_file"):
         undeformed = read_vertex_positions(item.undeformed_shape_file)
     with locate_errors(run, "model", "object"):
         return CableTopology(item.parent_vertices, dict(item.child_vertices), undeformed)
@@ -258,7 +238,7 @@ def input_files(run: RunSettings) -> dict[str, Path]:
         files[robot] = _existing(run, file, "URDF file", "model", "robot")
     if isinstance(run.model.object, CableSettings):
         file = Path(run.model.object.undeformed_shape_file)
-        files[str(file)] = _existing(run, file, "table of points", "model", "object", "undeformed")
+        files[str(file)] = _existing(run, file, "table of points", "model", "object", "undeformed_shape_file")
     for which in ("estimate", "held_out"):
         for i, path in enumerate(getattr(run.recordings, which)):
             files[path] = _existing(run, recording_path(path), "recording", "recordings", which, i)
@@ -355,12 +335,8 @@ def parameter_settings(run: RunSettings, parameters: Parameters) -> dict[str, Pa
     for key, given in run.parameters.items():
         matches = [name for name in parameters.names if name == key or fnmatch.fnmatchcase(name, key)]
         if not matches:
-            raise run.config_error(
-                f"there is no parameter '{key}'",
-                "parameters",
-                key,
-                hint=nearest_name_hint(key, parameters.names) + "; all of them are listed by `yid-ocp inspect`",
-            )
+            hint = nearest_name_hint(key, parameters.names) + "; all of them are listed by `yid-ocp inspect`"
+            raise run.config_error(f"there is no parameter '{key}'", "parameters", key, hint=hint)
         said = {name: value for name, value in vars(given).items() if value is not None}
         for name in matches:
             result[name] = replace(result.get(name, ParameterSettings()), **said)
@@ -377,13 +353,9 @@ def _set_parameters(run: RunSettings, parameters: Parameters, finer: int) -> Par
             value = entry.value if said.initial is None else factor * said.initial
             key = _key_of(run, entry.name)
             if lower < entry.lower or upper > entry.upper or lower > upper:
-                raise run.config_error(
-                    f"the bounds {lower:g} to {upper:g} {entry.unit} of {entry.name} are not possible",
-                    "parameters",
-                    key,
-                    "bounds",
-                    allowed=f"within {entry.lower:g} to {entry.upper:g} {entry.unit}, lower first",
-                )
+                what = f"the bounds {lower:g} to {upper:g} {entry.unit} of {entry.name} are not possible"
+                allowed = f"within {entry.lower:g} to {entry.upper:g} {entry.unit}, lower first"
+                raise run.config_error(what, "parameters", key, "bounds", allowed=allowed)
             with locate_errors(run, "parameters", key, "initial"):
                 entry = replace(entry, value=value, lower=lower, upper=upper)
         entries.append(entry)
@@ -448,8 +420,6 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
 
     Parameters
     ----------
-    run : Run
-    system : System
     recordings : sequence of Recording
         Where values differ from recording to recording (a cable's edges, places of markers), those of these.
     """
@@ -457,12 +427,8 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
     chosen = parameter_settings(run, parameters)
     for name in run.problem.start_fit_parameters:
         if name not in parameters:
-            raise run.config_error(
-                f"there is no parameter '{name}'",
-                "problem",
-                "start_parameters",
-                hint=nearest_name_hint(name, parameters.names),
-            )
+            hint = nearest_name_hint(name, parameters.names)
+            raise run.config_error(f"there is no parameter '{name}'", "problem", "start_fit_parameters", hint=hint)
     sensors = dict(run.sensors)
     if _arms_are_estimated_states(run):
         # what the encoders say is what counts of the arms, as it does where they are prescribed
@@ -501,15 +467,10 @@ def build_problem(
 
     Parameters
     ----------
-    run : Run
     step : Step, optional
         Compiled before; built when absent.
     reference_recordings : sequence of Recording
         That will be predicted only; the options say where markers sit in them.
-
-    Returns
-    -------
-    EstimationProblem
 
     Raises
     ------
@@ -525,13 +486,8 @@ def build_problem(
         )
     same = sorted(set(run.recordings.estimate) & set(run.recordings.held_out))
     if same:
-        raise run.config_error(
-            "a recording is both estimated on and held out",
-            "recordings",
-            "held_out",
-            allowed="one of the two",
-            hint=same[0],
-        )
+        what = "a recording is both estimated on and held out"
+        raise run.config_error(what, "recordings", "held_out", allowed="one of the two", hint=same[0])
     estimate, held_out = read_recordings(run, "estimate"), read_recordings(run, "held_out")
     if not estimate:
         raise run.config_error(
@@ -567,13 +523,7 @@ def initial_grasp_gaps(problem: EstimationProblem, episode: Episode) -> dict[str
 
 
 def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
-    """Raise an error for recordings at whose first configuration a grasp cannot be closed.
-
-    Raises
-    ------
-    DataError
-        Naming the recording, the grasp and the distance.
-    """
+    """Raise an error for recordings at whose first configuration a grasp cannot be closed."""
     for episode in (*problem.episodes, *problem.held_out):
         for name, gap in initial_grasp_gaps(problem, episode).items():
             if gap > _MAX_GRASP_GAP:
@@ -594,15 +544,11 @@ def _check_sensors(run: RunSettings, recordings: Sequence[Recording]) -> None:
     for name in run.sensors:
         if name not in known:
             raise run.config_error(
-                f"no recording has a group '{name}'",
-                "sensors",
-                name,
-                **unknown_name_details(name, sorted(known)),
+                f"no recording has a group '{name}'", "sensors", name, **unknown_name_details(name, sorted(known))
             )
         if run.sensors[name].effort_kind is not None and name != EFFORT_GROUP:
-            raise run.config_error(
-                f"'{name}' holds no efforts", "sensors", name, "kind", hint=f"say it of {EFFORT_GROUP}, or leave it out"
-            )
+            hint = f"say it of {EFFORT_GROUP}, or leave it out"
+            raise run.config_error(f"'{name}' holds no efforts", "sensors", name, "effort_kind", hint=hint)
 
 
 # -- from a file -----------------------------------------------------------------------------------------------------

@@ -60,15 +60,9 @@ def run_check(
 ) -> CheckCommandResult:
     """Validate a run without solving it.
 
-    Parameters
-    ----------
-    run : Run
-    out : str or Path, optional
-    progress : Progress, optional
-
     Returns
     -------
-    CheckOutcome
+    CheckCommandResult
         `warnings` in its result lists what will work but should be looked at; `measure_discretisation_shifts` says how far every
         estimate would move with a finer model if it were the initial value.
 

@@ -45,22 +45,17 @@ def clamp_mechanism(run: RunSettings) -> Mechanism | None:
     model = run.model
     if model.robot is not None:
         if model.clamps:
+            hint = "remove model.clamps, or set model.robot: null; a robot holds by model.grasp or by the mount"
             raise run.config_error(
-                "clamps hold an object without a robot, and the model has one",
-                "model",
-                "clamps",
-                hint="remove model.clamps, or set model.robot: null; a robot holds by model.grasp or by the mount",
+                "clamps hold an object without a robot, and the model has one", "model", "clamps", hint=hint
             )
         return None
     said = model.arms
     for key, given in (("joints", said.joints), ("passive", said.passive_joints), ("locked", said.locked_joints)):
         if given:
+            hint = "set model.robot to its URDF file, or remove model.arms; the world or model.clamps hold an object"
             raise run.config_error(
-                "the settings name joints, but the model has no robot",
-                "model",
-                "arms",
-                key,
-                hint="set model.robot to its URDF file, or remove model.arms; the world or model.clamps hold an object",
+                "the settings name joints, but the model has no robot", "model", "arms", key, hint=hint
             )
     found: Mechanism | None = None
     for name, clamp in model.clamps.items():
@@ -96,21 +91,14 @@ def with_extra_frames(
         tree = carrier if owner is None else made[owner].mechanism
         if owner is None:
             if said.marker_reference_pose:
-                raise run.config_error(
-                    f"'{name}' is placed by `straight`, but sits on nothing of the object",
-                    *where,
-                    allowed="a frame of the object, such as w_SEGMENT, its end, or SEGMENT:40%",
-                    hint=f"set model.frames.{name}.frame",
-                )
+                what = f"'{name}' is placed by `marker_reference_pose`, but sits on nothing of the object"
+                allowed = "a frame of the object, such as w_SEGMENT, its end, or SEGMENT:40%"
+                raise run.config_error(what, *where, allowed=allowed, hint=f"set model.frames.{name}.parent_frame")
             tree = Mechanism("world", (), {}) if tree is None else tree
             known = [*tree.frames, *(frame for item in made for frame in item.mechanism.frames)]
             if said.parent_frame is not None and not tree.has_frame(said.parent_frame):
-                raise run.config_error(
-                    f"there is no frame '{said.parent_frame}'",
-                    *where,
-                    "frame",
-                    hint=nearest_name_hint(said.parent_frame, known),
-                )
+                hint = nearest_name_hint(said.parent_frame, known)
+                raise run.config_error(f"there is no frame '{said.parent_frame}'", *where, "parent_frame", hint=hint)
         assert tree is not None
         if said.marker_reference_pose:
             tree = _marked(tree, name, str(said.parent_frame))
@@ -139,10 +127,8 @@ def marker_parameter_values(
 
     Parameters
     ----------
-    run : Run
     system : System
         Whose object stands in the world; without its weight it is straight.
-    recordings : sequence of Recording
 
     Returns
     -------
@@ -171,22 +157,15 @@ def marker_parameter_values(
     for recording in recordings:
         group = recording.points[0].names if recording.points else ()
         if recording.marker_reference_pose is None:
-            raise DataError(
-                "the recording does not say where its markers were while the object was held straight",
-                where=f"{recording.name}: straight",
-                allowed="positions of the points of its first group, shape (np, 3) [m]",
-                hint=f"record them, or give model.frames.{names[0]}.xyz in place of straight: true",
-            )
+            hint = f"record them, or give model.frames.{names[0]}.xyz in place of marker_reference_pose: true"
+            what = "the recording does not say where its markers were while the object was held straight"
+            allowed = "positions of the points of its first group, shape (np, 3) [m]"
+            raise DataError(what, where=f"{recording.name}: straight", allowed=allowed, hint=hint)
         values: dict[str, float] = {}
         for i, name in enumerate(names):
             if name not in group:
-                raise run.config_error(
-                    f"'{name}' is no point of {recording.name}",
-                    "model",
-                    "frames",
-                    name,
-                    hint=nearest_name_hint(name, group),
-                )
+                what = f"'{name}' is no point of {recording.name}"
+                raise run.config_error(what, "model", "frames", name, hint=nearest_name_hint(name, group))
             rotation, origin = placed[2 * i], placed[2 * i + 1].ravel()
             local = rotation.T @ (recording.marker_reference_pose[group.index(name)] - origin)
             values |= {f"{name}.{axis}": float(x) for axis, x in zip(_AXES, local, strict=True)}
@@ -197,12 +176,7 @@ def marker_parameter_values(
 def _check_standing(run: RunSettings, name: str) -> None:
     item = run.model.object
     if isinstance(item, CableSettings) or (item is not None and item.mount is not None and item.mount.parent_frame):
-        raise run.config_error(
-            "the object moves with what carries it, so `straight` does not say where it was",
-            "model",
-            "frames",
-            name,
-            "straight",
-            allowed="an object whose mount stands in the world",
-            hint=f"give model.frames.{name}.xyz instead",
-        )
+        what = "the object moves with what carries it, so `marker_reference_pose` does not say where it was"
+        allowed = "an object whose mount stands in the world"
+        hint = f"give model.frames.{name}.xyz instead"
+        raise run.config_error(what, "model", "frames", name, "marker_reference_pose", allowed=allowed, hint=hint)

@@ -68,11 +68,7 @@ def run_and_print(
 
 
 def print_result(
-    arguments: argparse.Namespace,
-    result: Mapping[str, Any],
-    texts: Callable[[], Sequence[str]],
-    place: str,
-    path: str,
+    arguments: argparse.Namespace, result: Mapping[str, Any], texts: Callable[[], Sequence[str]], place: str, path: str
 ) -> None:
     """Print a command's result: summary text, the path alone (`quiet`) or JSON (`json`).
 

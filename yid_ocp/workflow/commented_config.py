@@ -44,8 +44,6 @@ def commented_config_text(
     ----------
     robot : str
         As the file is to name it.
-    item : Object
-    proposal : Proposal
     recordings : sequence of str
         Files, as the configuration is to name them.
     imports : mapping
@@ -135,7 +133,7 @@ def _others(proposal: ConfigProposal) -> list[str]:
     stay = [name for name in proposal.unrecorded_joints if name not in proposal.joints]
     if stay or proposal.unused_joints:
         lines.append(
-            "    # all other joints of the URDF stay at zero; another value: locked: {JOINT: VALUE} [rad or m]"
+            "    # all other joints of the URDF stay at zero; another value: locked_joints: {JOINT: VALUE} [rad or m]"
         )
     return lines
 
@@ -154,8 +152,13 @@ def _servos(proposal: ConfigProposal) -> list[str]:
         return []
     return [
         "    servo:                                  # their gains, dampings, delays and limits are parameters, below",
-        _line("      ", "commands", "held", "until the next one; interpolated where the controller goes in between"),
-        _line("      ", "gravity_compensation", "false", "true where the controller carries the arm's own weight"),
+        _line(
+            "      ",
+            "command_interpolation",
+            "held",
+            "until the next one; interpolated where the controller goes in between",
+        ),
+        _line("      ", "has_gravity_compensation", "false", "true where the controller carries the arm's own weight"),
     ]
 
 
@@ -171,7 +174,7 @@ def _object(item: ObjectDescription, proposal: ConfigProposal) -> list[str]:
         _line("    ", "kind", "segments", "chains of rigid links with elastic joints"),
         "    # its root sits in this frame of the robot and leaves it along z, unless xyz [m] and rpy [rad] say else",
         f"    # other frames there: {', '.join(frames[:8]) or 'none'}",
-        f"    mount: {{frame: {_text(proposal.holder_frame)}, xyz: [0.0, 0.0, 0.0], rpy: [0.0, 0.0, 0.0]}}",
+        f"    mount: {{parent_frame: {_text(proposal.holder_frame)}, xyz: [0.0, 0.0, 0.0], rpy: [0.0, 0.0, 0.0]}}",
         "    segments:",
     ]
     for branch in item.branches:
@@ -187,7 +190,9 @@ def _segment(branch: BranchDescription, links: int) -> list[str]:
     ]
     if branch.cross_section is not None:
         lines.append(
-            _line(at, "section", f"[{branch.cross_section[0]:g}, {branch.cross_section[1]:g}]", "along x and y [m]")
+            _line(
+                at, "cross_section", f"[{branch.cross_section[0]:g}, {branch.cross_section[1]:g}]", "along x and y [m]"
+            )
         )
     if branch.radius is not None:
         lines.append(_line(at, "radius", f"{branch.radius:g}", "[m]"))
@@ -207,9 +212,11 @@ def _segment(branch: BranchDescription, links: int) -> list[str]:
     return [
         *lines,
         _line(at, "links", str(links), "rigid links; `check` says how far estimates move with more"),
-        _line(at, "joint_order", order, why),
-        _line(at, "rigidity", "true", "parameters per curvature, whatever the number of links"),
-        _line(at, "clamped", "true" if branch.parent is None else "false", "whether the grip holds its direction"),
+        _line(at, "joint_axes", order, why),
+        _line(at, "stiffness_per_curvature", "true", "parameters per curvature, whatever the number of links"),
+        _line(
+            at, "clamped_at_base", "true" if branch.parent is None else "false", "whether the grip holds its direction"
+        ),
     ]
 
 
@@ -218,7 +225,7 @@ def _grasps(proposal: ConfigProposal) -> list[str]:
         return []
     lines = ["  grasp:                                    # what else holds it: point 3, axis 5, weld 6 equations"]
     for i, (frame, point) in enumerate(proposal.grasps.items()):
-        lines.append(f"    grasp_{i + 1}: {{holder: {_text(frame)}, held: {_text(point)}, kind: point}}")
+        lines.append(f"    grasp_{i + 1}: {{holder_frame: {_text(frame)}, held_frame: {_text(point)}, kind: point}}")
     return lines
 
 

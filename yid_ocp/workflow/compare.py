@@ -41,13 +41,7 @@ class CompareCommandResult:
 
 
 def _chosen_solvers(run: RunSettings) -> list[Solver]:
-    """Solvers listed in `compare.methods`, with their settings.
-
-    Raises
-    ------
-    ConfigError
-        None at all.
-    """
+    """Solvers listed in `compare.methods`, with their settings."""
     if not run.compare.methods:
         raise run.config_error("there is no method to compare", "compare", "methods", allowed=", ".join(SOLVERS))
     return list(run.compare.methods.values())
@@ -64,17 +58,6 @@ def run_compare(
     run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS
 ) -> CompareCommandResult:
     """Run every method, compare, and write the run folder.
-
-    Parameters
-    ----------
-    run : Run
-    out : str or Path, optional
-        The run folder; see `new_run_folder`.
-    progress : Progress, optional
-
-    Returns
-    -------
-    CompareOutcome
 
     Raises
     ------
@@ -118,10 +101,7 @@ def run_compare(
 
 
 def _compare_result(problem: EstimationProblem, comparison: MethodComparison) -> dict[str, Any]:
-    """`yid-compare/1` without inputs, versions and what is known beside.
-
-    One `yid-solve/1` for each method, with its cost in time, and for the run whose verdicts count, `judged`.
-    """
+    """`yid-compare/1` without inputs, versions and what is known beside."""
     methods = {}
     for run in comparison.method_results:
         methods[run.method] = solve_result(problem, run.solution, run.held_out_predictions) | {
@@ -153,7 +133,7 @@ def _paper_estimates(run: RunSettings) -> dict[str, float]:
         return {}
     if name not in PAPER_ESTIMATES:
         raise run.config_error(
-            f"the paper has no experiment '{name}'", "compare", "published", allowed=", ".join(PAPER_ESTIMATES)
+            f"the paper has no experiment '{name}'", "compare", "paper_experiment", allowed=", ".join(PAPER_ESTIMATES)
         )
     return PAPER_ESTIMATES[name]
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -83,6 +84,23 @@ class GroupNoise:
     reason: str
 
 
+_RESULT_KEYS = {
+    "unused_joints": "left_out",
+    "unrecorded_joints": "not_recorded",
+    "holder_frame": "holder",
+    "arm_mode": "mode",
+    "arm_mode_reason": "mode_why",
+    "initial_state": "start",
+    "initial_state_reason": "start_why",
+    "point_placements": "places",
+    "noise_by_group": "noise",
+    "path_cutoff": "cutoff",
+    "clock_descriptions": "clocks",
+    "still_joints": "still",
+}
+"""Keys of `yid-init/1` by attribute, where they differ."""
+
+
 @dataclass(frozen=True)
 class ConfigProposal:
     """Proposed contents of a generated configuration.
@@ -99,12 +117,8 @@ class ConfigProposal:
         Frame that carries the object's root.
     grasps : mapping of frame to point
         Frames that hold another point of it.
-    arm_mode, arm_mode_reason, initial_state, initial_state_reason : str
-    point_placements : mapping of group to tuple of Place
-    noise_by_group : mapping of group to Noise
     time_step, path_cutoff : float
         [s], [Hz]
-    clock_descriptions : mapping of group to text
     still_joints : tuple of str
         Joints that hardly turn in any recording.
     """
@@ -125,6 +139,20 @@ class ConfigProposal:
     path_cutoff: float
     clock_descriptions: Mapping[str, str] = field(default_factory=dict)
     still_joints: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """The proposal as plain data, under the keys of `yid-init/1`."""
+        own = {_RESULT_KEYS.get(key, key): value for key, value in asdict(self).items()}
+        own["arms"] = [{"joints": arm.joints, "frames": arm.tool_frames} for arm in self.arms]
+        own["places"] = {
+            group: [{"point": place.point, "frame": place.frame, "why": place.reason} for place in places]
+            for group, places in self.point_placements.items()
+        }
+        own["noise"] = {
+            group: {"std": noise.std, "unit": noise.unit, "why": noise.reason}
+            for group, noise in self.noise_by_group.items()
+        }
+        return own
 
     @property
     def marked_frames(self) -> tuple[str, ...]:
@@ -149,7 +177,7 @@ def propose_config(
         URDF file, or `package:NAME`.
     recordings : sequence of Recording
         At least one, with joints.
-    branches : sequence of Branch
+    branches : sequence of BranchDescription
         Segments of the object, parents first.
     holder : str, optional
         Frame that carries the object's root; the tool of the arm that moves most when absent.
@@ -172,12 +200,9 @@ def propose_config(
     whole = read_urdf(robot)
     known = [name for name in whole.joint_names if name in first.joints.names]
     if not known:
-        raise ConfigError(
-            f"none of the recorded joints is in the URDF: {', '.join(first.joints.names)}",
-            where=robot,
-            allowed=", ".join(whole.joint_names),
-            hint=f"rename them: --joints {first.joints.names[0]}={whole.joint_names[0]},...",
-        )
+        what = f"none of the recorded joints is in the URDF: {', '.join(first.joints.names)}"
+        hint = f"rename them: --joints {first.joints.names[0]}={whole.joint_names[0]},..."
+        raise ConfigError(what, where=robot, allowed=", ".join(whole.joint_names), hint=hint)
     tree = read_urdf(robot, joints=known)
     arms = _arms(tree)
     arms = tuple(sorted(arms, key=lambda arm: -_travel(first, arm.joints)))
@@ -276,12 +301,10 @@ def _mode(recording: Recording, closed: bool) -> tuple[str, str]:
     assert joints is not None
     seen = ", ".join(group.name for group in recording.points)
     if joints.effort is None and not seen:
-        raise ConfigError(
-            "nothing in the recording shows what the object does",
-            where=recording.name,
-            allowed="points on the object, or efforts of the joints that move it",
-            hint="import points too (`yid-ocp import FILE --preview` lists what there is)",
-        )
+        hint = "import points too (`yid-ocp import FILE --preview` lists what there is)"
+        allowed = "points on the object, or efforts of the joints that move it"
+        what = "nothing in the recording shows what the object does"
+        raise ConfigError(what, where=recording.name, allowed=allowed, hint=hint)
     if joints.effort is None and _commanded(joints):
         return "servo", "commanded positions were recorded and no efforts: the arm's servos follow them"
     if joints.effort is None:

@@ -53,7 +53,6 @@ class DiagnoseCommandResult:
         The finished run folder.
     result : dict
         Contents of result.json.
-    diagnosis : Finding
     """
 
     folder: Path
@@ -75,17 +74,6 @@ def run_diagnose(
     run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS
 ) -> DiagnoseCommandResult:
     """Diagnose and write the run folder; finished refits of an interrupted, identical run are reused.
-
-    Parameters
-    ----------
-    run : Run
-    out : str or Path, optional
-        The run folder; see `new_run_folder`.
-    progress : Progress, optional
-
-    Returns
-    -------
-    DiagnoseOutcome
 
     Raises
     ------
@@ -191,16 +179,7 @@ def _flags(run: RunSettings) -> list[str]:
 
 
 def _with_noise_only_stds(problem: EstimationProblem, run: RunSettings) -> EstimationProblem:
-    """The problem with all stated standard deviations scaled by `diagnosis.noise_fraction` to noise alone.
-
-    Errors of torques and angles that drive the motion, priors and weak prior shrink alike, so that every fit stays what
-    it is; what changes is when a gap counts as one.
-
-    Raises
-    ------
-    ConfigError
-        A sensor, or a torque, without a standard deviation in the settings.
-    """
+    """The problem with all stated standard deviations scaled by `diagnosis.noise_fraction` to noise alone."""
     share, options = run.diagnosis.noise_fraction, problem.options
     if share == 1:
         return problem
@@ -208,12 +187,8 @@ def _with_noise_only_stds(problem: EstimationProblem, run: RunSettings) -> Estim
     for group, field in sorted(_noise_levels(problem)):
         level = getattr(sensors[group], field) if group in sensors else None
         if level is None:
-            raise run.config_error(
-                f"the fraction of noise in the {field} of '{group}' is given, but not the {field}",
-                "diagnosis",
-                "noise_fraction",
-                hint=f"set sensors.{group}.{field}",
-            )
+            what = f"the fraction of noise in the {field} of '{group}' is given, but not the {field}"
+            raise run.config_error(what, "diagnosis", "noise_fraction", hint=f"set sensors.{group}.{field}")
         smaller: dict[str, Any] = {field: _times(share, level)}
         sensors[group] = replace(sensors[group], **smaller)
     return problem.with_options(

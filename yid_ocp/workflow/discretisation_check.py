@@ -17,7 +17,7 @@ from yid_ocp.analysis.discretisation_shift import (
     inflate_estimates,
     joint_subdivision,
 )
-from yid_ocp.analysis.time_step_stability import largest_error_growth
+from yid_ocp.analysis.time_step_stability import StepErrorGrowth, largest_error_growth
 from yid_ocp.config.settings import FoamYSettings, RunSettings, SegmentedObjectSettings
 from yid_ocp.errors import YidError
 from yid_ocp.inference.uncertainty import typical_parameter_sizes
@@ -49,7 +49,7 @@ class DiscretisationShifts:
 
     Attributes
     ----------
-    estimate_shifts : mapping of parameter to Moves
+    estimate_shifts : mapping of parameter to DiscretisationShift
         Of every shared free parameter; empty where nothing was tried.
     notes : tuple of str
         Why something that was asked for is not known.
@@ -89,13 +89,9 @@ def measure_discretisation_shifts(
 
     Parameters
     ----------
-    run : Run
-    problem : EstimationProblem
     x : ndarray, shape (nx,)
     at_x : Evaluation
         With its Jacobian.
-    what : tuple of "links", "time_step"
-    progress : Progress, optional
     models_alone : bool
         At a point that is no estimate; see `discretisation_shifts`.
     """
@@ -157,7 +153,7 @@ def with_stability_check(problem: EstimationProblem, solution: Solution) -> tupl
     stable and leave that place; one that ends there has followed the step's own errors.
     """
     begin, end = largest_error_growth(problem, problem.initial_unknowns), largest_error_growth(problem, solution.x)
-    found = {key: None if own is None else asdict(own) for key, own in (("start", begin), ("estimate", end))}
+    found = {"start": _growth_result(begin), "estimate": _growth_result(end)}
     if end is not None and not end.is_stable:
         status = Status.STALLED if solution.status == Status.CONVERGED else solution.status
         return replace(
@@ -166,6 +162,18 @@ def with_stability_check(problem: EstimationProblem, solution: Solution) -> tupl
     if solution.status == Status.FAILED and begin is not None and not begin.is_stable:
         return replace(solution, message=f"at the start {begin.description} ({solution.message})"), found
     return solution, found
+
+
+def _growth_result(growth: StepErrorGrowth | None) -> dict[str, Any] | None:
+    if growth is None:
+        return None
+    return {
+        "recording": growth.recording_name,
+        "decades": growth.growth_decades,
+        "factor": growth.max_step_factor,
+        "time": growth.max_growth_time,
+        "time_step": growth.time_step,
+    }
 
 
 # -- frequencies ------------------------------------------------------------------------------------------------------

@@ -26,11 +26,9 @@ def run(arguments: argparse.Namespace) -> int:
     source, form = Path(arguments.source), arguments.format
     if source.is_dir():
         if form == "csv":
+            hint = "export a recording, or the run's signals as mcap"
             raise ConfigError(
-                "a run is no table",
-                where="--format csv",
-                allowed=", ".join((*MODEL_FORMATS, _MCAP)),
-                hint="export a recording, or the run's signals as mcap",
+                "a run is no table", where="--format csv", allowed=", ".join((*MODEL_FORMATS, _MCAP)), hint=hint
             )
         if form == _MCAP:
             written, notes = export_run_signals(source, arguments.out)
@@ -45,11 +43,8 @@ def run(arguments: argparse.Namespace) -> int:
         )
         return EXIT_DONE
     if form not in (None, "csv", _MCAP):
-        raise ConfigError(
-            f"{source.name} is no run folder",
-            where=f"--format {form}",
-            allowed=f"csv or {_MCAP} of a recording; {', '.join(MODEL_FORMATS)} of a run folder of `solve` or `diagnose`",
-        )
+        allowed = f"csv or {_MCAP} of a recording; {', '.join(MODEL_FORMATS)} of a run folder of `solve` or `diagnose`"
+        raise ConfigError(f"{source.name} is no run folder", where=f"--format {form}", allowed=allowed)
     recording = read_recording(source, allow_nan_effort=True)
     result, notes = recording_contents(recording), []
     if form == _MCAP:

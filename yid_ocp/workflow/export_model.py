@@ -27,18 +27,7 @@ MODEL_FORMATS = ("mjcf", "urdf", "sdf", "yaml")
 
 @dataclass(frozen=True)
 class _CalibratedModel:
-    """Final model of a run: settings with found effects, parameter values and stds.
-
-    Attributes
-    ----------
-    settings : Run
-        Its settings, with the effects that it found.
-    nominal_settings : Run
-        Its settings as they were.
-    parameter_values : mapping of parameter name to value
-    parameter_stds : mapping of parameter name to float or None
-        Of those that were estimated, None where nothing is known of them.
-    """
+    """Final model of a run: settings with found effects, parameter values and stds."""
 
     settings: RunSettings
     nominal_settings: RunSettings
@@ -47,13 +36,7 @@ class _CalibratedModel:
 
 
 def _read_calibrated_model(folder: str | Path) -> _CalibratedModel:
-    """The final model read from a run folder of `solve` or `diagnose`.
-
-    Raises
-    ------
-    ConfigError, DataError
-        There is no finished run of these commands, or its solve failed.
-    """
+    """The final model read from a run folder of `solve` or `diagnose`."""
     folder = Path(folder)
     result = read_run_result(folder)
     try:
@@ -92,7 +75,6 @@ def export_model(
         File to write.
     form : str
         Of `MODEL_FORMATS`.
-    progress : Progress, optional
 
     Returns
     -------
@@ -211,12 +193,9 @@ def _expressible(calibrated: _CalibratedModel, form: str) -> tuple[System, dict[
                     said[label] = FormatSupport("not representable", own.what)
                     break
             else:
-                raise ModelError(
-                    f"the model cannot be written as {form.upper()}: {error.what}",
-                    where=error.where,
-                    allowed=error.allowed,
-                    hint=error.hint or f"another format: {', '.join(MODEL_FORMATS)}",
-                ) from error
+                what = f"the model cannot be written as {form.upper()}: {error.what}"
+                hint = error.hint or f"another format: {', '.join(MODEL_FORMATS)}"
+                raise ModelError(what, where=error.where, allowed=error.allowed, hint=hint) from error
     raise AssertionError("effects run out")
 
 
@@ -287,7 +266,7 @@ def _replayed(
 
 def _together(errors: Sequence[ReplayMismatch]) -> ReplayMismatch:
     rmse, noise = (
-        (sum(getattr(error, key) ** 2 for error in errors) / len(errors)) ** 0.5 for key in ("rmse", "noise")
+        (sum(getattr(error, key) ** 2 for error in errors) / len(errors)) ** 0.5 for key in ("rmse", "noise_rms")
     )
     return ReplayMismatch(rmse, noise, errors[0].unit)
 

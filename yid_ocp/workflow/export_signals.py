@@ -41,11 +41,6 @@ def export_run_signals(folder: str | Path, out: str | Path) -> tuple[list[Path],
     out : str or Path
         Folder to write to.
 
-    Returns
-    -------
-    files : list of Path
-    notes : list of str
-
     Raises
     ------
     ConfigError, DataError, OutputError
@@ -56,11 +51,9 @@ def export_run_signals(folder: str | Path, out: str | Path) -> tuple[list[Path],
     with open_checked_hdf5(folder / "trajectories.h5") as file:
         form = str(file.attrs.get("format", ""))
         if form not in _PREDICTION_TOPICS:
+            what = f"the trajectories are of format '{form}'"
             raise DataError(
-                f"the trajectories are of format '{form}'",
-                where=str(folder / "trajectories.h5"),
-                allowed=", ".join(_PREDICTION_TOPICS),
-                hint="run it again",
+                what, where=str(folder / "trajectories.h5"), allowed=", ".join(_PREDICTION_TOPICS), hint="run it again"
             )
         for name, signals in _recordings(file, form).items():
             files.append(out / f"{name}.mcap")

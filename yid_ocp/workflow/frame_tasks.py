@@ -38,7 +38,7 @@ class FrameTasks:
 
     Attributes
     ----------
-    settings : Run
+    settings : RunSettings
         Settings on which frames depend, with files for the frames and the joints.
     work_folder : Path
         Of what is done; another one for other settings, frames or joints.
@@ -145,7 +145,7 @@ def open_frames(run: RunSettings) -> tuple[FrameSequence, Recording | None]:
         with locate_errors(run, "recordings", "estimate", 0):
             path = recording_path(run.recordings.estimate[0])
             recording = replace(read_recording(path, allow_nan_effort=True), name=path.stem)
-    with locate_errors(run, "track", "frames"):
+    with locate_errors(run, "track", "frames_path"):
         settings = run.track
         seen = read_frames(
             run.track.frames_path, pose=settings.camera_pose, unit=settings.length_unit, topic=settings.frame_topic
@@ -162,7 +162,7 @@ def read_background_frames(run: RunSettings) -> FrameSequence | None:
     """Background frames without robot and object; None where the settings have none."""
     if run.track.background_frames is None:
         return None
-    with locate_errors(run, "track", "background"):
+    with locate_errors(run, "track", "background_frames"):
         return read_frames(
             run.track.background_frames,
             pose=run.track.camera_pose,

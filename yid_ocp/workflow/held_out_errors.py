@@ -36,11 +36,9 @@ def prediction_error_entry(
 
     Parameters
     ----------
-    problem : EstimationProblem
-    episode : Episode
-    outcome : EpisodeResult or str
+    outcome : EpisodePrediction or str
         Prediction, or why there is none.
-    cable : Cable, optional
+    cable : CableTopology, optional
         For the baselines that only a cable held by clamps has.
     """
     entry: dict[str, Any] = {"recording": episode.name, "rmse": {}, "baselines": {}}

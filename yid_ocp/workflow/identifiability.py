@@ -128,17 +128,12 @@ def run_identifiability(
 
     Parameters
     ----------
-    run : Run
-    out : str or Path, optional
-        The run folder; see `new_run_folder`.
-    progress : Progress, optional
-    options : Question, optional
-    workers : Workers or Executor, optional
+    workers : WorkerConfig or Executor, optional
         Who works out intervals, one parameter a task, and the experiments of `what_if`; this process when absent.
 
     Returns
     -------
-    IdentifiabilityOutcome
+    IdentifiabilityCommandResult
         Also where the solver failed: the run folder then holds the reason.
 
     Raises

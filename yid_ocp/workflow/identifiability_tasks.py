@@ -48,12 +48,10 @@ class IdentifiabilityTasks:
 
     Attributes
     ----------
-    workers : Workers or Executor
     results_folder : Path
         Folder that their results are kept in while the run is not complete.
     task_arguments : mapping
         Arguments of every task.
-    progress : Progress
     """
 
     workers: WorkerConfig | Executor
@@ -77,17 +75,12 @@ class IdentifiabilityTasks:
 
         Parameters
         ----------
-        workers : Workers or Executor
-        folder : RunFolder
-        run : Run
-        problem : EstimationProblem
         solution : Solution or None
             Point at which to judge; the initial values where None.
         remembers : bool
             Whether the problem is the run's, not that of a cable that remembers nothing.
         start, grasp_std
             As in `identifiability`.
-        progress : Progress
         """
         told = {
             "config": folder.path / "config.yaml",

@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import ImportSettings
 from yid_ocp.data import Recording, preview_file, read_any, write_recording
+from yid_ocp.data.readers import FileContents
 from yid_ocp.data.readers.base import parse_units
 from yid_ocp.errors import ConfigError
 from yid_ocp.progress import NULL_PROGRESS, Progress
@@ -42,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
         if not is_recording_file(arguments.file):
             lines += ["", "to import it:", f"  {_import_command_line(arguments.file, options)}"]
         if arguments.json:
-            print_json({"format": _RESULT_FORMAT, "recording": None, **asdict(contents)})
+            print_json({"format": _RESULT_FORMAT, "recording": None, **_preview_result(contents)})
         else:
             print_lines(lines)
         return EXIT_DONE
@@ -74,6 +75,15 @@ def recording_contents(recording: Recording) -> dict[str, Any]:
     }
 
 
+def _preview_result(contents: FileContents) -> dict[str, Any]:
+    sources = [
+        {"name": own.name, "kind": own.kind, "count": own.n_samples, "rate": own.mean_rate, "becomes": own.imported_as}
+        | {"note": own.note}
+        for own in contents.sources
+    ]
+    return {"sources": sources, "options": contents.reader_options, "notes": contents.notes}
+
+
 def read_foreign_recording(
     file: str | Path, options: Mapping[str, Any], progress: Progress = NULL_PROGRESS
 ) -> Recording:
@@ -81,10 +91,8 @@ def read_foreign_recording(
 
     Parameters
     ----------
-    file : str or Path
     options : mapping of str to object
         Named options of its reader.
-    progress : Progress, optional
 
     Raises
     ------

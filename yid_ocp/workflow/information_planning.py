@@ -23,7 +23,6 @@ def read_parameter_run(run: RunSettings, commands: Sequence[str]) -> tuple[dict[
 
     Parameters
     ----------
-    run : Run
     commands : sequence of str
         Whose folders may be given.
 
@@ -35,27 +34,21 @@ def read_parameter_run(run: RunSettings, commands: Sequence[str]) -> tuple[dict[
     folder = Path(str(run.plan.parameter_run))
     file = folder / "result.json"
     if not file.is_file() or not (folder / "trajectories.h5").is_file():
-        raise run.config_error(
-            f"there is no finished run of {' or '.join(f'`{command}`' for command in commands)} in {folder}",
-            "plan",
-            "run",
-            hint="give the run folder that it printed",
-        )
+        what = f"there is no finished run of {' or '.join(f'`{command}`' for command in commands)} in {folder}"
+        raise run.config_error(what, "plan", "parameter_run", hint="give the run folder that it printed")
     try:
         result: dict[str, Any] = dict(json.loads(file.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError, RecursionError) as error:
         raise DataError(f"the result cannot be read ({error})", where=str(file), hint="run it again") from error
     formats = {"solve": "yid-solve/", "diagnose": "yid-diagnosis/"}
     if not str(result.get("format", "")).startswith(tuple(formats[command] for command in commands)):
+        what = f"{folder} is a run folder of another command ({result.get('format')})"
         raise run.config_error(
-            f"{folder} is a run folder of another command ({result.get('format')})",
-            "plan",
-            "run",
-            allowed=" or ".join(f"{formats[command]}1" for command in commands),
+            what, "plan", "parameter_run", allowed=" or ".join(f"{formats[command]}1" for command in commands)
         )
     if result.get("status") == "failed":
         raise DataError(
-            f"the solve in {folder} failed: {result['message']}", where=run.describe_location("plan", "run")
+            f"the solve in {folder} failed: {result['message']}", where=run.describe_location("plan", "parameter_run")
         )
     return result, folder
 
@@ -86,13 +79,9 @@ def require_same_effects(run: RunSettings, found: Iterable[str], own: Collection
     """Raise an error where the run has parameters of effects that the plan's model lacks."""
     lacking = sorted({name.rpartition(".")[0] for name in found if "@" in name and name not in own})
     if lacking:
-        raise run.config_error(
-            f"{run.plan.parameter_run} was solved with {', '.join(lacking)}, which this model does not have",
-            "plan",
-            "run",
-            allowed="a run of `solve` on the same model",
-            hint="list the same effects under model.effects",
-        )
+        what = f"{run.plan.parameter_run} was solved with {', '.join(lacking)}, which this model does not have"
+        hint = "list the same effects under model.effects"
+        raise run.config_error(what, "plan", "parameter_run", allowed="a run of `solve` on the same model", hint=hint)
 
 
 def parameter_and_effect_values(result: Mapping[str, Any]) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
@@ -149,7 +138,7 @@ def next_plan_settings(confusable: Sequence[Sequence[Mapping[str, str]]], folder
     if not confusable:
         return None
     labels = [f"{entry['kind']}@{entry['location']}" for entry in confusable[0]]
-    return {"goal": "information", "separate": labels[:_MAX_DISCRIMINATED_EFFECTS], "run": str(folder)}
+    return {"goal": "information", "discriminate": labels[:_MAX_DISCRIMINATED_EFFECTS], "parameter_run": str(folder)}
 
 
 def _number(value: float) -> float | None:

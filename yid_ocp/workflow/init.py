@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 from yid_ocp.config.reader import load_config
@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
     files = [relative_posix_path(file, out.parent) for file in made]
     text = commented_config_text(where, item, proposal, files, imports, _SCHEMA_FILE)
     _write(out, text, {file: raw for file, raw in made.items() if raw is not None})
-    result = {"format": _RESULT_FORMAT, "configuration": str(out), "recordings": files, "proposal": asdict(proposal)}
+    result = {"format": _RESULT_FORMAT, "configuration": str(out), "recordings": files, "proposal": proposal.to_dict()}
     print_result(arguments, result, lambda: _summary_lines(proposal, out), f"configuration: {out}", str(out))
     return EXIT_DONE
 
@@ -70,13 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _object_from_arguments(arguments: argparse.Namespace) -> ObjectDescription:
-    """Object description from the command-line options.
-
-    Raises
-    ------
-    ConfigError
-        A number that is missing or impossible; the error names its option.
-    """
+    """Object description from the command-line options."""
     kind = arguments.object
     links = _DEFAULT_LINKS[kind] if arguments.links is None else arguments.links
     if not 1 <= links <= 64:
@@ -98,12 +92,9 @@ def _object_from_arguments(arguments: argparse.Namespace) -> ObjectDescription:
             what = f"each branch of a tree needs a {name}" if kind == "tree" else f"a {kind} needs a {name}"
             raise ConfigError(what, where=f"--{name}", allowed=_OPTION_MEANINGS[name], hint=f"add --{name} NUMBER")
     if kind == "tree" and not arguments.branches:
-        raise ConfigError(
-            "a tree needs branches",
-            where="--branch",
-            allowed="--branch NAME=LENGTH,MASS,RADIUS[,ROLL,PITCH,YAW] for each, or --branches NUMBER of equal ones",
-            hint="--branches 4 --length 0.4 --mass 0.03 --radius 0.008",
-        )
+        allowed = "--branch NAME=LENGTH,MASS,RADIUS[,ROLL,PITCH,YAW] for each, or --branches NUMBER of equal ones"
+        advice = "--branches 4 --length 0.4 --mass 0.03 --radius 0.008"
+        raise ConfigError("a tree needs branches", where="--branch", allowed=allowed, hint=advice)
     if kind == "beam" and section is None and arguments.radius is None:
         hint = "add --radius NUMBER, or --section WIDTH,HEIGHT"
         raise ConfigError(

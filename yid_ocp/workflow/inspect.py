@@ -23,6 +23,7 @@ from yid_ocp.analysis.sparsity_patterns import (
 )
 from yid_ocp.analysis.step_diagnostics import (
     CheckedLinearisation,
+    StepStructure,
     linearise_and_check,
     linearise_step_equations,
     step_structure,
@@ -60,16 +61,7 @@ class InspectCommandResult:
 
 @dataclass(frozen=True)
 class _LinearisationPoint:
-    """State and inputs at which the equations are linearised.
-
-    Attributes
-    ----------
-    description : str
-        In a sentence.
-    is_equilibrium : bool
-        Whether it is a rest.
-    state, torque, theta, prescribed_positions : ndarray, shape (nx,), (nu,), (ntheta,), (nc,)
-    """
+    """State and inputs at which the equations are linearised."""
 
     description: str
     is_equilibrium: bool
@@ -98,9 +90,6 @@ def run_inspect(
 
     Parameters
     ----------
-    run : Run
-    out : str or Path, optional
-    progress : Progress, optional
     entries : sequence of str
         Equations or their derivatives to write out, see `StepSymbols.equation_entry`; of a parameter, where it enters.
     export : str or Path, optional
@@ -137,7 +126,7 @@ def run_inspect(
             "compiled": step.is_compiled,
             "variables": _variables(step),
             "parameters": _parameters(step, set(free)),
-            "equations": asdict(step_structure(step)),
+            "equations": _structure_result(step_structure(step)),
             "blocks": _blocks(symbols),
             "patterns": {name: _pattern_result(pattern) for name, pattern in patterns.items()},
             "nlp": nlp,
@@ -286,6 +275,15 @@ def _blocks(symbols: StepSymbols) -> dict[str, list[dict[str, Any]]]:
         kind: [{"name": b.name, "meaning": b.meaning, "names": list(b.full_names)} for b in blocks if b.labels]
         for kind, blocks in (("rows", symbols.row_blocks), ("columns", symbols.column_blocks))
     }
+
+
+def _structure_result(structure: StepStructure) -> dict[str, Any]:
+    functions = [
+        {"name": entry.name, "operations": entry.n_operations, "nonzeros": entry.n_nonzeros}
+        for entry in structure.function_sizes
+    ]
+    sizes = {"sizes": structure.dimensions, "unknowns": structure.n_unknowns}
+    return sizes | {"jacobian_nonzeros": structure.jacobian_nonzeros, "functions": functions}
 
 
 def _pattern_result(pattern: SparsityPattern) -> dict[str, Any]:

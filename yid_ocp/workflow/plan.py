@@ -68,16 +68,9 @@ def run(arguments: argparse.Namespace) -> int:
 def run_plan(run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS) -> PlanCommandResult:
     """Plan the motion of `plan_motion` and write `recording.h5`, CSV tables, `trajectory.json`, result.json and the report.
 
-    Parameters
-    ----------
-    run : Run
-    out : str or Path, optional
-        The run folder; see `new_run_folder`.
-    progress : Progress, optional
-
     Returns
     -------
-    PlanOutcome
+    PlanCommandResult
         Also where no motion within the limits was found: the run folder then says why.
 
     Raises

@@ -28,10 +28,6 @@ _loaded: dict[str, str] = {}  # what this process has run: file or entry point, 
 def load_plugins(run: RunSettings) -> None:
     """Import the files of `plugins` and the entry points of `_ENTRY_POINT_GROUP`, each once per process.
 
-    Parameters
-    ----------
-    run : Run
-
     Raises
     ------
     ConfigError
@@ -92,10 +88,7 @@ def _run(path: Path, digest: str) -> None:
 def _registering(
     name: str, where: str, hint: str, path: Path | None = None, nothing_new: bool = False
 ) -> Iterator[None]:
-    """Say what is wrong with a plug-in that the block runs, and forget what it registered until then.
-
-    Registering nothing is wrong as well, unless there may be `nothing_new`.
-    """
+    """Say what is wrong with a plug-in that the block runs, and forget what it registered until then."""
     before = [set(registry) for registry in _REGISTRIES]
     try:
         yield
@@ -109,18 +102,11 @@ def _registering(
         for registry, known in zip(_REGISTRIES, before, strict=True):
             registry.unregister(set(registry) - known)
         if isinstance(error, YidError):
-            raise ConfigError(
-                f"the {name} cannot be used: {error.what}" if error.where != where else error.what,
-                where=where,
-                allowed=error.allowed,
-                hint=error.hint or hint,
-            ) from error
+            what = f"the {name} cannot be used: {error.what}" if error.where != where else error.what
+            raise ConfigError(what, where=where, allowed=error.allowed, hint=error.hint or hint) from error
         line = None if path is None else _line(error, path)
-        raise ConfigError(
-            f"the {name} raised {type(error).__name__}: {error}",
-            where=f"{where} (line {line})" if line else where,
-            hint=hint,
-        ) from error
+        what = f"the {name} raised {type(error).__name__}: {error}"
+        raise ConfigError(what, where=f"{where} (line {line})" if line else where, hint=hint) from error
 
 
 def _line(error: BaseException, path: Path) -> int | None:

@@ -72,13 +72,10 @@ def check_recordings(
 
     Parameters
     ----------
-    run : Run
-    system : System
-    cable : Cable, optional
+    cable : CableTopology, optional
         The run's object, where it is one.
     free : sequence of str
         Parameters that are sought.
-    estimate, held_out : sequence of Recording
 
     Raises
     ------
@@ -107,11 +104,9 @@ def check_recordings(
         doubts += _excitation(run, arm, free, kept[0])
     raise_for_issues(run, doubts)
     if not kept[0]:
-        raise DataError(
-            "gaps leave nothing of the recordings to estimate on",
-            where=run.describe_location("recordings", "estimate"),
-            hint="; ".join(doubt.what for doubt in doubts if doubt.cause in ("gap", "clock_jump")),
-        )
+        hint = "; ".join(doubt.what for doubt in doubts if doubt.cause in ("gap", "clock_jump"))
+        what = "gaps leave nothing of the recordings to estimate on"
+        raise DataError(what, where=run.describe_location("recordings", "estimate"), hint=hint)
     return CheckedRecordings(tuple(kept[0]), tuple(kept[1]), tuple(doubts))
 
 
@@ -146,12 +141,10 @@ def _once(
         for other in used:
             same = duplicate_data_issue(other, recording)
             if same is not None:
-                raise DataError(
-                    f"a measurement is both estimated on and held out: {same.what}",
-                    where=run.describe_location("recordings", "held_out"),
-                    allowed="one of the two",
-                    hint=f"leave out {recording.name} or {other.name}",
-                )
+                what = f"a measurement is both estimated on and held out: {same.what}"
+                where = run.describe_location("recordings", "held_out")
+                hint = f"leave out {recording.name} or {other.name}"
+                raise DataError(what, where=where, allowed="one of the two", hint=hint)
         if all(duplicate_data_issue(other, recording) is None for other in others):
             others.append(recording)
         else:
@@ -234,11 +227,8 @@ def raise_for_issues(run: RunSettings, doubts: Sequence[Issue]) -> None:
         return
     first, *others = grave
     more = [f"{doubt.where}: {doubt.what}" for doubt in others]
-    raise DataError(
-        "; ".join([f"{ISSUE_CAUSES[first.cause]}: {first.what}", *more]),
-        where=first.where,
-        hint=first.advice + (f" ({first.setting})" if first.setting else ""),
-    )
+    what = "; ".join([f"{ISSUE_CAUSES[first.cause]}: {first.what}", *more])
+    raise DataError(what, where=first.where, hint=first.advice + (f" ({first.setting})" if first.setting else ""))
 
 
 @contextlib.contextmanager

@@ -26,10 +26,6 @@ class JsonRefitStore:
 
     Refits run in threads, not as tasks of `yid_ocp.parallel`: all of one diagnosis share a compiled step and what was
     worked out from the recordings, and a refit takes less time than to build these in another process.
-
-    Attributes
-    ----------
-    file : Path
     """
 
     def __init__(self, folder: RunFolder, *made_from: Mapping[str, str] | str) -> None:

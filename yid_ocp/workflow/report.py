@@ -49,13 +49,6 @@ def run_report(
     ----------
     folders : sequence of str or Path
         Run folders of `solve` or `diagnose`, in the order of time; two or more.
-    out : str or Path, optional
-        The folder to make; see `new_run_folder`.
-    progress : Progress, optional
-
-    Returns
-    -------
-    ReportOutcome
 
     Raises
     ------
@@ -64,12 +57,8 @@ def run_report(
     """
     paths = [Path(folder) for folder in folders]
     if len(paths) < 2:
-        raise ConfigError(
-            "one run has no history",
-            where="report",
-            allowed="two or more run folders",
-            hint="add the runs of other days",
-        )
+        hint = "add the runs of other days"
+        raise ConfigError("one run has no history", where="report", allowed="two or more run folders", hint=hint)
     twice = [str(path) for i, path in enumerate(paths) if path.resolve() in [p.resolve() for p in paths[:i]]]
     if twice:
         raise ConfigError("a run is given twice, and would count twice", where=twice[0], hint="list every run once")

@@ -63,8 +63,6 @@ class RunFolder:
 
         Parameters
         ----------
-        run : Run
-        command : str
         flags : sequence of str
             That the command was given beside its configuration.
         """
@@ -88,10 +86,8 @@ class RunFolder:
 
         Parameters
         ----------
-        run : Run
         result : mapping
             As it was written.
-        progress : Progress
         **known
             What the page can show beside it, by the attributes of `ReportData`.
         """
@@ -152,15 +148,10 @@ def new_run_folder(run: RunSettings, out: str | Path | None = None, command: str
 
     Parameters
     ----------
-    run : Run
     out : str or Path, optional
         Its name; `NAME-YYYYmmdd-HHMMSS` in `output.runs_folder` when absent.
     command : str
         Enters the name: `NAME-COMMAND-...`.
-
-    Yields
-    ------
-    RunFolder
 
     Raises
     ------
@@ -233,11 +224,7 @@ def _in_words_of(error: OutputError, temporary: Path, target: Path) -> OutputErr
 
 
 def _reserved(targets: Sequence[Path]) -> tuple[Path, FileLock]:
-    """The first name that no other run has or makes, and the lock that keeps it; it stands in the unfinished folder.
-
-    The system frees a lock when its process ends, however it ends: a folder whose lock is free was left by a killed
-    run.
-    """
+    """The first name that no other run has or makes, and the lock that keeps it; it stands in the unfinished folder."""
     _clear_left(targets[0].parent)
     for target in targets:
         if len(targets) > 1 and os.path.lexists(target):
@@ -255,11 +242,9 @@ def _reserved(targets: Sequence[Path]) -> tuple[Path, FileLock]:
             if entry.name != _LOCK:
                 shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
         return target, lock
+    hint = "choose another name with --out, or wait for the other run"
     raise OutputError(
-        "another run is making this folder",
-        where=str(targets[0]),
-        allowed="a name of its own for every run",
-        hint="choose another name with --out, or wait for the other run",
+        "another run is making this folder", where=str(targets[0]), allowed="a name of its own for every run", hint=hint
     )
 
 
@@ -325,12 +310,9 @@ def _targets(run: RunSettings, out: str | Path | None, command: str) -> list[Pat
         what = f"this cannot be a run folder: {os_error_reason(error)}"
         raise OutputError(what, where=str(out)[:200], hint="choose a writable folder with --out") from error
     if filled:
-        raise OutputError(
-            "the run folder exists and is not empty",
-            where=str(target),
-            allowed="a new name, or an empty folder",
-            hint="choose another name with --out, or leave it out for a numbered one",
-        )
+        hint = "choose another name with --out, or leave it out for a numbered one"
+        problem_text = "the run folder exists and is not empty"
+        raise OutputError(problem_text, where=str(target), allowed="a new name, or an empty folder", hint=hint)
     if is_file:
         raise OutputError("the run folder's name is that of a file", where=str(target), hint="choose another --out")
     return [target]

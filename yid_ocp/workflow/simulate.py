@@ -35,7 +35,6 @@ class SimulateCommandResult:
 
     Attributes
     ----------
-    folder : Path
     result : dict
         Contents of result.json.
     recording : Recording or None
@@ -78,9 +77,6 @@ def run_simulate(
 
     Parameters
     ----------
-    run : Run
-    out : str or Path, optional
-    progress : Progress, optional
     seed : int
         Of the motion and the noise.
     noise : bool
@@ -128,12 +124,10 @@ def _virtual(run: RunSettings, system: System, progress: Progress, seed: int) ->
     from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
     if run.model.robot is None:
+        allowed = "a recording whose start, clamps and times are taken over"
+        hint = "list one, or set model.robot for a virtual experiment"
         raise run.config_error(
-            "nothing moves an object without a robot by itself",
-            "recordings",
-            "estimate",
-            allowed="a recording whose start, clamps and times are taken over",
-            hint="list one, or set model.robot for a virtual experiment",
+            "nothing moves an object without a robot by itself", "recordings", "estimate", allowed=allowed, hint=hint
         )
     progress.begin_stage("simulating a virtual experiment in MuJoCo")
     duration = run.problem.duration or _DEFAULT_DURATION

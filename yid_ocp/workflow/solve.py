@@ -57,8 +57,6 @@ class SolveCommandResult:
         The finished run folder.
     result : dict
         Contents of result.json.
-    solution : Solution
-    problem : EstimationProblem
     """
 
     folder: Path
@@ -84,16 +82,9 @@ def run_solve(
 ) -> SolveCommandResult:
     """Estimate, validate and write the run folder.
 
-    Parameters
-    ----------
-    run : Run
-    out : str or Path, optional
-        The run folder; see `new_run_folder`.
-    progress : Progress, optional
-
     Returns
     -------
-    SolveOutcome
+    SolveCommandResult
         Also where the solver failed: the run folder then holds the reason and the best point.
 
     Raises
@@ -159,10 +150,9 @@ def with_fit_issues(
     ----------
     problem : EstimationProblem
         As it was solved.
-    solution : Solution
-    held_out : sequence of (Episode, EpisodeResult or str)
+    held_out : sequence of (Episode, EpisodePrediction or str)
         From `EstimationProblem.predict_held_out`.
-    cable : Cable, optional
+    cable : CableTopology, optional
         For the baselines that it has.
     """
     if solution.evaluation is None:
@@ -179,10 +169,7 @@ def with_fit_issues(
 
 
 def _covariance_result(solution: Solution, data_std: Mapping[str, float]) -> dict[str, Any]:
-    """Covariance of the shared free parameters as plain data, from the data alone.
-
-    How far a finer model is counts in the reported ±, not here: another run of this model is as far from it.
-    """
+    """Covariance of the shared free parameters as plain data, from the data alone."""
     names = [name for name in data_std if name in solution.unknown_names]
     at = [solution.unknown_names.index(name) for name in names]
     if not solution.covariance.size:
@@ -208,7 +195,7 @@ def solve_result(
         "evaluations": solution.n_evaluations,
         "seconds": solution.wall_time,
         "fit": asdict(solution.goodness_of_fit)
-        | {"channels_worse_than_baseline": channels_worse_than_baseline([*predicted, *fitted], _units(residuals))},
+        | {"worse_than_guess": channels_worse_than_baseline([*predicted, *fitted], _units(residuals))},
         "residuals": residuals,
         "held_out": predicted,
     }

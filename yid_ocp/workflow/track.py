@@ -63,7 +63,6 @@ class TrackCommandResult:
         With recording.h5, result.json, track.png and the pictures.
     result : dict
         Contents of result.json.
-    track : Track
     recording : Recording
         The joints' recording with the group `points_camera`.
     """
@@ -97,15 +96,8 @@ def run_track(
 
     Parameters
     ----------
-    run : Run
-    out : str or Path, optional
-    progress : Progress, optional
-    workers : Workers or Executor, optional
+    workers : WorkerConfig or Executor, optional
         Who works on the frames; this process alone when absent.
-
-    Returns
-    -------
-    TrackOutcome
 
     Raises
     ------
@@ -161,7 +153,7 @@ def run_track(
             )
             told = [moving("tracked", [shape], tracked)]
             if filmed.made is not None:
-                result["_truth_errors"] = _truth_errors(system, found, filmed.made)
+                result["truth_errors"] = _truth_errors(system, found, filmed.made)
         result |= {"doubts": issues_result(doubts), "refused": "" if refused is None else refused.what}
         written = folder.write_result(result)
         files = [folder.path / "track.png", *sorted((folder.path / "pictures").glob("*.png"))]
@@ -193,7 +185,7 @@ def _filmed(run: RunSettings, system: System, folder: RunFolder, progress: Progr
     if settings.frames_path is not None:
         open_frames(run)  # says in words of the settings what is wrong with the files
         joints = recording_path(run.recordings.estimate[0]) if run.recordings.estimate else None
-        with locate_errors(run, "track", "frames"):
+        with locate_errors(run, "track", "frames_path"):
             tasks = FrameTasks.from_run(run, Path(settings.frames_path), joints, folder.resume_folder)
         folder.input_hashes[settings.frames_path] = tasks.input_hashes["frames"]
         return _Filmed(tasks)
@@ -356,8 +348,9 @@ def simulate_frames(
     for name in settings.grasp_start_offsets:
         if name not in [grasp.name for grasp in system.grasps]:
             known = ", ".join(grasp.name for grasp in system.grasps)
-            raise run.config_error(f"there is no grasp '{name}'", "track", "virtual", "offsets", name, allowed=known)
-    with locate_errors(run, "track", "virtual"):
+            where = ("track", "virtual_frames", "grasp_start_offsets", name)
+            raise run.config_error(f"there is no grasp '{name}'", *where, allowed=known)
+    with locate_errors(run, "track", "virtual_frames"):
         posture = grasping_joint_angles(system, offsets=settings.grasp_start_offsets)
         simulation = SimulationOptions(settings.duration)
         excitation = MultisineOptions(gripper_travel=settings.max_gripper_travel, duration=settings.duration)

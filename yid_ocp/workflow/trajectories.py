@@ -82,7 +82,7 @@ def write_diagnosis_trajectories(path: Path, finding: DiagnosisResult, predicted
     `where/RECORDING/` for every recording that was estimated on, where there was a gap to locate: `edges` (J + 1,) [s]
     since its first node, of the intervals over which unknowns are constant; `mean` and `std` (J, nd) of the unknown
     forces, offsets and biases about the nominal model and `prior` (nd,), the standard deviation at the largest
-    evidence, zero where a group was not taken in; the attributes `unknowns`, `possible_locations`, `kinds`, `unknown_units` (nd,) each,
+    evidence, zero where a group was not taken in; the attributes `unknowns`, `locations`, `kinds`, `units` (nd,) each,
     and `start`, the time of the first node [s].
 
     `events/RECORDING/CHANNEL/` where a force acted as an event: `t` (M,) [s], `value` (M,) the force beside what model
@@ -105,7 +105,7 @@ def write_diagnosis_trajectories(path: Path, finding: DiagnosisResult, predicted
             group.attrs["unknowns"] = _texts(trace.unknown_names)
             group.attrs["locations"] = _texts([source.location for source in trace.unknown_groups])
             group.attrs["kinds"] = _texts([source.kind for source in trace.unknown_groups])
-            group.attrs["unknown_units"] = _texts(unknown_units(finding.nominal_model.problem.system, trace))
+            group.attrs["units"] = _texts(unknown_units(finding.nominal_model.problem.system, trace))
             variance = np.array([finding.smoother_result.group_variance[source] for source in trace.unknown_groups])
             arrays = {
                 "edges": trace.interval_edges,

@@ -33,9 +33,6 @@ class ReportData:
         Of the run.
     result : mapping
         Contents of result.json; `format` says of which command.
-    problem : EstimationProblem, optional
-    solution : Solution, optional
-    held_out : sequence of (Episode, EpisodeResult or text)
     animations : sequence of Scene
         What moves, where it does not follow from `problem`, `solution` and `held_out`.
     section_data : mapping

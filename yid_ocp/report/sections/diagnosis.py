@@ -35,15 +35,7 @@ _HeldOutPrediction = tuple[Episode, EpisodePrediction, EpisodePrediction]
 
 @dataclass(frozen=True)
 class _Chapter:
-    """A titled part of the section: sentences and figures.
-
-    Attributes
-    ----------
-    title : str
-    sentences : sequence of str
-    pictures : sequence of (str, str)
-        Heading, which may be empty, and HTML.
-    """
+    """A titled part of the section: sentences and figures."""
 
     title: str
     sentences: Sequence[str]
@@ -409,7 +401,7 @@ def _curves(finding: DiagnosisResult, predicted: Sequence[_HeldOutPrediction]) -
     what = "change most with the effects" if changed else "the nominal model misses most"
     sentences = [
         f"The {len(chosen)} held-out coordinates or joints that {what}, measured and predicted; below each "
-        "the error, with two standard deviations of the noise shaded: what is right stays within.",
+        "the error, with two standard deviations of the noise shaded: what is right stays within."
     ]
     return _Chapter("Measured and predicted", sentences, pictures)
 
