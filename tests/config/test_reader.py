@@ -133,7 +133,15 @@ def test_refusals(written, text, message):
 
 
 def test_old_or_misplaced_keys_are_told_their_section(written):
-    for key in ("time_step", "force_split", "use_compiler", "initial_state", "path_cutoff", "weighting", "huber_threshold"):
+    for key in (
+        "time_step",
+        "force_split",
+        "use_compiler",
+        "initial_state",
+        "path_cutoff",
+        "weighting",
+        "huber_threshold",
+    ):
         with pytest.raises(ConfigError, match=f"there is no key '{key}' in solver") as caught:
             load_config(written(f"solver: {{{key}: 1}}\n"))
         assert f"'{key}' is a key of `problem`" in caught.value.hint
@@ -145,7 +153,9 @@ def test_old_or_misplaced_keys_are_told_their_section(written):
     assert caught.value.hint == f"did you mean 'duration'?; {RENAMED}"
     with pytest.raises(ConfigError) as caught:
         load_config(written("problem: {max_iterations: 3}\n"))
-    assert "'max_iterations' is a key of `solver`, `compare.methods.NAME`, `track.options.shape_fit`" in caught.value.hint
+    assert (
+        "'max_iterations' is a key of `solver`, `compare.methods.NAME`, `track.options.shape_fit`" in caught.value.hint
+    )
     with pytest.raises(ConfigError) as caught:
         load_config(written("solver: {name: steepest_descent, step_tolerance: 1}\n"))
     assert "'step_tolerance' is a key of `solver` with name: gauss_newton, lifted" in caught.value.hint
@@ -161,7 +171,12 @@ def test_old_or_misplaced_keys_are_told_their_section(written):
 
 
 def test_what_only_code_sets_is_no_key(written):
-    for text in ("problem: {known_initial_states: {}}\n", "problem: {prior_stds: {a: 1}}\n", "key_locations: {}\n", "name: a\n"):
+    for text in (
+        "problem: {known_initial_states: {}}\n",
+        "problem: {prior_stds: {a: 1}}\n",
+        "key_locations: {}\n",
+        "name: a\n",
+    ):
         with pytest.raises(ConfigError, match="there is no key"):
             load_config(written(text))
 
@@ -176,7 +191,10 @@ METHODS = "compare:\n  methods:\n    gauss_newton: {}\n    lifted:\n      VALUE\
         ("max_iterations: -3", ("compare.methods.lifted.max_iterations = -3", "a whole number from 1", "line 5")),
         ("max_iterations: 3.0", ("a whole number from 1",)),
         ("defect_tolerance: 0", ("a number above 0 [rad, m or N m s]",)),
-        ("max_iteration: 3", ("there is no key 'max_iteration' in compare.methods.lifted", "did you mean 'max_iterations'?")),
+        (
+            "max_iteration: 3",
+            ("there is no key 'max_iteration' in compare.methods.lifted", "did you mean 'max_iterations'?"),
+        ),
         ("first_trial_step: last", ("there is no key 'first_trial_step'", "node_interval", "line 5")),
         ("name: lifted", ("there is no key 'name'",)),
     ],

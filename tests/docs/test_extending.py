@@ -80,7 +80,13 @@ def test_what_it_names_exists(text) -> None:
     from yid_ocp.model.system import RecordingErrorEffect
 
     rows = re.findall(r"^\| `(\w+)\((.*?)\)` \|.*\| (.*?) \|$", text, re.MULTILINE)
-    assert {name for name, _, _ in rows} >= {"apply_to_system", "step_terms", "distorted_reading", "corrected_reading", "added_delay"}
+    assert {name for name, _, _ in rows} >= {
+        "apply_to_system",
+        "step_terms",
+        "distorted_reading",
+        "corrected_reading",
+        "added_delay",
+    }
     for name, arguments, examples in rows:
         code = getattr(EffectBase, name).__code__
         assert list(code.co_varnames[1 : code.co_argcount]) == arguments.split(", ")

@@ -124,7 +124,9 @@ def test_every_row_is_so_many_times_larger_and_the_fit_the_same(step):
     rows = problem.residual_rows
     assert [part.stop - part.start for part in (rows.stated_priors, rows.weak_priors)] == [3, 1]
     for seed in range(3):
-        x = problem.initial_unknowns + problem.unknown_scales * np.random.default_rng(seed).uniform(-0.3, 0.3, len(problem.initial_unknowns))
+        x = problem.initial_unknowns + problem.unknown_scales * np.random.default_rng(seed).uniform(
+            -0.3, 0.3, len(problem.initial_unknowns)
+        )
         one, other = problem.evaluate(x), shrunk.evaluate(x)
         np.testing.assert_allclose(other.residual, one.residual / SHARE, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(other.jacobian, one.jacobian / SHARE, rtol=1e-9, atol=1e-9)

@@ -11,8 +11,14 @@ import pytest
 
 from yid_ocp.report.summary_blocks import SummaryStatement
 from yid_ocp.solvers import Iterate
-from yid_ocp.workflow.command_runner import run_and_print
-from yid_ocp.workflow.progress_display import NULL_PROGRESS, LineProgress, _BarProgress, _format_duration, show_progress
+from yid_ocp.workflow.command_runner import (
+    NULL_PROGRESS,
+    LineProgress,
+    _BarProgress,
+    _format_duration,
+    run_and_print,
+    show_progress,
+)
 
 ENTRY = Iterate(3, 12.5, np.zeros(1), 0.1, 4, 1.25, "first 2 s")
 
@@ -49,7 +55,7 @@ def test_the_tenths_begin_again_with_every_stage(capsys):
 def clock(monkeypatch):
     """A clock that is set by hand."""
     now = [100.0]
-    monkeypatch.setattr("yid_ocp.workflow.progress_display.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("yid_ocp.workflow.command_runner.time.monotonic", lambda: now[0])
     return now
 
 

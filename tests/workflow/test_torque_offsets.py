@@ -44,7 +44,9 @@ def problem_of(step, *, bias=OFFSET, white=WHITE, held_out=True, options=None):
         (),
         name="first",
     )  # fmt: skip
-    made = EstimationProblem(step, [first], ("elbow.stiffness",), replace(options, feedback="none", proportional_gains=None))
+    made = EstimationProblem(
+        step, [first], ("elbow.stiffness",), replace(options, feedback="none", proportional_gains=None)
+    )
     episode = made.episodes[0]
     swept = made.predictor.predict_episode(episode, *made.split(made.initial_unknowns, 0), False)
     joints = replace(first.joints, position=swept.rollout.state[:, :1], effort=torque + 0.3)

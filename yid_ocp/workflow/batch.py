@@ -28,7 +28,7 @@ from yid_ocp.report.summaries import batch_summary
 from yid_ocp.version import installed_versions
 from yid_ocp.workflow.baseline_runs import read_estimates, require_same_model
 from yid_ocp.workflow.build import input_files
-from yid_ocp.workflow.command_runner import EXIT_DONE, EXIT_FAILED, run_and_print, workers_from_arguments
+from yid_ocp.workflow.command_runner import CommandResult, run_and_print, workers_from_arguments
 from yid_ocp.workflow.diagnose import run_diagnose
 from yid_ocp.workflow.report import history_result
 from yid_ocp.workflow.run_folder import local_time_text
@@ -60,30 +60,15 @@ class BatchRun:
         return load_config(self.config_file, self.overrides)
 
 
-@dataclass(frozen=True)
-class BatchCommandResult:
-    """Result of `run_batch`: the folder and the contents of its batch.json."""
-
-    folder: Path
-    result: dict[str, Any]
-
-    @property
-    def is_successful(self) -> bool:
-        """Whether every run succeeded."""
-        return all(entry["ok"] for entry in self.result["runs"])
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     members = list_batch_runs(arguments.configs, arguments.recordings, arguments.overrides)
     workers = workers_from_arguments(arguments) or LOCAL_WORKERS
     out = arguments.out or Path("runs") / f"batch-{time.strftime('%Y%m%d-%H%M%S')}"
-    outcome = run_and_print(
-        lambda shown: run_batch(members, out, arguments.each, workers, shown, _again(arguments, out)),
-        batch_summary,
-        arguments,
+    again = _again(arguments, out)
+    return run_and_print(
+        arguments, lambda shown: run_batch(members, out, arguments.each, workers, shown, again), batch_summary
     )
-    return EXIT_DONE if outcome.is_successful else EXIT_FAILED
 
 
 def _again(arguments: argparse.Namespace, out: str | Path) -> str:
@@ -154,7 +139,7 @@ def run_batch(
     workers: WorkerConfig | Executor = LOCAL_WORKERS,
     progress: Progress = NULL_PROGRESS,
     command_line: str = "",
-) -> BatchCommandResult:
+) -> CommandResult:
     """Run a command for every run of a batch; finished runs in the folder are reused.
 
     Parameters
@@ -170,7 +155,7 @@ def run_batch(
 
     Returns
     -------
-    BatchCommandResult
+    CommandResult
         Also where runs failed: each says why.
 
     Raises
@@ -221,7 +206,7 @@ def run_batch(
     progress.begin_stage("writing the report")
     about = f"{len(entries)} runs of {command} side by side."
     write_report(folder / "report.html", ReportData(folder.name, about, written))
-    return BatchCommandResult(folder, written)
+    return CommandResult(folder, written, is_successful=all(entry["ok"] for entry in entries))
 
 
 def run_batch_task(

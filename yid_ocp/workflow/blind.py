@@ -10,7 +10,7 @@ import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +49,7 @@ from yid_ocp.workflow.blind_experiments import (
     list_experiments,
     require_blind_compatible,
 )
-from yid_ocp.workflow.command_runner import EXIT_DONE, run_and_print, workers_from_arguments
+from yid_ocp.workflow.command_runner import CommandResult, run_and_print, workers_from_arguments
 from yid_ocp.workflow.run_folder import local_time_text
 
 _COMMITMENT_FILE, _LABELS_FILE, _RESULT_FILE, _TABLE_FILE = (
@@ -70,14 +70,6 @@ _CONFIGS_FOLDER, _PREPARED_FOLDER, _DRAWN_FOLDER, _CASES_FOLDER, _ANSWERS_FOLDER
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class BlindCommandResult:
-    """Result of `run_blind`: the folder and the contents of its result.json."""
-
-    folder: Path
-    result: dict[str, Any]
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     given = arguments.configs or [None]
@@ -88,11 +80,10 @@ def run(arguments: argparse.Namespace) -> int:
     purpose = ENSEMBLE_PURPOSES[int(arguments.calibration)]
     out = arguments.out or f"{runs[0].name}-blind-{'calibration-' if arguments.calibration else ''}{arguments.seed}"
 
-    def proved(shown: Progress) -> BlindCommandResult:
+    def proved(shown: Progress) -> CommandResult:
         return run_blind(runs, out, arguments.cases, arguments.seed, shown, workers, purpose)
 
-    run_and_print(proved, blind_summary, arguments)
-    return EXIT_DONE
+    return run_and_print(arguments, proved, blind_summary)
 
 
 _MIN_TWO_ARM_CASES = 100
@@ -107,7 +98,7 @@ def run_blind(
     progress: Progress = NULL_PROGRESS,
     workers: WorkerConfig | Executor = LOCAL_WORKERS,
     purpose: str = ENSEMBLE_PURPOSES[0],
-) -> BlindCommandResult:
+) -> CommandResult:
     """Run a blind validation of the diagnosis in several processes; finished parts in the folder are reused.
 
     Parameters
@@ -181,7 +172,7 @@ def run_blind(
         progress.begin_stage("writing the report")
         said = f"{count} virtual cases whose effect was withheld, diagnosed, then opened."
         write_report(folder / "report.html", ReportData(folder.name, said, written))
-    return BlindCommandResult(folder, written)
+    return CommandResult(folder, written)
 
 
 # -- the ensemble -----------------------------------------------------------------------------------------------------

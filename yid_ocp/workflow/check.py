@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ from yid_ocp.sensors.joints import (
 )
 from yid_ocp.solvers.base import covariance_and_chi2, parameter_estimates
 from yid_ocp.workflow.build import build_problem, build_step, initial_grasp_gaps, input_files
-from yid_ocp.workflow.command_runner import EXIT_DONE, EXIT_WRONG_INPUT, run_and_print
+from yid_ocp.workflow.command_runner import EXIT_FAILED, EXIT_WRONG_INPUT, CommandResult, run_and_print
 from yid_ocp.workflow.discretisation_check import frequency_convergence, measure_discretisation_shifts
 from yid_ocp.workflow.recording_issues import issues_result
 from yid_ocp.workflow.run_folder import new_run_folder
@@ -40,31 +40,21 @@ from yid_ocp.workflow.run_folder import new_run_folder
 _RESULT_FORMAT = "yid-check/1"
 
 
-@dataclass(frozen=True)
-class CheckCommandResult:
-    """Result of `run_check`: the run folder and the contents of its result.json."""
-
-    folder: Path
-    result: dict[str, Any]
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     settings = load_config(arguments.config, arguments.overrides)
-    outcome = run_and_print(lambda shown: run_check(settings, arguments.out, shown), check_summary, arguments)
-    return EXIT_WRONG_INPUT if settings.recordings.strict and outcome.result["warnings"] else EXIT_DONE
+    code = run_and_print(arguments, lambda shown: run_check(settings, arguments.out, shown), check_summary)
+    return EXIT_WRONG_INPUT if code == EXIT_FAILED else code
 
 
-def run_check(
-    run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS
-) -> CheckCommandResult:
+def run_check(run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS) -> CommandResult:
     """Validate a run without solving it.
 
     Returns
     -------
-    CheckCommandResult
-        `warnings` in its result lists what will work but should be looked at; `measure_discretisation_shifts` says how far every
-        estimate would move with a finer model if it were the initial value.
+    CommandResult
+        `warnings` in its result lists what will work but should be looked at, `discretisation` how far every estimate
+        would move with a finer model if it were the initial value.
 
     Raises
     ------
@@ -113,7 +103,8 @@ def run_check(
             )
         else:
             folder.write_report_page(run, written, progress)
-    return CheckCommandResult(folder.path, written)
+    passed = not (run.recordings.strict and warnings)
+    return CommandResult(folder.path, written, is_successful=passed)
 
 
 def _mechanics(

@@ -15,10 +15,10 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.png_figures import draw_convergence
 from yid_ocp.report.summaries import compare_summary
-from yid_ocp.solvers import SOLVERS, Iterate
+from yid_ocp.solvers import SOLVERS, Iterate, Status
 from yid_ocp.solvers.base import Solver
 from yid_ocp.workflow.build import build_problem
-from yid_ocp.workflow.command_runner import EXIT_DONE, EXIT_FAILED, run_and_print
+from yid_ocp.workflow.command_runner import CommandResult, run_and_print
 from yid_ocp.workflow.recording_issues import issues_result
 from yid_ocp.workflow.run_folder import new_run_folder
 from yid_ocp.workflow.solve import solve_result, with_fit_issues
@@ -27,17 +27,10 @@ _RESULT_FORMAT = "yid-compare/1"
 
 
 @dataclass(frozen=True)
-class CompareCommandResult:
-    """Result of `run_compare`: the run folder, result.json's contents and the comparison."""
+class CompareCommandResult(CommandResult):
+    """Result of `run_compare` with the comparison; successful where any method converged."""
 
-    folder: Path
-    result: dict[str, Any]
     comparison: MethodComparison
-
-    @property
-    def is_successful(self) -> bool:
-        """Whether any method converged."""
-        return any(run.solution.status.value == "converged" for run in self.comparison.method_results)
 
 
 def _chosen_solvers(run: RunSettings) -> list[Solver]:
@@ -50,8 +43,7 @@ def _chosen_solvers(run: RunSettings) -> list[Solver]:
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     settings = load_config(arguments.config, arguments.overrides)
-    outcome = run_and_print(lambda shown: run_compare(settings, arguments.out, shown), compare_summary, arguments)
-    return EXIT_DONE if outcome.is_successful else EXIT_FAILED
+    return run_and_print(arguments, lambda shown: run_compare(settings, arguments.out, shown), compare_summary)
 
 
 def run_compare(
@@ -97,7 +89,8 @@ def run_compare(
         held_out = tuple(comparison.verdict_held_out_predictions)
         known = {"problem": own, "solution": judged, "held_out": held_out, "section_data": {"comparison": comparison}}
         folder.write_report_page(run, written, progress, **known)
-    return CompareCommandResult(folder.path, written, comparison)
+    done = any(run.solution.status == Status.CONVERGED for run in comparison.method_results)
+    return CompareCommandResult(folder.path, written, comparison, is_successful=done)
 
 
 def _compare_result(problem: EstimationProblem, comparison: MethodComparison) -> dict[str, Any]:

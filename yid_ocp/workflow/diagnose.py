@@ -32,7 +32,7 @@ from yid_ocp.workflow.baseline_runs import (
     with_baseline_effects,
 )
 from yid_ocp.workflow.build import build_problem
-from yid_ocp.workflow.command_runner import EXIT_DONE, run_and_print
+from yid_ocp.workflow.command_runner import CommandResult, run_and_print
 from yid_ocp.workflow.information_planning import next_plan_settings
 from yid_ocp.workflow.recording_issues import issues_result
 from yid_ocp.workflow.refit_store import JsonRefitStore
@@ -44,19 +44,9 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class DiagnoseCommandResult:
-    """Result of `run_diagnose`.
+class DiagnoseCommandResult(CommandResult):
+    """Result of `run_diagnose` with the diagnosis."""
 
-    Attributes
-    ----------
-    folder : Path
-        The finished run folder.
-    result : dict
-        Contents of result.json.
-    """
-
-    folder: Path
-    result: dict[str, Any]
     diagnosis: DiagnosisResult
 
 
@@ -66,8 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.baseline:
         said = tuple(str(Path(folder).expanduser().resolve()) for folder in arguments.baseline)
         settings = replace(settings, diagnosis=replace(settings.diagnosis, baseline=said))
-    run_and_print(lambda shown: run_diagnose(settings, arguments.out, shown), diagnose_summary, arguments)
-    return EXIT_DONE
+    return run_and_print(arguments, lambda shown: run_diagnose(settings, arguments.out, shown), diagnose_summary)
 
 
 def run_diagnose(

@@ -12,11 +12,10 @@ from yid_ocp.export.format_support import EXPORT_FORMAT
 from yid_ocp.export.mcap import export_mcap, signals_from_recording
 from yid_ocp.report.summaries import export_summary
 from yid_ocp.report.terminal import recording_summary_lines, terminal_lines
-from yid_ocp.workflow.command_runner import EXIT_DONE, print_result
+from yid_ocp.workflow.command_runner import EXIT_DONE, print_result, show_progress
 from yid_ocp.workflow.export_model import MODEL_FORMATS, export_model
 from yid_ocp.workflow.export_signals import export_run_signals
 from yid_ocp.workflow.import_recording import recording_contents
-from yid_ocp.workflow.progress_display import show_progress
 
 _MCAP = "mcap"
 

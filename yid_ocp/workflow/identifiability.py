@@ -30,7 +30,7 @@ from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.summaries import identifiability_summary
 from yid_ocp.solvers import Iterate, Solution, Status, solve
 from yid_ocp.workflow.build import build_problem, build_step, build_system
-from yid_ocp.workflow.command_runner import EXIT_DONE, EXIT_FAILED, run_and_print, workers_from_arguments
+from yid_ocp.workflow.command_runner import CommandResult, run_and_print, workers_from_arguments
 from yid_ocp.workflow.identifiability_tasks import IdentifiabilityTasks
 from yid_ocp.workflow.recording_issues import issues_result
 from yid_ocp.workflow.run_folder import RunFolder, new_run_folder
@@ -83,17 +83,10 @@ class IdentifiabilityOptions:
 
 
 @dataclass(frozen=True)
-class IdentifiabilityCommandResult:
-    """Result of `run_identifiability`: run folder, result.json's contents and the analysis (None if it failed)."""
+class IdentifiabilityCommandResult(CommandResult):
+    """Result of `run_identifiability` with the analysis, None where it was not possible."""
 
-    folder: Path
-    result: dict[str, Any]
     analysis: IdentifiabilityResult | None
-
-    @property
-    def is_successful(self) -> bool:
-        """Whether the analysis was possible."""
-        return self.analysis is not None
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -107,14 +100,12 @@ def run(arguments: argparse.Namespace) -> int:
         interval_parameters={"auto": "auto", "all": "all", "none": ()}.get(arguments.intervals, names),
         rank_changes=arguments.what_if,
     )
-
     workers = workers_from_arguments(arguments)
 
     def judged(shown: Progress) -> IdentifiabilityCommandResult:
         return run_identifiability(settings, arguments.out, shown, asked, workers)
 
-    outcome = run_and_print(judged, identifiability_summary, arguments)
-    return EXIT_DONE if outcome.is_successful else EXIT_FAILED
+    return run_and_print(arguments, judged, identifiability_summary)
 
 
 def run_identifiability(
@@ -171,7 +162,8 @@ def run_identifiability(
         folder.write_report_page(run, written, progress, problem=problem, solution=solution)
     if elsewhere is not None:
         elsewhere.delete_results()
-    return IdentifiabilityCommandResult(folder.path, written, information)
+    done = information is not None
+    return IdentifiabilityCommandResult(folder.path, written, information, is_successful=done)
 
 
 def _solved(run: RunSettings, problem: EstimationProblem, folder: RunFolder, progress: Progress) -> Solution:

@@ -17,8 +17,7 @@ from yid_ocp.data.readers.base import parse_units
 from yid_ocp.errors import ConfigError
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.terminal import file_contents_lines, recording_summary_lines
-from yid_ocp.workflow.command_runner import EXIT_DONE, print_json, print_lines, print_result
-from yid_ocp.workflow.progress_display import show_progress
+from yid_ocp.workflow.command_runner import EXIT_DONE, print_json, print_lines, print_result, show_progress
 
 _RESULT_FORMAT = "yid-import/1"
 _LISTS = {"joint_topics": "--joint-topic", "joints": "--joints"}

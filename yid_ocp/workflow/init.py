@@ -16,7 +16,7 @@ from yid_ocp.files import atomic_write, write_text
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.progress import Progress
 from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.command_runner import EXIT_DONE, print_result
+from yid_ocp.workflow.command_runner import EXIT_DONE, print_result, show_progress
 from yid_ocp.workflow.commented_config import ObjectDescription, commented_config_text
 from yid_ocp.workflow.config_proposal import (
     BranchDescription,
@@ -26,7 +26,6 @@ from yid_ocp.workflow.config_proposal import (
     rest_split_time,
 )
 from yid_ocp.workflow.import_recording import is_recording_file, read_foreign_recording, reader_options_from_arguments
-from yid_ocp.workflow.progress_display import show_progress
 
 _RESULT_FORMAT = "yid-init/1"
 _SCHEMA_FILE = "yid-ocp.schema.json"

@@ -43,20 +43,12 @@ from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.sparsity import draw_sparsity_patterns
 from yid_ocp.report.summaries import inspect_summary
 from yid_ocp.workflow.build import build_problem, build_step, parameter_settings
-from yid_ocp.workflow.command_runner import EXIT_DONE, run_and_print
+from yid_ocp.workflow.command_runner import CommandResult, run_and_print
 from yid_ocp.workflow.run_folder import new_run_folder
 
 _RESULT_FORMAT = "yid-inspect/1"
 _SHOWN_STEPS = 2  # of the NLP in its picture: what comes after looks the same
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class InspectCommandResult:
-    """Result of `run_inspect`: the run folder and the contents of its result.json."""
-
-    folder: Path
-    result: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -75,8 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     settings = load_config(arguments.config, arguments.overrides)
     asked = (tuple(arguments.entries), arguments.export)
-    run_and_print(lambda shown: run_inspect(settings, arguments.out, shown, *asked), inspect_summary, arguments)
-    return EXIT_DONE
+    return run_and_print(arguments, lambda shown: run_inspect(settings, arguments.out, shown, *asked), inspect_summary)
 
 
 def run_inspect(
@@ -85,7 +76,7 @@ def run_inspect(
     progress: Progress = NULL_PROGRESS,
     entries: Sequence[str] = (),
     export: str | Path | None = None,
-) -> InspectCommandResult:
+) -> CommandResult:
     """Write result.json, equations.txt, sparsity.png, kkt.png and linearisation.h5 of a run's model.
 
     Parameters
@@ -139,7 +130,7 @@ def run_inspect(
         written = folder.write_result(result)
         pictures = [path for path in (folder.path / name for name in ("sparsity.png", "kkt.png")) if path.exists()]
         folder.write_report_page(run, written, progress, section_data={"pictures": pictures})
-    return InspectCommandResult(folder.path, written)
+    return CommandResult(folder.path, written)
 
 
 # -- what is computed -------------------------------------------------------------------------------------------------

@@ -30,7 +30,7 @@ from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.animation import Animation, ModelTrajectory, make_animation
 from yid_ocp.report.summaries import plan_summary
 from yid_ocp.workflow.build import build_cable, build_step, locate_errors, parameter_settings, read_recordings
-from yid_ocp.workflow.command_runner import EXIT_DONE, EXIT_FAILED, run_and_print
+from yid_ocp.workflow.command_runner import CommandResult, run_and_print
 from yid_ocp.workflow.information_planning import (
     information_plan_result,
     plan_from_settings,
@@ -45,24 +45,16 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class PlanCommandResult:
-    """Result of `run_plan`: the run folder, the contents of result.json and the plan."""
+class PlanCommandResult(CommandResult):
+    """Result of `run_plan` with the plan; successful where the goal was reached within all limits."""
 
-    folder: Path
-    result: dict[str, Any]
     plan: MotionPlan | InformativeMotionPlan
-
-    @property
-    def is_successful(self) -> bool:
-        """Whether the goal was reached within all limits."""
-        return self.plan.is_successful
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     settings = load_config(arguments.config, arguments.overrides)
-    outcome = run_and_print(lambda shown: run_plan(settings, arguments.out, shown), plan_summary, arguments)
-    return EXIT_DONE if outcome.is_successful else EXIT_FAILED
+    return run_and_print(arguments, lambda shown: run_plan(settings, arguments.out, shown), plan_summary)
 
 
 def run_plan(run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS) -> PlanCommandResult:
@@ -106,7 +98,7 @@ def run_plan(run: RunSettings, out: str | Path | None = None, progress: Progress
         written = folder.write_result(_motion_result(run, found, source) | told)
         more = {"plan" if isinstance(found, MotionPlan) else "information": found}
         folder.write_report_page(run, written, progress, animations=_scenes(found), section_data=more)
-    return PlanCommandResult(folder.path, written, found)
+    return PlanCommandResult(folder.path, written, found, is_successful=found.is_successful)
 
 
 def compile_planning_step(run: RunSettings) -> Step:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,30 +18,20 @@ from yid_ocp.report.sections import ReportData
 from yid_ocp.report.summaries import history_summary
 from yid_ocp.version import installed_versions
 from yid_ocp.workflow.baseline_runs import read_estimates, require_same_model
-from yid_ocp.workflow.command_runner import EXIT_DONE, run_and_print
+from yid_ocp.workflow.command_runner import CommandResult, run_and_print
 from yid_ocp.workflow.run_folder import local_time_text, new_run_folder
 
 _RESULT_FORMAT = "yid-history/1"
 
 
-@dataclass(frozen=True)
-class ReportCommandResult:
-    """Result of `run_report`: the folder, contents of history.json and the history."""
-
-    folder: Path
-    result: dict[str, Any]
-    history: EstimateHistory
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    run_and_print(lambda shown: run_report(arguments.runs, arguments.out, shown), history_summary, arguments)
-    return EXIT_DONE
+    return run_and_print(arguments, lambda shown: run_report(arguments.runs, arguments.out, shown), history_summary)
 
 
 def run_report(
     folders: Sequence[str | Path], out: str | Path | None = None, progress: Progress = NULL_PROGRESS
-) -> ReportCommandResult:
+) -> CommandResult:
     """Compare runs of one model and write `history.json` and report.html.
 
     Parameters
@@ -75,7 +64,7 @@ def run_report(
         written = folder.write_json_file("history.json", result)
         progress.begin_stage("writing the report")
         write_report(folder.path / "report.html", ReportData("history", "Runs of one model side by side.", written))
-    return ReportCommandResult(folder.path, written, found)
+    return CommandResult(folder.path, written)
 
 
 def history_result(found: EstimateHistory) -> dict[str, Any]:

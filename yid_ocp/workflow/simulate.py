@@ -21,7 +21,7 @@ from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.animation import Animation, ModelTrajectory, make_animation, recording_animation
 from yid_ocp.report.summaries import simulate_summary
 from yid_ocp.workflow.build import build_step, build_system, problem_options, read_recordings
-from yid_ocp.workflow.command_runner import EXIT_DONE, EXIT_FAILED, run_and_print
+from yid_ocp.workflow.command_runner import CommandResult, run_and_print
 from yid_ocp.workflow.run_folder import new_run_folder
 
 _RESULT_FORMAT = "yid-simulate/1"
@@ -30,25 +30,10 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class SimulateCommandResult:
-    """Result of `run_simulate`.
+class SimulateCommandResult(CommandResult):
+    """Result of `run_simulate` with the recording, None where the rollout failed."""
 
-    Attributes
-    ----------
-    result : dict
-        Contents of result.json.
-    recording : Recording or None
-        None where the rollout failed.
-    """
-
-    folder: Path
-    result: dict[str, Any]
     recording: Recording | None
-
-    @property
-    def is_successful(self) -> bool:
-        """Whether a recording was made."""
-        return self.recording is not None
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -58,8 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
     def simulated(shown: Progress) -> SimulateCommandResult:
         return run_simulate(settings, arguments.out, shown, arguments.seed, arguments.noise)
 
-    outcome = run_and_print(simulated, simulate_summary, arguments)
-    return EXIT_DONE if outcome.is_successful else EXIT_FAILED
+    return run_and_print(arguments, simulated, simulate_summary)
 
 
 def run_simulate(
@@ -111,7 +95,7 @@ def run_simulate(
         written = folder.write_result(result)
         more = {"recordings": [] if recording is None else [recording], "system": system}
         folder.write_report_page(run, written, progress, animations=scenes, section_data=more)
-    return SimulateCommandResult(folder.path, written, recording)
+    return SimulateCommandResult(folder.path, written, recording, is_successful=recording is not None)
 
 
 def _flags(seed: int, noise: bool) -> list[str]:

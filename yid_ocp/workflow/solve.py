@@ -26,7 +26,7 @@ from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.summaries import solve_summary
 from yid_ocp.solvers import Iterate, Solution, Status, solve
 from yid_ocp.workflow.build import build_cable, build_problem
-from yid_ocp.workflow.command_runner import EXIT_DONE, EXIT_FAILED, run_and_print
+from yid_ocp.workflow.command_runner import CommandResult, run_and_print
 from yid_ocp.workflow.discretisation_check import (
     DiscretisationShifts,
     measure_discretisation_shifts,
@@ -48,33 +48,17 @@ _RESULT_FORMAT = "yid-solve/1"
 
 
 @dataclass(frozen=True)
-class SolveCommandResult:
-    """Result of `run_solve`.
+class SolveCommandResult(CommandResult):
+    """Result of `run_solve` with the solution and its problem; successful where the solver converged."""
 
-    Attributes
-    ----------
-    folder : Path
-        The finished run folder.
-    result : dict
-        Contents of result.json.
-    """
-
-    folder: Path
-    result: dict[str, Any]
     solution: Solution
     problem: EstimationProblem
-
-    @property
-    def is_successful(self) -> bool:
-        """Whether the solver converged."""
-        return self.solution.status == Status.CONVERGED
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     settings = load_config(arguments.config, arguments.overrides)
-    outcome = run_and_print(lambda shown: run_solve(settings, arguments.out, shown), solve_summary, arguments)
-    return EXIT_DONE if outcome.is_successful else EXIT_FAILED
+    return run_and_print(arguments, lambda shown: run_solve(settings, arguments.out, shown), solve_summary)
 
 
 def run_solve(
@@ -135,7 +119,8 @@ def run_solve(
         }
         written = folder.write_result(solve_result(problem, solution, held_out, cable) | more)
         folder.write_report_page(run, written, progress, problem=problem, solution=solution, held_out=tuple(held_out))
-    return SolveCommandResult(folder.path, written, solution, problem)
+    done = solution.status == Status.CONVERGED
+    return SolveCommandResult(folder.path, written, solution, problem, is_successful=done)
 
 
 def with_fit_issues(

@@ -44,7 +44,7 @@ from yid_ocp.vision.track import FrameTracker
 from yid_ocp.vision.track_figures import draw_frame_stages, draw_track
 from yid_ocp.vision.track_result import FrameReport, TrackResult, count_drop_reasons
 from yid_ocp.workflow.build import build_system, locate_errors, recording_path
-from yid_ocp.workflow.command_runner import EXIT_DONE, run_and_print, workers_from_arguments
+from yid_ocp.workflow.command_runner import CommandResult, run_and_print, workers_from_arguments
 from yid_ocp.workflow.frame_tasks import FrameTasks, camera_scene, open_frames, read_background_frames
 from yid_ocp.workflow.recording_issues import issues_result, single_recording_issues
 from yid_ocp.workflow.run_folder import RunFolder, new_run_folder
@@ -54,21 +54,9 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class TrackCommandResult:
-    """Result of `run_track`.
+class TrackCommandResult(CommandResult):
+    """Result of `run_track` with the track, and the joints' recording with the group `points_camera`."""
 
-    Attributes
-    ----------
-    folder : Path
-        With recording.h5, result.json, track.png and the pictures.
-    result : dict
-        Contents of result.json.
-    recording : Recording
-        The joints' recording with the group `points_camera`.
-    """
-
-    folder: Path
-    result: dict[str, Any]
     track: TrackResult
     recording: Recording
 
@@ -78,8 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
     overrides = (*arguments.overrides, *(["track.options.calibration.fix_pose=true"] if arguments.fix_pose else ()))
     settings = load_config(arguments.config, overrides)
     workers = workers_from_arguments(arguments)
-    run_and_print(lambda shown: run_track(settings, arguments.out, shown, workers), track_summary, arguments)
-    return EXIT_DONE
+    return run_and_print(arguments, lambda shown: run_track(settings, arguments.out, shown, workers), track_summary)
 
 
 def run_track(
