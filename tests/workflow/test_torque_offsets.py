@@ -68,7 +68,9 @@ def test_offsets_of_all_recordings_are_told_with_what_was_expected(step):
         assert own["std"] < 0.1 * OFFSET
         assert own["value"] == pytest.approx(0.3, abs=4 * own["std"])
     assert list(
-        estimated_torque_offsets(whitened_at(problem_of(step, held_out=False), problem.initial_unknowns), problem.initial_unknowns)
+        estimated_torque_offsets(
+            whitened_at(problem_of(step, held_out=False), problem.initial_unknowns), problem.initial_unknowns
+        )
     ) == ["first"]
 
 
