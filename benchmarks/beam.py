@@ -22,7 +22,8 @@ from rich.table import Table
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.solvers import solve
-from yid_ocp.workflow.build import build_problem, build_step, build_system
+from yid_ocp.workflow.build import build_step, build_system
+from yid_ocp.workflow.build_problem import build_problem
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "panda_beam.yaml"
 FIRST_MODE = 1.875104  # smallest root of 1 + cos x cosh x

@@ -36,7 +36,8 @@ from yid_ocp.virtual.experiment import VirtualExperiment
 from yid_ocp.virtual.injected import InjectedEffect, run_injected_experiment
 from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
 from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
-from yid_ocp.workflow.build import build_problem, build_system
+from yid_ocp.workflow.build import build_system
+from yid_ocp.workflow.build_problem import build_problem
 
 NOISE_SEEDS = (401, 402)
 

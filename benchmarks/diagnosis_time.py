@@ -18,7 +18,7 @@ from rich.table import Table
 from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG, load_config
 from yid_ocp.diagnosis import diagnose
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.workflow.build import build_problem
+from yid_ocp.workflow.build_problem import build_problem
 
 
 def main() -> int:

@@ -22,7 +22,7 @@ from typing import Any
 from yid_ocp.config.reader import load_config
 from yid_ocp.diagnosis import DiagnosisResult, diagnose
 from yid_ocp.diagnosis.events import DisturbanceEvent
-from yid_ocp.workflow.build import build_problem
+from yid_ocp.workflow.build_problem import build_problem
 
 ROOT = Path(__file__).parents[1]
 CONFIG = ROOT / "configs" / "double_pendulum.yaml"

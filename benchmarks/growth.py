@@ -40,7 +40,7 @@ from yid_ocp.parallel import Task, WorkerConfig, process_pool, run_tasks
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.solvers import GaussNewton, solve
-from yid_ocp.workflow.build import build_problem
+from yid_ocp.workflow.build_problem import build_problem
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 CONFIG = REPOSITORY / "configs" / "single_arm_no_vision.yaml"

@@ -35,9 +35,9 @@ from yid_ocp.solvers import GaussNewton, Solution, solve
 from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, baxter_foam_y_system, run_virtual_experiment
 from yid_ocp.virtual.injected import InjectedEffect, run_injected_experiment
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
-from yid_ocp.workflow.build import build_problem
+from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.command_runner import LineProgress
-from yid_ocp.workflow.information_planning import parameter_and_effect_values
+from yid_ocp.workflow.plan import parameter_and_effect_values
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "single_arm_vision.yaml"
 SOUGHT = "T3.bend"

@@ -28,7 +28,8 @@ from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.errors import DataError, YidError
 from yid_ocp.solvers import solve
-from yid_ocp.workflow.build import build_problem, recording_path
+from yid_ocp.workflow.build_problem import build_problem
+from yid_ocp.workflow.run_inputs import recording_path
 
 Damage = Callable[[Recording], Recording]
 CONFIGS = Path(__file__).parents[1] / "configs"

@@ -37,8 +37,7 @@ from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.vision.frame_folder import read_frame_folder, write_frame_folder
 from yid_ocp.vision.track import FrameTracker
 from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.frame_tasks import camera_scene
-from yid_ocp.workflow.track import simulate_frames
+from yid_ocp.workflow.track import camera_scene, simulate_frames
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 SHIPPED = (CONFIGS / "track_single_arm.yaml", CONFIGS / "track_dual_arm.yaml")

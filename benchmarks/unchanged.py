@@ -24,7 +24,7 @@ from diagnosis_cases import CASES, found, show
 from yid_ocp import cli
 from yid_ocp.config.reader import load_config
 from yid_ocp.parallel import Task, WorkerConfig, run_tasks
-from yid_ocp.workflow.build import recording_path
+from yid_ocp.workflow.run_inputs import recording_path
 
 REPOSITORY = Path(__file__).parents[1]
 RECORDED = Path(__file__).with_suffix(".json")

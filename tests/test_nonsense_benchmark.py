@@ -9,7 +9,8 @@ import pytest
 from test_coverage_benchmark import loaded
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.workflow.build import build_problem, recording_path
+from yid_ocp.workflow.build_problem import build_problem
+from yid_ocp.workflow.run_inputs import recording_path
 
 QUICK = {
     "single_arm_vision": ["effort x 0.1", "gap of 2 s", "camera mirrored", "wrist angles x 20", "a link renamed"],

@@ -41,9 +41,9 @@ if TYPE_CHECKING:
     from yid_ocp.solvers import solve as solve
     from yid_ocp.solvers.nonlinear_program import NonlinearProgram as NonlinearProgram
     from yid_ocp.solvers.symbolic_transcription import transcribe as transcribe
-    from yid_ocp.workflow.baseline_runs import read_estimates as read_estimates
-    from yid_ocp.workflow.build import load_problem as load_problem
     from yid_ocp.workflow.build import load_system as load_system
+    from yid_ocp.workflow.build_problem import load_problem as load_problem
+    from yid_ocp.workflow.run_history import read_estimates as read_estimates
 
     __version__: str
 
@@ -64,7 +64,8 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "solvers.nonlinear_program": ("NonlinearProgram",),
     "solvers.symbolic_transcription": ("transcribe",),
     "workflow.baseline_runs": ("read_estimates",),
-    "workflow.build": ("load_problem", "load_system"),
+    "workflow.build": ("load_system",),
+    "workflow.build_problem": ("load_problem",),
     "solvers": (
         "GaussNewton",
         "Lifted",

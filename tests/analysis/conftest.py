@@ -15,7 +15,7 @@ from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.workflow.build import load_problem
+from yid_ocp.workflow.build_problem import load_problem
 
 STIFFNESSES = ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twist")
 PENDULUM = {"elbow.stiffness": 4.0, "elbow.damping": 0.15, "elbow.rest": 0.3}

@@ -13,7 +13,7 @@ from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.parallel import Task, run_tasks
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import GaussNewton, solve
-from yid_ocp.workflow.build import load_problem
+from yid_ocp.workflow.build_problem import load_problem
 
 TWINS = 100
 SEEN = ("T1.bend", "T1.twist", "T2.bend", "T3.bend")

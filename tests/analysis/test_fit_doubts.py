@@ -12,7 +12,7 @@ from yid_ocp.analysis.data_quality import check_fit_residuals
 from yid_ocp.config.reader import load_config
 from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.solvers import solve
-from yid_ocp.workflow.build import build_problem
+from yid_ocp.workflow.build_problem import build_problem
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from yid_ocp.data.recording import PointGroup
 from yid_ocp.inference.linear_model import residual_without_weak_priors
 from yid_ocp.inference.whitening import whitened_at, without_input_errors
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.workflow.build import load_problem
+from yid_ocp.workflow.build_problem import load_problem
 
 STEPS, NX, NU, READINGS = 30, 4, 2, 3
 

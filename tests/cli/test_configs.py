@@ -7,7 +7,7 @@ import json
 import pytest
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.workflow.build import recording_path
+from yid_ocp.workflow.run_inputs import recording_path
 
 PAPER = ("single_arm_no_vision", "single_arm_vision", "dual_arm_no_vision", "dual_arm_vision")
 # settings that make each run quick: fewer links, a short horizon, interpreted where that is faster than compiling

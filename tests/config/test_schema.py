@@ -9,8 +9,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.schema import config_json_schema, settings_markdown
-from yid_ocp.config.settings_examples import SETTINGS_EXAMPLES
+from yid_ocp.config.schema import SETTINGS_EXAMPLES, config_json_schema, settings_markdown
 from yid_ocp.errors import ConfigError
 
 

@@ -14,8 +14,7 @@ from yid_ocp.data import read_recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.report.summaries import _planning_command, plan_summary
 from yid_ocp.report.terminal import terminal_lines
-from yid_ocp.workflow.information_planning import next_plan_settings
-from yid_ocp.workflow.plan import run_plan
+from yid_ocp.workflow.plan import next_plan_settings, run_plan
 
 CONFIG = """\
 model:

@@ -12,8 +12,8 @@ from yid_ocp.data import read_recording
 from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.planning.frame_positions import FramePositions
-from yid_ocp.workflow.build import recording_path
 from yid_ocp.workflow.plan import run_plan
+from yid_ocp.workflow.run_inputs import recording_path
 
 STIFF = "parameters={T*.bend: {initial: 15}, T*.twist: {initial: 10}}"
 COARSE = {

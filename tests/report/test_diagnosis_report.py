@@ -19,7 +19,7 @@ from yid_ocp.report.categorical_charts import BeforeAfter, RankedCandidate, Time
 from yid_ocp.report.figures import TimePlot
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import ReportData
-from yid_ocp.workflow.build import load_problem
+from yid_ocp.workflow.build_problem import load_problem
 from yid_ocp.workflow.diagnose import _held_out_predictions
 
 KNOWN = {"command": "yid-ocp diagnose 'a b.yaml'", "next_plan": None, "versions": {"python": "3"}, "date": "today"}

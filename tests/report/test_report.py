@@ -46,7 +46,7 @@ def solved(tmp_path_factory, urdf_folder):
     """A pendulum's problem and solution."""
     from yid_ocp.data import JointGroup, Recording, write_recording
     from yid_ocp.solvers import GaussNewton, solve
-    from yid_ocp.workflow.build import load_problem
+    from yid_ocp.workflow.build_problem import load_problem
 
     folder = tmp_path_factory.mktemp("report")
     t = 0.01 * np.arange(101)

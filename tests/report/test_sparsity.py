@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from yid_ocp.analysis.sparsity_patterns import NamedRange, SparsityPattern
 from yid_ocp.errors import OutputError
-from yid_ocp.report.sparsity import _MAX_SINGLE_LABELS, draw_sparsity_patterns
+from yid_ocp.report.png_figures import _MAX_SINGLE_LABELS, draw_sparsity_patterns
 
 
 @pytest.fixture

@@ -11,15 +11,9 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import FoamYSettings, SegmentedObjectSettings, dump_config
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model import forward_kinematics
-from yid_ocp.workflow.build import (
-    _arms_are_estimated_states,
-    build_problem,
-    build_system,
-    load_problem,
-    load_system,
-    problem_options,
-    read_recordings,
-)
+from yid_ocp.workflow.build import arms_are_estimated_states, build_system, load_system
+from yid_ocp.workflow.build_problem import build_problem, load_problem, problem_options
+from yid_ocp.workflow.run_inputs import read_recordings
 
 
 @pytest.mark.parametrize(("name", "size", "constraints"), [("single_arm_vision", 43, 3), ("dual_arm_vision", 50, 6)])
@@ -279,7 +273,7 @@ def test_a_problem_has_the_options_of_its_section(written):
 )
 def test_prescribed_arms_that_hold_an_object_are_states(repository, file, overrides, expected):
     run = load_config(repository / "configs" / f"{file}.yaml", overrides)
-    assert _arms_are_estimated_states(run) is expected
+    assert arms_are_estimated_states(run) is expected
     system = build_system(run)
     assert bool(system.driven) == (expected or run.model.arms.mode == "driven")
 

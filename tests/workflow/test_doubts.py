@@ -13,7 +13,8 @@ from yid_ocp.data import read_recording, write_recording
 from yid_ocp.data.issues import Issue
 from yid_ocp.errors import DataError
 from yid_ocp.solvers import solve
-from yid_ocp.workflow.build import build_problem, build_system
+from yid_ocp.workflow.build import build_system
+from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.recording_issues import _is_modelled, single_recording_issues
 
 

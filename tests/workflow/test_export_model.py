@@ -12,9 +12,10 @@ import pytest
 
 from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG, load_config
 from yid_ocp.config.settings import dump_config
-from yid_ocp.workflow.build import build_system, read_recordings
+from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.diagnose import run_diagnose
-from yid_ocp.workflow.export_model import _manifest_path, export_model
+from yid_ocp.workflow.export import _manifest_path, export_model
+from yid_ocp.workflow.run_inputs import read_recordings
 
 mujoco = pytest.importorskip("mujoco", reason="exported models need MuJoCo: pip install 'yid-ocp[blind]'")
 

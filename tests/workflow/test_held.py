@@ -15,14 +15,16 @@ from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.diagnosis.baseline_comparison import with_baseline_prior
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.solvers import GaussNewton, MultipleShooting, solve
-from yid_ocp.workflow.baseline_runs import (
+from yid_ocp.workflow.build import build_system
+from yid_ocp.workflow.build_problem import build_problem
+from yid_ocp.workflow.run_history import (
     baseline_estimates,
     load_reference_recordings,
     read_estimates,
+    run_report,
     with_baseline_effects,
 )
-from yid_ocp.workflow.build import build_problem, build_system, read_recordings
-from yid_ocp.workflow.report import run_report
+from yid_ocp.workflow.run_inputs import read_recordings
 from yid_ocp.workflow.simulate import run_simulate
 
 BEAM = """

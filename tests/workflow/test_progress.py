@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from yid_ocp.report.summary_blocks import SummaryStatement
+from yid_ocp.report.terminal import SummaryStatement
 from yid_ocp.solvers import Iterate
 from yid_ocp.workflow.command_runner import (
     NULL_PROGRESS,

@@ -6,7 +6,7 @@ import pytest
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.diagnosis import StoredFit
-from yid_ocp.workflow.refit_store import JsonRefitStore
+from yid_ocp.workflow.diagnose import JsonRefitStore
 from yid_ocp.workflow.run_folder import new_run_folder
 
 

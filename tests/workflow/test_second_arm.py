@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.second_arm import system_with_second_arm
+from yid_ocp.workflow.build import build_system, system_with_second_arm
 
 
 def test_the_other_arm_of_a_robot(repository):

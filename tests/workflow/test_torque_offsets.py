@@ -19,7 +19,7 @@ from yid_ocp.report.model_summaries import _noise_words
 from yid_ocp.report.tables import torque_offset_rows
 from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.workflow.check import _input_noise
-from yid_ocp.workflow.torque_offset_results import estimated_torque_offsets
+from yid_ocp.workflow.prediction_outputs import estimated_torque_offsets
 
 STEPS, OFFSET, WHITE, ANGLE = 200, 0.2, 0.05, 1e-4
 

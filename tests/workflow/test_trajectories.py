@@ -11,9 +11,12 @@ import pytest
 from yid_ocp.diagnosis.events import NO_EVENTS
 from yid_ocp.errors import OutputError
 from yid_ocp.solvers import GaussNewton, solve
-from yid_ocp.workflow.build import load_problem
-from yid_ocp.workflow.held_out_errors import prediction_error_entry
-from yid_ocp.workflow.trajectories import write_diagnosis_trajectories, write_solve_trajectories
+from yid_ocp.workflow.build_problem import load_problem
+from yid_ocp.workflow.prediction_outputs import (
+    prediction_error_entry,
+    write_diagnosis_trajectories,
+    write_solve_trajectories,
+)
 
 
 @pytest.fixture

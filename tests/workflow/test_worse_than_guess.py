@@ -9,7 +9,7 @@ import pytest
 
 from yid_ocp.data import read_recording, write_recording
 from yid_ocp.inference.uncertainty import ParameterEstimate, mark_not_trusted
-from yid_ocp.workflow.held_out_errors import worse_than_baseline_issues
+from yid_ocp.workflow.prediction_outputs import worse_than_baseline_issues
 
 UNITS = {"joints.effort.a": "N m", "joints.effort.b": "N m", "points.p": "m", "points.q": "m"}
 

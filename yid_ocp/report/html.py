@@ -13,7 +13,7 @@ from pathlib import Path
 from yid_ocp.files import write_text
 from yid_ocp.report.figures import DARK_MODE_COLORS
 from yid_ocp.report.sections import REPORT_SECTIONS, ReportData, render_sections
-from yid_ocp.report.summary_blocks import CodeBlock, SummaryStatement, SummaryTable
+from yid_ocp.report.terminal import CodeBlock, SummaryStatement, SummaryTable
 from yid_ocp.solvers.fit_messages import VERDICT_WORDS
 
 log = logging.getLogger(__name__)

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from yid_ocp.report.summary_blocks import (
+from yid_ocp.report.tables import discretisation_sentences, format_error_and_unit, issue_blocks
+from yid_ocp.report.terminal import (
     CodeBlock,
     SummaryBlock,
     SummaryStatement,
@@ -14,7 +15,6 @@ from yid_ocp.report.summary_blocks import (
     make_statements,
     nonempty_tables,
 )
-from yid_ocp.report.tables import discretisation_sentences, format_error_and_unit, issue_blocks
 
 
 def check_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:

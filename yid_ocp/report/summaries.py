@@ -8,23 +8,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.report.batch_tables import MAX_TERMINAL_PARAMETERS, batch_rows, batch_sentences, parameter_spread_rows
-from yid_ocp.report.history_tables import (
+from yid_ocp.report.model_summaries import check_summary, inspect_summary, simulate_summary
+from yid_ocp.report.run_comparison_tables import (
+    MAX_TERMINAL_PARAMETERS,
     baseline_rows,
+    batch_rows,
+    batch_sentences,
     counterfactual_rows,
     history_rows,
     history_sentences,
+    parameter_spread_rows,
     run_consistency_rows,
-)
-from yid_ocp.report.model_summaries import check_summary, inspect_summary, simulate_summary
-from yid_ocp.report.summary_blocks import (
-    CodeBlock,
-    SummaryBlock,
-    SummaryStatement,
-    SummaryTable,
-    TableRows,
-    make_statements,
-    nonempty_tables,
 )
 from yid_ocp.report.tables import (
     baseline_legend,
@@ -46,6 +40,15 @@ from yid_ocp.report.tables import (
     plan_sentences,
     torque_offset_rows,
     worse_than_baseline_sentences,
+)
+from yid_ocp.report.terminal import (
+    CodeBlock,
+    SummaryBlock,
+    SummaryStatement,
+    SummaryTable,
+    TableRows,
+    make_statements,
+    nonempty_tables,
 )
 from yid_ocp.solvers.fit_messages import VERDICT_WORDS, fit_message, interval_text, parameter_text, percent_text
 

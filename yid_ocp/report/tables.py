@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from yid_ocp.data.issues import ISSUE_CAUSES
-from yid_ocp.report.summary_blocks import CodeBlock, SummaryBlock, SummaryStatement, SummaryTable, TableRows
+from yid_ocp.report.terminal import CodeBlock, SummaryBlock, SummaryStatement, SummaryTable, TableRows
 from yid_ocp.solvers.fit_messages import VERDICT_WORDS
 
 _MAX_ISSUES_PER_CAUSE = 3  # doubts of one kind

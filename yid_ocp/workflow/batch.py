@@ -26,12 +26,11 @@ from yid_ocp.report.html import write_report, write_shared_plotly_script
 from yid_ocp.report.sections import ReportData
 from yid_ocp.report.summaries import batch_summary
 from yid_ocp.version import installed_versions
-from yid_ocp.workflow.baseline_runs import read_estimates, require_same_model
-from yid_ocp.workflow.build import input_files
 from yid_ocp.workflow.command_runner import CommandResult, run_and_print, workers_from_arguments
 from yid_ocp.workflow.diagnose import run_diagnose
-from yid_ocp.workflow.report import history_result
 from yid_ocp.workflow.run_folder import local_time_text
+from yid_ocp.workflow.run_history import history_result, read_estimates, require_same_model
+from yid_ocp.workflow.run_inputs import input_files
 from yid_ocp.workflow.solve import run_solve
 
 _RESULT_FORMAT = "yid-batch/1"

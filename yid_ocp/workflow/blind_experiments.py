@@ -26,7 +26,9 @@ from yid_ocp.diagnosis.blind.ensemble import MAX_CASE_DRAWS
 from yid_ocp.errors import ConfigError, ModelError, YidError
 from yid_ocp.virtual.experiment import ArmSensorNoise
 from yid_ocp.virtual.mujoco_simulation import DEFAULT_SIMULATOR_STEP, SimulationOptions
-from yid_ocp.workflow.build import build_problem, build_system, read_recordings
+from yid_ocp.workflow.build import build_system
+from yid_ocp.workflow.build_problem import build_problem
+from yid_ocp.workflow.run_inputs import read_recordings
 
 log = logging.getLogger(__name__)
 _TORQUE_NOISE_STD, _TORQUE_OFFSET_STD = 0.1, 0.3

@@ -1,71 +1,48 @@
-"""Builds system, compiled step, recordings and estimation problem from the settings."""
+"""Builds the system of a run, its parameters and its compiled step."""
 
 from __future__ import annotations
 
-import contextlib
 import fnmatch
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from importlib import resources
 from pathlib import Path
 
 import casadi as ca
 import numpy as np
 
-from yid_ocp.analysis.convergence import min_grasp_gaps
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import (
     CableSettings,
     FoamYSettings,
+    GraspSettings,
     MountSettings,
     ParameterSettings,
     RunSettings,
     SegmentedObjectSettings,
 )
 from yid_ocp.data.edge_lengths import median_edge_lengths
-from yid_ocp.data.recording import Recording
-from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.effects import make_effect
-from yid_ocp.errors import DataError, ModelError, YidError, nearest_name_hint, unknown_name_details
-from yid_ocp.files import is_file
+from yid_ocp.errors import ModelError, YidError, nearest_name_hint
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model import FlexibleObject, Grasp, Mechanism, Segment, System, flexible_object
-from yid_ocp.model.cable import CableTopology, cable_system, edge_length_parameters, read_vertex_positions
+from yid_ocp.model.cable import CableTopology, cable_system, read_vertex_positions
 from yid_ocp.model.parameters import Parameters
 from yid_ocp.model.rotations import rotation_from_rpy, transform_from_xyz_rpy
 from yid_ocp.model.servos_and_springs import PositionServoOptions, RobotJointSpring
-from yid_ocp.model.urdf import read_urdf, resolve_urdf_path
+from yid_ocp.model.urdf import read_urdf
 from yid_ocp.model.y_object import Y_FOOT_POSITION, y_segments
-from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.episodes import Episode
-from yid_ocp.sensors.joints import EFFORT_GROUP, POSITION_GROUP, is_measured_by_arm
-from yid_ocp.workflow.clamps import clamp_mechanism, clamp_paths, marker_parameter_values, with_extra_frames
-from yid_ocp.workflow.plugins import load_plugins
-from yid_ocp.workflow.recording_issues import (
-    check_recordings,
-    mention_issues_in_errors,
-    object_point_issues,
-    raise_for_issues,
+from yid_ocp.workflow.clamps import clamp_mechanism, marker_parameter_values, with_extra_frames
+from yid_ocp.workflow.run_inputs import (
+    input_files,
+    load_plugins,
+    locate_errors,
+    read_recordings,
 )
 
-_START_FRAMES = 2  # of a cable's free points, from which every prediction starts
-_MAX_GRASP_GAP = 0.01  # what encoder noise and a slightly wrong length of the object can make of a grasp [m]
 _OBJECT_DAMPING_KEY = "object"  # key of the object's damping beside those of the joints
 _PER_JOINT_QUANTITIES = ("bend", "twist", "damping", "twist_damping")
 _DEFAULT_JOINT_DAMPING = 0.05  # of joints that a damping by name does not mention [N m s/rad]
 _PlacedObject = tuple[FlexibleObject, str | None, np.ndarray | None]
-
-
-@contextlib.contextmanager
-def locate_errors(run: RunSettings, *path: str | int) -> Iterator[None]:
-    """Context manager that adds the location of a setting to errors raised in its block."""
-    try:
-        yield
-    except YidError as error:
-        where = run.describe_location(*path)
-        if error.where and error.where not in where:
-            where = f"{where} ({error.where})"
-        raise type(error)(error.what, where=where, allowed=error.allowed, hint=error.hint) from error
 
 
 def build_system(run: RunSettings, link_division: int = 1) -> System:
@@ -100,7 +77,7 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
             damping[name] = spring.damping
     with locate_errors(run, "model", "object"):
         objects = _objects(run, of_object, link_division)
-    mode = "driven" if _arms_are_estimated_states(run) else model.arms.mode
+    mode = "driven" if arms_are_estimated_states(run) else model.arms.mode
     for i, name in enumerate(model.arms.passive_joints):
         if name not in joints:
             hint = nearest_name_hint(name, joints)
@@ -137,7 +114,7 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
     return _completed(run, system, link_division)
 
 
-def _arms_are_estimated_states(run: RunSettings) -> bool:
+def arms_are_estimated_states(run: RunSettings) -> bool:
     """Whether prescribed arms become estimated states, driven by measured torques and corrected by encoders."""
     if run.model.arms.mode != "prescribed" or not run.model.grasp:
         return False
@@ -216,44 +193,6 @@ def _robot(run: RunSettings) -> Mechanism | None:
     with locate_errors(run, "model", "arms", "joints"):
         arms = model.arms
         return read_urdf(model.robot, joints=arms.joints, locked=arms.locked_joints, exclude_links=arms.exclude_links)
-
-
-def input_files(run: RunSettings) -> dict[str, Path]:
-    """Every file that a run reads, by its name in the settings: configuration, plug-ins, robot, recordings.
-
-    Raises
-    ------
-    ConfigError
-        One does not exist; the error names the setting and the nearest file that does.
-    """
-    files: dict[str, Path] = {}
-    if run.config_file:
-        files["configuration"] = Path(run.config_file)
-    for i, path in enumerate(run.plugins):
-        files[path] = _existing(run, Path(path), "plug-in", "plugins", i)
-    robot = run.model.robot
-    if robot is not None:
-        with locate_errors(run, "model", "robot"):
-            file = resolve_urdf_path(robot)
-        files[robot] = _existing(run, file, "URDF file", "model", "robot")
-    if isinstance(run.model.object, CableSettings):
-        file = Path(run.model.object.undeformed_shape_file)
-        files[str(file)] = _existing(run, file, "table of points", "model", "object", "undeformed_shape_file")
-    for which in ("estimate", "held_out"):
-        for i, path in enumerate(getattr(run.recordings, which)):
-            files[path] = _existing(run, recording_path(path), "recording", "recordings", which, i)
-    return files
-
-
-def _existing(run: RunSettings, file: Path, noun: str, *key: str | int) -> Path:
-    if is_file(file):
-        return file
-    folder = file.parent
-    names = [entry.name for entry in folder.glob(f"*{file.suffix}")] if folder.is_dir() else []
-    hint = (
-        nearest_name_hint(file.name, names) if names else "check the path, which is relative to the configuration file"
-    )
-    raise run.config_error(f"there is no such {noun}: {file}", *key, hint=hint)
 
 
 def _objects(run: RunSettings, damping: float, finer: int) -> list[_PlacedObject]:
@@ -381,174 +320,11 @@ def _key_of(run: RunSettings, name: str) -> str:
 # -- data and problem -------------------------------------------------------------------------------------------------
 
 
-def recording_path(path: str) -> Path:
-    """Path of a recording named in the settings; `default:NAME` is one shipped with the package."""
-    if not path.startswith("default:"):
-        return Path(path)
-    return Path(str(resources.files("yid_ocp.data").joinpath("defaults", path.removeprefix("default:"))))
-
-
-def read_recordings(run: RunSettings, which: str) -> list[Recording]:
-    """Recordings under `recordings.estimate` or `recordings.held_out`, each with a name of its own.
-
-    Raises
-    ------
-    DataError
-        As `read_recording`; the error names the setting.
-    """
-    paths: Sequence[str] = getattr(run.recordings, which)
-    result: list[Recording] = []
-    for i, path in enumerate(paths):
-        file = _existing(run, recording_path(path), "recording", "recordings", which, i)
-        with locate_errors(run, "recordings", which, i):
-            recording = read_recording(file)
-        if recording.name in [entry.name for entry in result]:
-            recording = replace(recording, name=f"{recording.name}_{i}")
-        result.append(recording)
-    return result
-
-
 def build_step(run: RunSettings, system: System | None = None) -> Step:
     """The compiled step of a run."""
     said = run.problem
     system = build_system(run) if system is None else system
     return compile_step(system, said.time_step, said.force_split, said.constraint_force, use_compiler=said.use_compiler)
-
-
-def problem_options(run: RunSettings, system: System, recordings: Sequence[Recording] = ()) -> ProblemOptions:
-    """`ProblemOptions` of a run, with values that depend on system and recordings.
-
-    Parameters
-    ----------
-    recordings : sequence of Recording
-        Where values differ from recording to recording (a cable's edges, places of markers), those of these.
-    """
-    parameters = system.parameters
-    chosen = parameter_settings(run, parameters)
-    for name in run.problem.start_fit_parameters:
-        if name not in parameters:
-            hint = nearest_name_hint(name, parameters.names)
-            raise run.config_error(f"there is no parameter '{name}'", "problem", "start_fit_parameters", hint=hint)
-    sensors = dict(run.sensors)
-    if _arms_are_estimated_states(run):
-        # what the encoders say is what counts of the arms, as it does where they are prescribed
-        sensors[POSITION_GROUP] = replace(sensors.get(POSITION_GROUP, SensorOptions()), use=True)
-        for group in {
-            group.name for recording in recordings for group in recording.points if is_measured_by_arm(group)
-        }:
-            sensors[group] = replace(sensors.get(group, SensorOptions()), use=False)
-    cable = build_cable(run)
-    own = marker_parameter_values(run, system, recordings)
-    if cable is not None and isinstance(run.model.object, CableSettings):
-        for group in {group.name for recording in recordings for group in recording.points}:
-            said = sensors.get(group, SensorOptions())
-            sensors[group] = said if said.points is not None else replace(said, points=cable.free_vertices)
-        if run.model.object.lengths_per_recording:
-            own = {
-                recording.name: edge_length_parameters(
-                    cable, median_edge_lengths(cable.edges, [recording], _START_FRAMES)
-                )
-                for recording in recordings
-            }
-    return replace(
-        run.problem,
-        sensors=sensors,
-        clamp_paths=clamp_paths(run, cable),
-        local_parameters=tuple(name for name, said in chosen.items() if said.per_recording),
-        prior_stds={name: said.prior_std for name, said in chosen.items() if said.prior_std is not None},
-        parameters_by_recording=own,
-    )
-
-
-def build_problem(
-    run: RunSettings, step: Step | None = None, reference_recordings: Sequence[Recording] = ()
-) -> EstimationProblem:
-    """The estimation problem of a run.
-
-    Parameters
-    ----------
-    step : Step, optional
-        Compiled before; built when absent.
-    reference_recordings : sequence of Recording
-        That will be predicted only; the options say where markers sit in them.
-
-    Raises
-    ------
-    ConfigError, DataError, ModelError
-        Settings, recordings or names that do not fit, a grasp that cannot be closed, a recording that nothing can be
-        done with; with `recordings.strict` any doubt about one.
-    """
-    system = build_system(run) if step is None else step.system
-    free = [name for name, said in parameter_settings(run, system.parameters).items() if said.free]
-    if not free:
-        raise run.config_error(
-            "no parameter is free", "parameters", hint="set parameters.NAME.free: true for what is sought"
-        )
-    same = sorted(set(run.recordings.estimate) & set(run.recordings.held_out))
-    if same:
-        what = "a recording is both estimated on and held out"
-        raise run.config_error(what, "recordings", "held_out", allowed="one of the two", hint=same[0])
-    estimate, held_out = read_recordings(run, "estimate"), read_recordings(run, "held_out")
-    if not estimate:
-        raise run.config_error(
-            "there is no recording to estimate on", "recordings", "estimate", hint="list at least one recording"
-        )
-    _check_sensors(run, [*estimate, *held_out])
-    seen = check_recordings(run, system, build_cable(run), free, estimate, held_out)
-    options = problem_options(run, system, [*seen.estimate, *seen.held_out, *reference_recordings])
-    step = build_step(run, system) if step is None else step
-    said = replace(options, data_issues=seen.issues)
-    problem = EstimationProblem(step, seen.estimate, free, said, None, seen.held_out)
-    with mention_issues_in_errors(seen.issues):
-        _check_grasps_close(run, problem)
-    more = object_point_issues(problem)
-    if more:
-        raise_for_issues(run, more)
-        problem = problem.with_options(replace(said, data_issues=(*seen.issues, *more)))
-    return problem
-
-
-def initial_grasp_gaps(problem: EstimationProblem, episode: Episode) -> dict[str, float]:
-    """Remaining gap of every grasp at the first configuration of a recording, by grasp name [m]."""
-    system = problem.system
-    if not system.grasps:
-        return {}
-    posture = dict(
-        zip((*system.driven, *system.prescribed), map(float, episode.initial_known_coordinates), strict=True)
-    )
-    theta = problem.theta.copy()
-    for name, value in problem.options.parameters_by_recording.get(episode.name, {}).items():
-        theta[system.parameters.index(name)] = value
-    return min_grasp_gaps(system, posture, theta)
-
-
-def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
-    """Raise an error for recordings at whose first configuration a grasp cannot be closed."""
-    for episode in (*problem.episodes, *problem.held_out):
-        for name, gap in initial_grasp_gaps(problem, episode).items():
-            if gap > _MAX_GRASP_GAP:
-                raise DataError(
-                    f"grasp '{name}' cannot be closed at the first posture of '{episode.name}': "
-                    f"{1e3 * gap:.3g} mm are missing",
-                    where=run.describe_location("model", "grasp", name),
-                    allowed=f"at most {1e3 * _MAX_GRASP_GAP:g} mm",
-                    hint="check the object's lengths and mount, the grasp's frames and the recording's joints",
-                )
-
-
-def _check_sensors(run: RunSettings, recordings: Sequence[Recording]) -> None:
-    known = {group.name for recording in recordings for group in recording.points}
-    known |= (
-        {"joints.position", "joints.effort"} if any(recording.joints is not None for recording in recordings) else set()
-    )
-    for name in run.sensors:
-        if name not in known:
-            raise run.config_error(
-                f"no recording has a group '{name}'", "sensors", name, **unknown_name_details(name, sorted(known))
-            )
-        if run.sensors[name].effort_kind is not None and name != EFFORT_GROUP:
-            hint = f"say it of {EFFORT_GROUP}, or leave it out"
-            raise run.config_error(f"'{name}' holds no efforts", "sensors", name, "effort_kind", hint=hint)
 
 
 # -- from a file -----------------------------------------------------------------------------------------------------
@@ -559,9 +335,36 @@ def load_system(path: str | Path, overrides: Sequence[str] = ()) -> System:
     return build_system(load_config(path, overrides))
 
 
-def load_problem(path: str | Path | None = None, overrides: Sequence[str] = ()) -> EstimationProblem:
-    """The estimation problem of a configuration file, of the embedded one when absent.
+# -- the second arm ---------------------------------------------------------------------------------------------------
 
-    Parameters and errors as `load_config`; errors as `build_problem`.
-    """
-    return build_problem(load_config(path, overrides))
+_OTHER_SIDE = {"left": "right", "right": "left"}
+
+
+def system_with_second_arm(run: RunSettings, system: System) -> System | None:
+    """The run's system with the second arm at a free end of the object; None where impossible."""
+    model = run.model
+    joints = model.arms.joints
+    if joints is None or model.arms.mode != "driven" or len(model.grasp) != 1:
+        return None
+    side, grasp = next(iter(model.grasp.items()))
+    prefix = f"{side}_"
+    if side not in _OTHER_SIDE or not all(name.startswith(prefix) for name in (*joints, grasp.holder_frame)):
+        return None
+    parents = {segment.parent_segment for segment in system.segment_layouts}
+    free = [
+        f"w_{s.name}" for s in system.segment_layouts if s.name not in parents and f"w_{s.name}" != grasp.held_frame
+    ]
+    if not free:
+        return None
+
+    def mirrored(name: str) -> str:
+        return f"{_OTHER_SIDE[side]}_{name.removeprefix(prefix)}"
+
+    arms = replace(model.arms, joints=(*joints, *(mirrored(name) for name in joints)))
+    added = GraspSettings(holder_frame=mirrored(grasp.holder_frame), held_frame=free[0], kind=grasp.kind, rpy=grasp.rpy)
+    changed = replace(model, arms=arms, grasp={**model.grasp, _OTHER_SIDE[side]: added})
+    try:
+        return build_system(replace(run, model=changed))
+    except YidError:
+        # the robot has no other arm of that name
+        return None

@@ -31,11 +31,13 @@ from yid_ocp.sensors.joints import (
     joint_torque_noise_std,
 )
 from yid_ocp.solvers.base import covariance_and_chi2, parameter_estimates
-from yid_ocp.workflow.build import build_problem, build_step, initial_grasp_gaps, input_files
+from yid_ocp.workflow.build import build_step
+from yid_ocp.workflow.build_problem import build_problem, initial_grasp_gaps
 from yid_ocp.workflow.command_runner import EXIT_FAILED, EXIT_WRONG_INPUT, CommandResult, run_and_print
 from yid_ocp.workflow.discretisation_check import frequency_convergence, measure_discretisation_shifts
 from yid_ocp.workflow.recording_issues import issues_result
 from yid_ocp.workflow.run_folder import new_run_folder
+from yid_ocp.workflow.run_inputs import input_files
 
 _RESULT_FORMAT = "yid-check/1"
 

@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any
 from yid_ocp.files import to_json_types
 from yid_ocp.parallel import WorkerConfig
 from yid_ocp.progress import NULL_PROGRESS, AcceptedIterate, Progress
-from yid_ocp.report.summary_blocks import SummaryBlock
-from yid_ocp.report.terminal import terminal_lines
+from yid_ocp.report.terminal import SummaryBlock, terminal_lines
 
 if TYPE_CHECKING:
     import rich.progress

@@ -17,7 +17,7 @@ from yid_ocp.report.png_figures import draw_convergence
 from yid_ocp.report.summaries import compare_summary
 from yid_ocp.solvers import SOLVERS, Iterate, Status
 from yid_ocp.solvers.base import Solver
-from yid_ocp.workflow.build import build_problem
+from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.command_runner import CommandResult, run_and_print
 from yid_ocp.workflow.recording_issues import issues_result
 from yid_ocp.workflow.run_folder import new_run_folder

@@ -1,9 +1,13 @@
-"""The command `diagnose`: detects, locates and explains the gap, and writes the run folder."""
+"""The command `diagnose`: detects, locates and explains the gap; finished refits survive an interruption."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import json
 import logging
+import math
+import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,9 +19,11 @@ from yid_ocp.analysis.estimate_history import RunEstimates, pool_estimates
 from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG, load_config
 from yid_ocp.config.settings import RunSettings, dump_config
 from yid_ocp.data.recording import Recording
-from yid_ocp.diagnosis import DiagnosisResult, diagnose
+from yid_ocp.diagnosis import DiagnosisResult, StoredFit, diagnose
 from yid_ocp.diagnosis.baseline_comparison import with_baseline_prior
 from yid_ocp.diagnosis.diagnosis_result import final_model_to_dict
+from yid_ocp.errors import OutputError
+from yid_ocp.files import json_sha256, write_json
 from yid_ocp.inference.whitening import whitened_by_sensor_noise
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import NULL_PROGRESS, AcceptedIterate, Progress
@@ -25,20 +31,22 @@ from yid_ocp.report.animation import Animation, ModelTrajectory, make_animation
 from yid_ocp.report.summaries import diagnose_summary
 from yid_ocp.sensors.joints import EFFORT_GROUP, POSITION_GROUP
 from yid_ocp.solvers import Solution, solve
-from yid_ocp.workflow.baseline_runs import (
+from yid_ocp.workflow.build_problem import build_problem
+from yid_ocp.workflow.command_runner import CommandResult, run_and_print
+from yid_ocp.workflow.plan import next_plan_settings
+from yid_ocp.workflow.prediction_outputs import (
+    HeldOutPrediction,
+    estimated_torque_offsets,
+    write_diagnosis_trajectories,
+)
+from yid_ocp.workflow.recording_issues import issues_result
+from yid_ocp.workflow.run_folder import RunFolder, new_run_folder, software_versions
+from yid_ocp.workflow.run_history import (
     baseline_estimates,
     load_reference_recordings,
     require_distinct_recordings,
     with_baseline_effects,
 )
-from yid_ocp.workflow.build import build_problem
-from yid_ocp.workflow.command_runner import CommandResult, run_and_print
-from yid_ocp.workflow.information_planning import next_plan_settings
-from yid_ocp.workflow.recording_issues import issues_result
-from yid_ocp.workflow.refit_store import JsonRefitStore
-from yid_ocp.workflow.run_folder import RunFolder, new_run_folder, software_versions
-from yid_ocp.workflow.torque_offset_results import estimated_torque_offsets
-from yid_ocp.workflow.trajectories import HeldOutPrediction, write_diagnosis_trajectories
 
 log = logging.getLogger(__name__)
 
@@ -249,3 +257,93 @@ def _scenes(finding: DiagnosisResult, predicted: Sequence[HeldOutPrediction]) ->
             )
         scenes.append(make_animation(f"{episode.name} (held out)", told, episode.recording))
     return scenes
+
+
+_STORE_FORMAT = "yid-refits/1"
+
+
+class JsonRefitStore:
+    """A store of refits in one JSON file: {format, key, refits: {name: {values, std, message}}}.
+
+    The file is replaced as a whole after every refit. One that was made from other inputs, by another configuration or
+    by another version is skipped with a notice.
+
+    Refits run in threads, not as tasks of `yid_ocp.parallel`: all of one diagnosis share a compiled step and what was
+    worked out from the recordings, and a refit takes less time than to build these in another process.
+    """
+
+    def __init__(self, folder: RunFolder, *made_from: Mapping[str, str] | str) -> None:
+        self.file = folder.resume_folder / "refits.json"
+        self._folder = folder
+        self._key = json_sha256(made_from)
+        self._lock = threading.Lock()
+        self._warned = False
+        self._known = self._read()
+
+    def __len__(self) -> int:
+        return len(self._known)
+
+    def get(self, name: str) -> StoredFit | None:
+        """The stored refit of that name, or None; a reused refit is logged."""
+        found = self._known.get(name)
+        if found is not None:
+            self._folder.log_event("resumed", refit=name)
+        return found
+
+    def put(self, name: str, refitted: StoredFit) -> None:
+        """Store a refit and rewrite the file."""
+        with self._lock:
+            self._known[name] = refitted
+            refits = {
+                key: {
+                    "values": _texts(fit.values),
+                    "std": _texts(fit.std),
+                    "amplitude_std": _texts(fit.amplitude_std),
+                    "message": fit.solver_message,
+                }
+                for key, fit in self._known.items()
+            }
+            try:
+                self.file.parent.mkdir(parents=True, exist_ok=True)
+                write_json(self.file, {"format": _STORE_FORMAT, "key": self._key, "refits": refits})
+            except (OSError, OutputError) as error:
+                if not self._warned:
+                    log.warning("finished refits cannot be kept (%s); the diagnosis goes on without", error)
+                self._warned = True
+
+    def delete_file(self) -> None:
+        """Delete the file, its temporary copies and its folder if empty."""
+        with contextlib.suppress(OSError):
+            for file in self.file.parent.glob(f"*{self.file.name}*"):
+                file.unlink()
+            self.file.parent.rmdir()
+
+    def _read(self) -> dict[str, StoredFit]:
+        try:
+            held = json.loads(self.file.read_text(encoding="utf-8"))
+            if (held["format"], held["key"]) == (_STORE_FORMAT, self._key):
+                return {
+                    name: StoredFit(
+                        _numbers(fit["values"]),
+                        _numbers(fit["std"]),
+                        _numbers(fit["amplitude_std"]),
+                        str(fit["message"]),
+                    )
+                    for name, fit in held["refits"].items()
+                }
+            reason = "other inputs, another configuration or another version"
+        except FileNotFoundError:
+            return {}
+        except (OSError, ValueError, LookupError, TypeError, AttributeError):
+            reason = "something that cannot be read"
+        log.warning("the refits in %s are from %s and are not resumed", self.file, reason)
+        return {}
+
+
+def _texts(values: Mapping[str, float]) -> dict[str, float | str]:
+    """JSON has no infinities: what is not finite is kept as text."""
+    return {name: value if math.isfinite(value) else str(value) for name, value in values.items()}
+
+
+def _numbers(values: Mapping[str, float | str]) -> dict[str, float]:
+    return {name: float(value) for name, value in values.items()}

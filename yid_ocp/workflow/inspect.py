@@ -40,9 +40,10 @@ from yid_ocp.integrator.step import Step
 from yid_ocp.integrator.step_model import StepLinearization
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import NULL_PROGRESS, Progress
-from yid_ocp.report.sparsity import draw_sparsity_patterns
+from yid_ocp.report.png_figures import draw_sparsity_patterns
 from yid_ocp.report.summaries import inspect_summary
-from yid_ocp.workflow.build import build_problem, build_step, parameter_settings
+from yid_ocp.workflow.build import build_step, parameter_settings
+from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.command_runner import CommandResult, run_and_print
 from yid_ocp.workflow.run_folder import new_run_folder
 

@@ -25,8 +25,7 @@ from yid_ocp.progress import Progress
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import ReportData
 from yid_ocp.version import installed_versions
-from yid_ocp.workflow.build import input_files
-from yid_ocp.workflow.plugins import plugin_versions
+from yid_ocp.workflow.run_inputs import input_files, plugin_versions
 
 log = logging.getLogger(__name__)
 _UNFINISHED, _LOCK, _NAMES = ".partial", "lock", 1000

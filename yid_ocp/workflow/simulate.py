@@ -20,9 +20,11 @@ from yid_ocp.problem.synthetic_recording import recording_from_prediction
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.animation import Animation, ModelTrajectory, make_animation, recording_animation
 from yid_ocp.report.summaries import simulate_summary
-from yid_ocp.workflow.build import build_step, build_system, problem_options, read_recordings
+from yid_ocp.workflow.build import build_step, build_system
+from yid_ocp.workflow.build_problem import problem_options
 from yid_ocp.workflow.command_runner import CommandResult, run_and_print
 from yid_ocp.workflow.run_folder import new_run_folder
+from yid_ocp.workflow.run_inputs import read_recordings
 
 _RESULT_FORMAT = "yid-simulate/1"
 _DEFAULT_DURATION = 5.0  # of a virtual experiment whose configuration does not say [s]

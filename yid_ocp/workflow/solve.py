@@ -25,7 +25,8 @@ from yid_ocp.problem.prediction_result import EpisodePrediction
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.summaries import solve_summary
 from yid_ocp.solvers import Iterate, Solution, Status, solve
-from yid_ocp.workflow.build import build_cable, build_problem
+from yid_ocp.workflow.build import build_cable
+from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.command_runner import CommandResult, run_and_print
 from yid_ocp.workflow.discretisation_check import (
     DiscretisationShifts,
@@ -34,15 +35,15 @@ from yid_ocp.workflow.discretisation_check import (
     with_discretisation_uncertainty,
     with_stability_check,
 )
-from yid_ocp.workflow.held_out_errors import (
+from yid_ocp.workflow.prediction_outputs import (
     channels_worse_than_baseline,
+    estimated_torque_offsets,
     prediction_error_entry,
     worse_than_baseline_issues,
+    write_solve_trajectories,
 )
 from yid_ocp.workflow.recording_issues import issues_result
 from yid_ocp.workflow.run_folder import new_run_folder
-from yid_ocp.workflow.torque_offset_results import estimated_torque_offsets
-from yid_ocp.workflow.trajectories import write_solve_trajectories
 
 _RESULT_FORMAT = "yid-solve/1"
 

@@ -1,20 +1,28 @@
-"""Plug-ins: effects and sensors from files named in a configuration and from installed packages."""
+"""What a run reads: its files, recordings and plug-ins, and where its settings stand in messages."""
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import sys
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from importlib import metadata
+from dataclasses import replace
+from importlib import metadata, resources
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.config.settings import RunSettings
+from yid_ocp.config.settings import (
+    CableSettings,
+    RunSettings,
+)
+from yid_ocp.data.recording import Recording
+from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.effects import EFFECTS
-from yid_ocp.errors import ConfigError, YidError
-from yid_ocp.files import file_sha256
+from yid_ocp.errors import ConfigError, YidError, nearest_name_hint
+from yid_ocp.files import file_sha256, is_file
+from yid_ocp.model.urdf import resolve_urdf_path
 from yid_ocp.registry import Registry
 from yid_ocp.sensors import SENSOR_READERS
 
@@ -115,3 +123,83 @@ def _line(error: BaseException, path: Path) -> int | None:
         return error.lineno
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
     return lines[-1] if lines else None
+
+
+# -- files ------------------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def locate_errors(run: RunSettings, *path: str | int) -> Iterator[None]:
+    """Context manager that adds the location of a setting to errors raised in its block."""
+    try:
+        yield
+    except YidError as error:
+        where = run.describe_location(*path)
+        if error.where and error.where not in where:
+            where = f"{where} ({error.where})"
+        raise type(error)(error.what, where=where, allowed=error.allowed, hint=error.hint) from error
+
+
+def input_files(run: RunSettings) -> dict[str, Path]:
+    """Every file that a run reads, by its name in the settings: configuration, plug-ins, robot, recordings.
+
+    Raises
+    ------
+    ConfigError
+        One does not exist; the error names the setting and the nearest file that does.
+    """
+    files: dict[str, Path] = {}
+    if run.config_file:
+        files["configuration"] = Path(run.config_file)
+    for i, path in enumerate(run.plugins):
+        files[path] = _existing(run, Path(path), "plug-in", "plugins", i)
+    robot = run.model.robot
+    if robot is not None:
+        with locate_errors(run, "model", "robot"):
+            file = resolve_urdf_path(robot)
+        files[robot] = _existing(run, file, "URDF file", "model", "robot")
+    if isinstance(run.model.object, CableSettings):
+        file = Path(run.model.object.undeformed_shape_file)
+        files[str(file)] = _existing(run, file, "table of points", "model", "object", "undeformed_shape_file")
+    for which in ("estimate", "held_out"):
+        for i, path in enumerate(getattr(run.recordings, which)):
+            files[path] = _existing(run, recording_path(path), "recording", "recordings", which, i)
+    return files
+
+
+def _existing(run: RunSettings, file: Path, noun: str, *key: str | int) -> Path:
+    if is_file(file):
+        return file
+    folder = file.parent
+    names = [entry.name for entry in folder.glob(f"*{file.suffix}")] if folder.is_dir() else []
+    hint = (
+        nearest_name_hint(file.name, names) if names else "check the path, which is relative to the configuration file"
+    )
+    raise run.config_error(f"there is no such {noun}: {file}", *key, hint=hint)
+
+
+def recording_path(path: str) -> Path:
+    """Path of a recording named in the settings; `default:NAME` is one shipped with the package."""
+    if not path.startswith("default:"):
+        return Path(path)
+    return Path(str(resources.files("yid_ocp.data").joinpath("defaults", path.removeprefix("default:"))))
+
+
+def read_recordings(run: RunSettings, which: str) -> list[Recording]:
+    """Recordings under `recordings.estimate` or `recordings.held_out`, each with a name of its own.
+
+    Raises
+    ------
+    DataError
+        As `read_recording`; the error names the setting.
+    """
+    paths: Sequence[str] = getattr(run.recordings, which)
+    result: list[Recording] = []
+    for i, path in enumerate(paths):
+        file = _existing(run, recording_path(path), "recording", "recordings", which, i)
+        with locate_errors(run, "recordings", which, i):
+            recording = read_recording(file)
+        if recording.name in [entry.name for entry in result]:
+            recording = replace(recording, name=f"{recording.name}_{i}")
+        result.append(recording)
+    return result

@@ -1,0 +1,357 @@
+"""What is written of predictions: trajectories, held-out errors beside baselines, estimated torque offsets."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from yid_ocp.data.hdf5_io import create_hdf5_atomically
+from yid_ocp.data.issues import MAX_LIMIT_RATIO, Issue
+from yid_ocp.diagnosis import DiagnosisResult
+from yid_ocp.diagnosis.localise import unknown_units
+from yid_ocp.inference.whitening import (
+    WhiteningFilter,
+    estimate_torque_bias,
+    estimate_torque_biases,
+    held_out_whitened_at,
+)
+from yid_ocp.model.cable import CableTopology
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.measurements import Measurements
+from yid_ocp.problem.prediction_errors import (
+    clamp_displacement_baseline,
+    constant_position_baseline,
+    interpolated_displacement_baseline,
+)
+from yid_ocp.problem.prediction_result import EpisodePrediction
+from yid_ocp.solvers import Solution
+
+Array = NDArray[np.float64]
+
+_WORSE_RATIO = 1.05  # two errors nearer than that are alike
+_START_FRAMES = 2  # frames from which the baselines of a cable start, as its own start state does
+
+
+def prediction_error_entry(
+    problem: EstimationProblem, episode: Episode, outcome: EpisodePrediction | str, cable: CableTopology | None = None
+) -> dict[str, Any]:
+    """Prediction errors of one recording: RMSE per channel for the model and for every baseline.
+
+    A group of several points has an entry of its own beside its channels: the square root of the mean squared distance
+    over all its points and frames but those that fixed the start.
+
+    Parameters
+    ----------
+    outcome : EpisodePrediction or str
+        Prediction, or why there is none.
+    cable : CableTopology, optional
+        For the baselines that only a cable held by clamps has.
+    """
+    entry: dict[str, Any] = {"recording": episode.name, "rmse": {}, "baselines": {}}
+    fixed = _start_end(problem, episode)
+    if isinstance(outcome, str):
+        entry["message"] = outcome
+    else:
+        for samples, predicted in zip(episode.measurements, outcome.predicted_outputs, strict=True):
+            entry["rmse"] |= _errors(samples, predicted, fixed)
+    for samples in episode.measurements:
+        for name, predicted in _baselines(episode, samples, cable).items():
+            errors = _errors(samples, predicted, fixed)
+            if errors:
+                entry["baselines"].setdefault(name, {}).update(errors)
+    return entry
+
+
+def channels_worse_than_baseline(
+    entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]
+) -> list[dict[str, Any]]:
+    """Channels that a model-free baseline predicts clearly better than the model, from `prediction_error_entry` entries."""
+    worse = []
+    for entry in entries:
+        for channel, error in entry["rmse"].items():
+            guesses = {name: errors[channel] for name, errors in entry["baselines"].items() if channel in errors}
+            best = min(guesses, key=guesses.__getitem__, default=None)
+            if best is not None and error > _WORSE_RATIO * guesses[best]:
+                said = {
+                    "recording": entry["recording"],
+                    "channel": channel,
+                    "rmse": error,
+                    "unit": _unit(channel, units),
+                }
+                worse.append(said | {"baseline": best, "guess": guesses[best]})
+    return worse
+
+
+def worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]) -> list[Issue]:
+    """Issues for sensors that a model-free baseline predicts better than the model, over all their channels.
+
+    Single channels that say little of what the model is about may well be worse; see `channels_worse_than_baseline`.
+    """
+    found = []
+    for entry in entries:
+        groups: dict[str, list[str]] = {}
+        for channel in entry["rmse"]:
+            if channel in units:  # not the sum over a group
+                groups.setdefault(channel.rpartition(".")[0], []).append(channel)
+        for group, channels in groups.items():
+            error = _together(entry["rmse"], channels)
+            known = {name: errors for name, errors in entry["baselines"].items() if set(channels) <= set(errors)}
+            guesses = {name: _together(errors, channels) for name, errors in known.items()}
+            best = min(guesses, key=guesses.__getitem__, default=None)
+            if best is None or not error > _WORSE_RATIO * guesses[best]:
+                continue
+            unit = _unit(channels[0], units)
+            found.append(
+                Issue(
+                    "worse_than_guess",
+                    f"the model is off by {error:.3g} {unit} (rms), the guess '{best}' without a model by "
+                    f"{guesses[best]:.3g} {unit}",
+                    "not_trusted",
+                    error / (_WORSE_RATIO * guesses[best]) if guesses[best] > 0 else MAX_LIMIT_RATIO,
+                    "look at the residuals, and let `yid-ocp diagnose` say what the model lacks",
+                    entry["recording"],
+                    group.partition(".")[0],
+                    group.partition(".")[2],
+                )
+            )
+    return found
+
+
+def _together(errors: Mapping[str, float], channels: Sequence[str]) -> float:
+    """Root mean square over channels."""
+    return float(np.sqrt(np.mean([errors[channel] ** 2 for channel in channels])))
+
+
+def _unit(channel: str, units: Mapping[str, str]) -> str:
+    """Unit of a channel, or of the first channel of a group."""
+    return next((unit for name, unit in units.items() if name == channel or name.startswith(f"{channel}.")), "")
+
+
+def _start_end(problem: EstimationProblem, episode: Episode) -> float:
+    """Node up to which measured points were used to fix the start, -1 where none were."""
+    options = problem.options
+    return options.start_fit_window / problem.step.time_step if options.initial_state == "fitted_to_points" else -1.0
+
+
+def _errors(samples: Measurements, predicted: Array, fixed: float) -> dict[str, float]:
+    sensor = samples.sensor
+    shape = (len(predicted), len(sensor.channel_names), sensor.outputs_per_channel)
+    square = np.sum((predicted - samples.value).reshape(shape) ** 2, axis=2)
+    result = {}
+    for c, channel in enumerate(sensor.channel_names):
+        seen = square[np.isfinite(square[:, c]), c]
+        if len(seen):
+            result[channel] = float(np.sqrt(np.mean(seen)))
+    if len(sensor.point_names) > 1:
+        later = square[samples.node + samples.fraction > fixed + 1e-6]
+        if np.any(np.isfinite(later)):
+            result[sensor.group_name] = float(np.sqrt(np.nanmean(later)))
+    return result
+
+
+def _baselines(episode: Episode, samples: Measurements, cable: CableTopology | None) -> dict[str, Array]:
+    sensor = samples.sensor
+    if sensor.naive_prediction == "zero":
+        return {"zero": np.zeros_like(samples.value)}
+    if cable is not None and sensor.point_names and set(sensor.point_names) <= set(cable.vertices):
+        recording, held, points = episode.recording, cable.clamped_vertices, sensor.point_names
+        group = next(group for group in recording.points if group.name == sensor.group_name)
+        inside = (group.t >= episode.grid.start_time - 1e-9) & (group.t <= episode.grid.node_times[-1] + 1e-9)
+        arrays = {
+            "stays": constant_position_baseline(recording, points, _START_FRAMES),
+            "moves_with_clamps": clamp_displacement_baseline(recording, points, held, _START_FRAMES),
+            "linear_carry": interpolated_displacement_baseline(
+                recording, points, cable.parent_vertices, cable.child_vertices, given=_START_FRAMES
+            ),
+        }
+        return {name: array[inside].reshape(len(samples.value), -1) for name, array in arrays.items()}
+    first = np.full(samples.value.shape[1], np.nan)
+    for column in range(len(first)):
+        seen = samples.value[np.isfinite(samples.value[:, column]), column]
+        first[column] = seen[0] if len(seen) else np.nan
+    return {"stays": np.broadcast_to(first, samples.value.shape)}
+
+
+_OffsetsByRecording = dict[str, dict[str, dict[str, float]]]
+
+
+def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> _OffsetsByRecording:
+    """Estimated torque offset by recording and joint: `value`, `std`, `prior_std` [N m], held-out included.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        With weights frozen near `x` (`whitened_at`); where it has none, or offsets are no part of the model, there is
+        nothing to say.
+    x : ndarray, shape (nx,)
+    """
+    found: _OffsetsByRecording = {}
+    if all(whitening is None for whitening in problem.whitening_filters):
+        return found
+    for episode, own in zip(problem.episodes, estimate_torque_biases(problem, x), strict=True):
+        found |= _entry(problem, episode, own)
+    apart = [e for e in problem.held_out if e.input_errors is not None and e.initial_state_shared_with is None]
+    if not any(np.any(e.input_errors.torque_bias_std > 0) for e in apart if e.input_errors is not None):
+        return found
+    held = problem if any(problem.held_out_whitening_filters) else held_out_whitened_at(problem, x)
+    for (episode, result), whitening in zip(held.predict_held_out(x), held.held_out_whitening_filters, strict=True):
+        if (
+            isinstance(whitening, WhiteningFilter)
+            and not isinstance(result, str)
+            and episode.initial_state_shared_with is None
+        ):
+            value = estimate_torque_bias(episode, result, whitening)
+            found |= _entry(held, episode, (value, whitening.torque_bias_std))
+    return found
+
+
+def _entry(
+    problem: EstimationProblem, episode: Episode, own: Sequence[Array] | None
+) -> Mapping[str, dict[str, dict[str, float]]]:
+    """One recording's part; empty where none of its torques may be off."""
+    if own is None or episode.input_errors is None or not np.any(episode.input_errors.torque_bias_std > 0):
+        return {}
+    rows = zip(problem.system.driven, *own, episode.input_errors.torque_bias_std, strict=True)
+    return {
+        episode.name: {
+            joint: {"value": float(value), "std": float(std), "prior_std": float(prior)}
+            for joint, value, std, prior in rows
+            if prior > 0
+        }
+    }
+
+
+SOLVE_TRAJECTORIES_FORMAT = "yid-trajectories/1"
+DIAGNOSIS_TRAJECTORIES_FORMAT = "yid-diagnosis-trajectories/1"
+HeldOutPrediction = tuple[Episode, EpisodePrediction, EpisodePrediction]
+"""A held-out recording, its prediction by the nominal model and that with the effects."""
+
+
+def write_solve_trajectories(
+    path: Path,
+    problem: EstimationProblem,
+    solution: Solution,
+    held_out: Sequence[tuple[Episode, EpisodePrediction | str]],
+) -> None:
+    """Write trajectories, predictions and unknowns with covariance as `yid-trajectories/1`.
+
+    `unknowns/`: names, x, covariance. `recordings/NAME/`: `t` (N+1,) [s], `q`, `p` (N+1, n), `multipliers` (N, m)
+    [N s], `torque` (N, nu) [N m] or what servos are commanded, `command` (N, nu) [rad or m], `effort` (N, nc) [N m],
+    the attributes `joints` (n names), `driven` (nu) and `prescribed` (nc), and for every sensor `GROUP/` with `t`,
+    `measured`, `predicted`, `std` and the attributes `channels`, `unit`.
+
+    Raises
+    ------
+    OutputError
+    """
+    pairs: list[tuple[str, Episode, EpisodePrediction | str]] = [("held_out", *pair) for pair in held_out]
+    if solution.evaluation is not None:
+        done = solution.episode_predictions
+        pairs = [("estimate", e, r) for e, r in zip(problem.episodes, done, strict=True)] + pairs
+    with _file(path, SOLVE_TRAJECTORIES_FORMAT) as file:
+        unknowns = file.create_group("unknowns")
+        unknowns.attrs["names"] = _texts(solution.unknown_names)
+        unknowns.create_dataset("x", data=solution.x)
+        unknowns.create_dataset("covariance", data=solution.covariance)
+        for role, episode, outcome in pairs:
+            group = file.require_group("recordings").create_group(episode.name)
+            group.attrs["role"] = role
+            group.attrs["joints"] = _texts(problem.system.mechanism.joint_names)
+            group.attrs["driven"] = _texts(problem.system.driven)
+            group.attrs["prescribed"] = _texts(problem.system.prescribed)
+            if isinstance(outcome, str):
+                group.attrs["message"] = outcome
+                continue
+            n, rollout = problem.system.n_coordinates, outcome.rollout
+            arrays = {
+                "t": episode.grid.node_times,
+                "q": rollout.state[:, :n],
+                "p": rollout.state[:, n : 2 * n],
+                "multipliers": rollout.multipliers,
+                "command" if problem.system.servos else "torque": rollout.torque,
+                "effort": rollout.effort,
+            }
+            _store(group, arrays)
+            for samples, predicted in zip(episode.measurements, outcome.predicted_outputs, strict=True):
+                _store_sensor(group, episode, samples, {"predicted": predicted})
+
+
+def write_diagnosis_trajectories(path: Path, finding: DiagnosisResult, predicted: Sequence[HeldOutPrediction]) -> None:
+    """Write held-out predictions and smoothed unknowns as `yid-diagnosis-trajectories/1`.
+
+    `RECORDING/GROUP/` for every held-out recording: `t` (M,) [s], `measured`, `before`, `after`, `std` (M, k) and the
+    attributes `channels`, `unit`.
+
+    `where/RECORDING/` for every recording that was estimated on, where there was a gap to locate: `edges` (J + 1,) [s]
+    since its first node, of the intervals over which unknowns are constant; `mean` and `std` (J, nd) of the unknown
+    forces, offsets and biases about the nominal model and `prior` (nd,), the standard deviation at the largest
+    evidence, zero where a group was not taken in; the attributes `unknowns`, `locations`, `kinds`, `units` (nd,) each,
+    and `start`, the time of the first node [s].
+
+    `events/RECORDING/CHANNEL/` where a force acted as an event: `t` (M,) [s], `value` (M,) the force beside what model
+    and recording have, `allowed` (M,) what the model may be wrong by; the attribute `unit`.
+
+    Raises
+    ------
+    OutputError
+    """
+    with _file(path, DIAGNOSIS_TRAJECTORIES_FORMAT) as file:
+        for episode, before, after in predicted:
+            for k, samples in enumerate(episode.measurements):
+                both = {"before": before.predicted_outputs[k], "after": after.predicted_outputs[k]}
+                _store_sensor(file.require_group(episode.name), episode, samples, both)
+        for trace in () if finding.smoother_result is None else finding.smoother_result.smoothed_unknowns:
+            assert finding.smoother_result is not None
+            episodes = finding.nominal_model.problem.episodes
+            group = file.create_group(f"where/{trace.recording}")
+            group.attrs["start"] = next(e.grid.start_time for e in episodes if e.name == trace.recording)
+            group.attrs["unknowns"] = _texts(trace.unknown_names)
+            group.attrs["locations"] = _texts([source.location for source in trace.unknown_groups])
+            group.attrs["kinds"] = _texts([source.kind for source in trace.unknown_groups])
+            group.attrs["units"] = _texts(unknown_units(finding.nominal_model.problem.system, trace))
+            variance = np.array([finding.smoother_result.group_variance[source] for source in trace.unknown_groups])
+            arrays = {
+                "edges": trace.interval_edges,
+                "mean": trace.posterior_mean * trace.reference_std,
+                "std": trace.posterior_std * trace.reference_std,
+                "prior": np.sqrt(variance) * trace.reference_std,
+            }
+            _store(group, arrays)
+        for force in finding.events.force_series:
+            group = file.create_group(f"events/{force.recording}/{force.channel}")
+            group.attrs["unit"] = force.unit
+            _store(group, {"t": force.t, "value": force.force, "allowed": force.allowed_model_error})
+
+
+@contextlib.contextmanager
+def _file(path: Path, form: str) -> Iterator[h5py.File]:
+    with create_hdf5_atomically(path) as file:
+        file.attrs["format"] = form
+        yield file
+
+
+def _store_sensor(
+    parent: h5py.Group, episode: Episode, samples: Measurements, predicted: Mapping[str, NDArray[np.float64]]
+) -> None:
+    """What a sensor measured and what was predicted of it."""
+    group = parent.create_group(samples.sensor.group_name)
+    group.attrs["channels"] = _texts(samples.sensor.channel_names)
+    group.attrs["unit"] = samples.sensor.unit
+    times = episode.grid.start_time + episode.grid.time_step * (samples.node + samples.fraction)
+    _store(group, {"t": times, "measured": samples.value, **predicted, "std": samples.std})
+
+
+def _store(group: h5py.Group, arrays: Mapping[str, ArrayLike]) -> None:
+    for name, array in arrays.items():
+        group.create_dataset(name, data=array, compression="gzip", shuffle=True)
+
+
+def _texts(values: Sequence[str]) -> NDArray[np.object_]:
+    return np.array(values, dtype=h5py.string_dtype())
