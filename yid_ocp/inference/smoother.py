@@ -24,6 +24,7 @@ import scipy.optimize
 import threadpoolctl
 from numpy.typing import NDArray
 
+from yid_ocp.inference.kalman import KalmanStep, Transition, kalman_step
 from yid_ocp.inference.smoother_model import (
     DEFAULT_SMOOTHER_THRESHOLDS,
     LinearResidualModel,
@@ -153,20 +154,12 @@ class _Pass:
 
 @dataclass(frozen=True)
 class _Update:
-    """One interval of the filter, as its backward pass needs it.
+    """One interval of the filter, as its backward pass needs it: prediction `mean`, covariance `p` and innovations."""
 
-    Prediction `mean` (ns + nd, 1 + ntheta) and covariance `p` of states and unknowns, the lower `factor` of the
-    innovations' covariance, innovations `white` and design `shaped` divided by it, `half` = `shaped` `p`, and the
-    `move` to the next interval.
-    """
-
+    step: KalmanStep
     mean: Array
     p: Array
-    factor: Array
     white: Array
-    shaped: Array
-    half: Array
-    move: Array
 
 
 def _filter(model: LinearResidualModel, variance: Array, smooth: bool) -> _Pass:
@@ -199,23 +192,16 @@ def _forwards(model: LinearResidualModel, variance: Array, updates: list[_Update
     for interval in model.intervals:
         design = np.hstack([interval.state_jacobian, interval.unknown_jacobian[:, used]])
         products += interval.unreachable_products
-        cross = p @ design.T
-        innovation = interval.negative_residual_jacobian - design @ mean
-        factor, failed = scipy.linalg.lapack.dpotrf(design @ cross + np.eye(len(design)), lower=1)
-        if failed:
+        move = np.hstack([interval.state_transition, interval.unknown_input_matrix[:, used]])
+        step, later, own = kalman_step(p, design, Transition(move, np.full(nd, model.interval_correlation)))
+        if math.isinf(own):
             return products, math.inf, begin
-        white = scipy.linalg.solve_triangular(factor, innovation, lower=True, check_finite=False)
-        shaped = scipy.linalg.solve_triangular(factor, design, lower=True, check_finite=False)
+        white, after = step.update(mean, interval.negative_residual_jacobian)
         products += white.T @ white
-        log_determinant += 2 * float(np.sum(np.log(np.diag(factor))))
-        move = np.zeros((size, size))
-        move[:ns, :ns], move[:ns, ns:] = interval.state_transition, interval.unknown_input_matrix[:, used]
-        move[ns:, ns:] = model.interval_correlation * np.eye(nd)
-        half = shaped @ p
+        log_determinant += own
         if updates is not None:
-            updates.append(_Update(mean, p, factor, white, shaped, half, move))
-        mean = move @ (mean + half.T @ white)
-        p = move @ (p - half.T @ half) @ move.T + fresh
+            updates.append(_Update(step, mean, p, white))
+        mean, p = after, later + fresh
         p = (p + p.T) / 2
     return products, log_determinant, begin
 
@@ -237,13 +223,9 @@ def _backwards(
         done = updates[j]
         if j + 1 < count:
             score[j + 1], information[j + 1] = gain * r[ns:], gain**2 * np.diag(n)[ns:]
-        pull = done.white - done.half @ (done.move.T @ r)
-        left.append(scipy.linalg.solve_triangular(done.factor, pull, lower=True, trans="T", check_finite=False))
-        # L = T (I - P H' S^-1 H)
-        loop = done.move - (done.move @ done.half.T) @ done.shaped
-        r = done.shaped.T @ done.white + loop.T @ r
-        n = done.shaped.T @ done.shaped + loop.T @ n @ loop
-        n = (n + n.T) / 2
+        noise, r = done.step.backward(done.white, r)
+        left.append(noise)
+        n = done.step.backward_information(n)
         smoothed[j] = (done.mean + done.p @ r)[ns:]
         own = done.p[ns:]
         covariance[j] = np.diag(done.p)[ns:] - np.sum((own @ n) * own, axis=1)
@@ -395,12 +377,17 @@ def _responses(base: _Base, chosen: NDArray[np.int64]) -> Array:
         unknown[:, :k] *= model.interval_correlation
         unknown[:, k] = math.sqrt(1 - model.interval_correlation**2) if k else 1.0
         left = behind.reshape(len(kept), u * count)
-        rows = update.shaped[:, kept] @ left
-        rows += (update.shaped[:, ns + chosen][:, :, None] * unknown).reshape(rows.shape)
+        shaped, half, move = (
+            update.step.normalized_observation,
+            update.step.projected_covariance,
+            update.step.transition,
+        )
+        rows = shaped[:, kept] @ left
+        rows += (shaped[:, ns + chosen][:, :, None] * unknown).reshape(rows.shape)
         found.append(rows)
-        left = update.move[np.ix_(kept, kept)] @ (left - update.half[:, kept].T @ rows)
-        behind = left.reshape(behind.shape)
-        behind[:ns] += update.move[:ns, ns + chosen][:, :, None] * unknown
+        follow = Transition(move.state_rows[:, kept], move.decay[kept[ns:] - ns])
+        behind = follow.forward(left - half[:, kept].T @ rows).reshape(behind.shape)
+        behind[:ns] += move.state_rows[:, ns + chosen][:, :, None] * unknown
     return np.vstack(found)
 
 

@@ -35,9 +35,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-import scipy.linalg.lapack
 from numpy.typing import ArrayLike, NDArray
 
+from yid_ocp.inference.kalman import KalmanStep, Transition, kalman_step
 from yid_ocp.integrator.linearized_steps import LinearizedStep, active_state_mask, linearized_steps
 from yid_ocp.integrator.momentum_shift import torque_error_feedthrough
 from yid_ocp.integrator.step import Rollout, TrackingFeedback
@@ -65,60 +65,28 @@ _TORQUE_BIAS_TOLERANCE = 0.05
 
 @dataclass(frozen=True)
 class _FilterStep:
-    """One step of a frozen filter, by which rows and the prediction m of (d, w, b) are turned over.
+    """One step of a frozen filter of (d, w, b): rows of the residual, the filter, and the rows' slopes by a torque.
 
-    Attributes
-    ----------
-    rows : ndarray of int, shape (r,)
-    observe : ndarray, shape (r, na)
-        H
-    whiten : ndarray, shape (r, r)
-        S^(-1/2)
-    gain : ndarray, shape (na, r)
-        Of the prediction a step later.
-    ahead : ndarray, shape (r, nu)
-        Rows by a known correction of the torque over the step.
-    move : ndarray, shape (ns, na)
-        d after the step by (d, w, b): A_k, less B_k K_k where the tracking filter is part of the model, and B_k twice.
-    held : bool
-        Whether w stays what it is.
+    `by_torque` (r, nu) is by a known correction of the torque over the step.
     """
 
     rows: _RowIndices
-    observe: Array
-    whiten: Array
-    gain: Array
-    ahead: Array
-    move: Array
-    held: bool
+    kalman: KalmanStep
+    by_torque: Array
 
-    def over(self, mean: Array, own: Array, push: Array | None) -> tuple[Array, Array]:
-        """What the rows say beyond the prediction, and the prediction a step later.
-
-        Only what d becomes is as large as (d, w, b) squared, so that the whole is not kept as one matrix.
-        """
-        ns, kept, gap = len(self.move), self._kept, own - self.observe @ mean
-        if push is not None:
-            gap -= self.ahead @ push
-        later = self.gain @ gap
-        later[:ns] += self.move @ mean
-        later[kept:] += mean[kept:]
-        if push is not None:
-            later[:ns] += self.move[:, ns : ns + len(push)] @ push
-        return gap, later
-
-    def back(self, costate: Array) -> Array:
-        """The transposed map of (d, w, b) over the step, without what the rows tell."""
-        ns, kept = len(self.move), self._kept
-        earlier = self.move.T @ costate[:ns]
-        earlier[kept:] += costate[kept:]
-        return earlier
+    def update(self, mean: Array, own: Array, push: Array | None) -> tuple[Array, Array]:
+        """Innovations of the rows, and the prediction a step later."""
+        if push is None:
+            return self.kalman.update(mean, own)
+        white, later = self.kalman.update(mean, own - self.by_torque @ push)
+        move = self.kalman.transition.state_rows
+        later[: len(move)] += move[:, len(move) : len(move) + len(push)] @ push
+        return white, later
 
     @property
-    def _kept(self) -> int:
-        """Where in (d, w, b) that begins which stays what it is."""
-        ns, na = self.move.shape
-        return ns if self.held else (ns + na) // 2
+    def holds_noise(self) -> bool:
+        """Whether w stays what it is."""
+        return bool(self.kalman.transition.decay[0])
 
 
 @dataclass(frozen=True)
@@ -182,8 +150,7 @@ class WhiteningFilter:
         """
         result, mean = np.empty_like(rows), self._expected(rows.shape[1])
         for k, step in enumerate(self.filter_steps):
-            gap, mean = self._over(k, mean, rows[step.rows], push)
-            result[step.rows] = step.whiten @ gap
+            result[step.rows], mean = self._updated(k, mean, rows[step.rows], push)
         bias = mean[-len(self.input_errors.torque_bias) :]
         bias[:, 0] += self.input_errors.torque_bias
         return result, bias
@@ -204,25 +171,23 @@ class WhiteningFilter:
         column, noise = rows[:, None], np.zeros((len(rows), 1))
         mean = self._expected(1)
         for k, step in enumerate(self.filter_steps):
-            gap, mean = self._over(k, mean, column[step.rows], push)
-            noise[step.rows] = step.whiten.T @ (step.whiten @ gap)
+            noise[step.rows], mean = self._updated(k, mean, column[step.rows], push)
         offset = mean[-nu:, 0] + errors.torque_bias
         white, costate = np.zeros_like(errors.torque_noise), np.zeros_like(mean)
         for k in range(last, -1, -1):
             step = self.filter_steps[k]
-            if not step.held:
+            if not step.holds_noise:
                 white[k + 1] = errors.torque_std**2 * costate[torque, 0]
-            noise[step.rows] -= step.gain.T @ costate
-            costate = step.back(costate) + step.observe.T @ noise[step.rows]
+            noise[step.rows], costate = step.kalman.backward(noise[step.rows], costate)
         mean = self._expected(1) + self.initial_covariance @ costate
         white[0] = errors.torque_noise[0] + mean[torque, 0]
         error = np.zeros((last + 1, len(self.state_mask)))
         for k, step in enumerate(self.filter_steps):
             error[k, self.state_mask] = mean[:ns, 0]
             # without the sensors' noise there is no innovation; what rounding makes of one keeps the error bounded
-            _, mean = self._over(k, mean, column[step.rows] - noise[step.rows], push)
+            _, mean = self._updated(k, mean, column[step.rows] - noise[step.rows], push)
             if k + 1 < last:
-                white[k + 1] = white[k] if step.held else white[k + 1]
+                white[k + 1] = white[k] if step.holds_noise else white[k + 1]
                 mean[torque, 0] = white[k + 1] - errors.torque_noise[k + 1]
         return _SmoothedInputErrors(offset, white, error)
 
@@ -234,13 +199,14 @@ class WhiteningFilter:
         )
         return mean
 
-    def _over(self, k: int, mean: Array, own: Array, push: Array | None) -> tuple[Array, Array]:
-        """Step k, and the mean of another w after it."""
-        gap, later = self.filter_steps[k].over(mean, own, None if push is None or k >= len(push) else push[k])
-        if not self.filter_steps[k].held:
+    def _updated(self, k: int, mean: Array, own: Array, push: Array | None) -> tuple[Array, Array]:
+        """Innovations of step k, and the mean of another w after it."""
+        step = self.filter_steps[k]
+        white, later = step.update(mean, own, None if push is None or k >= len(push) else push[k])
+        if not step.holds_noise:
             nu = len(self.input_errors.torque_bias)
             later[len(later) - 2 * nu : len(later) - nu, 0] -= self.input_errors.torque_noise[k + 1]
-        return gap, later
+        return white, later
 
 
 @dataclass(frozen=True)
@@ -302,25 +268,16 @@ def build_whitening_filter(course: NominalTrajectory, errors: InputErrors) -> Wh
         fresh = k + 1 < count and errors.sample_of_step[k + 1] != errors.sample_of_step[k]
         here = next(steps, None)
         turn = (
-            _last_turn(len(kept), nu)
+            _Turn(_transition(np.eye(len(kept), len(kept) + 2 * nu), nu, fresh), None, None)
             if here is None
             else _turn(here, kept, course.tracking_feedback, momentum, errors, k, fresh)
         )
-        rows, observe, ahead = readings.at(k, turn)
-        cross = observe @ covariance
-        try:
-            factor = np.linalg.cholesky(cross @ observe.T + np.eye(len(rows)))
-        except np.linalg.LinAlgError:
-            # rounding beside covariances that differ by many decades
-            factor = np.diag(np.sqrt(1.0 + np.maximum(np.sum(cross * observe, axis=1), 0.0)))
-        whiten = scipy.linalg.lapack.dtrtri(factor, lower=1)[0] if len(rows) else factor
-        known = whiten @ cross
-        gain = turn.over(known.T @ whiten)
-        made.append(_FilterStep(rows, observe, whiten, gain, ahead, turn.move, not turn.fresh))
-        covariance = turn.over(turn.over(covariance - known.T @ known).T)
+        rows, observe, ahead = readings.at(k, turn, nu)
+        kalman, covariance, _ = kalman_step(covariance, observe, turn.transition)
+        made.append(_FilterStep(rows, kalman, ahead))
         if turn.shaken is not None:
             covariance[: len(kept), : len(kept)] += turn.shaken @ turn.shaken.T
-        if turn.fresh:
+        if fresh:
             torque = np.arange(len(kept), len(kept) + nu)
             covariance[torque, torque] += errors.torque_std**2
         covariance = 0.5 * (covariance + covariance.T)
@@ -332,34 +289,18 @@ def build_whitening_filter(course: NominalTrajectory, errors: InputErrors) -> Wh
 class _Turn:
     """How (d, w, b) comes through one step.
 
-    Attributes
-    ----------
-    move : ndarray, shape (ns, na)
-        d after it.
-    fresh : bool
-        Whether w is another one after it.
-    shaken : ndarray, shape (ns, s), or None
-        By unit noises of its own that come to d.
-    effort : ndarray, shape (nc, na), or None
-        Of prescribed coordinates at the node before; None after the last step, and where there are none.
+    `shaken` (ns, s) is by unit noises of its own that come to d; `effort` (nc, na) is that of prescribed coordinates at
+    the node before, None after the last step and where there are none.
     """
 
-    move: Array
-    fresh: bool
+    transition: Transition
     shaken: Array | None
     effort: Array | None
 
-    def over(self, columns: Array) -> Array:
-        """Columns (na, c) after the step."""
-        (ns, na), later = self.move.shape, columns.copy()
-        later[:ns] = self.move @ columns
-        if self.fresh:
-            later[ns : (ns + na) // 2] = 0.0
-        return later
 
-
-def _last_turn(ns: int, nu: int) -> _Turn:
-    return _Turn(np.eye(ns, ns + 2 * nu), False, None, None)
+def _transition(move: Array, nu: int, fresh: bool) -> Transition:
+    """d after the step by (d, w, b), with another w where it is `fresh`, and the same b."""
+    return Transition(move, np.repeat([0.0 if fresh else 1.0, 1.0], nu))
 
 
 def _turn(
@@ -387,7 +328,8 @@ def _turn(
     effort = None
     if len(effort_by_state):
         effort = np.hstack([effort_by_state[:, kept], effort_by_error, effort_by_error])
-    return _Turn(np.hstack([by_state[np.ix_(kept, kept)], by_error, by_error]), fresh, shaken, effort)
+    move = np.hstack([by_state[np.ix_(kept, kept)], by_error, by_error])
+    return _Turn(_transition(move, by_error.shape[1], fresh), shaken, effort)
 
 
 @dataclass(frozen=True)
@@ -451,14 +393,12 @@ class _Readings:
         """States that a residual depends on, shape (nx,)."""
         return np.any(self.before != 0, axis=0) | np.any(self.after != 0, axis=0)
 
-    def at(self, k: int, turn: _Turn) -> tuple[_RowIndices, Array, Array]:
+    def at(self, k: int, turn: _Turn, nu: int) -> tuple[_RowIndices, Array, Array]:
         """Rows of node k, their slopes by (d, w, b), and by a known correction of the torque over the step."""
-        rows = self.order[self.first[k] : self.first[k + 1]]
-        before, after = self.before[rows], self.after[rows]
-        observe = after @ turn.move
-        ns, na = turn.move.shape
-        ahead = observe[:, ns : (ns + na) // 2].copy()
-        observe[:, :ns] += before
+        rows, move = self.order[self.first[k] : self.first[k + 1]], turn.transition.state_rows
+        observe = self.after[rows] @ move
+        ahead = observe[:, len(move) : len(move) + nu].copy()
+        observe[:, : len(move)] += self.before[rows]
         if turn.effort is not None:
             observe += self.effort[rows] @ turn.effort
         return rows, observe, ahead

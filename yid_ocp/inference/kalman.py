@@ -1,0 +1,123 @@
+"""Linear Kalman filter and fixed-interval smoother along frozen steps: whitening and weak constraints both use it.
+
+A state x = (s, p) of s and parameters p is measured by y = H x + e with noise e of unit covariance, and goes on by
+x' = (M x, f p) + process noise. With the covariance P before the measurement and S = I + H P H', the normalized
+innovations S^(-1/2) (y - H mean) of all steps are independent, of unit variance.
+
+References
+----------
+Anderson and Moore (1979), Optimal Filtering, chapters 3 and 5. Bryson and Frazier (1963), Smoothing for linear and
+nonlinear dynamic systems, Aeronautical Systems Division report TDR-63-119. de Jong (1989), doi:10.2307/2290075.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg.lapack
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Transition:
+    """Transition x' = (M x, f p) of the state x = (s, p); only what s becomes needs a matrix.
+
+    Attributes
+    ----------
+    state_rows : ndarray, shape (ns, nx)
+        M
+    decay : ndarray, shape (nx - ns,)
+        f, a factor for each parameter.
+    """
+
+    state_rows: Array
+    decay: Array
+
+    def forward(self, columns: Array) -> Array:
+        """Columns (nx, c) after the step."""
+        return np.vstack([self.state_rows @ columns, self.decay[:, None] * columns[len(self.state_rows) :]])
+
+    def adjoint(self, costate: Array) -> Array:
+        """Columns (nx, c) of the transposed map."""
+        ns = len(self.state_rows)
+        earlier = self.state_rows.T @ costate[:ns]
+        earlier[ns:] += self.decay[:, None] * costate[ns:]
+        return earlier
+
+
+@dataclass(frozen=True)
+class KalmanStep:
+    """Frozen measurement update and transition of one step.
+
+    Attributes
+    ----------
+    observation : ndarray, shape (r, nx)
+        H
+    whitening : ndarray, shape (r, r)
+        S^(-1/2)
+    projected_covariance : ndarray, shape (r, nx)
+        S^(-1/2) H P
+    transition : Transition
+    """
+
+    observation: Array
+    whitening: Array
+    projected_covariance: Array
+    transition: Transition
+
+    @property
+    def normalized_observation(self) -> Array:
+        """S^(-1/2) H, shape (r, nx)."""
+        return self.whitening @ self.observation
+
+    def update(self, mean: Array, measured: Array) -> tuple[Array, Array]:
+        """Normalized innovations (r, c) of measured columns (r, c), and the mean (nx, c) after the step."""
+        white = self.whitening @ (measured - self.observation @ mean)
+        return white, self.transition.forward(mean + self.projected_covariance.T @ white)
+
+    def backward(self, white: Array, costate: Array) -> tuple[Array, Array]:
+        """Smoothed measurement noise (r, c), and the costate (nx, c) before the step from that after it.
+
+        The smoothed state is the filter's prediction + P costate.
+        """
+        pulled = self.transition.adjoint(costate)
+        noise = self.whitening.T @ (white - self.projected_covariance @ pulled)
+        return noise, pulled + self.observation.T @ noise
+
+    def backward_information(self, information: Array) -> Array:
+        """Covariance of the costate before the step, shape (nx, nx), from that after it."""
+        shaped, projected = self.normalized_observation, self.projected_covariance
+        pulled = self.transition.adjoint(self.transition.adjoint(information).T)
+        pulled -= (pulled @ projected.T) @ shaped
+        found = shaped.T @ shaped + pulled - shaped.T @ (projected @ pulled)
+        return (found + found.T) / 2
+
+
+def kalman_step(covariance: Array, observation: Array, transition: Transition) -> tuple[KalmanStep, Array, float]:
+    """Freeze one step of the filter, with the covariance after it (without process noise) and log det S.
+
+    The determinant is infinite, and S counts by its diagonal alone, where covariances differ by so many decades that
+    rounding shows.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (nx, nx)
+        P, before the measurement.
+    observation : ndarray, shape (r, nx)
+    transition : Transition
+    """
+    cross = observation @ covariance
+    whitening, log_determinant = np.zeros((0, 0)), 0.0
+    if len(observation):
+        factor, failed = scipy.linalg.lapack.dpotrf(cross @ observation.T + np.eye(len(observation)), lower=1)
+        if failed:
+            factor = np.diag(np.sqrt(1.0 + np.maximum(np.sum(cross * observation, axis=1), 0.0)))
+        whitening = scipy.linalg.lapack.dtrtri(factor, lower=1)[0]
+        log_determinant = math.inf if failed else 2 * float(np.sum(np.log(np.diag(factor))))
+    projected = whitening @ cross
+    later = transition.forward(transition.forward(covariance - projected.T @ projected).T)
+    return KalmanStep(observation, whitening, projected, transition), later, log_determinant
