@@ -13,9 +13,13 @@ from test_smoother import random_model
 from yid_ocp.diagnosis.localise import localise_gap
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.inference import smoother
-from yid_ocp.inference.segment_forces import _FORCE_POINT, generalized_forces_per_newton, segment_weights
 from yid_ocp.inference.smoother import _instead, _run
-from yid_ocp.inference.smoother_model import UnknownGroup
+from yid_ocp.inference.smoother_unknowns import (
+    _FORCE_POINT,
+    UnknownGroup,
+    generalized_forces_per_newton,
+    segment_weights,
+)
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.virtual.experiment import baxter_foam_y_system
 

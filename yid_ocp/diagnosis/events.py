@@ -27,7 +27,8 @@ from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects.base import robot_joints
 from yid_ocp.inference.null_test import benjamini_hochberg_mask, sample_times
 from yid_ocp.inference.smoother import SmootherResult, force_likelihood_terms
-from yid_ocp.inference.smoother_model import LinearResidualModel, linear_residual_models, sensor_bias_location
+from yid_ocp.inference.smoother_model import LinearResidualModel, linear_residual_models
+from yid_ocp.inference.smoother_unknowns import sensor_bias_location
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.constant_sensor_errors import subtract_estimated_biases
 from yid_ocp.problem.episodes import Episode

@@ -13,30 +13,29 @@ what follows is linear in the number of intervals.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated, Literal
+from typing import Literal
 
-import casadi as ca
 import numpy as np
 import scipy.linalg
 import scipy.sparse
-from annotated_types import Ge, Gt, Le
 from numpy.typing import NDArray
 
-from yid_ocp.effects.base import grasp_names, robot_joints
-from yid_ocp.inference.segment_forces import generalized_forces_per_newton, segment_weights
+from yid_ocp.inference.residual_slopes import ResidualSlopes, nominal_trajectory
+from yid_ocp.inference.smoother_unknowns import (
+    DEFAULT_SMOOTHER_THRESHOLDS,
+    LinearizedEpisode,
+    SmootherThresholds,
+    SmootherUnknowns,
+    UnknownGroup,
+    generalized_forces_per_newton,
+    smoother_unknowns,
+)
 from yid_ocp.integrator.linearized_steps import AdditionalLoads, active_state_mask, linearized_steps
-from yid_ocp.integrator.rollout import applied_joint_torque
-from yid_ocp.integrator.step_model import Rollout
-from yid_ocp.model.system import System
-from yid_ocp.options import OptionInfo
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import Episode, mass_matrix_diagonal
+from yid_ocp.problem.episodes import mass_matrix_diagonal
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.prediction_result import EpisodePrediction
-from yid_ocp.sensors import Sensor
 
 Array = NDArray[np.float64]
 _UnknownKind = Literal["force", "push", "offset", "bias"]
@@ -47,62 +46,6 @@ _MIN_INTERVAL = 0.1
 """Shortest time over which unknowns are constant [s]."""
 _MAX_INTERVAL_COUNT = 150
 """Number of intervals of a long recording, beyond which they become longer."""
-
-
-@dataclass(frozen=True)
-class SmootherThresholds:
-    """How large unknowns may be, and what counts as evidence for a group of them.
-
-    Attributes
-    ----------
-    min_log_bayes_factor : float
-        Smallest log Bayes factor for adding a group of unknowns; 5 means odds of 150 to 1.
-    max_unknown_groups : int
-        Maximum number of groups of unknowns.
-    detectable_chi2 : float
-        Rise of r'r at which unknowns of the reference size below are detectable.
-    force_prior_std : float
-        Prior standard deviation of an unknown force, relative to the load at its location.
-    grasp_offset_prior_std : float
-        Prior standard deviation of a grasp's unknown offset [m].
-    bias_prior_std : float
-        Prior standard deviation of a sensor's unknown bias, relative to its noise.
-    location_tie : float
-        Fraction of a location's log evidence that another must reach to be indistinguishable from it.
-    """
-
-    min_log_bayes_factor: Annotated[
-        float, Gt(0), OptionInfo("rise of the log evidence that a group of unknowns must bring")
-    ] = 5.0
-    max_unknown_groups: Annotated[int, Ge(1), OptionInfo("groups of unknowns taken in at most")] = 4
-    detectable_chi2: Annotated[float, Gt(0), OptionInfo("rise of r'r by which unknowns would be noticed")] = 10.0
-    force_prior_std: Annotated[float, Gt(0), OptionInfo("unknown force over the load that its place carries")] = 0.1
-    grasp_offset_prior_std: Annotated[float, Gt(0), OptionInfo("unknown offset of a grasp", "m")] = 2e-3
-    bias_prior_std: Annotated[float, Gt(0), OptionInfo("unknown bias over the noise of its sensor")] = 3.0
-    location_tie: Annotated[
-        float, Gt(0), Le(1), OptionInfo("part of a place's evidence at which another is named beside it")
-    ] = 0.9
-
-
-DEFAULT_SMOOTHER_THRESHOLDS = SmootherThresholds()
-"""Default thresholds of the smoother."""
-
-
-@dataclass(frozen=True)
-class UnknownGroup:
-    """Group of unknowns that share a location and a standard deviation.
-
-    Attributes
-    ----------
-    location : str
-    kind : "force", "push", "offset" or "bias"
-    is_confounded_with_bias : bool
-        Whether a bias of an effort sensor would be the same: a force at a prescribed joint whose effort is measured.
-    """
-
-    location: str
-    kind: _UnknownKind
-    is_confounded_with_bias: bool = False
 
 
 @dataclass(frozen=True)
@@ -196,10 +139,15 @@ def linear_residual_models(
     columns = -np.column_stack([evaluation.residual, evaluation.jacobian * problem.unknown_scales])
     found = []
     for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episode_predictions, strict=True)):
-        theta = problem.predictor.episode_theta(episode, problem.split(x, i)[0])
         groups = problem.residual_rows.measurements[i]
         observed = columns[groups[0].start : groups[-1].stop]
-        found.append(_recording(_Course(problem, episode, theta, result), observed, limits, interval))
+        nominal = nominal_trajectory(problem.predictor, episode, result, problem.split(x, i)[0])
+        factor = [
+            samples.residual_block(predicted, threshold=problem.options.huber_threshold).robust_factor
+            for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True)
+        ]
+        course = LinearizedEpisode(problem, episode, nominal)
+        found.append(_recording(course, np.concatenate(factor), observed, limits, interval))
     prior = columns[problem.residual_rows.stated_priors]
     # stated priors of the free parameters are observations that no unknown reaches
     first, *later = found[0].intervals
@@ -207,170 +155,10 @@ def linear_residual_models(
     return (replace(found[0], intervals=(first, *later)), *found[1:])
 
 
-@dataclass(frozen=True)
-class _Course:
-    """The rollout of one recording about which the model is linear.
-
-    Attributes
-    ----------
-    problem : EstimationProblem
-    episode : Episode
-    theta : ndarray, shape (ntheta,)
-    result : EpisodeResult
-    """
-
-    problem: EstimationProblem
-    episode: Episode
-    theta: Array
-    result: EpisodePrediction
-
-    @property
-    def system(self) -> System:
-        return self.problem.system
-
-    @property
-    def rollout(self) -> Rollout:
-        return self.result.rollout
-
-    @property
-    def fixed(self) -> NDArray[np.int64]:
-        """Prescribed coordinates."""
-        return np.array(self.system.prescribed_indices, int)
-
-    @property
-    def free(self) -> NDArray[np.int64]:
-        """All others."""
-        return np.array(self.system.free_indices, int)
-
-
-# -- the unknowns -----------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Unknowns:
-    """What gets an unknown, and how large it may be.
-
-    Attributes
-    ----------
-    names : tuple of str, length nd
-        Coordinate, grasp, segment or channel, and axis: first forces, then offsets, pushes and biases.
-    sources : tuple of Source, length nd
-    reference : ndarray, shape (nd,)
-    forced : ndarray of int
-        Coordinates with an unknown force.
-    grasped : ndarray of int
-        Constraint rows with an unknown offset.
-    pushed : tuple of str
-        Segments with an unknown push.
-    biased : tuple of (int, int)
-        Group of samples and column with an unknown bias.
-    """
-
-    names: tuple[str, ...]
-    sources: tuple[UnknownGroup, ...]
-    reference: Array
-    forced: NDArray[np.int64]
-    grasped: NDArray[np.int64]
-    pushed: tuple[str, ...]
-    biased: tuple[tuple[int, int], ...]
-
-    @property
-    def loading(self) -> int:
-        """How many of them add the same to every step."""
-        return len(self.forced) + len(self.grasped)
-
-    @property
-    def driving(self) -> int:
-        """How many of them move the state."""
-        return self.loading + 3 * len(self.pushed)
-
-
-def _unknowns(course: _Course, limits: SmootherThresholds) -> _Unknowns:
-    names, sources, reference, forced = _unknown_forces(course, limits.force_prior_std)
-    grasped, row = [], 0
-    for grasp, name in zip(course.system.grasps, grasp_names(course.system), strict=True):
-        grasped += [row, row + 1, row + 2]
-        names += [f"{name}.{axis}" for axis in "xyz"]
-        sources += [UnknownGroup(name, "offset")] * 3
-        reference += [limits.grasp_offset_prior_std] * 3
-        row += grasp.n_equations
-    pushed = []
-    for segment, weight in segment_weights(course.system, course.theta).items():
-        pushed.append(segment)
-        names += [f"{segment}.push_{axis}" for axis in "xyz"]
-        sources += [UnknownGroup(segment, "push")] * 3
-        reference += [limits.force_prior_std * weight] * 3
-    biased = []
-    for k, samples in enumerate(course.episode.measurements):
-        sensor = samples.sensor
-        if sensor.effort_joints:
-            continue  # at a prescribed joint a bias and a force are the same
-        for column, channel in enumerate(samples.channel_of_column):
-            if not np.any(samples.is_used[:, column]):
-                continue
-            axis = f".{'xyz'[column % 3]}" if sensor.outputs_per_channel == 3 else ""
-            frame = sensor.frame_names[column // sensor.outputs_per_channel] if sensor.frame_names else ""
-            biased.append((k, column))
-            names.append(f"{channel}{axis}")
-            sources.append(UnknownGroup(sensor_bias_location(course.system, sensor, frame), "bias"))
-            reference.append(limits.bias_prior_std * float(np.nanmedian(samples.std[:, column])))
-    held = np.array(grasped, int)
-    return _Unknowns(tuple(names), tuple(sources), np.array(reference), forced, held, tuple(pushed), tuple(biased))
-
-
-def _unknown_forces(
-    course: _Course, part: float
-) -> tuple[list[str], list[UnknownGroup], list[float], NDArray[np.int64]]:
-    """Names, sources, reference sizes and coordinates of the unknown forces."""
-    system, joint_names = course.system, course.system.mechanism.joint_names
-    place = {joint: s.name for s in system.segment_layouts for link in s.link_joints for joint in link}
-    place |= {joint: joint for joint in robot_joints(system)}
-    measured = {joint for samples in course.episode.measurements for joint in samples.sensor.effort_joints}
-    silent = {joint_names[i] for i in course.fixed} - measured
-    names = [n for n in joint_names if n in place and n not in silent and n not in system.joint_compliances]
-    forced = np.array([joint_names.index(name) for name in names], int)
-    load = _loads(course)
-    of_place: dict[str, list[float]] = {}
-    for name, index in zip(names, forced, strict=True):
-        of_place.setdefault(place[name], []).append(load[index])
-    largest = max((max(v) for v in of_place.values()), default=1.0)
-    size = {p: part * max(float(np.sqrt(np.mean(np.square(v)))), 1e-2 * largest) for p, v in of_place.items()}
-    sources = [UnknownGroup(place[name], "force", name in measured) for name in names]
-    return names, sources, [size[place[name]] for name in names], forced
-
-
-def sensor_bias_location(system: System, sensor: Sensor, frame: str) -> str:
-    """Return the location of a sensor's bias: the camera, the arm that holds the frame, else the sensor's group."""
-    if sensor.camera_pose is not None:
-        return "camera"
-    for grasp in system.grasps:
-        if frame in (grasp.held_frame, grasp.holder_frame):
-            return grasp.name
-    return sensor.group_name
-
-
-def _loads(course: _Course) -> Array:
-    """Typical load of every coordinate: of its spring, its motor or its prescription, shape (n,) [N m or N]."""
-    system, rollout = course.system, course.rollout
-    load = np.zeros(system.n_coordinates)
-    q = rollout.state[:, : system.n_coordinates]
-    springs = [(system.mechanism.joint_index(s.joint_name), s) for s in system.elastic_joints]
-    if springs:
-        symbols = ca.vertcat(*(ca.vertcat(s.stiffness, s.rest_angle) for _, s in springs))
-        values = np.array(ca.Function("springs", [system.parameters.symbols], [symbols])(course.theta)).ravel()
-        for (index, _), stiffness, rest in zip(springs, values[::2], values[1::2], strict=True):
-            load[index] = stiffness * float(np.sqrt(np.mean((q[:, index] - rest) ** 2)))
-    torque = applied_joint_torque(course.problem.step, course.theta, rollout)
-    for indices, force in ((system.driven_indices, torque), (system.prescribed_indices, rollout.effort)):
-        if len(indices):
-            load[list(indices)] = np.sqrt(np.mean(force**2, axis=0))
-    return load
-
-
 # -- the slopes of single steps ---------------------------------------------------------------------------------------
 
 
-def _loads_of(course: _Course, unknowns: _Unknowns) -> AdditionalLoads:
+def _loads_of(course: LinearizedEpisode, unknowns: SmootherUnknowns) -> AdditionalLoads:
     """What unknown forces and grasp offsets of their reference size add to every step."""
     step = course.problem.step
     n, nz, m = (step.sizes[key] for key in ("n", "nz", "m"))
@@ -386,7 +174,7 @@ def _loads_of(course: _Course, unknowns: _Unknowns) -> AdditionalLoads:
 
 
 def _steps(
-    course: _Course, loads: AdditionalLoads, pushes: Array, moving: NDArray[np.int64], first: int, last: int
+    course: LinearizedEpisode, loads: AdditionalLoads, pushes: Array, moving: NDArray[np.int64], first: int, last: int
 ) -> tuple[Array, Array, Array]:
     """A_k (steps, ns, ns), E_k (steps, ns, nd') and the effort's slopes (steps, nc, ns + nd') of some steps.
 
@@ -399,7 +187,9 @@ def _steps(
         if feedback is None
         else np.vstack([0 * loads.next_momentum, loads.next_momentum])[feedback.state_indices]
     )
-    found = linearized_steps(course.problem.step, course.theta, course.rollout, loads, slice(first, last))
+    found = linearized_steps(
+        course.problem.step, course.nominal.theta, course.nominal.rollout, loads, slice(first, last)
+    )
     for k, one in enumerate(found, first):
         by_state, effort_by_state = one.state_by_state, one.effort_by_state
         by_load, effort_by_load = one.state_by_load, one.effort_by_load
@@ -425,30 +215,42 @@ def _steps(
 # -- from steps to intervals ------------------------------------------------------------------------------------------
 
 
-def _recording(course: _Course, observed: Array, limits: SmootherThresholds, shortest: float) -> LinearResidualModel:
+def _recording(
+    course: LinearizedEpisode, factor: Array, observed: Array, limits: SmootherThresholds, shortest: float
+) -> LinearResidualModel:
     """The linear model of one recording from its whitened residuals and their slopes."""
     h, steps = course.problem.step.time_step, course.episode.grid.steps
     length = int(max(round(shortest / h), math.ceil(steps * _MIN_INTERVAL / (_MAX_INTERVAL_COUNT * shortest)), 1))
     edges = np.unique(np.append(np.arange(0, steps, length), steps))
-    unknowns = _unknowns(course, limits)
+    unknowns = smoother_unknowns(course, limits)
     loads, forces = _loads_of(course, unknowns), len(unknowns.forced)
-    nodes = course.rollout.state[:, : course.system.n_coordinates]
-    pushes = generalized_forces_per_newton(course.system, course.theta, nodes, unknowns.pushed)[:, unknowns.forced]
+    nodes = course.nominal.rollout.state[:, : course.system.n_coordinates]
+    pushes = generalized_forces_per_newton(course.system, course.nominal.theta, nodes, unknowns.pushed)[
+        :, unknowns.forced
+    ]
     pushes *= unknowns.reference[unknowns.loading : unknowns.driving] / unknowns.reference[:forces, None]
-    linear = partial(linearized_steps, course.problem.step, course.theta, course.rollout, loads)
+    linear = partial(linearized_steps, course.problem.step, course.nominal.theta, course.nominal.rollout, loads)
     ends = [*linear(slice(0, 1)), *linear(slice(steps - 1, steps))]
     moving = np.flatnonzero(active_state_mask(course.problem.step, ends))
-    reading = _reading(course, moving, edges)
+    slopes = ResidualSlopes.along(course.nominal).by_some_states(moving)
+    by_bias = _bias_slopes(course, unknowns)
+    interval_of_row = np.clip(np.searchsorted(edges, slopes.node, side="right") - 1, 0, len(edges) - 2)
     rests = course.problem.options.initial_state != "fitted_to_points"
     ns, driving = len(moving), unknowns.driving
     at_rest = np.zeros((ns, len(unknowns.names)))
     intervals = []
     for j in range(len(edges) - 1):
-        slopes = _steps(course, loads, pushes, moving, int(edges[j]), int(edges[j + 1]))
+        made = _steps(course, loads, pushes, moving, int(edges[j]), int(edges[j + 1]))
         if j == 0 and rests:
             # rest under constant unknowns, x = A x + E d; what has no stiffness does not come to rest
-            at_rest[:, :driving] = np.linalg.lstsq(np.eye(ns) - slopes[0][0], slopes[1][0], rcond=1e-6)[0]
-        intervals.append(_interval(slopes, unknowns, reading, j, observed))
+            at_rest[:, :driving] = np.linalg.lstsq(np.eye(ns) - made[0][0], made[1][0], rcond=1e-6)[0]
+        rows = np.flatnonzero(interval_of_row == j)
+        own = factor[rows, None] * by_bias[rows]
+        state, drive, moved = _interval_response(made, slopes.some_rows(rows), int(edges[j]))
+        moved *= factor[rows, None]
+        by_unknown = np.hstack([moved[:, ns:], own])
+        drive = np.pad(drive, ((0, 0), (0, own.shape[1])))
+        intervals.append(_compressed(observed[rows], moved[:, :ns], by_unknown, state, drive))
     span = h * float(np.median(np.diff(edges)))
     decay = math.exp(-span / _CORRELATION_TIME)
     return LinearResidualModel(
@@ -465,7 +267,7 @@ def _recording(course: _Course, observed: Array, limits: SmootherThresholds, sho
     )
 
 
-def _torque_noise(course: _Course, unknowns: _Unknowns, span: float, decay: float) -> Array:
+def _torque_noise(course: LinearizedEpisode, unknowns: SmootherUnknowns, span: float, decay: float) -> Array:
     """Variance of unknown forces that stand for the noise of recorded torques, in units of the squared reference.
 
     White noise counts by its spectral density at low frequencies, which an unknown force of memory `decay` from
@@ -484,38 +286,50 @@ def _torque_noise(course: _Course, unknowns: _Unknowns, span: float, decay: floa
     return known
 
 
-def _loose_start(course: _Course) -> Array:
+def _loose_start(course: LinearizedEpisode) -> Array:
     """Standard deviation of a start that was fitted to points, shape (nx,)."""
     problem, free = course.problem, course.free
     options, joints = problem.options, course.system.mechanism.joint_names
-    inertia = mass_matrix_diagonal(problem.step, course.theta, tuple(joints[i] for i in free))
+    inertia = mass_matrix_diagonal(problem.step, course.nominal.theta, tuple(joints[i] for i in free))
     loose = np.zeros(problem.step.sizes["nx"])
     loose[free] = options.start_configuration_std
     loose[course.system.n_coordinates + free] = options.start_velocity_std * np.abs(inertia)
     return loose
 
 
-def _interval(
-    slopes: tuple[Array, Array, Array], unknowns: _Unknowns, reading: _Reading, j: int, observed: Array
-) -> IntervalModel:
-    """Interval `j` from the slopes of its steps (A_k, E_k, effort's), states inside it eliminated."""
-    a, e, by_effort = slopes
-    steps, ns, driving, count = len(a), a.shape[1], unknowns.driving, len(unknowns.names)
-    node = np.zeros((steps + 1, ns, ns + driving))
+def _interval_response(
+    steps: tuple[Array, Array, Array], slopes: ResidualSlopes, first: int
+) -> tuple[Array, Array, Array]:
+    """The state at an interval's end by that at its beginning, by unknowns, and its rows by both.
+
+    From (A_k, E_k, effort's slopes) of its steps; states inside it are eliminated.
+    """
+    a, e, by_effort = steps
+    count, ns, driving = len(a), a.shape[1], e.shape[2]
+    node = np.zeros((count + 1, ns, ns + driving))
     node[0, :, :ns] = np.eye(ns)
-    effort = np.zeros((steps + 1, by_effort.shape[1], ns + driving))
-    for k in range(steps):
+    effort = np.zeros((count + 1, by_effort.shape[1], ns + driving))
+    for k in range(count):
         node[k + 1] = a[k] @ node[k]
         node[k + 1][:, ns:] += e[k]
         effort[k] = by_effort[k][:, :ns] @ node[k]
         effort[k][:, ns:] += by_effort[k][:, ns:]
     effort[-1] = effort[-2]
-    rows, moved = reading.rows(j, node, effort)
-    by_unknown, drive = np.zeros((len(rows), count)), np.zeros((ns, count))
-    by_unknown[:, :driving] = moved[:, ns:]
-    by_unknown[:, driving:] = reading.bias(rows, unknowns.biased, unknowns.reference[driving:])
-    drive[:, :driving] = node[-1][:, ns:]
-    return _compressed(observed[rows], moved[:, :ns], by_unknown, node[-1][:, :ns], drive)
+    return node[-1][:, :ns], node[-1][:, ns:], slopes.response(node, effort, first)
+
+
+def _bias_slopes(course: LinearizedEpisode, unknowns: SmootherUnknowns) -> Array:
+    """Slopes of all rows by the biases, in units of their reference, shape (r, nb)."""
+    reference, found = unknowns.reference[unknowns.driving :], []
+    for k, samples in enumerate(course.episode.measurements):
+        sample, column = np.nonzero(samples.is_used)
+        size = [
+            r * (column == c) if group == k else np.zeros(len(column))
+            for r, (group, c) in zip(reference, unknowns.biased, strict=True)
+        ]
+        own = np.array(size).reshape(len(size), len(column)).T
+        found.append(samples.decorrelate(samples.weight[sample, column][:, None] * own))
+    return np.concatenate(found)
 
 
 def _compressed(observed: Array, by_state: Array, by_unknown: Array, transition: Array, drive: Array) -> IntervalModel:
@@ -529,119 +343,3 @@ def _compressed(observed: Array, by_state: Array, by_unknown: Array, transition:
         observed, joined = turned, r
     ns = by_state.shape[1]
     return IntervalModel(observed, joined[:, :ns], joined[:, ns:], transition, drive, rest, count)
-
-
-@dataclass(frozen=True)
-class _Reading:
-    """Slopes of the whitened samples of one recording by the states of the nodes about them.
-
-    Attributes
-    ----------
-    edges : ndarray of int, shape (J + 1,)
-        First nodes of the intervals and the last node.
-    interval, group, column, node : ndarray of int, shape (nr,)
-        Interval, group of samples, column in it and node before every row of the residual.
-    fraction, weight, factor : ndarray, shape (nr,)
-        Place between that node and the next, weight, and factor of the robust loss.
-    mixing : sparse array, shape (nr, nr), or None
-        What makes correlated noise independent, between weight and factor.
-    slope : tuple of ndarray, shape (N + 1, k, ns)
-        Of every group's sensor by the states of a node.
-    load : tuple of ndarray, shape (N + 1, k, nc)
-        By the efforts of prescribed joints.
-    """
-
-    edges: NDArray[np.int64]
-    interval: NDArray[np.int64]
-    group: NDArray[np.int64]
-    column: NDArray[np.int64]
-    node: NDArray[np.int64]
-    fraction: Array
-    weight: Array
-    factor: Array
-    mixing: scipy.sparse.csr_array | None
-    slope: tuple[Array, ...]
-    load: tuple[Array, ...]
-
-    def rows(self, j: int, node: Array, effort: Array) -> tuple[NDArray[np.int64], Array]:
-        """Rows of the residual in one interval and their slopes by its directions.
-
-        Parameters
-        ----------
-        j : int
-        node : ndarray, shape (steps + 1, ns, d)
-            Slopes of the states at its nodes.
-        effort : ndarray, shape (steps + 1, nc, d)
-        """
-        rows = np.flatnonzero(self.interval == j)
-        found = np.zeros((len(rows), node.shape[2]))
-        first = int(self.edges[j])
-        for k, (slope, load) in enumerate(zip(self.slope, self.load, strict=True)):
-            own = np.flatnonzero(self.group[rows] == k)
-            at, column = self.node[rows[own]], self.column[rows[own]]
-            fraction = self.fraction[rows[own]]
-            for shift, part in ((0, 1 - fraction), (1, fraction)):
-                used = part > 0
-                place = np.minimum(at[used] + shift, len(slope) - 1)
-                local = np.minimum(place - first, len(node) - 1)
-                value = np.einsum("rx,rxd->rd", slope[place, column[used]], node[local])
-                if effort.shape[1]:
-                    value += np.einsum("rx,rxd->rd", load[place, column[used]], effort[local])
-                found[own[used]] += part[used, None] * value
-        return rows, self._whitened(rows, found)
-
-    def bias(self, rows: NDArray[np.int64], biased: Sequence[tuple[int, int]], reference: Array) -> Array:
-        """Slopes of rows by the biases, in units of their reference."""
-        found = np.zeros((len(rows), len(biased)))
-        for i, (k, column) in enumerate(biased):
-            own = (self.group[rows] == k) & (self.column[rows] == column)
-            found[own, i] = reference[i]
-        return self._whitened(rows, found)
-
-    def _whitened(self, rows: NDArray[np.int64], slopes: Array) -> Array:
-        found = slopes * self.weight[rows, None]
-        if self.mixing is not None:
-            found = self.mixing[rows][:, rows] @ found
-        return np.asarray(found * self.factor[rows, None])
-
-
-def _reading(course: _Course, moving: NDArray[np.int64], edges: NDArray[np.int64]) -> _Reading:
-    problem, theta, n = course.problem, course.theta, course.system.n_coordinates
-    predictor, threshold = problem.predictor, problem.options.huber_threshold
-    state, efforts = course.rollout.state, predictor.joint_efforts(course.rollout)
-    group: list[NDArray[np.int64]] = []
-    column, node, fraction, weight, factor, slope, load = [], [], [], [], [], [], []
-    for samples, predicted in zip(course.episode.measurements, course.result.predicted_outputs, strict=True):
-        placed = predictor.measurements_at_true_times(samples, theta)
-        shape, keep = samples.weight.shape, samples.is_used
-        where = placed.node if placed.node.ndim > 1 else np.broadcast_to(placed.node[:, None], shape)
-        beyond = placed.fraction if placed.node.ndim > 1 else np.broadcast_to(placed.fraction[:, None], shape)
-        read = problem.model_functions.compiled_sensor(samples.sensor, ())
-        _, by_q, by_z, by_e, _ = read(state[:, :n], state[:, 2 * n :], efforts, theta)
-        group.append(np.full(samples.n_residuals, len(group)))
-        column.append(np.broadcast_to(np.arange(shape[1]), shape)[keep])
-        node.append(where[keep])
-        fraction.append(beyond[keep])
-        weight.append(samples.weight[keep])
-        factor.append(samples.residual_block(predicted, threshold=threshold).robust_factor)
-        slope.append(np.concatenate([by_q, np.zeros((*by_q.shape[:2], n)), by_z], axis=2)[:, :, moving])
-        load.append(by_e[:, :, course.fixed])
-    nodes = np.concatenate(node)
-    interval = np.clip(np.searchsorted(edges, nodes, side="right") - 1, 0, len(edges) - 2)
-    mixing = None
-    if any(samples.decorrelation_matrix is not None for samples in course.episode.measurements):
-        own = [s.decorrelate(scipy.sparse.eye_array(s.n_residuals, format="csr")) for s in course.episode.measurements]
-        mixing = scipy.sparse.csr_array(scipy.sparse.block_diag(own))
-    return _Reading(
-        edges,
-        interval,
-        np.concatenate(group),
-        np.concatenate(column),
-        nodes,
-        np.concatenate(fraction),
-        np.concatenate(weight),
-        np.concatenate(factor),
-        mixing,
-        tuple(slope),
-        tuple(load),
-    )

@@ -38,9 +38,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.inference.kalman import KalmanStep, Transition, kalman_step
+from yid_ocp.inference.residual_slopes import NominalTrajectory, ResidualSlopes, nominal_trajectory
 from yid_ocp.integrator.linearized_steps import LinearizedStep, active_state_mask, linearized_steps
 from yid_ocp.integrator.momentum_shift import torque_error_feedthrough
-from yid_ocp.integrator.step import Rollout, TrackingFeedback
+from yid_ocp.integrator.step import TrackingFeedback
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EquilibriumGuesses, EstimationProblem
 from yid_ocp.problem.constant_sensor_errors import subtract_estimated_biases
@@ -48,8 +49,6 @@ from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.evaluation import ResidualWhitener
 from yid_ocp.problem.input_errors import InputErrors
-from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.model_functions import ModelFunctions
 from yid_ocp.problem.prediction_result import EpisodePrediction
 
 Array = NDArray[np.float64]
@@ -209,35 +208,6 @@ class WhiteningFilter:
         return white, later
 
 
-@dataclass(frozen=True)
-class NominalTrajectory:
-    """Nominal trajectory of an episode and its measurements, about which the Kalman filter is linearized.
-
-    Attributes
-    ----------
-    model_functions : ModelFunctions
-    theta : ndarray, shape (ntheta,)
-    rollout : Rollout
-    measurements : sequence of Measurements
-        Shifted by their delays to the times at which they were true.
-    tracking_feedback : Feedback or None
-    joint_efforts : ndarray, shape (N + 1, n)
-        Of prescribed and driven joints.
-    initial_state_by_angles, initial_state_by_torque : ndarray, shape (nx, nu)
-        Derivatives of the start by the first angles and the first torque of the driven joints, zero where it does not
-        follow from them.
-    """
-
-    model_functions: ModelFunctions
-    theta: Array
-    rollout: Rollout
-    measurements: Sequence[Measurements]
-    tracking_feedback: TrackingFeedback | None
-    joint_efforts: Array
-    initial_state_by_angles: Array
-    initial_state_by_torque: Array
-
-
 def build_whitening_filter(course: NominalTrajectory, errors: InputErrors) -> WhiteningFilter:
     """Build the whitening Kalman filter along a trajectory.
 
@@ -252,11 +222,11 @@ def build_whitening_filter(course: NominalTrajectory, errors: InputErrors) -> Wh
     """
     step, nu, count = course.model_functions.step, len(errors.torque_bias_std), len(course.rollout.torque)
     linear = partial(linearized_steps, step, course.theta, course.rollout)
-    readings = _Readings.of(course)
+    slopes = ResidualSlopes.along(course)
     ends = [*linear(chosen=slice(0, 1)), *linear(chosen=slice(count - 1, count))]
-    live = active_state_mask(step, ends, readings.seen)
+    live = active_state_mask(step, ends, slopes.visible_states)
     kept = np.flatnonzero(live)
-    readings = replace(readings, before=readings.before[:, kept], after=readings.after[:, kept])
+    rows_of_node, slopes = slopes.rows_by_node(count), slopes.by_some_states(kept)
     start = np.hstack([course.initial_state_by_angles, course.initial_state_by_torque, course.initial_state_by_torque])[
         kept
     ]
@@ -272,9 +242,14 @@ def build_whitening_filter(course: NominalTrajectory, errors: InputErrors) -> Wh
             if here is None
             else _turn(here, kept, course.tracking_feedback, momentum, errors, k, fresh)
         )
-        rows, observe, ahead = readings.at(k, turn, nu)
+        rows, move = rows_of_node[k], turn.transition.state_rows
+        observe = slopes.after[rows] @ move
+        by_torque = observe[:, len(kept) : len(kept) + nu].copy()
+        observe[:, : len(kept)] += slopes.before[rows]
+        if turn.effort is not None:
+            observe += (slopes.by_effort_before[rows] + slopes.by_effort_after[rows]) @ turn.effort
         kalman, covariance, _ = kalman_step(covariance, observe, turn.transition)
-        made.append(_FilterStep(rows, kalman, ahead))
+        made.append(_FilterStep(rows, kalman, by_torque))
         if turn.shaken is not None:
             covariance[: len(kept), : len(kept)] += turn.shaken @ turn.shaken.T
         if fresh:
@@ -332,99 +307,7 @@ def _turn(
     return _Turn(_transition(move, by_error.shape[1], fresh), shaken, effort)
 
 
-@dataclass(frozen=True)
-class _Readings:
-    """Slopes of all residuals of a recording, sorted by the node before them.
-
-    Attributes
-    ----------
-    order : ndarray of int, shape (r,)
-    first : ndarray of int, shape (N + 2,)
-        Where the rows of every node begin.
-    fraction : ndarray, shape (r,)
-        Of a step beyond the node.
-    before, after : ndarray, shape (r, nx), or of some of the states alone
-        By the states of the two nodes, their shares of the interpolation included.
-    effort : ndarray, shape (r, nc)
-        By the effort of prescribed joints, as at the node before.
-    """
-
-    order: _RowIndices
-    first: _RowIndices
-    before: Array
-    after: Array
-    effort: Array
-
-    @staticmethod
-    def of(course: NominalTrajectory) -> _Readings:
-        """From the sensors' own derivatives along the rollout."""
-        step = course.model_functions.step
-        n, nx, fixed = step.sizes["n"], step.sizes["nx"], list(step.system.prescribed_indices)
-        nodes, before, after, effort = [], [], [], []
-        state, last = course.rollout.state, len(course.rollout.torque)
-        for samples in course.measurements:
-            used = samples.evaluation_nodes
-            function = course.model_functions.compiled_sensor(samples.sensor, ())
-            q, z = state[used, :n], state[used, 2 * n :]
-            _, by_q, by_z, by_load, _ = function(q, z, course.joint_efforts[used], course.theta)
-            slopes = np.zeros((len(used), by_q.shape[1], nx))
-            slopes[:, :, :n], slopes[:, :, 2 * n :] = by_q, by_z
-            sample, column = np.nonzero(samples.is_used)
-            wide = samples.node.ndim > 1
-            node, fraction = (
-                array[sample, column] if wide else array[sample] for array in (samples.node, samples.fraction)
-            )
-            weight = samples.weight[sample, column]
-            place = np.searchsorted(used, node)
-            later = np.minimum(place + 1, len(used) - 1)
-            early = (weight * (1 - fraction))[:, None] * slopes[place, column]
-            late = (weight * fraction)[:, None] * np.where(fraction > 0, 1.0, 0.0)[:, None] * slopes[later, column]
-            before.append(samples.decorrelate(early))
-            after.append(samples.decorrelate(late))
-            effort.append(samples.decorrelate(weight[:, None] * by_load[place, column][:, fixed]))
-            nodes.append(np.minimum(node, last))
-        at = np.concatenate(nodes)
-        order = np.argsort(at, kind="stable")
-        first = np.searchsorted(at[order], np.arange(last + 2))
-        return _Readings(order, first, np.vstack(before), np.vstack(after), np.vstack(effort))
-
-    @property
-    def seen(self) -> NDArray[np.bool_]:
-        """States that a residual depends on, shape (nx,)."""
-        return np.any(self.before != 0, axis=0) | np.any(self.after != 0, axis=0)
-
-    def at(self, k: int, turn: _Turn, nu: int) -> tuple[_RowIndices, Array, Array]:
-        """Rows of node k, their slopes by (d, w, b), and by a known correction of the torque over the step."""
-        rows, move = self.order[self.first[k] : self.first[k + 1]], turn.transition.state_rows
-        observe = self.after[rows] @ move
-        ahead = observe[:, len(move) : len(move) + nu].copy()
-        observe[:, : len(move)] += self.before[rows]
-        if turn.effort is not None:
-            observe += self.effort[rows] @ turn.effort
-        return rows, observe, ahead
-
-
 # -- about an episode -------------------------------------------------------------------------------------------------
-
-
-def nominal_trajectory(
-    predictor: EpisodePredictor, episode: Episode, result: EpisodePrediction, theta: Array
-) -> NominalTrajectory:
-    """Trajectory of an episode about which its input errors are linearized."""
-    own, rest, sizes = predictor.episode_theta(episode, theta), result.equilibrium, predictor.step.sizes
-    by_angles = by_torque = np.zeros((sizes["nx"], sizes["nu"]))
-    if rest is not None:
-        by_angles, by_torque = rest.state_by_known_coordinates[:, : sizes["nu"]], rest.state_by_torque
-    return NominalTrajectory(
-        predictor.model_functions,
-        own,
-        result.rollout,
-        [predictor.measurements_at_true_times(samples, own) for samples in episode.measurements],
-        episode.tracking_feedback,
-        predictor.joint_efforts(result.rollout),
-        by_angles,
-        by_torque,
-    )
 
 
 def estimate_torque_bias(episode: Episode, result: EpisodePrediction, whitening: ResidualWhitener) -> Array:
