@@ -92,6 +92,7 @@ class ResidualSlopes:
         """From the sensors' own derivatives along the trajectory."""
         step, theta, state = course.model_functions.step, course.theta, course.rollout.state
         n, nx, fixed = step.sizes["n"], step.sizes["nx"], list(step.system.prescribed_indices)
+        found: list[NDArray[np.int64]] = []
         parts: list[tuple[Array, ...]] = []
         for samples in course.measurements:
             used = samples.evaluation_nodes
@@ -109,8 +110,10 @@ class ResidualSlopes:
             nodes = ((place, shares[0]), (later, shares[1]))
             by_state = (samples.decorrelate(share[:, None] * slopes[k, column]) for k, share in nodes)
             by_effort = (samples.decorrelate(share[:, None] * by_load[k, column][:, fixed]) for k, share in nodes)
-            parts.append((np.minimum(node, len(course.rollout.torque)), *by_state, *by_effort))
-        return ResidualSlopes(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+            found.append(np.minimum(node, len(course.rollout.torque)))
+            parts.append((*by_state, *by_effort))
+        arrays = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+        return ResidualSlopes(np.concatenate(found), *arrays)
 
     @property
     def visible_states(self) -> NDArray[np.bool_]:
@@ -123,8 +126,8 @@ class ResidualSlopes:
 
     def some_rows(self, rows: NDArray[np.int64]) -> ResidualSlopes:
         """Some of the rows alone."""
-        arrays = (self.node, self.before, self.after, self.by_effort_before, self.by_effort_after)
-        return ResidualSlopes(*(array[rows] for array in arrays))
+        slopes = (self.before, self.after, self.by_effort_before, self.by_effort_after)
+        return ResidualSlopes(self.node[rows], *(array[rows] for array in slopes))
 
     def response(self, by_node: Array, effort: Array, first: int) -> Array:
         """Slopes of the rows by d directions, shape (r, d).

@@ -288,7 +288,7 @@ def _torque_noise(course: LinearizedEpisode, unknowns: SmootherUnknowns, span: f
 
 def _loose_start(course: LinearizedEpisode) -> Array:
     """Standard deviation of a start that was fitted to points, shape (nx,)."""
-    problem, free = course.problem, course.free
+    problem, free = course.problem, np.array(course.system.free_indices, int)
     options, joints = problem.options, course.system.mechanism.joint_names
     inertia = mass_matrix_diagonal(problem.step, course.nominal.theta, tuple(joints[i] for i in free))
     loose = np.zeros(problem.step.sizes["nx"])
