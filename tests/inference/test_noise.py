@@ -234,8 +234,7 @@ def test_jacobians_of_innovations_are_those_of_differences(urdf_folder):
 
 
 @pytest.mark.parametrize(
-    ("arm", "use", "expected"),
-    [(True, None, False), (False, None, True), (False, False, False), (False, True, True)],
+    ("arm", "use", "expected"), [(True, None, False), (False, None, True), (False, False, False), (False, True, True)]
 )
 def test_encoders_are_measurements_where_no_point_of_the_arm_is(urdf_folder, arm, use, expected):
     step = pendulum_step(urdf_folder, driven=("shoulder",))

@@ -318,10 +318,7 @@ def test_a_constant_misfit_of_every_channel_of_a_recording_counts_as_one_each(ur
 
 def saturating(top):
     """One sample whose prediction saturates: seen where it is small, not where it is large."""
-    return lambda x, duration: (
-        np.array([top * np.tanh(x[0] / top)]),
-        np.array([[1.0 / np.cosh(x[0] / top) ** 2]]),
-    )
+    return lambda x, duration: (np.array([top * np.tanh(x[0] / top)]), np.array([[1.0 / np.cosh(x[0] / top) ** 2]]))
 
 
 @pytest.mark.parametrize(("top", "kept"), [(1e6, True), (20.0, True), (0.5, False)])

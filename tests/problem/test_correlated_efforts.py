@@ -92,9 +92,7 @@ def correlated_problem(folder, cutoff=math.inf, **how):
 
 
 @pytest.mark.parametrize(
-    "how",
-    [{"prescribed": JOINTS}, {"prescribed": JOINTS, "cutoff": 15.0}, {}],
-    ids=["moved", "moved_smoothly", "free"],
+    "how", [{"prescribed": JOINTS}, {"prescribed": JOINTS, "cutoff": 15.0}, {}], ids=["moved", "moved_smoothly", "free"]
 )
 def test_derivatives_and_transcriptions_count_what_is_correlated(urdf_folder, how):
     problem = correlated_problem(urdf_folder, **how)

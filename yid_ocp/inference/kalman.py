@@ -61,7 +61,6 @@ class KalmanStep:
         S^(-1/2)
     projected_covariance : ndarray, shape (r, nx)
         S^(-1/2) H P
-    transition : Transition
     """
 
     observation: Array
@@ -108,7 +107,6 @@ def kalman_step(covariance: Array, observation: Array, transition: Transition) -
     covariance : ndarray, shape (nx, nx)
         P, before the measurement.
     observation : ndarray, shape (r, nx)
-    transition : Transition
     """
     cross = observation @ covariance
     whitening, log_determinant = np.zeros((0, 0)), 0.0

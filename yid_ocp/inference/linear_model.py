@@ -64,7 +64,6 @@ def is_stationary(problem: EstimationProblem, x: Array, evaluation: Evaluation) 
 
     Parameters
     ----------
-    problem : EstimationProblem
     x : ndarray, shape (nx,)
     evaluation : Evaluation
         At `x`, with its Jacobian.

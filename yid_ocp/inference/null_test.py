@@ -53,9 +53,6 @@ class ResidualChannel:
 
     Attributes
     ----------
-    recording, channel : str
-    group : str
-    unit : str
     t : ndarray, shape (M,)
         Times since the start of the recording [s].
     residual_indices : ndarray of int, shape (M,)
@@ -79,10 +76,8 @@ class ChannelNoiseLevel:
 
     Attributes
     ----------
-    channel, unit : str
     noise_std : float
         Median standard deviation of its samples, after smoothing where they are smoothed, in `unit`.
-    n_samples : int
     """
 
     channel: str
@@ -97,7 +92,6 @@ class _ResidualWindow:
 
     Attributes
     ----------
-    recording, channel : str
     start_time, end_time : float
         [s]
     z_score : float
@@ -120,7 +114,6 @@ class NullTestResult:
 
     Attributes
     ----------
-    chi2_per_dof : float
     degrees_of_freedom : float
         Effective, of coloured noise.
     p_value : float
@@ -129,7 +122,6 @@ class NullTestResult:
         Mean square of its whitened residual.
     whiteness_p_values : dict of channel to float
         p-value of its first autocorrelations under the noise's colour (Ljung-Box; NaN for smoothed channels).
-    windows : tuple of Window
     """
 
     chi2_per_dof: float
@@ -169,7 +161,6 @@ def run_null_test(
 
     Parameters
     ----------
-    series : sequence of Series
     residual : ndarray, shape (nr,)
         Rows that belong to no series (priors) do not count.
     parameters : int
@@ -220,7 +211,6 @@ def exceeds_noise(tests: Sequence[NullTestResult], limits: GapCriteria = DEFAULT
     ----------
     tests : sequence of NullTest
         Of the recordings that were fitted, of those held out, or of both.
-    limits : GapLimits
     """
     return (
         bonferroni_p_value(tests) < limits.significance_level

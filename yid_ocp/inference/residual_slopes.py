@@ -24,12 +24,9 @@ class NominalTrajectory:
 
     Attributes
     ----------
-    model_functions : ModelFunctions
     theta : ndarray, shape (ntheta,)
-    rollout : Rollout
     measurements : sequence of Measurements
         Shifted by their delays to the times at which they were true.
-    tracking_feedback : Feedback or None
     joint_efforts : ndarray, shape (N + 1, n)
         Of prescribed and driven joints.
     initial_state_by_angles, initial_state_by_torque : ndarray, shape (nx, nu)
@@ -138,7 +135,6 @@ class ResidualSlopes:
             Slopes of the states of K nodes from `first` on; a row beyond them is read at the last.
         effort : ndarray, shape (K, nc, d)
             Of the efforts of prescribed joints.
-        first : int
         """
         found = np.zeros((len(self.node), by_node.shape[2]))
         pairs = ((0, self.before, self.by_effort_before), (1, self.after, self.by_effort_after))

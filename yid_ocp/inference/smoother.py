@@ -47,11 +47,8 @@ class SmoothedUnknowns:
 
     Attributes
     ----------
-    recording : str
     interval_edges : ndarray, shape (J + 1,)
         [s]
-    unknown_names : tuple of str
-    unknown_groups : tuple of Source
     reference_std : ndarray, shape (nd,)
         [N m, N or m]
     posterior_mean, posterior_std : ndarray, shape (J, nd)
@@ -73,7 +70,6 @@ class SmootherResult:
 
     Attributes
     ----------
-    smoothed_unknowns : tuple of Trace
     group_variance : dict of Source to float
         Of every group, in units of its squared reference, at the largest evidence.
     log_evidence_drop : dict of Source to float
@@ -430,11 +426,6 @@ def run_smoother(
         Its fit.
     evaluation : Evaluation
         At `x`, with its Jacobian.
-    limits : SmootherThresholds
-
-    Returns
-    -------
-    Smoothed
     """
     # matrices of this size are multiplied faster by one thread
     with threadpoolctl.threadpool_limits(1):
@@ -480,7 +471,6 @@ def force_likelihood_terms(
 
     Parameters
     ----------
-    model : Linear
     variance : mapping of Source to float
         Of all groups of unknowns beside it, squared reference.
     unknown : int

@@ -83,8 +83,6 @@ class LinearResidualModel:
 
     Attributes
     ----------
-    recording : str
-    intervals : tuple of Interval
     interval_edges : ndarray, shape (J + 1,)
         Beginnings of the intervals and the end [s].
     unknown_names : tuple of str
@@ -126,7 +124,6 @@ def linear_residual_models(
 
     Parameters
     ----------
-    problem : EstimationProblem
     x : ndarray, shape (nx,)
     evaluation : Evaluation
         At `x`, with its Jacobian.

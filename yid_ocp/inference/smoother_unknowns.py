@@ -78,8 +78,6 @@ class UnknownGroup:
 
     Attributes
     ----------
-    location : str
-    kind : "force", "push", "offset" or "bias"
     is_confounded_with_bias : bool
         Whether a bias of an effort sensor would be the same: a force at a prescribed joint whose effort is measured.
     """
@@ -111,7 +109,6 @@ class SmootherUnknowns:
     ----------
     names : tuple of str, length nd
         Coordinate, grasp, segment or channel, and axis: first forces, then offsets, pushes and biases.
-    sources : tuple of Source, length nd
     reference : ndarray, shape (nd,)
     forced : ndarray of int
         Coordinates with an unknown force.
@@ -232,7 +229,6 @@ def segment_weights(system: System, theta: Array) -> dict[str, float]:
 
     Parameters
     ----------
-    system : System
     theta : ndarray, shape (ntheta,)
     """
     tree, masses = system.mechanism, {}
@@ -252,11 +248,9 @@ def generalized_forces_per_newton(system: System, theta: Array, q: Array, segmen
 
     Parameters
     ----------
-    system : System
     theta : ndarray, shape (ntheta,)
     q : ndarray, shape (N, n)
         Configurations.
-    segments : sequence of str
 
     Returns
     -------

@@ -76,9 +76,6 @@ class ParameterEstimate:
     ----------
     value, std : float
         In `unit`; `std` is infinite where the data do not inform the parameter.
-    unit : str
-    initial, lower, upper : float
-    free : bool
     verdict : str
         See `verdict`; `fixed` where it was not free.
     interval : (float or None, float or None), or None
@@ -177,18 +174,6 @@ def _misfit_sandwich_covariance(problem: EstimationProblem, evaluation: Evaluati
     A^-1 S A^-1 therefore takes S from the scores J' r summed over blocks of time of one recording, all channels
     together, and where there are enough from those of single channels of whole recordings (a zero that moves, friction
     that holds) and of whole recordings; the largest variance of each unknown counts.
-
-    Parameters
-    ----------
-    problem : EstimationProblem
-    evaluation : Evaluation
-        With its Jacobian.
-    covariance : ndarray, shape (nx, nx)
-        From `covariance_and_chi2`.
-
-    Returns
-    -------
-    ndarray, shape (nx, nx)
 
     References
     ----------
@@ -298,7 +283,6 @@ def covariance_to_dict(names: Sequence[str], matrix: Array, std: Sequence[float]
 
     Parameters
     ----------
-    names : sequence of str, length n
     matrix : ndarray, shape (n, n)
     std : sequence of float, length n
         Those that are not finite and positive are left out: nothing is known of their parameters.
@@ -343,7 +327,6 @@ def parameter_verdict(
         In the same unit.
     scale : float
         Plausible size of the parameter, zero where unknown.
-    explains, at_bound : bool
     """
     found = verdict_by_relative_std(value, std, scale)
     if found == "not_identifiable":
@@ -373,7 +356,6 @@ def with_profile_interval(entry: ParameterEstimate, interval: ConfidenceInterval
 
     Parameters
     ----------
-    entry : Estimate
     interval : (float or None, float or None)
         95 %.
     scale : float
@@ -449,7 +431,6 @@ def parameter_estimates(
 
     Parameters
     ----------
-    problem : EstimationProblem
     x : ndarray, shape (nx,)
     evaluation : Evaluation
         At `x`, with its Jacobian.
@@ -502,16 +483,7 @@ def _bound_side(value: float, lower: float, upper: float, size: float) -> int:
 
 
 def _one_sided_interval(value: float, std: float, side: int, slope: float) -> ConfidenceInterval:
-    """95 % interval of a parameter at its bound: slope d + d^2/(2 std^2) = 2.71/2 at a distance d from it.
-
-    Parameters
-    ----------
-    value, std : float
-    side : -1 or 1
-        Whether the bound is the lower or the upper one.
-    slope : float
-        Rise of the cost, over the factor by which the noise is larger than stated, away from the bound.
-    """
+    """95 % interval of a parameter at its bound: slope d + d^2/(2 std^2) = 2.71/2 at a distance d from it."""
     pull = max(slope, 0.0)
     reach = std * (math.sqrt((pull * std) ** 2 + _CHI2_95_ONE_SIDED) - pull * std)
     return (value, value - side * reach) if side < 0 else (value - side * reach, value)

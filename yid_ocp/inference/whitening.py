@@ -209,17 +209,7 @@ class WhiteningFilter:
 
 
 def build_whitening_filter(course: NominalTrajectory, errors: InputErrors) -> WhiteningFilter:
-    """Build the whitening Kalman filter along a trajectory.
-
-    Parameters
-    ----------
-    course : Course
-    errors : InputErrors
-
-    Returns
-    -------
-    Innovations
-    """
+    """Build the whitening Kalman filter along a trajectory."""
     step, nu, count = course.model_functions.step, len(errors.torque_bias_std), len(course.rollout.torque)
     linear = partial(linearized_steps, step, course.theta, course.rollout)
     slopes = ResidualSlopes.along(course)
@@ -395,7 +385,6 @@ def whitened_at(
 
     Parameters
     ----------
-    problem : EstimationProblem
     x : array_like, shape (nx,)
     equilibrium_guesses : EquilibriumGuesses, optional
         As in `EstimationProblem.evaluate`.

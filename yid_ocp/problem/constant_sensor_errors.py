@@ -79,7 +79,6 @@ def subtract_estimated_biases(samples: Sequence[Measurements], predicted: Sequen
 
     Parameters
     ----------
-    samples : sequence of Measurements
     predicted : sequence of ndarray, shape (M, k) each
     """
     slopes = constant_error_sensitivities(samples)

@@ -46,14 +46,7 @@ class _Prepared:
 
 @dataclass(frozen=True)
 class EpisodePredictor:
-    """Predicts episodes: initial state, rollout, sensor readings and derivatives; stateless.
-
-    Attributes
-    ----------
-    model_functions : ModelFunctions
-    options : ProblemOptions
-    unknowns : Unknowns
-    """
+    """Predicts episodes: initial state, rollout, sensor readings and derivatives; stateless."""
 
     model_functions: ModelFunctions
     options: ProblemOptions
@@ -116,7 +109,6 @@ class EpisodePredictor:
 
         Parameters
         ----------
-        episode : Episode
         theta : ndarray, shape (ntheta,)
             From `episode_theta`.
         offset : ndarray, shape (number of estimated rows,)
@@ -185,9 +177,7 @@ class EpisodePredictor:
 
         Parameters
         ----------
-        episode : Episode
         theta : ndarray, shape (ntheta,)
-        wanted : tuple of str
         state : ndarray, shape (nx,)
             Initial state.
         by_unknowns : ndarray, optional, shape (nx, d)
@@ -347,7 +337,6 @@ class EpisodePredictor:
 
         Parameters
         ----------
-        samples : Measurements
         state : ndarray, shape (N + 1, nx)
         by_state : ndarray, shape (N + 1, nx, d)
             The first of the d directions are the free parameters.
@@ -447,7 +436,6 @@ class EpisodePredictor:
 
         Parameters
         ----------
-        episode : Episode
         result : EpisodeResult
             At the same unknowns.
         theta : ndarray, shape (ntheta,)

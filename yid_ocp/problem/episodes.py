@@ -40,8 +40,6 @@ class Episode:
 
     Attributes
     ----------
-    recording : Recording
-    grid : Grid
     torque : ndarray, shape (N, nu)
         Of motors, or what servos are commanded.
     prescribed_path : ndarray, shape (N + 1, nc)
@@ -49,7 +47,6 @@ class Episode:
         Known coordinates (driven, then prescribed) at node 0.
     measured_driven_angles : ndarray, shape (N + 1, nu)
         Measured angles of the driven joints at every node.
-    measurements : tuple of Measurements
     joint_loads : ndarray, shape (N + 1, nk)
         Recorded effort of driven, then prescribed joints, where an effect makes their true angle depend on it.
     smoothed_driven_angles : ndarray, shape (N + 1, nu)
@@ -107,9 +104,6 @@ def prepare_episode(functions: ModelFunctions, recording: Recording, options: Pr
 
     Parameters
     ----------
-    functions : ModelFunctions
-    recording : Recording
-    options : ProblemOptions
     theta : ndarray, shape (ntheta,)
         Nominal parameters, at which encoder noise is converted to effort and the filter's gains are computed.
 
@@ -216,16 +210,7 @@ def mass_matrix_diagonal(step: Step, theta: Array, names: tuple[str, ...]) -> Ar
 
 
 def _joint_mass_matrices(step: Step, theta: Array, names: tuple[str, ...], angles: Array) -> Array:
-    """Mass matrix block of the named joints in several configurations, shape (K, k, k).
-
-    Parameters
-    ----------
-    step : Step
-    theta : ndarray, shape (ntheta,)
-    names : tuple of str
-    angles : ndarray, shape (K, k)
-        Of these joints [rad or m]; all others are at zero.
-    """
+    """Mass matrix block of the named joints in several configurations, shape (K, k, k)."""
     places = [step.system.mechanism.joint_index(name) for name in names]
     q = np.zeros((len(angles), step.sizes["n"]))
     q[:, places] = angles

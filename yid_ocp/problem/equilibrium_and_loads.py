@@ -31,8 +31,6 @@ def with_observed_equilibrium(predictor: EpisodePredictor, episode: Episode, the
 
     Parameters
     ----------
-    predictor : Predictor
-    episode : Episode
     theta : ndarray, shape (ntheta,)
         Nominal parameters.
     """

@@ -60,7 +60,6 @@ class EstimationProblem(ReprMixin):
         To estimate on.
     free : sequence of str
         Names of free parameters.
-    options : ProblemOptions, optional
     values : mapping of str to float, optional
         Initial values, and values of fixed parameters, where they differ from the model's.
     held_out : sequence of Recording
@@ -70,12 +69,10 @@ class EstimationProblem(ReprMixin):
 
     Attributes
     ----------
-    free : tuple of str
     theta : ndarray, shape (ntheta,)
         Initial values of free parameters and values of fixed ones.
     unknowns : Unknowns
         Layout of the unknown vector.
-    episodes, held_out : tuple of Episode
     residual_rows : ResidualRows
         Layout of the residual.
     whitening_filters, held_out_whitening_filters : tuple of ResidualWhitener or None
@@ -285,7 +282,6 @@ class EstimationProblem(ReprMixin):
         Parameters
         ----------
         x : array_like, shape (nx,)
-        derivatives : bool
         equilibrium_guesses : WarmStart, optional
             `Evaluation.equilibrium_guesses` of a nearby point; without it the equilibrium of least energy is searched, which takes
             longer.
@@ -336,7 +332,6 @@ class EstimationProblem(ReprMixin):
 
         Returns
         -------
-        cost : float
         gradient : ndarray, shape (nx,)
         evaluation : Evaluation
             Without a Jacobian.
@@ -378,7 +373,6 @@ class EstimationProblem(ReprMixin):
 
         Parameters
         ----------
-        episode : Episode
         theta : ndarray, shape (ntheta,)
         offset : ndarray, optional
             Of an estimated start from rest.

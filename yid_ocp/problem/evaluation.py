@@ -61,7 +61,6 @@ class ResidualRows:
     ----------
     measurements : tuple of tuple of slice
         Rows of every group of measurements of every episode, those without a measurement left out.
-    data, stated_priors, weak_priors : slice
     """
 
     measurements: tuple[tuple[slice, ...], ...]
@@ -97,9 +96,6 @@ class Evaluation(ReprMixin):
         1/2 |r|^2, or the robust loss; infinite where the rollout failed.
     residual : ndarray, shape (nr,)
     jacobian : ndarray, shape (nr, nx), or None
-    ok : bool
-    message : str
-    episode_predictions : tuple of EpisodeResult
     """
 
     cost: float

@@ -81,7 +81,6 @@ class InitialStateFitter:
 
     Parameters
     ----------
-    step : Step
     fitted_parameters : sequence of str
         Parameters fitted along with every start; their bounds must be finite.
     """
@@ -141,10 +140,6 @@ class InitialStateFitter:
             How far from the start frames may be used [s].
         path : ndarray, shape (N + 1, nc)
             Prescribed coordinates.
-
-        Returns
-        -------
-        FittedStart
 
         Raises
         ------

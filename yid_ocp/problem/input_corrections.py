@@ -91,13 +91,11 @@ class CorrectedInputs:
 
         Parameters
         ----------
-        shift : MomentumShift
         recorded : Motion
             Its angles are smooth.
         measured : ndarray, shape (N + 1, nu)
             Angles as they were read.
         theta : ndarray, shape (ntheta,)
-        wanted : sequence of str
         by_internal : ndarray, shape (nz, d), or None
             Derivative of the internal coordinates at the start.
         """
@@ -145,10 +143,8 @@ class InputCorrections:
 
     Parameters
     ----------
-    system : System
     names : tuple of str
         Parameters by which derivatives may be asked for; those wanted are some of them.
-    use_compiler : bool
     """
 
     def __init__(self, system: System, names: tuple[str, ...], use_compiler: bool) -> None:

@@ -112,10 +112,6 @@ def recorded_input_errors(
 
     Parameters
     ----------
-    recording : Recording
-    system : System
-    grid : Grid
-    sensors : mapping of group to SensorOptions
     samples : sequence of Measurements
         Of the recording.
     """

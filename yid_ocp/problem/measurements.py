@@ -45,7 +45,6 @@ class Measurements:
 
     Attributes
     ----------
-    sensor : Sensor
     node : ndarray of int, shape (M,), or (M, k) where outputs are late by different times
         Node before each sample.
     fraction : ndarray, shape of `node`

@@ -31,7 +31,6 @@ class _SelectedDerivatives:
     ----------
     all_derivatives : Mapped
         Its last output has one column for every parameter.
-    columns : tuple of int
     """
 
     all_derivatives: MappedFunction
@@ -48,7 +47,6 @@ class ModelFunctions:
 
     Parameters
     ----------
-    step : Step
     parameter_names : tuple of str
         Parameters by which derivatives may be asked for.
     start_parameters : tuple of str

@@ -63,7 +63,6 @@ class MultivariateGaussianPrior:
 
     Attributes
     ----------
-    parameter_names : tuple of str, length n
     covariance : ndarray, shape (n, n)
         Positive definite, in the parameters' units.
     """
@@ -88,8 +87,6 @@ class ProblemOptions:
 
     Attributes
     ----------
-    sensors : mapping of group to SensorOptions
-    clamp_paths : tuple of ClampPath
     local_parameters : tuple of str
         Free parameters with a value of their own in every recording.
     prior_stds : mapping of parameter to standard deviation

@@ -39,7 +39,6 @@ def constant_position_baseline(recording: Recording, points: Sequence[str], give
 
     Parameters
     ----------
-    recording : Recording
     points : sequence of str
         To predict.
     given : int
@@ -86,7 +85,6 @@ def interpolated_displacement_baseline(
 
     Parameters
     ----------
-    recording : Recording
     points : sequence of str
         To predict.
     parent : sequence of str
@@ -95,7 +93,6 @@ def interpolated_displacement_baseline(
         Points of each child, the first one the parent's point at which it leaves.
     clamped : sequence of str, optional
         Points of the parent between which is interpolated; its two ends when absent.
-    given : int
 
     Returns
     -------
@@ -186,7 +183,6 @@ class ChannelPrediction(ReprMixin):
 
     Attributes
     ----------
-    recording, channel, unit : str
     t : ndarray, shape (M,)
         On the channel's own clock [s].
     measured, predicted : ndarray, shape (M, w)

@@ -19,7 +19,6 @@ class EpisodePrediction:
 
     Attributes
     ----------
-    rollout : Rollout
     equilibrium : Rest or None
         Equilibrium from which the rollout starts.
     predicted_outputs : tuple of ndarray, shape (M, k) each

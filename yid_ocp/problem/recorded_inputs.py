@@ -39,9 +39,6 @@ def mean_step_inputs(
 
     Parameters
     ----------
-    joints : JointGroup
-    driven : tuple of str
-    grid : Grid
     where : str
         Name of the recording.
     delay : ndarray, shape (nu,), optional

@@ -37,8 +37,6 @@ def recording_from_prediction(
 
     Parameters
     ----------
-    predictor : Predictor
-    episode : Episode
     outcome : EpisodeResult
         Of this predictor.
     theta : ndarray, shape (ntheta,)

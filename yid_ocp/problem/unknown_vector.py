@@ -31,7 +31,6 @@ class UnknownVectorLayout:
         Free parameters with one value for all recordings, and with a value in each.
     initial_state_names : tuple of str
         Estimated components of the initial state: `q.JOINT`, `p.JOINT` and, of unobserved internal ones, `z.NAME`.
-    recording_names : tuple of str
     """
 
     shared_parameters: tuple[str, ...]
@@ -115,8 +114,6 @@ def stated_prior_jacobian(unknowns: UnknownVectorLayout, options: ProblemOptions
 
     Parameters
     ----------
-    unknowns : Unknowns
-    options : ProblemOptions
     std : ndarray, shape (nx,)
         From `stated_prior_std`.
     """
