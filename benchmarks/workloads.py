@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
-from yid_ocp.inference.linear_model import bounded_least_squares_step
+from yid_ocp.inference.linearized_residual import bounded_least_squares_step
 from yid_ocp.integrator import compiled
 from yid_ocp.integrator.lqr import lqr_feedback
 from yid_ocp.integrator.statics import EquilibriumSolver

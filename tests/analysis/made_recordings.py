@@ -15,7 +15,7 @@ from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import ProblemOptions
-from yid_ocp.problem.time_grid import TimeGrid
+from yid_ocp.problem.measurements import TimeGrid
 
 GRID = TimeGrid(10.0, 0.1, 20)
 

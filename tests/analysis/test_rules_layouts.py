@@ -25,7 +25,7 @@ from yid_ocp.model import Segment, System, flexible_object
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import SensorOptions
-from yid_ocp.problem.time_grid import TimeGrid
+from yid_ocp.problem.measurements import TimeGrid
 
 # -- what a recording saw ---------------------------------------------------------------------------------------------
 

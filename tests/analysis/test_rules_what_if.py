@@ -35,7 +35,7 @@ from yid_ocp.analysis.what_if import (
     what_if,
 )
 from yid_ocp.errors import SolverError
-from yid_ocp.problem.time_grid import TimeGrid
+from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.progress import NULL_PROGRESS
 
 

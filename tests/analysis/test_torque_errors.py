@@ -14,7 +14,7 @@ from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.analysis.torque_error_propagation import _NEGLIGIBLE_STD, _low_rank_error_sensitivity
 from yid_ocp.analysis.what_if import WhatIfOptions, what_if
 from yid_ocp.data.recording import PointGroup
-from yid_ocp.inference.linear_model import residual_without_weak_priors
+from yid_ocp.inference.linearized_residual import residual_without_weak_priors
 from yid_ocp.inference.whitening import whitened_at, without_input_errors
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.workflow.build_problem import load_problem

@@ -30,7 +30,7 @@ from yid_ocp.diagnosis.transfer_check import TransferCheck
 from yid_ocp.effects.base import EffectBase, ParameterDefinition
 from yid_ocp.inference.null_test import ChannelNoiseLevel, NullTestResult, _ResidualWindow
 from yid_ocp.inference.smoother import SmoothedUnknowns, SmootherResult
-from yid_ocp.inference.smoother_unknowns import UnknownGroup
+from yid_ocp.inference.smoother_model import UnknownGroup
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem.evaluation import Evaluation, ResidualRows
 from yid_ocp.problem.measurements import Measurements

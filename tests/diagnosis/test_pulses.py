@@ -11,7 +11,7 @@ import pytest
 from yid_ocp.diagnosis.pulse_detection import DetectedPulse, ForceEstimate, detect_pulses
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.inference.null_test import benjamini_hochberg_mask
-from yid_ocp.problem.low_pass_filter import LowPassFilter
+from yid_ocp.problem.signal_filters import LowPassFilter
 
 T = 0.1 * np.arange(80)
 NOISE = 0.02

@@ -16,7 +16,7 @@ from yid_ocp.diagnosis.localise import (
     merge_intervals,
     unknown_units,
 )
-from yid_ocp.inference.smoother_unknowns import UnknownGroup
+from yid_ocp.inference.smoother_model import UnknownGroup
 
 TWIST = UnknownGroup("T1", "bias")
 

@@ -34,7 +34,7 @@ from yid_ocp.inference.null_test import (
     run_null_test,
 )
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.low_pass_filter import LowPassFilter
+from yid_ocp.problem.signal_filters import LowPassFilter
 
 
 def white(rows, colour=None):

@@ -15,7 +15,7 @@ from yid_ocp.diagnosis.diagnose import _held_out_null_test, fit_nominal_model
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.screening import linearize_candidates
-from yid_ocp.inference.linear_model import residual_without_weak_priors
+from yid_ocp.inference.linearized_residual import residual_without_weak_priors
 from yid_ocp.inference.smoother_model import _CORRELATION_TIME, _MIN_INTERVAL, linear_residual_models
 from yid_ocp.inference.uncertainty import noise_covariance_factor
 from yid_ocp.inference.whitening import (

@@ -14,7 +14,7 @@ from yid_ocp.diagnosis.localise import localise_gap
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.inference import smoother
 from yid_ocp.inference.smoother import _instead, _run
-from yid_ocp.inference.smoother_unknowns import (
+from yid_ocp.inference.smoother_model import (
     _FORCE_POINT,
     UnknownGroup,
     generalized_forces_per_newton,

@@ -19,8 +19,7 @@ from yid_ocp.diagnosis.localise import (
 )
 from yid_ocp.inference import smoother_model
 from yid_ocp.inference.smoother import _filter, _run, _scores, force_likelihood_terms, run_smoother
-from yid_ocp.inference.smoother_model import IntervalModel, LinearResidualModel, linear_residual_models
-from yid_ocp.inference.smoother_unknowns import UnknownGroup
+from yid_ocp.inference.smoother_model import IntervalModel, LinearResidualModel, UnknownGroup, linear_residual_models
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System

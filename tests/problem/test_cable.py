@@ -22,7 +22,7 @@ from yid_ocp.model.cable import (
     read_vertex_positions,
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.low_pass_filter import LowPassFilter
+from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.prediction_errors import (
     interpolated_displacement_baseline,
     measured_positions,
@@ -30,7 +30,7 @@ from yid_ocp.problem.prediction_errors import (
     position_rmse,
 )
 from yid_ocp.problem.recorded_inputs import prescribed_path
-from yid_ocp.problem.time_grid import TimeGrid
+from yid_ocp.problem.signal_filters import LowPassFilter
 from yid_ocp.solvers import GaussNewton, solve
 
 PARENT = tuple(f"p{i}" for i in range(7))

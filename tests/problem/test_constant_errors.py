@@ -11,7 +11,7 @@ from small_problems import pendulum_step, taken
 
 from yid_ocp.inference.whitening import whitened_at
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.constant_sensor_errors import (
+from yid_ocp.problem.measurements import (
     ConstantErrorModel,
     constant_error_sensitivities,
     subtract_estimated_biases,

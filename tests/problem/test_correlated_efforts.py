@@ -12,7 +12,7 @@ from small_problems import correlated, efforts, measured, pendulum_step, taken
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.inference.smoother_model import linear_residual_models
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.low_pass_filter import LowPassFilter
+from yid_ocp.problem.signal_filters import LowPassFilter
 from yid_ocp.solvers import GaussNewton, Lifted, MultipleShooting, SingleShooting, solve
 from yid_ocp.solvers.symbolic_transcription import transcribe
 

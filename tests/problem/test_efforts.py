@@ -13,7 +13,7 @@ from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.low_pass_filter import LowPassFilter, effort_filter
+from yid_ocp.problem.signal_filters import LowPassFilter, effort_filter
 from yid_ocp.solvers import GaussNewton, solve
 
 JOINTS = ("shoulder", "elbow")

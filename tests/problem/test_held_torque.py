@@ -8,8 +8,8 @@ from small_problems import PENDULUM, pendulum_step, taken
 
 from yid_ocp.data.recording import JointGroup
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
+from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.recorded_inputs import mean_step_inputs, mean_step_inputs_by_delay
-from yid_ocp.problem.time_grid import TimeGrid
 from yid_ocp.sensors.joints import EFFORT_GROUP
 
 H = 0.01

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from yid_ocp.problem.first_order_lag import FirstOrderLag
+from yid_ocp.problem.signal_filters import FirstOrderLag
 
 H, N = 0.01, 40
 RNG = np.random.default_rng(4)

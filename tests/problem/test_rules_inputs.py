@@ -13,7 +13,7 @@ from small_problems import joints, recording, seen
 
 from yid_ocp.errors import DataError
 from yid_ocp.model.cable import ClampPath
-from yid_ocp.problem.low_pass_filter import LowPassFilter, effort_filter
+from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.recorded_inputs import (
     _smoothed_point_path,
     mean_step_inputs,
@@ -23,7 +23,7 @@ from yid_ocp.problem.recorded_inputs import (
     smoothed_joint_angles,
     smoothed_joint_efforts,
 )
-from yid_ocp.problem.time_grid import TimeGrid
+from yid_ocp.problem.signal_filters import LowPassFilter, effort_filter
 
 PLAIN = LowPassFilter(math.inf)
 

@@ -9,8 +9,7 @@ import pytest
 from small_problems import efforts, joints, measured, points, recording, seen
 
 from yid_ocp.errors import DataError
-from yid_ocp.problem.measurements import huber_loss, place_on_grid, with_paper_weights
-from yid_ocp.problem.time_grid import TimeGrid, make_time_grid
+from yid_ocp.problem.measurements import TimeGrid, huber_loss, make_time_grid, place_on_grid, with_paper_weights
 from yid_ocp.sensors.base import SensorData
 
 NAN = math.nan

@@ -12,7 +12,7 @@ from small_problems import PENDULUM, STEPS, H, pendulum_step, taken
 from yid_ocp.integrator.step import TrackingFeedback
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import truncate_episode
-from yid_ocp.problem.input_corrections import CorrectedInputs
+from yid_ocp.problem.model_functions import CorrectedInputs
 
 MISREAD = (("encoder_offset", "shoulder", {"offset": 0.03}), ("effort_gain", "shoulder", {"scale": 0.9}))
 LATE = (("camera_latency", "camera", {"delay": 0.0137}), ("clock_scale", "clock", {"scale": 0.97}))

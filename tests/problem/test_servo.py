@@ -17,8 +17,8 @@ from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model.servos_and_springs import TORQUE_LIMIT_POWER, PositionServoOptions
 from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.recorded_inputs import mean_step_inputs
-from yid_ocp.problem.time_grid import TimeGrid
 from yid_ocp.solvers import GaussNewton
 
 VALUES = {

@@ -9,7 +9,7 @@ import pytest
 from made_problems import MadeUp, Steps, linear
 
 from yid_ocp.errors import DataError, SolverError
-from yid_ocp.inference.linear_model import is_stationary, predicted_reduction
+from yid_ocp.inference.linearized_residual import is_stationary, predicted_reduction
 from yid_ocp.problem.unknown_vector import soft_logarithm
 from yid_ocp.solvers import GaussNewton, Status, solve
 from yid_ocp.solvers.gauss_newton import _PATIENCE_STEPS

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.inference.linear_model import bounded_least_squares_step
+from yid_ocp.inference.linearized_residual import bounded_least_squares_step
 from yid_ocp.inference.null_test import DEFAULT_GAP_CRITERIA, GapCriteria
 from yid_ocp.model.cable import START_SPEED_PARAMETER, START_SPEED_SCALE_PARAMETER
 from yid_ocp.problem import EstimationProblem

@@ -16,8 +16,7 @@ from yid_ocp.inference.null_test import DEFAULT_GAP_CRITERIA, GapCriteria
 from yid_ocp.inference.uncertainty import MAX_IDENTIFIABLE_RELATIVE_STD, ParameterEstimate
 from yid_ocp.inference.whitening import without_input_errors
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.prediction_result import EpisodePrediction
+from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.solvers import GaussNewton, Iterate, Solution, Status, solve
 from yid_ocp.solvers.base import Solver, uses_process_noise_covariance
 from yid_ocp.solvers.fit_messages import VERDICT_PREDICATES, VERDICT_WORDS

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.inference.linear_model import bounded_least_squares_step
+from yid_ocp.inference.linearized_residual import bounded_least_squares_step
 from yid_ocp.inference.uncertainty import ParameterEstimate, verdict_by_relative_std
 from yid_ocp.inference.whitening import whitened_at
 from yid_ocp.model.system import System

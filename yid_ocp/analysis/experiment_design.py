@@ -23,7 +23,7 @@ from yid_ocp.model.mechanism import Frame, Placement
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.time_grid import TimeGrid
+from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.sensors import recorded_camera_pose
 from yid_ocp.sensors.joints import POSITION_GROUP, PositionSensor, is_measured_by_arm

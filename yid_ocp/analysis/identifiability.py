@@ -16,7 +16,7 @@ from yid_ocp.analysis.profile import ParameterProfile, check_small_estimate, nea
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError, SolverError, nearest_name_hint
-from yid_ocp.inference.linear_model import residual_without_weak_priors
+from yid_ocp.inference.linearized_residual import residual_without_weak_priors
 from yid_ocp.inference.null_test import DEFAULT_GAP_CRITERIA, GapCriteria
 from yid_ocp.inference.uncertainty import (
     MAX_IDENTIFIABLE_RELATIVE_STD,

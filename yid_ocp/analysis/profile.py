@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.inference.linear_model import bounded_least_squares_step, residual_without_weak_priors
+from yid_ocp.inference.linearized_residual import bounded_least_squares_step, residual_without_weak_priors
 from yid_ocp.inference.uncertainty import (
     ConfidenceInterval,
     ParameterEstimate,

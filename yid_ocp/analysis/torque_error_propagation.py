@@ -24,8 +24,8 @@ from yid_ocp.inference.whitening import NominalTrajectory, nominal_trajectory
 from yid_ocp.integrator.linearized_steps import linearized_steps
 from yid_ocp.integrator.momentum_shift import torque_error_feedthrough
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.episodes import InputErrors
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.input_errors import InputErrors
 from yid_ocp.sensors import Sensor
 from yid_ocp.sensors.joints import PositionSensor
 

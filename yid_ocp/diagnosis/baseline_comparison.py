@@ -16,7 +16,7 @@ import scipy.stats
 from yid_ocp.analysis.estimate_history import RunEstimates, nearest_positive_definite
 from yid_ocp.diagnosis.refit import RefitModel
 from yid_ocp.errors import ConfigError, nearest_name_hint
-from yid_ocp.inference.linear_model import residual_without_weak_priors
+from yid_ocp.inference.linearized_residual import residual_without_weak_priors
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.options import MultivariateGaussianPrior
 

@@ -63,7 +63,7 @@ from yid_ocp.inference.uncertainty import noise_covariance_factor
 from yid_ocp.inference.whitening import whitened_at, whitened_by_sensor_noise
 from yid_ocp.parallel import map_with_batched_calls
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.constant_sensor_errors import subtract_estimated_biases
+from yid_ocp.problem.measurements import subtract_estimated_biases
 from yid_ocp.progress import LoggingProgress, Progress
 from yid_ocp.solvers import GaussNewton, Solution, solve
 from yid_ocp.solvers.base import RESTART_FACTORS

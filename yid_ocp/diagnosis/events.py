@@ -27,16 +27,13 @@ from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects.base import robot_joints
 from yid_ocp.inference.null_test import benjamini_hochberg_mask, sample_times
 from yid_ocp.inference.smoother import SmootherResult, force_likelihood_terms
-from yid_ocp.inference.smoother_model import LinearResidualModel, linear_residual_models
-from yid_ocp.inference.smoother_unknowns import sensor_bias_location
+from yid_ocp.inference.smoother_model import LinearResidualModel, linear_residual_models, sensor_bias_location
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.constant_sensor_errors import subtract_estimated_biases
-from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.low_pass_filter import effort_filter
-from yid_ocp.problem.measurements import Measurements
+from yid_ocp.problem.measurements import Measurements, subtract_estimated_biases
 from yid_ocp.problem.options import SensorOptions
-from yid_ocp.problem.prediction_result import EpisodePrediction
+from yid_ocp.problem.signal_filters import effort_filter
 from yid_ocp.sensors.joints import values_by_joint
 
 Array = NDArray[np.float64]

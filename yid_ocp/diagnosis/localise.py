@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS
 from yid_ocp.inference.smoother import SmoothedUnknowns, SmootherResult
-from yid_ocp.inference.smoother_unknowns import UnknownGroup
+from yid_ocp.inference.smoother_model import UnknownGroup
 from yid_ocp.model.system import System
 
 Array = NDArray[np.float64]

@@ -29,7 +29,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.problem.low_pass_filter import effort_filter
+from yid_ocp.problem.signal_filters import effort_filter
 
 Array = NDArray[np.float64]
 _SparseMatrix = Any  # scipy.sparse.csc_array or, of few profiles, ndarray; the former has no types

@@ -28,7 +28,7 @@ from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
-from yid_ocp.inference.linear_model import residual_without_weak_priors
+from yid_ocp.inference.linearized_residual import residual_without_weak_priors
 from yid_ocp.inference.null_test import ResidualChannel, residual_channels
 
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ from typing import Annotated
 from annotated_types import Ge, Gt, Le, Lt
 
 from yid_ocp.inference.null_test import DEFAULT_GAP_CRITERIA, RESIDUAL_WINDOW_LENGTH, GapCriteria
-from yid_ocp.inference.smoother_unknowns import SmootherThresholds
+from yid_ocp.inference.smoother_model import SmootherThresholds
 from yid_ocp.options import OptionInfo
 
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.estimation_problem import EstimationProblem
-from yid_ocp.problem.low_pass_filter import LowPassFilter, effort_filter
 from yid_ocp.problem.measurements import Measurements
+from yid_ocp.problem.signal_filters import LowPassFilter, effort_filter
 
 Array = NDArray[np.float64]
 

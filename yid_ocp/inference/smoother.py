@@ -25,8 +25,13 @@ import threadpoolctl
 from numpy.typing import NDArray
 
 from yid_ocp.inference.kalman import KalmanStep, Transition, kalman_step
-from yid_ocp.inference.smoother_model import LinearResidualModel, linear_residual_models
-from yid_ocp.inference.smoother_unknowns import DEFAULT_SMOOTHER_THRESHOLDS, SmootherThresholds, UnknownGroup
+from yid_ocp.inference.smoother_model import (
+    DEFAULT_SMOOTHER_THRESHOLDS,
+    LinearResidualModel,
+    SmootherThresholds,
+    UnknownGroup,
+    linear_residual_models,
+)
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation

@@ -38,18 +38,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.inference.kalman import KalmanStep, Transition, kalman_step
-from yid_ocp.inference.residual_slopes import NominalTrajectory, ResidualSlopes, nominal_trajectory
+from yid_ocp.inference.linearized_residual import NominalTrajectory, ResidualSlopes, nominal_trajectory
 from yid_ocp.integrator.linearized_steps import LinearizedStep, active_state_mask, linearized_steps
 from yid_ocp.integrator.momentum_shift import torque_error_feedthrough
 from yid_ocp.integrator.step import TrackingFeedback
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EquilibriumGuesses, EstimationProblem
-from yid_ocp.problem.constant_sensor_errors import subtract_estimated_biases
 from yid_ocp.problem.episode_prediction import EpisodePredictor
-from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.episodes import Episode, EpisodePrediction, InputErrors
 from yid_ocp.problem.evaluation import ResidualWhitener
-from yid_ocp.problem.input_errors import InputErrors
-from yid_ocp.problem.prediction_result import EpisodePrediction
+from yid_ocp.problem.measurements import subtract_estimated_biases
 
 Array = NDArray[np.float64]
 _RowIndices = NDArray[np.int64]

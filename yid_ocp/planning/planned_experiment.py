@@ -24,7 +24,7 @@ from scipy.interpolate import BSpline
 from yid_ocp.analysis.experiment_design import DEFAULT_TORQUE_STD
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import ConfigError, DataError, SolverError
-from yid_ocp.inference.linear_model import residual_without_weak_priors
+from yid_ocp.inference.linearized_residual import residual_without_weak_priors
 from yid_ocp.inference.whitening import whitened_at
 from yid_ocp.integrator.step import Step, compile_step_like
 from yid_ocp.parallel import map_with_batched_calls
@@ -35,8 +35,8 @@ from yid_ocp.planning.path_simulator import PathSimulator
 from yid_ocp.planning.spline_path import SplinePath
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.low_pass_filter import effort_filter
 from yid_ocp.problem.measurements import Measurements
+from yid_ocp.problem.signal_filters import effort_filter
 from yid_ocp.sensors.joints import EFFORT_GROUP, POSITION_GROUP
 
 Array = NDArray[np.float64]

@@ -16,15 +16,12 @@ from yid_ocp.integrator.step import Rollout, SensitivityDirections, Step
 from yid_ocp.integrator.step_model import RolloutInputs
 from yid_ocp.model.system import System
 from yid_ocp.parallel import map_in_threads
-from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.first_order_lag import FirstOrderLag
-from yid_ocp.problem.input_corrections import CorrectedInputs
-from yid_ocp.problem.low_pass_filter import LowPassFilter, NodeSmoother
+from yid_ocp.problem.episodes import Episode, EpisodePrediction, InitialState
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.model_functions import ModelFunctions
+from yid_ocp.problem.model_functions import CorrectedInputs, ModelFunctions
 from yid_ocp.problem.options import ProblemOptions
-from yid_ocp.problem.prediction_result import EpisodePrediction, InitialState
 from yid_ocp.problem.recorded_inputs import mean_step_inputs, mean_step_inputs_by_delay
+from yid_ocp.problem.signal_filters import FirstOrderLag, LowPassFilter, NodeSmoother
 from yid_ocp.problem.unknown_vector import UnknownVectorLayout
 
 Array = NDArray[np.float64]

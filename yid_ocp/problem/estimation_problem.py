@@ -15,9 +15,9 @@ from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.step import Step
 from yid_ocp.model.system import System
+from yid_ocp.problem.episode_initialization import estimate_initial_state_offset, with_observed_equilibrium
 from yid_ocp.problem.episode_prediction import EpisodePredictor
-from yid_ocp.problem.episodes import Episode, mass_matrix_diagonal, prepare_episode
-from yid_ocp.problem.equilibrium_and_loads import with_observed_equilibrium
+from yid_ocp.problem.episodes import Episode, EpisodePrediction, InitialState, mass_matrix_diagonal, prepare_episode
 from yid_ocp.problem.evaluation import (
     EquilibriumGuesses,
     Evaluation,
@@ -25,11 +25,9 @@ from yid_ocp.problem.evaluation import (
     ResidualWhitener,
     whitened_episode_residual,
 )
-from yid_ocp.problem.held_out_initial_state import estimate_initial_state_offset
 from yid_ocp.problem.measurements import ResidualBlock, huber_loss
 from yid_ocp.problem.model_functions import ModelFunctions
 from yid_ocp.problem.options import ProblemOptions
-from yid_ocp.problem.prediction_result import EpisodePrediction, InitialState
 from yid_ocp.problem.synthetic_recording import synthesize_recording
 from yid_ocp.problem.unknown_vector import (
     UnknownVectorLayout,

@@ -11,11 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
-from yid_ocp.problem.constant_sensor_errors import ConstantErrorModel, constant_error_sensitivities
-from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.input_errors import InputErrors
-from yid_ocp.problem.measurements import Measurements, ResidualBlock, huber_loss
-from yid_ocp.problem.prediction_result import EpisodePrediction
+from yid_ocp.problem.episodes import Episode, EpisodePrediction, InputErrors
+from yid_ocp.problem.measurements import (
+    ConstantErrorModel,
+    Measurements,
+    ResidualBlock,
+    constant_error_sensitivities,
+    huber_loss,
+)
 
 Array = NDArray[np.float64]
 EquilibriumGuesses = tuple[Array | None, ...]

@@ -1,21 +1,80 @@
-"""Measurements of one sensor on the nodes of a rollout: interpolation, weights, whitening, robust loss."""
+"""Measurements of one sensor on the nodes of a rollout: time grid, interpolation, weights, whitening, constant errors."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
 import scipy.sparse
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError
-from yid_ocp.problem.time_grid import TimeGrid
 from yid_ocp.sensors import Sensor, SensorData
 
 Array = NDArray[np.float64]
+
+
+_MAX_STEPS = 200_000
+"""Steps of a rollout: half an hour in steps of 10 ms; a clock in milliseconds or one that jumps asks for more."""
+
+_MAX_STEPS_PER_SAMPLE = 500
+"""Steps from one sample to the next, on average; a clock in milliseconds read as seconds asks for a thousand."""
+
+
+@dataclass(frozen=True)
+class TimeGrid:
+    """Uniform time grid of a rollout: t_k = start + k time_step, k = 0..steps."""
+
+    start_time: float
+    time_step: float
+    steps: int
+
+    @property
+    def node_times(self) -> Array:
+        """Times of all nodes, shape (steps + 1,) [s]."""
+        return np.asarray(self.start_time + self.time_step * np.arange(self.steps + 1), dtype=float)
+
+    def node_and_fraction(self, t: ArrayLike) -> tuple[NDArray[np.int64], Array]:
+        """Return the node before each time and the fraction of a step after it, to within 1e-6 of a step."""
+        position = (np.asarray(t, float) - self.start_time) / self.time_step
+        near = np.rint(position)
+        position = np.where(np.abs(position - near) < 1e-6, near, position)
+        node = np.clip(np.floor(position).astype(np.int64), 0, self.steps - 1)
+        return node, position - node
+
+
+def make_time_grid(recording: Recording, time_step: float, duration: float | None = None) -> TimeGrid:
+    """Time grid that covers the recording's joint samples, or its first group of points where it has no joints.
+
+    Raises
+    ------
+    DataError
+        The recording is shorter than two steps, or longer than `_MAX_STEPS`, or has too few samples for its length.
+    """
+    t = recording.joints.t if recording.joints is not None else recording.points[0].t
+    span = float(t[-1] - t[0]) if duration is None else min(duration, float(t[-1] - t[0]))
+    steps = math.floor(span / time_step + 1e-6)
+    if steps > _MAX_STEPS or steps > _MAX_STEPS_PER_SAMPLE * len(t):
+        raise DataError(
+            f"{span:.3g} s of data, {len(t)} samples, are {steps:.3g} time steps of {time_step:g} s",
+            where=recording.name,
+            allowed=f"at most {_MAX_STEPS}, and {_MAX_STEPS_PER_SAMPLE} from one sample to the next",
+            hint="see whether times are in seconds and the clock does not jump; else cut the recording",
+        )
+    if steps < 2:
+        raise DataError(
+            f"{span:.3g} s of data are shorter than two time steps of {time_step:g} s",
+            where=recording.name,
+            hint="record longer, or choose a smaller time step",
+        )
+    return TimeGrid(float(t[0]), time_step, steps)
+
+
 ResidualWeighting = Literal["whitened", "paper"]
 
 
@@ -286,3 +345,78 @@ def huber_loss(residual: Array, scale: float) -> tuple[float, Array]:
         cost = np.where(inside, 0.5 * residual**2, scale * (size - 0.5 * scale) if np.isfinite(scale) else 0.0)
     factor = np.where(inside, 1.0, np.sqrt(scale / np.maximum(size, 1e-300)))
     return float(np.sum(cost)), factor
+
+
+@dataclass(frozen=True)
+class ConstantErrorModel:
+    """Noise model of constant sensor errors: SVD of the residual's sensitivities to errors of unit variance.
+
+    Attributes
+    ----------
+    left_vectors : ndarray, shape (r, m)
+        Q
+    singular_values : ndarray, shape (m,)
+        S
+    right_vectors : ndarray, shape (m, m)
+        V'
+    """
+
+    left_vectors: Array
+    singular_values: Array
+    right_vectors: Array
+
+    @staticmethod
+    def from_sensitivities(slopes: Array) -> ConstantErrorModel:
+        """Model from the sensitivities of residuals of unit variance, shape (r, m)."""
+        return ConstantErrorModel(*np.linalg.svd(slopes, full_matrices=False))
+
+    def whiten(self, columns: Array) -> Array:
+        """Whiten columns (a residual, its derivatives) by sensor noise and constant errors, shape (r, c)."""
+        along = self.left_vectors.T @ columns
+        return np.asarray(
+            columns - self.left_vectors @ ((1 - 1 / np.sqrt(1 + self.singular_values**2))[:, None] * along)
+        )
+
+    def estimate_errors(self, residual: Array) -> Array:
+        """Estimate the errors, measured minus true, from a residual, prediction minus measurement, shape (m,)."""
+        return np.asarray(
+            -self.right_vectors.T
+            @ ((self.singular_values / (1 + self.singular_values**2)) * (self.left_vectors.T @ residual))
+        )
+
+
+def constant_error_sensitivities(samples: Sequence[Measurements]) -> Array:
+    """Sensitivities of whitened measurements to constant sensor errors [standard deviations], shape (r, m).
+
+    Those of the residual, prediction minus measurement, have the opposite sign.
+    """
+    parts = [(s.weight * s.bias_std)[:, :, None] * np.eye(len(s.bias_std))[:, s.bias_std > 0] for s in samples]
+    count, before = sum(part.shape[2] for part in parts), 0
+    found = np.zeros((sum(s.n_residuals for s in samples), count))
+    rows = 0
+    for s, part in zip(samples, parts, strict=True):
+        own = s.decorrelate(part[s.is_used])
+        found[rows : rows + s.n_residuals, before : before + own.shape[1]] = own
+        rows, before = rows + s.n_residuals, before + own.shape[1]
+    return found
+
+
+def subtract_estimated_biases(samples: Sequence[Measurements], predicted: Sequence[Array]) -> tuple[Measurements, ...]:
+    """Measurements minus their constant errors as estimated from a prediction, with zero `bias_std`.
+
+    Parameters
+    ----------
+    predicted : sequence of ndarray, shape (M, k) each
+    """
+    slopes = constant_error_sensitivities(samples)
+    if not slopes.shape[1]:
+        return tuple(samples)
+    residual = np.concatenate([s.whitened_residual(y)[s.is_used] for s, y in zip(samples, predicted, strict=True)])
+    left = ConstantErrorModel.from_sensitivities(slopes).estimate_errors(residual)
+    made = []
+    for s in samples:
+        error, own = s.bias_std.copy(), s.bias_std > 0
+        error[own] *= left[: np.count_nonzero(own)]
+        left = left[np.count_nonzero(own) :]
+        made.append(replace(s, value=s.value - error, bias_std=np.zeros_like(error)))
+    return tuple(made)

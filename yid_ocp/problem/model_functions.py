@@ -1,26 +1,284 @@
-"""Compiled functions of a model (sensors, equilibrium, input corrections) that many estimation problems share.
-
-They are differentiated by every parameter that may become free; each problem takes the columns that it needs.
-"""
+"""Compiled functions of a model that many estimation problems share: sensors, equilibrium, input corrections."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.integrator.lqr import arms_only_step
 from yid_ocp.integrator.mapped_function import MappedFunction
-from yid_ocp.integrator.momentum_shift import MomentumShift
+from yid_ocp.integrator.momentum_shift import DrivenJointMotion, MomentumShift
 from yid_ocp.integrator.statics import Equilibrium, EquilibriumSolver
-from yid_ocp.integrator.step import Step
+from yid_ocp.integrator.step import Step, TrackingFeedback
+from yid_ocp.model.system import RecordingErrorEffect, System
 from yid_ocp.parallel import LockedCache
 from yid_ocp.problem.initial_state_fit import InitialStateFitter
-from yid_ocp.problem.input_corrections import InputCorrections
 from yid_ocp.sensors import Sensor, sensor_function
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CorrectedInputs:
+    """True inputs of a rollout, with derivatives by d parameters; a derivative that is zero is None.
+
+    Attributes
+    ----------
+    torque : ndarray, shape (N, nu)
+        [N m]
+    first_torque : ndarray, shape (nu,)
+        Torque of the initial equilibrium [N m].
+    prescribed_path : ndarray, shape (N + 1, nc)
+    driven_angles : ndarray, shape (N + 1, nu)
+        Angles of the driven joints [rad].
+    torque_sensitivity, first_torque_sensitivity, prescribed_path_sensitivity, driven_angles_sensitivity : ndarray, shape (..., d), or None
+    momentum_shift : ndarray, shape (N, nu), or None
+        Momentum that effects add to the driven joints along their measured motion.
+    momentum_shift_sensitivity : ndarray, shape (N, nu, d'), or None
+        Includes the initial state's unknowns where they are asked for.
+    """
+
+    torque: Array
+    first_torque: Array
+    prescribed_path: Array
+    driven_angles: Array
+    torque_sensitivity: Array | None = None
+    first_torque_sensitivity: Array | None = None
+    prescribed_path_sensitivity: Array | None = None
+    driven_angles_sensitivity: Array | None = None
+    momentum_shift: Array | None = None
+    momentum_shift_sensitivity: Array | None = None
+
+    @property
+    def initial_known_coordinates(self) -> Array:
+        """Coordinates of driven, then prescribed joints at node 0, shape (nk,)."""
+        return np.concatenate([self.driven_angles[0], self.prescribed_path[0]])
+
+    def initial_known_coordinates_sensitivity(self, width: int) -> Array:
+        """Derivative of `initial_known_coordinates` by the parameters, shape (nk, d)."""
+        parts = (
+            (self.driven_angles_sensitivity, self.driven_angles),
+            (self.prescribed_path_sensitivity, self.prescribed_path),
+        )
+        return np.vstack([np.zeros((x.shape[1], width)) if by is None else by[0] for by, x in parts])
+
+    def corrected_feedback(
+        self, feedback: TrackingFeedback | None, driven: tuple[int, ...], measured: Array
+    ) -> TrackingFeedback | None:
+        """Tracking filter whose reference has the true angles and the momentum shift of the effects."""
+        if feedback is None or (self.driven_angles_sensitivity is None and self.momentum_shift is None):
+            return feedback
+        reference = feedback.reference.copy()
+        for column, at in self._followed(feedback, driven, momenta=False):
+            if self.driven_angles_sensitivity is not None:
+                reference[:, column] += (self.driven_angles - measured)[: len(reference), at]
+        for column, at in self._followed(feedback, driven, momenta=True):
+            if self.momentum_shift is not None:
+                reference[:, column] += self.momentum_shift[:, at]
+        return TrackingFeedback(feedback.state_indices, feedback.gain, reference)
+
+    def with_momentum_shift(
+        self,
+        shift: MomentumShift,
+        recorded: DrivenJointMotion,
+        measured: Array,
+        theta: Array,
+        wanted: Sequence[str],
+        by_internal: Array | None,
+    ) -> CorrectedInputs:
+        """Inputs with the momentum that effects add to the driven joints.
+
+        Parameters
+        ----------
+        recorded : Motion
+            Its angles are smooth.
+        measured : ndarray, shape (N + 1, nu)
+            Angles as they were read.
+        theta : ndarray, shape (ntheta,)
+        by_internal : ndarray, shape (nz, d), or None
+            Derivative of the internal coordinates at the start.
+        """
+        slopes = [x for x in (self.torque_sensitivity, self.driven_angles_sensitivity) if x is not None]
+        read = np.array_equal(self.torque, recorded.torque) and np.array_equal(self.driven_angles, measured)
+        if read and not any(np.any(x) for x in slopes) and not shift.is_active(theta, wanted):
+            return self
+        smooth = recorded.angles + self.driven_angles - measured
+        true = DrivenJointMotion(
+            smooth,
+            self.torque,
+            recorded.initial_internal,
+            self.driven_angles_sensitivity,
+            self.torque_sensitivity,
+            by_internal,
+        )
+        momentum, slope = shift.shift_and_derivatives(recorded, true, theta, wanted)
+        return replace(self, momentum_shift=momentum, momentum_shift_sensitivity=slope if np.any(slope) else None)
+
+    def nominal_torque_tangents(
+        self, feedback: TrackingFeedback | None, driven: tuple[int, ...], width: int
+    ) -> Array | None:
+        """Tangents of the nominal torque, including those of the filter's reference, shape (N, nu, width)."""
+        reached = [] if self.torque_sensitivity is None else [self.torque_sensitivity]
+        for slope, momenta in ((self.driven_angles_sensitivity, False), (self.momentum_shift_sensitivity, True)):
+            if feedback is not None and slope is not None:
+                columns, own = (list(x) for x in zip(*self._followed(feedback, driven, momenta), strict=True))
+                reached.append(feedback.gain[:, :, columns] @ slope[: len(self.torque), own])
+        if not reached:
+            return None
+        return np.asarray(sum(np.pad(by, ((0, 0), (0, 0), (0, width - by.shape[2]))) for by in reached))
+
+    def _followed(self, feedback: TrackingFeedback, driven: tuple[int, ...], momenta: bool) -> list[tuple[int, int]]:
+        """Columns of a filter that follow angles, or momenta, and the driven joint of each."""
+        rows = [int(row) for row in feedback.state_indices]
+        if not momenta:
+            return [(column, driven.index(row)) for column, row in enumerate(rows) if row in driven]
+        # momenta come after all coordinates, those of driven joints in the same order
+        later = [column for column, row in enumerate(rows) if row not in driven]
+        return list(zip(later, range(len(driven)), strict=False))
+
+
+class InputCorrections:
+    """Maps from recorded to true inputs and times, from `RecordingErrorEffect.corrected_reading` and `.delay` of a system's effects.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Parameters by which derivatives may be asked for; those wanted are some of them.
+    """
+
+    def __init__(self, system: System, names: tuple[str, ...], use_compiler: bool) -> None:
+        self.system = system
+        self._names = names
+        self._effects = tuple(e for e in system.effects if isinstance(e, RecordingErrorEffect))
+        self.joint_names = (*system.driven, *system.prescribed)
+        count = len(self.joint_names)
+        angle, effort = ca.SX.sym("angle", count), ca.SX.sym("effort", count)
+        true_angle, true_effort = self._corrected(angle, effort)
+        theta = system.parameters.symbols
+        late = ca.vertcat(ca.SX(0, 1), *(self._delay(f"torque.{joint}", False) for joint in system.driven))
+        self.corrects_angles = _depends(true_angle, theta)
+        self.corrects_efforts = _depends(true_effort, theta)
+        self.angles_depend_on_effort = _depends(true_angle, effort)
+        self.delays_torque = _depends(late, theta)
+        self._lags = {
+            kind: self._lag_function(kind, joints)
+            for kind, joints in (("torque", system.driven), ("joints.effort", system.prescribed))
+        }
+        self.lags_torque = self._lags["torque"] is not None
+        chosen = ca.vertcat(ca.SX(0, 1), *(system.parameters[name].symbol for name in names))
+        self._late = ca.Function("delay", [theta], [late, ca.jacobian(late, chosen)])
+        slope = ca.vertcat(ca.SX(0, 1), *(ca.jacobian(true_effort[i], effort[i]) for i in range(count)))
+        outputs = [true_angle, true_effort, ca.densify(slope)]
+
+        def compiled(differentiated: bool) -> MappedFunction:
+            slopes = [ca.jacobian(x, chosen) for x in outputs[:2]] if differentiated else []
+            function = ca.Function("true", [angle, effort, theta], [*outputs, *slopes])
+            return MappedFunction(function, shared_inputs=(2,), use_compiler=use_compiler)
+
+        self._maps: LockedCache[bool, MappedFunction] = LockedCache(compiled)
+        self._sensor_delays: LockedCache[Sensor, ca.Function | None] = LockedCache(self._sensor_delay)
+
+    def _corrected(self, angle: ca.SX, effort: ca.SX) -> tuple[ca.SX, ca.SX]:
+        angles, efforts = [], []
+        for i, joint in enumerate(self.joint_names):
+            # the last effect is the nearest to the reading
+            true_effort, true_angle = effort[i], angle[i]
+            # a servo is commanded what its encoder is to read
+            channel = "joints.position" if joint in self.system.servos else "joints.effort"
+            for effect in reversed(self._effects):
+                true_effort = effect.corrected_reading(f"{channel}.{joint}", true_effort, true_effort)
+            for effect in reversed(self._effects):
+                true_angle = effect.corrected_reading(f"joints.position.{joint}", true_angle, true_effort)
+            efforts.append(true_effort)
+            angles.append(true_angle)
+        return ca.vertcat(ca.SX(0, 1), *angles), ca.vertcat(ca.SX(0, 1), *efforts)
+
+    def _delay(self, channel: str, camera: bool) -> ca.SX:
+        total = sum((effect.added_delay(channel, camera) for effect in self._effects), ca.SX(0))
+        kind, _, joint = channel.partition(".")
+        if kind == "torque" and joint in self.system.servos:
+            total += self.system.servos[joint].command_delay
+        # a delay is in true time, a recording in its own
+        return total / self.system.recorded_time_scale
+
+    def true_angles_and_efforts(
+        self, angle: Array, effort: Array, theta: Array, wanted: tuple[str, ...]
+    ) -> tuple[Array, Array, Array, Array, Array]:
+        """True angles and efforts of `joint_names` behind readings.
+
+        Parameters
+        ----------
+        angle, effort : ndarray, shape (K, nj)
+        theta : ndarray, shape (ntheta,)
+        wanted : tuple of str
+            Parameters by which to differentiate, d of them.
+
+        Returns
+        -------
+        angle, effort : ndarray, shape (K, nj)
+        angle_by_theta, effort_by_theta : ndarray, shape (K, nj, d)
+        effort_by_reading : ndarray, shape (K, nj)
+        """
+        a, e, e_reading, *slopes = self._maps(bool(wanted))(angle, effort, theta)
+        at = [self._names.index(name) for name in wanted]
+        a_theta, e_theta = (x[:, :, at] for x in slopes) if wanted else (np.zeros((*a.shape[:2], 0)),) * 2
+        return a[:, :, 0], e[:, :, 0], a_theta, e_theta, e_reading[:, :, 0]
+
+    def torque_delay(self, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array]:
+        """Delay from recorded to acting torque of each driven joint, shape (nu,) [s], and its derivative."""
+        return self._evaluate(self._late, theta, wanted)
+
+    def torque_time_constants(self, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array] | None:
+        """Time constant of each driven joint's torque lag, (nu,) [s], and its derivative; None without lags."""
+        function = self._lags["torque"]
+        return None if function is None else self._evaluate(function, theta, wanted)
+
+    def effort_time_constants(self, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array] | None:
+        """Time constant of each prescribed joint's effort lag, (nc,) [s], and its derivative; None without lags."""
+        function = self._lags["joints.effort"]
+        return None if function is None else self._evaluate(function, theta, wanted)
+
+    def _lag_function(self, kind: str, joints: tuple[str, ...]) -> ca.Function | None:
+        theta = self.system.parameters.symbols
+        lags = [
+            sum((effect.lag_time_constant(f"{kind}.{joint}") for effect in self._effects), ca.SX(0))
+            / self.system.recorded_time_scale
+            for joint in joints
+        ]
+        expression = ca.vertcat(ca.SX(0, 1), *lags)
+        if not _depends(expression, theta):
+            return None
+        chosen = ca.vertcat(ca.SX(0, 1), *(self.system.parameters[name].symbol for name in self._names))
+        return ca.Function("lag", [theta], [expression, ca.jacobian(expression, chosen)])
+
+    def sensor_delay(self, sensor: Sensor, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array] | None:
+        """Delay from true to recorded time of each output, shape (k,) [s], and its derivative; None without delays."""
+        found = self._sensor_delays(sensor)
+        return None if found is None else self._evaluate(found, theta, wanted)
+
+    def _sensor_delay(self, sensor: Sensor) -> ca.Function | None:
+        camera, theta = sensor.camera_pose is not None, self.system.parameters.symbols
+        late = [
+            self._delay(channel, camera) for channel in sensor.channel_names for _ in range(sensor.outputs_per_channel)
+        ]
+        expression = ca.vertcat(ca.SX(0, 1), *late)
+        if not _depends(expression, theta):
+            return None
+        chosen = ca.vertcat(ca.SX(0, 1), *(self.system.parameters[name].symbol for name in self._names))
+        return ca.Function("delay", [theta], [expression, ca.jacobian(expression, chosen)])
+
+    def _evaluate(self, function: ca.Function, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array]:
+        value, slope = (np.array(ca.densify(x)) for x in function(theta))
+        at = [self._names.index(name) for name in wanted]
+        return value.ravel(), slope.reshape(value.size, len(self._names))[:, at]
+
+
+def _depends(expression: ca.SX, symbols: ca.SX) -> bool:
+    return expression.numel() > 0 and symbols.numel() > 0 and bool(ca.depends_on(expression, symbols))
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.display import ReprMixin, ReprSummary
 from yid_ocp.errors import DataError, nearest_name_hint
-from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.estimation_problem import EstimationProblem
-from yid_ocp.problem.prediction_result import EpisodePrediction
 
 Array = NDArray[np.float64]
 

@@ -14,8 +14,8 @@ from yid_ocp.errors import DataError, nearest_name_hint
 from yid_ocp.model.cable import ClampPath
 from yid_ocp.model.servos_and_springs import PositionServo
 from yid_ocp.model.system import System
-from yid_ocp.problem.low_pass_filter import LowPassFilter
-from yid_ocp.problem.time_grid import TimeGrid
+from yid_ocp.problem.measurements import TimeGrid
+from yid_ocp.problem.signal_filters import LowPassFilter
 from yid_ocp.sensors import recorded_camera_pose, recorded_joint_columns
 
 Array = NDArray[np.float64]

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate_recording
 from yid_ocp.errors import SolverError
 from yid_ocp.problem.episode_prediction import EpisodePredictor
-from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.options import SensorOptions
-from yid_ocp.problem.prediction_result import EpisodePrediction
 from yid_ocp.sensors.joints import (
     EFFORT_GROUP,
     POSITION_GROUP,

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import ConfigError, YidError
-from yid_ocp.inference.linear_model import is_stationary
+from yid_ocp.inference.linearized_residual import is_stationary
 from yid_ocp.inference.null_test import DEFAULT_GAP_CRITERIA, GapCriteria
 from yid_ocp.inference.uncertainty import (
     GoodnessOfFit,
@@ -29,10 +29,10 @@ from yid_ocp.inference.uncertainty import (
     parameter_estimates,
 )
 from yid_ocp.inference.whitening import whitened_at, whitened_by_sensor_noise
+from yid_ocp.problem.episodes import EpisodePrediction
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
 from yid_ocp.problem.prediction_errors import ChannelPrediction, channel_predictions
-from yid_ocp.problem.prediction_result import EpisodePrediction
 from yid_ocp.registry import Registry
 from yid_ocp.solvers.effect_initialization import initialize_free_effects
 from yid_ocp.solvers.fit_messages import VERDICT_WORDS, finite_or_none, parameter_text

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.effects import EffectBase
-from yid_ocp.inference.linear_model import bounded_least_squares_step, predicted_reduction
+from yid_ocp.inference.linearized_residual import bounded_least_squares_step, predicted_reduction
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 

@@ -10,7 +10,7 @@ import numpy as np
 from annotated_types import Ge, Gt
 from numpy.typing import NDArray
 
-from yid_ocp.inference.linear_model import (
+from yid_ocp.inference.linearized_residual import (
     achievable_reduction,
     bounded_least_squares_step,
     is_stationary,

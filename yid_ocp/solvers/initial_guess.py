@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from yid_ocp.integrator.lqr import lqr_feedback
 from yid_ocp.integrator.rollout import generalized_momentum, simulate
 from yid_ocp.integrator.step import Rollout, TrackingFeedback
-from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.episodes import Episode, InitialState
 from yid_ocp.problem.estimation_problem import EstimationProblem
-from yid_ocp.problem.low_pass_filter import LowPassFilter
-from yid_ocp.problem.prediction_result import InitialState
+from yid_ocp.problem.signal_filters import LowPassFilter
 
 Array = NDArray[np.float64]
 _MisfitFunction = Callable[[int, Array, Array, Array], float]

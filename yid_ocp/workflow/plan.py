@@ -24,9 +24,9 @@ from yid_ocp.export.ros_trajectory import joint_trajectory_message
 from yid_ocp.integrator.step import Step
 from yid_ocp.planning.information_plan import InformativeMotionPlan, plan_informative_motion
 from yid_ocp.planning.motion_plan import MotionPlan, ParameterCovariance, plan_motion
-from yid_ocp.problem.low_pass_filter import LowPassFilter
+from yid_ocp.problem.measurements import make_time_grid
 from yid_ocp.problem.recorded_inputs import prescribed_path
-from yid_ocp.problem.time_grid import make_time_grid
+from yid_ocp.problem.signal_filters import LowPassFilter
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.animation import Animation, ModelTrajectory, make_animation
 from yid_ocp.report.summaries import plan_summary

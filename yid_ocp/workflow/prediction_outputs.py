@@ -23,14 +23,13 @@ from yid_ocp.inference.whitening import (
 )
 from yid_ocp.model.cable import CableTopology
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.prediction_errors import (
     clamp_displacement_baseline,
     constant_position_baseline,
     interpolated_displacement_baseline,
 )
-from yid_ocp.problem.prediction_result import EpisodePrediction
 from yid_ocp.solvers import Solution
 
 Array = NDArray[np.float64]

@@ -33,7 +33,7 @@ from yid_ocp.errors import DataError
 from yid_ocp.model.cable import CableTopology
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem, SensorOptions
-from yid_ocp.problem.prediction_result import EpisodePrediction
+from yid_ocp.problem.episodes import EpisodePrediction
 from yid_ocp.sensors.joints import EFFORT_GROUP, POSITION_GROUP
 
 _EFFECTS_BY_CAUSE = {

@@ -19,9 +19,8 @@ from yid_ocp.data.issues import Issue
 from yid_ocp.inference.uncertainty import covariance_to_dict, mark_not_trusted
 from yid_ocp.model.cable import CableTopology
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.prediction_errors import rmse_by_channel
-from yid_ocp.problem.prediction_result import EpisodePrediction
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.summaries import solve_summary
 from yid_ocp.solvers import Iterate, Solution, Status, solve

@@ -23,8 +23,7 @@ from yid_ocp.data.issues import Issue, Severity, median_sample_period
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.model.cable import CableTopology
 from yid_ocp.model.system import System
-from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.prediction_result import EpisodePrediction
+from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.sensors.base import SensorUsage
 
 Array = NDArray[np.float64]

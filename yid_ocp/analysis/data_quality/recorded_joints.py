@@ -18,7 +18,7 @@ from yid_ocp.model.kinematics import forward_kinematics, rigid_body_derivatives
 from yid_ocp.model.mechanism import Joint
 from yid_ocp.model.system import System
 from yid_ocp.parallel import LockedCache
-from yid_ocp.problem.low_pass_filter import LowPassFilter
+from yid_ocp.problem.signal_filters import LowPassFilter
 
 Array = NDArray[np.float64]
 

@@ -18,9 +18,9 @@ from yid_ocp.analysis.data_quality.clock_synchronization import (
 from yid_ocp.data.issues import MIN_NOISE_DIFFERENCES, QUALITY_LIMITS, Issue
 from yid_ocp.inference.null_test import residual_channels
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.episodes import EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.prediction_result import EpisodePrediction
 
 Array = NDArray[np.float64]
 

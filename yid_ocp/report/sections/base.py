@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.prediction_result import EpisodePrediction
+from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.registry import Registry
 from yid_ocp.report.animation import Animation
 from yid_ocp.solvers import Solution

@@ -15,8 +15,7 @@ from yid_ocp.diagnosis.diagnosis_messages import overspeed_messages
 from yid_ocp.diagnosis.localise import informed_z_scores, unknown_units
 from yid_ocp.inference.null_test import residual_channels
 from yid_ocp.inference.smoother import SmootherResult
-from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.prediction_result import EpisodePrediction
+from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.report import categorical_charts, figures
 from yid_ocp.report.categorical_charts import BeforeAfter, RankedCandidate, TimeMapRow
 from yid_ocp.report.figures import TimePlot

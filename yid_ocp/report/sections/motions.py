@@ -10,8 +10,7 @@ import numpy as np
 
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.model.system import System
-from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.prediction_result import EpisodePrediction
+from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.report import figures
 from yid_ocp.report.animation import Animation, ModelTrajectory, make_animation
 from yid_ocp.report.figures import TimePlot

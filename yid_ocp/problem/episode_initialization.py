@@ -1,4 +1,4 @@
-"""Preparation of episodes before estimation: the observed initial equilibrium and the gear loads."""
+"""Preparation of episodes: observed equilibrium, gear loads, and initial states of held-out recordings."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from yid_ocp.errors import DataError
 from yid_ocp.problem.episode_prediction import EpisodePredictor
-from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.episodes import Episode, InitialState, truncate_episode
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.prediction_result import InitialState
 from yid_ocp.problem.recorded_inputs import denoised_gear_loads
+from yid_ocp.problem.unknown_vector import initial_state_limits
 
 Array = NDArray[np.float64]
 
@@ -107,3 +107,39 @@ def _loaded(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Epis
         cutoff = predictor.options.path_cutoff
         load[:, at] = denoised_gear_loads(load[:, at], own[:, column], samples.node, episode.grid.node_times, cutoff)
     return replace(episode, joint_loads=load)
+
+
+_HELD_OUT_START_WINDOW = 0.2
+"""Duration of the data from which a held-out recording's initial state is estimated [s]."""
+_HELD_OUT_ITERATIONS = 3
+"""Gauss-Newton iterations of this nearly linear estimate."""
+
+
+def estimate_initial_state_offset(predictor: EpisodePredictor, episode: Episode, theta: Array, std: Array) -> Array:
+    """Offset of the initial state from equilibrium, estimated from the first `_HELD_OUT_START_WINDOW` seconds and its prior.
+
+    Zero where the rollout fails; `std` is the prior's, (number of estimated rows,).
+    """
+    offset = np.zeros(len(predictor.unknowns.initial_state_names))
+    if not len(offset):
+        return offset
+    short = truncate_episode(episode, max(round(_HELD_OUT_START_WINDOW / predictor.step.time_step), 2))
+    weight, guess, limit = (
+        1.0 / std,
+        None,
+        initial_state_limits(predictor.system, predictor.unknowns.initial_state_names),
+    )
+    for _ in range(_HELD_OUT_ITERATIONS):
+        result = predictor.predict_episode(short, theta, offset, True, guess)
+        if isinstance(result, str) or result.output_sensitivities is None:
+            return np.zeros(len(predictor.unknowns.initial_state_names))
+        guess = result.equilibrium_guess
+        rows, slopes = [weight * offset], [np.diag(weight)]
+        for k, samples in enumerate(short.measurements):
+            by_start = result.output_sensitivities[k][:, :, len(predictor.unknowns.free_parameters) :]
+            part = samples.residual_block(result.predicted_outputs[k], by_start)
+            rows.append(part.residual)
+            slopes += [] if part.jacobian is None else [part.jacobian]
+        offset = offset - np.linalg.lstsq(np.vstack(slopes), np.concatenate(rows), rcond=None)[0]
+        offset = np.clip(offset, -limit, limit)
+    return offset
