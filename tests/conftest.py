@@ -152,7 +152,7 @@ def momentum():
 
     def evaluate(step, q, v, theta):
         e = step.equations
-        function = ca.Function("momentum", [e.q0, e.q1, e.theta, e.time_step], [e.rigid.by_v])
+        function = ca.Function("momentum", [e.q0, e.q1, e.theta, e.time_step], [e.rigid_body_terms.lagrangian_by_v])
         half = 0.5 * step.time_step * np.asarray(v, float)
         return np.array(function(np.asarray(q) - half, np.asarray(q) + half, theta, step.time_step)).ravel()
 

@@ -43,13 +43,13 @@ def measured(sensor, node, fraction, value, weight=None, std=None, span=(0, 100)
 def correlated(episode):
     """The episode with noise that is correlated among the outputs of every sample, each time another way."""
     rng, made = np.random.default_rng(8), []
-    for samples in episode.samples:
+    for samples in episode.measurements:
         size = samples.value.shape[1]
         factor = rng.standard_normal((len(samples.value), size, size)) + 1.5 * np.eye(size)
         covariance = factor @ factor.transpose(0, 2, 1)
         std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-        made.append(replace(samples, correlation=covariance / (std[:, :, None] * std[:, None, :])))
-    return replace(episode, samples=tuple(made))
+        made.append(replace(samples, noise_correlation=covariance / (std[:, :, None] * std[:, None, :])))
+    return replace(episode, measurements=tuple(made))
 
 
 def joints(names, t, position, **more) -> JointGroup:

@@ -38,15 +38,15 @@ def problem_of(folder, *, encoders, period=1, feedback=TRACKED, effects=(), size
 def residual(problem, x, torque=0.0, posture=0.0, reference=None):
     """Residual by the sensors' noise alone of an episode whose torques, first angles and reference are changed."""
     episode = problem.episodes[0]
-    errors = replace(episode.errors, offset=np.zeros(1))
+    errors = replace(episode.input_errors, torque_bias=np.zeros(1))
     arm = episode.measured_driven_angles.copy()
     arm[0] += posture
-    feedback = episode.feedback
+    feedback = episode.tracking_feedback
     if reference is not None and feedback is not None:
         feedback = replace(feedback, reference=feedback.reference + reference)
-    changed = replace(episode, torque=episode.torque + torque, measured_arm=arm, feedback=feedback, errors=errors)
-    result = problem.predictor.run(changed, *problem.split(x, 0), False)
-    return _sensor_whitened_residual(changed.samples, result).residual
+    changed = replace(episode, torque=episode.torque + torque, measured_driven_angles=arm, tracking_feedback=feedback, input_errors=errors)
+    result = problem.predictor.predict_episode(changed, *problem.split(x, 0), False)
+    return _sensor_whitened_residual(changed.measurements, result).residual
 
 
 def slopes(change, count, size):
@@ -57,11 +57,11 @@ def slopes(change, count, size):
 def dense_covariance(problem, x, angle):
     """Covariance of the residual where encoders are no measurements, the tracking filter at work on wrong angles."""
     episode = problem.episodes[0]
-    errors, steps = episode.errors, episode.grid.steps
-    samples = np.unique(errors.sample)
+    errors, steps = episode.input_errors, episode.grid.steps
+    samples = np.unique(errors.sample_of_step)
 
     def held(k, size):
-        return residual(problem, x, torque=size * (errors.sample == samples[k])[:, None])
+        return residual(problem, x, torque=size * (errors.sample_of_step == samples[k])[:, None])
 
     def followed(k, size):
         return residual(problem, x, reference=size * (np.arange(steps) == k)[:, None])
@@ -78,7 +78,7 @@ def dense_covariance(problem, x, angle):
 @pytest.fixture
 def point(urdf_folder):
     problem = problem_of(urdf_folder, encoders=False)
-    return problem, problem.start * 1.1
+    return problem, problem.initial_unknowns * 1.1
 
 
 @pytest.mark.parametrize(
@@ -96,10 +96,10 @@ def point(urdf_folder):
 def test_innovations_weigh_by_the_covariance_of_all_residuals(urdf_folder, how, effects, together):
     problem = problem_of(urdf_folder, encoders=False, effects=effects, **how)
     if together:
-        problem = problem.on([correlated(episode) for episode in problem.episodes], ())
-    x = problem.start * 1.1
+        problem = problem.with_episodes([correlated(episode) for episode in problem.episodes], ())
+    x = problem.initial_unknowns * 1.1
     plain, weighted = problem.evaluate(x), whitened_at(problem, x).evaluate(x)
-    rows = problem.rows.data
+    rows = problem.residual_rows.data
     covariance = dense_covariance(problem, x, how.get("angle", ANGLE))
     solved = np.linalg.solve(covariance, np.column_stack([plain.residual[rows], plain.jacobian[rows]]))
     left = np.column_stack([plain.residual[rows], plain.jacobian[rows]]).T @ solved
@@ -116,8 +116,8 @@ def test_with_encoders_the_outcome_does_not_depend_on_the_tracking_filter(urdf_f
         feedback = {"feedback": "proportional", "gains": (g,)}
         problem = small_gap(problem_of(urdf_folder, encoders=True, feedback=feedback, size=0.1), size=0.1)
         weighted = whitened_at(problem, problem.start)
-        rows = problem.rows.data
-        found = weighted.evaluate(problem.start)
+        rows = problem.residual_rows.data
+        found = weighted.evaluate(problem.initial_unknowns)
         r, jacobian = found.residual[rows], found.jacobian[rows]
         costs.append(
             (r @ r, np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ r), np.linalg.inv(jacobian.T @ jacobian))
@@ -132,18 +132,18 @@ def small_gap(problem, size=1.0):
     episode = problem.episodes[0]
     rng = np.random.default_rng(5)
     truth = replace(episode, torque=episode.torque + 0.3 * size * TORQUE * rng.standard_normal(episode.torque.shape))
-    truth = replace(truth, feedback=None)
-    result = problem.predictor.run(truth, *problem.split(problem.start, 0), False)
+    truth = replace(truth, tracking_feedback=None)
+    result = problem.predictor.predict_episode(truth, *problem.split(problem.initial_unknowns, 0), False)
     samples = tuple(
         replace(s, value=y + s.std * rng.standard_normal(y.shape))
-        for s, y in zip(episode.samples, result.predicted, strict=True)
+        for s, y in zip(episode.measurements, result.predicted_outputs, strict=True)
     )
     angles = result.rollout.state[:, :1] + size * ANGLE * rng.standard_normal((len(result.rollout.state), 1))
     angles[0] = episode.measured_driven_angles[0]
-    feedback = episode.feedback
+    feedback = episode.tracking_feedback
     if feedback is not None:
         feedback = replace(feedback, reference=angles[:-1].copy())
-    return problem.on([replace(episode, samples=samples, feedback=feedback, measured_arm=angles)], [])
+    return problem.with_episodes([replace(episode, measurements=samples, tracking_feedback=feedback, measured_driven_angles=angles)], [])
 
 
 def test_without_errors_of_inputs_nothing_changes(urdf_folder):
@@ -158,40 +158,40 @@ def test_without_errors_of_inputs_nothing_changes(urdf_folder):
 def test_the_papers_cost_knows_no_noise(urdf_folder):
     problem = problem_of(urdf_folder, encoders=False, weighting="paper")
     assert not problem.has_process_noise
-    assert {s.sensor.group for s in problem.episodes[0].samples} == {"points_arm", "points_camera"}
+    assert {s.sensor.group_name for s in problem.episodes[0].measurements} == {"points_arm", "points_camera"}
 
 
 def test_a_constant_error_is_seen_and_its_spread_said(urdf_folder):
     problem = small_gap(problem_of(urdf_folder, encoders=True))
     episode = problem.episodes[0]
-    problem = problem.on([replace(episode, torque=episode.torque + 0.35)], [])
-    weighted = whitened_at(problem, problem.start)
-    ((value, std),) = estimate_torque_biases(weighted, problem.start)
+    problem = problem.with_episodes([replace(episode, torque=episode.torque + 0.35)], [])
+    weighted = whitened_at(problem, problem.initial_unknowns)
+    ((value, std),) = estimate_torque_biases(weighted, problem.initial_unknowns)
     assert std[0] < BIAS
     assert value[0] == pytest.approx(0.35, abs=4 * std[0])
-    again = whitened_at(weighted, problem.start)
-    np.testing.assert_allclose(again.episodes[0].errors.offset, value)
-    ((settled, _),) = estimate_torque_biases(again, problem.start)
+    again = whitened_at(weighted, problem.initial_unknowns)
+    np.testing.assert_allclose(again.episodes[0].input_errors.torque_bias, value)
+    ((settled, _),) = estimate_torque_biases(again, problem.initial_unknowns)
     assert settled[0] == pytest.approx(value[0], abs=0.5 * std[0])
-    assert estimate_torque_biases(problem, problem.start) == [None]
+    assert estimate_torque_biases(problem, problem.initial_unknowns) == [None]
 
 
 @pytest.mark.parametrize("feedback", [TRACKED, {"feedback": "lqr"}], ids=["angles", "angles_and_momenta"])
 def test_a_constant_error_counts_in_what_the_filter_follows_too(urdf_folder, feedback):
     """The momentum of the measured motion is worked out from recorded torques; weights know what their error does."""
     problem = problem_of(urdf_folder, encoders=False, feedback=feedback)
-    x, error = problem.start, 1e-3
+    x, error = problem.initial_unknowns, 1e-3
     weighted = whitened_at(problem, x)
     [episode], [whitening] = weighted.episodes, weighted.whitening_filters
     group = episode.recording.joints
     wrong = replace(episode.recording, joints=replace(group, effort=group.effort + error))
     again = EstimationProblem(problem.step, [wrong], problem.free, problem.options).episodes[0]
-    other = replace(again, input_errors=episode.errors)
+    other = replace(again, input_errors=episode.input_errors)
     found = []
     for each in (episode, other):
-        result = weighted.predictor.run(each, *problem.split(x, 0), False)
+        result = weighted.predictor.predict_episode(each, *problem.split(x, 0), False)
         found.append(weighted.predictor.estimate_torque_bias(each, result, whitening)[0])
-    seen = 1 - (whitening.bias_std[0] / BIAS) ** 2
+    seen = 1 - (whitening.torque_bias_std[0] / BIAS) ** 2
     assert seen > 0.05
     assert (found[1] - found[0]) / error == pytest.approx(seen, rel=0.01)
 
@@ -208,7 +208,7 @@ def test_weights_are_frozen_until_they_are_asked_for_again(point):
     problem, x = point
     weighted = whitened_at(problem, x)
     there, back = weighted.evaluate(1.2 * x), weighted.evaluate(x)
-    assert weighted.whitening_filters[0] is weighted.freeing(problem.free[:1]).whitening_filters[0]
+    assert weighted.whitening_filters[0] is weighted.with_free_subset(problem.free[:1]).whitening_filters[0]
     np.testing.assert_array_equal(back.residual, weighted.evaluate(x).residual)
     assert there.cost != back.cost
     assert problem.whitening_filters == (None,)
@@ -216,13 +216,13 @@ def test_weights_are_frozen_until_they_are_asked_for_again(point):
 
 def test_jacobians_of_innovations_are_those_of_differences(urdf_folder):
     problem = small_gap(problem_of(urdf_folder, encoders=True))
-    weighted = whitened_at(problem, problem.start)
-    x = problem.start * 1.05
+    weighted = whitened_at(problem, problem.initial_unknowns)
+    x = problem.initial_unknowns * 1.05
     found = weighted.evaluate(x)
     for i in range(len(x)):
         step = np.zeros(len(x))
         step[i] = 1e-5 * x[i]
-        ends = [weighted.evaluate(x + sign * step, warm=found.warm).residual for sign in (1, -1)]
+        ends = [weighted.evaluate(x + sign * step, equilibrium_guesses=found.equilibrium_guesses).residual for sign in (1, -1)]
         numeric = (ends[0] - ends[1]) / (2 * step[i])
         np.testing.assert_allclose(numeric, found.jacobian[:, i], atol=2e-5 * np.abs(found.jacobian[:, i]).max())
     cost, gradient, again = weighted.gradient(x)

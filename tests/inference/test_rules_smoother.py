@@ -254,8 +254,8 @@ def test_several_groups_are_taken_in_while_the_evidence_rises_enough(monkeypatch
         less = Dense(models, found.group_variance | {source: 0.0}).evidence
         assert found.log_evidence_drop[source] == pytest.approx(full - less, rel=1e-6)
     assert found.gap_origin == "both"
-    assert sum(v > 0 for v in smoothed(monkeypatch, models, places=2).variance.values()) == 2
-    assert not any(smoothed(monkeypatch, models, worth=1e6).variance.values())
+    assert sum(v > 0 for v in smoothed(monkeypatch, models, places=2).group_variance.values()) == 2
+    assert not any(smoothed(monkeypatch, models, worth=1e6).group_variance.values())
 
 
 def test_noise_alone_takes_nothing_in(monkeypatch):
@@ -317,7 +317,7 @@ def test_what_would_be_noticed_comes_from_the_model_alone(monkeypatch):
         expected = math.sqrt(10.0 / reference.scores(0, column)[1])
         assert found.detectable_std[source] == pytest.approx(expected, rel=1e-8)
     more = smoothed(monkeypatch, models, noticed=40.0)
-    assert more.detectable == {s: pytest.approx(2 * v) for s, v in found.detectable.items()}
+    assert more.detectable_std == {s: pytest.approx(2 * v) for s, v in found.detectable_std.items()}
 
 
 def test_known_noise_of_torques_is_as_strong_at_low_frequencies_as_the_unknown_force_for_it():

@@ -57,12 +57,12 @@ def cable_options(cable, recordings, noise, model_error, path_cutoff=8.0, option
     return ProblemOptions(
         initial_state="fitted_to_points",
         path_cutoff=path_cutoff,
-        sensors={"points": SensorOptions(std=model_error, points=cable.free)},
-        clamp_paths=cable.clamps,
+        sensors={"points": SensorOptions(std=model_error, points=cable.free_vertices)},
+        clamp_paths=cable.clamp_paths,
         prior_stds=dict.fromkeys(names, 0.2),
         start_fit_window=PERIOD,
         start_point_noise_std=noise,
-        start_fit_parameters=("clamp_start.roll", "clamp_end.roll") if options.end == "weld" else ("clamp_start.roll",),
+        start_fit_parameters=("clamp_start.roll", "clamp_end.roll") if options.end_clamp == "weld" else ("clamp_start.roll",),
         parameters_by_recording=known if options.lengths_per_recording else {},
     )
 
@@ -101,7 +101,7 @@ def twin(cable, clamps):
     stub = as_recording(cable, t, held)
     system = cable_system(median_edge_lengths(cable.edges, [as_recording(cable, t, {})]), cable, options)
     step = compile_step(system, PERIOD)
-    path = prescribed_path(stub, system, TimeGrid(0.0, PERIOD, len(t) - 1), LowPassFilter(np.inf), cable.clamps)
+    path = prescribed_path(stub, system, TimeGrid(0.0, PERIOD, len(t) - 1), LowPassFilter(np.inf), cable.clamp_paths)
     theta = system.parameters.vector(TRUTH)
     rest = EquilibriumSolver(step).solve(path[0], theta)
     assert rest.is_converged, rest.message
@@ -121,23 +121,23 @@ def twin(cable, clamps):
 
 def test_a_cable_names_segments_clamps_junctions_and_vertices(cable, twin):
     system = twin[0].system
-    assert [s.name for s in system.segments] == ["parent", "c"]
+    assert [s.name for s in system.segment_layouts] == ["parent", "c"]
     assert system.prescribed[:6] == tuple(f"clamp_start_{k}" for k in ("x", "y", "z", "rx", "ry", "rz"))
     assert set(cable.vertices) | {"junction_c", "clamp_start", "clamp_end"} <= set(system.mechanism.frames)
     assert system.n_constraints == 5
-    assert cable.free == ("p2", "p3", "p4", "c1", "c2")
-    assert cable.held == ("p0", "p1", "p5", "p6")
+    assert cable.free_vertices == ("p2", "p3", "p4", "c1", "c2")
+    assert cable.clamped_vertices == ("p0", "p1", "p5", "p6")
 
 
 def test_the_undeformed_model_has_the_undeformed_shape(cable, twin):
     system = twin[0].system
-    q = ca.SX.sym("q", system.size)
+    q = ca.SX.sym("q", system.n_coordinates)
     kinematics = forward_kinematics(system.mechanism, q)
     places = ca.Function(
         "places", [q, system.parameters.symbols], [kinematics.frame_position(v) for v in cable.vertices]
     )
-    at = np.array([np.array(p).ravel() for p in places(np.zeros(system.size), system.parameters.vector())])
-    shape = cable.shape(cable.vertices)
+    at = np.array([np.array(p).ravel() for p in places(np.zeros(system.n_coordinates), system.parameters.vector())])
+    shape = cable.undeformed_polyline(cable.vertices)
 
     def distances(points):
         return np.linalg.norm(points[:, None] - points[None], axis=2)
@@ -147,15 +147,15 @@ def test_the_undeformed_model_has_the_undeformed_shape(cable, twin):
 
 def test_every_row_of_the_axis_constraint_matches_its_derivatives(twin):
     e = twin[0].equations
-    phi = ca.Function("phi", [e.q1, e.z1, e.lam, e.theta, e.time_step], [e.constraint, ca.jacobian(e.constraint, e.q1)])
-    closed = ca.Function("closed", e.arguments, [e.constraint_impulses.before, e.constraint_impulses.before_force_by_q])
+    phi = ca.Function("phi", [e.q1, e.z1, e.lam, e.theta, e.time_step], [e.constraint_residual, ca.jacobian(e.constraint_residual, e.q1)])
+    closed = ca.Function("closed", e.arguments, [e.constraint_impulses.before_jacobian, e.constraint_impulses.before_force_by_q])
     random = np.random.default_rng(3)
     q, lam = random.normal(scale=0.4, size=e.q0.numel()), random.normal(size=5)
     theta = twin[0].system.parameters.vector()
     zero = np.zeros
     matrix, hessian = (np.array(ca.densify(x)) for x in closed(q, q, zero(len(q)), [], [], lam, [], theta, PERIOD))
     np.testing.assert_allclose(matrix, np.array(ca.densify(phi(q, [], lam, theta, PERIOD)[1])), atol=1e-12)
-    pull = ca.Function("pull", [e.q1, e.lam, e.theta], [ca.jacobian(ca.jacobian(e.constraint, e.q1).T @ e.lam, e.q1)])
+    pull = ca.Function("pull", [e.q1, e.lam, e.theta], [ca.jacobian(ca.jacobian(e.constraint_residual, e.q1).T @ e.lam, e.q1)])
     np.testing.assert_allclose(hessian, np.array(ca.densify(pull(q, lam, theta))), atol=1e-11)
 
 
@@ -164,18 +164,18 @@ def test_the_values_of_a_twin_are_found_from_its_vertices(cable, twin):
     settings = replace(
         cable_options(cable, [recording], 1e-6, 1e-3, path_cutoff=np.inf, options=options),
         # the first edge of the twin is not seen bent, so its roll is given here and fitted elsewhere
-        start_parameters=(),
-        recording_values={recording.name: {"clamp_start.roll": TRUTH["clamp_start.roll"]}},
+        start_fit_parameters=(),
+        parameters_by_recording={recording.name: {"clamp_start.roll": TRUTH["clamp_start.roll"]}},
     )
     free = ("parent.bend", "parent.damping", "c.bend")
     problem = EstimationProblem(step, [recording], free, settings)
-    before = point_rmse_by_recording(problem, problem.initial_unknowns, cable.free)["twin"]
+    before = point_rmse_by_recording(problem, problem.initial_unknowns, cable.free_vertices)["twin"]
     solution = solve(problem, GaussNewton())
     # what the points leave open of the start follows the stiffnesses with which it was fitted, so once more
     problem = problem.with_free_parameters(free, dict(zip(free, solution.x, strict=True)))
     solution = solve(problem, GaussNewton())
     np.testing.assert_allclose(solution.x, [TRUTH[name] for name in free], rtol=0.08)
-    after = point_rmse_by_recording(problem, solution.x, cable.free)["twin"]
+    after = point_rmse_by_recording(problem, solution.x, cable.free_vertices)["twin"]
     assert after < 5e-4
     assert before > 10 * after
 
@@ -195,7 +195,7 @@ def test_the_roll_of_a_clamp_is_found_from_two_frames(cable, twin):
 def test_held_out_starts_use_no_frame_after_the_second(cable, twin):
     step, options, recording = twin
     seen = recording.points[0].position.copy()
-    free = [recording.points[0].names.index(v) for v in cable.free]
+    free = [recording.points[0].names.index(v) for v in cable.free_vertices]
     seen[2:, free] += 1.0
     other = Recording(points=(replace(recording.points[0], position=seen),), name="other")
     settings = cable_options(cable, [recording, other], 1e-6, 1e-3, options=options)

@@ -41,7 +41,7 @@ def arm(folder, bias, free, recordings=2, **how):
 
 def least(problem, x):
     """The least cost over the offsets, in which it is square, and where."""
-    own = [i for i, name in enumerate(problem.names) if name.startswith("effort_offset")]
+    own = [i for i, name in enumerate(problem.unknown_names) if name.startswith("effort_offset")]
     for _ in range(2):
         found = problem.evaluate(x)
         x = x.copy()
@@ -96,8 +96,8 @@ def test_beside_noise_that_drives_other_joints_too(urdf_folder):
 
 def test_the_gradient_is_that_of_the_cost(urdf_folder):
     problem = arm(urdf_folder, BIAS, ("shoulder.damping", "elbow.mass"), prescribed=tuple(BIAS))
-    x = problem.start * 1.1
-    _, gradient, _ = problem.gradient(x)
+    x = problem.initial_unknowns * 1.1
+    _, gradient, _ = problem.cost_and_gradient(x)
     for i, size in enumerate(1e-5 * np.abs(x)):
         moved = size * np.eye(len(x))[i]
         rise = problem.evaluate(x + moved, False).cost - problem.evaluate(x - moved, False).cost
@@ -107,13 +107,13 @@ def test_the_gradient_is_that_of_the_cost(urdf_folder):
 def test_what_is_known_of_constants_is_taken_off_the_samples(urdf_folder):
     problem = arm(urdf_folder, BIAS, ("shoulder.damping",), prescribed=tuple(BIAS))
     spelt = arm(urdf_folder, None, ("shoulder.damping",), prescribed=tuple(BIAS))
-    _, x = least(spelt, spelt.start)
-    found = problem.evaluate(problem.start, derivatives=False)
-    for i, (episode, result) in enumerate(zip(problem.episodes, found.episodes, strict=True)):
+    _, x = least(spelt, spelt.initial_unknowns)
+    found = problem.evaluate(problem.initial_unknowns, derivatives=False)
+    for i, (episode, result) in enumerate(zip(problem.episode_predictions, found.episode_predictions, strict=True)):
         [(before, after)] = [
             pair
-            for pair in zip(episode.samples, subtract_estimated_biases(episode.samples, result.predicted), strict=True)
-            if pair[0].sensor.efforts
+            for pair in zip(episode.measurements, subtract_estimated_biases(episode.measurements, result.predicted_outputs), strict=True)
+            if pair[0].sensor.effort_joints
         ]
         offsets = [x[spelt.names.index(f"effort_offset@{joint}.offset[{episode.name}]")] for joint in BIAS]
         np.testing.assert_allclose(before.value - after.value, np.broadcast_to(offsets, before.value.shape), rtol=1e-6)
@@ -122,10 +122,10 @@ def test_what_is_known_of_constants_is_taken_off_the_samples(urdf_folder):
 
 def test_held_out_rows_count_it_and_rows_without_a_constant_stay(urdf_folder):
     problem = arm(urdf_folder, BIAS, ("shoulder.damping",), prescribed=tuple(BIAS))
-    [(episode, result)] = problem.validate(problem.start)
+    [(episode, result)] = problem.predict_held_out(problem.initial_unknowns)
     counted = problem.held_out_residual(0, episode, result).residual
-    plain = np.concatenate([s.rows(y).residual for s, y in zip(episode.samples, result.predicted, strict=True)])
-    slopes = constant_error_sensitivities(episode.samples)
+    plain = np.concatenate([s.residual_block(y).residual for s, y in zip(episode.measurements, result.predicted_outputs, strict=True)])
+    slopes = constant_error_sensitivities(episode.measurements)
     rows = np.any(slopes != 0, axis=1)
     np.testing.assert_allclose(counted[~rows], plain[~rows], rtol=1e-14)
     covariance = np.eye(len(plain)) + slopes @ slopes.T

@@ -62,7 +62,7 @@ def motion():
 def needed(step, path):
     """Efforts that a clean motion needs, at every sample."""
     clean = arm(step, path, np.zeros_like(path), angle=0.0, cutoff=math.inf)
-    inner = clean.evaluate(clean.start, derivatives=False).episodes[0].predicted[0]
+    inner = clean.evaluate(clean.initial_unknowns, derivatives=False).episode_predictions[0].predicted_outputs[0]
     return np.vstack([inner[:1], inner, inner[-1:]])
 
 
@@ -73,8 +73,8 @@ def test_residuals_of_a_right_model_are_white_among_joints(urdf_folder):
         rng = np.random.default_rng(seed)
         noisy = (a + b * rng.standard_normal(path.shape) for a, b in ((path, ANGLE), (effort, EFFORT)))
         problem = arm(step, *noisy)
-        evaluation = problem.evaluate(problem.start, derivatives=False)
-        [samples], [predicted] = problem.episodes[0].samples, evaluation.episodes[0].predicted
+        evaluation = problem.evaluate(problem.initial_unknowns, derivatives=False)
+        [samples], [predicted] = problem.episode_predictions[0].measurements, evaluation.episode_predictions[0].predicted_outputs
         found.append(evaluation.residual.reshape(-1, 2))
         alone.append((predicted - samples.value) / samples.std)
     rows, plain = np.vstack(found), np.vstack(alone)
@@ -96,14 +96,14 @@ def correlated_problem(folder, cutoff=math.inf, **how):
 )
 def test_derivatives_and_transcriptions_count_what_is_correlated(urdf_folder, how):
     problem = correlated_problem(urdf_folder, **how)
-    x = 1.2 * problem.start
+    x = 1.2 * problem.initial_unknowns
     evaluation = problem.evaluate(x)
     size = 1e-6 * x
     moved = [
         (problem.evaluate(x + d).residual - problem.evaluate(x - d).residual) / (2 * d.max()) for d in np.diag(size)
     ]
     np.testing.assert_allclose(evaluation.jacobian, np.stack(moved, axis=1), rtol=1e-5, atol=1e-5 * np.abs(moved).max())
-    np.testing.assert_allclose(problem.gradient(x)[1], evaluation.jacobian.T @ evaluation.residual, rtol=1e-8)
+    np.testing.assert_allclose(problem.cost_and_gradient(x)[1], evaluation.jacobian.T @ evaluation.residual, rtol=1e-8)
     program = transcribe(problem)
     arguments, theta = program.solver_arguments, program.block("theta").index.ravel()
     arguments["lbx"][theta] = arguments["ubx"][theta] = x
@@ -120,10 +120,10 @@ def test_derivatives_and_transcriptions_count_what_is_correlated(urdf_folder, ho
 
 def test_unknown_forces_are_seen_as_correlated(urdf_folder):
     problem = correlated_problem(urdf_folder, prescribed=JOINTS)
-    [linear] = linear_residual_models(problem, problem.start, problem.evaluate(problem.start))
+    [linear] = linear_residual_models(problem, problem.initial_unknowns, problem.evaluate(problem.initial_unknowns))
     at = [linear.unknown_names.index(joint) for joint in JOINTS]
     found = sum(interval.unknown_jacobian[:, at].T @ interval.unknown_jacobian[:, at] for interval in linear.intervals)
-    [samples] = (s for s in problem.episodes[0].samples if s.sensor.efforts)
+    [samples] = (s for s in problem.episodes[0].measurements if s.sensor.effort_joints)
     slopes = samples.weight[:, :, None] * np.diag(linear.reference_std[at])
     assert np.array_equal(samples.sensor.efforts, JOINTS)
     seen = samples.mixing @ slopes[samples.seen]
@@ -142,16 +142,16 @@ def test_a_gear_does_not_give_way_to_the_noise_of_an_effort_that_is_compared(urd
         for made in (effort, effort + 0.3 * rng.standard_normal(effort.shape), effort + 2.0)
     )
     inner, gain = slice(50, -50), LowPassFilter(CUTOFF).noise_gains(0.01)[0]
-    np.testing.assert_allclose(clean.load[inner], LowPassFilter(CUTOFF)(clean.grid.times, effort)[inner], atol=0.02)
-    assert np.std((noisy.load - clean.load)[inner]) < 0.5 * 0.3 * gain
+    np.testing.assert_allclose(clean.joint_loads[inner], LowPassFilter(CUTOFF)(clean.grid.node_times, effort)[inner], atol=0.02)
+    assert np.std((noisy.joint_loads - clean.joint_loads)[inner]) < 0.5 * 0.3 * gain
     # what the model does not know of a load is measured all the same
-    np.testing.assert_allclose((heavier.load - clean.load)[inner], 2.0, atol=1e-6)
+    np.testing.assert_allclose((heavier.joint_loads - clean.joint_loads)[inner], 2.0, atol=1e-6)
     # and so an elasticity that is not there is found as often as chance has it
     sizes = []
     for seed in range(TWINS):
         rng = np.random.default_rng(seed)
         problem = arm(step, path, effort + 0.3 * rng.standard_normal(effort.shape), angle=0.0, std=0.3, free=(name,))
-        found = problem.evaluate(problem.start)
+        found = problem.evaluate(problem.initial_unknowns)
         slope = found.jacobian[:, 0]
         sizes.append((slope @ found.residual) / np.linalg.norm(slope))
     assert np.mean(np.square(sizes)) < 2.0
@@ -164,7 +164,7 @@ def test_dry_friction_needs_no_time_to_turn(urdf_folder):
     effort = needed(step, path)
     noisy = effort + 0.05 * np.random.default_rng(2).standard_normal(path.shape)
     problem = arm(step, path, noisy, angle=0.0, std=0.05)
-    found = problem.evaluate(problem.start, derivatives=False).residual
+    found = problem.evaluate(problem.initial_unknowns, derivatives=False).residual
     assert found @ found / len(found) < 1.5
-    [samples] = problem.episodes[0].samples
+    [samples] = problem.episodes[0].measurements
     assert np.abs(np.diff(samples.value[:, 1])).max() > 30 * samples.std.max()

@@ -42,7 +42,7 @@ def arm(urdf_folder):
 
 def test_deviations_are_those_of_repeats(arm):
     exact = arm(np.zeros((601, 2)), math.inf)
-    inner = exact.evaluate(exact.start, derivatives=False).episodes[0].predicted[0]
+    inner = exact.evaluate(exact.initial_unknowns, derivatives=False).episode_predictions[0].predicted_outputs[0]
     clean = np.vstack([inner[:1], inner, inner[-1:]])
     found, stated = [], []
     for seed in range(TWINS):
@@ -62,7 +62,7 @@ def test_a_record_shorter_than_the_filter_is_refused(arm):
 
 
 def test_neighbours_that_repeat_each_other_are_left_out(arm):
-    plain, smooth = (arm(np.zeros((601, 2)), cutoff).episodes[0].samples[0] for cutoff in (math.inf, CUTOFF))
+    plain, smooth = (arm(np.zeros((601, 2)), cutoff).episodes[0].measurements[0] for cutoff in (math.inf, CUTOFF))
     np.testing.assert_array_equal(plain.node, np.arange(1, 600))
     np.testing.assert_array_equal(smooth.node + np.rint(smooth.fraction), np.arange(77, 524, 10))
     assert LowPassFilter(CUTOFF).decorrelation_stride(0.01) == 10
@@ -74,7 +74,7 @@ def test_neighbours_that_repeat_each_other_are_left_out(arm):
 @pytest.mark.parametrize(("kind", "late"), [(None, 0.0), ("sample", 0.0), ("mean", 0.005), ("command", 0.005)])
 def test_an_effort_that_stands_for_an_interval_belongs_to_its_middle(arm, kind, late):
     t = 0.01 * np.arange(601)
-    [samples] = arm(np.stack([t, 2 - t], axis=1), np.inf, kind).episodes[0].samples
+    [samples] = arm(np.stack([t, 2 - t], axis=1), np.inf, kind).episodes[0].measurements
     at = 0.01 * (samples.node + samples.fraction)[:, None]
     expected = np.hstack([at - late, 2 - at + late])
     np.testing.assert_allclose(samples.value.reshape(len(at), 2), expected, atol=1e-12)
@@ -87,7 +87,7 @@ def test_efforts_are_compared_where_they_were_measured(arm, cutoff, time_step):
     effort = np.random.default_rng(0).standard_normal((601, 2))
     found = {}
     for h in (0.01, time_step):
-        samples = arm(effort, cutoff, time_step=h).episodes[0].samples[0]
+        samples = arm(effort, cutoff, time_step=h).episodes[0].measurements[0]
         found[h] = dict(zip(np.round((samples.node + samples.fraction) * h / 0.01, 6), samples.value, strict=True))
     assert all(time == round(time) for time in found[time_step])
     if time_step < 0.01:

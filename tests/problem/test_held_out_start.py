@@ -27,8 +27,8 @@ def swinging(urdf_folder):
 
 def misfit(problem):
     found = []
-    for episode, result in problem.validate(problem.start):
-        for samples, predicted in zip(episode.samples, result.predicted, strict=True):
+    for episode, result in problem.predict_held_out(problem.initial_unknowns):
+        for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
             found.append(samples.weight * (predicted - samples.value))
     return float(np.mean(np.concatenate(found) ** 2))
 
@@ -43,14 +43,14 @@ def test_an_estimated_start_is_estimated_in_held_out_recordings_too(swinging):
 def test_only_the_first_moments_count(swinging):
     problem = swinging(initial_state="estimated", configuration_std=0.2, velocity_std=1.0)
     episode = problem.held_out[0]
-    found = problem.held_out_initial_state_offset(0, problem.start)
+    found = problem.held_out_evaluation_points(problem.initial_unknowns)[0][2]
     assert np.any(found)
     moved = {}
     for first in (50, 5):
-        value = episode.samples[0].value.copy()
+        value = episode.measurements[0].value.copy()
         value[first:] += 1.0
-        changed = replace(episode, samples=(replace(episode.samples[0], value=value),))
-        moved[first] = problem.on(problem.episodes, [changed]).held_out_initial_state_offset(0, problem.start)
+        changed = replace(episode, measurements=(replace(episode.measurements[0], value=value),))
+        moved[first] = problem.with_episodes(problem.episodes, [changed]).held_out_evaluation_points(problem.initial_unknowns)[0][2]
     assert moved[50] == pytest.approx(found, abs=1e-12)
     assert moved[5] != pytest.approx(found, abs=1e-3)
 

@@ -48,8 +48,8 @@ def arm(single_arm, clean):
 def said(problem, x):
     """Everything that a problem says of a point."""
     evaluation = problem.evaluate(x)
-    cost, gradient, _ = problem.gradient(x)
-    held_out = [r if isinstance(r, str) else r.predicted for _, r in problem.validate(x)]
+    cost, gradient, _ = problem.cost_and_gradient(x)
+    held_out = [r if isinstance(r, str) else r.predicted_outputs for _, r in problem.predict_held_out(x)]
     return evaluation.cost, evaluation.residual, evaluation.jacobian, cost, gradient, held_out
 
 
@@ -65,9 +65,9 @@ def points(problem, seeds):
     lower, upper = problem.bounds
     found = []
     for seed in seeds:
-        change = np.random.default_rng(seed).uniform(0.5, 2.0, len(problem.start))
-        offset = np.where(problem.start == 0, 0.01 * (change - 1), 0.0)
-        found.append(np.clip(problem.start * change + offset, lower, upper))
+        change = np.random.default_rng(seed).uniform(0.5, 2.0, len(problem.initial_unknowns))
+        offset = np.where(problem.initial_unknowns == 0, 0.01 * (change - 1), 0.0)
+        found.append(np.clip(problem.initial_unknowns * change + offset, lower, upper))
     return found
 
 
@@ -85,7 +85,7 @@ def test_an_answer_does_not_depend_on_earlier_questions(kind, pendulum):
         for seed, x in zip(order, points(asked, order), strict=True):
             assert_same(said(asked, x), reference[seed])
             for question in between:
-                ask = {"e": asked.evaluate, "g": asked.gradient, "v": asked.validate}[question]
+                ask = {"e": asked.evaluate, "g": asked.cost_and_gradient, "v": asked.predict_held_out}[question]
                 ask(2.0 * x)
 
     check()
@@ -99,8 +99,8 @@ def test_an_answer_at_rest_does_not_depend_on_earlier_questions(arm):
         assert_same(said(arm("equilibrium"), x), said(asked, x))
     # a warm start leads to the same equilibrium, to the tolerance of the statics
     x, near = points(fresh, [1, 2])
-    warm = fresh.evaluate(near).warm
-    assert fresh.evaluate(x, warm=warm).cost == pytest.approx(fresh.evaluate(x).cost, rel=1e-8)
+    warm = fresh.evaluate(near).equilibrium_guesses
+    assert fresh.evaluate(x, equilibrium_guesses=warm).cost == pytest.approx(fresh.evaluate(x).cost, rel=1e-8)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -127,41 +127,41 @@ def test_compiled_answers_do_not_depend_on_threads(arm):
 
 def test_problems_like_another_leave_it_as_it_is(pendulum):
     problem = pendulum("estimated")
-    before = said(problem, problem.start)
-    other = problem.freeing(("elbow.damping",)).at({"shoulder.damping": 0.4})
-    said(other, other.start)
-    assert other.names[0] == "elbow.damping"
-    assert "shoulder.damping" not in other.names
-    assert other.functions is problem.functions
-    assert_same(said(problem, problem.start), before)
+    before = said(problem, problem.initial_unknowns)
+    other = problem.with_free_subset(("elbow.damping",)).with_parameter_values({"shoulder.damping": 0.4})
+    said(other, other.initial_unknowns)
+    assert other.unknown_names[0] == "elbow.damping"
+    assert "shoulder.damping" not in other.unknown_names
+    assert other.model_functions is problem.model_functions
+    assert_same(said(problem, problem.initial_unknowns), before)
     with pytest.raises(ValueError, match="read-only"):
         problem.theta[0] = 1.0
 
 
 def test_a_freed_part_has_the_columns_of_the_whole(pendulum):
     problem = pendulum("estimated")
-    part = problem.freeing(("shoulder.damping",))
-    whole = problem.evaluate(problem.start).jacobian
-    mine = part.evaluate(part.start).jacobian
-    kept = [problem.names.index(name) for name in part.names]
-    rows = slice(0, part.rows.data.stop)
+    part = problem.with_free_subset(("shoulder.damping",))
+    whole = problem.evaluate(problem.initial_unknowns).jacobian
+    mine = part.evaluate(part.initial_unknowns).jacobian
+    kept = [problem.unknown_names.index(name) for name in part.unknown_names]
+    rows = slice(0, part.residual_rows.data.stop)
     np.testing.assert_array_equal(mine[rows], whole[rows][:, kept])
 
 
 def test_the_residual_says_what_its_rows_are(pendulum):
     problem = pendulum("estimated")
     x = problem.vector({"elbow.damping": 0.2, f"start.q.elbow[{problem.episodes[0].name}]": 0.01})
-    evaluation, rows = problem.evaluate(x), problem.rows
+    evaluation, rows = problem.evaluate(x), problem.residual_rows
     parts = [rows.data, rows.stated_priors, rows.weak_priors]
     assert [part.start for part in parts] == [0, rows.data.stop, rows.stated_priors.stop]
     assert rows.weak_priors.stop == len(evaluation.residual)
-    for episode, groups, result in zip(problem.episodes, rows.measurements, evaluation.episodes, strict=True):
-        for samples, part, predicted in zip(episode.samples, groups, result.predicted, strict=True):
-            np.testing.assert_array_equal(evaluation.residual[part], samples.whitened(predicted)[samples.seen])
+    for episode, groups, result in zip(problem.episode_predictions, rows.measurements, evaluation.episode_predictions, strict=True):
+        for samples, part, predicted in zip(episode.measurements, groups, result.predicted_outputs, strict=True):
+            np.testing.assert_array_equal(evaluation.residual[part], samples.whitened_residual(predicted)[samples.is_used])
     stated = evaluation.residual[rows.stated_priors]
     assert np.count_nonzero(stated) == 1
     assert stated[np.flatnonzero(stated)[0]] == pytest.approx(0.01 / problem.options.start_configuration_std)
     # a factor of two of the ten that call one standard deviation
     assert sorted(evaluation.residual[rows.weak_priors]) == pytest.approx([0.0, np.log10(2.0)])
-    residual, jacobian = problem.informing(evaluation)
+    residual, jacobian = problem.residual_without_weak_priors(evaluation)
     assert len(residual) == len(jacobian) == rows.stated_priors.stop

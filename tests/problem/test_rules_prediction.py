@@ -59,7 +59,7 @@ def problem(request, urdf_folder):
 
 def moved(problem):
     """A point beside the start."""
-    x = problem.start
+    x = problem.initial_unknowns
     change = np.random.default_rng(3).uniform(0.9, 1.1, len(x))
     return np.where(x == 0, 0.01 * (change - 0.9), x * change)
 
@@ -68,16 +68,16 @@ def test_forward_and_adjoint_derivatives_are_those_of_differences(problem):
     x = moved(problem)
     evaluation = problem.evaluate(x)
     assert evaluation.ok, evaluation.message
-    cost, gradient, _ = problem.gradient(x)
+    cost, gradient, _ = problem.cost_and_gradient(x)
     scale = np.maximum(np.abs(x), 1e-2)
     forward = evaluation.jacobian.T @ evaluation.residual
     np.testing.assert_allclose(gradient * scale, forward * scale, rtol=1e-6, atol=1e-8 * np.abs(forward * scale).max())
     assert cost == pytest.approx(evaluation.cost, rel=1e-12)
-    rows = problem.rows.informing
+    rows = problem.residual_rows.without_weak_priors
     for i in range(len(x)):
         step = np.zeros(len(x))
         step[i] = 1e-5 * scale[i]
-        ends = [problem.evaluate(x + sign * step, warm=evaluation.warm) for sign in (1, -1)]
+        ends = [problem.evaluate(x + sign * step, equilibrium_guesses=evaluation.equilibrium_guesses) for sign in (1, -1)]
         slope = (ends[0].cost - ends[1].cost) / (2 * step[i])
         assert slope == pytest.approx(gradient[i], rel=2e-4, abs=1e-6 * np.abs(gradient * scale).max() / scale[i])
         if problem.options.huber_threshold == math.inf:
@@ -92,21 +92,21 @@ def test_without_derivatives_the_cost_is_the_same(problem):
     np.testing.assert_array_equal(plain.residual, full.residual)
     assert plain.jacobian is None
     assert (plain.cost, plain.ok) == (full.cost, True)
-    warm = problem.evaluate(x, warm=full.warm)
+    warm = problem.evaluate(x, equilibrium_guesses=full.equilibrium_guesses)
     np.testing.assert_allclose(warm.residual, full.residual, atol=1e-7)
 
 
 def test_what_is_freed_later_has_the_same_derivatives(urdf_folder):
     whole = problem_of(urdf_folder, "driven, filtered")
-    x, few = moved(whole), whole.names[1:4]
-    part = whole.freeing(few).at(dict(zip(whole.names, x, strict=True)))
-    own = np.array([x[whole.names.index(name)] for name in few])
+    x, few = moved(whole), whole.unknown_names[1:4]
+    part = whole.with_free_subset(few).with_parameter_values(dict(zip(whole.unknown_names, x, strict=True)))
+    own = np.array([x[whole.unknown_names.index(name)] for name in few])
     one, two = part.evaluate(own), whole.evaluate(x)
-    data = whole.rows.data
-    np.testing.assert_allclose(one.residual[part.rows.data], two.residual[data], atol=1e-9)
-    columns = [whole.names.index(name) for name in few]
-    np.testing.assert_allclose(one.jacobian[part.rows.data], two.jacobian[data][:, columns], atol=1e-7)
-    none = whole.freeing(()).at(dict(zip(whole.names, x, strict=True)))
+    data = whole.residual_rows.data
+    np.testing.assert_allclose(one.residual[part.residual_rows.data], two.residual[data], atol=1e-9)
+    columns = [whole.unknown_names.index(name) for name in few]
+    np.testing.assert_allclose(one.jacobian[part.residual_rows.data], two.jacobian[data][:, columns], atol=1e-7)
+    none = whole.with_free_subset(()).with_parameter_values(dict(zip(whole.unknown_names, x, strict=True)))
     alone = none.evaluate(np.zeros(0))
     np.testing.assert_allclose(alone.residual, two.residual[data], atol=1e-9)
     assert alone.jacobian.shape == (len(alone.residual), 0)
@@ -116,15 +116,15 @@ def test_what_is_freed_later_has_the_same_derivatives(urdf_folder):
 
 
 def predicted(problem, values, group=0):
-    return problem.evaluate(problem.vector(values), derivatives=False).episodes[0].predicted[group]
+    return problem.evaluate(problem.vector(values), derivatives=False).episode_predictions[0].predicted_outputs[group]
 
 
 def test_a_late_camera_sees_what_was_before(urdf_folder):
     problem = problem_of(urdf_folder, "robust", seeds=(1,))
-    camera = problem.episodes[0].samples[1]
+    camera = problem.episodes[0].measurements[1]
     delay = "camera_latency@camera.delay"
     neutral = {"clock_scale@clock.scale": 1.0}
-    whole = problem.evaluate(problem.vector({**neutral, delay: 0.0}), False).episodes[0].predicted[0]
+    whole = problem.evaluate(problem.vector({**neutral, delay: 0.0}), False).episode_predictions[0].predicted_outputs[0]
     t = H * (camera.node + camera.fraction)
     late = predicted(problem, {**neutral, delay: 0.02}, group=1)
     for i in range(3):
@@ -135,23 +135,23 @@ def test_a_late_camera_sees_what_was_before(urdf_folder):
 
 def test_a_delay_is_in_true_time(urdf_folder):
     problem = problem_of(urdf_folder, "robust", seeds=(1,))
-    samples, theta = problem.episodes[0].samples[1], problem.system.parameters.vector
+    samples, theta = problem.episodes[0].measurements[1], problem.system.parameters.vector
     values = {"camera_latency@camera.delay": 0.02, "clock_scale@clock.scale": 0.8}
     late, _ = problem.predictor._delay_in_steps(samples, theta(values), ())
     assert late.shape == (6,)
     # a clock that goes slow shows 0.8 s for a second, and 16 ms for a delay of 20 ms
     np.testing.assert_allclose(late, 0.8 * 0.02 / H)
-    assert problem.predictor._delay_in_steps(problem.episodes[0].samples[0], theta(values), ()) is None
+    assert problem.predictor._delay_in_steps(problem.episodes[0].measurements[0], theta(values), ()) is None
 
 
 def test_an_encoder_that_is_offset_moves_the_path(urdf_folder):
     problem = problem_of(urdf_folder, "prescribed", seeds=(1,))
     values = {"encoder_offset@shoulder.offset": 0.05}
     episode = problem.episodes[0]
-    inputs = problem.predictor.inputs(episode, problem.system.parameters.vector(values), ())
-    np.testing.assert_allclose(inputs.path - episode.path, -0.05, atol=1e-12)
-    rollout = problem.evaluate(problem.vector(values), False).episodes[0].rollout
-    np.testing.assert_allclose(rollout.state[:, 0], inputs.path[:, 0], atol=1e-12)
+    inputs = problem.predictor.corrected_inputs(episode, problem.system.parameters.vector(values), ())
+    np.testing.assert_allclose(inputs.prescribed_path - episode.prescribed_path, -0.05, atol=1e-12)
+    rollout = problem.evaluate(problem.vector(values), False).episode_predictions[0].rollout
+    np.testing.assert_allclose(rollout.state[:, 0], inputs.prescribed_path[:, 0], atol=1e-12)
 
 
 def test_an_elastic_gear_gives_under_the_recorded_effort(urdf_folder):
@@ -160,10 +160,10 @@ def test_an_elastic_gear_gives_under_the_recorded_effort(urdf_folder):
     theta = problem.system.parameters.vector(
         {"series_elasticity@shoulder.compliance": 0.004, "backlash@shoulder.width": 0.0}
     )
-    inputs = problem.predictor.inputs(episode, theta, ())
+    inputs = problem.predictor.corrected_inputs(episode, theta, ())
     effort = episode.recording.joints.effort
-    np.testing.assert_allclose(episode.load, effort, atol=1e-12)
-    np.testing.assert_allclose(inputs.path, episode.path - 0.004 * effort, atol=1e-12)
+    np.testing.assert_allclose(episode.joint_loads, effort, atol=1e-12)
+    np.testing.assert_allclose(inputs.prescribed_path, episode.prescribed_path - 0.004 * effort, atol=1e-12)
 
 
 def test_a_torque_acts_as_it_was_recorded_less_what_its_sensor_adds(urdf_folder):
@@ -176,35 +176,35 @@ def test_a_torque_acts_as_it_was_recorded_less_what_its_sensor_adds(urdf_folder)
         "effort_gain@shoulder.inverse": 1.0,
         "encoder_offset@shoulder.offset": 0.0,
     }
-    assert set(neutral) <= set(problem.names)
-    plain = problem.predictor.inputs(episode, vector(neutral), ())
+    assert set(neutral) <= set(problem.unknown_names)
+    plain = problem.predictor.corrected_inputs(episode, vector(neutral), ())
     np.testing.assert_allclose(plain.torque, episode.torque, atol=1e-12)
     np.testing.assert_allclose(plain.first_torque, episode.torque[0])
-    shifted = problem.predictor.inputs(episode, vector(neutral | {"effort_delay@gripper.delay": H}), ())
+    shifted = problem.predictor.corrected_inputs(episode, vector(neutral | {"effort_delay@gripper.delay": H}), ())
     np.testing.assert_allclose(shifted.torque[1:], episode.torque[:-1], atol=1e-9)
-    offset = problem.predictor.inputs(episode, vector(neutral | {"effort_offset@shoulder.offset": 0.5}), ())
+    offset = problem.predictor.corrected_inputs(episode, vector(neutral | {"effort_offset@shoulder.offset": 0.5}), ())
     np.testing.assert_allclose(offset.torque, episode.torque - 0.5, atol=1e-12)
     np.testing.assert_allclose(offset.first_torque, episode.torque[0] - 0.5, atol=1e-12)
 
 
 def test_a_problem_is_as_recorded_unless_an_effect_may_change_it(urdf_folder):
     plain = problem_of(urdf_folder, "free", seeds=(1,))
-    assert plain.as_recorded
+    assert plain.has_uncorrected_inputs
     for case in ("prescribed", "prescribed gears", "driven", "driven, filtered", "robust"):
-        assert not problem_of(urdf_folder, case, seeds=(1,)).as_recorded, case
+        assert not problem_of(urdf_folder, case, seeds=(1,)).has_uncorrected_inputs, case
     neutral = {"encoder_offset@shoulder.offset": 0.0, "effort_gain@shoulder.inverse": 1.0}
     made = problem_of(urdf_folder, "all prescribed", seeds=(1,))
-    assert not made.at(neutral).as_recorded, "a free one may change it"
-    fixed = made.freeing(("elbow.damping",))
-    assert fixed.at(neutral).as_recorded
-    assert not fixed.at(neutral | {"encoder_offset@shoulder.offset": 0.01}).as_recorded
-    assert problem_of(urdf_folder, "local", seeds=(1,)).as_recorded
+    assert not made.with_parameter_values(neutral).has_uncorrected_inputs, "a free one may change it"
+    fixed = made.with_free_subset(("elbow.damping",))
+    assert fixed.with_parameter_values(neutral).has_uncorrected_inputs
+    assert not fixed.with_parameter_values(neutral | {"encoder_offset@shoulder.offset": 0.01}).has_uncorrected_inputs
+    assert problem_of(urdf_folder, "local", seeds=(1,)).has_uncorrected_inputs
 
 
 def test_efforts_along_a_rollout_are_those_of_driven_and_prescribed_joints(urdf_folder):
     problem = problem_of(urdf_folder, "driven and prescribed", seeds=(1,))
-    rollout = problem.evaluate(problem.start, False).episodes[0].rollout
-    effort = problem.predictor.efforts(rollout)
+    rollout = problem.evaluate(problem.initial_unknowns, False).episode_predictions[0].rollout
+    effort = problem.predictor.joint_efforts(rollout)
     assert effort.shape == (STEPS + 1, 2)
     np.testing.assert_array_equal(effort[:-1, 0], rollout.effort[:, 0])
     np.testing.assert_array_equal(effort[:-1, 1], rollout.torque[:, 0])
@@ -213,18 +213,18 @@ def test_efforts_along_a_rollout_are_those_of_driven_and_prescribed_joints(urdf_
 
 def test_readings_along_a_trajectory_are_those_of_its_rollout(urdf_folder):
     problem = problem_of(urdf_folder, "free", seeds=(1,))
-    x = problem.start
+    x = problem.initial_unknowns
     evaluation = problem.evaluate(x, False)
-    state, theta = evaluation.episodes[0].rollout.state, problem.split(x, 0)[0]
+    state, theta = evaluation.episode_predictions[0].rollout.state, problem.split(x, 0)[0]
     by_state = np.zeros((STEPS + 1, 4, len(x)))
-    for k, samples in enumerate(problem.episodes[0].samples):
-        along, slopes = problem.predictor.along(samples, state, by_state, theta)
-        np.testing.assert_allclose(along, evaluation.episodes[0].predicted[k], atol=1e-12)
+    for k, samples in enumerate(problem.episodes[0].measurements):
+        along, slopes = problem.predictor.readings_along_trajectory(samples, state, by_state, theta)
+        np.testing.assert_allclose(along, evaluation.episode_predictions[0].predicted_outputs[k], atol=1e-12)
         np.testing.assert_array_equal(slopes, np.zeros((*along.shape, len(x))))
     by_state[:, 0, 1] = 1.0
-    _, slopes = problem.predictor.along(problem.episodes[0].samples[0], state, by_state, theta)
+    _, slopes = problem.predictor.readings_along_trajectory(problem.episodes[0].measurements[0], state, by_state, theta)
     # turned about the shoulder as a whole, the tip moves across its lever
-    lever = evaluation.episodes[0].predicted[0] - [0.0, 0.0, 1.2]
+    lever = evaluation.episode_predictions[0].predicted_outputs[0] - [0.0, 0.0, 1.2]
     np.testing.assert_allclose(slopes[:, 1, 1], -lever[:, 2], atol=1e-9)
     np.testing.assert_allclose(slopes[:, 2, 1], lever[:, 1], atol=1e-9)
 
@@ -232,14 +232,14 @@ def test_readings_along_a_trajectory_are_those_of_its_rollout(urdf_folder):
 def test_heavier_joints_have_more_momentum_for_the_filter_to_follow(urdf_folder):
     problem = problem_of(urdf_folder, "driven, filtered, both", seeds=(1,))
     episode, vector = problem.episodes[0], problem.system.parameters.vector
-    neutral = {name: value for effect in problem.system.effects for name, value in effect.neutral.items()}
+    neutral = {name: value for effect in problem.system.effects for name, value in effect.neutral_values.items()}
     none = np.zeros(problem.step.sizes["nx"])
-    assert problem.predictor.tracked(episode, vector(neutral), (), none).momentum is None
+    assert problem.predictor.tracking_inputs(episode, vector(neutral), (), none).momentum_shift is None
     armature = neutral | {"rotor_inertia@shoulder.armature": 0.05}
-    found = problem.predictor.tracked(episode, vector(armature), ("rotor_inertia@shoulder.armature",), none)
+    found = problem.predictor.tracking_inputs(episode, vector(armature), ("rotor_inertia@shoulder.armature",), none)
     # of the motion up to each node; it begins from a stand
     rate = np.diff(episode.smoothed_driven_angles[:, 0], prepend=episode.smoothed_driven_angles[0, 0])[:-1] / H
-    np.testing.assert_allclose(found.momentum, np.stack([0.05 * rate, 0 * rate], axis=1), atol=1e-12)
+    np.testing.assert_allclose(found.momentum_shift, np.stack([0.05 * rate, 0 * rate], axis=1), atol=1e-12)
     np.testing.assert_allclose(found.momentum_shift_sensitivity[:, 0, 0], rate, atol=1e-12)
 
 
@@ -248,12 +248,12 @@ def test_the_filter_of_an_episode_is_the_one_that_was_asked_for(urdf_folder):
         case: problem_of(urdf_folder, case, seeds=(1,)).episodes[0]
         for case in ("free", "prescribed", "driven", "driven, proportional", "driven, filtered, both")
     }
-    assert [filters[case].feedback for case in ("free", "prescribed", "driven")] == [None] * 3
+    assert [filters[case].tracking_feedback for case in ("free", "prescribed", "driven")] == [None] * 3
     tracked = filters["driven, proportional"]
-    np.testing.assert_array_equal(tracked.feedback.gain, np.full((STEPS, 1, 1), 9.0))
-    np.testing.assert_array_equal(tracked.feedback.reference, tracked.measured_driven_angles[:-1])
-    followed = filters["driven, filtered, both"].feedback
-    assert followed.index.tolist() == [0, 1, 2, 3]
+    np.testing.assert_array_equal(tracked.tracking_feedback.gain, np.full((STEPS, 1, 1), 9.0))
+    np.testing.assert_array_equal(tracked.tracking_feedback.reference, tracked.measured_driven_angles[:-1])
+    followed = filters["driven, filtered, both"].tracking_feedback
+    assert followed.state_indices.tolist() == [0, 1, 2, 3]
     assert np.all(followed.gain[0, [0, 1], [0, 1]] > 1.0)
 
 
@@ -277,9 +277,9 @@ def test_an_episode_begins_at_its_first_posture(urdf_folder, case, driven, presc
     episode = problem_of(urdf_folder, case, seeds=(1,)).episodes[0]
     position = episode.recording.joints.position
     assert episode.measured_driven_angles.shape == (STEPS + 1, driven)
-    assert episode.path.shape == (STEPS + 1, prescribed)
-    np.testing.assert_allclose(episode.posture, position[0], atol=1e-12)
-    np.testing.assert_allclose(np.hstack([episode.measured_driven_angles, episode.path]), position, atol=1e-12)
+    assert episode.prescribed_path.shape == (STEPS + 1, prescribed)
+    np.testing.assert_allclose(episode.initial_known_coordinates, position[0], atol=1e-12)
+    np.testing.assert_allclose(np.hstack([episode.measured_driven_angles, episode.prescribed_path]), position, atol=1e-12)
     assert episode.torque.shape == (STEPS, driven)
     np.testing.assert_allclose(episode.torque, episode.recording.joints.effort[:-1, :driven], atol=1e-9)
 
@@ -309,18 +309,18 @@ def test_a_filtered_arm_is_smooth_enough_to_be_differenced(urdf_folder):
 def test_the_beginning_of_an_episode_is_predicted_as_in_the_whole(urdf_folder, case):
     problem = problem_of(urdf_folder, case, seeds=(1,))
     whole = problem.episodes[0]
-    short = problem.on([truncate_episode(whole, 10)], ())
+    short = problem.with_episodes([truncate_episode(whole, 10)], ())
     x = moved(problem)
-    one, two = problem.evaluate(x, False).episodes[0], short.evaluate(x, False).episodes[0]
+    one, two = problem.evaluate(x, False).episode_predictions[0], short.evaluate(x, False).episode_predictions[0]
     assert short.episodes[0].grid.steps == 10
     np.testing.assert_allclose(two.rollout.state, one.rollout.state[:11], atol=1e-9)
-    for k, samples in enumerate(short.episodes[0].samples):
-        before = whole.samples[k]
-        last = 10 - (STEPS - before.span[1])
-        assert samples.span == (before.span[0], last)
+    for k, samples in enumerate(short.episodes[0].measurements):
+        before = whole.measurements[k]
+        last = 10 - (STEPS - before.predictable_nodes[1])
+        assert samples.predictable_nodes == (before.predictable_nodes[0], last)
         early = before.node + before.fraction <= last + 1e-9
         np.testing.assert_array_equal(samples.value, before.value[early])
-        np.testing.assert_allclose(two.predicted[k], one.predicted[k][early], atol=1e-9)
+        np.testing.assert_allclose(two.predicted_outputs[k], one.predicted_outputs[k][early], atol=1e-9)
     assert truncate_episode(whole, 99).grid.steps == STEPS
 
 

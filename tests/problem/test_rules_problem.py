@@ -82,7 +82,7 @@ def test_blocks_and_values_find_their_places():
 
 def test_a_recording_has_its_own_values_and_start(make):
     problem = make(local=("elbow.rest",), initial_state="estimated")
-    x = np.arange(1.0, 1 + len(problem.names))
+    x = np.arange(1.0, 1 + len(problem.unknown_names))
     theta, offset = problem.split(x, 1)
     names = problem.system.parameters.names
     assert [theta[names.index(name)] for name in ("shoulder.stiffness", "elbow.stiffness", "elbow.rest")] == [1, 2, 8]
@@ -90,23 +90,23 @@ def test_a_recording_has_its_own_values_and_start(make):
     assert theta[names.index("elbow.damping")] == 0.2
     assert problem.split(x, 0)[1].tolist() == [4, 5, 6, 7]
     assert problem.theta[names.index("elbow.rest")] == 0.1
-    assert (problem.shared, problem.local) == (FREE[:2], FREE[2:])
+    assert (problem.shared_parameters, problem.local_parameters) == (FREE[:2], FREE[2:])
 
 
 def test_start_bounds_and_values_by_name(make):
     problem = make(initial_state="estimated", seeds=(1,))
-    assert problem.named(problem.start) == {**START, **dict.fromkeys(problem.names[3:], 0.0)}
+    assert problem.named_values(problem.initial_unknowns) == {**START, **dict.fromkeys(problem.unknown_names[3:], 0.0)}
     lower, upper = problem.bounds
     assert lower[0] == 0.0
     assert upper[0] == math.inf
     np.testing.assert_array_equal(lower[3:], -np.inf)
     np.testing.assert_array_equal(upper[3:], np.inf)
     found = problem.vector({"elbow.stiffness": 9.0, "shoulder.stiffness": -1.0, "start.q.elbow[run_1]": 0.5})
-    assert problem.named(found) == {
+    assert problem.named_values(found) == {
         **START,
         "elbow.stiffness": 9.0,
         "shoulder.stiffness": 0.0,
-        **dict.fromkeys(problem.names[3:], 0.0),
+        **dict.fromkeys(problem.unknown_names[3:], 0.0),
         "start.q.elbow[run_1]": 0.5,
     }
 
@@ -133,42 +133,42 @@ def test_an_estimated_start_has_a_prior_in_angles_and_momenta(make, momentum, fr
     inertia = [momentum(free_step, np.zeros(2), velocity, theta)[i] for i, velocity in enumerate(np.eye(2))]
     # two rods: 1/3 m l^2 and more about the shoulder
     assert inertia == pytest.approx([0.0208 + 0.25**2 + 0.008 + 0.6 * 0.7**2, 0.008 + 0.6 * 0.2**2], rel=1e-9)
-    np.testing.assert_allclose(problem.start_std, [0.07, 0.07, 0.3 * inertia[0], 0.3 * inertia[1]], rtol=1e-9)
+    np.testing.assert_allclose(problem.initial_state_prior_std, [0.07, 0.07, 0.3 * inertia[0], 0.3 * inertia[1]], rtol=1e-9)
     np.testing.assert_allclose(mass_matrix_diagonal(free_step, theta, ("elbow", "shoulder")), inertia[::-1], rtol=1e-9)
-    assert problem.names[3:] == tuple(f"start.{kind}.{joint}[run_1]" for kind in "qp" for joint in PENDULUM)
+    assert problem.unknown_names[3:] == tuple(f"start.{kind}.{joint}[run_1]" for kind in "qp" for joint in PENDULUM)
     assert problem.predictor.estimated_state_indices == (0, 1, 2, 3)
 
 
 def test_without_estimated_starts_there_are_none(make):
     problem = make()
     assert problem.predictor.estimated_state_indices == ()
-    assert problem.start_std.shape == (0,)
-    assert problem.names == FREE
+    assert problem.initial_state_prior_std.shape == (0,)
+    assert problem.unknown_names == FREE
 
 
 def test_stated_priors_are_gaussian_about_the_start(make):
     problem = make(priors={"elbow.stiffness": 0.5, "elbow.rest": 0.02}, weak_prior_factor=0.0)
     x = np.array([7.0, 4.0, 0.14])
-    residual, rows = problem.prior(x)
+    residual, rows = problem.prior_residual(x)
     np.testing.assert_allclose(residual, [2.0, 2.0])
     np.testing.assert_allclose(rows, [[0.0, 2.0, 0.0], [0.0, 0.0, 50.0]])
-    assert problem.rows.stated_priors.stop - problem.rows.stated_priors.start == 2
-    assert problem.rows.weak_priors.stop == problem.rows.weak_priors.start
+    assert problem.residual_rows.stated_priors.stop - problem.residual_rows.stated_priors.start == 2
+    assert problem.residual_rows.weak_priors.stop == problem.residual_rows.weak_priors.start
 
 
 def test_weak_priors_are_log_normal_and_only_of_positive_unknowns_without_another(make):
     problem = make(priors={"shoulder.stiffness": 2.0}, weak_prior_factor=10.0)
     x = np.array([7.0, 30.0, 0.5])
-    residual, rows = problem.prior(x)
+    residual, rows = problem.prior_residual(x)
     np.testing.assert_allclose(residual, [0.5, 1.0])
     np.testing.assert_allclose(rows, [[0.5, 0.0, 0.0], [0.0, 1 / (math.log(10.0) * 30.0), 0.0]])
-    assert problem.positive.tolist() == [True, True, False]
-    assert (problem.rows.weak_priors, problem.rows.informing) == (
-        slice(problem.rows.data.stop + 1, problem.rows.data.stop + 2),
-        slice(0, problem.rows.data.stop + 1),
+    assert problem.is_positive.tolist() == [True, True, False]
+    assert (problem.residual_rows.weak_priors, problem.residual_rows.without_weak_priors) == (
+        slice(problem.residual_rows.data.stop + 1, problem.residual_rows.data.stop + 2),
+        slice(0, problem.residual_rows.data.stop + 1),
     )
     # at its bound the row is one that a step can follow: a thousandth of the start has its value but for 0.65
-    low, slope = problem.prior(np.array([7.0, 0.0, 0.5]))
+    low, slope = problem.prior_residual(np.array([7.0, 0.0, 0.5]))
     assert low[1] == pytest.approx(-3.0 - 1.5 / math.log(10.0))
     assert slope[1, 1] == pytest.approx(2000.0 / (math.log(10.0) * 3.0))
 
@@ -186,21 +186,21 @@ def test_the_weak_priors_logarithm_ends_smoothly_where_the_ratio_is_small():
 @pytest.mark.parametrize("options", [{"weak_prior_factor": 1.0}, {"weak_prior_factor": 0.0}, {"weighting": "paper"}])
 def test_some_problems_have_no_weak_prior(make, options):
     problem = make(**options)
-    residual, rows = problem.prior(problem.start)
+    residual, rows = problem.prior_residual(problem.initial_unknowns)
     assert residual.shape == (0,)
     assert rows.shape == (0, 3)
-    assert make(weak_prior_factor=1.1).prior(problem.start)[0].shape == (2,)
+    assert make(weak_prior_factor=1.1).prior_residual(problem.initial_unknowns)[0].shape == (2,)
 
 
 def test_an_unknown_is_as_large_as_its_start_its_prior_or_a_tenth_of_its_range(make):
     values = {"shoulder.stiffness": 0.0, "elbow.stiffness": 0.0, "elbow.rest": 0.0}
     problem = make(values=values, priors={"elbow.stiffness": 0.25}, initial_state="estimated", seeds=(1,))
-    np.testing.assert_allclose(problem.scales[:2], [1.0, 0.25])
-    np.testing.assert_allclose(problem.scales[3:], problem.start_std)
+    np.testing.assert_allclose(problem.unknown_scales[:2], [1.0, 0.25])
+    np.testing.assert_allclose(problem.unknown_scales[3:], problem.initial_state_prior_std)
     lower, upper = problem.bounds
     width = upper[2] - lower[2]
-    assert problem.scales[2] == pytest.approx(0.1 * width if math.isfinite(width) else 1.0)
-    np.testing.assert_allclose(make(values={"elbow.rest": -0.4}).scales, [6.0, 3.0, 0.4])
+    assert problem.unknown_scales[2] == pytest.approx(0.1 * width if math.isfinite(width) else 1.0)
+    np.testing.assert_allclose(make(values={"elbow.rest": -0.4}).unknown_scales, [6.0, 3.0, 0.4])
 
 
 # -- rows -------------------------------------------------------------------------------------------------------------
@@ -208,14 +208,14 @@ def test_an_unknown_is_as_large_as_its_start_its_prior_or_a_tenth_of_its_range(m
 
 def test_the_residual_is_made_of_measurements_then_priors(make):
     problem = make(priors={"elbow.stiffness": 1.0}, weak_prior_factor=5.0)
-    evaluation = problem.evaluate(problem.start + np.array([1.0, 2.0, 0.1]))
-    rows = problem.rows
+    evaluation = problem.evaluate(problem.initial_unknowns + np.array([1.0, 2.0, 0.1]))
+    rows = problem.residual_rows
     assert [[part.stop - part.start for part in group] for group in rows.measurements] == [[75, 39], [75, 39]]
     assert rows.measurements[1][0] == slice(114, 189)
     assert (rows.data, rows.stated_priors, rows.weak_priors) == (slice(0, 228), slice(228, 229), slice(229, 230))
     np.testing.assert_allclose(evaluation.residual[228:], [2.0, math.log(7.0 / 6.0) / math.log(5.0)])
     assert evaluation.cost == pytest.approx(0.5 * evaluation.residual @ evaluation.residual)
-    residual, jacobian = problem.informing(evaluation)
+    residual, jacobian = problem.residual_without_weak_priors(evaluation)
     np.testing.assert_array_equal(residual, evaluation.residual[:229])
     np.testing.assert_array_equal(jacobian, evaluation.jacobian[:229])
     assert ResidualRows.from_episodes((), 2, 3) == ResidualRows((), slice(0, 0), slice(0, 2), slice(2, 5))
@@ -223,20 +223,20 @@ def test_the_residual_is_made_of_measurements_then_priors(make):
 
 @pytest.mark.parametrize("stated", [None, 2.0], ids=["small", "more than a metre"])
 def test_the_papers_rows_are_metres_and_inform_in_units_of_the_noise(make, stated):
-    names = () if stated is None else sorted({s.sensor.group for s in make().episodes[0].samples})
+    names = () if stated is None else sorted({s.sensor.group_name for s in make().episodes[0].measurements})
     sensors = {name: SensorOptions(std=stated) for name in names}
     problem = make(weighting="paper", priors={"elbow.stiffness": 1.0}, sensors=sensors)
-    evaluation = problem.evaluate(problem.start + np.array([0.0, 2.0, 0.0]))
+    evaluation = problem.evaluate(problem.initial_unknowns + np.array([0.0, 2.0, 0.0]))
     # 75 coordinates of 2 cm and 39 of 5 cm in each recording
     noise = stated or math.sqrt((75 * 0.02**2 + 39 * 0.05**2) / 114)
-    assert problem.noise == pytest.approx(noise)
-    residual, jacobian = problem.informing(evaluation)
-    data = problem.rows.data
+    assert problem.data_noise_unit == pytest.approx(noise)
+    residual, jacobian = problem.residual_without_weak_priors(evaluation)
+    data = problem.residual_rows.data
     np.testing.assert_allclose(residual[data], evaluation.residual[data] / noise)
     np.testing.assert_allclose(jacobian[data], evaluation.jacobian[data] / noise)
     assert residual[-1] == 2.0
     assert jacobian[-1].tolist() == [0.0, 1.0, 0.0]
-    assert make().noise == 1.0
+    assert make().data_noise_unit == 1.0
 
 
 def test_predictions_are_those_of_a_rollout_from_rest(make, free_step, roll):
@@ -245,16 +245,16 @@ def test_predictions_are_those_of_a_rollout_from_rest(make, free_step, roll):
     x = problem.vector({"elbow.stiffness": 4.0})
     evaluation = problem.evaluate(x, derivatives=False)
     assert evaluation.jacobian is None
-    result = evaluation.episodes[0]
+    result = evaluation.episode_predictions[0]
     theta, _ = problem.split(x, 0)
-    state = result.rest.state
+    state = result.equilibrium.state
     np.testing.assert_allclose(result.rollout.state, roll(free_step, theta, state[:2], state[2:], 24).state, atol=1e-12)
 
     places = np.stack([tip(q) for q in result.rollout.state[:, :2]])
     episode = problem.episodes[0]
-    seen_tip = (places - episode.samples[0].value) / 0.02
+    seen_tip = (places - episode.measurements[0].value) / 0.02
     np.testing.assert_allclose(evaluation.residual[:75], seen_tip.ravel(), atol=1e-9)
-    camera = episode.samples[1]
+    camera = episode.measurements[1]
     t = H * (camera.node + camera.fraction)
     between = np.stack([np.interp(t, H * np.arange(25), places[:, i]) for i in range(3)], axis=1)
     expected = (between - camera.value[:, 3:]) / 0.05
@@ -275,9 +275,9 @@ def test_a_problem_whose_rollout_fails_says_why(make):
     problem = make(free=("elbow.rest",))
     failing = problem.evaluate([1e8])
     assert not failing.ok
-    assert (failing.cost, failing.jacobian, failing.episodes, failing.warm) == (math.inf, None, (), ())
+    assert (failing.cost, failing.jacobian, failing.episode_predictions, failing.equilibrium_guesses) == (math.inf, None, (), ())
     assert failing.message.startswith("run_1: no equilibrium found")
-    cost, gradient, same = problem.gradient([1e8])
+    cost, gradient, same = problem.cost_and_gradient([1e8])
     assert (cost, gradient.tolist(), same.ok) == (math.inf, [0.0], False)
 
 
@@ -287,7 +287,7 @@ def test_a_problem_whose_rollout_fails_says_why(make):
 @pytest.fixture(scope="module")
 def held(free_step, make, roll):
     """Two swings from near rest, the tip seen."""
-    rest = make().evaluate(list(START.values()), False).episodes[0].rest.state
+    rest = make().evaluate(list(START.values()), False).episode_predictions[0].equilibrium.state
     theta = free_step.system.parameters.vector()
     found = []
     for seed in (8, 9):
@@ -305,57 +305,57 @@ def held(free_step, make, roll):
 def test_a_held_out_start_balances_its_prior_and_its_first_moments(make, held, configuration, velocity):
     options = {"initial_state": "estimated", "configuration_std": configuration, "velocity_std": velocity}
     problem = make(held_out=held, **options)
-    x = problem.start
+    x = problem.initial_unknowns
     short = truncate_episode(problem.held_out[1], 20)
     theta, _ = problem.split(x, 0)
 
     def rows(offset):
-        result = problem.predictor.run(short, theta, offset, False)
-        parts = [s.whitened_residual(y).ravel() for s, y in zip(short.measurements, result.predicted, strict=True)]
-        return np.concatenate([*parts, offset / problem.start_std])
+        result = problem.predictor.predict_episode(short, theta, offset, False)
+        parts = [s.whitened_residual(y).ravel() for s, y in zip(short.measurements, result.predicted_outputs, strict=True)]
+        return np.concatenate([*parts, offset / problem.initial_state_prior_std])
 
-    best = scipy.optimize.least_squares(rows, np.zeros(4), x_scale=problem.start_std, xtol=1e-12, ftol=1e-14)
-    found = problem.held_out_initial_state_offset(1, x)
-    np.testing.assert_allclose(found / problem.start_std, best.x / problem.start_std, atol=2e-3)
+    best = scipy.optimize.least_squares(rows, np.zeros(4), x_scale=problem.initial_state_prior_std, xtol=1e-12, ftol=1e-14)
+    found = problem.held_out_evaluation_points(x)[1][2]
+    np.testing.assert_allclose(found / problem.initial_state_prior_std, best.x / problem.initial_state_prior_std, atol=2e-3)
 
 
 def test_held_out_recordings_are_predicted_with_shared_parameters_only(make, held):
     problem = make(held_out=held, local=("elbow.rest",), initial_state="estimated")
     x = problem.vector({"elbow.stiffness": 4.0, "elbow.rest[run_1]": 0.7})
-    found = problem.validate(x)
+    found = problem.predict_held_out(x)
     assert [episode.name for episode, _ in found] == ["run_8", "run_9"]
     for i, (episode, result) in enumerate(found):
         theta = problem.system.parameters.vector({"elbow.stiffness": 4.0, "elbow.rest": 0.1})
-        expected = problem.predictor.run(episode, theta, problem.held_out_initial_state_offset(i, x), False)
-        np.testing.assert_allclose(result.predicted[0], expected.predicted[0], atol=1e-12)
-        assert np.any(problem.held_out_initial_state_offset(i, x))
+        expected = problem.predictor.predict_episode(episode, theta, problem.held_out_evaluation_points(x)[i][2], False)
+        np.testing.assert_allclose(result.predicted_outputs[0], expected.predicted_outputs[0], atol=1e-12)
+        assert np.any(problem.held_out_evaluation_points(x)[i][2])
 
 
 def test_a_held_out_part_of_a_recording_shares_its_start(make):
     problem = make(initial_state="estimated")
-    part = replace(problem.episodes[1], shares_start_of=1)
-    split = problem.on(problem.episodes, [part])
-    x = problem.vector({name: 0.01 * i for i, name in enumerate(problem.names[3:])})
-    assert split.held_out_initial_state_offset(0, x).tolist() == problem.split(x, 1)[1].tolist()
+    part = replace(problem.episodes[1], initial_state_shared_with=1)
+    split = problem.with_episodes(problem.episodes, [part])
+    x = problem.vector({name: 0.01 * i for i, name in enumerate(problem.unknown_names[3:])})
+    assert split.held_out_evaluation_points(x).tolist() == problem.split(x, 1)[1].tolist()[0][2]
     np.testing.assert_array_equal(
-        split.validate(x)[0][1].predicted[0], problem.evaluate(x, False).episodes[1].predicted[0]
+        split.predict_held_out(x)[0][1].predicted_outputs[0], problem.evaluate(x, False).episode_predictions[1].predicted_outputs[0]
     )
 
 
 def test_a_start_at_rest_needs_no_offset(make, held):
-    assert make(held_out=held).held_out_initial_state_offset(0, np.array([6.0, 3.0, 0.1])).shape == (0,)
+    assert make(held_out=held).held_out_evaluation_points(np.array([6.0, 3.0, 0.1])).shape == (0,)[0][2]
 
 
 def test_the_first_moments_are_at_least_two_steps_of_a_fifth_of_a_second(make, held):
     problem = make(held_out=held, initial_state="estimated")
     episode = problem.held_out[0]
-    value = episode.samples[0].value.copy()
+    value = episode.measurements[0].value.copy()
     for first, same in ((21, True), (20, False)):
         changed = value.copy()
         changed[first:] += 0.3
-        moved = replace(episode, samples=(replace(episode.samples[0], value=changed),))
-        found = problem.on(problem.episodes, [moved]).held_out_initial_state_offset(0, problem.start)
-        assert np.allclose(found, problem.held_out_initial_state_offset(0, problem.start), atol=1e-12) is same
+        moved = replace(episode, measurements=(replace(episode.measurements[0], value=changed),))
+        found = problem.with_episodes(problem.episodes, [moved]).held_out_evaluation_points(problem.initial_unknowns)[0][2]
+        assert np.allclose(found, problem.held_out_evaluation_points(problem.initial_unknowns)[0][2], atol=1e-12) is same
 
 
 # -- other problems like it -------------------------------------------------------------------------------------------
@@ -363,15 +363,15 @@ def test_the_first_moments_are_at_least_two_steps_of_a_fifth_of_a_second(make, h
 
 def test_problems_that_free_other_parameters_share_all_else(make):
     problem = make(may_free=("elbow.damping",), local=("elbow.rest",))
-    other = problem.freeing(("elbow.damping", "shoulder.stiffness"))
-    assert other.names == ("elbow.damping", "shoulder.stiffness")
+    other = problem.with_free_subset(("elbow.damping", "shoulder.stiffness"))
+    assert other.unknown_names == ("elbow.damping", "shoulder.stiffness")
     assert other.episodes is problem.episodes
-    assert other.functions is problem.functions
+    assert other.model_functions is problem.model_functions
     whole = make(free=("elbow.damping", "shoulder.stiffness"))
-    one, two = other.evaluate(other.start), whole.evaluate(whole.start)
+    one, two = other.evaluate(other.initial_unknowns), whole.evaluate(whole.initial_unknowns)
     np.testing.assert_allclose(one.residual, two.residual, atol=1e-9)
     np.testing.assert_allclose(one.jacobian, two.jacobian, atol=1e-7)
-    moved = problem.at({"elbow.damping": 0.9})
+    moved = problem.with_parameter_values({"elbow.damping": 0.9})
     assert moved.theta[problem.system.parameters.index("elbow.damping")] == 0.9
     assert problem.theta[problem.system.parameters.index("elbow.damping")] == 0.2
     assert moved.episodes is problem.episodes
@@ -386,11 +386,11 @@ def test_problems_prepared_anew_keep_what_is_not_changed(make, held):
     changed = problem.with_options(replace(problem.options, weak_prior_factor=3.0))
     assert (changed.options.weak_prior_factor, len(changed.held_out), changed.free) == (3.0, 2, FREE)
     fewer = problem.with_free_parameters(("elbow.stiffness",), {"elbow.stiffness": 5.0})
-    assert (fewer.free, fewer.options.local, fewer.options.priors) == (("elbow.stiffness",), (), {})
-    assert fewer.start.tolist() == [5.0]
+    assert (fewer.free, fewer.options.local_parameters, fewer.options.prior_stds) == (("elbow.stiffness",), (), {})
+    assert fewer.initial_unknowns.tolist() == [5.0]
     assert fewer.theta[index("elbow.damping")] == 0.7
     kept = problem.with_free_parameters(("elbow.rest",))
-    assert (kept.options.local, kept.options.priors) == (("elbow.rest",), {"elbow.rest": 0.1})
+    assert (kept.options.local_parameters, kept.options.prior_stds) == (("elbow.rest",), {"elbow.rest": 0.1})
     assert len(kept.held_out) == 2
 
 

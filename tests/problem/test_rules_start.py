@@ -60,7 +60,7 @@ def test_a_single_frame_gives_a_configuration_at_rest(step):
     found = solved(step, [at(0, q)])
     np.testing.assert_allclose(found.state[:2], q, atol=1e-4)
     np.testing.assert_array_equal(found.state[2:], np.zeros(2))
-    assert found.values == {}
+    assert found.fitted_parameters == {}
 
 
 @pytest.mark.parametrize(("std", "soft"), [(0.2, 1.0), (1.0, 1.0), (1.0, 0.1)])

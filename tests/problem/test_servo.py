@@ -223,9 +223,9 @@ def test_neutral_it_changes_nothing_and_shows_at_once(urdf_folder, step, kind) -
     [effect] = with_it.system.effects
     both = [made.evaluate(made.initial_unknowns).residual for made in (plain, with_it)]
     np.testing.assert_allclose(both[0], both[1], atol=1e-8)
-    freed = problem_of(with_it.step, commanded(), [*effect.amplitudes])
+    freed = problem_of(with_it.step, commanded(), [*effect.amplitude_names])
     slope = freed.evaluate(freed.initial_unknowns).jacobian[: len(both[0]), 0]
-    low, high = effect.prior_range[effect.amplitudes[0]]
+    low, high = effect.prior_ranges[effect.amplitude_names[0]]
     assert np.abs(slope).max() * (high - low) > 1.0
 
 
@@ -247,7 +247,7 @@ def test_a_saturation_reports_its_limit_and_binds_like_the_servos_own(urdf_folde
     limited = servo_step(urdf_folder, [("servo_saturation", "shoulder", {"limit": 5.0})])
     [effect] = limited.system.effects
     name = effect.amplitude_names[0]
-    told = effect.reported(
+    told = effect.reported_parameters(
         {name: 5.0**-TORQUE_LIMIT_POWER}, {name: 0.01 * TORQUE_LIMIT_POWER * 5.0**-TORQUE_LIMIT_POWER}
     )["limit"]
     assert (told.value, told.std, told.unit) == (pytest.approx(5.0), pytest.approx(0.05), "N m")

@@ -48,7 +48,7 @@ def buckled(urdf_folder):
 
 def problem_of(step, state, first=0.1, std=1e-3, **options):
     """A recording of the rod at rest, its middle seen from `first` seconds on."""
-    n, t = step.system.size, 0.01 * np.arange(int(100 * (first + 0.3)))
+    n, t = step.system.n_coordinates, 0.01 * np.arange(int(100 * (first + 0.3)))
     sensor = PointSensor("points_camera", (MIDDLE,), (MIDDLE,), None)
     place = np.array(
         sensor_function(step.system, sensor, ())(state[:n], [], np.zeros(n), step.system.parameters.vector())[0]
@@ -71,19 +71,19 @@ def problem_of(step, state, first=0.1, std=1e-3, **options):
 def test_a_recording_starts_in_the_shape_that_its_first_points_show(buckled, which):
     step, *states = buckled
     problem = problem_of(step, states[which - 1])
-    found = problem.evaluate(problem.start)
+    found = problem.evaluate(problem.initial_unknowns)
     assert np.abs(found.residual).max() < 0.05
-    assert (problem.episodes[0].near is None) is (which == 1)
-    [(_, held)] = problem.validate(problem.start)
+    assert (problem.episodes[0].equilibrium_guess is None) is (which == 1)
+    [(_, held)] = problem.predict_held_out(problem.initial_unknowns)
     np.testing.assert_allclose(held.rollout.state[0], states[which - 1], atol=1e-6)
     if which == 2:  # and so it does with other stiffnesses
-        moved = problem.evaluate(2.0 * problem.start)
-        np.testing.assert_allclose(moved.episodes[0].rollout.state[0][:5], states[1][:5], atol=0.05)
+        moved = problem.evaluate(2.0 * problem.initial_unknowns)
+        np.testing.assert_allclose(moved.episode_predictions[0].rollout.state[0][:5], states[1][:5], atol=0.05)
 
 
 def test_points_that_come_late_or_that_no_shape_is_near_leave_the_least_energy(buckled):
     step, least, mirrored = buckled
-    assert problem_of(step, mirrored, first=_MAX_FIRST_SAMPLE_TIME + 0.1).episodes[0].near is None
+    assert problem_of(step, mirrored, first=_MAX_FIRST_SAMPLE_TIME + 0.1).episodes[0].equilibrium_guess is None
     # an error of some standard deviations is what is to be found out, not another shape
-    assert problem_of(step, mirrored, std=0.2).episodes[0].near is None
-    assert problem_of(step, least, first=0.0, initial_state="fitted_to_points").held_out[0].near is None
+    assert problem_of(step, mirrored, std=0.2).episodes[0].equilibrium_guess is None
+    assert problem_of(step, least, first=0.0, initial_state="fitted_to_points").held_out[0].equilibrium_guess is None

@@ -24,7 +24,7 @@ def problem(urdf_folder):
 
 def test_what_is_simulated_is_what_is_found(problem):
     truth = {"elbow.stiffness": 4.2, "elbow.damping": 0.31}
-    made = problem.simulate(truth)
+    made = problem.simulate_recording(truth)
     assert made.name == "run_1_simulated"
     assert {name: made.truth[name] for name in FREE} == truth
     assert np.array_equal(made.points[0].t, problem.episodes[0].recording.points[0].t)
@@ -38,9 +38,9 @@ def test_what_is_simulated_is_what_is_found(problem):
 
 
 def test_its_own_values_without_any_and_noise_by_its_seed(problem):
-    plain, first, same, other = (problem.simulate(seed=seed) for seed in (None, 3, 3, 4))
-    own = problem.evaluate(problem.start, derivatives=False).episodes[0]
-    [samples] = [s for s in problem.episodes[0].samples if s.sensor.group == plain.points[0].name]
+    plain, first, same, other = (problem.simulate_recording(seed=seed) for seed in (None, 3, 3, 4))
+    own = problem.evaluate(problem.initial_unknowns, derivatives=False).episode_predictions[0]
+    [samples] = [s for s in problem.episodes[0].measurements if s.sensor.group_name == plain.points[0].name]
     predicted = own.predicted[problem.episodes[0].samples.index(samples)]
     where = samples.seen
     assert np.allclose(plain.points[0].position.reshape(predicted.shape)[where], predicted[where], atol=1e-12)
@@ -52,7 +52,7 @@ def test_its_own_values_without_any_and_noise_by_its_seed(problem):
 
 def test_a_parameter_that_is_not_there_is_named(problem):
     with pytest.raises(ConfigError, match=r"there is no parameter 'elbow\.stifness'") as caught:
-        problem.simulate({"elbow.stifness": 1.0})
+        problem.simulate_recording({"elbow.stifness": 1.0})
     assert caught.value.hint == "did you mean 'elbow.stiffness'?"
 
 

@@ -40,6 +40,12 @@ from yid_ocp.sensors import Sensor
 Array = NDArray[np.float64]
 _UnknownKind = Literal["force", "push", "offset", "bias"]
 
+_CORRELATION_TIME = 0.5
+"""Correlation time of the unknowns [s]."""
+_MIN_INTERVAL = 0.1
+"""Shortest time over which unknowns are constant [s]."""
+_MAX_INTERVAL_COUNT = 150
+"""Number of intervals of a long recording, beyond which they become longer."""
 _FORCE_POINT = "75%"
 """Where a segment is pushed, by arc length: what acts on its tip and what acts all along it are both near that."""
 
@@ -276,16 +282,6 @@ def generalized_forces_per_newton(system: System, theta: Array, q: Array, segmen
     function = ca.Function("pushed", [symbol, system.parameters.symbols], [ca.densify(jacobian.T)])
     found = np.array(function.map(len(q))(q.T, np.tile(theta[:, None], len(q))))
     return found.reshape(system.n_coordinates, len(q), 3 * len(segments)).transpose(1, 0, 2)
-
-
-_UnknownKind = Literal["force", "push", "offset", "bias"]
-
-_CORRELATION_TIME = 0.5
-"""Correlation time of the unknowns [s]."""
-_MIN_INTERVAL = 0.1
-"""Shortest time over which unknowns are constant [s]."""
-_MAX_INTERVAL_COUNT = 150
-"""Number of intervals of a long recording, beyond which they become longer."""
 
 
 @dataclass(frozen=True)
