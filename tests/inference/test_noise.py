@@ -10,7 +10,7 @@ import pytest
 from small_problems import H, correlated, pendulum_step, taken
 
 from yid_ocp.errors import ConfigError
-from yid_ocp.inference.whitening import estimate_torque_biases, whitened_at
+from yid_ocp.inference.whitening import estimate_torque_bias, estimate_torque_biases, whitened_at
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.evaluation import _sensor_whitened_residual
 
@@ -44,7 +44,13 @@ def residual(problem, x, torque=0.0, posture=0.0, reference=None):
     feedback = episode.tracking_feedback
     if reference is not None and feedback is not None:
         feedback = replace(feedback, reference=feedback.reference + reference)
-    changed = replace(episode, torque=episode.torque + torque, measured_driven_angles=arm, tracking_feedback=feedback, input_errors=errors)
+    changed = replace(
+        episode,
+        torque=episode.torque + torque,
+        measured_driven_angles=arm,
+        tracking_feedback=feedback,
+        input_errors=errors,
+    )
     result = problem.predictor.predict_episode(changed, *problem.split(x, 0), False)
     return _sensor_whitened_residual(changed.measurements, result).residual
 
@@ -143,7 +149,9 @@ def small_gap(problem, size=1.0):
     feedback = episode.tracking_feedback
     if feedback is not None:
         feedback = replace(feedback, reference=angles[:-1].copy())
-    return problem.with_episodes([replace(episode, measurements=samples, tracking_feedback=feedback, measured_driven_angles=angles)], [])
+    return problem.with_episodes(
+        [replace(episode, measurements=samples, tracking_feedback=feedback, measured_driven_angles=angles)], []
+    )
 
 
 def test_without_errors_of_inputs_nothing_changes(urdf_folder):
@@ -190,7 +198,7 @@ def test_a_constant_error_counts_in_what_the_filter_follows_too(urdf_folder, fee
     found = []
     for each in (episode, other):
         result = weighted.predictor.predict_episode(each, *problem.split(x, 0), False)
-        found.append(weighted.predictor.estimate_torque_bias(each, result, whitening)[0])
+        found.append(estimate_torque_bias(each, result, whitening)[0])
     seen = 1 - (whitening.torque_bias_std[0] / BIAS) ** 2
     assert seen > 0.05
     assert (found[1] - found[0]) / error == pytest.approx(seen, rel=0.01)
@@ -200,7 +208,7 @@ def test_what_cannot_be_rolled_out_has_no_constant_error(point, monkeypatch):
     problem, x = point
     weighted = whitened_at(problem, x)
     assert len(estimate_torque_biases(weighted, x)[0]) == 2
-    monkeypatch.setattr(type(weighted.predictor), "run", lambda *_: "it snaps")
+    monkeypatch.setattr(type(weighted.predictor), "predict_episode", lambda *_: "it snaps")
     assert estimate_torque_biases(weighted, x) == [None]
 
 
@@ -222,7 +230,10 @@ def test_jacobians_of_innovations_are_those_of_differences(urdf_folder):
     for i in range(len(x)):
         step = np.zeros(len(x))
         step[i] = 1e-5 * x[i]
-        ends = [weighted.evaluate(x + sign * step, equilibrium_guesses=found.equilibrium_guesses).residual for sign in (1, -1)]
+        ends = [
+            weighted.evaluate(x + sign * step, equilibrium_guesses=found.equilibrium_guesses).residual
+            for sign in (1, -1)
+        ]
         numeric = (ends[0] - ends[1]) / (2 * step[i])
         np.testing.assert_allclose(numeric, found.jacobian[:, i], atol=2e-5 * np.abs(found.jacobian[:, i]).max())
     cost, gradient, again = weighted.gradient(x)

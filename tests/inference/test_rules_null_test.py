@@ -288,7 +288,7 @@ def test_the_noise_floor_is_the_median_of_each_channel():
     nan = math.nan
     first = samples(["points.a", "points.b"], [[1.0, 9.0], [2.0, nan], [6.0, nan]])
     second = samples(["points.a", "effort"], [[3.0, nan], [4.0, nan]], unit="N m")
-    problem = SimpleNamespace(episodes=[SimpleNamespace(samples=[first]), SimpleNamespace(samples=[second])])
+    problem = SimpleNamespace(episodes=[SimpleNamespace(measurements=[first]), SimpleNamespace(measurements=[second])])
     found = {entry.channel: entry for entry in channel_noise_levels(problem)}
     assert set(found) == {"points.a", "points.b"}
     assert (found["points.a"].noise_std, found["points.a"].n_samples) == (3.0, 5)

@@ -9,12 +9,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import threadpoolctl
-from factories import BIAS, FORCE, OTHER_FORCE
 
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.inference import smoother, smoother_model
-from yid_ocp.inference.smoother_model import IntervalModel, LinearResidualModel
+from yid_ocp.inference.smoother_model import IntervalModel, LinearResidualModel, UnknownGroup
 
+FORCE, OTHER_FORCE, BIAS = UnknownGroup("T1", "force"), UnknownGroup("T2", "force"), UnknownGroup("camera", "bias")
 SOURCES = (FORCE, OTHER_FORCE, BIAS)
 STATES, COUNT, ROWS, DECAY = 2, 8, 6, 0.7
 
@@ -233,11 +233,7 @@ def test_the_group_that_explains_the_residual_is_taken_in(monkeypatch, column):
     assert set(at_work) == {source}
     reference, nothing = Dense(models, found.group_variance), Dense(models, NOTHING)
     own, other = ("sensor", "plant") if source is BIAS else ("plant", "sensor")
-    assert (
-        found.log_evidence[own]
-        == found.log_evidence["both"]
-        == pytest.approx(reference.log_evidence - nothing.log_evidence)
-    )
+    assert found.log_evidence[own] == found.log_evidence["both"] == pytest.approx(reference.evidence - nothing.evidence)
     assert found.log_evidence[own] > found.log_evidence[other] + 5
     assert found.log_evidence["none"] == 0.0
     assert found.log_evidence_drop == NOTHING | {source: pytest.approx(reference.evidence - nothing.evidence)}
@@ -254,7 +250,7 @@ def test_several_groups_are_taken_in_while_the_evidence_rises_enough(monkeypatch
         less = Dense(models, found.group_variance | {source: 0.0}).evidence
         assert found.log_evidence_drop[source] == pytest.approx(full - less, rel=1e-6)
     assert found.gap_origin == "both"
-    assert sum(v > 0 for v in smoothed(monkeypatch, models, places=2).group_variance.values()) == 2
+    assert sum(v > 0 for v in smoothed(monkeypatch, models, max_unknown_groups=2).group_variance.values()) == 2
     assert not any(smoothed(monkeypatch, models, worth=1e6).group_variance.values())
 
 
@@ -316,16 +312,16 @@ def test_what_would_be_noticed_comes_from_the_model_alone(monkeypatch):
     for column, source in enumerate(SOURCES):
         expected = math.sqrt(10.0 / reference.scores(0, column)[1])
         assert found.detectable_std[source] == pytest.approx(expected, rel=1e-8)
-    more = smoothed(monkeypatch, models, noticed=40.0)
+    more = smoothed(monkeypatch, models, detectable_chi2=40.0)
     assert more.detectable_std == {s: pytest.approx(2 * v) for s, v in found.detectable_std.items()}
 
 
 def test_known_noise_of_torques_is_as_strong_at_low_frequencies_as_the_unknown_force_for_it():
     held, span, decay = 3 * 0.005, 0.1, 0.7
-    errors = SimpleNamespace(sample=np.repeat(np.arange(20), 3), torque_std=np.array([0.4, 0.2]))
-    errors.bias_std = np.array([0.0, 0.3])
+    errors = SimpleNamespace(sample_of_step=np.repeat(np.arange(20), 3), torque_std=np.array([0.4, 0.2]))
+    errors.torque_bias_std = np.array([0.0, 0.3])
     course = SimpleNamespace(
-        episode=SimpleNamespace(errors=errors),
+        episode=SimpleNamespace(input_errors=errors),
         system=SimpleNamespace(driven=("a", "b")),
         problem=SimpleNamespace(step=SimpleNamespace(time_step=0.005)),
     )
@@ -336,5 +332,5 @@ def test_known_noise_of_torques_is_as_strong_at_low_frequencies_as_the_unknown_f
     lags = 1 + 2 * sum(decay**k for k in range(1, 200))
     white = np.array([0.4, 0.2]) ** 2 * held / (span * lags)
     np.testing.assert_allclose(known, [(white[1] + 0.3**2) / 4.0, 0.0, white[0] / 16.0, 0.0], rtol=1e-9)
-    course.episode.errors = None
+    course.episode.input_errors = None
     np.testing.assert_array_equal(smoother_model._torque_noise(course, unknowns, span, decay), np.zeros(4))

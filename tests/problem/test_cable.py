@@ -62,7 +62,9 @@ def cable_options(cable, recordings, noise, model_error, path_cutoff=8.0, option
         prior_stds=dict.fromkeys(names, 0.2),
         start_fit_window=PERIOD,
         start_point_noise_std=noise,
-        start_fit_parameters=("clamp_start.roll", "clamp_end.roll") if options.end_clamp == "weld" else ("clamp_start.roll",),
+        start_fit_parameters=("clamp_start.roll", "clamp_end.roll")
+        if options.end_clamp == "weld"
+        else ("clamp_start.roll",),
         parameters_by_recording=known if options.lengths_per_recording else {},
     )
 
@@ -147,15 +149,23 @@ def test_the_undeformed_model_has_the_undeformed_shape(cable, twin):
 
 def test_every_row_of_the_axis_constraint_matches_its_derivatives(twin):
     e = twin[0].equations
-    phi = ca.Function("phi", [e.q1, e.z1, e.lam, e.theta, e.time_step], [e.constraint_residual, ca.jacobian(e.constraint_residual, e.q1)])
-    closed = ca.Function("closed", e.arguments, [e.constraint_impulses.before_jacobian, e.constraint_impulses.before_force_by_q])
+    phi = ca.Function(
+        "phi",
+        [e.q1, e.z1, e.lam, e.theta, e.time_step],
+        [e.constraint_residual, ca.jacobian(e.constraint_residual, e.q1)],
+    )
+    closed = ca.Function(
+        "closed", e.arguments, [e.constraint_impulses.before_jacobian, e.constraint_impulses.before_force_by_q]
+    )
     random = np.random.default_rng(3)
     q, lam = random.normal(scale=0.4, size=e.q0.numel()), random.normal(size=5)
     theta = twin[0].system.parameters.vector()
     zero = np.zeros
     matrix, hessian = (np.array(ca.densify(x)) for x in closed(q, q, zero(len(q)), [], [], lam, [], theta, PERIOD))
     np.testing.assert_allclose(matrix, np.array(ca.densify(phi(q, [], lam, theta, PERIOD)[1])), atol=1e-12)
-    pull = ca.Function("pull", [e.q1, e.lam, e.theta], [ca.jacobian(ca.jacobian(e.constraint_residual, e.q1).T @ e.lam, e.q1)])
+    pull = ca.Function(
+        "pull", [e.q1, e.lam, e.theta], [ca.jacobian(ca.jacobian(e.constraint_residual, e.q1).T @ e.lam, e.q1)]
+    )
     np.testing.assert_allclose(hessian, np.array(ca.densify(pull(q, lam, theta))), atol=1e-11)
 
 

@@ -109,13 +109,17 @@ def test_what_is_known_of_constants_is_taken_off_the_samples(urdf_folder):
     spelt = arm(urdf_folder, None, ("shoulder.damping",), prescribed=tuple(BIAS))
     _, x = least(spelt, spelt.initial_unknowns)
     found = problem.evaluate(problem.initial_unknowns, derivatives=False)
-    for i, (episode, result) in enumerate(zip(problem.episode_predictions, found.episode_predictions, strict=True)):
+    for i, (episode, result) in enumerate(zip(problem.episodes, found.episode_predictions, strict=True)):
         [(before, after)] = [
             pair
-            for pair in zip(episode.measurements, subtract_estimated_biases(episode.measurements, result.predicted_outputs), strict=True)
+            for pair in zip(
+                episode.measurements,
+                subtract_estimated_biases(episode.measurements, result.predicted_outputs),
+                strict=True,
+            )
             if pair[0].sensor.effort_joints
         ]
-        offsets = [x[spelt.names.index(f"effort_offset@{joint}.offset[{episode.name}]")] for joint in BIAS]
+        offsets = [x[spelt.unknown_names.index(f"effort_offset@{joint}.offset[{episode.name}]")] for joint in BIAS]
         np.testing.assert_allclose(before.value - after.value, np.broadcast_to(offsets, before.value.shape), rtol=1e-6)
         assert not np.any(after.bias_std), i
 
@@ -124,7 +128,9 @@ def test_held_out_rows_count_it_and_rows_without_a_constant_stay(urdf_folder):
     problem = arm(urdf_folder, BIAS, ("shoulder.damping",), prescribed=tuple(BIAS))
     [(episode, result)] = problem.predict_held_out(problem.initial_unknowns)
     counted = problem.held_out_residual(0, episode, result).residual
-    plain = np.concatenate([s.residual_block(y).residual for s, y in zip(episode.measurements, result.predicted_outputs, strict=True)])
+    plain = np.concatenate(
+        [s.residual_block(y).residual for s, y in zip(episode.measurements, result.predicted_outputs, strict=True)]
+    )
     slopes = constant_error_sensitivities(episode.measurements)
     rows = np.any(slopes != 0, axis=1)
     np.testing.assert_allclose(counted[~rows], plain[~rows], rtol=1e-14)

@@ -74,7 +74,10 @@ def test_residuals_of_a_right_model_are_white_among_joints(urdf_folder):
         noisy = (a + b * rng.standard_normal(path.shape) for a, b in ((path, ANGLE), (effort, EFFORT)))
         problem = arm(step, *noisy)
         evaluation = problem.evaluate(problem.initial_unknowns, derivatives=False)
-        [samples], [predicted] = problem.episode_predictions[0].measurements, evaluation.episode_predictions[0].predicted_outputs
+        [samples], [predicted] = (
+            problem.episode_predictions[0].measurements,
+            evaluation.episode_predictions[0].predicted_outputs,
+        )
         found.append(evaluation.residual.reshape(-1, 2))
         alone.append((predicted - samples.value) / samples.std)
     rows, plain = np.vstack(found), np.vstack(alone)
@@ -125,8 +128,8 @@ def test_unknown_forces_are_seen_as_correlated(urdf_folder):
     found = sum(interval.unknown_jacobian[:, at].T @ interval.unknown_jacobian[:, at] for interval in linear.intervals)
     [samples] = (s for s in problem.episodes[0].measurements if s.sensor.effort_joints)
     slopes = samples.weight[:, :, None] * np.diag(linear.reference_std[at])
-    assert np.array_equal(samples.sensor.efforts, JOINTS)
-    seen = samples.mixing @ slopes[samples.seen]
+    assert np.array_equal(samples.sensor.effort_joints, JOINTS)
+    seen = samples.decorrelation_matrix @ slopes[samples.is_used]
     # but for the first and the last step, of which a node sees half
     np.testing.assert_allclose(found, seen.T @ seen, rtol=0.03)
     assert abs(found[0, 1]) > 0.05 * found.diagonal().min()
@@ -142,7 +145,9 @@ def test_a_gear_does_not_give_way_to_the_noise_of_an_effort_that_is_compared(urd
         for made in (effort, effort + 0.3 * rng.standard_normal(effort.shape), effort + 2.0)
     )
     inner, gain = slice(50, -50), LowPassFilter(CUTOFF).noise_gains(0.01)[0]
-    np.testing.assert_allclose(clean.joint_loads[inner], LowPassFilter(CUTOFF)(clean.grid.node_times, effort)[inner], atol=0.02)
+    np.testing.assert_allclose(
+        clean.joint_loads[inner], LowPassFilter(CUTOFF)(clean.grid.node_times, effort)[inner], atol=0.02
+    )
     assert np.std((noisy.joint_loads - clean.joint_loads)[inner]) < 0.5 * 0.3 * gain
     # what the model does not know of a load is measured all the same
     np.testing.assert_allclose((heavier.joint_loads - clean.joint_loads)[inner], 2.0, atol=1e-6)

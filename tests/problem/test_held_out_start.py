@@ -50,7 +50,9 @@ def test_only_the_first_moments_count(swinging):
         value = episode.measurements[0].value.copy()
         value[first:] += 1.0
         changed = replace(episode, measurements=(replace(episode.measurements[0], value=value),))
-        moved[first] = problem.with_episodes(problem.episodes, [changed]).held_out_evaluation_points(problem.initial_unknowns)[0][2]
+        moved[first] = problem.with_episodes(problem.episodes, [changed]).held_out_evaluation_points(
+            problem.initial_unknowns
+        )[0][2]
     assert moved[50] == pytest.approx(found, abs=1e-12)
     assert moved[5] != pytest.approx(found, abs=1e-3)
 

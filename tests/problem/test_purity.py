@@ -155,9 +155,13 @@ def test_the_residual_says_what_its_rows_are(pendulum):
     parts = [rows.data, rows.stated_priors, rows.weak_priors]
     assert [part.start for part in parts] == [0, rows.data.stop, rows.stated_priors.stop]
     assert rows.weak_priors.stop == len(evaluation.residual)
-    for episode, groups, result in zip(problem.episode_predictions, rows.measurements, evaluation.episode_predictions, strict=True):
+    for episode, groups, result in zip(
+        problem.episode_predictions, rows.measurements, evaluation.episode_predictions, strict=True
+    ):
         for samples, part, predicted in zip(episode.measurements, groups, result.predicted_outputs, strict=True):
-            np.testing.assert_array_equal(evaluation.residual[part], samples.whitened_residual(predicted)[samples.is_used])
+            np.testing.assert_array_equal(
+                evaluation.residual[part], samples.whitened_residual(predicted)[samples.is_used]
+            )
     stated = evaluation.residual[rows.stated_priors]
     assert np.count_nonzero(stated) == 1
     assert stated[np.flatnonzero(stated)[0]] == pytest.approx(0.01 / problem.options.start_configuration_std)

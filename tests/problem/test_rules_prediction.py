@@ -77,7 +77,9 @@ def test_forward_and_adjoint_derivatives_are_those_of_differences(problem):
     for i in range(len(x)):
         step = np.zeros(len(x))
         step[i] = 1e-5 * scale[i]
-        ends = [problem.evaluate(x + sign * step, equilibrium_guesses=evaluation.equilibrium_guesses) for sign in (1, -1)]
+        ends = [
+            problem.evaluate(x + sign * step, equilibrium_guesses=evaluation.equilibrium_guesses) for sign in (1, -1)
+        ]
         slope = (ends[0].cost - ends[1].cost) / (2 * step[i])
         assert slope == pytest.approx(gradient[i], rel=2e-4, abs=1e-6 * np.abs(gradient * scale).max() / scale[i])
         if problem.options.huber_threshold == math.inf:
@@ -279,7 +281,9 @@ def test_an_episode_begins_at_its_first_posture(urdf_folder, case, driven, presc
     assert episode.measured_driven_angles.shape == (STEPS + 1, driven)
     assert episode.prescribed_path.shape == (STEPS + 1, prescribed)
     np.testing.assert_allclose(episode.initial_known_coordinates, position[0], atol=1e-12)
-    np.testing.assert_allclose(np.hstack([episode.measured_driven_angles, episode.prescribed_path]), position, atol=1e-12)
+    np.testing.assert_allclose(
+        np.hstack([episode.measured_driven_angles, episode.prescribed_path]), position, atol=1e-12
+    )
     assert episode.torque.shape == (STEPS, driven)
     np.testing.assert_allclose(episode.torque, episode.recording.joints.effort[:-1, :driven], atol=1e-9)
 

@@ -133,7 +133,9 @@ def test_an_estimated_start_has_a_prior_in_angles_and_momenta(make, momentum, fr
     inertia = [momentum(free_step, np.zeros(2), velocity, theta)[i] for i, velocity in enumerate(np.eye(2))]
     # two rods: 1/3 m l^2 and more about the shoulder
     assert inertia == pytest.approx([0.0208 + 0.25**2 + 0.008 + 0.6 * 0.7**2, 0.008 + 0.6 * 0.2**2], rel=1e-9)
-    np.testing.assert_allclose(problem.initial_state_prior_std, [0.07, 0.07, 0.3 * inertia[0], 0.3 * inertia[1]], rtol=1e-9)
+    np.testing.assert_allclose(
+        problem.initial_state_prior_std, [0.07, 0.07, 0.3 * inertia[0], 0.3 * inertia[1]], rtol=1e-9
+    )
     np.testing.assert_allclose(mass_matrix_diagonal(free_step, theta, ("elbow", "shoulder")), inertia[::-1], rtol=1e-9)
     assert problem.unknown_names[3:] == tuple(f"start.{kind}.{joint}[run_1]" for kind in "qp" for joint in PENDULUM)
     assert problem.predictor.estimated_state_indices == (0, 1, 2, 3)
@@ -275,7 +277,12 @@ def test_a_problem_whose_rollout_fails_says_why(make):
     problem = make(free=("elbow.rest",))
     failing = problem.evaluate([1e8])
     assert not failing.ok
-    assert (failing.cost, failing.jacobian, failing.episode_predictions, failing.equilibrium_guesses) == (math.inf, None, (), ())
+    assert (failing.cost, failing.jacobian, failing.episode_predictions, failing.equilibrium_guesses) == (
+        math.inf,
+        None,
+        (),
+        (),
+    )
     assert failing.message.startswith("run_1: no equilibrium found")
     cost, gradient, same = problem.cost_and_gradient([1e8])
     assert (cost, gradient.tolist(), same.ok) == (math.inf, [0.0], False)
@@ -311,12 +318,18 @@ def test_a_held_out_start_balances_its_prior_and_its_first_moments(make, held, c
 
     def rows(offset):
         result = problem.predictor.predict_episode(short, theta, offset, False)
-        parts = [s.whitened_residual(y).ravel() for s, y in zip(short.measurements, result.predicted_outputs, strict=True)]
+        parts = [
+            s.whitened_residual(y).ravel() for s, y in zip(short.measurements, result.predicted_outputs, strict=True)
+        ]
         return np.concatenate([*parts, offset / problem.initial_state_prior_std])
 
-    best = scipy.optimize.least_squares(rows, np.zeros(4), x_scale=problem.initial_state_prior_std, xtol=1e-12, ftol=1e-14)
+    best = scipy.optimize.least_squares(
+        rows, np.zeros(4), x_scale=problem.initial_state_prior_std, xtol=1e-12, ftol=1e-14
+    )
     found = problem.held_out_evaluation_points(x)[1][2]
-    np.testing.assert_allclose(found / problem.initial_state_prior_std, best.x / problem.initial_state_prior_std, atol=2e-3)
+    np.testing.assert_allclose(
+        found / problem.initial_state_prior_std, best.x / problem.initial_state_prior_std, atol=2e-3
+    )
 
 
 def test_held_out_recordings_are_predicted_with_shared_parameters_only(make, held):
@@ -336,14 +349,15 @@ def test_a_held_out_part_of_a_recording_shares_its_start(make):
     part = replace(problem.episodes[1], initial_state_shared_with=1)
     split = problem.with_episodes(problem.episodes, [part])
     x = problem.vector({name: 0.01 * i for i, name in enumerate(problem.unknown_names[3:])})
-    assert split.held_out_evaluation_points(x).tolist() == problem.split(x, 1)[1].tolist()[0][2]
+    assert split.held_out_evaluation_points(x)[0][2].tolist() == problem.split(x, 1)[1].tolist()
     np.testing.assert_array_equal(
-        split.predict_held_out(x)[0][1].predicted_outputs[0], problem.evaluate(x, False).episode_predictions[1].predicted_outputs[0]
+        split.predict_held_out(x)[0][1].predicted_outputs[0],
+        problem.evaluate(x, False).episode_predictions[1].predicted_outputs[0],
     )
 
 
 def test_a_start_at_rest_needs_no_offset(make, held):
-    assert make(held_out=held).held_out_evaluation_points(np.array([6.0, 3.0, 0.1])).shape == (0,)[0][2]
+    assert make(held_out=held).held_out_evaluation_points(np.array([6.0, 3.0, 0.1]))[0][2].shape == (0,)
 
 
 def test_the_first_moments_are_at_least_two_steps_of_a_fifth_of_a_second(make, held):
@@ -354,8 +368,12 @@ def test_the_first_moments_are_at_least_two_steps_of_a_fifth_of_a_second(make, h
         changed = value.copy()
         changed[first:] += 0.3
         moved = replace(episode, measurements=(replace(episode.measurements[0], value=changed),))
-        found = problem.with_episodes(problem.episodes, [moved]).held_out_evaluation_points(problem.initial_unknowns)[0][2]
-        assert np.allclose(found, problem.held_out_evaluation_points(problem.initial_unknowns)[0][2], atol=1e-12) is same
+        found = problem.with_episodes(problem.episodes, [moved]).held_out_evaluation_points(problem.initial_unknowns)[
+            0
+        ][2]
+        assert (
+            np.allclose(found, problem.held_out_evaluation_points(problem.initial_unknowns)[0][2], atol=1e-12) is same
+        )
 
 
 # -- other problems like it -------------------------------------------------------------------------------------------

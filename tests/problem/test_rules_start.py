@@ -289,9 +289,9 @@ def test_errors_are_euclidean_for_points_and_plain_for_efforts():
     tips = measured(points("a", "b"), [0, 1], [0.0, 0.0], [[0, 0, 0, 0, 0, 0], [0, 0, 0, NAN, 0, 0]])
     loads = measured(efforts("j"), [0, 1, 2], [0.0] * 3, [[1.0], [2.0], [NAN]])
     result = SimpleNamespace(
-        predicted=(np.array([[3.0, 4, 0, 1, 0, 0], [0, 0, 1, 5, 5, 5]]), np.array([[4.0], [6.0], [9.0]]))
+        predicted_outputs=(np.array([[3.0, 4, 0, 1, 0, 0], [0, 0, 1, 5, 5, 5]]), np.array([[4.0], [6.0], [9.0]]))
     )
-    found = rmse_by_channel([result, result], [SimpleNamespace(samples=(tips, loads))] * 2)
+    found = rmse_by_channel([result, result], [SimpleNamespace(measurements=(tips, loads))] * 2)
     assert found == {
         "points.a": {"rmse": pytest.approx(math.sqrt(13.0)), "unit": "m", "n": 4},
         "points.b": {"rmse": 1.0, "unit": "m", "n": 2},

@@ -41,8 +41,8 @@ def test_its_own_values_without_any_and_noise_by_its_seed(problem):
     plain, first, same, other = (problem.simulate_recording(seed=seed) for seed in (None, 3, 3, 4))
     own = problem.evaluate(problem.initial_unknowns, derivatives=False).episode_predictions[0]
     [samples] = [s for s in problem.episodes[0].measurements if s.sensor.group_name == plain.points[0].name]
-    predicted = own.predicted[problem.episodes[0].samples.index(samples)]
-    where = samples.seen
+    predicted = own.predicted_outputs[problem.episodes[0].measurements.index(samples)]
+    where = samples.is_used
     assert np.allclose(plain.points[0].position.reshape(predicted.shape)[where], predicted[where], atol=1e-12)
     assert np.array_equal(first.points[0].position, same.points[0].position, equal_nan=True)
     assert not np.array_equal(first.points[0].position, other.points[0].position, equal_nan=True)
