@@ -39,8 +39,7 @@ _KeyPath = tuple[str | int, ...]
 DEFAULT_CONFIG = "dual_arm_vision.yaml"
 DEFAULT_DIAGNOSIS_CONFIG = "diagnosis.yaml"
 
-_MAX_DEPTH, _MAX_ENTRIES = 40, 100_000
-"""Levels and entries of a configuration, far beyond what any needs."""
+_MAX_DEPTH, _MAX_ENTRIES = 40, 100_000  # levels and entries of a configuration, far beyond what any needs
 
 
 def load_config(

@@ -15,12 +15,9 @@ from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 
 Array = NDArray[np.float64]
-_MAX_FRAMES = 150
-"""Moments of a motion that a page holds; between two it goes straight."""
-_ARM_RADIUS = 0.03
-"""How thick an arm is drawn [m]."""
-_POSITION_SCALE = 1e4
-"""Places are kept as whole numbers of a tenth of a millimetre."""
+_MAX_FRAMES = 150  # moments of a motion that a page holds; between two it goes straight
+_ARM_RADIUS = 0.03  # how thick an arm is drawn [m]
+_POSITION_SCALE = 1e4  # places are kept as whole numbers of a tenth of a millimetre
 _MIN_STICK_LENGTH, _TIME_TOLERANCE = 1e-6, 1e-9  # what counts as one place [m], as one time [s]
 
 

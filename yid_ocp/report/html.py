@@ -19,8 +19,7 @@ from yid_ocp.solvers.fit_messages import VERDICT_WORDS
 log = logging.getLogger(__name__)
 _SHARED_SCRIPT_LEVELS = 2
 """Levels above a page where a script that it may share is looked for: a batch is two above the pages of its runs."""
-_WRAP_LENGTH = 24
-"""Characters from which the cells of a column are wrapped."""
+_WRAP_LENGTH = 24  # characters from which the cells of a column are wrapped
 _VERDICTS = {words: verdict for verdict, words in VERDICT_WORDS.items()}
 _NUMBER = re.compile(
     r"^(–|-|unknown|failed|(< |± )?[-+]?\d[\d.]*(e[-+]?\d+)?( %| ms| s| Hz)?( ± [\d.]+(e[-+]?\d+)?( %)?)?)?$"

@@ -76,8 +76,7 @@ def _convergence(convergence: Mapping[str, Any]) -> list[SummaryBlock]:
     return [*blocks, *make_statements([f"frequencies: {convergence['message']}" if convergence["message"] else ""])]
 
 
-_MAX_SHOWN_PARAMETERS = 12
-"""Free parameters of which `inspect` speaks; result.json has all."""
+_MAX_SHOWN_PARAMETERS = 12  # free parameters of which `inspect` speaks; result.json has all
 
 
 def inspect_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:

@@ -9,8 +9,7 @@ from typing import Any
 from yid_ocp.report.terminal import TableRows
 from yid_ocp.solvers.fit_messages import VERDICT_WORDS
 
-MAX_TERMINAL_PARAMETERS = 6
-"""Parameters that have a column of their own on a terminal; result.json has all."""
+MAX_TERMINAL_PARAMETERS = 6  # parameters that have a column of their own on a terminal; result.json has all
 
 
 _FOUND_VERDICTS = ("identifiable", "weak", None)

@@ -323,8 +323,7 @@ def _known(name: str, quantity: Mapping[str, Any], refitted: bool) -> str:
     return f"{name} = {quantity['value']:.3g} ± {quantity['std']:.2g}{unit}"
 
 
-_MAX_CANDIDATES = 15
-"""Candidates that are listed; result.json has them all."""
+_MAX_CANDIDATES = 15  # candidates that are listed; result.json has them all
 
 
 def diagnose_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
@@ -374,7 +373,7 @@ def history_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
 
 def _planning_command(section: Mapping[str, Any]) -> str:
     """Shell command that plans the motion of a `plan` section with the configuration in its run folder."""
-    words = ["yid-ocp", "plan", str(Path(section["run"]) / "config.yaml")]
+    words = ["yid-ocp", "plan", str(Path(section["parameter_run"]) / "config.yaml")]
     for key, value in section.items():
         text = f"[{', '.join(value)}]" if isinstance(value, list) else str(value)
         words += ["--set", f"plan.{key}={text}"]

@@ -56,6 +56,8 @@ def _value(hint: Any, value: Any) -> Any:
     if origin is tuple:
         inner = [arguments[0]] * len(value) if arguments[-1] is Ellipsis else arguments
         return tuple(_value(entry, item) for entry, item in zip(inner, value, strict=True))
+    if origin in (dict, Mapping):
+        return {key: _value(arguments[1], entry) for key, entry in value.items()}
     if dataclasses.is_dataclass(hint):
         return from_plain_data(typing.cast(type, hint), value)
     return float(value) if hint is float else value

@@ -86,8 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
     return run_and_print(arguments, proved, blind_summary)
 
 
-_MIN_TWO_ARM_CASES = 100
-"""Cases from which the embedded proof has experiments with two arms as well."""
+_MIN_TWO_ARM_CASES = 100  # cases from which the embedded proof has experiments with two arms as well
 
 
 def run_blind(

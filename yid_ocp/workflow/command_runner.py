@@ -114,10 +114,8 @@ def print_lines(texts: Sequence[str]) -> None:
 
 # -- progress ---------------------------------------------------------------------------------------------------------
 
-_MIN_LINE_INTERVAL = 5.0
-"""Least time between two lines of one tenth of a stage [s]."""
-_MIN_ESTIMATE_TIME = 2.0
-"""Time that a stage has to last before the rest of it is guessed [s]."""
+_MIN_LINE_INTERVAL = 5.0  # least time between two lines of one tenth of a stage [s]
+_MIN_ESTIMATE_TIME = 2.0  # time that a stage has to last before the rest of it is guessed [s]
 
 
 class _RemainingTime:

@@ -11,13 +11,11 @@ from typing import Any
 from yid_ocp.version import package_version
 from yid_ocp.workflow.config_proposal import STANDARD_GRAVITY, BranchDescription, ConfigProposal
 
-_PLAIN_TEXT = re.compile(r"[A-Za-z_/][\w./@-]*")
-"""Text that YAML reads as it stands."""
+_PLAIN_TEXT = re.compile(r"[A-Za-z_/][\w./@-]*")  # text that YAML reads as it stands
 _YAML_KEYWORDS = ("true", "false", "null", "yes", "no", "on", "off")
 _RIGIDITY_RATIO = {"cable": 0.01, "beam": 1.0, "tree": 0.1}
 """Where the search for a bending rigidity starts, over weight times length squared."""
-_DAMPING_TIME = 0.02
-"""Damping over rigidity, where the search for it starts [s]."""
+_DAMPING_TIME = 0.02  # damping over rigidity, where the search for it starts [s]
 _COMMENT_COLUMN = 44
 
 

@@ -23,26 +23,18 @@ from yid_ocp.model.urdf import read_urdf
 
 _TOOL_FRAME_NAMES = ("tool0", "tcp", "gripper", "tool", "end_effector", "ee_link", "flange", "hand", "link8")
 """What the frame at the end of an arm is called, the likeliest first."""
-_MAX_TIME_STEP = 0.01
-"""Of the integrator, where nobody has looked yet [s]."""
-_SLOW_SAMPLE_PERIOD = 0.05
-"""Samples farther apart than this say nothing of their noise: the motion is as fast [s]."""
+_MAX_TIME_STEP = 0.01  # of the integrator, where nobody has looked yet [s]
+_SLOW_SAMPLE_PERIOD = 0.05  # samples farther apart than this say nothing of their noise: the motion is as fast [s]
 _CAMERA_STD, _MARKER_STD = 5e-3, 1e-3
 """Of points whose noise cannot be seen in the data: of slow and of fast sensors [m]."""
-_JOINT_REST_SPEED, _POINT_REST_SPEED = 0.02, 0.03
-"""A joint [rad/s] or a point [m/s] slower than this is at rest."""
-_REST_WINDOW = 0.1
-"""Over which speeds are taken [s]; up to twice that of slow sensors."""
-_MIN_FRICTION_TRAVEL = 0.02
-"""A joint that turns less than this says nothing of its own friction [rad]."""
-_COPIED_COMMAND_RATIO = 1e-6
-"""Commands nearer to the measured angles than this part of the motion are a copy of them."""
-_MIN_ARM_TRAVEL = 0.1
-"""Joints that turn less than this together do not move [rad]."""
+_JOINT_REST_SPEED, _POINT_REST_SPEED = 0.02, 0.03  # A joint [rad/s] or a point [m/s] slower than this is at rest
+_REST_WINDOW = 0.1  # over which speeds are taken [s]; up to twice that of slow sensors
+_MIN_FRICTION_TRAVEL = 0.02  # A joint that turns less than this says nothing of its own friction [rad]
+_COPIED_COMMAND_RATIO = 1e-6  # commands nearer to the measured angles than this part of the motion are a copy of them
+_MIN_ARM_TRAVEL = 0.1  # joints that turn less than this together do not move [rad]
 STANDARD_GRAVITY = 9.81
 _Y_TUBES = ("T1", "T2", "T3")
-_POSITION_STEP_PERCENT = 5
-"""Places along a segment are told apart in so many percent."""
+_POSITION_STEP_PERCENT = 5  # places along a segment are told apart in so many percent
 
 
 @dataclass(frozen=True)

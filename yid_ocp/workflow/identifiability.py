@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import math
 import shutil
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
@@ -12,8 +11,6 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
-
-import numpy as np
 
 from yid_ocp.analysis.cable_memory_check import decide_cable_memory, without_cable_memory
 from yid_ocp.analysis.experiment_design import BaseExperiment
@@ -45,6 +42,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.summaries import identifiability_summary
 from yid_ocp.solvers import Iterate, Solution, Status, solve
+from yid_ocp.vision.serialization import from_plain_data, to_plain_data
 from yid_ocp.workflow.build import build_step, build_system, system_with_second_arm
 from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.command_runner import CommandResult, run_and_print, workers_from_arguments
@@ -365,8 +363,8 @@ class IdentifiabilityTasks:
         )
         parameters, profiles = dict(information.parameters), dict(information.profiles)
         for name, told in zip(names, found, strict=True):
-            parameters[name] = _parameter(told["parameter"])
-            profiles[name] = _profile(told["profile"])
+            parameters[name] = from_plain_data(ParameterInformation, told["parameter"])
+            profiles[name] = from_plain_data(ParameterProfile, told["profile"])
         return replace(information, parameters=parameters, profiles=profiles)
 
     def change_evaluator(self) -> ChangeSetEvaluator:
@@ -388,7 +386,9 @@ class IdentifiabilityTasks:
             )
             found: dict[int, ChangedExperimentResult] = {}
             for members, told in zip(groups.values(), done, strict=True):
-                found |= {i: _changed_experiment(entry) for i, entry in zip(members, told, strict=True)}
+                found |= {
+                    i: from_plain_data(ChangedExperimentResult, entry) for i, entry in zip(members, told, strict=True)
+                }
             return [found[i] for i in range(len(sets))]
 
         return judged
@@ -422,8 +422,9 @@ def profile_parameter(
     found = identifiability(
         problem, x, start=start, grasp_std=grasp_std, intervals=[name], limits=run.diagnosis.fit_gap_limits
     )
-    own, profile = asdict(found.parameters[name]), asdict(found.profiles[name])
-    return {"parameter": _finite(own), "profile": _finite(profile)}
+    return {
+        key: to_plain_data(own[name]) for key, own in (("parameter", found.parameters), ("profile", found.profiles))
+    }
 
 
 def change_set_outcomes(
@@ -450,47 +451,10 @@ def change_set_outcomes(
         options.torque_std,
         options.motion_seed,
     )
-    return [_finite(asdict(entry)) for entry in evaluate_change_sets(setting, sets, inflation)]
+    return [to_plain_data(entry) for entry in evaluate_change_sets(setting, sets, inflation)]
 
 
 def _problem(config: Path, remembers: bool) -> tuple[RunSettings, EstimationProblem]:
     run = load_config(config)
     problem = build_problem(run, build_step(run, with_grasp_offset_effects(build_system(run))))
     return run, problem if remembers else without_cable_memory(problem)
-
-
-# -- plain data -------------------------------------------------------------------------------------------------------
-
-
-def _finite(value: Any) -> Any:
-    """Plain data in which numbers that JSON does not have are text."""
-    if isinstance(value, Mapping):
-        return {key: _finite(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple, np.ndarray)):
-        return [_finite(entry) for entry in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _number(value: float | str) -> float:
-    return float(value)
-
-
-def _parameter(told: Mapping[str, Any]) -> ParameterInformation:
-    numbers = {key: _number(told[key]) for key in ("value", "std", "std_relative", "std_alone")}
-    interval = None if told["interval"] is None else tuple(told["interval"])
-    return ParameterInformation(**{**told, **numbers, "interval": interval})
-
-
-def _profile(told: Mapping[str, Any]) -> ParameterProfile:
-    values, deltas = (np.array([_number(x) for x in told[key]]) for key in ("values", "delta_chi2"))
-    return ParameterProfile(
-        told["name"], _number(told["value"]), told["lower"], told["upper"], values, deltas, tuple(told["notes"])
-    )
-
-
-def _changed_experiment(told: Mapping[str, Any]) -> ChangedExperimentResult:
-    std = {name: _number(value) for name, value in told["std_relative"].items()}
-    own = {"changes": tuple(told["changes"]), "std_relative": std, "gain": _number(told["gain"])}
-    return ChangedExperimentResult(**{**told, **own})

@@ -236,8 +236,7 @@ def _share(values: Array, limit: float) -> float | None:
     return float(np.max(np.abs(values)) / limit) if math.isfinite(limit) and limit > 0 else None
 
 
-_MAX_DISCRIMINATED_EFFECTS = 3
-"""Effects that one motion is asked to separate, the likeliest ones."""
+_MAX_DISCRIMINATED_EFFECTS = 3  # effects that one motion is asked to separate, the likeliest ones
 
 
 def read_parameter_run(run: RunSettings, commands: Sequence[str]) -> tuple[dict[str, Any], Path]:

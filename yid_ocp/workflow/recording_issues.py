@@ -47,8 +47,7 @@ _EFFECTS_BY_CAUSE = {
 """Effects by which a model takes such an error into account."""
 _MOTION_PARAMETER_WORDS = ("damping", "viscous", "coulomb", "stribeck", "inertia", "tau")
 """Words in the names of parameters that nothing at rest tells."""
-_MAX_QUOTED_ISSUES = 3
-"""Doubts that an error quotes."""
+_MAX_QUOTED_ISSUES = 3  # doubts that an error quotes
 
 
 @dataclass(frozen=True)
