@@ -212,7 +212,7 @@ model:
   object:
     kind: segments
     segments:
-      beam: {length: 0.52, mass: 0.33, cross_section: [0.001, 0.08], links: 8, joint_axes: y, stiffness_per_curvature: true, clamped_at_base: true}
+      beam: {length: 0.52, mass: 0.33, cross_section: [0.001, 0.08], links: 8, joint_axes: y, clamped_at_base: true}
 """,
     "model.object, kind: cable": """\
 model:

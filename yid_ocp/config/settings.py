@@ -58,8 +58,8 @@ class FrameSettings(MountSettings):
     marker_reference_pose: Annotated[
         bool,
         OptionInfo(
-            "whether each recording's `marker_reference_pose` says where the point of this name sits, in place of xyz, for markers "
-            "on an object that stands in the world"
+            "whether each recording's dataset `straight` says where the point of this name sits, in place of xyz; "
+            "for markers on an object that stands in the world"
         ),
     ] = False
 

@@ -109,8 +109,8 @@ def confusion_figure(
     figure = go.Figure()
     figure.add_heatmap(
         x=list(columns), y=list(rows), z=parts.tolist(), zmin=0.0, zmax=1.0, showscale=False, xgap=1, ygap=1,
-        colorscale=SEQUENTIAL_COLORSCALE, text=[[f"{n:.0f}" if n else "" for n in line] for line in counts], texttemplate="%{text}",
-        hovertemplate="%{y}: said %{x}<extra></extra>",
+        colorscale=SEQUENTIAL_COLORSCALE, text=[[f"{n:.0f}" if n else "" for n in line] for line in counts],
+        texttemplate="%{text}", hovertemplate="%{y}: said %{x}<extra></extra>",
     )  # fmt: skip
     figure = apply_page_style(figure, 200 + 24 * len(rows), column, row)
     every = {"type": "category", "tickmode": "array", "title_standoff": 6, "showgrid": False, "automargin": True}
@@ -286,8 +286,8 @@ def candidate_ranking_figure(
     last = 2 if done else 1
     figure = make_subplots(rows=1, cols=last, shared_yaxes=True, horizontal_spacing=0.08)
     figure.add_bar(
-        x=[entry.predicted_decrease for entry in entries], y=[entry.name for entry in entries], orientation="h", width=0.55,
-        marker={"color": LINE_COLORS[1]}, showlegend=False, row=1, col=last,
+        x=[entry.predicted_decrease for entry in entries], y=[entry.name for entry in entries], orientation="h",
+        width=0.55, marker={"color": LINE_COLORS[1]}, showlegend=False, row=1, col=last,
     )  # fmt: skip
     figure = apply_page_style(figure, 100 + 28 * len(entries), "", "")
     figure.update_xaxes(title_text=promised, rangemode="tozero", row=1, col=last)

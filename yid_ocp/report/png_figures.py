@@ -178,9 +178,8 @@ def _draw(axes: Axes, pattern: SparsityPattern) -> None:
     from matplotlib.colors import ListedColormap
 
     shown = pattern.nonzero_mask.astype(int)
-    words = [
-        f"{pattern.nonzero_mask.shape[0]} x {pattern.nonzero_mask.shape[1]}, {pattern.n_nonzeros} entries can differ from zero"
-    ]
+    height, width = pattern.nonzero_mask.shape
+    words = [f"{height} x {width}, {pattern.n_nonzeros} entries can differ from zero"]
     if pattern.marked_mask is not None:
         shown[pattern.nonzero_mask & pattern.marked_mask] = 2
         words.append(f"dark: {np.count_nonzero(shown == 2)} {pattern.mark_label}")

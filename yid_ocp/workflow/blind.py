@@ -67,6 +67,7 @@ _CONFIGS_FOLDER, _PREPARED_FOLDER, _DRAWN_FOLDER, _CASES_FOLDER, _ANSWERS_FOLDER
     "answers",
     "best",
 )
+_MIN_TWO_ARM_CASES = 100  # cases from which the embedded proof has experiments with two arms as well
 log = logging.getLogger(__name__)
 
 
@@ -84,9 +85,6 @@ def run(arguments: argparse.Namespace) -> int:
         return run_blind(runs, out, arguments.cases, arguments.seed, shown, workers, purpose)
 
     return run_and_print(arguments, proved, blind_summary)
-
-
-_MIN_TWO_ARM_CASES = 100  # cases from which the embedded proof has experiments with two arms as well
 
 
 def run_blind(
@@ -163,13 +161,19 @@ def run_blind(
         result["calibration_of_thresholds"] = found
         made = {key: result[key] for key in ("cases", "seed", "code", "code_of_cases", "command", "date", "versions")}
         write_json(folder / _THRESHOLDS_FILE, to_json_types(found | made))
+    return _write_outcome(folder, result, runs, progress)
+
+
+def _write_outcome(
+    folder: Path, result: Mapping[str, Any], runs: Sequence[RunSettings], progress: Progress
+) -> CommandResult:
     written = to_json_types(result)
     write_json(folder / _RESULT_FILE, written)
     write_text(folder / _TABLE_FILE, "\n".join(blind_markdown(written)) + "\n")
     draw_blind_results(folder, written)
     if all(entry.output.write_report for entry in runs):
         progress.begin_stage("writing the report")
-        said = f"{count} virtual cases whose effect was withheld, diagnosed, then opened."
+        said = f"{written['cases']} virtual cases whose effect was withheld, diagnosed, then opened."
         write_report(folder / "report.html", ReportData(folder.name, said, written))
     return CommandResult(folder, written)
 
@@ -214,8 +218,7 @@ def _made(
             **BlindExperiment(folder / _CONFIGS_FOLDER / f"{config}.yaml", variation, seed, purpose).task_arguments,
             "first": folder / _PREPARED_FOLDER / f"{entry['experiment']}.h5",
             "name": name,
-            "estimate": [folder / _CASES_FOLDER / file for file in entry["estimate"]],
-            "held_out": folder / _CASES_FOLDER / entry["held_out"],
+            "recordings": [folder / _CASES_FOLDER / file for file in (*entry["estimate"], entry["held_out"])],
         }
         tasks.append(Task(name, {**arguments, "without": entry["without"]}))
     return tasks
@@ -330,16 +333,15 @@ def diagnose_case_task(
     purpose: str,
     first: Path,
     name: str,
-    estimate: Sequence[Path],
-    held_out: Path,
+    recordings: Sequence[Path],
     without: Sequence[str],
 ) -> dict[str, Any]:
-    """Task: diagnose a case from its recordings alone; returns {seconds, result} with a `yid-diagnosis/1` result.
+    """Task: diagnose a case from its recordings, the last one held out; returns {seconds, result}.
 
     For calibration, one without a gap has `open` too: the statistics of a diagnosis that takes anything for a gap.
     """
     run, ensemble = BlindExperiment(config, variation, seed, purpose).build_ensemble(first)
-    case = _case(name, estimate, held_out, without)
+    case = _case(name, recordings, without)
     begun = time.perf_counter()
     try:
         result = diagnose_case(ensemble, case, run.diagnosis.candidates, run.diagnosis).to_dict()
@@ -364,13 +366,12 @@ def true_effect_closure(
     purpose: str,
     first: Path,
     name: str,
-    estimate: Sequence[Path],
-    held_out: Path,
+    recordings: Sequence[Path],
     label: Mapping[str, Any],
 ) -> float | None:
     """Task: fraction of a case's gap closed by its refitted true effects; None where it cannot be computed."""
     run, ensemble = BlindExperiment(config, variation, seed, purpose).build_ensemble(first)
-    case = _case(name, estimate, held_out, ())
+    case = _case(name, recordings, ())
     try:
         best = best_possible_closure(ensemble, case, CaseLabel.from_dict(label), run.diagnosis.candidates)
     except YidError:
@@ -378,8 +379,9 @@ def true_effect_closure(
     return best if math.isfinite(best) else None
 
 
-def _case(name: str, estimate: Sequence[Path], held_out: Path, without: Sequence[str]) -> BlindCase:
-    return BlindCase(name, tuple(read_recording(path) for path in estimate), read_recording(held_out), tuple(without))
+def _case(name: str, recordings: Sequence[Path], without: Sequence[str]) -> BlindCase:
+    *estimate, held_out = map(read_recording, recordings)
+    return BlindCase(name, tuple(estimate), held_out, tuple(without))
 
 
 def _best(

@@ -72,7 +72,7 @@ def with_extra_frames(
 ) -> tuple[Mechanism | None, list[FlexibleObject]]:
     """Robot (or clamps) and objects with the additional frames of the settings.
 
-    A frame whose place each recording's `straight` tells has the parameters NAME.x, .y, .z; see `marker_parameter_values`.
+    A frame whose place the recordings tell has the parameters NAME.x, .y, .z; see `marker_parameter_values`.
 
     Raises
     ------

@@ -204,8 +204,8 @@ def frequency_convergence(run: RunSettings, problem: EstimationProblem | None, w
     if own.n_unstable_modes:
         remedy = "problem.constraint_force: midpoint, " if rule[1] == "node" and system.grasps else ""
         warnings.append(
-            f"{own.n_unstable_modes} modes grow from step to step about the first posture: take a shorter problem.time_step, "
-            f"{remedy}or more damping"
+            f"{own.n_unstable_modes} modes grow from step to step about the first posture: take a shorter "
+            f"problem.time_step, {remedy}or more damping"
         )
     values = dict(zip(system.parameters.names, theta, strict=True))
     steps = [_row(h, own)]

@@ -159,7 +159,7 @@ def run_identifiability(
             problem, solution = safe.problem, safe.solution
         elsewhere = None
         if workers is not None:
-            point = (problem, solution, problem is whole, asked.start_knowledge, asked.grasp_offset_std)
+            point = (problem, solution, problem is whole, asked)
             elsewhere = IdentifiabilityTasks.from_run(workers, folder, run, *point, progress)
         unknown = information = ranking = None
         if solution is None or solution.status != Status.FAILED:
@@ -322,8 +322,7 @@ class IdentifiabilityTasks:
         problem: EstimationProblem,
         solution: Solution | None,
         remembers: bool,
-        start: InitialStateKnowledge,
-        grasp_std: float | None,
+        asked: IdentifiabilityOptions,
         progress: Progress,
     ) -> IdentifiabilityTasks:
         """Tasks for a run whose folder contains its configuration.
@@ -334,16 +333,14 @@ class IdentifiabilityTasks:
             Point at which to judge; the initial values where None.
         remembers : bool
             Whether the problem is the run's, not that of a cable that remembers nothing.
-        start, grasp_std
-            As in `identifiability`.
         """
         told = {
             "config": folder.path / "config.yaml",
             "inputs": sorted({path.absolute() for name, path in input_files(run).items() if name != "configuration"}),
             "x": None if solution is None else [float(value) for value in unknowns_from_solution(problem, solution)],
             "remembers": remembers,
-            "start": start,
-            "grasp_std": grasp_std,
+            "start": asked.start_knowledge,
+            "grasp_std": asked.grasp_offset_std,
         }
         return IdentifiabilityTasks(workers, folder.resume_folder / "tasks", told, progress)
 

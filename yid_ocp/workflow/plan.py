@@ -55,7 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def run_plan(run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS) -> PlanCommandResult:
-    """Plan the motion of `plan_motion` and write `recording.h5`, CSV tables, `trajectory.json`, result.json and the report.
+    """Plan the motion of a run's goal; write `recording.h5`, CSV tables, `trajectory.json`, result.json and the report.
 
     Returns
     -------

@@ -71,7 +71,7 @@ def prediction_error_entry(
 def channels_worse_than_baseline(
     entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]
 ) -> list[dict[str, Any]]:
-    """Channels that a model-free baseline predicts clearly better than the model, from `prediction_error_entry` entries."""
+    """Channels of `prediction_error_entry` entries that a model-free baseline predicts clearly better than the model."""
     worse = []
     for entry in entries:
         for channel, error in entry["rmse"].items():

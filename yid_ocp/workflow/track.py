@@ -24,8 +24,7 @@ from yid_ocp.files import file_sha256, json_sha256, os_error_reason, write_text
 from yid_ocp.model.system import System
 from yid_ocp.parallel import InlineExecutor, Task, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.progress import NULL_PROGRESS, Progress
-from yid_ocp.report.animation import ModelTrajectory
-from yid_ocp.report.animation import make_animation as moving
+from yid_ocp.report.animation import ModelTrajectory, make_animation
 from yid_ocp.report.summaries import track_summary
 from yid_ocp.vision.calibration import CameraCalibration
 from yid_ocp.vision.camera import DepthCamera, FrameTiming, VirtualCamera, VirtualFrames, render_virtual_frames
@@ -106,10 +105,7 @@ def run_track(
         refused: DataError | None = None
         try:
             with locate_errors(run, "track"):
-                seen, recording = open_frames(filmed.tasks.settings)
-                tracker = FrameTracker(
-                    camera_scene(run, system), recording, seen, settings.options, read_background_frames(run)
-                )
+                tracker, recording = _frame_tracker(filmed.tasks.settings, system)
                 doubts = [] if recording is None else single_recording_issues(run, system, recording)
                 progress.begin_stage("finding what is common to the frames")
                 common = filmed.tasks.calibrate_sequence()
@@ -138,13 +134,11 @@ def run_track(
             write_recording(tracked, folder.path / "recording.h5")
             # what was tracked may be elsewhere than the object reaches, where the model says where it stands
             if settings.options.root_placement == "model":
-                doubts += [
-                    doubt for doubt in single_recording_issues(run, system, tracked) if doubt.cause.startswith("point_")
-                ]
-            shape = ModelTrajectory(
-                "fitted shape", tracker.system, system.parameters.vector(), found.t, found.configurations
-            )
-            told = [moving("tracked", [shape], tracked)]
+                own = single_recording_issues(run, system, tracked)
+                doubts += [doubt for doubt in own if doubt.cause.startswith("point_")]
+            theta = system.parameters.vector()
+            shape = ModelTrajectory("fitted shape", tracker.system, theta, found.t, found.configurations)
+            told = [make_animation("tracked", [shape], tracked)]
             if filmed.made is not None:
                 result["truth_errors"] = _truth_errors(system, found, filmed.made)
         result |= {"doubts": issues_result(doubts), "refused": "" if refused is None else refused.what}
@@ -539,7 +533,10 @@ def _tracker(text: str, config: Path) -> FrameTracker:
     """One for all frames that a process works on; the text makes another one of it when the file has changed."""
     del text
     run = load_config(config)
+    return _frame_tracker(run, build_system(run))[0]
+
+
+def _frame_tracker(run: RunSettings, system: System) -> tuple[FrameTracker, Recording | None]:
     sequence, recording = open_frames(run)
-    return FrameTracker(
-        camera_scene(run, build_system(run)), recording, sequence, run.track.options, read_background_frames(run)
-    )
+    scene, background = camera_scene(run, system), read_background_frames(run)
+    return FrameTracker(scene, recording, sequence, run.track.options, background), recording

@@ -209,10 +209,10 @@ def _side(smoothed: SmootherResult) -> str:
     }
     evidence = smoothed.log_evidence
     return (
-        f"By evidence the gap lies in {verdicts[smoothed.gap_origin]}: the log evidence rises by {evidence['plant']:.4g} "
-        f"with unknown forces and offsets alone, by {evidence['sensor']:.4g} with biases alone, by "
-        f"{evidence['both']:.4g} with both (5 is odds of 150 to 1). They explain {100 * smoothed.explainable_fraction:.0f} % of "
-        "the gap where it was fitted."
+        f"By evidence the gap lies in {verdicts[smoothed.gap_origin]}: the log evidence rises by "
+        f"{evidence['plant']:.4g} with unknown forces and offsets alone, by {evidence['sensor']:.4g} with biases "
+        f"alone, by {evidence['both']:.4g} with both (5 is odds of 150 to 1). They explain "
+        f"{100 * smoothed.explainable_fraction:.0f} % of the gap where it was fitted."
     )
 
 
@@ -298,7 +298,7 @@ def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
     promise = f"hat each promises to first order where the model was fitted, {unit}."
     if done:
         said = [
-            f"{e.name} {e.closure_interval_percent[0]:.3g} % ({e.closure_interval_percent[1]:.3g} to {e.closure_interval_percent[2]:.3g} %)"
+            "{} {:.3g} % ({:.3g} to {:.3g} %)".format(e.name, *e.closure_interval_percent)
             for e in done[:3]
             if e.closure_interval_percent
         ]
