@@ -177,7 +177,6 @@ def _unwrap(node: Any, path: _KeyPath, places: dict[_KeyPath, str], origin: str)
 
 
 def _line(node: CommentedMap | CommentedSeq, key: Any) -> int:
-    """Line of an entry; of the section where a merge brought it there."""
     try:
         return int((node.lc.key(key) if isinstance(node, CommentedMap) else node.lc.item(key))[0]) + 1
     except (KeyError, TypeError):

@@ -85,7 +85,6 @@ def _section(sections: SectionVariants, word: str) -> dict[str, Any]:
 
 
 def _about(hint: Any) -> OptionInfo:
-    """What the outermost marker says."""
     return next(
         (marker for marker in reversed(split_annotated(hint)[1]) if isinstance(marker, OptionInfo)), OptionInfo()
     )

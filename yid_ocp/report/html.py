@@ -105,7 +105,6 @@ def _packed() -> str:
 
 
 def _format_number(value: object, digits: int = 4) -> str:
-    """A number formatted for display; a dash for None."""
     if value is None:
         return "–"
     return f"{value:.{digits}g}" if isinstance(value, float) else str(value)

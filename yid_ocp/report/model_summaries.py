@@ -125,7 +125,6 @@ def inspect_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
 
 
 def _patterns(result: Mapping[str, Any]) -> list[SummaryBlock]:
-    """Sizes of matrices, and how many entries can and do differ from zero."""
     rows: TableRows = [("matrix (sparsity.png)", "size", "can differ from zero", "do at this point")]
     for name, entry in result["patterns"].items():
         height, width = entry["shape"]

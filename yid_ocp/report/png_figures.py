@@ -116,7 +116,6 @@ def draw_blind_results(folder: Path, result: Mapping[str, Any]) -> None:
 
 
 def _rates(axes: Any, places: list[float], rates: list[Mapping[str, Any]], label: str) -> None:
-    """Rates with their intervals; nothing where there are none."""
     if rates:
         values = np.array([own["rate"] for own in rates])
         low, high = (np.array([own[key] for own in rates]) for key in ("low", "high"))
@@ -170,7 +169,6 @@ def draw_sparsity_patterns(path: Path, layout: Sequence[Sequence[SparsityPattern
 
 
 def _inches(count: int) -> float:
-    """Room for so many rows or columns and what stands around them."""
     return 2.2 + float(np.clip(0.085 * count, 1.2, 11.0))
 
 

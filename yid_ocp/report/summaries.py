@@ -236,7 +236,6 @@ def _agreement(result: Mapping[str, Any]) -> list[str]:
 
 
 def _efforts(methods: Mapping[str, Mapping[str, Any]]) -> TableRows:
-    """What every method reached and what it took."""
     entries = methods.values()
     costs = [entry["whitened_cost"] for entry in entries]
     rows: TableRows = [("", *methods)]
@@ -300,7 +299,6 @@ def identifiability_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
 
 
 def _what_if(asked: Mapping[str, Any], names: Sequence[str]) -> list[SummaryBlock]:
-    """Changes of the experiment, the best ones first."""
     rows: TableRows = [("change", "found", "gain [nat]", "")]
     for entry in [asked["base"], *asked["singles"], *asked["smallest"]]:
         gain = "" if entry["gain"] is None else f"{entry['gain']:.1f}"
@@ -316,7 +314,6 @@ def _percent(value: float | None) -> str:
 
 
 def _known(name: str, quantity: Mapping[str, Any], refitted: bool) -> str:
-    """A candidate's parameter; without a refit its value is a first step and has no standard deviation."""
     unit = "" if quantity["unit"] == "1" else f" {quantity['unit']}"
     if quantity["std"] is None:
         return f"{name} unknown" if refitted else f"{name} = {quantity['value']:.3g}{unit}"
@@ -372,7 +369,6 @@ def history_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
 
 
 def _planning_command(section: Mapping[str, Any]) -> str:
-    """Shell command that plans the motion of a `plan` section with the configuration in its run folder."""
     words = ["yid-ocp", "plan", str(Path(section["parameter_run"]) / "config.yaml")]
     for key, value in section.items():
         text = f"[{', '.join(value)}]" if isinstance(value, list) else str(value)

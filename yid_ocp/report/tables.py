@@ -51,7 +51,6 @@ class _IssueRow:
 
 
 def _issue_rows(result: Mapping[str, Any]) -> list[_IssueRow]:
-    """Issues of a result for display: at most `_MAX_ISSUES_PER_CAUSE` per cause, then the number of further ones."""
     rows: list[_IssueRow] = []
     for cause in dict.fromkeys(entry["cause"] for entry in result.get("doubts", ())):
         alike = [entry for entry in result["doubts"] if entry["cause"] == cause]

@@ -120,7 +120,6 @@ def list_batch_runs(
 
 
 def _named(entries: Sequence[tuple[str, Path, tuple[str, ...]]]) -> list[BatchRun]:
-    """Members with names of their own, those of one stem numbered."""
     members: list[BatchRun] = []
     for stem, path, settings in entries:
         taken, name, number = {member.name for member in members}, stem, 1
@@ -240,7 +239,6 @@ def run_batch_task(
 
 
 def _entry(result: TaskResult, folder: Path) -> dict[str, Any]:
-    """What stands of a run in batch.json."""
     own = {
         "name": result.name,
         "folder": f"{_RUNS_FOLDER}/{result.name}" if (folder / _RUNS_FOLDER / result.name).is_dir() else None,
@@ -264,7 +262,6 @@ def _alike(folders: Sequence[Path]) -> dict[str, Any] | None:
 
 
 def _folder(path: Path) -> Path:
-    """The folder of a batch, made or found."""
     folder = path.expanduser().absolute()
     try:
         if folder.is_dir() and any(folder.iterdir()) and not (folder / _TASKS_FOLDER).is_dir():

@@ -404,7 +404,6 @@ def _best(
 
 
 def _nothing(message: str) -> dict[str, Any]:
-    """The answer where the nominal model cannot even be fitted."""
     return {
         "verdict": "insufficient_data",
         "message": message,

@@ -123,7 +123,6 @@ def arms_are_estimated_states(run: RunSettings) -> bool:
 
 
 def _dampings(run: RunSettings, joints: Sequence[str]) -> tuple[dict[str, float], float]:
-    """Damping of every joint of the robot, and of the object's joints."""
     said = run.model.damping
     if not isinstance(said, Mapping):
         return dict.fromkeys(joints, said), said
@@ -145,7 +144,6 @@ def _dampings(run: RunSettings, joints: Sequence[str]) -> tuple[dict[str, float]
 
 
 def _completed(run: RunSettings, system: System, finer: int = 1) -> System:
-    """The system with its effects, its parameters at the values and bounds of the settings."""
     for i, said in enumerate(run.model.effects):
         with locate_errors(run, "model", "effects", i):
             system = system.with_effects([make_effect(said.kind, said.location, system, dict(said.values))])

@@ -112,7 +112,6 @@ def run_check(run: RunSettings, out: str | Path | None = None, progress: Progres
 def _mechanics(
     run: RunSettings, step: Step, problem: EstimationProblem | None, warnings: list[str]
 ) -> dict[str, dict[str, Any]]:
-    """The robot's file as it was read, and the built model, beside Pinocchio's."""
     system, arms = step.system, run.model.arms
     theta = system.parameters.vector()
     posture = np.zeros(system.n_coordinates)
@@ -183,7 +182,6 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
 
 
 def _input_noise(problem: EstimationProblem, episode: Episode) -> dict[str, Any]:
-    """Noise of what drives the motion, and whether nobody stated it; medians over the driven joints."""
     joints, errors = episode.recording.joints, episode.input_errors
     if joints is None or errors is None:
         return {}
@@ -224,7 +222,6 @@ def _scenes(problem: EstimationProblem, first: Evaluation) -> list[Animation]:
 def _moves(
     run: RunSettings, problem: EstimationProblem, at_x: Evaluation, warnings: list[str], progress: Progress
 ) -> dict[str, Any]:
-    """How far estimates would move with a finer model if they were the initial values, and by what they are known."""
     x = problem.initial_unknowns
     growth = largest_error_growth(problem, x)
     if growth is not None and not growth.is_stable:

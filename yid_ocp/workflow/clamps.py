@@ -30,7 +30,6 @@ def clamp_paths(run: RunSettings, cable: CableTopology | None) -> tuple[ClampPat
 
 
 def _clamped_points(paths: Sequence[ClampPath]) -> tuple[str, ...]:
-    """Names of the points that clamps follow, without duplicates."""
     return tuple(dict.fromkeys(point for path in paths for point in (path.origin_point, path.z_axis_point)))
 
 

@@ -137,7 +137,6 @@ class _RemainingTime:
 
 
 def _format_duration(seconds: float) -> str:
-    """A duration as text in seconds, minutes or hours."""
     for unit, size in (("h", 3600.0), ("min", 60.0)):
         if seconds >= 1.5 * size:
             return f"{seconds / size:.1f} h" if unit == "h" else f"{seconds / size:.0f} min"
@@ -206,7 +205,6 @@ class _BarProgress:
 
 
 def _format_iterate(entry: AcceptedIterate) -> str:
-    """One line of text on an accepted point."""
     note = f", {entry.note}" if entry.note else ""
     return f"iteration {entry.iteration}, cost {entry.cost:.6g}, {entry.seconds:.1f} s{note}"
 

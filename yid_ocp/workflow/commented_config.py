@@ -98,7 +98,6 @@ def _line(indent: str, key: str, value: str, comment: str = "") -> str:
 
 
 def _text(value: str) -> str:
-    """Text as YAML reads it back."""
     return (
         value
         if _PLAIN_TEXT.fullmatch(value) and value.lower() not in _YAML_KEYWORDS
@@ -250,7 +249,6 @@ def _by_effort(proposal: ConfigProposal) -> bool:
 
 
 def _effects(proposal: ConfigProposal) -> list[str]:
-    """What the arm has beside the numbers of its URDF, whatever moves it."""
     if proposal.arm_mode == "servo":
         kind, words = "rotor_inertia", "what rotors add through their gears, free below"
     elif _by_effort(proposal):

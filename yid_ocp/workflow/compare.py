@@ -34,7 +34,6 @@ class CompareCommandResult(CommandResult):
 
 
 def _chosen_solvers(run: RunSettings) -> list[Solver]:
-    """Solvers listed in `compare.methods`, with their settings."""
     if not run.compare.methods:
         raise run.config_error("there is no method to compare", "compare", "methods", allowed=", ".join(SOLVERS))
     return list(run.compare.methods.values())
@@ -94,7 +93,6 @@ def run_compare(
 
 
 def _compare_result(problem: EstimationProblem, comparison: MethodComparison) -> dict[str, Any]:
-    """`yid-compare/1` without inputs, versions and what is known beside."""
     methods = {}
     for run in comparison.method_results:
         methods[run.method] = solve_result(problem, run.solution, run.held_out_predictions) | {
@@ -120,7 +118,6 @@ def _compare_result(problem: EstimationProblem, comparison: MethodComparison) ->
 
 
 def _paper_estimates(run: RunSettings) -> dict[str, float]:
-    """The paper's estimates for the experiment named by `compare.paper_experiment`; empty where none is named."""
     name = run.compare.paper_experiment
     if name is None:
         return {}
@@ -132,7 +129,6 @@ def _paper_estimates(run: RunSettings) -> dict[str, float]:
 
 
 def _truth(problem: EstimationProblem) -> dict[str, float]:
-    """Parameter values that the recordings of a virtual experiment carry along."""
     known: dict[str, float] = {}
     for episode in problem.episodes:
         known |= {name: value for name, value in episode.recording.true_parameters.items() if name in problem.free}

@@ -237,7 +237,6 @@ def _groups(recording: Recording) -> list[tuple[str, JointGroup | PointGroup]]:
 
 
 def _arms(tree: Mechanism) -> tuple[ArmChain, ...]:
-    """Chains of joints from the base to joints that carry no other, and the frames there."""
     arms = []
     for j in range(len(tree.joints)):
         if j in tree.parent_indices:
@@ -250,14 +249,12 @@ def _arms(tree: Mechanism) -> tuple[ArmChain, ...]:
 
 
 def _tool_rank(frame: str) -> tuple[int, bool]:
-    """How unlikely a frame is the one that holds something."""
     name = frame.lower()
     rank = next((i for i, word in enumerate(_TOOL_FRAME_NAMES) if word in name), len(_TOOL_FRAME_NAMES))
     return rank, rank < len(_TOOL_FRAME_NAMES) and not name.endswith(_TOOL_FRAME_NAMES[rank])
 
 
 def _travel(recording: Recording, joints: Sequence[str]) -> float:
-    """How far the joints of an arm turn together [rad]."""
     group = recording.joints
     if group is None:
         return 0.0
@@ -281,7 +278,6 @@ def _holder(tree: Mechanism, arms: Sequence[ArmChain], frame: str | None, standi
 def _held(
     arms: Sequence[ArmChain], own: ArmChain, branches: Sequence[BranchDescription], standing: bool
 ) -> dict[str, str]:
-    """Frames of the arms that probably hold ends of the object."""
     if standing:
         return {arm.tool_frames[0]: end for arm, end in zip(arms, ("w_T2", "w_T3"), strict=False)}
     others = [arm for arm in arms if arm is not own]
@@ -309,7 +305,6 @@ def _mode(recording: Recording, closed: bool) -> tuple[str, str]:
 
 
 def _commanded(joints: JointGroup) -> bool:
-    """Whether commanded positions were recorded, and are not the measured ones once more."""
     commands = joints.position_command
     if commands is None:
         return False
@@ -381,7 +376,6 @@ def rest_split_time(recording: Recording, joints: Sequence[str]) -> float | None
 def _places(
     tree: Mechanism, recording: Recording, branches: Sequence[BranchDescription], holder: str, standing: bool
 ) -> dict[str, tuple[PointPlacement, ...]]:
-    """Where on the object every recorded point probably sits."""
     frames = [f"w_{name}" for name in (_Y_TUBES if standing else [branch.name for branch in branches])]
     return {
         group.name: tuple(
@@ -400,7 +394,6 @@ def _places(
 def _named(
     point: str, frames: Sequence[str], branches: Sequence[BranchDescription], tree: Mechanism
 ) -> PointPlacement | None:
-    """The place that the name of a point says."""
     owner, colon, part = point.partition(":")
     names = [branch.name for branch in branches]
     if point in frames or point in tree.frames or (colon and owner in names and part.endswith("%")):
@@ -454,7 +447,6 @@ def _along(name: str, percent: int) -> str:
 
 
 def _straight(branches: Sequence[BranchDescription]) -> dict[str, Array]:
-    """Places along the straight object in the frame of what holds it: name to position (3,) [m]."""
     spots: dict[str, Array] = {}
     ends: dict[str | None, tuple[Array, Array]] = {None: (np.eye(3), np.zeros(3))}
     for branch in branches:
@@ -468,7 +460,6 @@ def _straight(branches: Sequence[BranchDescription]) -> dict[str, Array]:
 
 
 def _poses(tree: Mechanism, recording: Recording, frame: str, t: Array) -> Array:
-    """Poses of a frame at times, by the recorded angles, shape (N, 4, 4)."""
     group = recording.joints
     assert group is not None
     q = ca.SX.sym("q", len(tree.joints))
@@ -484,7 +475,6 @@ def _poses(tree: Mechanism, recording: Recording, frame: str, t: Array) -> Array
 
 
 def _noise(recordings: Sequence[Recording], joints: Sequence[str]) -> dict[str, GroupNoise]:
-    """Noise of every group, from the first recording that has it."""
     found: dict[str, GroupNoise] = {}
     first = recordings[0].joints
     if first is not None:
@@ -521,7 +511,6 @@ def _point_noise(group: PointGroup) -> GroupNoise:
 
 
 def _size(t: Array, values: Array) -> float:
-    """White noise of a channel, at least that of its steps."""
     return max(white_noise_std(t, values), quantization_step(values) / math.sqrt(12))
 
 
@@ -535,7 +524,6 @@ def _time_step(period: float) -> float:
 
 
 def _clock(t: Array, clock: str) -> str:
-    """Rate of a clock, and how uneven it is, in words."""
     steps = np.diff(t)
     if not len(steps):
         return "one sample"

@@ -167,7 +167,6 @@ def _found(
 
 
 def _flags(run: RunSettings) -> list[str]:
-    """What the command was given beside the configuration: baselines that it does not say itself."""
     if any(origin.startswith("--set") for origin in run.key_locations.values()):
         return []
     if any(key[:2] == ("diagnosis", "baseline") for key in run.key_locations):
@@ -205,7 +204,6 @@ def _with_noise_only_stds(problem: EstimationProblem, run: RunSettings) -> Estim
 
 
 def _noise_levels(problem: EstimationProblem) -> set[tuple[str, str]]:
-    """Group and field of every noise level that residuals or their weights depend on."""
     levels = {(samples.sensor.group_name, "std") for episode in problem.episodes for samples in episode.measurements}
     recorded = [e.recording.joints.position_std for e in problem.episodes if e.recording.joints is not None]
     encoders = problem.options.sensors.get(POSITION_GROUP)
@@ -229,7 +227,6 @@ def _times(share: float, std: float | Mapping[str, float]) -> float | Mapping[st
 
 
 def _held_out_predictions(finding: DiagnosisResult) -> list[HeldOutPrediction]:
-    """Held-out episodes with predictions of the nominal and of the final model; failed ones are left out."""
     before, after = (
         whitened_by_sensor_noise(fit.problem).predict_held_out(fit.problem.vector(fit.values))
         for fit in (finding.nominal_model, finding.final_model)
@@ -341,7 +338,6 @@ class JsonRefitStore:
 
 
 def _texts(values: Mapping[str, float]) -> dict[str, float | str]:
-    """JSON has no infinities: what is not finite is kept as text."""
     return {name: value if math.isfinite(value) else str(value) for name, value in values.items()}
 
 

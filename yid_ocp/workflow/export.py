@@ -95,7 +95,6 @@ class _CalibratedModel:
 
 
 def _read_calibrated_model(folder: str | Path) -> _CalibratedModel:
-    """The final model read from a run folder of `solve` or `diagnose`."""
     folder = Path(folder)
     result = read_run_result(folder)
     try:
@@ -189,12 +188,10 @@ def export_model(
 
 
 def _manifest_path(out: Path) -> Path:
-    """Path of the manifest of an exported file."""
     return out.with_name(f"{out.name}.manifest.json")
 
 
 def _settings_with_estimates(calibrated: _CalibratedModel) -> RunSettings:
-    """Settings of the run with found effects, and estimates as initial values."""
     system = build_system(calibrated.settings)
     chosen = dict(parameter_settings(calibrated.settings, system.parameters))
     for name in calibrated.parameter_stds:
@@ -234,7 +231,6 @@ def _said_of_grasp(form: str) -> FormatSupport:
 
 
 def _expressible(calibrated: _CalibratedModel, form: str) -> tuple[System, dict[str, FormatSupport]]:
-    """The system with those effects that the format can say, and what it makes of every one."""
     system = build_system(calibrated.settings)
     said = effect_support(system, _own(calibrated.parameter_values, system), form)
     for _ in range(len(said) + 1):
@@ -314,7 +310,6 @@ def _gate(calibrated: _CalibratedModel, system: System, text: str, progress: Pro
 def _replayed(
     text: str, system: System, recordings: Sequence[Recording], progress: Progress, round_: int = 0
 ) -> dict[str, ReplayMismatch]:
-    """Errors over all recordings together; in the first or second of two rounds."""
     found: dict[str, list[ReplayMismatch]] = {}
     for i, recording in enumerate(recordings):
         progress.report_parts_done(round_ * len(recordings) + i, 2 * len(recordings), recording.name)
@@ -388,7 +383,6 @@ def export_run_signals(folder: str | Path, out: str | Path) -> tuple[list[Path],
 
 
 def _recordings(file: h5py.File, form: str) -> dict[str, list[TopicSignal]]:
-    """Signals by recording, those that have any."""
     parent = file.get("recordings", {}) if form == SOLVE_TRAJECTORIES_FORMAT else file
     found: dict[str, list[TopicSignal]] = {}
     for name in parent:
@@ -474,7 +468,6 @@ def _triples(names: Sequence[str], kinds: Sequence[str], kind: str) -> dict[str,
 
 
 def _topic(name: str) -> str:
-    """A name as parts of a topic, whose letters are few."""
     return "".join(c if c.isalnum() or c in "_/" else "_" for c in name.replace(".", "/"))
 
 

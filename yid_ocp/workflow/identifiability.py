@@ -235,7 +235,6 @@ def _ranking(
 def _wanted(
     problem: EstimationProblem, information: IdentifiabilityResult, asked: IdentifiabilityOptions
 ) -> Sequence[str]:
-    """Parameters whose intervals are worked out."""
     if asked.interval_parameters not in ("auto", "all"):
         return asked.interval_parameters
     return information.parameter_names if asked.interval_parameters == "all" or is_small_problem(problem) else ()

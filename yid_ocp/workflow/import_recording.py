@@ -111,7 +111,6 @@ def is_recording_file(file: str | Path) -> bool:
 
 
 def _reader_options_from_settings(settings: ImportSettings) -> dict[str, Any]:
-    """Reader options from the section `import` of the settings."""
     said = ((entry.name, getattr(settings, entry.name)) for entry in fields(settings))
     return {name: value for name, value in said if value is not None}
 

@@ -170,7 +170,6 @@ def _grasps(given: Sequence[str]) -> dict[str, str]:
 
 
 def _recordings(arguments: argparse.Namespace, out: Path, progress: Progress) -> dict[Path, Recording | None]:
-    """Files of the recordings; with what is to be written there where they are of another tool."""
     options = reader_options_from_arguments(arguments)
     made: dict[Path, Recording | None] = {}
     for name in arguments.files:
@@ -232,7 +231,6 @@ def _write(out: Path, text: str, made: Mapping[Path, Recording]) -> None:
 
 
 def _summary_lines(proposal: ConfigProposal, out: Path) -> list[str]:
-    """Text lines on the proposed configuration and the next commands."""
     held = ", ".join(dict.fromkeys([proposal.holder_frame, *proposal.grasps]))
     lines = [
         f"joints: {', '.join(proposal.joints)}",

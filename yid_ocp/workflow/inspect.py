@@ -182,7 +182,6 @@ def _linearised(step: Step, point: _LinearisationPoint) -> tuple[CheckedLinearis
 
 
 def _columns_at(step: Step, point: _LinearisationPoint) -> Array:
-    """Every variable of the step that starts at the point, in the order of `StepSymbols.column_blocks`."""
     n = step.sizes["n"]
     q, p, z = point.state[:n], point.state[n : 2 * n], point.state[2 * n :]
     q1, _, lam, status = step(
@@ -194,7 +193,6 @@ def _columns_at(step: Step, point: _LinearisationPoint) -> Array:
 def _patterns(
     symbols: StepSymbols, linearisation: CheckedLinearisation, rows: StepLinearization, point: _LinearisationPoint
 ) -> dict[str, SparsityPattern]:
-    """Patterns of a step, with the entries marked that differ from zero at the point."""
     system = symbols.equations.system
     count = rows.residual_by_new.shape[1]
     known = list(system.prescribed_indices)

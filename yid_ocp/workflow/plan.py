@@ -162,7 +162,6 @@ def identified_parameters(run: RunSettings, step: Step) -> tuple[Array, Paramete
 
 
 def _plan_as_recording(run: RunSettings, found: MotionPlan | InformativeMotionPlan) -> Recording:
-    """The planned motion as a recording: joints, and object points predicted by the model."""
     joints = JointGroup(
         found.joint_names, found.t, found.joint_positions, found.joint_velocities, found.joint_efforts,
         position_command=found.joint_positions, velocity_command=found.joint_velocities, effort_kind="sample",
@@ -182,7 +181,6 @@ def _plan_as_recording(run: RunSettings, found: MotionPlan | InformativeMotionPl
 def _motion_result(
     run: RunSettings, found: MotionPlan | InformativeMotionPlan, source: dict[str, Any]
 ) -> dict[str, Any]:
-    """Entries of `yid-plan/1` common to all goals, without inputs and versions."""
     joints = found.simulator.step.system.mechanism.joints
     limits = [joints[i] for i in found.simulator.joint_indices]
     shares = {
@@ -206,7 +204,6 @@ def _motion_result(
 
 
 def _plan_result(run: RunSettings, found: MotionPlan) -> dict[str, Any]:
-    """Entries of `yid-plan/1` for a point that is moved to a target."""
     return {
         "point": run.plan.point,
         "place": found.target_position.tolist(),

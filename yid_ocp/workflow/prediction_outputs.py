@@ -124,17 +124,14 @@ def worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Mapp
 
 
 def _together(errors: Mapping[str, float], channels: Sequence[str]) -> float:
-    """Root mean square over channels."""
     return float(np.sqrt(np.mean([errors[channel] ** 2 for channel in channels])))
 
 
 def _unit(channel: str, units: Mapping[str, str]) -> str:
-    """Unit of a channel, or of the first channel of a group."""
     return next((unit for name, unit in units.items() if name == channel or name.startswith(f"{channel}.")), "")
 
 
 def _start_end(problem: EstimationProblem, episode: Episode) -> float:
-    """Node up to which measured points were used to fix the start, -1 where none were."""
     options = problem.options
     return options.start_fit_window / problem.step.time_step if options.initial_state == "fitted_to_points" else -1.0
 
@@ -214,7 +211,6 @@ def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> _OffsetsBy
 def _entry(
     problem: EstimationProblem, episode: Episode, own: Sequence[Array] | None
 ) -> Mapping[str, dict[str, dict[str, float]]]:
-    """One recording's part; empty where none of its torques may be off."""
     if own is None or episode.input_errors is None or not np.any(episode.input_errors.torque_bias_std > 0):
         return {}
     rows = zip(problem.system.driven, *own, episode.input_errors.torque_bias_std, strict=True)
@@ -339,7 +335,6 @@ def _file(path: Path, form: str) -> Iterator[h5py.File]:
 def _store_sensor(
     parent: h5py.Group, episode: Episode, samples: Measurements, predicted: Mapping[str, NDArray[np.float64]]
 ) -> None:
-    """What a sensor measured and what was predicted of it."""
     group = parent.create_group(samples.sensor.group_name)
     group.attrs["channels"] = _texts(samples.sensor.channel_names)
     group.attrs["unit"] = samples.sensor.unit

@@ -121,7 +121,6 @@ def single_recording_issues(run: RunSettings, system: System, recording: Recordi
 
 
 def _choice(run: RunSettings) -> Callable[[str], SensorOptions]:
-    """What is chosen of a group of sensors, by its name."""
     return lambda name: run.sensors.get(name, SensorOptions())
 
 
@@ -244,7 +243,6 @@ def mention_issues_in_errors(doubts: Sequence[Issue]) -> Iterator[None]:
 
 
 def _sorted_by_severity(doubts: Sequence[Issue]) -> list[Issue]:
-    """The issues sorted by severity, most severe first."""
     return sorted(doubts, key=lambda doubt: (doubt.weight == "warning", -doubt.evidence))
 
 

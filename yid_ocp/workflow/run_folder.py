@@ -263,7 +263,6 @@ def _locked(temporary: Path) -> FileLock | None:
 
 
 def _clear_left(parent: Path) -> None:
-    """Remove what killed runs left in a folder."""
     for temporary in parent.glob(f".*{_UNFINISHED}") if parent.is_dir() else ():
         if not (temporary / _LOCK).is_file():  # not ours, or complete but for its name
             continue
@@ -293,7 +292,6 @@ def _refusal(what: str, error: OSError, target: Path, hint: str) -> OutputError:
 
 
 def _targets(run: RunSettings, out: str | Path | None, command: str) -> list[Path]:
-    """Names that the folder may get, the first that is free first."""
     if out is None:
         parent = Path(run.output.runs_folder) if run.output.runs_folder is not None else Path.cwd() / "runs"
         stem = _stem(run, command, time.strftime("%Y%m%d-%H%M%S"))
@@ -322,7 +320,6 @@ def _stem(run: RunSettings, *parts: str) -> str:
 
 
 def _clear(temporary: Path | None, made: Sequence[Path]) -> None:
-    """Remove an unfinished folder, and those around it that were made for it and are empty."""
     with interruption.defer_interruption():
         if temporary is not None:
             shutil.rmtree(temporary, ignore_errors=True)
@@ -337,7 +334,6 @@ def local_time_text() -> str:
 
 
 def _reproducing_command(run: RunSettings, folder: Path, command: str, flags: Sequence[str] = ()) -> str:
-    """Shell command that reproduces a result; it names the resolved configuration where `--set` was used."""
     origins = list(run.key_locations.values())
     if any(origin.startswith("--set") for origin in origins):
         near = os.path.relpath(folder)

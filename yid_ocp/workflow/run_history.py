@@ -241,7 +241,6 @@ def _read(run: RunSettings, i: int, path: str) -> Recording:
 
 
 def _named(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
-    """Names of their own, that no recording of today has."""
     return tuple(replace(recording, name=f"{recording.name} (without)") for recording in recordings)
 
 

@@ -60,7 +60,6 @@ def load_plugins(run: RunSettings) -> None:
 
 
 def _plugin_files(run: RunSettings) -> list[tuple[Path, str]]:
-    """Plug-in files, each with the location of its setting."""
     return [(Path(path), run.describe_location("plugins", i)) for i, path in enumerate(run.plugins)]
 
 
@@ -118,7 +117,6 @@ def _registering(
 
 
 def _line(error: BaseException, path: Path) -> int | None:
-    """Last line of a file on the way to an error."""
     if isinstance(error, SyntaxError):
         return error.lineno
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]

@@ -63,7 +63,6 @@ def _commands(parser: argparse.ArgumentParser) -> list[argparse.ArgumentParser]:
 
 
 def _settings(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[str]:
-    """Keys of `--set` that begin so, with names that the given configuration has."""
     from yid_ocp.config.reader import settable_keys  # it takes a second, which no other completion needs
 
     given = getattr(parsed_args, "config", None) or next(iter(getattr(parsed_args, "configs", None) or ()), None)

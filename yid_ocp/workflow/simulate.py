@@ -101,7 +101,6 @@ def run_simulate(
 
 
 def _flags(seed: int, noise: bool) -> list[str]:
-    """What the command was given beside the configuration."""
     return [*(["--seed", str(seed)] if seed else []), *(["--noise"] if noise else [])]
 
 

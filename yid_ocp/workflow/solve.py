@@ -154,7 +154,6 @@ def with_fit_issues(
 
 
 def _covariance_result(solution: Solution, data_std: Mapping[str, float]) -> dict[str, Any]:
-    """Covariance of the shared free parameters as plain data, from the data alone."""
     names = [name for name in data_std if name in solution.unknown_names]
     at = [solution.unknown_names.index(name) for name in names]
     if not solution.covariance.size:
@@ -208,5 +207,4 @@ def _predictions(
 
 
 def _units(residuals: Mapping[str, Any]) -> dict[str, str]:
-    """Unit of every channel."""
     return {channel: entry["unit"] for channel, entry in residuals.items()}

@@ -244,7 +244,6 @@ def _track_result(
 
 
 def _sizes_result(sizes: DimensionCheck) -> dict[str, Any]:
-    """Lengths and radii as plain data: model value, value fitted to the frames, and its standard deviation."""
     fits = sizes.model_values * np.exp(sizes.log_ratio)
     return {
         "frames": sizes.n_frames,
@@ -263,7 +262,6 @@ def _sizes_result(sizes: DimensionCheck) -> dict[str, Any]:
 
 
 def _camera_result(calibration: CameraCalibration) -> dict[str, Any]:
-    """Camera calibration as plain data: estimated and specified pose, depth and clock, with stds."""
     state, told, change = (
         calibration.camera_state,
         calibration.prior_state,
@@ -306,7 +304,6 @@ def _points(found: TrackResult) -> dict[str, Any]:
 
 
 def _truth_errors(system: System, found: TrackResult, made: VirtualFrames) -> Mapping[str, Mapping[str, float]]:
-    """Median and largest error of every tracked point against the simulated truth [m]."""
     shape = ShapeFitter(system)
     columns = [system.point_frames.index(name) for name in found.point_names]
     truth = np.array([shape.points_at(made.true_configuration_at(t))[columns] for t in found.t])
