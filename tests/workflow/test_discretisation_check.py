@@ -1,4 +1,4 @@
-"""What the number of links and the time step do to estimates, against an object that is a finer chain in truth."""
+"""Estimates with finer links and shorter steps."""
 
 from __future__ import annotations
 

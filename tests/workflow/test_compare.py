@@ -1,4 +1,4 @@
-"""What the command `compare` shows beside its own results."""
+"""The command `compare`."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
-"""Intervals and what-if by workers: the same numbers as in one process, and only once."""
+"""The command `identifiability` on workers, and the second arm among its changes."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 from here import Here
@@ -10,6 +11,7 @@ from here import Here
 from yid_ocp.config.reader import load_config
 from yid_ocp.errors import SolverError, WorkerError
 from yid_ocp.workflow import identifiability as identifiability_command
+from yid_ocp.workflow.build import build_system, system_with_second_arm
 from yid_ocp.workflow.identifiability import IdentifiabilityOptions, run_identifiability
 
 QUICK = ("output.write_report=false",)
@@ -67,3 +69,19 @@ def test_a_part_that_fails_is_said(repository, tmp_path, monkeypatch):
         run_identifiability(
             run, tmp_path / "run", options=IdentifiabilityOptions(interval_parameters="all"), workers=Here()
         )
+
+
+def test_the_other_arm_of_a_robot(repository):
+    run = load_config(repository / "configs" / "single_arm_vision.yaml")
+    system = build_system(run)
+    both = system_with_second_arm(run, system)
+    assert both is not None
+    assert both.driven[:7] == system.driven
+    assert both.driven[7:] == tuple(name.replace("left_", "right_") for name in system.driven)
+    assert [(grasp.name, grasp.holder_frame, grasp.held_frame) for grasp in both.grasps] == [
+        ("left", "left_gripper", "w_T2"),
+        ("right", "right_gripper", "w_T3"),
+    ]
+    assert system_with_second_arm(load_config(repository / "configs" / "dual_arm_vision.yaml"), both) is None
+    moved = replace(run, model=replace(run.model, arms=replace(run.model.arms, mode="prescribed")))
+    assert system_with_second_arm(moved, system) is None

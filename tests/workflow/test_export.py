@@ -1,4 +1,4 @@
-"""The model of a run in other engines, and back in a configuration."""
+"""Models in other formats."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command `import`: flags, the section of a configuration, the preview, and what is refused."""
+"""The command `import`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Run folders: whole under their name or not there, with a log and results that JSON can hold."""
+"""Run folders: complete or not there, named once, cleared of what killed runs left."""
 
 from __future__ import annotations
 

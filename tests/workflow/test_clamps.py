@@ -1,4 +1,4 @@
-"""Objects without a robot, and what an earlier run says: markers, clamps, baseline, counterfactual, history."""
+"""Objects held by clamps or the world, frames and markers."""
 
 from __future__ import annotations
 
@@ -227,7 +227,7 @@ def test_report_says_what_drifted_and_writes_the_history(tmp_path):
 
 @pytest.mark.slow
 def test_a_program_with_node_states_has_the_same_joint_prior(tmp_path):
-    """`python -m pytest -m slow tests/workflow/test_held.py`: some seconds in IPOPT."""
+    """`python -m pytest -m slow tests/workflow/test_clamps.py`: some seconds in IPOPT."""
     run = settings(tmp_path, None, ("problem.initial_state=equilibrium",))
     known = read_estimates(folder_of(tmp_path / "old", values=(0.018, 4e-5)))
     problem = with_baseline_prior(build_problem(run), known)

@@ -1,4 +1,4 @@
-"""Pictures of patterns: the entries where they belong, blocks set apart and named, every label once."""
+"""Pictures of sparsity patterns."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a long run shows how it is doing."""
+"""Progress on a terminal and in lines, and what commands print."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where `inspect` linearises: at rest, at a fitted start, or at zero where there is no rest; and what it then says."""
+"""Where the command `inspect` looks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Effects from outside the package: what is run, and what is said of what does not work."""
+"""Plug-ins from files and packages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The doctor of recordings in a run: what it leaves out, what it stops, and what may still be said of parameters."""
+"""What is in doubt about recordings, and what it does to a run."""
 
 from __future__ import annotations
 

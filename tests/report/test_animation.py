@@ -1,4 +1,4 @@
-"""What moves on a page: places by the model's own kinematics, measured ones beside them, on one clock."""
+"""Stick figures and what was measured beside them."""
 
 from __future__ import annotations
 

@@ -1,0 +1,291 @@
+"""Trajectories, held-out errors beside guesses, and torque offsets as they are written."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import h5py
+import numpy as np
+import pytest
+
+from yid_ocp.data import read_recording, write_recording
+from yid_ocp.data.recording import JointGroup, Recording
+from yid_ocp.diagnosis.events import NO_EVENTS
+from yid_ocp.errors import OutputError
+from yid_ocp.inference.uncertainty import ParameterEstimate, mark_not_trusted
+from yid_ocp.inference.whitening import whitened_at, without_input_errors
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.model import System
+from yid_ocp.model.servos_and_springs import RobotJointSpring
+from yid_ocp.model.urdf import read_urdf
+from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
+from yid_ocp.problem.synthetic_recording import recording_from_prediction
+from yid_ocp.report.model_summaries import _noise_words
+from yid_ocp.report.tables import torque_offset_rows
+from yid_ocp.report.terminal import aligned_table_lines
+from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.workflow.build_problem import load_problem
+from yid_ocp.workflow.check import _input_noise
+from yid_ocp.workflow.prediction_outputs import (
+    estimated_torque_offsets,
+    prediction_error_entry,
+    worse_than_baseline_issues,
+    write_diagnosis_trajectories,
+    write_solve_trajectories,
+)
+
+
+@pytest.fixture
+def solved(pendulum):
+    problem = load_problem(pendulum)
+    solution = solve(problem, GaussNewton())
+    return problem, solution, problem.predict_held_out(solution.x)
+
+
+def test_a_solution_with_its_predictions(solved, tmp_path):
+    problem, solution, held_out = solved
+    unpredicted = [(held_out[0][0], "step 3 did not converge")]
+    write_solve_trajectories(tmp_path / "t.h5", problem, solution, unpredicted)
+    with h5py.File(tmp_path / "t.h5") as file:
+        assert file.attrs["format"] == "yid-trajectories/1"
+        assert list(file["unknowns"].attrs["names"]) == list(solution.unknown_names)
+        np.testing.assert_array_equal(file["unknowns/x"], solution.x)
+        np.testing.assert_array_equal(file["unknowns/covariance"], solution.covariance)
+        made, missing = file["recordings/estimate"], file["recordings/held_out"]
+        assert (made.attrs["role"], missing.attrs["role"]) == ("estimate", "held_out")
+        assert missing.attrs["message"] == "step 3 did not converge"
+        assert list(missing) == []
+        episode, outcome = problem.episodes[0], solution.episode_predictions[0]
+        n = problem.system.n_coordinates
+        np.testing.assert_array_equal(made["t"], episode.grid.node_times)
+        np.testing.assert_array_equal(made["q"], outcome.rollout.state[:, :n])
+        np.testing.assert_array_equal(made["p"], outcome.rollout.state[:, n : 2 * n])
+        np.testing.assert_array_equal(made["effort"], outcome.rollout.effort)
+        assert {"multipliers", "torque"} < set(made)
+        sensor, samples = made["joints.effort"], episode.measurements[0]
+        assert list(sensor.attrs["channels"]) == list(samples.sensor.channel_names)
+        assert sensor.attrs["unit"] == "N m"
+        np.testing.assert_array_equal(sensor["measured"], samples.value)
+        np.testing.assert_array_equal(sensor["predicted"], outcome.predicted_outputs[0])
+        np.testing.assert_array_equal(sensor["std"], samples.std)
+        inside = np.min(np.abs(sensor["t"][()][:, None] - episode.recording.joints.t[None, :]), axis=1)
+        assert np.max(inside) < 0.5 * problem.step.time_step
+
+
+def test_a_diagnosis_without_a_gap_has_predictions_alone(solved, tmp_path):
+    ((episode, outcome),) = solved[2]
+    other = SimpleNamespace(predicted_outputs=[2 * array for array in outcome.predicted_outputs])
+    finding = SimpleNamespace(smoother_result=None, events=NO_EVENTS)
+    write_diagnosis_trajectories(tmp_path / "t.h5", finding, [(episode, outcome, other)])
+    with h5py.File(tmp_path / "t.h5") as file:
+        assert file.attrs["format"] == "yid-diagnosis-trajectories/1"
+        assert list(file) == ["held_out"]
+        group = file["held_out/joints.effort"]
+        np.testing.assert_array_equal(group["before"], outcome.predicted_outputs[0])
+        np.testing.assert_array_equal(group["after"], 2 * outcome.predicted_outputs[0])
+        assert group["t"].shape == (len(group["measured"]),)
+
+
+def test_a_file_that_cannot_be_written(solved, tmp_path):
+    with pytest.raises(OutputError, match="does not exist"):
+        write_solve_trajectories(tmp_path / "no" / "t.h5", *solved)
+
+
+def test_a_held_out_recording_beside_a_guess_without_a_model(solved):
+    problem, _, held_out = solved
+    entry = prediction_error_entry(problem, *held_out[0])
+    assert entry["recording"] == "held_out"
+    samples = held_out[0][0].measurements[0]
+    for i, channel in enumerate(samples.sensor.channel_names):
+        error = held_out[0][1].predicted_outputs[0][:, i] - samples.value[:, i]
+        assert entry["rmse"][channel] == pytest.approx(np.sqrt(np.nanmean(error**2)))
+        assert entry["baselines"]["zero"][channel] == pytest.approx(np.sqrt(np.nanmean(samples.value[:, i] ** 2)))
+    failed = prediction_error_entry(problem, held_out[0][0], "step 3 did not converge")
+    assert failed["message"] == "step 3 did not converge"
+    assert failed["rmse"] == {}
+    assert failed["baselines"] == entry["baselines"]
+
+
+STEPS, OFFSET, WHITE, ANGLE = 200, 0.2, 0.05, 1e-4
+
+
+@pytest.fixture(scope="module")
+def step(urdf_folder):
+    tree = read_urdf(urdf_folder / "double_pendulum.urdf")
+    system = System.build(tree, driven=("shoulder",), springs={"elbow": RobotJointSpring(3.0)}, damping=0.2)
+    return compile_step(system, 0.01, use_compiler=False)
+
+
+def problem_of(step, *, bias=OFFSET, white=WHITE, held_out=True, options=None):
+    """A pendulum under torques that are 0.3 N m too large, in one recording to estimate on and one held out."""
+    t = 0.01 * np.arange(STEPS + 1)
+    torque = np.sin(6 * t)[:, None]
+    options = options or ProblemOptions(feedback="proportional", proportional_gains=(9.0,))
+    first = Recording(
+        JointGroup(
+            ("shoulder",), t, np.zeros((STEPS + 1, 1)), effort=torque, effort_std=white, effort_bias_std=bias,
+            position_std=ANGLE, effort_kind="command",
+        ),
+        (),
+        name="first",
+    )  # fmt: skip
+    made = EstimationProblem(
+        step, [first], ("elbow.stiffness",), replace(options, feedback="none", proportional_gains=None)
+    )
+    episode = made.episodes[0]
+    swept = made.predictor.predict_episode(episode, *made.split(made.initial_unknowns, 0), False)
+    joints = replace(first.joints, position=swept.rollout.state[:, :1], effort=torque + 0.3)
+    recordings = [replace(first, joints=joints, name=name) for name in ("first", "second")]
+    return EstimationProblem(
+        step, recordings[:1], ("elbow.stiffness",), options, None, recordings[1:] if held_out else ()
+    )
+
+
+def test_offsets_of_all_recordings_are_told_with_what_was_expected(step):
+    problem = problem_of(step)
+    assert estimated_torque_offsets(problem, problem.initial_unknowns) == {}
+    weighted = whitened_at(problem, problem.initial_unknowns, rounds=2)
+    found = estimated_torque_offsets(weighted, problem.initial_unknowns)
+    assert list(found) == ["first", "second"]
+    for offset_entry in found.values():
+        own = offset_entry["shoulder"]
+        assert own["prior_std"] == OFFSET
+        assert own["std"] < 0.1 * OFFSET
+        assert own["value"] == pytest.approx(0.3, abs=4 * own["std"])
+    assert list(
+        estimated_torque_offsets(
+            whitened_at(problem_of(step, held_out=False), problem.initial_unknowns), problem.initial_unknowns
+        )
+    ) == ["first"]
+
+
+def test_where_offsets_are_no_part_of_the_model_nothing_is_said(step):
+    problem = problem_of(step, bias=0.0)
+    assert estimated_torque_offsets(whitened_at(problem, problem.initial_unknowns), problem.initial_unknowns) == {}
+    assert torque_offset_rows({"torque_offsets": {}}) == torque_offset_rows({}) == []
+
+
+def offset_entry(value, prior=0.3):
+    return {"value": value, "std": 0.012, "prior_std": prior}
+
+
+def test_the_table_has_a_row_for_a_joint_and_a_column_for_a_recording():
+    offsets = {"a": {"s0": offset_entry(0.4), "e0": offset_entry(-0.1)}, "b": {"s0": offset_entry(0.2, 0.1)}}
+    rows = torque_offset_rows({"torque_offsets": offsets})
+    assert rows == [
+        ("torque offset [N m]", "a", "b", "expected"),
+        ("s0", "0.40 ± 0.01", "0.20 ± 0.01", "± 0.3, ± 0.1"),
+        ("e0", "-0.10 ± 0.01", "", "± 0.3"),
+    ]
+    many = {f"run {i}": {"s0": offset_entry(0.1)} for i in range(6)}
+    assert torque_offset_rows({"torque_offsets": many})[-1][0] == "2 more recordings are in result.json"
+    assert aligned_table_lines(rows)[0].split() == ["torque", "offset", "[N", "m]", "a", "b", "expected"]
+
+
+def simulated(problem, seed):
+    episode = problem.episodes[0]
+    outcome = problem.predictor.predict_episode(episode, *problem.split(problem.initial_unknowns, 0), False)
+    return recording_from_prediction(problem.predictor, episode, outcome, problem.theta, seed).joints
+
+
+def test_simulated_torques_are_wrong_as_the_estimation_expects_and_say_so(step):
+    problem = problem_of(step)
+    exact = simulated(problem, None)
+    errors = np.array([(simulated(problem, seed).effort - exact.effort)[:, 0] for seed in range(60)])
+    # for 60 draws a standard deviation is good to a tenth of itself
+    assert errors.mean(axis=1).std() == pytest.approx(OFFSET, rel=0.3)
+    assert (errors - errors.mean(axis=1, keepdims=True)).std() == pytest.approx(WHITE, rel=0.05)
+    made = simulated(problem, 1)
+    for group in (made, exact):
+        assert (group.effort_std, group.effort_bias_std, group.position_std) == (WHITE, OFFSET, ANGLE)
+
+
+def test_settings_come_before_what_the_recording_says(step):
+    sensors = {"joints.effort": SensorOptions(std={"shoulder": 0.4}, bias_std=0.7)}
+    options = ProblemOptions(feedback="proportional", proportional_gains=(9.0,), sensors=sensors)
+    made = simulated(problem_of(step, options=options), 1)
+    assert (made.effort_std, made.effort_bias_std) == (0.4, 0.7)
+
+
+@pytest.mark.parametrize(("white", "estimated"), [(WHITE, False), (None, True)])
+def test_check_lists_noise_that_drives_the_motion_and_whether_anybody_stated_it(step, white, estimated):
+    problem = problem_of(step, white=white)
+    noise = _input_noise(problem, problem.episodes[0])
+    effort, position = noise["joints.effort"], noise["joints.position"]
+    assert (effort["estimated"], position["estimated"]) == (estimated, False)
+    assert (effort["bias_std"], position["std"]) == (OFFSET, ANGLE)
+    words = _noise_words(noise, "joints")
+    assert ("(estimated)" in words) is estimated
+    assert words.endswith("; 0.0001 rad")
+    assert ", offset 0.2" in words
+    calm = without_input_errors(problem)
+    assert _input_noise(calm, calm.episodes[0]) == {}
+
+
+UNITS = {"joints.effort.a": "N m", "joints.effort.b": "N m", "points.p": "m", "points.q": "m"}
+
+
+def entry(rmse, guess):
+    return {"recording": "run", "rmse": rmse, "baselines": {"zero": guess}}
+
+
+EFFORT, POINTS = [("joints", "effort")], [("points", "")]
+
+
+@pytest.mark.parametrize(
+    ("rmse", "guess", "places"),
+    [
+        ({"joints.effort.a": 1.0, "joints.effort.b": 0.2}, {"joints.effort.a": 3.0, "joints.effort.b": 0.1}, []),
+        ({"joints.effort.a": 3.2, "joints.effort.b": 0.2}, {"joints.effort.a": 3.0, "joints.effort.b": 0.4}, EFFORT),
+        ({"joints.effort.a": 3.1}, {"joints.effort.a": 3.0}, []),
+        ({"points.p": 0.2, "points.q": 0.1, "points": 0.1}, {"points.p": 0.1, "points.q": 0.1, "points": 0.1}, POINTS),
+        ({"points.p": 0.2}, {}, []),
+        ({}, {"points.p": 0.2}, []),
+    ],
+)
+def test_a_sensor_counts_as_a_whole(rmse, guess, places):
+    found = worse_than_baseline_issues([entry(rmse, guess)], UNITS)
+    assert [(doubt.group, doubt.channel) for doubt in found] == places
+    assert all((d.cause, d.weight, d.recording) == ("worse_than_guess", "not_trusted", "run") for d in found)
+
+
+def test_the_best_guess_counts():
+    said = entry({"points.p": 0.2}, {"points.p": 0.3})
+    said["baselines"]["stays"] = {"points.p": 0.1}
+    (doubt,) = worse_than_baseline_issues([said], UNITS)
+    assert doubt.what == "the model is off by 0.2 m (rms), the guess 'stays' without a model by 0.1 m"
+    assert doubt.evidence == pytest.approx(0.2 / 0.105)
+
+
+def test_what_was_found_is_not_trusted_and_what_was_not_stays_so():
+    one = ParameterEstimate(1.0, 0.1, "N m/rad", 1.0, 0.0, 9.0, True, "identifiable")
+    known = {
+        "found": one,
+        "weak": replace(one, verdict="weak"),
+        "lost": replace(one, verdict="not_identifiable"),
+        "fixed": replace(one, free=False, verdict="fixed"),
+    }
+    verdicts = {name: made.verdict for name, made in mark_not_trusted(known).items()}
+    assert verdicts == {"found": "not_trusted", "weak": "not_trusted", "lost": "not_identifiable", "fixed": "fixed"}
+
+
+@pytest.mark.parametrize(("factor", "believed"), [(1.0, True), (0.4, False)])
+def test_a_recording_held_out_that_a_guess_predicts_better_withholds_trust(
+    cli, pendulum_data, tmp_path, factor, believed
+):
+    recording = read_recording(pendulum_data.folder / "held_out.h5")
+    less = replace(recording, joints=replace(recording.joints, effort=factor * recording.joints.effort))
+    write_recording(less, tmp_path / "held_out.h5")
+    (tmp_path / "run.yaml").write_text(
+        pendulum_data.text.replace(str(pendulum_data.folder / "held_out.h5"), "held_out.h5")
+    )
+    done = cli("solve", tmp_path / "run.yaml", "--out", tmp_path / "run", "--set", "output.write_report=false")
+    assert done.code == 0, done.err
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert result["fit"]["believed"] is believed
+    assert [doubt["cause"] for doubt in result["doubts"]] == ([] if believed else ["worse_than_guess"])
+    verdict = result["parameters"]["shoulder.stiffness"]["verdict"]
+    assert verdict == ("identifiable" if believed else "not_trusted")
+    assert ("a prediction without a model is nearer" in done.out) is not believed
