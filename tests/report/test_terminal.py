@@ -206,7 +206,8 @@ def test_a_recording_in_a_table():
 def test_blocks_on_a_terminal():
     table = SummaryTable([("a", "b"), ("1", "2")], "a title for the page")
     assert terminal.terminal_lines([]) == []
-    assert terminal.terminal_lines([table, SummaryStatement("said"), table, replace(table, is_page_only=True), CodeBlock("do it\nnow")]) == [
+    hidden = replace(table, is_page_only=True)
+    assert terminal.terminal_lines([table, SummaryStatement("said"), table, hidden, CodeBlock("do it\nnow")]) == [
         "a  b", "-  -", "1  2", "", "said", "", "a  b", "-  -", "1  2", "", "  do it", "  now",
     ]  # fmt: skip
     prose = terminal.terminal_lines([SummaryStatement("A sentence of some length. " * 9 + "It ends.")])

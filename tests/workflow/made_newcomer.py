@@ -17,6 +17,7 @@ from yid_ocp.workflow.build import build_system
 
 START = 1_700_000_000 * 10**9
 QUARTER = 1.5707963
+CURVED = "stiffness_per_curvature: true, clamped_at_base: true"
 
 UR5 = """\
 model:
@@ -26,7 +27,7 @@ model:
     kind: segments
     mount: {{parent_frame: tool0}}
     segments:
-      cable: {{length: 1.0, mass: 0.1, radius: 0.005, links: {links}, joint_axes: xy, stiffness_per_curvature: true, clamped_at_base: true}}
+      cable: {{length: 1.0, mass: 0.1, radius: 0.005, links: {links}, joint_axes: xy, {curved}}}}
   damping: {{shoulder_pan_joint: 0.1, object: 5.0e-4}}
   points: [w_cable, "cable:50%"]
 parameters: {{cable.bend: {{initial: 0.03}}}}
@@ -68,7 +69,7 @@ model:
     kind: segments
     mount: {{parent_frame: gripper}}
     segments:
-      rod: {{length: 0.4, mass: 0.04, radius: 0.003, links: {links}, joint_axes: xy, stiffness_per_curvature: true, clamped_at_base: true}}
+      rod: {{length: 0.4, mass: 0.04, radius: 0.003, links: {links}, joint_axes: xy, {curved}}}}
   damping: {{pan: 0.05, object: 4.0e-4}}
   points: [w_rod, "rod:50%"]
   effects: [{effects}]
@@ -90,15 +91,15 @@ SERVOS = {
 
 def servo_text(links: int = 12) -> str:
     rotors = (f"{{kind: rotor_inertia, location: {joint}, values: {{armature: 0.01}}}}" for joint in SERVO_POSTURE)
-    return SERVO.format(links=links, effects=", ".join(rotors))
+    return SERVO.format(links=links, curved=CURVED, effects=", ".join(rotors))
 
 
 def ur5_text(links: int = 16) -> str:
-    return UR5.format(links=links)
+    return UR5.format(links=links, curved=CURVED)
 
 
 def panda_text(links: int = 10) -> str:
-    shape = f"length: 0.4, mass: 0.03, radius: 0.004, links: {links}, joint_axes: xy, stiffness_per_curvature: true, clamped_at_base: true"
+    shape = f"length: 0.4, mass: 0.03, radius: 0.004, links: {links}, joint_axes: xy, {CURVED}"
     turns = [f"rpy: [0.0, {QUARTER}, {round(QUARTER * i, 7)}]" for i in range(4)]
     branches = [f"      {name}: {{{shape}, {turn}}}" for name, turn in zip(PANDA_BENDS, turns, strict=True)]
     parameters = ", ".join(f"{name}.bend: {{initial: {value}}}" for name, value in PANDA_BENDS.items())
