@@ -18,7 +18,7 @@ from yid_ocp.analysis.compare import compare_methods
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.solvers import GaussNewton, Lifted, MultipleShooting, SingleShooting, SteepestDescent
+from yid_ocp.solvers import GaussNewton, MultipleShooting, SingleShooting, SteepestDescent
 from yid_ocp.virtual.experiment import baxter_foam_y_system
 
 RECORDINGS = {1: "single_arm_vision_estimate.h5", 2: "dual_arm_vision_estimate.h5"}
@@ -37,11 +37,9 @@ def main(arguments: list[str] | None = None) -> int:
     methods = {
         "gauss_newton": GaussNewton(),
         "single_shooting": SingleShooting(),
-        "lifted": Lifted(),
-        "multiple_shooting, node every 10 steps": MultipleShooting(node_interval=10),
-        "multiple_shooting, symbolic": MultipleShooting(),
-        "multiple_shooting, symbolic, exact": MultipleShooting(hessian="exact"),
-        "multiple_shooting, compiled": MultipleShooting(transcription="compiled"),
+        "multiple_shooting, condensing": MultipleShooting(condensing=True),
+        "multiple_shooting": MultipleShooting(),
+        "multiple_shooting, exact": MultipleShooting(hessian="exact"),
         "steepest_descent, as in the paper": SteepestDescent(),
         "steepest_descent, spectral": SteepestDescent(
             first_trial_step="spectral", nonmonotone_memory=10, max_iterations=800, gradient_tolerance=1e-4

@@ -54,27 +54,28 @@ class MadeUp:
         count: int | None = None,
         priors: Mapping[str, float] | None = None,
     ) -> None:
-        self._rows, self._stated, self._weak, self.noise, self.duration = rows, stated, weak, noise, duration
-        self.start = np.array(start, float)
-        size = len(self.start)
-        self.names = tuple(f"k{i}" for i in range(size))
-        self.shared, self.local = self.names, ()
+        self._rows, self._stated, self._weak, self.duration = rows, stated, weak, duration
+        self.data_noise_unit = noise
+        self.initial_unknowns = np.array(start, float)
+        size = len(self.initial_unknowns)
+        self.unknown_names = tuple(f"k{i}" for i in range(size))
+        self.shared_parameters, self.local_parameters = self.unknown_names, ()
         self.bounds = np.full(size, lower), np.full(size, upper)
-        self.scales = np.abs(self.start) if scales is None else np.array(scales, float)
+        self.unknown_scales = np.abs(self.initial_unknowns) if scales is None else np.array(scales, float)
         self.options = SimpleNamespace(
-            believed=True,
+            has_trusted_data=True,
             weighting=weighting,
-            priors=dict(priors or {}),
+            prior_stds=dict(priors or {}),
             path_cutoff=np.inf,
-            joint_prior=MultivariateGaussianPrior(),
+            multivariate_prior=MultivariateGaussianPrior(),
         )
-        self.disturbed = False
-        values = [*self.start, *fixed]
+        self.has_process_noise = False
+        values = [*self.initial_unknowns, *fixed]
         entries = [Parameter(f"k{i}", v, "N m/rad", lower, upper, "made up") for i, v in enumerate(values)]
         self.system = SimpleNamespace(parameters=Parameters(entries[::-1]), effects=())
         self.theta = np.array(values[::-1])
         self.step = SimpleNamespace(time_step=0.1)
-        self._count = len(rows(self.start, duration)[0]) if count is None else count
+        self._count = len(rows(self.initial_unknowns, duration)[0]) if count is None else count
         self.episodes = tuple(self._episode(i, round(duration / period)) for i, period in enumerate((0.2, 0.1)))
         self.asked: list[tuple[np.ndarray, bool, object]] = []
 
@@ -83,27 +84,27 @@ class MadeUp:
         data = (self._count - self._stated - self._weak) if i == 0 else 0
         node = np.linspace(0, steps, data).astype(int)
         group = samples(
-            ("points.tip",), np.full((data, 1), self.noise), seen=np.ones((data, 1), bool), value=np.zeros((data, 1)),
-            node=node, fraction=np.zeros(data), count=data,
+            ("points.tip",), np.full((data, 1), self.data_noise_unit), is_used=np.ones((data, 1), bool),
+            value=np.zeros((data, 1)), node=node, fraction=np.zeros(data), n_residuals=data,
         )  # fmt: skip
         grid = SimpleNamespace(steps=steps, time_step=0.1)
-        return SimpleNamespace(name=f"run {i}", grid=grid, samples=(group,), has_constant_errors=False)
+        return SimpleNamespace(name=f"run {i}", grid=grid, measurements=(group,), has_constant_sensor_errors=False)
 
     @property
-    def positive(self) -> np.ndarray:
-        return (self.bounds[0] >= 0) & (self.start > 0)
+    def is_positive(self) -> np.ndarray:
+        return (self.bounds[0] >= 0) & (self.initial_unknowns > 0)
 
     @property
-    def rows(self) -> ResidualRows:
+    def residual_rows(self) -> ResidualRows:
         total = self._count
         data = total - self._stated - self._weak
         made = ResidualRows.from_episodes(self.episodes, self._stated, self._weak)
         return ResidualRows(made.measurements, slice(0, data), slice(data, data + self._stated), slice(data, total))
 
-    def informing(self, evaluation: Evaluation) -> tuple[np.ndarray, np.ndarray]:
+    def residual_without_weak_priors(self, evaluation: Evaluation) -> tuple[np.ndarray, np.ndarray]:
         count = len(evaluation.residual) - self._weak
         unit = np.ones(count)
-        unit[: count - self._stated] = self.noise
+        unit[: count - self._stated] = self.data_noise_unit
         return evaluation.residual[:count] / unit, evaluation.jacobian[:count] / unit[:, None]
 
     def split(self, x: np.ndarray, episode: int) -> tuple[np.ndarray, np.ndarray]:
@@ -111,21 +112,21 @@ class MadeUp:
         theta[len(theta) - len(x) :] = x[::-1]
         return theta, np.zeros(0)
 
-    def evaluate(self, x: np.ndarray, derivatives: bool = True, warm: object = None) -> Evaluation:
-        self.asked.append((np.array(x), derivatives, warm))
+    def evaluate(self, x: np.ndarray, derivatives: bool = True, equilibrium_guesses: object = None) -> Evaluation:
+        self.asked.append((np.array(x), derivatives, equilibrium_guesses))
         found = self._rows(np.asarray(x), self.duration)
         if found is None:
             return Evaluation(np.inf, np.zeros(0), None, False, "it snaps", ())
         residual, jacobian = found
-        data = np.asarray(residual)[self.rows.data, None]
-        done = tuple(SimpleNamespace(predicted=(part,), warm="warm") for part in (data, data[:0]))
+        data = np.asarray(residual)[self.residual_rows.data, None]
+        done = tuple(SimpleNamespace(predicted_outputs=(part,), equilibrium_guess="warm") for part in (data, data[:0]))
         cost = 0.5 * float(residual @ residual)
         return Evaluation(cost, residual, jacobian if derivatives else None, True, "", done)
 
-    def shortened(self, duration: float) -> MadeUp:
+    def truncated_to(self, duration: float) -> MadeUp:
         lower, upper = self.bounds
         bounds = {"lower": lower[0], "upper": upper[0]}
-        return MadeUp(self._rows, self.start, **bounds, duration=duration, count=self._count)
+        return MadeUp(self._rows, self.initial_unknowns, **bounds, duration=duration, count=self._count)
 
 
 class Steps:
@@ -137,7 +138,9 @@ class Steps:
         self._paths, self._status = list(paths), status
         self.runs: list[tuple[list[float], float]] = []
 
-    def run(self, problem: MadeUp, start: np.ndarray, callback: Callable[[Iterate], None] | None) -> SolverResult:
+    def minimize_cost(
+        self, problem: MadeUp, start: np.ndarray, callback: Callable[[Iterate], None] | None
+    ) -> SolverResult:
         self.runs.append((start.tolist(), problem.duration))
         path = self._paths.pop(0) if self._paths else [start]
         history = tuple(Iterate(i, 1.0, np.array(x, float), 0.0, i + 1, 0.0) for i, x in enumerate(path))

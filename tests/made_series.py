@@ -29,4 +29,7 @@ def samples(channels: Sequence[str], std, unit="m", width=1, **more):
 
 def seeing(channels: Sequence[str], unit="m", width=1, efforts=()):
     """A sensor, as far as rules look at it."""
-    return SimpleNamespace(channels=tuple(channels), unit=unit, width=width, group="points", efforts=tuple(efforts))
+    return SimpleNamespace(
+        channel_names=tuple(channels), unit=unit, outputs_per_channel=width, group_name="points",
+        effort_joints=tuple(efforts),
+    )  # fmt: skip

@@ -18,17 +18,17 @@ HEAD = """
 import signal, sys, time
 from pathlib import Path
 from yid_ocp import interruption
-interruption.PATIENCE, interruption.LAST_RESORT = 0.2, {last}
+interruption._RERAISE_INTERVAL, interruption._FORCED_EXIT_DELAY = 0.2, {last}
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have had it ignored, as nohup has SIGHUP
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 folder = Path(sys.argv[1])
 folder.mkdir()
 try:
-    with interruption.signals_raised(), interruption.removed_by_force(folder):
+    with interruption.raise_on_signals(), interruption.remove_on_forced_exit(folder):
 {body}
-except interruption.Interrupted as error:
+except interruption.InterruptedBySignal as error:
     print("ENDED", error, flush=True)
-    sys.exit(128 + error.number)
+    sys.exit(128 + error.signal_number)
 """
 
 
@@ -64,9 +64,8 @@ def test_a_call_that_does_not_come_back_is_ended_by_force(tmp_path):
 
 
 def test_a_deferred_block_ends_first(tmp_path):
-    deferring = (
-        f"with interruption.deferred():\n    {READY}\n    time.sleep(1)\n    print('WHOLE', flush=True)\ntime.sleep(20)"
-    )
+    whole = "    time.sleep(1)\n    print('WHOLE', flush=True)\ntime.sleep(20)"
+    deferring = f"with interruption.defer_interruption():\n    {READY}\n{whole}"
     code, out, _ = ended(tmp_path, deferring, signal.SIGINT)
     assert (code, out.split("\n")) == (130, ["WHOLE", "ENDED SIGINT"])
 

@@ -11,7 +11,7 @@ from annotated_types import Ge, Gt, Le, Len, Lt
 
 from yid_ocp.errors import ConfigError
 from yid_ocp.options import OptionInfo, check_option_bounds, dataclass_options, describe_type
-from yid_ocp.solvers import GaussNewton, Lifted, SteepestDescent
+from yid_ocp.solvers import GaussNewton, MultipleShooting, SteepestDescent
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def test_numbers_on_their_bounds_and_none_are_allowed():
     Wheel(1.0, 3, (0.0,), load={"rear": -1.0}, serial=-5)
 
 
-@pytest.mark.parametrize("kind", [GaussNewton, Lifted, SteepestDescent])
+@pytest.mark.parametrize("kind", [GaussNewton, MultipleShooting, SteepestDescent])
 def test_solvers_refuse_them_too(kind):
-    with pytest.raises(ConfigError, match="iterations = -3"):
-        kind(iterations=-3)
+    with pytest.raises(ConfigError, match="max_iterations = -3"):
+        kind(max_iterations=-3)

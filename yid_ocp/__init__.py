@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from yid_ocp.problem import ProblemOptions as ProblemOptions
     from yid_ocp.problem import SensorOptions as SensorOptions
     from yid_ocp.solvers import GaussNewton as GaussNewton
-    from yid_ocp.solvers import Lifted as Lifted
     from yid_ocp.solvers import MultipleShooting as MultipleShooting
     from yid_ocp.solvers import SingleShooting as SingleShooting
     from yid_ocp.solvers import Solution as Solution
@@ -68,7 +67,6 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "workflow.build_problem": ("load_problem",),
     "solvers": (
         "GaussNewton",
-        "Lifted",
         "MultipleShooting",
         "SingleShooting",
         "Solution",
@@ -85,7 +83,6 @@ __all__ = [
     "FlexibleObject",
     "GaussNewton",
     "Grasp",
-    "Lifted",
     "Mechanism",
     "MultipleShooting",
     "NonlinearProgram",

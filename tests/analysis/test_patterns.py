@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from itertools import pairwise
 
+import casadi as ca
 import numpy as np
 import pytest
 from made_recordings import holding_pendulum
@@ -27,7 +28,7 @@ from yid_ocp.effects import make_effect
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.solvers.compiled_transcription import CompiledTranscription
+from yid_ocp.solvers.symbolic_transcription import transcribe
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -150,7 +151,7 @@ def made_problem(urdf_folder, feedback, start):
 @pytest.mark.parametrize(("feedback", "start"), [("lqr", "equilibrium"), ("none", "equilibrium"), ("lqr", "estimated")])
 def test_the_nlp_has_the_pattern_that_is_shown(urdf_folder, feedback, start):
     problem = made_problem(urdf_folder, feedback, start)
-    transcription = CompiledTranscription(problem, 1)
+    program = transcribe(problem)
     episode = problem.episodes[0]
     symbols = StepSymbols.from_equations(problem.step.equations)
     followed = () if episode.tracking_feedback is None else tuple(episode.tracking_feedback.state_indices)
@@ -159,20 +160,24 @@ def test_the_nlp_has_the_pattern_that_is_shown(urdf_folder, feedback, start):
         symbols, problem.shared_parameters, sensors, followed, problem.predictor.estimated_state_indices
     )
     jacobian, hessian, measured = _nlp_sparsity_masks(stage, episode.grid.steps)
-    rng = np.random.default_rng(0)
-    w = transcription.initial_guess(problem.initial_unknowns)
-    w = w + 1e-3 * rng.normal(size=w.shape)
-    exact = transcription.constraints(w, True)[1].toarray()
-    assert exact.shape == jacobian.shape
-    assert not np.any((np.abs(exact) > 1e-12) & ~jacobian)
-    # random states leave hardly anything at zero that can differ from it; the start is a rest at any parameter
-    begun = len(stage.fixed_start_rows)
-    assert np.mean(exact[begun:][jacobian[begun:]] != 0) > 0.95
-    slope = transcription.residual(w, True)[1].toarray()
-    gauss_newton = np.abs(slope.T @ slope) > 0
-    curvature = transcription.constraint_hessian(w, rng.normal(size=len(exact))).toarray()
+    # the program has the equilibrium at the start and the torques' errors besides
     size = kkt_size(stage, [episode.grid.steps])
-    assert (size.variables, size.constraints) == (transcription.n_variables, len(exact))
+    shown = np.setdiff1d(np.arange(program.w.numel()), program.block("rest").index)[: size.variables]
+    rng = np.random.default_rng(0)
+    w = program.initial_guess + 1e-3 * rng.normal(size=len(program.initial_guess))
+    weights = rng.normal(size=program.g.numel())
+    weights[: program.constraint_terms[0].n_values] = 0.0
+    expressions = [program.jac_g, program.jac_r, ca.hessian(ca.dot(ca.DM(weights), program.g), program.w)[0]]
+    values = ca.Function("values", [program.w, program.p], expressions)(w, program.parameter_values)
+    found, slope, curvature = (np.array(value)[:, shown] for value in values)
+    exact, begun = found[program.constraint_terms[0].n_values :], len(stage.fixed_start_rows)
+    assert exact.shape == jacobian[begun:].shape
+    assert not np.any((np.abs(exact) > 1e-12) & ~jacobian[begun:])
+    # random states leave hardly anything at zero that can differ from it; the start is a rest at any parameter
+    assert np.mean(exact[jacobian[begun:]] != 0) > 0.95
+    gauss_newton = np.abs(slope.T @ slope) > 0
+    curvature = curvature[shown]
+    assert (size.variables, size.constraints) == (len(shown), begun + len(exact))
     assert size.jacobian_nonzeros == np.count_nonzero(jacobian)
     assert size.hessian_nonzeros == np.count_nonzero(hessian)
     outside = (np.abs(curvature) > 1e-5 * np.abs(curvature).max()) & ~hessian

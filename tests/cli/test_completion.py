@@ -57,9 +57,9 @@ def test_keys_that_may_be_set(tmp_path):
     assert settable_keys("parameters.", file) == ["parameters.T1.bend.", "parameters.T1.twist."]
     assert "parameters.T1.bend.free=" in settable_keys("parameters.T1.bend.", file)
     assert settable_keys("parameters.") == settable_keys("nothing.") == []
-    assert settable_keys("compare.methods.lif") == ["compare.methods.lifted."]
+    assert settable_keys("compare.methods.multi") == ["compare.methods.multiple_shooting."]
     assert "model.object.links=" in settable_keys("model.object.l", file)
-    assert "compare.methods.lifted.max_iterations=" in settable_keys("compare.methods.lifted.")
+    assert "compare.methods.multiple_shooting.condensing=" in settable_keys("compare.methods.multiple_shooting.")
 
 
 def test_without_the_package_the_command_says_so_and_the_shell_gets_nothing(cli, monkeypatch):

@@ -111,7 +111,8 @@ def test_a_verdict_goes_by_the_relative_standard_deviation(value, std, said):
 
 
 def judged(problem, at=None):
-    return covariance_and_chi2(problem, problem.evaluate(np.zeros(len(problem.start)) if at is None else np.array(at)))
+    x = np.zeros(len(problem.initial_unknowns)) if at is None else np.array(at)
+    return covariance_and_chi2(problem, problem.evaluate(x))
 
 
 def test_the_covariance_is_the_inverse_of_the_information():
@@ -281,7 +282,7 @@ def test_a_misfit_of_one_block_or_of_none_widens_nothing():
         MadeUp(linear(np.ones((3, 1)), [5.0, 5.0, 5.0]), duration=0.2),
         MadeUp(linear(np.zeros((3, 0))), ()),
     ):
-        found = problem.evaluate(np.zeros(len(problem.start)))
+        found = problem.evaluate(np.zeros(len(problem.initial_unknowns)))
         covariance, _ = covariance_and_chi2(problem, found)
         np.testing.assert_array_equal(_misfit_sandwich_covariance(problem, found, covariance), covariance)
 

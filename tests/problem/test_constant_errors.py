@@ -68,7 +68,7 @@ def test_a_stated_constant_is_what_an_offset_of_every_recording_beside_its_prior
     assert found.cost == pytest.approx(other.cost, rel=1e-9)
     for name in free:
         assert found.parameters[name].value == pytest.approx(other.parameters[name].value, rel=1e-3)
-    shot = solve(stated, MultipleShooting(transcription="symbolic", max_iterations=1), restarts=False)
+    shot = solve(stated, MultipleShooting(max_iterations=1), restarts=False)
     assert "without the constant errors" in shot.message
     plain = solve(arm(urdf_folder, 0.0, free, prescribed=tuple(BIAS)), GaussNewton(), restarts=False)
     assert plain.cost > found.cost + 10.0

@@ -13,7 +13,7 @@ from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.inference.smoother_model import linear_residual_models
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.signal_filters import LowPassFilter
-from yid_ocp.solvers import GaussNewton, Lifted, MultipleShooting, SingleShooting, solve
+from yid_ocp.solvers import GaussNewton, MultipleShooting, SingleShooting, solve
 from yid_ocp.solvers.symbolic_transcription import transcribe
 
 NAN = math.nan
@@ -114,7 +114,7 @@ def test_derivatives_and_transcriptions_count_what_is_correlated(urdf_folder, ho
     assert float(solver(**arguments)["f"]) == pytest.approx(evaluation.cost, rel=1e-8)
     if "cutoff" in how:  # what is measured of the efforts says little beside points that are this wrong
         return
-    solvers = [GaussNewton(), SingleShooting(), *([] if how else [MultipleShooting(), Lifted()])]
+    solvers = [GaussNewton(), SingleShooting(), *([] if how else [MultipleShooting(), MultipleShooting(condensing=True)])]
     found = [solve(problem, s, restarts=False) for s in solvers]
     for other in found[1:]:
         assert other.cost == pytest.approx(found[0].cost, rel=1e-6)

@@ -13,8 +13,7 @@ from yid_ocp.data import read_recording
 from yid_ocp.errors import SolverError
 from yid_ocp.integrator.step import compile_step, compile_step_like
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.solvers import GaussNewton, Lifted, MultipleShooting, SingleShooting, Status, SteepestDescent, solve
-from yid_ocp.solvers.compiled_transcription import CompiledTranscription
+from yid_ocp.solvers import GaussNewton, MultipleShooting, SingleShooting, Status, SteepestDescent, solve
 from yid_ocp.solvers.symbolic_transcription import transcribe
 
 FREE = ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twist")
@@ -71,18 +70,23 @@ def test_single_shooting_agrees(short, reference):
     assert solution.cost == pytest.approx(reference.cost, rel=1e-5)
 
 
-@pytest.mark.parametrize(("interval", "hessian"), [(1, "gauss_newton"), (10, "gauss_newton")])
-def test_multiple_shooting_agrees(make_problem, interval, hessian):
-    problem = make_problem(free=("T1.bend", "T2.bend"), duration=0.4 if interval == 1 else 1.0)
+CONDENSED = MultipleShooting(condensing=True)
+
+
+@pytest.mark.parametrize(
+    ("solver", "duration"), [(MultipleShooting(), 0.4), (MultipleShooting(condensing=True, node_interval=10), 1.0)]
+)
+def test_multiple_shooting_agrees(make_problem, solver, duration):
+    problem = make_problem(free=("T1.bend", "T2.bend"), duration=duration)
     single = solve(problem, GaussNewton())
-    solution = solve(problem, MultipleShooting(node_interval=interval, hessian=hessian))
+    solution = solve(problem, solver)
     assert solution.status == Status.CONVERGED, solution.message
     assert within(solution, single)
     assert solution.cost == pytest.approx(single.cost, rel=1e-4)
 
 
-def test_lifted_agrees(short, reference):
-    solution = solve(short, Lifted())
+def test_condensing_agrees(short, reference):
+    solution = solve(short, CONDENSED)
     assert solution.status == Status.CONVERGED, solution.message
     assert within(solution, reference)
 
@@ -98,11 +102,11 @@ def two_arms(paper_systems, clean):
 @pytest.mark.parametrize(
     "solver",
     [
-        Lifted(),
-        pytest.param(MultipleShooting(node_interval=10), marks=pytest.mark.slow),
-        pytest.param(MultipleShooting(node_interval=1), marks=pytest.mark.slow),
+        CONDENSED,
+        pytest.param(MultipleShooting(condensing=True, node_interval=10), marks=pytest.mark.slow),
+        pytest.param(MultipleShooting(), marks=pytest.mark.slow),
     ],
-    ids=["lifted", "node every 10 steps", "node every step"],
+    ids=["node every 20 steps", "node every 10 steps", "node every step"],
 )
 def test_fifty_variables_from_far_away(two_arms, solver):
     """One start is enough, and weakly informed parameters do not keep the methods busy."""
@@ -141,7 +145,7 @@ def test_steepest_descent_with_a_memory_returns_the_best_point(make_problem):
 def test_estimated_start_gives_the_same_optimum_in_both_formulations(make_problem):
     problem = make_problem(free=("T1.bend", "T2.bend"), duration=0.6, initial_state="estimated")
     single = solve(problem, GaussNewton())
-    multiple = solve(problem, MultipleShooting(node_interval=10))
+    multiple = solve(problem, CONDENSED)
     spread = np.sqrt(np.diag(single.covariance))[:2]
     assert np.all(np.abs(single.x[:2] - multiple.x[:2]) <= 0.2 * spread)
 
@@ -152,7 +156,7 @@ def test_bounds_are_respected(one_arm, recording, make_problem):
     narrow = replace(system, parameters=system.parameters.with_bounds({"T1.bend": (0.0, 15.0)}))
     step = compile_step_like(problem.step, narrow)
     problem = EstimationProblem(step, [recording], problem.free, problem.options)
-    for solver in (GaussNewton(), SingleShooting(), MultipleShooting(node_interval=10)):
+    for solver in (GaussNewton(), SingleShooting(), CONDENSED):
         solution = solve(problem, solver)
         assert solution.x[0] <= 15.0 + 1e-9, solver.name
         assert solution.x[0] == pytest.approx(15.0, abs=1e-2), solver.name
@@ -161,8 +165,8 @@ def test_bounds_are_respected(one_arm, recording, make_problem):
 def test_open_loop_is_for_multiple_shooting(make_problem):
     """Without feedback the arm leaves the measured motion; a second of it can be rolled out, three cannot."""
     problem = make_problem(free=("T1.bend", "T2.bend"), feedback="none", duration=1.0)
-    single = GaussNewton(max_iterations=15).minimize_cost(problem, problem.start, None)
-    nodes = MultipleShooting(node_interval=10).minimize_cost(problem, problem.start, None)
+    single = GaussNewton(max_iterations=15).minimize_cost(problem, problem.initial_unknowns, None)
+    nodes = CONDENSED.minimize_cost(problem, problem.initial_unknowns, None)
     assert nodes.status == Status.CONVERGED, nodes.message
     assert nodes.history[-1].cost == pytest.approx(single.history[-1].cost, rel=1e-3)
     assert nodes.x == pytest.approx([22.0, 10.7], rel=0.1)
@@ -173,17 +177,17 @@ def test_open_loop_is_for_multiple_shooting(make_problem):
 def test_limited_memory_is_refused_with_a_reason(short):
     solver = MultipleShooting(ipopt={"hessian_approximation": "limited-memory"})
     with pytest.raises(SolverError, match="limited-memory"):
-        solver.minimize_cost(short, short.start, None)
+        solver.minimize_cost(short, short.initial_unknowns, None)
 
 
 def test_recording_shorter_than_a_node_interval(short):
     with pytest.raises(SolverError, match="fewer than one node interval"):
-        MultipleShooting(node_interval=1000).minimize_cost(short, short.start, None)
+        MultipleShooting(condensing=True, node_interval=1000).minimize_cost(short, short.initial_unknowns, None)
 
 
 def test_iteration_limit_is_a_status_with_the_best_point(make_problem):
     problem = make_problem(free=SEEN, duration=0.4)
-    few = (MultipleShooting(node_interval=10, max_iterations=2), MultipleShooting(max_iterations=2))
+    few = (MultipleShooting(condensing=True, max_iterations=2), MultipleShooting(max_iterations=2))
     for solver in (GaussNewton(max_iterations=1), *few):
         solution = solve(problem, solver)
         assert solution.status == Status.ITERATION_LIMIT
@@ -191,34 +195,18 @@ def test_iteration_limit_is_a_status_with_the_best_point(make_problem):
         assert "iterations" in solution.message
 
 
-def test_trial_points_that_cannot_be_worked_out_are_told_in_the_status_and_not_on_stderr(short, monkeypatch, capfd):
-    plain = CompiledTranscription.constraints
-
-    def broken(self, w, derivatives):
-        value, jacobian = plain(self, w, derivatives)
-        return (value if derivatives else value * np.nan), jacobian
-
-    monkeypatch.setattr(CompiledTranscription, "constraints", broken)
-    found = MultipleShooting(node_interval=10, max_iterations=3).minimize_cost(short, short.start, None)
-    assert found.status == Status.STALLED
-    assert "trial points could not be worked out" in found.message
-    assert capfd.readouterr() == ("", "")
-
-
-def test_eliminated_steps_are_for_the_compiled_form(short):
-    with pytest.raises(SolverError, match="node_interval = 10 with the symbolic transcription"):
-        MultipleShooting(node_interval=10, transcription="symbolic").minimize_cost(short, short.start, None)
-    with pytest.raises(SolverError, match="transcription = 'callback'"):
-        MultipleShooting(transcription="callback").minimize_cost(short, short.start, None)
+def test_steps_between_nodes_are_eliminated_by_condensing_alone(short):
+    with pytest.raises(SolverError, match="node_interval = 10 without condensing"):
+        MultipleShooting(node_interval=10).minimize_cost(short, short.initial_unknowns, None)
 
 
 def test_more_memory_than_there_is_ends_with_a_status(make_problem, monkeypatch, caplog):
     problem = make_problem(free=("T1.bend",), duration=0.1)
     monkeypatch.setattr("yid_ocp.solvers.multiple_shooting.available_memory", lambda: 1e6)
     with caplog.at_level("INFO"):
-        found = MultipleShooting().minimize_cost(problem, problem.start, None)
+        found = MultipleShooting().minimize_cost(problem, problem.initial_unknowns, None)
     assert found.status == Status.FAILED
-    assert found.x == pytest.approx(problem.start)
+    assert found.x == pytest.approx(problem.initial_unknowns)
     assert "of memory, of which 0.001 GB are free" in found.message
     assert "IPOPT on 1023 unknowns, 1022 equations" in caplog.text
 
@@ -231,7 +219,7 @@ def test_a_program_that_ipopt_cannot_begin_is_a_status_and_silent(make_problem, 
         return program.with_user_terms(ca.log(program["theta"][0] - 100.0))
 
     monkeypatch.setattr("yid_ocp.solvers.multiple_shooting.transcribe", lost)
-    found = MultipleShooting(max_iterations=3).minimize_cost(problem, problem.start, None)
+    found = MultipleShooting(max_iterations=3).minimize_cost(problem, problem.initial_unknowns, None)
     assert found.status in (Status.STALLED, Status.FAILED)
     assert "IPOPT: Invalid_Number_Detected" in found.message
     assert np.all(np.isfinite(found.x))

@@ -49,7 +49,8 @@ def cable():
         )
 
     true = problem(TRUTH, np.zeros((STEPS + 1, 3, 3)))
-    exact = true.evaluate(true.start, derivatives=False).episodes[0].predicted[0].reshape(STEPS + 1, 3, 3)
+    [prediction] = true.evaluate(true.initial_unknowns, derivatives=False).episode_predictions
+    exact = prediction.predicted_outputs[0].reshape(STEPS + 1, 3, 3)
     measured = exact + STD * rng.standard_normal(exact.shape)
     return lambda start: problem(dict.fromkeys(TRUTH, start), measured)
 
@@ -57,7 +58,7 @@ def cable():
 @pytest.mark.parametrize("start", [4.5e-4, 1.5e-2, 7.5e-2])
 def test_stiffnesses_are_found_from_starts_far_below_and_above(cable, start):
     problem = cable(start)
-    outcome = GaussNewton().minimize_cost(problem, problem.start, None)
+    outcome = GaussNewton().minimize_cost(problem, problem.initial_unknowns, None)
     assert outcome.status == Status.CONVERGED
     found = problem.evaluate(outcome.x)
     assert found.cost < 0.6 * len(found.residual), "the noise's half a unit for each of the samples"
@@ -78,7 +79,7 @@ def test_what_is_found_is_true_and_what_the_tips_hardly_see_is_not_called_found(
 
 def test_from_next_to_zero_a_search_comes_back(cable):
     problem = cable(4.5e-4)
-    x = problem.start
+    x = problem.initial_unknowns
     x[1] *= 1e-7
     outcome = GaussNewton().minimize_cost(problem, x, None)
     assert outcome.status == Status.CONVERGED

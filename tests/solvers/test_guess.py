@@ -35,11 +35,10 @@ def nodes_of(problem):
 def test_larger_parameters_are_tried_until_states_fit(problem, misfits, taken, tried):
     told = []
 
-    def misfit(i, state, pull, x):
+    def misfit(i, state, x):
         factor = float(x[0] / START[0])
         np.testing.assert_allclose(x, factor * START)
         assert state.shape == (11, problem.step.sizes["nx"])
-        assert pull.shape == (10, problem.step.sizes["m"])
         told.append(factor)
         return misfits[factor]
 
@@ -53,12 +52,12 @@ def test_larger_parameters_are_tried_until_states_fit(problem, misfits, taken, t
 def test_what_fits_is_the_rollout_and_what_does_not_is_rest_where_the_arm_was(problem):
     nodes, episode = nodes_of(problem), problem.episodes[0]
     driven = list(problem.system.driven_indices)
-    rolled = problem.evaluate(START).episodes[0].rollout
-    found = guess_node_states(problem, nodes, START, lambda i, state, pull, x: 1.0)
+    rolled = problem.evaluate(START).episode_predictions[0].rollout
+    found = guess_node_states(problem, nodes, START, lambda i, state, x: 1.0)
     np.testing.assert_allclose(found.node_states[0], rolled.state, atol=1e-9)
     np.testing.assert_allclose(found.multipliers[0], rolled.multipliers, atol=1e-9)
 
-    def strays(i, state, pull, x):
+    def strays(i, state, x):
         return 1e3 * np.abs(state[:, driven] - episode.measured_driven_angles).max() + 20.0
 
     found = guess_node_states(problem, nodes, START, strays)
@@ -73,7 +72,7 @@ def test_bounds_hold_larger_parameters_back(one_arm, recording):
     problem = EstimationProblem(step, [recording], ("T1.bend", "T2.bend"), ProblemOptions(duration=0.1))
     told = []
 
-    def misfit(i, state, pull, x):
+    def misfit(i, state, x):
         told.append(x.tolist())
         return 1e3
 

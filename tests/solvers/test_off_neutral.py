@@ -48,7 +48,7 @@ def moved(urdf_folder):
 @pytest.mark.parametrize(("stiffness", "rest_angle"), [(8.0, 1.8), (8.0, -1.5), (25.0, 0.3)])
 def test_a_spring_relaxed_elsewhere_is_found_from_its_neutral_value(moved, stiffness, rest_angle):
     problem = moved("joint_spring", {"stiffness": stiffness, "rest_angle": rest_angle}, ("stiffness", "rest_angle"))
-    assert problem.start[1] == 0.0
+    assert problem.initial_unknowns[1] == 0.0
     solution = solve(problem, GaussNewton())
     assert solution.status == Status.CONVERGED
     for name, truth in (("stiffness", stiffness), ("rest_angle", rest_angle)):
@@ -60,7 +60,7 @@ def test_a_spring_relaxed_elsewhere_is_found_from_its_neutral_value(moved, stiff
 def test_from_its_neutral_value_a_spring_that_would_have_to_push_stays_at_zero(moved):
     """What the start off neutral is for: relaxed at zero, the spring would need a stiffness below zero."""
     problem = moved("joint_spring", {"stiffness": 8.0, "rest_angle": 1.8}, ("stiffness", "rest_angle"))
-    held = GaussNewton().minimize_cost(problem, problem.start, None)
+    held = GaussNewton().minimize_cost(problem, problem.initial_unknowns, None)
     assert held.x[1] == 0.0
 
 
@@ -74,25 +74,25 @@ def test_a_spring_that_is_not_there_is_found_to_be_none(moved):
 
 def test_an_amplitude_seen_at_its_neutral_value_begins_there(moved):
     problem = moved("joint_viscous", {"b": 0.3}, ("b",))
-    np.testing.assert_array_equal(initialize_free_effects(problem, problem.start), problem.start)
+    np.testing.assert_array_equal(initialize_free_effects(problem, problem.initial_unknowns), problem.initial_unknowns)
     fixed = moved("joint_spring", {"stiffness": 8.0, "rest_angle": 1.4}, ())
-    np.testing.assert_array_equal(initialize_free_effects(fixed, fixed.start), fixed.start)
+    np.testing.assert_array_equal(initialize_free_effects(fixed, fixed.initial_unknowns), fixed.initial_unknowns)
 
 
 def test_an_effect_that_was_given_a_value_begins_there(moved):
     problem = moved("joint_spring", {"stiffness": 8.0, "rest_angle": 1.4}, ("stiffness", "rest_angle"))
     begun = problem.at({"joint_spring@elbow.stiffness": 2.0})
-    np.testing.assert_array_equal(initialize_free_effects(begun, begun.start), begun.start)
+    np.testing.assert_array_equal(initialize_free_effects(begun, begun.initial_unknowns), begun.initial_unknowns)
 
 
 def test_a_start_that_cannot_be_rolled_out_is_drawn_back(moved, monkeypatch):
     problem = moved("joint_spring", {"stiffness": 8.0, "rest_angle": 1.4}, ("stiffness", "rest_angle"))
-    whole, plain = initialize_free_effects(problem, problem.start), problem.evaluate
+    whole, plain = initialize_free_effects(problem, problem.initial_unknowns), problem.evaluate
 
     def stiff(x, derivatives=True, warm=None):
         found = plain(x, derivatives, warm)
         return found if x[1] < 0.6 * whole[1] else type(found)(np.inf, found.residual, None, False, "it snaps", ())
 
     monkeypatch.setattr(problem, "evaluate", stiff)
-    drawn = initialize_free_effects(problem, problem.start)
+    drawn = initialize_free_effects(problem, problem.initial_unknowns)
     assert drawn[1] == pytest.approx(0.5 * whole[1])

@@ -237,11 +237,11 @@ class Disturbed(MadeUp):
 
     def __init__(self, *arguments, asked=None, **more):
         super().__init__(*arguments, **more)
-        self.disturbed, self.frozen = True, [] if asked is None else asked
+        self.has_process_noise, self.frozen = True, [] if asked is None else asked
 
-    def weighted_at(self, x, warm=None):
+    def whitened_at(self, x, warm=None):
         self.frozen.append((np.asarray(x).tolist(), warm))
-        made = Disturbed(self._rows, self.start, asked=self.frozen)
+        made = Disturbed(self._rows, self.initial_unknowns, asked=self.frozen)
         made.frozen_at = np.asarray(x).tolist()
         return made
 
@@ -249,7 +249,7 @@ class Disturbed(MadeUp):
 class Carrying(Steps):
     """A method that weighs residuals by noise that drives the motion."""
 
-    carries_covariance = True
+    uses_process_noise_covariance = True
 
 
 def test_passes_begin_where_the_last_one_ended_and_end_when_one_changes_nothing():
@@ -334,7 +334,7 @@ def test_without_noise_that_drives_the_motion_there_is_one_pass():
 
 def test_a_recording_that_its_torques_as_they_are_cannot_follow_has_the_reason_in_place_of_a_prediction():
     """Weights are about smoothed torques, which may be followed where the recorded ones are not."""
-    smoothed = SimpleNamespace(ok=True, warm="warm", episodes=("smoothed a", "smoothed b"))
+    smoothed = SimpleNamespace(ok=True, equilibrium_guesses="warm", episode_predictions=("smoothed a", "smoothed b"))
 
     def run(episode, theta, offset, derivatives):
         assert (theta, offset, derivatives) == (f"theta {episode}", "offset", False)
@@ -343,11 +343,13 @@ def test_a_recording_that_its_torques_as_they_are_cannot_follow_has_the_reason_i
     def known(ok):
         plain = SimpleNamespace(
             episodes=("a", "b"),
-            predictor=SimpleNamespace(run=run),
+            predictor=SimpleNamespace(predict_episode=run),
             split=lambda x, i: (f"theta {'ab'[i]}", "offset"),
-            evaluate=lambda x, derivatives, warm: SimpleNamespace(ok=ok, episodes=("plain a", "plain b") if ok else ()),
+            evaluate=lambda x, derivatives, warm: SimpleNamespace(
+                ok=ok, episode_predictions=("plain a", "plain b") if ok else ()
+            ),
         )
-        return SimpleNamespace(disturbed=True, weighted_by_sensors=lambda: plain)
+        return SimpleNamespace(has_process_noise=True, whitened_by_sensor_noise=lambda: plain)
 
     fitted = solve(MadeUp(misfit(lambda x: 1.0)), Steps())
     assert replace(fitted, evaluation=smoothed, problem=known(True)).episode_predictions == ("plain a", "plain b")
@@ -355,6 +357,6 @@ def test_a_recording_that_its_torques_as_they_are_cannot_follow_has_the_reason_i
         {"episode": "a"},
         "b falls",
     )
-    calm = SimpleNamespace(disturbed=False)
+    calm = SimpleNamespace(has_process_noise=False)
     assert replace(fitted, evaluation=smoothed, problem=calm).episode_predictions == ("smoothed a", "smoothed b")
     assert replace(fitted, evaluation=None, problem=calm).episode_predictions == ()

@@ -133,10 +133,10 @@ def test_a_horizon_too_short_for_a_filter_is_left_out():
 
 def test_another_start_that_cannot_even_begin_loses_nothing():
     class Fragile(Steps):
-        def run(self, problem, start, callback):
+        def minimize_cost(self, problem, start, callback):
             if start[0] > 3.0:
                 raise SolverError("no transcription from here")
-            return super().run(problem, start, callback)
+            return super().minimize_cost(problem, start, callback)
 
     problem = MadeUp(lambda x, duration: (9.0 * (-1.0) ** np.arange(10), np.ones((10, 1))))
     solution = solve(problem, Fragile())

@@ -280,9 +280,6 @@ problem:
     "solver, name: gauss_newton": """\
 solver: {name: gauss_newton, max_iterations: 100}
 """,
-    "solver, name: lifted": """\
-solver: {name: lifted, node_interval: 10}
-""",
     "solver, name: multiple_shooting": """\
 solver: {name: multiple_shooting, hessian: exact, ipopt: {max_cpu_time: 600}}
 """,
@@ -296,7 +293,7 @@ solver: {name: steepest_descent, first_trial_step: spectral, nonmonotone_memory:
 compare:
   methods:
     gauss_newton: {}
-    multiple_shooting: {node_interval: 20}
+    multiple_shooting: {condensing: true}
 """,
     "diagnosis": """\
 diagnosis:

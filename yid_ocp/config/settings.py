@@ -26,7 +26,7 @@ from yid_ocp.model.servos_and_springs import CommandInterpolation
 from yid_ocp.options import OptionInfo, RegistryChoice, dataclass_options, split_annotated
 from yid_ocp.planning.options import PlanOptions
 from yid_ocp.problem.options import ProblemOptions, SensorOptions
-from yid_ocp.solvers import SOLVERS, GaussNewton, Lifted, MultipleShooting, SingleShooting, SteepestDescent
+from yid_ocp.solvers import SOLVERS, GaussNewton, MultipleShooting, SingleShooting, SteepestDescent
 from yid_ocp.solvers.base import Solver
 from yid_ocp.vision.options import TrackOptions
 from yid_ocp.vision.surface_meshes import ExtraMesh
@@ -397,7 +397,6 @@ def _compared() -> dict[str, Solver]:
         "single_shooting": SingleShooting(),
         "gauss_newton": GaussNewton(),
         "multiple_shooting": MultipleShooting(),
-        "lifted": Lifted(),
     }
 
 

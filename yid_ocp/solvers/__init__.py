@@ -6,7 +6,6 @@ from yid_ocp.solvers.base import Solution as Solution
 from yid_ocp.solvers.base import Status as Status
 from yid_ocp.solvers.base import solve as solve
 from yid_ocp.solvers.gauss_newton import GaussNewton as GaussNewton
-from yid_ocp.solvers.lifted import Lifted as Lifted
 from yid_ocp.solvers.multiple_shooting import MultipleShooting as MultipleShooting
 from yid_ocp.solvers.single_shooting import SingleShooting as SingleShooting
 from yid_ocp.solvers.steepest_descent import SteepestDescent as SteepestDescent

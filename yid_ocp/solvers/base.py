@@ -196,8 +196,8 @@ IterationCallback = Callable[[Iterate], None]
 class SolverResult:
     """Raw result of a solver: best unknown vector, termination status, message and history.
 
-    `equilibrium_guesses` holds guesses of the equilibria at the best point, where known. `stopped_at_noise_level` tells that the search ended
-    because many steps reduced the cost negligibly compared with the noise.
+    `equilibrium_guesses` are those at the best point, where known. `stopped_at_noise_level`: the search ended because
+    many steps reduced the cost negligibly compared with the noise.
     """
 
     status: Status
@@ -262,13 +262,9 @@ _LOOSE_RELATIVE_STD, _COLLAPSED_FRACTION = 0.1, 0.02
 _NEARBY_START_FACTORS = (1.25, 1.6)
 # A branch that is seen a few times a second has the phase of several frequencies: what is known worse than this part of
 # its value may have other valleys. It is moved by these factors, the others as the fit's covariance says, and where the
-# cost then rises by less than this part of what the fit predicts, the search goes on from there.
-_MIN_SCANNED_RELATIVE_STD, _SCAN_FACTORS, _MAX_COST_RISE_RATIO, _MAX_LOCAL_MINIMUM_STARTS = (
-    0.03,
-    (1 / 2.5, 1 / 1.6, 1.6, 2.5),
-    0.2,
-    2,
-)
+# cost then rises by less than this part of what the fit predicts, the search goes on from there, twice at most.
+_MIN_SCANNED_RELATIVE_STD, _MAX_COST_RISE_RATIO, _MAX_LOCAL_MINIMUM_STARTS = 0.03, 0.2, 2
+_SCAN_FACTORS = (1 / 2.5, 1 / 1.6, 1.6, 2.5)
 # Noise that drives the motion is linearised where a pass begins; passes end when one changes nothing.
 _MAX_WHITENING_PASSES = 6
 _STALLED_REMEDY = "start nearer, widen the bounds, or use gauss_newton"
@@ -284,10 +280,10 @@ def solve(
 ) -> Solution:
     """Solve an estimation problem and return estimates with uncertainty and verdicts.
 
-    Free effects begin off their neutral value (`initialize_free_effects`) unless a start is given. Where the rollout fails at the
-    start (a soft object snaps, an arm falls), the problem is first solved over its first seconds only, and then over
-    longer and longer horizons. A poor fit is started again from other initial values. Where noise drives the motion,
-    methods that can weigh residuals by it do so in several passes, its covariance frozen in each
+    Free effects begin off their neutral value (`initialize_free_effects`) unless a start is given. Where the rollout
+    fails at the start (a soft object snaps, an arm falls), the problem is first solved over its first seconds only, and
+    then over longer and longer horizons. A poor fit is started again from other initial values. Where noise drives the
+    motion, methods that can weigh residuals by it do so in several passes, its covariance frozen in each
     (`whitened_at`); the answer of one that has its errors as unknowns is judged in the same way.
 
     Parameters
@@ -299,7 +295,7 @@ def solve(
         Initial unknown vector; the problem's when absent.
     callback : callable, optional
         Called with every `Iterate`.
-    limits : GapLimits, optional
+    limits : GapCriteria, optional
         Criteria for a residual that exceeds noise.
     restarts : bool
         Whether a poor fit is started again from other initial values.
@@ -311,142 +307,147 @@ def solve(
     """
     # the matrices are small: threads of the linear algebra library cost more than they give
     with threadpoolctl.threadpool_limits(1):
-        return _solved(
-            problem,
-            solver or SOLVERS[_DEFAULT_SOLVER](),
-            initial_unknowns,
-            callback,
-            limits,
-            RESTART_FACTORS if restarts else (),
-        )
+        if initial_unknowns is None:
+            start = initialize_free_effects(problem, problem.initial_unknowns)
+        else:
+            start = np.clip(np.asarray(initial_unknowns, float), *problem.bounds)
+        search = _MultiStartSearch(problem, solver or SOLVERS[_DEFAULT_SOLVER](), callback, start)
+        if restarts:
+            search.restart(start, limits)
+        return search.solution(limits)
 
 
-def _solved(
-    problem: EstimationProblem,
-    solver: Solver,
-    start: Sequence[float] | None,
-    callback: IterationCallback | None,
-    limits: GapCriteria,
-    restarts: Sequence[float],
-) -> Solution:
-    begun = time.perf_counter()
-    lower, upper = problem.bounds
-    first = (
-        initialize_free_effects(problem, problem.initial_unknowns)
-        if start is None
-        else np.clip(np.asarray(start, float), lower, upper)
-    )
-    best, evaluations, history = _attempt(problem, solver, first, callback)
-    tried = number = 1
+@dataclass(frozen=True)
+class _Fit:
+    """End of one run of a solver, evaluated, and the problem as it was weighted."""
 
-    def try_from(x: Array, what: str, most: int) -> None:
-        nonlocal best, evaluations, tried, number
-        number += 1
-        note = f"start {number} of at most {most}: {what}"
+    result: SolverResult
+    evaluation: Evaluation
+    weighted: EstimationProblem
+
+
+class _MultiStartSearch:
+    """Fits from several starts, of which the best is kept."""
+
+    def __init__(
+        self, problem: EstimationProblem, solver: Solver, callback: IterationCallback | None, start: Array
+    ) -> None:
+        self._problem, self._solver, self._callback = problem, solver, callback
+        self._begun = time.perf_counter()
+        self._best, self._n_evaluations, self._history = _fit_from(problem, solver, start, callback)
+        self._n_fits = self._n_starts = 1
+
+    def restart(self, first: Array, limits: GapCriteria) -> None:
+        """Try other starts as far as the best fit so far gives reason to."""
+        problem, noisy = self._problem, self._problem.has_process_noise
+        for factor in RESTART_FACTORS:
+            if _good_fit(problem, self._best.evaluation):
+                break
+            self._try(self._multiple(first, factor), f"initial values x {factor:g}", 1 + len(RESTART_FACTORS))
+        once = self._n_fits == 1 and noisy and _accounts_for_process_noise(self._solver)
+        if once and np.any(_doubtful(self._best, first)):
+            factor = RESTART_FACTORS[0]
+            self._try(self._multiple(first, factor), f"initial values x {factor:g}", 2)
+        if not uses_process_noise_covariance(self._solver):
+            return
+        most = self._n_starts + len(_NEARBY_START_FACTORS)
+        for factor in _NEARBY_START_FACTORS if noisy else ():
+            best = self._best
+            if not best.evaluation.ok or assess_goodness_of_fit(best.weighted, best.evaluation, limits).explains:
+                break
+            self._try(self._multiple(best.result.x, factor), f"best fit x {factor:g}", most)
+        valleys = _other_valleys(self._best)
+        most = self._n_starts + len(valleys)
+        for near in valleys:
+            self._try(near, "another valley", most)
+
+    def _multiple(self, x: Array, factor: float) -> Array:
+        return np.where(self._problem.is_positive, np.clip(x * factor, *self._problem.bounds), x)
+
+    def _try(self, x: Array, what: str, most: int) -> None:
+        self._n_starts += 1
+        note = f"start {self._n_starts} of at most {most}: {what}"
         log.info("starting again: %s", note)
         try:
-            again, more, steps = _attempt(problem, solver, x, _noting(callback, note))
+            again, more, steps = _fit_from(self._problem, self._solver, x, _noting(self._callback, note))
         except YidError as error:
             # another start is a chance, never a reason to lose what is there
             log.info("no fit from there: %s", error)
             return
-        tried, evaluations = tried + 1, evaluations + more
-        history.extend(replace(entry, note=note) for entry in steps)
-        if again[1].cost < best[1].cost:
-            best = again
+        self._n_fits, self._n_evaluations = self._n_fits + 1, self._n_evaluations + more
+        self._history.extend(replace(entry, note=note) for entry in steps)
+        if again.evaluation.cost < self._best.evaluation.cost:
+            self._best = again
 
-    for factor in restarts:
-        if _good_fit(problem, best[1]):
-            break
-        moved = np.where(problem.is_positive, np.clip(first * factor, lower, upper), first)
-        try_from(moved, f"initial values x {factor:g}", 1 + len(restarts))
-    once = tried == 1 and restarts and problem.has_process_noise and _accounts_for_process_noise(solver)
-    if once and np.any(_doubtful(best[2], best[1], best[0].x, first)):
-        factor = RESTART_FACTORS[0]
-        moved = np.where(problem.is_positive, np.clip(first * factor, lower, upper), first)
-        try_from(moved, f"initial values x {factor:g}", 2)
-    most = number + len(_NEARBY_START_FACTORS)
-    for factor in (
-        _NEARBY_START_FACTORS
-        if restarts and problem.has_process_noise and uses_process_noise_covariance(solver)
-        else ()
-    ):
-        outcome, finish, weighted = best
-        if not finish.ok or assess_goodness_of_fit(weighted, finish, limits).explains:
-            break
-        near = np.where(problem.is_positive, np.clip(outcome.x * factor, lower, upper), outcome.x)
-        try_from(near, f"best fit x {factor:g}", most)
-    looks = restarts and uses_process_noise_covariance(solver)
-    valleys = _other_valleys(best[2], best[1], best[0].x) if looks else []
-    most = number + len(valleys)
-    for near in valleys:
-        try_from(near, "another valley", most)
-    outcome, finish, weighted = best
-    if problem.has_process_noise and not _accounts_for_process_noise(solver):
-        remark = "; weighted by the sensors' noise alone, without the noise that drives the motion"
-        outcome = replace(outcome, message=outcome.message + remark)
-    if not getattr(solver, "needs_rollout", True) and any(e.has_constant_sensor_errors for e in problem.episodes):
-        remark = "; weighted without the constant errors that measured efforts may have"
-        outcome = replace(outcome, message=outcome.message + remark)
-    problem = weighted
-    fit = assess_goodness_of_fit(problem, finish, limits)
-    covariance = covariance_of_fit(problem, finish, fit)
-    status, message = outcome.status, outcome.message
-    if not finish.ok:
-        status, message = Status.FAILED, finish.message
-    elif status == Status.CONVERGED and not (
-        outcome.stopped_at_noise_level or is_stationary(problem, outcome.x, finish)
-    ):
-        status = Status.STALLED
-        message = f"the search stopped where a further step would lower the cost ({message}); {_STALLED_REMEDY}"
-    elif tried > 1:
-        message += f" (best of {tried} starts)"
-    return Solution(
-        status,
-        message,
-        problem.unknown_names,
-        outcome.x,
-        covariance,
-        parameter_estimates(problem, outcome.x, finish, covariance, fit),
-        finish.cost,
-        fit,
-        tuple(history),
-        max(len(history) - 1, 0),
-        evaluations,
-        time.perf_counter() - begun,
-        finish if finish.ok else None,
-        solver.name,
-        problem,
-    )
+    def solution(self, limits: GapCriteria) -> Solution:
+        """Solution of the best fit, with its uncertainty."""
+        result, finish, problem = self._best.result, self._best.evaluation, self._best.weighted
+        fit = assess_goodness_of_fit(problem, finish, limits)
+        covariance = covariance_of_fit(problem, finish, fit)
+        status, message = self._status_and_message()
+        return Solution(
+            status,
+            message,
+            problem.unknown_names,
+            result.x,
+            covariance,
+            parameter_estimates(problem, result.x, finish, covariance, fit),
+            finish.cost,
+            fit,
+            tuple(self._history),
+            max(len(self._history) - 1, 0),
+            self._n_evaluations,
+            time.perf_counter() - self._begun,
+            finish if finish.ok else None,
+            self._solver.name,
+            problem,
+        )
+
+    def _status_and_message(self) -> tuple[Status, str]:
+        result, finish, solver = self._best.result, self._best.evaluation, self._solver
+        status, message = result.status, result.message
+        if self._problem.has_process_noise and not _accounts_for_process_noise(solver):
+            message += "; weighted by the sensors' noise alone, without the noise that drives the motion"
+        constant = any(episode.has_constant_sensor_errors for episode in self._problem.episodes)
+        if constant and not getattr(solver, "needs_rollout", True):
+            message += "; weighted without the constant errors that measured efforts may have"
+        if not finish.ok:
+            return Status.FAILED, finish.message
+        ended = result.stopped_at_noise_level or is_stationary(self._best.weighted, result.x, finish)
+        if status == Status.CONVERGED and not ended:
+            stopped = f"the search stopped where a further step would lower the cost ({message})"
+            return Status.STALLED, f"{stopped}; {_STALLED_REMEDY}"
+        return status, message + (f" (best of {self._n_fits} starts)" if self._n_fits > 1 else "")
 
 
 def _noting(callback: IterationCallback | None, note: str) -> IterationCallback | None:
     """The callback for a part of the search, whose points say which part it is."""
-    if callback is None:
-        return None
+    if callback is None or not note:
+        return callback
     return lambda entry: callback(replace(entry, note=", ".join(filter(None, (note, entry.note)))))
 
 
-def _attempt(
+def _fit_from(
     problem: EstimationProblem, solver: Solver, x: Array, callback: IterationCallback | None
-) -> tuple[tuple[SolverResult, Evaluation, EstimationProblem], int, list[Iterate]]:
-    """One run from one start, by shorter horizons where the rollout fails there, and the problem as it was weighted."""
+) -> tuple[_Fit, int, list[Iterate]]:
+    """Fit, number of evaluations and history of one start, by shorter horizons where the rollout fails there."""
     history: list[Iterate] = []
     evaluations = 0
     if getattr(solver, "needs_rollout", True) and not problem.evaluate(x, derivatives=False).ok:
         longest = max(episode.grid.steps for episode in problem.episodes) * problem.step.time_step
         for fraction in _HORIZON_FRACTIONS:
+            note = f"first {fraction * longest:.3g} s"
             try:
                 shorter = problem.truncated_to(fraction * longest)
                 if not shorter.evaluate(x, derivatives=False).ok:
                     continue
-                part = solver.minimize_cost(shorter, x, _noting(callback, f"first {fraction * longest:.3g} s"))
+                part = solver.minimize_cost(shorter, x, _noting(callback, note))
             except YidError as error:
                 # so short a piece may hold too little for a filter or a node, or nothing to compare with
-                log.info("the first %.3g s are left out: %s", fraction * longest, error)
+                log.info("the %s are left out: %s", note, error)
                 continue
             x, evaluations = part.x, evaluations + part.n_evaluations
-            history += [replace(entry, note=f"first {fraction * longest:.3g} s") for entry in part.history]
+            history += [replace(entry, note=note) for entry in part.history]
             if problem.evaluate(x, derivatives=False).ok:
                 break
     passes = _MAX_WHITENING_PASSES if problem.has_process_noise and uses_process_noise_covariance(solver) else 1
@@ -454,33 +455,31 @@ def _attempt(
     for number in range(passes):
         weighted = whitened_at(weighted, x, warm) if passes > 1 else problem
         which = f"pass {number + 1} of at most {passes}" if passes > 1 else ""
-        outcome = solver.minimize_cost(weighted, x, _noting(callback, which) if which else callback)
-        x, warm, evaluations = outcome.x, outcome.equilibrium_guesses, evaluations + outcome.n_evaluations
-        history += outcome.history
+        result = solver.minimize_cost(weighted, x, _noting(callback, which))
+        x, warm, evaluations = result.x, result.equilibrium_guesses, evaluations + result.n_evaluations
+        history += result.history
         # the second pass is the first about torque offsets that are not guessed
-        if number and len(outcome.history) < 2:
+        if number and len(result.history) < 2:
             break
     if problem.has_process_noise and passes == 1 and _accounts_for_process_noise(solver):
         # it had the errors themselves as unknowns; what is judged is their likelihood about its answer
         weighted = whitened_at(problem, x, warm, rounds=2)
-    return (
-        (outcome, weighted.evaluate(outcome.x, equilibrium_guesses=outcome.equilibrium_guesses), weighted),
-        evaluations,
-        history,
-    )
+    return _Fit(result, weighted.evaluate(x, equilibrium_guesses=warm), weighted), evaluations, history
 
 
-def _doubtful(problem: EstimationProblem, finish: Evaluation, x: Array, first: Array) -> NDArray[np.bool_]:
+def _doubtful(fit: _Fit, first: Array) -> NDArray[np.bool_]:
     """Positive unknowns that the data inform, but loosely, and those that have all but vanished."""
-    if not finish.ok or finish.jacobian is None:
+    x = fit.result.x
+    if not fit.evaluation.ok or fit.evaluation.jacobian is None:
         return np.zeros(len(x), bool)
-    std = np.sqrt(np.maximum(np.diag(covariance_and_chi2(problem, finish)[0]), 0.0))
+    std = np.sqrt(np.maximum(np.diag(covariance_and_chi2(fit.weighted, fit.evaluation)[0]), 0.0))
     loose = (std > _LOOSE_RELATIVE_STD * np.abs(x)) & (std < 100 * np.abs(first))
-    return problem.is_positive & (loose | (x < _COLLAPSED_FRACTION * first))
+    return fit.weighted.is_positive & (loose | (x < _COLLAPSED_FRACTION * first))
 
 
-def _other_valleys(problem: EstimationProblem, finish: Evaluation, x: Array) -> list[Array]:
+def _other_valleys(fit: _Fit) -> list[Array]:
     """Starts from which a loosely known unknown may go to another value than the one found, the likeliest first."""
+    problem, finish, x = fit.weighted, fit.evaluation, fit.result.x
     if not finish.ok or finish.jacobian is None or not problem.has_process_noise:
         return []
     covariance, _ = covariance_and_chi2(problem, finish)
@@ -514,9 +513,9 @@ def _accounts_for_process_noise(solver: Solver) -> bool:
 
 def _good_fit(problem: EstimationProblem, finish: Evaluation) -> bool:
     """Whether a fit needs no other start: good, or with a cost that says nothing of noise."""
-    if problem.options.weighting == "paper":
+    if problem.options.weighting == "paper" or not finish.ok:
         return finish.ok
-    return finish.ok and covariance_and_chi2(problem, finish)[1] < _POOR_CHI2_PER_DOF
+    return covariance_and_chi2(problem, finish)[1] < _POOR_CHI2_PER_DOF
 
 
 def projected_gradient_norm(x: Array, gradient: Array, lower: Array, upper: Array, scale: Array) -> float:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +18,13 @@ from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.signal_filters import LowPassFilter
 
 Array = NDArray[np.float64]
-_MisfitFunction = Callable[[int, Array, Array, Array], float]
-"""Mean square whitened residual of one recording: which, node states, multipliers, unknowns of the problem."""
+
+
+class _MisfitFunction(Protocol):
+    """Mean square whitened residual of recording `i` with given node states, at unknowns `x` of the problem."""
+
+    def __call__(self, i: int, nodes: Array, x: Array) -> float: ...
+
 
 # Mean square whitened residual above which another guess of the node states is tried.
 _POOR_GUESS_CHI2 = 10.0
@@ -73,9 +80,7 @@ def guess_node_states(
             theta = problem.predictor.episode_theta(episode, problem.split(moved, i)[0])
             begins.append(problem.initial_state(episode, theta))
 
-            def judged(state: Array, pull: Array, i: int = i, moved: Array = moved) -> float:
-                return misfit(i, state, pull, moved)
-
+            judged = partial(misfit, i, x=moved)
             size, state, pull = _node_states(problem, episode, nodes[i], theta, begins[-1], judged)
             states.append(state)
             multipliers.append(pull)
@@ -88,23 +93,34 @@ def guess_node_states(
     return best[1]
 
 
+def mean_square_residual(problem: EstimationProblem, i: int, trajectory: Array, theta: Array) -> float:
+    """Mean square whitened residual of a trajectory (N + 1, nx) of recording `i`, without effort channels."""
+    slopes = np.zeros((*trajectory.shape, len(problem.unknowns.free_parameters)))
+    parts = [np.zeros(1)]
+    for samples in problem.episodes[i].measurements:
+        if not samples.sensor.effort_joints:
+            predicted, _ = problem.predictor.readings_along_trajectory(samples, trajectory, slopes, theta)
+            parts.append(samples.residual_block(predicted, threshold=problem.options.huber_threshold).residual)
+    return float(np.mean(np.concatenate(parts) ** 2))
+
+
 def _node_states(
     problem: EstimationProblem,
     episode: Episode,
     nodes: NDArray[np.int64],
     theta: Array,
     begin: InitialState,
-    misfit: Callable[[Array, Array], float],
+    misfit: Callable[[Array], float],
 ) -> tuple[float, Array, Array]:
     """Misfit, node states and multipliers of one recording."""
     found: list[tuple[float, Array, Array]] = []
     rollout = None if begin.failure_message else _tracked(problem, episode, theta, begin.state)
     if rollout is not None and rollout.status.is_converged:
         state = rollout.state[nodes]
-        found.append((misfit(state, rollout.multipliers), state, rollout.multipliers))
+        found.append((misfit(state), state, rollout.multipliers))
     if not found or found[0][0] > _POOR_GUESS_CHI2:
         state, pull = _resting(problem, episode, nodes, theta, begin.state)
-        found.append((misfit(state, pull), state, pull))
+        found.append((misfit(state), state, pull))
     return min(found, key=lambda entry: entry[0])
 
 

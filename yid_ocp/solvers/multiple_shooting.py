@@ -1,80 +1,105 @@
-"""Multiple shooting: node states as unknowns of a nonlinear program, solved by IPOPT.
-
-The program is CasADi's own (`symbolic`), or its values and derivatives come from the compiled kernel (`compiled`),
-which also eliminates steps between nodes. With a node at every step both have the same constraints and, where no noise
-drives the motion, the same objective; the errors that do are unknowns of the first and left out of the second.
-"""
+"""Multiple shooting: node states as unknowns, in one program for IPOPT or condensed onto the parameters."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, Any, ClassVar
 
 import casadi as ca
 import numpy as np
-import scipy.sparse
 from annotated_types import Ge, Gt
 from numpy.typing import NDArray
 
 from yid_ocp.errors import SolverError
+from yid_ocp.integrator.rollout import simulate
+from yid_ocp.integrator.step import Rollout, SensitivityDirections
 from yid_ocp.options import OptionInfo, check_option_bounds
 from yid_ocp.problem.estimation_problem import EstimationProblem
-from yid_ocp.solvers.base import SOLVERS, IterationCallback, IterationRecorder, SolverResult, Status
-from yid_ocp.solvers.compiled_transcription import CompiledTranscription
+from yid_ocp.problem.prediction_result import InitialState
+from yid_ocp.solvers.base import (
+    SOLVERS,
+    IterationCallback,
+    IterationRecorder,
+    SolverResult,
+    Status,
+    projected_gradient_norm,
+)
+from yid_ocp.solvers.initial_guess import guess_node_states, mean_square_residual
+from yid_ocp.inference.linear_model import bounded_least_squares_step, predicted_reduction
 from yid_ocp.solvers.nonlinear_program import QUIET_OPTIONS, HessianKind, NonlinearProgram, available_memory
-from yid_ocp.solvers.symbolic_transcription import MIN_RIDGE_FACTOR, transcribe, unknowns_from_program
+from yid_ocp.solvers.symbolic_transcription import (
+    MIN_RIDGE_FACTOR,
+    check_inputs_as_recorded,
+    transcribe,
+    unknowns_from_program,
+)
 
 log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
-_TranscriptionForm = Literal["symbolic", "compiled"]
 
 _MEMORY_WARNING_BYTES = 2e9
-"""Estimated memory above which a warning is logged before solving [bytes]."""
 _IPOPT_SUCCESS = {"Solve_Succeeded", "Solved_To_Acceptable_Level"}
+_CONDENSING_NODE_INTERVAL = 20
+
+# Condensing. Largest factor by which one iteration changes an unknown that is positive by nature.
+_MAX_CHANGE_FACTOR = 3.0
+# Fraction of a point's cost or defects that a better point may at most have; shortest fraction of a step that is tried.
+_IMPROVEMENT_MARGIN = 1.0 - 1e-5
+_MIN_STEP_FRACTION = 1e-3
+# Damping up to which a step tells how far the cost can still be lowered, and beyond which the search has stalled.
+_MAX_TRUSTED_DAMPING, _STALLED_DAMPING = 0.1, 1e2
+# Largest defect that counts as closed [rad, m or N m s].
+_CLOSED_DEFECT = 1e-7
 
 
 @SOLVERS.register("multiple_shooting")
 @dataclass(frozen=True)
 class MultipleShooting:
-    """Multiple shooting: min 1/2 |r(w)|^2 subject to the DEL equations of every step (or interval) and bounds.
+    """Multiple shooting: minimize 1/2 |r|^2 over parameters and node states, subject to the equations of motion.
 
-    The start is that of `solvers.guess`; defects are scaled to order one, the cost by its initial value,
-    and IPOPT's own scaling is off. In these units IPOPT's first bound multipliers, which are one, weigh as much as the
-    cost, so that the first steps change no parameter by much more than a factor.
+    IPOPT solves the program of `transcribe`, with the DEL equations of every step as constraints. Defects are scaled to
+    order one, the cost by its initial value, and IPOPT's own scaling is off. In these units its first bound
+    multipliers, which are one, weigh as much as the cost, so that the first steps change no parameter by much more than
+    a factor. A barrier parameter much above the default pushes parameters that the data hardly inform off their bounds.
 
-    A barrier parameter much above the default pushes parameters that the data hardly inform away from their bounds, and
-    time is lost in bringing them back.
+    With `condensing` the steps between nodes are rolled out, and Gauss-Newton iterates on node states s_j and
+    parameters x with defects d_j = F^n(s_j, x) - s_{j+1}. A linear step closes every defect; the recursion
+    S_{j+1} = A_j S_j + B_j,  c_{j+1} = A_j c_j + d_j  expresses all node steps by the parameters' step, so that an
+    iteration costs one sweep with one direction more than single shooting's. A step must improve the cost or the
+    defects.
 
     References
     ----------
     Bock and Plitt (1984), IFAC Proc. 17(2):1603, doi:10.1016/S1474-6670(17)61205-9.
     Waechter and Biegler (2006), Math. Programming 106:25, doi:10.1007/s10107-004-0559-y.
+    Albersmeyer and Diehl (2010), SIAM J. Optim. 20(3):1655, doi:10.1137/080724885 (condensing).
     """
 
-    node_interval: Annotated[
-        int,
-        Ge(1),
-        OptionInfo("steps between nodes; 1 makes every equation of motion and multiplier part of the program"),
-    ] = 1
-    transcription: Annotated[
-        _TranscriptionForm | None,
+    condensing: Annotated[
+        bool,
         OptionInfo(
-            "whether the program is CasADi's own or calls the compiled step; when absent symbolic with a node at every "
-            "step, else compiled, which alone can eliminate steps"
+            "whether node states are condensed onto the parameters, at the cost of single shooting, in place of IPOPT"
         ),
+    ] = False
+    node_interval: Annotated[
+        int | None,
+        Ge(1),
+        OptionInfo("steps between nodes; above 1 with condensing only; when absent 1, with condensing 20"),
     ] = None
     hessian: Annotated[
-        HessianKind,
-        OptionInfo(
-            "of the Lagrangian; exact adds the curvature of equations and sensors (compiled: of equations alone, by "
-            "differences of their Jacobian)"
-        ),
+        HessianKind, OptionInfo("of the Lagrangian in IPOPT; exact adds the curvature of equations and sensors")
     ] = "gauss_newton"
-    max_iterations: Annotated[int, Ge(1), OptionInfo("limit on IPOPT's iterations")] = 200
+    max_iterations: Annotated[int, Ge(1), OptionInfo("limit on iterations")] = 200
     tolerance: Annotated[float, Gt(0), OptionInfo("IPOPT's tol")] = 1e-6
+    step_tolerance: Annotated[
+        float, Gt(0), OptionInfo("condensing: converged when no unknown moves by more than this fraction of its size")
+    ] = 1e-5
+    cost_tolerance: Annotated[
+        float, Gt(0), OptionInfo("condensing: converged when the promised relative reduction of the cost is below this")
+    ] = 1e-5
     mu_init: Annotated[float, Gt(0), OptionInfo("initial barrier parameter, in units of the initial cost")] = 1e-7
     ipopt: Annotated[dict[str, Any], OptionInfo("further options of IPOPT, which win")] = field(default_factory=dict)
     name: ClassVar[str] = "multiple_shooting"
@@ -84,19 +109,22 @@ class MultipleShooting:
         check_option_bounds(self, f"solver {self.name}")
 
     @property
-    def chosen_transcription(self) -> _TranscriptionForm:
-        """Transcription that is used: `transcription`, else by `node_interval`."""
-        return self.transcription or ("symbolic" if self.node_interval == 1 else "compiled")
-
-    @property
     def estimates_torque_errors(self) -> bool:
         """Whether the torque errors are estimated as unknowns of the program."""
-        return self.chosen_transcription == "symbolic"
+        return not self.condensing
 
     def minimize_cost(
         self, problem: EstimationProblem, start: Array, callback: IterationCallback | None
     ) -> SolverResult:
-        """Minimize the problem's cost from `start` with IPOPT on the chosen transcription."""
+        """Minimize the problem's cost from `start` with IPOPT, or by condensed Gauss-Newton steps."""
+        if self.condensing:
+            return self._by_condensing(problem, start, IterationRecorder(callback))
+        self._check_ipopt_settings()
+        return self._by_ipopt(problem, start, IterationRecorder(callback))
+
+    # -- IPOPT --------------------------------------------------------------------------------------------------------
+
+    def _check_ipopt_settings(self) -> None:
         if self.hessian not in ("gauss_newton", "exact"):
             raise SolverError(
                 f"hessian = '{self.hessian}'",
@@ -111,26 +139,19 @@ class MultipleShooting:
                 allowed="exact",
                 hint="the node states number in the thousands; use hessian: gauss_newton",
             )
-        if self.chosen_transcription not in get_args(_TranscriptionForm):
+        if self.node_interval not in (None, 1):
             raise SolverError(
-                f"transcription = '{self.chosen_transcription}'",
-                where="solver.transcription",
-                allowed=", ".join(get_args(_TranscriptionForm)),
+                f"node_interval = {self.node_interval} without condensing",
+                where="solver.node_interval",
+                allowed="1",
+                hint="condensing: true eliminates the steps between nodes",
             )
-        if self.chosen_transcription == "symbolic" and self.node_interval != 1:
-            raise SolverError(
-                f"node_interval = {self.node_interval} with the symbolic transcription",
-                where="solver.transcription",
-                allowed="node_interval: 1",
-                hint="transcription: compiled eliminates the steps between nodes",
-            )
-        return (self._symbolic if self.chosen_transcription == "symbolic" else self._compiled)(problem, start, callback)
 
-    def _symbolic(self, problem: EstimationProblem, start: Array, callback: IterationCallback | None) -> SolverResult:
+    def _by_ipopt(self, problem: EstimationProblem, start: Array, recorder: IterationRecorder) -> SolverResult:
         program = transcribe(problem, start)
         assert program.ridge is not None
-        held = _Held(program.ridge.scale)
-        program = replace(program, ridge=replace(program.ridge, factor=_Factor(held, program.w.numel())))
+        ridge = _AdaptiveRidge(program.ridge.scale)
+        program = replace(program, ridge=replace(program.ridge, factor=_RidgeFactor(ridge, program.w.numel())))
         needed, free = program.estimated_memory(self.hessian), available_memory()
         size = f"{program.w.numel()} unknowns, {program.g.numel()} equations, about {needed / 1e9:.2g} GB of memory"
         log.log(logging.WARNING if needed > _MEMORY_WARNING_BYTES else logging.INFO, "IPOPT on %s", size)
@@ -138,93 +159,112 @@ class MultipleShooting:
             message = f"{size}, of which {free / 1e9:.2g} GB are free; take a longer time_step, a shorter duration or "
             return SolverResult(Status.FAILED, message + "gauss_newton", start, (), 0)
         functions = ca.Function("point", [program.w, program.p], [program.f, program.grad_f, program.g])
-        watch = _Watch(problem, program, functions, held, IterationRecorder(callback))
-        options = self._options()
-        options["ipopt"] = {"obj_scaling_factor": 1.0 / watch.unit, **options["ipopt"]}
-        solver = program.make_solver("ipopt", self.hessian, iteration_callback=watch, **options)
+        watch = _Watch(problem, program, functions, ridge, recorder)
+        solver = program.make_solver(
+            "ipopt", self.hessian, iteration_callback=watch, **self._solver_options(1.0 / watch.unit)
+        )
         w = np.array(solver(**program.solver_arguments)["x"]).ravel()
         w = w if np.all(np.isfinite(w)) else watch.best
         defect = float(ca.norm_inf(functions(w, program.parameter_values)[2]))
         stats = solver.stats()
-        status, message = self._ended(stats["return_status"], defect, 0)
-        history, n = tuple(watch.recorder.history), problem.step.sizes["n"]
+        status, message = self._ipopt_status(stats["return_status"], defect)
+        n = problem.step.sizes["n"]
         warm = tuple(w[program.variables[f"q[{episode.name}]"].index[:n, 0]] for episode in problem.episodes)
         x = unknowns_from_program(problem, program, w)
-        return SolverResult(status, message, x, history, int(stats["n_call_nlp_g"]), warm)
+        return SolverResult(status, message, x, tuple(recorder.history), int(stats["n_call_nlp_g"]), warm)
 
-    def _compiled(self, problem: EstimationProblem, start: Array, callback: IterationCallback | None) -> SolverResult:
-        transcription = CompiledTranscription(problem, self.node_interval)
-        nlp = _Nlp(transcription, self.hessian, IterationRecorder(callback))
-        w0 = transcription.initial_guess(start)
-        lower, upper = transcription.variable_bounds()
-        nlp.prepare(w0)
-        functions = nlp.functions()
-        solver = ca.nlpsol("multiple_shooting", "ipopt", functions.pop("nlp"), {**self._options(), **functions})
-        result = solver(x0=w0, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
-        w = np.array(result["x"]).ravel()
-        best = w if np.all(np.isfinite(w)) else nlp.best
-        defect = float(np.max(np.abs(transcription.constraints(w, False)[0]), initial=0.0))
-        status, message = self._ended(solver.stats()["return_status"], defect, nlp.lost)
-        history, evaluations = tuple(nlp.recorder.history), nlp.recorder.n_evaluations
-        return SolverResult(
-            status,
-            message,
-            transcription.unknowns_from_variables(best),
-            history,
-            evaluations,
-            transcription.equilibrium_guesses,
-        )
-
-    def _options(self) -> dict[str, Any]:
+    def _solver_options(self, cost_factor: float) -> dict[str, Any]:
         """Options of CasADi's IPOPT interface."""
-        return {
-            **QUIET_OPTIONS,
-            "no_nlp_grad": True,
-            "ipopt": {
-                "print_level": 0,
-                "sb": "yes",
-                "max_iter": self.max_iterations,
-                "tol": self.tolerance,
-                "mu_init": self.mu_init,
-                "nlp_scaling_method": "none",
-                # the Hessian is positive definite by construction: MUMPS, which counts wrong signs among nearly
-                # vanishing pivots, would have IPOPT regularise and factorise again
-                "neg_curv_test_tol": 1e-11 if self.hessian == "gauss_newton" else 0.0,
-                # measured on 50 variables and 500 steps: a sixth of the time of MUMPS's own choice
-                "mumps_scaling": 8,
-                "mumps_pivot_order": 0,
-                "mumps_permuting_scaling": 0,
-                "bound_relax_factor": 0.0,
-                "acceptable_tol": 1e-3,
-                "acceptable_iter": 4,
-                "acceptable_constr_viol_tol": 1e-6,
-                "acceptable_obj_change_tol": 1e-5,
-                "fixed_variable_treatment": "make_parameter",
-                **self.ipopt,
-            },
+        ipopt = {
+            "obj_scaling_factor": cost_factor,
+            "print_level": 0,
+            "sb": "yes",
+            "max_iter": self.max_iterations,
+            "tol": self.tolerance,
+            "mu_init": self.mu_init,
+            "nlp_scaling_method": "none",
+            # the Hessian is positive definite by construction: MUMPS, which counts wrong signs among nearly
+            # vanishing pivots, would have IPOPT regularise and factorise again
+            "neg_curv_test_tol": 1e-11 if self.hessian == "gauss_newton" else 0.0,
+            # measured on 50 variables and 500 steps: a sixth of the time of MUMPS's own choice
+            "mumps_scaling": 8,
+            "mumps_pivot_order": 0,
+            "mumps_permuting_scaling": 0,
+            "bound_relax_factor": 0.0,
+            "acceptable_tol": 1e-3,
+            "acceptable_iter": 4,
+            "acceptable_constr_viol_tol": 1e-6,
+            "acceptable_obj_change_tol": 1e-5,
+            "fixed_variable_treatment": "make_parameter",
         }
+        return {**QUIET_OPTIONS, "no_nlp_grad": True, "ipopt": {**ipopt, **self.ipopt}}
 
-    def _ended(self, returned: str, defect: float, lost: int) -> tuple[Status, str]:
-        """Status and message from IPOPT's own word, the largest defect and the trial points without a value."""
+    def _ipopt_status(self, returned: str, defect: float) -> tuple[Status, str]:
         if returned in _IPOPT_SUCCESS:
             return Status.CONVERGED, f"IPOPT: {returned}, largest defect {defect:.1e}"
         if returned == "Maximum_Iterations_Exceeded":
             limit = f"IPOPT stopped after {self.max_iterations} iterations, largest defect {defect:.1e}"
             return Status.ITERATION_LIMIT, f"{limit}; raise solver.max_iterations"
-        if lost:
-            returned += f", {lost} trial points could not be worked out"
-        remedy = "start nearer, use more nodes, or use gauss_newton"
-        return Status.STALLED, f"IPOPT: {returned}, largest defect {defect:.1e}; {remedy}"
+        return Status.STALLED, f"IPOPT: {returned}, largest defect {defect:.1e}; start nearer, or use gauss_newton"
+
+    # -- condensing ---------------------------------------------------------------------------------------------------
+
+    def _by_condensing(self, problem: EstimationProblem, start: Array, recorder: IterationRecorder) -> SolverResult:
+        intervals = _ShootingIntervals(problem, self.node_interval or _CONDENSING_NODE_INTERVAL)
+        x, nodes = intervals.initial_guess(start)
+
+        def ended(status: Status, message: str) -> SolverResult:
+            history, guesses = tuple(recorder.history), intervals.equilibrium_guesses
+            return SolverResult(status, message, x, history, recorder.n_evaluations, guesses)
+
+        recorder.n_evaluations += 1
+        now = intervals.linearize(x, nodes)
+        if isinstance(now, str):
+            return ended(Status.FAILED, now)
+        mu, filtered = 1e-4, _StepFilter(now)
+        for _ in range(self.max_iterations):
+            size = np.maximum(np.abs(x), problem.unknown_scales)
+            gradient = now.jacobian.T @ now.residual
+            recorder.record_iterate(now.cost, x, projected_gradient_norm(x, gradient, *problem.bounds, size))
+            closed = now.residual + now.by_defect
+            step = size * bounded_least_squares_step(now.jacobian * size, closed, mu, *_step_bounds(problem, x, size))
+            promised = predicted_reduction(now.jacobian, closed, step)
+            moved = float(np.max(np.abs(step) / size, initial=0.0))
+            flat = mu < _MAX_TRUSTED_DAMPING and promised <= self.cost_tolerance * now.cost
+            if moved < self.step_tolerance or flat:
+                if now.defect < _CLOSED_DEFECT:
+                    return ended(Status.CONVERGED, f"closed to {now.defect:.1e}")
+                # a change along what the data do not inform would only open the defects again
+                step = np.zeros_like(step)
+            slope = float(now.residual @ (now.by_defect + now.jacobian @ step))
+            factor = 1.0
+            while factor >= _MIN_STEP_FRACTION:
+                trial_x = np.clip(x + factor * step, *problem.bounds)
+                trial_nodes = intervals.moved(nodes, now, step, factor)
+                trial = intervals.linearize(trial_x, trial_nodes)
+                recorder.n_evaluations += 1
+                if not isinstance(trial, str) and filtered.accepts(now, trial, factor * slope):
+                    mu *= 0.2 if factor == 1.0 else 5.0
+                    x, nodes, now = trial_x, trial_nodes, trial
+                    break
+                factor *= 0.5
+            else:
+                if mu > _STALLED_DAMPING:
+                    reason = trial if isinstance(trial, str) else "no step lowers the cost or closes the defects"
+                    return ended(Status.STALLED, f"{reason}; try more nodes, or gauss_newton")
+                mu = max(mu * 30.0, 1e-4)
+        limit = f"no convergence in {self.max_iterations} iterations; largest defect {now.defect:.1e}"
+        return ended(Status.ITERATION_LIMIT, limit)
 
 
-class _Held:
-    """A ridge that rises where parameters swing to and fro, and falls where they keep going."""
+class _AdaptiveRidge:
+    """Factor of a ridge that rises where parameters swing to and fro, and falls where they keep going."""
 
     def __init__(self, scale: Array) -> None:
         self.factor = MIN_RIDGE_FACTOR
         self._scale, self._change = scale, np.zeros(len(scale))
 
-    def moved(self, before: Array, after: Array) -> None:
+    def update(self, before: Array, after: Array) -> None:
         """Take note of an iterate."""
         change = (after - before) / np.maximum(np.abs(after), self._scale)
         turned = float(change @ self._change) < 0
@@ -232,12 +272,12 @@ class _Held:
         self._change = change
 
 
-class _Factor(ca.Callback):
+class _RidgeFactor(ca.Callback):
     """The factor of a ridge, as CasADi asks for it."""
 
-    def __init__(self, held: _Held, size: int) -> None:
+    def __init__(self, ridge: _AdaptiveRidge, size: int) -> None:
         ca.Callback.__init__(self)
-        self._held, self._size = held, size
+        self._ridge, self._size = ridge, size
         self.construct("factor", {})
 
     def get_sparsity_in(self, _: int) -> ca.Sparsity:
@@ -245,7 +285,7 @@ class _Factor(ca.Callback):
 
     def eval(self, _: Sequence[ca.DM]) -> list[float]:
         """Whatever the point is."""
-        return [self._held.factor]
+        return [self._ridge.factor]
 
 
 class _Watch(ca.Callback):
@@ -256,11 +296,11 @@ class _Watch(ca.Callback):
         problem: EstimationProblem,
         program: NonlinearProgram,
         functions: ca.Function,
-        held: _Held,
+        ridge: _AdaptiveRidge,
         recorder: IterationRecorder,
     ) -> None:
         ca.Callback.__init__(self)
-        self.recorder, self.best, self._held = recorder, program.initial_guess, held
+        self.recorder, self.best, self._ridge = recorder, program.initial_guess, ridge
         self._problem, self._program, self._functions = problem, program, functions
         cost = float(functions(program.initial_guess, program.parameter_values)[0])
         self.unit = max(cost, 0.5 * program.residual.numel() * problem.data_noise_unit**2)
@@ -289,7 +329,7 @@ class _Watch(ca.Callback):
         cost, slope, _ = self._functions(w, self._program.parameter_values)
         assert self._program.ridge is not None
         at = self._program.ridge.index
-        self._held.moved(self.best[at], w[at])
+        self._ridge.update(self.best[at], w[at])
         self.best = w
         x = unknowns_from_program(self._problem, self._program, w)
         self.recorder.n_evaluations += 1
@@ -298,187 +338,172 @@ class _Watch(ca.Callback):
         return [0]
 
 
-class _Function(ca.Callback):
-    """A CasADi function computed in Python."""
-
-    def __init__(
-        self,
-        name: str,
-        inputs: Sequence[str],
-        outputs: Sequence[str],
-        sparsity: dict[str, ca.Sparsity],
-        compute: Callable[..., list],
-    ) -> None:
-        ca.Callback.__init__(self)
-        self._inputs, self._outputs, self._sparsity, self._compute = list(inputs), list(outputs), sparsity, compute
-        self.construct(name, {})
-
-    def get_n_in(self) -> int:
-        return len(self._inputs)
-
-    def get_n_out(self) -> int:
-        return len(self._outputs)
-
-    def get_name_in(self, i: int) -> str:
-        return self._inputs[i]
-
-    def get_name_out(self, i: int) -> str:
-        return self._outputs[i]
-
-    def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        return self._sparsity[self._inputs[i]]
-
-    def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        return self._sparsity[self._outputs[i]]
-
-    def has_eval_buffer(self) -> bool:
-        return True
-
-    def eval_buffer(self, arguments: Sequence[memoryview | None], results: Sequence[memoryview | None]) -> int:
-        """Compute on CasADi's own memory: a Jacobian of millions of entries is not copied to and fro."""
-        # the arguments' memory is CasADi's only as long as this call lasts
-        values = self._compute(*(np.zeros(0) if a is None else np.frombuffer(a).copy() for a in arguments))
-        for place, value in zip(results, values, strict=True):
-            if place is not None:
-                np.frombuffer(place)[:] = value
-        return 0
+# -- condensing -------------------------------------------------------------------------------------------------------
 
 
-class _Nlp:
-    """Objective, constraints and their derivatives in the form that CasADi's IPOPT interface takes."""
+@dataclass(frozen=True)
+class _Linearization:
+    """Whitened residual, its derivative by the unknowns and its change by closing the defects; largest defect.
 
-    def __init__(self, transcription: CompiledTranscription, hessian: HessianKind, recorder: IterationRecorder) -> None:
-        self.transcription = transcription
-        self.hessian = hessian
-        self.recorder = recorder
-        self.best = np.zeros(transcription.n_variables)
-        self.lost = 0
-        self._asked = np.zeros(0)
-        count = len(transcription.problem.shared_parameters)
-        self._held = _Held(transcription.problem.unknown_scales[:count])
-        self._keep: list[_Function] = []
+    `node_slopes` has for every recording the derivatives of its node states by its unknowns and by closing the defects.
+    """
 
-    def prepare(self, w0: Array) -> None:
-        """Fix scaling and sparsity from the start and from random points about it."""
-        t = self.transcription
-        rng = np.random.default_rng(0)
-        pattern_g: Any = None
-        pattern_r: Any = None
-        for trial in range(3):
-            w = w0 + (rng.normal(scale=1e-2, size=len(w0)) * np.maximum(np.abs(w0), 1e-2) if trial else 0.0)
-            _, jacobian = t.constraints(w, True)
-            _, slope, _ = t.residual(w, True)
-            assert jacobian is not None
-            assert slope is not None
-            pattern_g = abs(jacobian).sign() if pattern_g is None else pattern_g + abs(jacobian).sign()
-            pattern_r = abs(slope).sign() if pattern_r is None else pattern_r + abs(slope).sign()
-        self._g = _Pattern(pattern_g)
-        curvature = pattern_r.T @ pattern_r
-        if self.hessian == "exact":
-            curvature = curvature + pattern_g.T @ pattern_g
-        curvature = curvature + scipy.sparse.identity(t.n_variables, format="csc")
-        self._h = _Pattern(scipy.sparse.triu(curvature, format="csc"))
-        residual, _, cost = t.residual(w0, False)
-        self._unit = max(cost, 0.5 * len(residual) * t.problem.data_noise_unit**2)
-        self.best = w0
-        self.recorder.n_evaluations += 1
-        self.recorder.record_iterate(cost, w0[: len(t.problem.shared_parameters)], np.nan, "start")
-
-    def functions(self) -> dict[str, ca.Function]:
-        """The functions `nlp`, `grad_f`, `jac_g` and `hess_lag`."""
-        t = self.transcription
-        count = self._g.shape[0]
-        sparsity = {
-            "x": ca.Sparsity.dense(t.n_variables, 1),
-            "p": ca.Sparsity.dense(0, 1),
-            "f": ca.Sparsity.dense(1, 1),
-            "g": ca.Sparsity.dense(count, 1),
-            "lam_f": ca.Sparsity.dense(1, 1),
-            "lam_g": ca.Sparsity.dense(count, 1),
-            "grad_f": ca.Sparsity.dense(t.n_variables, 1),
-            "jac_g": self._g.sparsity,
-            "hess_lag": self._h.sparsity,
-        }
-
-        def make(name: str, inputs: Sequence[str], outputs: Sequence[str], compute: Callable[..., list]) -> _Function:
-            self._keep.append(_Function(name, inputs, outputs, sparsity, compute))
-            return self._keep[-1]
-
-        return {
-            "nlp": make("nlp", ("x", "p"), ("f", "g"), self._values),
-            "grad_f": make("grad_f", ("x", "p"), ("f", "grad_f"), self._gradient),
-            "jac_g": make("jac_g", ("x", "p"), ("g", "jac_g"), self._jacobian),
-            "hess_lag": make("hess_lag", ("x", "p", "lam_f", "lam_g"), ("hess_lag",), self._curvature),
-        }
-
-    def _values(self, w: Array, _: Array) -> list:
-        if not np.array_equal(w, self._asked):
-            # IPOPT asks for the cost and for the constraints of a point one after the other
-            self.recorder.n_evaluations += 1
-            self._asked = w
-        cost, constraints = self.transcription.residual(w, False)[2], self.transcription.constraints(w, False)[0]
-        self.lost += not (np.isfinite(cost) and np.all(np.isfinite(constraints)))
-        return [cost / self._unit, constraints]
-
-    def _gradient(self, w: Array, _: Array) -> list:
-        residual, slope, cost = self.transcription.residual(w, True)
-        assert slope is not None
-        gradient = slope.T @ residual
-        if not np.array_equal(w, self.best):
-            # IPOPT may ask more than once for the gradient at the point that it accepted
-            count = len(self.transcription.problem.shared_parameters)
-            self._held.moved(self.best[:count], w[:count])
-            self.best = w
-            self.recorder.record_iterate(
-                cost, self.transcription.unknowns_from_variables(w), float(np.max(np.abs(gradient))) / self._unit
-            )
-        return [cost / self._unit, gradient / self._unit]
-
-    def _size(self, w: Array) -> Array:
-        problem = self.transcription.problem
-        count = len(problem.shared_parameters)
-        return np.maximum(np.abs(w[:count]), problem.unknown_scales[:count])
-
-    def _jacobian(self, w: Array, _: Array) -> list:
-        value, jacobian = self.transcription.constraints(w, True)
-        assert jacobian is not None
-        return [value, self._g.filled(jacobian)]
-
-    def _curvature(self, w: Array, _: Array, lam_f: Array, lam_g: Array) -> list:
-        residual, slope, cost = self.transcription.residual(w, True)
-        assert slope is not None
-        size = self._size(w)
-        # along weakly informed parameters the curvature that Gauss-Newton leaves out may be as large as its own
-        ridge = np.zeros(len(w))
-        ridge[: len(size)] = self._held.factor * 2 * cost / len(residual) / size**2
-        matrix = (slope.T @ slope + scipy.sparse.diags(ridge)) * (float(lam_f[0]) / self._unit)
-        if self.hessian == "exact":
-            matrix = matrix + self.transcription.constraint_hessian(w, lam_g)
-        return [self._h.filled(scipy.sparse.triu(matrix, format="csc"))]
+    cost: float
+    defect: float
+    residual: Array
+    jacobian: Array
+    by_defect: Array
+    node_slopes: tuple[tuple[Array, Array], ...]
 
 
-class _Pattern:
-    """A fixed sparsity into which matrices of fewer entries are filled."""
+class _StepFilter:
+    """Accepts trial points that are better than every point so far in cost or in defects.
 
-    def __init__(self, matrix: Any) -> None:
-        matrix = scipy.sparse.csc_matrix(matrix)
-        matrix.sort_indices()
-        self.shape = matrix.shape
-        self._start, self._row = matrix.indptr.astype(np.int64), matrix.indices.astype(np.int64)
-        self.sparsity = ca.Sparsity(matrix.shape[0], matrix.shape[1], self._start.tolist(), self._row.tolist())
-        columns = np.repeat(np.arange(self.shape[1]), np.diff(self._start))
-        self._keys = columns * self.shape[0] + self._row
+    A merit function has to weigh the two against each other; a weight that was needed far from the solution makes steps
+    short near it (Waechter and Biegler 2005, SIAM J. Optim. 16(1):1, doi:10.1137/S1052623403426556).
+    """
 
-    def filled(self, matrix: Any) -> Array:
-        """The matrix's entries in this pattern; entries outside it (a derivative that vanished by chance) are lost."""
-        matrix = scipy.sparse.csc_matrix(matrix)
-        matrix.sort_indices()
-        if np.array_equal(matrix.indptr, self._start) and np.array_equal(matrix.indices, self._row):
-            return np.asarray(matrix.data)
-        columns = np.repeat(np.arange(self.shape[1]), np.diff(matrix.indptr))
-        keys = columns * self.shape[0] + matrix.indices
-        place = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
-        values = np.zeros(len(self._keys))
-        inside = self._keys[place] == keys
-        values[place[inside]] = matrix.data[inside]
-        return values
+    def __init__(self, start: _Linearization) -> None:
+        self._largest = 1e4 * max(start.defect, 1.0)
+        self._points: list[tuple[float, float]] = []
+
+    def accepts(self, now: _Linearization, trial: _Linearization, slope: float) -> bool:
+        """Whether to go on from `trial`, for which the linear model says that the cost changes by `slope`."""
+        margin = _IMPROVEMENT_MARGIN
+        if not trial.defect <= self._largest or not np.isfinite(trial.cost):
+            return False
+        if any(trial.defect >= margin * defect and trial.cost >= margin * cost for defect, cost in self._points):
+            return False
+        # with defects as good as closed the cost has to fall as it should
+        if slope < 0 and (-slope / max(now.cost, 1e-300)) ** 2.3 > now.defect**1.1:
+            return trial.cost <= now.cost + 1e-4 * slope
+        if trial.defect <= margin * now.defect or trial.cost <= margin * now.cost:
+            self._points.append((now.defect, now.cost))
+            return True
+        return False
+
+
+def _step_bounds(problem: EstimationProblem, x: Array, size: Array) -> tuple[Array, Array]:
+    """Bounds of a step in units of `size`; the linear model is good for a factor, not for a jump to a bound."""
+    lower, upper = problem.bounds
+    largest = np.maximum(x, 1e-3 * problem.unknown_scales) * _MAX_CHANGE_FACTOR
+    low = np.where(problem.is_positive, np.maximum(lower, x / _MAX_CHANGE_FACTOR), lower)
+    high = np.where(problem.is_positive, np.minimum(upper, largest), upper)
+    return (low - x) / size, (high - x) / size
+
+
+class _ShootingIntervals:
+    """Recordings cut at nodes, each interval a rollout from its node state; condensed onto the parameters."""
+
+    def __init__(self, problem: EstimationProblem, node_interval: int) -> None:
+        check_inputs_as_recorded(problem, "multiple shooting")
+        self.problem, self.node_steps = problem, list[NDArray[np.int64]]()
+        for episode in problem.episodes:
+            steps = episode.grid.steps
+            if steps < node_interval:
+                raise SolverError(
+                    f"the recording has {steps} steps, fewer than one node interval of {node_interval}",
+                    where=episode.name,
+                    allowed=f"solver.node_interval from 1 to {steps}",
+                )
+            if any(s.sensor.effort_joints for s in episode.measurements):
+                raise SolverError(
+                    "effort channels depend on whole steps, which node states do not carry",
+                    where=episode.name,
+                    hint="use gauss_newton",
+                )
+            self.node_steps.append(np.unique(np.append(np.arange(0, steps + 1, node_interval), steps)))
+        # equilibria are looked for near those of the problem's start, whatever the point
+        starts = [
+            problem.initial_state(episode, problem.split(problem.initial_unknowns, i)[0])
+            for i, episode in enumerate(problem.episodes)
+        ]
+        n = problem.step.sizes["n"]
+        self.equilibrium_guesses = tuple(
+            None if s.equilibrium is None or s.failure_message else s.equilibrium.state[:n] for s in starts
+        )
+
+    def initial_guess(self, start: Array) -> tuple[Array, list[Array]]:
+        """Unknowns near `start` and the node states of every recording."""
+        shared, x = len(self.problem.shared_parameters), start.copy()
+        about = self.problem.initial_unknowns.copy()
+        about[:shared] = start[:shared]
+        found = guess_node_states(self.problem, self.node_steps, about, self._misfit)
+        x[:shared] = found.x[:shared]
+        return x, list(found.node_states)
+
+    def _misfit(self, i: int, nodes: Array, x: Array) -> float:
+        theta = self.problem.predictor.episode_theta(self.problem.episodes[i], self.problem.split(x, i)[0])
+        rollouts = [self._rollout(i, j, nodes[j], theta, None) for j in range(len(nodes) - 1)]
+        trajectory = np.vstack([*(rollout.state[:-1] for rollout in rollouts), rollouts[-1].state[-1:]])
+        return mean_square_residual(self.problem, i, trajectory, theta)
+
+    def moved(self, nodes: list[Array], now: _Linearization, step: Array, factor: float) -> list[Array]:
+        """Node states after a part of a step of the unknowns that also closes as large a part of the defects."""
+        columns = self.problem.unknowns.recording_columns
+        return [
+            state + factor * (by_x @ step[columns(i)] + by_defect)
+            for i, (state, (by_x, by_defect)) in enumerate(zip(nodes, now.node_slopes, strict=True))
+        ]
+
+    def linearize(self, x: Array, nodes: list[Array]) -> _Linearization | str:
+        """Residual and derivatives about a point; the message of a rollout that failed."""
+        problem = self.problem
+        cost, defect, residuals, jacobians, changes, slopes = 0.0, 0.0, [], [], [], []
+        for i, episode in enumerate(problem.episodes):
+            theta, offset = problem.split(x, i)
+            theta = problem.predictor.episode_theta(episode, theta)
+            start = problem.initial_state(episode, theta, offset, self.equilibrium_guesses[i])
+            condensed = start.failure_message or self._condensed(i, theta, start, nodes[i])
+            if isinstance(condensed, str):
+                return condensed
+            trajectory, by_unknowns, by_x, by_defect, largest = condensed
+            defect = max(defect, largest)
+            slopes.append((by_x, by_defect))
+            for samples in episode.measurements:
+                read = problem.predictor.readings_along_trajectory(samples, trajectory, by_unknowns, theta)
+                part = samples.residual_block(*read, problem.options.huber_threshold)
+                assert part.jacobian is not None
+                cost += part.cost
+                residuals.append(part.residual)
+                jacobians.append(problem.unknowns.scatter_columns(part.jacobian[:, :-1], i))
+                changes.append(part.jacobian[:, -1])
+        prior, by_x_prior = problem.prior_residual(x)
+        residual, jacobian = np.concatenate([*residuals, prior]), np.vstack([*jacobians, by_x_prior])
+        change = np.concatenate([*changes, np.zeros(len(prior))])
+        return _Linearization(cost + 0.5 * float(prior @ prior), defect, residual, jacobian, change, tuple(slopes))
+
+    def _condensed(
+        self, i: int, theta: Array, start: InitialState, nodes: Array
+    ) -> tuple[Array, Array, Array, Array, float] | str:
+        """Trajectory and node states' derivatives by (free parameters and start, closing of defects); largest defect.
+
+        Returns the trajectory (N + 1, nx), its derivatives (N + 1, nx, width + 1), those of the nodes by the unknowns
+        and by closing the defects, and the largest defect.
+        """
+        wanted, by_start = self.problem.unknowns.free_parameters, start.state_sensitivity
+        nx, width = by_start.shape
+        steps = self.problem.episodes[i].grid.steps
+        trajectory, slopes = np.zeros((steps + 1, nx)), np.zeros((steps + 1, nx, width + 1))
+        by_nodes, gaps = np.zeros((len(nodes), nx, width + 1)), np.zeros((len(nodes), nx))
+        gaps[0] = start.state - nodes[0]
+        by_nodes[0] = np.column_stack([by_start, gaps[0]])
+        for j, (first, last) in enumerate(zip(self.node_steps[i][:-1], self.node_steps[i][1:], strict=True)):
+            rollout = self._rollout(i, j, nodes[j], theta, SensitivityDirections(wanted, by_nodes[j]))
+            if not rollout.status.is_converged or rollout.state_sensitivity is None:
+                return f"{self.problem.episodes[i].name}: interval {j}: {rollout.status.message}"
+            trajectory[first:last], slopes[first:last] = rollout.state[:-1], rollout.state_sensitivity[:-1]
+            gaps[j + 1] = rollout.state[-1] - nodes[j + 1]
+            by_nodes[j + 1] = rollout.state_sensitivity[-1]
+            by_nodes[j + 1, :, width] += gaps[j + 1]
+            trajectory[last], slopes[last] = nodes[j + 1], by_nodes[j + 1]
+        return trajectory, slopes, by_nodes[:, :, :width], by_nodes[:, :, width], float(np.max(np.abs(gaps)))
+
+    def _rollout(self, i: int, j: int, start: Array, theta: Array, directions: SensitivityDirections | None) -> Rollout:
+        """Rollout of one interval under the recording's tracking feedback."""
+        episode, (first, last) = self.problem.episodes[i], self.node_steps[i][j : j + 2].tolist()
+        feedback = episode.tracking_feedback
+        if feedback is not None:
+            feedback = replace(feedback, gain=feedback.gain[first:last], reference=feedback.reference[first:last])
+        torque, path = episode.torque[first:last], episode.prescribed_path[first : last + 1]
+        return simulate(self.problem.step, theta, start, last - first, torque, path, feedback, directions)

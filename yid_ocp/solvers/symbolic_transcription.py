@@ -33,7 +33,7 @@ from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.unknown_vector import MIN_LOG_RATIO
 from yid_ocp.sensors import Sensor, sensor_function
 from yid_ocp.solvers.driven_stage import DrivenStage, FreeParameterSymbols, make_driven_stage
-from yid_ocp.solvers.initial_guess import NodeStateGuess, guess_node_states
+from yid_ocp.solvers.initial_guess import NodeStateGuess, guess_node_states, mean_square_residual
 from yid_ocp.solvers.nonlinear_program import NonlinearProgram, VectorBlock
 from yid_ocp.solvers.program_terms import IndexArray, LocalFunction, ProgramTerm, ResidualTerm, RidgeRegularization
 
@@ -97,8 +97,8 @@ def _about_zero(problem: EstimationProblem) -> EstimationProblem:
     return problem.with_episodes(episodes, problem.held_out)
 
 
-def _check_transcribable(problem: EstimationProblem, where: str) -> None:
-    """Raise `SolverError` for problems that no transcription with nodes supports."""
+def check_inputs_as_recorded(problem: EstimationProblem, where: str) -> None:
+    """Raise `SolverError` where an effect changes recorded inputs, which nodes do not carry."""
     if not problem.has_uncorrected_inputs:
         raise SolverError(
             "an effect changes recorded inputs, times or what the tracking filter follows",
@@ -106,6 +106,11 @@ def _check_transcribable(problem: EstimationProblem, where: str) -> None:
             allowed="effects of the mechanics and of what sensors read",
             hint="use gauss_newton",
         )
+
+
+def _check_transcribable(problem: EstimationProblem, where: str) -> None:
+    """Raise `SolverError` for problems that the program does not support."""
+    check_inputs_as_recorded(problem, where)
     names = [episode.name for episode in problem.episodes]
     twice = [name for name in names if names.count(name) > 1]
     if twice:
@@ -323,16 +328,9 @@ class _Maker:
         gain = self._p.add(f"gain[{episode.name}]", feedback.gain.reshape(steps, -1).T, pairs)
         return gain, self._p.add(f"reference[{episode.name}]", feedback.reference.T, followed)
 
-    def _misfit(self, i: int, state: Array, _: Array, x: Array) -> float:
-        """Mean square whitened residual of what node states alone predict."""
-        problem, episode = self._problem, self._problem.episodes[i]
-        theta = problem.predictor.episode_theta(episode, problem.split(x, i)[0])
-        flat, parts = np.zeros((*state.shape, len(self._names))), [np.zeros(1)]
-        for samples in episode.measurements:
-            if not samples.sensor.effort_joints:
-                predicted, _ = problem.predictor.readings_along_trajectory(samples, state, flat, theta)
-                parts.append(samples.residual_block(predicted, threshold=problem.options.huber_threshold).residual)
-        return float(np.mean(np.concatenate(parts) ** 2))
+    def _misfit(self, i: int, nodes: Array, x: Array) -> float:
+        theta = self._problem.predictor.episode_theta(self._problem.episodes[i], self._problem.split(x, i)[0])
+        return mean_square_residual(self._problem, i, nodes, theta)
 
     def _driven(self, episode: Episode) -> DrivenStage:
         """The stage as a recording drives it."""

@@ -87,7 +87,7 @@ def commented_config_text(
         ),
         "",
         "solver:",
-        _line("  ", "name", "gauss_newton", "lifted or multiple_shooting where it does not converge"),
+        _line("  ", "name", "gauss_newton", "multiple_shooting where it does not converge"),
     ]
     return "\n".join(lines) + "\n"
 
