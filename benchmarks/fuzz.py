@@ -56,15 +56,15 @@ model:
   robot: {urdf}
   arms: {{mode: prescribed}}
   springs:
-    shoulder: {{stiffness: 1.0, rest: 0.2}}
+    shoulder: {{stiffness: 1.0, rest_position: 0.2}}
 recordings:
   estimate: [recording.h5]
   held_out: []
 parameters:
   shoulder.stiffness: {{free: true, bounds: [0.0, 100.0]}}
   elbow.damping: {{free: true}}
-problem: {{path_cutoff: 20, compiler: false, time_step: 0.01}}
-solver: {{name: gauss_newton, iterations: 2}}
+problem: {{path_cutoff: 20, use_compiler: false, time_step: 0.01}}
+solver: {{name: gauss_newton, max_iterations: 2}}
 output: {{report: false}}
 """
 

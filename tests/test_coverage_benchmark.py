@@ -135,7 +135,7 @@ def test_errors_that_nobody_states_must_not_pass_for_findings(coverage: ModuleTy
             "twins warn" in line for line in coverage.shortcomings({"offsets_unstated": entries(38, **changed)})
         )
     assert "white_0.1" in coverage.CELLS
-    assert not coverage.CELLS["offsets_unstated"].records_effort_std
+    assert not coverage.CELLS["offsets_unstated"].stated
 
 
 def test_every_cell_has_its_row(coverage: ModuleType) -> None:
@@ -149,7 +149,7 @@ def test_recipes_decide_what_is_kept(coverage: ModuleType) -> None:
     recipes = [cell.recipe for cell in coverage.CELLS.values()]
     steps, base = coverage.CELLS["steps_5ms"], coverage.CELLS["no_torque_error"]
     assert steps.recipe == base.recipe  # how a twin is solved does not change its recording
-    assert len({coverage.content_hash(recipe) for recipe in recipes}) == len(recipes) - 1
+    assert len({coverage.json_sha256(recipe) for recipe in recipes}) == len(recipes) - 1
 
 
 @pytest.mark.slow

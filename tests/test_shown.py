@@ -88,8 +88,8 @@ def shown(urdf_folder):
         ("EstimationProblem", "2 of 6 parameters free"),
         ("Solution", "by gauss_newton"),
         ("Evaluation", "by 2 unknowns"),
-        ("Series", "of 'run_1'"),
-        ("Identifiability", "of 2 parameters found"),
+        ("ChannelPrediction", "of 'run_1'"),
+        ("IdentifiabilityResult", "of 2 parameters found"),
         ("StepSymbols", "4 equations of a step of double_pendulum"),
     ],
 )

@@ -190,7 +190,7 @@ def job_of(mutant: Mutant, package: str, covered: dict[str, Any], rules: bool) -
         file = name.partition("::")[0]
         return not _of_rules(name), seconds[file], file
 
-    name = f"{mutant.file}:{mutant.line}: {mutant.was}  ->  {mutant.imported_as}"
+    name = f"{mutant.file}:{mutant.line}: {mutant.was}  ->  {mutant.becomes}"
     limit = 3 * sum(seconds.values()) + 20
     return Job(package, name, mutant.file, mutant.text(ROOT), tuple(sorted(tests, key=order)), limit)
 

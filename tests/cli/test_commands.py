@@ -177,11 +177,11 @@ def test_errors_are_json_where_that_is_asked_for(cli, pendulum, tmp_path, monkey
         "kind": "ConfigError",
         "what": "there is no key 'iteration'",
         "where": "--set solver.iteration",
-        "allowed": "name, iterations, step_tolerance, cost_tolerance, damping",
-        "hint": "did you mean 'iterations'?",
+        "allowed": "name, max_iterations, step_tolerance, cost_tolerance, initial_damping",
+        "hint": "did you mean 'max_iterations'?",
         "exit_code": 2,
     }
-    assert "did you mean 'iterations'?" in wrong.err
+    assert "did you mean 'max_iterations'?" in wrong.err
     assert json.loads(cli("solve", "--json", "--sett", "a").out)["what"] == "there is no option '--sett'"
     assert cli("solve", "--sett", "a").out == ""
 

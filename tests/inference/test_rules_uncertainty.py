@@ -443,7 +443,9 @@ def test_rounding_below_zero_is_no_variance_and_no_unknowns_need_none():
 
 def test_initial_states_are_no_parameters_and_a_parameter_of_the_start_is_one():
     names = ("k", "start.speed_scale", "rest[run]", "start.q.elbow[run]", "start.p.elbow[run]")
-    problem = SimpleNamespace(names=names, shared=("k", "start.speed_scale"), local=("rest",))
+    problem = SimpleNamespace(
+        unknown_names=names, shared_parameters=("k", "start.speed_scale"), local_parameters=("rest",)
+    )
     assert parameter_unknown_names(problem) == names[:3]
 
 

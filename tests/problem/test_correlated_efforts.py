@@ -114,7 +114,11 @@ def test_derivatives_and_transcriptions_count_what_is_correlated(urdf_folder, ho
     assert float(solver(**arguments)["f"]) == pytest.approx(evaluation.cost, rel=1e-8)
     if "cutoff" in how:  # what is measured of the efforts says little beside points that are this wrong
         return
-    solvers = [GaussNewton(), SingleShooting(), *([] if how else [MultipleShooting(), MultipleShooting(condensing=True)])]
+    solvers = [
+        GaussNewton(),
+        SingleShooting(),
+        *([] if how else [MultipleShooting(), MultipleShooting(condensing=True)]),
+    ]
     found = [solve(problem, s, restarts=False) for s in solvers]
     for other in found[1:]:
         assert other.cost == pytest.approx(found[0].cost, rel=1e-6)

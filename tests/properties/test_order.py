@@ -41,7 +41,7 @@ class Motion:
         torque = np.sin(2 * np.pi * times / self.duration + 0.3)[:, None] * self.amplitude
         p = momentum(step, self.q, self.v, theta)
         rollout = roll(step, theta, self.q, p, count, torque=torque)
-        assert rollout.status.ok, rollout.status.message
+        assert rollout.status.is_converged, rollout.status.message
         n = self.system.n_coordinates
         return rollout.state[-1, :n], rollout.state[-1, n : 2 * n]
 

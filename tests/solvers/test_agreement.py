@@ -171,7 +171,7 @@ def test_open_loop_is_for_multiple_shooting(make_problem):
     assert nodes.history[-1].cost == pytest.approx(single.history[-1].cost, rel=1e-3)
     assert nodes.x == pytest.approx([22.0, 10.7], rel=0.1)
     longer = make_problem(free=("T1.bend", "T2.bend"), feedback="none", duration=3.0)
-    assert not longer.evaluate(longer.start, derivatives=False).ok
+    assert not longer.evaluate(longer.initial_unknowns, derivatives=False).ok
 
 
 def test_limited_memory_is_refused_with_a_reason(short):

@@ -23,7 +23,7 @@ STD, H, STEPS = 1e-3, 0.01, 200
 @pytest.fixture(scope="module")
 def cable():
     """Makes the problem from a start, the same for all free stiffnesses [N m^2]; recorded by the model at the truth."""
-    how = {"radius": 0.005, "rigidity": True, "damping": 2e-4}
+    how = {"radius": 0.005, "stiffness_per_curvature": True, "damping": 2e-4}
     segments = [
         Segment("a", 0.3, 0.03, links=4, clamped_at_base=True, **how),
         Segment("b", 0.2, 0.02, links=3, parent="a", rest_rotation=rotation_from_rpy(0.64, 0.0, 0.0), **how),

@@ -25,7 +25,12 @@ FINE, COARSE, DURATION = 12, 5, 3.0
 
 def arm_with_cable(links: int, mode: str) -> System:
     """A UR5 that carries 1 m of cable, bending alone."""
-    how = {"bend": TRUTH["cable.bend"], "damping": TRUTH["cable.damping"], "rigidity": True, "clamped": True}
+    how = {
+        "bend": TRUTH["cable.bend"],
+        "damping": TRUTH["cable.damping"],
+        "stiffness_per_curvature": True,
+        "clamped_at_base": True,
+    }
     cable = flexible_object([Segment("cable", 1.0, 0.1, 0.006, links=links, joint_axes="xy", **how)], name="cable")
     robot = read_urdf("package:ur5", joints=list(JOINTS))
     parts = {"objects": [(cable, "tool0", None)], "points": ("w_cable",), "damping": dict.fromkeys(JOINTS, 1.0)}

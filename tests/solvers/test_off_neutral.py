@@ -81,7 +81,7 @@ def test_an_amplitude_seen_at_its_neutral_value_begins_there(moved):
 
 def test_an_effect_that_was_given_a_value_begins_there(moved):
     problem = moved("joint_spring", {"stiffness": 8.0, "rest_angle": 1.4}, ("stiffness", "rest_angle"))
-    begun = problem.at({"joint_spring@elbow.stiffness": 2.0})
+    begun = problem.with_parameter_values({"joint_spring@elbow.stiffness": 2.0})
     np.testing.assert_array_equal(initialize_free_effects(begun, begun.initial_unknowns), begun.initial_unknowns)
 
 

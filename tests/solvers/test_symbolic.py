@@ -22,15 +22,19 @@ from yid_ocp.solvers.nonlinear_program import NonlinearProgram, VectorBlock
 from yid_ocp.solvers.program_terms import LocalFunction, ProgramTerm, ResidualTerm
 from yid_ocp.solvers.symbolic_transcription import transcribe, unknowns_from_program
 
-TRACKED = {"feedback": "proportional", "gains": (9.0,)}
+TRACKED = {"feedback": "proportional", "proportional_gains": (9.0,)}
 CASES = {
     "free": ((), {}, {}),
     "robust": ((), {}, {"huber_threshold": 0.8}),
     "paper": ((), {}, {"weighting": "paper"}),
     "estimated": ((), {}, {"initial_state": "estimated"}),
-    "local": ((), {}, {"local": ("elbow.stiffness",)}),
-    "prior": ((), {}, {"priors": {"elbow.damping": 0.3}}),
-    "known start": ((), {}, {"known_start": {"run_1": [0.1, 0.2, 0.01, 0.02], "run_2": [0.0, 0.3, 0.0, -0.01]}}),
+    "local": ((), {}, {"local_parameters": ("elbow.stiffness",)}),
+    "prior": ((), {}, {"prior_stds": {"elbow.damping": 0.3}}),
+    "known start": (
+        (),
+        {},
+        {"known_initial_states": {"run_1": [0.1, 0.2, 0.01, 0.02], "run_2": [0.0, 0.3, 0.0, -0.01]}},
+    ),
     "prescribed": ((), {"prescribed": ("shoulder",)}, {}),
     "all prescribed": ((), {"prescribed": PENDULUM}, {}),
     "driven": ((), {"driven": ("shoulder",)}, {"feedback": "none"}),
@@ -85,7 +89,9 @@ def beside(problem):
 
 
 def values_at(program, w, *expressions):
-    found = ca.Function("f", [program.w, program.p], [ca.densify(e) for e in expressions]).call([w, program.values])
+    found = ca.Function("f", [program.w, program.p], [ca.densify(e) for e in expressions]).call(
+        [w, program.parameter_values]
+    )
     return [np.array(value) for value in found]
 
 

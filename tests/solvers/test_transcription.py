@@ -10,7 +10,6 @@ import pytest
 from yid_ocp.solvers.multiple_shooting import _ShootingIntervals
 
 
-
 @pytest.mark.parametrize("weighting", ["whitened", "paper"])
 def test_gradients_of_the_cost_agree(make_problem, weighting):
     problem = make_problem(

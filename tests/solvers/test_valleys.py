@@ -56,7 +56,7 @@ def test_nothing_is_evaluated_where_nothing_is_doubtful(sure):
     problem.has_process_noise = sure
     at = problem.evaluate(np.array([ALIAS]))
     if sure:
-        at = type(at)(at.cost, at.residual, 1e3 * at.jacobian, at.ok, at.message, at.episodes)
+        at = type(at)(at.cost, at.residual, 1e3 * at.jacobian, at.ok, at.message, at.episode_predictions)
     before = len(problem.asked)
     assert base._other_valleys(problem, at, np.array([ALIAS])) == []
     assert len(problem.asked) == before

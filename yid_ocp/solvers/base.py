@@ -247,6 +247,12 @@ class IterationRecorder:
         if self.callback is not None:
             self.callback(entry)
 
+    def result(
+        self, status: Status, message: str, x: Array, equilibrium_guesses: EquilibriumGuesses | None = None
+    ) -> SolverResult:
+        """Result of a search that ended at `x`."""
+        return SolverResult(status, message, x, tuple(self.history), self.n_evaluations, equilibrium_guesses)
+
 
 # A start from which the rollout fails is approached over shorter horizons, each the start of the next [fraction].
 _HORIZON_FRACTIONS = (0.06, 0.12, 0.25, 0.5)

@@ -38,6 +38,7 @@ _MAX_DECREASE_FACTOR, _NEAR_ZERO_FRACTION = 10.0, 1e-3
 # standard deviation is worth, and move no unknown by more than this part of its standard deviation, and if the linear
 # model promises no more than what a 95 % interval is worth.
 _PATIENCE_STEPS, _NEGLIGIBLE_COST_REDUCTION, _NEGLIGIBLE_MOVE_STDS = 20, 0.05, 0.1
+_LOWEST = "the cost cannot be lowered any further"
 
 
 @SOLVERS.register("gauss_newton")
@@ -47,9 +48,8 @@ class GaussNewton:
 
     Every iteration solves  min |J d + r|^2 + mu |d/s|^2  with  lower <= x + d <= upper, and accepts d when the cost
     falls by a fair part of what the linear model promised. A short step, or one that damping keeps from promising
-    anything, is no end: see `linear_model.is_stationary`. Many steps that are worth nothing beside the noise are one: where
-    the valley is rough (friction that turns, fast waves over many seconds) the linear model promises what no step
-    keeps.
+    anything, is no end (`is_stationary`). Many steps that are worth nothing beside the noise are one: where the valley
+    is rough (friction that turns, fast waves over many seconds) the linear model promises what no step keeps.
 
     References
     ----------
@@ -81,51 +81,44 @@ class GaussNewton:
         callback: IterationCallback | None,
         evaluate: EvaluateFunction | None = None,
     ) -> SolverResult:
-        """Minimize the problem's cost from `start` by Gauss-Newton steps; `evaluate` may stand in for its evaluation."""
-        evaluate = evaluate or problem.evaluate
-        lower, upper = problem.bounds
-        scale = problem.unknown_scales
-        recorder = IterationRecorder(callback)
-        x = start.copy()
-        now = evaluate(x)
+        """Minimize the problem's cost from `start` by Gauss-Newton steps."""
+        (lower, upper), scale = problem.bounds, problem.unknown_scales
+        recorder, x = IterationRecorder(callback), start.copy()
+        now = problem.evaluate(x)
         recorder.n_evaluations += 1
         if not now.ok or now.jacobian is None:
-            return SolverResult(Status.FAILED, now.message, x, (), recorder.n_evaluations)
+            return recorder.result(Status.FAILED, now.message, x)
+
+        def ended(status: Status, message: str) -> SolverResult:
+            return recorder.result(status, message, x, now.equilibrium_guesses)
+
         mu, rejected = self.initial_damping, 0
         while True:
             jacobian, residual = now.jacobian, now.residual
             assert jacobian is not None
-            gradient = jacobian.T @ residual
             size = np.maximum(np.abs(x), scale)
             if rejected == 0:
-                recorder.record_iterate(now.cost, x, projected_gradient_norm(x, gradient, lower, upper, size))
+                slope = projected_gradient_norm(x, jacobian.T @ residual, lower, upper, size)
+                recorder.record_iterate(now.cost, x, slope)
                 saved = _saved(problem, recorder.history, now)
                 if saved is not None:
-                    message = (
-                        f"the last {_PATIENCE_STEPS} steps lowered the cost by {saved:.2g} together and moved nothing by a "
-                        "tenth of its standard deviation"
-                    )
-                    ended = self._end(Status.CONVERGED, message, x, recorder, now)
-                    return replace(ended, stopped_at_noise_level=True)
+                    message = f"the last {_PATIENCE_STEPS} steps lowered the cost by {saved:.2g} together and "
+                    message += "moved nothing by a tenth of its standard deviation"
+                    return replace(ended(Status.CONVERGED, message), stopped_at_noise_level=True)
             if len(recorder.history) > self.max_iterations:
-                message = f"no convergence in {self.max_iterations} iterations; raise solver.max_iterations or free fewer parameters"
-                return self._end(Status.ITERATION_LIMIT, message, x, recorder, now)
+                remedy = "raise solver.max_iterations or free fewer parameters"
+                return ended(Status.ITERATION_LIMIT, f"no convergence in {self.max_iterations} iterations; {remedy}")
             # the linear model is good for a factor, not for a jump to a bound at zero, whence little leads back
-            low = np.where(
-                problem.is_positive & (x > _NEAR_ZERO_FRACTION * scale),
-                np.maximum(lower, x / _MAX_DECREASE_FACTOR),
-                lower,
-            )
-            step = (
-                bounded_least_squares_step(jacobian * size, residual, mu, (low - x) / size, (upper - x) / size) * size
-            )
-            fall = predicted_reduction(jacobian, residual, step)
+            guarded = problem.is_positive & (x > _NEAR_ZERO_FRACTION * scale)
+            low = (np.where(guarded, np.maximum(lower, x / _MAX_DECREASE_FACTOR), lower) - x) / size
+            step = size * bounded_least_squares_step(jacobian * size, residual, mu, low, (upper - x) / size)
+            promised = predicted_reduction(jacobian, residual, step)
             # damping makes any step promise little
-            if fall <= self.cost_tolerance * max(now.cost, 1e-300) and is_stationary(problem, x, now):
-                return self._end(Status.CONVERGED, "the cost cannot be lowered any further", x, recorder, now)
-            trial = evaluate(np.clip(x + step, lower, upper), equilibrium_guesses=now.equilibrium_guesses)
+            if promised <= self.cost_tolerance * max(now.cost, 1e-300) and is_stationary(problem, x, now):
+                return ended(Status.CONVERGED, _LOWEST)
+            trial = problem.evaluate(np.clip(x + step, lower, upper), equilibrium_guesses=now.equilibrium_guesses)
             recorder.n_evaluations += 1
-            gain = (now.cost - trial.cost) / fall if trial.ok and fall > 0 else -1.0
+            gain = (now.cost - trial.cost) / promised if trial.ok and promised > 0 else -1.0
             if gain > 1e-3:
                 moved = float(np.max(np.abs(step) / size))
                 x, now, rejected = np.clip(x + step, lower, upper), trial, 0
@@ -133,29 +126,15 @@ class GaussNewton:
                 if moved < self.step_tolerance and now.jacobian is not None and is_stationary(problem, x, now):
                     slope = projected_gradient_norm(x, now.jacobian.T @ now.residual, lower, upper, size)
                     recorder.record_iterate(now.cost, x, slope)
-                    return self._end(Status.CONVERGED, "the step is below its tolerance", x, recorder, now)
+                    return ended(Status.CONVERGED, "the step is below its tolerance")
                 continue
             rejected += 1
             mu = max(mu * 8.0, 1e-6)
             if mu > 1e10 or rejected > 40:
-                end = is_stationary(problem, x, now)
-                status = Status.CONVERGED if end else Status.STALLED
-                message = (
-                    "the cost cannot be lowered any further"
-                    if end
-                    else (
-                        f"no step lowers the cost ({trial.message or 'the linear model does not hold'}); "
-                        "start nearer, shorten the recording, or use multiple_shooting"
-                    )
-                )
-                return self._end(status, message, x, recorder, now)
-
-    def _end(
-        self, status: Status, message: str, x: Array, recorder: IterationRecorder, now: Evaluation
-    ) -> SolverResult:
-        return SolverResult(
-            status, message, x, tuple(recorder.history), recorder.n_evaluations, now.equilibrium_guesses
-        )
+                if is_stationary(problem, x, now):
+                    return ended(Status.CONVERGED, _LOWEST)
+                reason = f"no step lowers the cost ({trial.message or 'the linear model does not hold'})"
+                return ended(Status.STALLED, f"{reason}; start nearer, shorten the recording, or use multiple_shooting")
 
 
 def _saved(problem: EstimationProblem, history: Sequence[Iterate], now: Evaluation) -> float | None:

@@ -157,7 +157,7 @@ class MultipleShooting:
         log.log(logging.WARNING if needed > _MEMORY_WARNING_BYTES else logging.INFO, "IPOPT on %s", size)
         if needed > free:
             message = f"{size}, of which {free / 1e9:.2g} GB are free; take a longer time_step, a shorter duration or "
-            return SolverResult(Status.FAILED, message + "gauss_newton", start, (), 0)
+            return recorder.result(Status.FAILED, message + "gauss_newton", start)
         functions = ca.Function("point", [program.w, program.p], [program.f, program.grad_f, program.g])
         watch = _Watch(problem, program, functions, ridge, recorder)
         solver = program.make_solver(
@@ -214,8 +214,7 @@ class MultipleShooting:
         x, nodes = intervals.initial_guess(start)
 
         def ended(status: Status, message: str) -> SolverResult:
-            history, guesses = tuple(recorder.history), intervals.equilibrium_guesses
-            return SolverResult(status, message, x, history, recorder.n_evaluations, guesses)
+            return recorder.result(status, message, x, intervals.equilibrium_guesses)
 
         recorder.n_evaluations += 1
         now = intervals.linearize(x, nodes)

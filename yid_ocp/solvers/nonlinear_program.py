@@ -238,7 +238,7 @@ class NonlinearProgram(ReprMixin):
     def hessian(self, kind: HessianKind = "gauss_newton") -> ca.MX:
         """Hessian of lam_f f + lam_g . g, exact or Gauss-Newton, sparse and symmetric.
 
-        Gauss-Newton leaves out the curvature of residuals and of the terms of `constraint_terms`, not of what was added.
+        Gauss-Newton leaves out the curvature of residuals and of `constraint_terms`, not of what was added.
         """
         return self._once(kind, lambda: self._data_curvature(kind) + self._other_curvature(kind))
 

@@ -47,13 +47,12 @@ class SingleShooting:
         self, problem: EstimationProblem, start: Array, callback: IterationCallback | None
     ) -> SolverResult:
         """Minimize the problem's cost from `start` by L-BFGS-B."""
-        lower, upper = problem.bounds
-        scale = problem.unknown_scales
+        (lower, upper), scale = problem.bounds, problem.unknown_scales
         recorder = IterationRecorder(callback)
         first = problem.cost_and_gradient(start)
         recorder.n_evaluations += 1
         if not first[2].ok:
-            return SolverResult(Status.FAILED, first[2].message, start, (), recorder.n_evaluations)
+            return recorder.result(Status.FAILED, first[2].message, start)
         unit = max(first[0], 1e-300)
         warm = first[2].equilibrium_guesses
         seen: dict[bytes, tuple[float, Array]] = {start.tobytes(): (first[0], first[1])}
@@ -92,11 +91,5 @@ class SingleShooting:
             },
         )
         best = min(recorder.history, key=lambda entry: entry.cost if np.isfinite(entry.cost) else np.inf)
-        status = (
-            Status.CONVERGED
-            if result.status == 0
-            else (Status.ITERATION_LIMIT if result.status == 1 else Status.STALLED)
-        )
-        return SolverResult(
-            status, str(result.message).lower(), best.x, tuple(recorder.history), recorder.n_evaluations, warm
-        )
+        status = {0: Status.CONVERGED, 1: Status.ITERATION_LIMIT}.get(result.status, Status.STALLED)
+        return recorder.result(status, str(result.message).lower(), best.x, warm)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from yid_ocp.options import OptionInfo, check_option_bounds
 from yid_ocp.problem.estimation_problem import EstimationProblem
-from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.solvers.base import (
     SOLVERS,
     IterationCallback,
@@ -71,7 +70,12 @@ class SteepestDescent:
         cost, gradient, evaluation = problem.cost_and_gradient(x)
         recorder.n_evaluations += 1
         if not evaluation.ok:
-            return SolverResult(Status.FAILED, evaluation.message, x, (), recorder.n_evaluations)
+            return recorder.result(Status.FAILED, evaluation.message, x)
+
+        def ended(status: Status, message: str) -> SolverResult:
+            best = min(recorder.history, key=lambda entry: entry.cost)
+            return recorder.result(status, message, best.x, evaluation.equilibrium_guesses)
+
         # the first trial moves the unknowns by about a tenth of their size
         length = 0.1 * float(np.linalg.norm(problem.unknown_scales)) / max(float(np.linalg.norm(gradient)), 1e-300)
         for _ in range(self.max_iterations):
@@ -80,7 +84,7 @@ class SteepestDescent:
             recorder.record_iterate(cost, x, slope)
             reference = max(entry.cost for entry in recorder.history[-self.nonmonotone_memory :])
             if slope <= self.gradient_tolerance * max(cost, 1e-300):
-                return self._end(Status.CONVERGED, "the projected gradient vanishes", recorder, evaluation)
+                return ended(Status.CONVERGED, "the projected gradient vanishes")
             while True:
                 trial = np.clip(x - length * gradient, lower, upper)
                 attempt = problem.evaluate(trial, False, evaluation.equilibrium_guesses)
@@ -90,7 +94,7 @@ class SteepestDescent:
                     break
                 length *= self.backtracking_factor
                 if np.max(np.abs(length * gradient) / size) < 1e-12:
-                    return self._end(Status.STALLED, "no step along the gradient lowers the cost", recorder, evaluation)
+                    return ended(Status.STALLED, "no step along the gradient lowers the cost")
             before, slope_before = x, gradient
             x = trial
             cost, gradient, evaluation = problem.cost_and_gradient(x, attempt)
@@ -101,10 +105,4 @@ class SteepestDescent:
         size = np.maximum(np.abs(x), problem.unknown_scales)
         recorder.record_iterate(cost, x, projected_gradient_norm(x, gradient, lower, upper, size))
         message = f"no convergence in {self.max_iterations} iterations, as is usual for this method; try gauss_newton"
-        return self._end(Status.ITERATION_LIMIT, message, recorder, evaluation)
-
-    def _end(self, status: Status, message: str, recorder: IterationRecorder, last: Evaluation) -> SolverResult:
-        best = min(recorder.history, key=lambda entry: entry.cost)
-        return SolverResult(
-            status, message, best.x, tuple(recorder.history), recorder.n_evaluations, last.equilibrium_guesses
-        )
+        return ended(Status.ITERATION_LIMIT, message)
