@@ -25,7 +25,7 @@ def test_the_page_in_the_docs_is_current(repository):
     )
     for line in (
         "| `time_step` | of the integrator | a number above 0 up to 0.1 [s] | `0.01` |",
-        "## solver, name: lifted",
+        "## solver, name: multiple_shooting",
         "## model.object.segments.NAME",
         "| `mass` | mass of the whole segment | a number above 0 [kg] | needed |",
     ):
@@ -67,7 +67,7 @@ def test_the_schema_accepts_every_configuration_and_refuses_typos(repository):
         {"model": {"effects": [{"kind": "density"}]}},
         {"solver": {"max_iterations": -3}},
         {"solver": {"backtracking_factor": 0.3}},
-        {"solver": {"name": "lifted", "first_trial_step": "last"}},
+        {"solver": {"name": "multiple_shooting", "first_trial_step": "last"}},
         {"compare": {"methods": {"gauss_newton": {"max_iterations": "abc"}}}},
         {"compare": {"methods": {"newton": {}}}},
     ):
@@ -76,7 +76,7 @@ def test_the_schema_accepts_every_configuration_and_refuses_typos(repository):
     for right in (
         {"solver": {"name": "steepest_descent", "backtracking_factor": 0.3}},
         {"solver": {"max_iterations": 3}},
-        {"compare": {"methods": {"gauss_newton": {"max_iterations": 3}, "lifted": {}}}},
+        {"compare": {"methods": {"gauss_newton": {"max_iterations": 3}, "multiple_shooting": {}}}},
         {"model": {"object": None}},
     ):
         jsonschema.validate(right, rules)

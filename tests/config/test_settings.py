@@ -24,23 +24,13 @@ def test_written_back_it_is_the_same_run(repository, tmp_path, name):
 
 def test_written_back_every_setting_is_there(written):
     text = (
-        "solver: {name: lifted, node_interval: 3}\ncompare: {methods: {lifted: {max_iterations: 2}}}\n"
+        "solver: {name: single_shooting, max_iterations: 3}\ncompare: {methods: {single_shooting: {cost_tolerance: 2}}}\n"
         "track: {options: {filters: {max_depth_behind_base: null}}}\n"
     )
     run = load_config(written(text))
     told = YAML(typ="safe", pure=True).load(dump_config(run))
-    assert told["solver"] == {
-        "name": "lifted",
-        "node_interval": 3,
-        "max_iterations": 80,
-        "step_tolerance": 1e-5,
-        "cost_tolerance": 1e-5,
-        "defect_tolerance": 1e-7,
-    }
-    assert told["compare"]["methods"] == {
-        "lifted": {name: value for name, value in told["solver"].items() if name != "name"}
-        | {"node_interval": 20, "max_iterations": 2}
-    }
+    assert told["solver"] == {"name": "single_shooting", "max_iterations": 3, "cost_tolerance": 1e-9}
+    assert told["compare"]["methods"] == {"single_shooting": {"max_iterations": 200, "cost_tolerance": 2}}
     assert told["problem"]["time_step"] == 0.01
     assert told["track"]["options"]["filters"]["max_depth_behind_base"] is None
     assert "duration" not in told["problem"]

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from made_problems import MadeUp, Steps, linear
 
+from yid_ocp.solvers import base
 from yid_ocp.solvers.base import IterationRecorder, Solution, Status, projected_gradient_norm, solve
 
 
@@ -230,6 +231,12 @@ def test_a_solver_that_needs_no_rollout_is_not_given_shorter_horizons(needs):
 
 
 # -- passes, where noise drives the motion ----------------------------------------------------------------------------
+
+
+@pytest.fixture(autouse=True)
+def weighted_as_made_up_problems_say(monkeypatch):
+    for name in ("whitened_at", "whitened_by_sensor_noise"):
+        monkeypatch.setattr(base, name, lambda problem, *at, name=name, **how: getattr(problem, name)(*at, **how))
 
 
 class Disturbed(MadeUp):

@@ -143,7 +143,7 @@ def test_its_reduced_gradient_is_the_problems(problem):
 
 def test_the_program_and_condensing_have_one_solution(urdf_folder):
     """Of sensor noise alone, which is what condensing knows; the Hessian changes the way, not the end."""
-    problem = problem_of(urdf_folder, "driven, proportional", seeds=(1,)).without_input_errors()
+    problem = without_input_errors(problem_of(urdf_folder, "driven, proportional", seeds=(1,)))
     tight = {"tol": 1e-12, "acceptable_iter": 0, "mu_init": 1e-12, "mu_target": 1e-15}
     condensed = MultipleShooting(condensing=True, node_interval=5, cost_tolerance=1e-12, step_tolerance=1e-10)
     solvers = (condensed, MultipleShooting(ipopt=tight), MultipleShooting(hessian="exact", ipopt=tight))

@@ -81,10 +81,11 @@ class GaussNewton:
         callback: IterationCallback | None,
         evaluate: EvaluateFunction | None = None,
     ) -> SolverResult:
-        """Minimize the problem's cost from `start` by Gauss-Newton steps."""
+        """Minimize the problem's cost from `start` by Gauss-Newton steps; `evaluate` may stand in for its evaluation."""
+        evaluate = evaluate or problem.evaluate
         (lower, upper), scale = problem.bounds, problem.unknown_scales
         recorder, x = IterationRecorder(callback), start.copy()
-        now = problem.evaluate(x)
+        now = evaluate(x)
         recorder.n_evaluations += 1
         if not now.ok or now.jacobian is None:
             return recorder.result(Status.FAILED, now.message, x)
@@ -116,7 +117,7 @@ class GaussNewton:
             # damping makes any step promise little
             if promised <= self.cost_tolerance * max(now.cost, 1e-300) and is_stationary(problem, x, now):
                 return ended(Status.CONVERGED, _LOWEST)
-            trial = problem.evaluate(np.clip(x + step, lower, upper), equilibrium_guesses=now.equilibrium_guesses)
+            trial = evaluate(np.clip(x + step, lower, upper), equilibrium_guesses=now.equilibrium_guesses)
             recorder.n_evaluations += 1
             gain = (now.cost - trial.cost) / promised if trial.ok and promised > 0 else -1.0
             if gain > 1e-3:

@@ -13,6 +13,7 @@ from annotated_types import Ge, Gt
 from numpy.typing import NDArray
 
 from yid_ocp.errors import SolverError
+from yid_ocp.inference.linear_model import bounded_least_squares_step, predicted_reduction
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import Rollout, SensitivityDirections
 from yid_ocp.options import OptionInfo, check_option_bounds
@@ -27,7 +28,6 @@ from yid_ocp.solvers.base import (
     projected_gradient_norm,
 )
 from yid_ocp.solvers.initial_guess import guess_node_states, mean_square_residual
-from yid_ocp.inference.linear_model import bounded_least_squares_step, predicted_reduction
 from yid_ocp.solvers.nonlinear_program import QUIET_OPTIONS, HessianKind, NonlinearProgram, available_memory
 from yid_ocp.solvers.symbolic_transcription import (
     MIN_RIDGE_FACTOR,
