@@ -65,55 +65,11 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "workflow.baseline_runs": ("read_estimates",),
     "workflow.build": ("load_system",),
     "workflow.build_problem": ("load_problem",),
-    "solvers": (
-        "GaussNewton",
-        "MultipleShooting",
-        "SingleShooting",
-        "Solution",
-        "Status",
-        "SteepestDescent",
-        "solve",
-    ),
+    "solvers": ("GaussNewton", "MultipleShooting", "SingleShooting", "Solution", "Status", "SteepestDescent", "solve"),
 }
 _MODULE_OF = {name: module for module, names in _HOMES.items() for name in names}
 
-__all__ = [
-    "DiagnosisResult",
-    "EstimationProblem",
-    "FlexibleObject",
-    "GaussNewton",
-    "Grasp",
-    "Mechanism",
-    "MultipleShooting",
-    "NonlinearProgram",
-    "ProblemOptions",
-    "Recording",
-    "Segment",
-    "SensorOptions",
-    "SingleShooting",
-    "Solution",
-    "Status",
-    "SteepestDescent",
-    "StepSymbols",
-    "System",
-    "YidError",
-    "__version__",
-    "compile_step",
-    "diagnose",
-    "flexible_object",
-    "identifiability",
-    "load_config",
-    "load_problem",
-    "load_system",
-    "read_any",
-    "read_estimates",
-    "read_recording",
-    "simulate",
-    "solve",
-    "transcribe",
-    "what_if",
-    "write_recording",
-]
+__all__ = ["__version__", *sorted(_MODULE_OF)]
 
 
 def __getattr__(name: str) -> Any:

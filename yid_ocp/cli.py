@@ -28,16 +28,7 @@ _ERROR_FORMAT = "yid-error/1"
 
 @dataclass(frozen=True)
 class CliCommand:
-    """A command of the command line: name, help, implementing module, arguments.
-
-    Attributes
-    ----------
-    name, help : str
-    workflow_module : str
-        File of `workflow` whose `run` takes the parsed arguments and returns the exit code.
-    add_arguments : callable
-        Adds the command's arguments to its parser.
-    """
+    """A command: name, help, and the file of `workflow` whose `run` takes the parsed arguments and returns the code."""
 
     name: str
     help: str
@@ -85,7 +76,7 @@ def _working(parser: argparse.ArgumentParser, absent: str = "as many as there ar
     parser.add_argument("--scheduler", metavar="ADDRESS", default="", help=text)
 
 
-def _doubting_or_embedded(parser: argparse.ArgumentParser) -> None:
+def _solve(parser: argparse.ArgumentParser) -> None:
     _doubting(parser, optional=True)
 
 
@@ -253,7 +244,7 @@ def _schema(parser: argparse.ArgumentParser) -> None:
 
 COMMANDS: tuple[CliCommand, ...] = (
     CliCommand("init", "write a commented configuration from a robot and recordings of it", "init", _init),
-    CliCommand("solve", "estimate the free parameters from recordings", "solve", _doubting_or_embedded),
+    CliCommand("solve", "estimate the free parameters from recordings", "solve", _solve),
     CliCommand("compare", "run several methods on one problem and say whether they agree", "compare", _doubting),
     CliCommand(
         "identifiability",
@@ -261,12 +252,7 @@ COMMANDS: tuple[CliCommand, ...] = (
         "identifiability",
         _identifiability,
     ),
-    CliCommand(
-        "diagnose",
-        "find the gap between model and recordings, and what makes it",
-        "diagnose",
-        _diagnose,
-    ),
+    CliCommand("diagnose", "find the gap between model and recordings, and what makes it", "diagnose", _diagnose),
     CliCommand(
         "blind",
         "prove the diagnosis on virtual recordings whose effect is withheld; goes on where it was interrupted",
@@ -316,9 +302,8 @@ class _Parser(argparse.ArgumentParser):
         if chosen:
             known = [name.strip(" '") for name in chosen[3].split(",")]
             noun = "command" if chosen[1] == "COMMAND" else f"choice of {chosen[1]}"
-            raise ConfigError(
-                f"there is no {noun} '{chosen[2]}'", where=self.prog, **unknown_name_details(chosen[2], known)
-            )
+            details = unknown_name_details(chosen[2], known)
+            raise ConfigError(f"there is no {noun} '{chosen[2]}'", where=self.prog, **details)
         raise ConfigError(message, where=self.prog, hint=self._help())
 
     def _help(self) -> str:
@@ -430,9 +415,8 @@ def _failed(error: Exception, as_json: bool) -> int:
         return _wrong(error, as_json)
     if isinstance(error, BrokenPipeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python fails again when it ends
-        return _wrong(
-            OutputError("standard output was closed before all was printed", hint="read it to its end"), False
-        )
+        what = "standard output was closed before all was printed"
+        return _wrong(OutputError(what, hint="read it to its end"), False)
     if isinstance(error, OSError):
         what = f"the system refused: {error.strerror or error}"
         hint = "see whether disk and rights allow it"

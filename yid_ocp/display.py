@@ -12,15 +12,7 @@ _MAX_TABLE_ROWS = 30
 
 @dataclass(frozen=True)
 class ReprSummary:
-    """The representation of an object: one line and an optional table.
-
-    Attributes
-    ----------
-    one_line : str
-        In one line, without the name of its class.
-    table_rows : sequence of sequence of str
-        The table of a notebook; its first row is the head.
-    """
+    """The representation of an object: one line without its class, and a notebook's table with its head first."""
 
     one_line: str
     table_rows: Sequence[Sequence[str]] = ()

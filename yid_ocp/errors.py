@@ -72,35 +72,14 @@ class UnknownNameDetails(TypedDict):
 def nearest_name_hint(name: str, known: Iterable[str]) -> str:
     """Hint for an error about an unknown name: the most similar known name, or a list of known names.
 
-    Parameters
-    ----------
-    name : str
-        The name that was not found.
-    known : iterable of str
-        The names that exist.
-
-    Returns
-    -------
-    str
-        A sentence for the `hint` of an error that does not say what is allowed; beside a list, see `unknown_name_details`.
+    It is for errors that do not say what is allowed; beside a list, see `unknown_name_details`.
     """
     names = [str(entry) for entry in known]
     return _meant(name, names) or f"known: {_listed(name, sorted(names)) or 'none'}"
 
 
 def unknown_name_details(name: str, known: Iterable[str]) -> UnknownNameDetails:
-    """Allowed names and hint for an error about an unknown name; long lists are cut.
-
-    Parameters
-    ----------
-    name, known
-        As in `nearest_name_hint`.
-
-    Returns
-    -------
-    dict
-        Arguments of an error: `ConfigError(what, where=where, **choices(name, known))`.
-    """
+    """Allowed names and hint for an error about an unknown name, as its arguments; long lists are cut."""
     names = [str(entry) for entry in known]
     return {"allowed": _listed(name, names) or "none", "hint": _meant(name, names)}
 

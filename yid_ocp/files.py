@@ -21,16 +21,6 @@ from yid_ocp.errors import DataError, OutputError
 def atomic_write(path: Path) -> Iterator[Path]:
     """Context manager that writes a file atomically: the yielded temporary file replaces `path` on success.
 
-    Parameters
-    ----------
-    path : Path
-        The file to make or replace.
-
-    Yields
-    ------
-    Path
-        Where to write meanwhile.
-
     Raises
     ------
     OutputError
@@ -46,10 +36,8 @@ def atomic_write(path: Path) -> Iterator[Path]:
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except (OSError, RuntimeError) as error:
-        what, hint = (
-            f"the file cannot be written ({os_error_reason(error)})",
-            "choose a writable folder on a disk with room",
-        )
+        hint = "choose a writable folder on a disk with room"
+        what = f"the file cannot be written ({os_error_reason(error)})"
         raise OutputError(what, where=str(path), hint=hint) from error
     finally:
         with contextlib.suppress(OSError):
@@ -73,17 +61,7 @@ def is_file(path: Path) -> bool:
 
 
 def file_sha256(path: Path) -> str:
-    """SHA-256 of a file, or of all files in a folder in the order of their names.
-
-    Parameters
-    ----------
-    path : Path
-        The file or folder.
-
-    Returns
-    -------
-    str
-        SHA-256, 64 hexadecimal digits.
+    """SHA-256 of a file, or of all files in a folder in the order of their names; 64 hexadecimal digits.
 
     Raises
     ------

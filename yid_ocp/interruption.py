@@ -9,6 +9,7 @@ import signal
 import socket
 import threading
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
 
@@ -25,26 +26,20 @@ _TERMINATION_SIGNALS = tuple(
 
 
 class InterruptedBySignal(KeyboardInterrupt):
-    """Exception raised when a signal ends the command.
-
-    Parameters
-    ----------
-    signal_number : int
-        The signal's.
-    """
+    """Exception raised when a signal ends the command."""
 
     def __init__(self, signal_number: int) -> None:
         super().__init__(signal.Signals(signal_number).name)
         self.signal_number = signal_number
 
 
+@dataclass
 class _State:
     """State of interruptions in this process."""
 
-    def __init__(self) -> None:
-        self.asked: int | None = None
-        self.deferring = 0
-        self.unfinished: set[Path] = set()
+    asked: int | None = None
+    deferring: int = 0
+    unfinished: set[Path] = field(default_factory=set)
 
 
 _STATE = _State()
@@ -83,9 +78,9 @@ def raise_on_signals() -> Iterator[None]:
     """Context manager that raises `InterruptedBySignal` for SIGINT, SIGTERM and SIGHUP during its block.
 
     An exception can get lost: in what collects garbage, in callbacks of libraries, in a call that does not come back.
-    So it is raised again every `_RERAISE_INTERVAL` seconds, and after `_FORCED_EXIT_DELAY` seconds the process is ended with the exit
-    code that shells expect, when nothing but the folders of `remove_on_forced_exit` has to be cleared away. Signals that the
-    parent had ignored stay so, as under `nohup`. Outside the main thread nothing is changed.
+    So it is raised again every `_RERAISE_INTERVAL` seconds, and after `_FORCED_EXIT_DELAY` seconds the process is ended
+    with the exit code that shells expect, when nothing but the folders of `remove_on_forced_exit` has to be cleared
+    away. Signals that the parent had ignored stay so, as under `nohup`. Outside the main thread nothing is changed.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

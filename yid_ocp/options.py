@@ -2,7 +2,7 @@
 
 An option is a field of a frozen dataclass, annotated with its bounds and with `OptionInfo`:
 
-    time_step: Annotated[float, Gt(0), Le(0.1), About("of the integrator", "s")] = 0.01
+    time_step: Annotated[float, Gt(0), Le(0.1), OptionInfo("of the integrator", "s")] = 0.01
 
 Reader, `--set`, checks and JSON Schema follow from it. A field without `OptionInfo` is set by code alone.
 """
@@ -33,15 +33,10 @@ _TYPE_WORDS = {float: "a number", int: "a whole number", bool: "true or false", 
 
 @dataclass(frozen=True)
 class OptionInfo:
-    """Annotation of an option: its meaning and unit.
+    """Annotation of an option: its meaning and SI unit, empty for text and pure numbers.
 
-    Attributes
-    ----------
-    description : str
-    unit : str
-        SI, empty for text and pure numbers.
-    is_path : bool
-        Whether the text names a file, relative to the configuration; `package:NAME` and `default:NAME` are kept.
+    `is_path` tells that the text names a file, relative to the configuration; `package:NAME` and `default:NAME` are
+    kept.
     """
 
     description: str = ""
@@ -51,14 +46,7 @@ class OptionInfo:
 
 @dataclass(frozen=True)
 class RegistryChoice:
-    """Annotation of a type: the user chooses a class of a registry by the key `name`, or by a mapping's key.
-
-    Attributes
-    ----------
-    registry : Registry
-    default_name : str
-        Chosen where there is no `name`.
-    """
+    """Annotation of a type: the user chooses a class of a registry by the key `name`, or by a mapping's key."""
 
     registry: Registry[Any]
     default_name: str = ""

@@ -76,16 +76,7 @@ class LoggingProgress(NullProgress):
 
 
 class ParallelProgress:
-    """Progress of a stage whose parts run in parallel; counts them as they finish.
-
-    Parameters
-    ----------
-    progress : Progress
-    total : int
-        How many there are.
-    first : str
-        One that is begun with.
-    """
+    """Progress of a stage whose `total` parts run in parallel, `first` to begin with; counts them as they finish."""
 
     def __init__(self, progress: Progress, total: int, first: str) -> None:
         self._progress, self._total, self._count, self._lock = progress, total, 0, threading.Lock()

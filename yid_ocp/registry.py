@@ -11,13 +11,7 @@ _Entry = TypeVar("_Entry")
 
 
 class Registry(Generic[_Entry]):
-    """A table from name to implementation, filled by decorators.
-
-    Parameters
-    ----------
-    entry_noun : str
-        What the entries are, used in error messages.
-    """
+    """A table from name to implementation, filled by decorators; `entry_noun` is for error messages."""
 
     def __init__(self, entry_noun: str) -> None:
         self.entry_noun = entry_noun
@@ -28,10 +22,8 @@ class Registry(Generic[_Entry]):
 
         def enter(entry: _Entry) -> _Entry:
             if name in self._entries:
-                raise ConfigError(
-                    f"the name '{name}' is taken: another {self.entry_noun} has it",
-                    hint="register it under another name",
-                )
+                what = f"the name '{name}' is taken: another {self.entry_noun} has it"
+                raise ConfigError(what, hint="register it under another name")
             self._entries[name] = entry
             return entry
 

@@ -14,7 +14,7 @@ from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, Status, solve
-from yid_ocp.solvers.effect_initialization import initialize_free_effects
+from yid_ocp.solvers.initial_guess import initialize_free_effects
 
 H, STEPS, STD = 0.01, 150, 0.02
 JOINTS = ("shoulder", "elbow")

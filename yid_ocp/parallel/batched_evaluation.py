@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-from yid_ocp.parallel.threads import limit_threads, max_threads
+from yid_ocp.parallel.threads_and_processes import limit_threads, max_threads
 
 _MAX_CONCURRENT_ITEMS = 8
 """Largest number of concurrent items, equal to the largest batch size."""
@@ -87,13 +87,9 @@ _HERE = threading.local()
 
 
 def batched_call(function: Callable[[list[_Query]], list[_Answer]], questions: list[_Query]) -> list[_Answer]:
-    """Results of a function for some arguments, evaluated in one call with those of other `map_with_batched_calls` items.
+    """Results of a function of many arguments, in one call with those of other `map_with_batched_calls` items.
 
-    Parameters
-    ----------
-    function : callable
-        From any number of questions to their answers; equal functions are asked together.
-    questions : list
+    `function` answers any number of questions; equal functions are asked together.
     """
     march = getattr(_HERE, "march", None)
     if march is None:

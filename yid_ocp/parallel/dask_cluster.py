@@ -142,12 +142,9 @@ def _question(module: str, probe: str) -> Callable[[], Any]:
 
 
 def _unfit(worker: str, unlike: Sequence[str]) -> WorkerError:
-    return WorkerError(
-        version_mismatch_message(worker, unlike),
-        where=worker,
-        allowed="workers of the same versions and sources as this process",
-        hint="install the same version there, and start the workers again",
-    )
+    allowed = "workers of the same versions and sources as this process"
+    hint = "install the same version there, and start the workers again"
+    return WorkerError(version_mismatch_message(worker, unlike), where=worker, allowed=allowed, hint=hint)
 
 
 def version_mismatch_message(worker: str, unlike: Sequence[str]) -> str:

@@ -20,14 +20,7 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    CancelledError,
-    Executor,
-    Future,
-    wait,
-)
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -35,8 +28,7 @@ from typing import Any
 from yid_ocp.errors import ConfigError, OutputError, WorkerError, YidError
 from yid_ocp.files import file_sha256, json_sha256, os_error_reason, write_json
 from yid_ocp.parallel.dask_cluster import dask_executor, version_mismatch_message
-from yid_ocp.parallel.processes import InlineExecutor, process_pool
-from yid_ocp.parallel.threads import processor_count
+from yid_ocp.parallel.threads_and_processes import InlineExecutor, process_pool, processor_count
 from yid_ocp.version import fingerprint_differences, package_source_hash, software_fingerprint
 
 _TASK_FORMAT = "yid-task/1"
@@ -46,20 +38,15 @@ _WORKER_CHECK_INTERVAL = 60.0
 """Time without a finished task after which it is checked that there are workers [s]."""
 log = logging.getLogger(__name__)
 _TaskFunction = Callable[..., Any]
-_TaskProgressCallback = Callable[[int, int, str], None]
+TaskProgressCallback = Callable[[int, int, str], None]
 """Callback with the number of finished tasks, the number of all tasks, and the name of the last one."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """One function call.
+    """One function call; its name is for people and does not count for what is resumed.
 
-    Attributes
-    ----------
-    name : str
-        For people; it does not count for what is resumed.
-    arguments : mapping of str to Any
-        By keyword: text, numbers, None, lists and mappings of them, and `Path` for files and folders that are read.
+    `arguments`, by keyword, are text, numbers, None, lists and mappings of them, and `Path` for what is read.
     """
 
     name: str
@@ -68,20 +55,9 @@ class Task:
 
 @dataclass(frozen=True)
 class TaskResult:
-    """The result of a task.
+    """The result of a task: what its function returned, as read back from its file, or why it failed.
 
-    Attributes
-    ----------
-    name : str
-        The task's.
-    value : Any
-        What the function returned, as read back from its file; None where it failed.
-    error : str
-        Why it failed, empty where it did not.
-    seconds : float
-        Time that the function took.
-    was_resumed : bool
-        Whether an earlier run did it.
+    `seconds` is the function's time, `was_resumed` tells that an earlier run did it.
     """
 
     name: str
@@ -93,14 +69,7 @@ class TaskResult:
 
 @dataclass(frozen=True)
 class WorkerConfig:
-    """The workers of a run: processes on this machine or a scheduler.
-
-    Attributes
-    ----------
-    n_processes : int, optional
-        Processes on this machine; as many as there are processors when absent.
-    scheduler_address : str
-        Address of a Dask scheduler, or its scheduler file, whose workers do the tasks instead.
+    """The workers of a run: processes on this machine, or those of a Dask scheduler (address or scheduler file).
 
     Raises
     ------
@@ -144,7 +113,7 @@ def run_tasks(
     tasks: Sequence[Task],
     folder: Path,
     workers: WorkerConfig | Executor = LOCAL_WORKERS,
-    progress: _TaskProgressCallback | None = None,
+    progress: TaskProgressCallback | None = None,
     code: str | None = None,
 ) -> list[TaskResult]:
     """Results of a function for all tasks; those already stored in the folder are not computed again.
@@ -159,7 +128,7 @@ def run_tasks(
     tasks : sequence of Task
     folder : Path
         Of results; made where absent.
-    workers : Workers or concurrent.futures.Executor
+    workers : WorkerConfig or concurrent.futures.Executor
         Processes of this machine stop at once when the run is interrupted, and one that dies takes no task with it but
         the one that killed it. Workers of a scheduler end the task that they are at.
     progress : callable, optional
@@ -188,9 +157,8 @@ def run_tasks(
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(
-            f"the folder of results cannot be made ({os_error_reason(error)})", where=str(folder)
-        ) from error
+        reason = os_error_reason(error)
+        raise OutputError(f"the folder of results cannot be made ({reason})", where=str(folder)) from error
     kept = {key: job.kept() for key, job in unique.items()}
     found = {key: replace(result, was_resumed=True) for key, result in kept.items() if result is not None}
     if found and progress is not None:
@@ -248,15 +216,7 @@ def _done_by(workers: WorkerConfig | Executor, jobs: Sequence[_Job], finished: _
 
 
 def _task_input(function: _TaskFunction, task: Task, code: str) -> dict[str, Any]:
-    """All inputs of a task as plain data: function, source hash, arguments and file hashes; its hash is the key.
-
-    Raises
-    ------
-    ValueError, TypeError
-        A function that another process could not import, an argument that is neither plain data nor a path.
-    DataError
-        A file that cannot be read.
-    """
+    """All inputs of a task as plain data: function, source hash, arguments and file hashes; its hash is the key."""
     if "<" in function.__qualname__:
         raise ValueError(f"{function.__qualname__} does not stand at the top of a module")
     name = f"{function.__module__}.{function.__qualname__}"

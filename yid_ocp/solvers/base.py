@@ -34,8 +34,8 @@ from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
 from yid_ocp.problem.prediction_errors import ChannelPrediction, channel_predictions
 from yid_ocp.registry import Registry
-from yid_ocp.solvers.effect_initialization import initialize_free_effects
 from yid_ocp.solvers.fit_messages import VERDICT_WORDS, finite_or_none, parameter_text
+from yid_ocp.solvers.initial_guess import initialize_free_effects
 
 if TYPE_CHECKING:
     import pandas

@@ -81,7 +81,7 @@ class GaussNewton:
         callback: IterationCallback | None,
         evaluate: EvaluateFunction | None = None,
     ) -> SolverResult:
-        """Minimize the problem's cost from `start` by Gauss-Newton steps; `evaluate` may stand in for its evaluation."""
+        """Minimize the problem's cost from `start` by Gauss-Newton steps; `evaluate` may replace its evaluation."""
         evaluate = evaluate or problem.evaluate
         (lower, upper), scale = problem.bounds, problem.unknown_scales
         recorder, x = IterationRecorder(callback), start.copy()
