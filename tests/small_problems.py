@@ -111,7 +111,7 @@ def taken(step, seed, *, efforts=True, camera=True, name=None, steps=STEPS):
 def swinging_pendulum(folder):
     """The step of a damped double pendulum, and a function that records a free swing of it, its lower points seen.
 
-    `simulate_recording(seed, steps, bend, noise)` starts with angles of `bend` times a standard normal number and adds `noise`
+    The function (seed, steps, bend, noise) starts with angles of `bend` times a standard normal number and adds `noise`
     metres to what is seen; the standard deviation said is 1 mm.
     """
     system = System.build(read_urdf(str(folder / "double_pendulum.urdf")), damping={"shoulder": 0.1, "elbow": 0.1})

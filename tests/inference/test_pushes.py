@@ -17,8 +17,8 @@ from yid_ocp.inference.smoother import _instead, _run
 from yid_ocp.inference.smoother_model import (
     _FORCE_POINT,
     UnknownGroup,
-    generalized_forces_per_newton,
-    segment_weights,
+    _generalized_forces_per_newton,
+    _segment_weights,
 )
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.virtual.experiment import baxter_foam_y_system
@@ -29,7 +29,7 @@ THETA = np.array([parameter.value for parameter in SYSTEM.parameters])
 
 def test_a_push_is_what_virtual_work_says():
     q = 0.3 * np.random.default_rng(3).standard_normal((2, SYSTEM.n_coordinates))
-    found = generalized_forces_per_newton(SYSTEM, THETA, q, ("T1", "T3"))
+    found = _generalized_forces_per_newton(SYSTEM, THETA, q, ("T1", "T3"))
     assert found.shape == (2, SYSTEM.n_coordinates, 6)
     symbol = ca.SX.sym("q", SYSTEM.n_coordinates)
     at = ca.vertcat(
@@ -45,13 +45,13 @@ def test_a_push_is_what_virtual_work_says():
 
 
 def test_pushes_are_measured_by_the_weight_of_their_segment():
-    found = segment_weights(SYSTEM, THETA)
+    found = _segment_weights(SYSTEM, THETA)
     assert found == pytest.approx({"T1": 9.81 * 0.064, "T2": 9.81 * 0.015, "T3": 9.81 * 0.016})
 
 
 def test_what_cannot_be_pushed_is_not():
-    assert segment_weights(replace(SYSTEM, segment_layouts=()), THETA) == {}
-    assert generalized_forces_per_newton(SYSTEM, THETA, np.zeros((4, SYSTEM.n_coordinates)), ()).shape == (
+    assert _segment_weights(replace(SYSTEM, segment_layouts=()), THETA) == {}
+    assert _generalized_forces_per_newton(SYSTEM, THETA, np.zeros((4, SYSTEM.n_coordinates)), ()).shape == (
         4,
         SYSTEM.n_coordinates,
         0,

@@ -105,7 +105,7 @@ class UnknownGroup:
 
 
 @dataclass(frozen=True)
-class LinearizedEpisode:
+class _LinearizedEpisode:
     """An episode of a problem and the trajectory about which the smoother's model of it is linear."""
 
     problem: EstimationProblem
@@ -119,7 +119,7 @@ class LinearizedEpisode:
 
 
 @dataclass(frozen=True)
-class SmootherUnknowns:
+class _SmootherUnknowns:
     """What gets an unknown, and how large it may be.
 
     Attributes
@@ -156,7 +156,7 @@ class SmootherUnknowns:
         return self.loading + 3 * len(self.pushed)
 
 
-def smoother_unknowns(course: LinearizedEpisode, limits: SmootherThresholds) -> SmootherUnknowns:
+def _smoother_unknowns(course: _LinearizedEpisode, limits: SmootherThresholds) -> _SmootherUnknowns:
     """Unknowns of one recording, with their groups and reference sizes."""
     names, sources, reference, forced = _unknown_forces(course, limits.force_prior_std)
     grasped, row = [], 0
@@ -167,7 +167,7 @@ def smoother_unknowns(course: LinearizedEpisode, limits: SmootherThresholds) -> 
         reference += [limits.grasp_offset_prior_std] * 3
         row += grasp.n_equations
     pushed = []
-    for segment, weight in segment_weights(course.system, course.nominal.theta).items():
+    for segment, weight in _segment_weights(course.system, course.nominal.theta).items():
         pushed.append(segment)
         names += [f"{segment}.push_{axis}" for axis in "xyz"]
         sources += [UnknownGroup(segment, "push")] * 3
@@ -187,13 +187,13 @@ def smoother_unknowns(course: LinearizedEpisode, limits: SmootherThresholds) -> 
             sources.append(UnknownGroup(sensor_bias_location(course.system, sensor, frame), "bias"))
             reference.append(limits.bias_prior_std * float(np.nanmedian(samples.std[:, column])))
     held = np.array(grasped, int)
-    return SmootherUnknowns(
+    return _SmootherUnknowns(
         tuple(names), tuple(sources), np.array(reference), forced, held, tuple(pushed), tuple(biased)
     )
 
 
 def _unknown_forces(
-    course: LinearizedEpisode, part: float
+    course: _LinearizedEpisode, part: float
 ) -> tuple[list[str], list[UnknownGroup], list[float], NDArray[np.int64]]:
     """Names, sources, reference sizes and coordinates of the unknown forces."""
     system, joint_names = course.system, course.system.mechanism.joint_names
@@ -223,7 +223,7 @@ def sensor_bias_location(system: System, sensor: Sensor, frame: str) -> str:
     return sensor.group_name
 
 
-def _loads(course: LinearizedEpisode) -> Array:
+def _loads(course: _LinearizedEpisode) -> Array:
     """Typical load of every coordinate: of its spring, its motor or its prescription, shape (n,) [N m or N]."""
     system, rollout = course.system, course.nominal.rollout
     load = np.zeros(system.n_coordinates)
@@ -241,13 +241,8 @@ def _loads(course: LinearizedEpisode) -> Array:
     return load
 
 
-def segment_weights(system: System, theta: Array) -> dict[str, float]:
-    """Return the weight of every segment that has a mass [N].
-
-    Parameters
-    ----------
-    theta : ndarray, shape (ntheta,)
-    """
+def _segment_weights(system: System, theta: Array) -> dict[str, float]:
+    """Return the weight of every segment that has a mass [N]."""
     tree, masses = system.mechanism, {}
     for segment in system.segment_layouts:
         joints = [tree.joints[tree.joint_index(name)] for link in segment.link_joints for name in link]
@@ -260,20 +255,8 @@ def segment_weights(system: System, theta: Array) -> dict[str, float]:
     return {name: float(weight) for name, weight in zip(masses, found, strict=True) if weight > 0}
 
 
-def generalized_forces_per_newton(system: System, theta: Array, q: Array, segments: Sequence[str]) -> Array:
-    """Return the generalized forces of 1 N along x, y and z on each of some segments.
-
-    Parameters
-    ----------
-    theta : ndarray, shape (ntheta,)
-    q : ndarray, shape (N, n)
-        Configurations.
-
-    Returns
-    -------
-    ndarray, shape (N, n, 3 ns)
-        [N m/N or 1].
-    """
+def _generalized_forces_per_newton(system: System, theta: Array, q: Array, segments: Sequence[str]) -> Array:
+    """Return the generalized forces of 1 N along x, y and z on each of some segments."""
     if not segments:
         return np.zeros((*q.shape, 0))
     symbol = ca.SX.sym("q", system.n_coordinates)
@@ -379,7 +362,7 @@ def linear_residual_models(
             samples.residual_block(predicted, threshold=problem.options.huber_threshold).robust_factor
             for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True)
         ]
-        course = LinearizedEpisode(problem, episode, nominal)
+        course = _LinearizedEpisode(problem, episode, nominal)
         found.append(_recording(course, np.concatenate(factor), observed, limits, interval))
     prior = columns[problem.residual_rows.stated_priors]
     # stated priors of the free parameters are observations that no unknown reaches
@@ -391,7 +374,7 @@ def linear_residual_models(
 # -- the slopes of single steps ---------------------------------------------------------------------------------------
 
 
-def _loads_of(course: LinearizedEpisode, unknowns: SmootherUnknowns) -> AdditionalLoads:
+def _loads_of(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> AdditionalLoads:
     """What unknown forces and grasp offsets of their reference size add to every step."""
     step = course.problem.step
     n, nz, m = (step.sizes[key] for key in ("n", "nz", "m"))
@@ -407,7 +390,7 @@ def _loads_of(course: LinearizedEpisode, unknowns: SmootherUnknowns) -> Addition
 
 
 def _steps(
-    course: LinearizedEpisode, loads: AdditionalLoads, pushes: Array, moving: NDArray[np.int64], first: int, last: int
+    course: _LinearizedEpisode, loads: AdditionalLoads, pushes: Array, moving: NDArray[np.int64], first: int, last: int
 ) -> tuple[Array, Array, Array]:
     """A_k (steps, ns, ns), E_k (steps, ns, nd') and the effort's slopes (steps, nc, ns + nd') of some steps.
 
@@ -449,16 +432,16 @@ def _steps(
 
 
 def _recording(
-    course: LinearizedEpisode, factor: Array, observed: Array, limits: SmootherThresholds, shortest: float
+    course: _LinearizedEpisode, factor: Array, observed: Array, limits: SmootherThresholds, shortest: float
 ) -> LinearResidualModel:
     """The linear model of one recording from its whitened residuals and their slopes."""
     h, steps = course.problem.step.time_step, course.episode.grid.steps
     length = int(max(round(shortest / h), math.ceil(steps * _MIN_INTERVAL / (_MAX_INTERVAL_COUNT * shortest)), 1))
     edges = np.unique(np.append(np.arange(0, steps, length), steps))
-    unknowns = smoother_unknowns(course, limits)
+    unknowns = _smoother_unknowns(course, limits)
     loads, forces = _loads_of(course, unknowns), len(unknowns.forced)
     nodes = course.nominal.rollout.state[:, : course.system.n_coordinates]
-    pushes = generalized_forces_per_newton(course.system, course.nominal.theta, nodes, unknowns.pushed)[
+    pushes = _generalized_forces_per_newton(course.system, course.nominal.theta, nodes, unknowns.pushed)[
         :, unknowns.forced
     ]
     pushes *= unknowns.reference[unknowns.loading : unknowns.driving] / unknowns.reference[:forces, None]
@@ -500,7 +483,7 @@ def _recording(
     )
 
 
-def _torque_noise(course: LinearizedEpisode, unknowns: SmootherUnknowns, span: float, decay: float) -> Array:
+def _torque_noise(course: _LinearizedEpisode, unknowns: _SmootherUnknowns, span: float, decay: float) -> Array:
     """Variance of unknown forces that stand for the noise of recorded torques, in units of the squared reference.
 
     White noise counts by its spectral density at low frequencies, which an unknown force of memory `decay` from
@@ -519,7 +502,7 @@ def _torque_noise(course: LinearizedEpisode, unknowns: SmootherUnknowns, span: f
     return known
 
 
-def _loose_start(course: LinearizedEpisode) -> Array:
+def _loose_start(course: _LinearizedEpisode) -> Array:
     """Standard deviation of a start that was fitted to points, shape (nx,)."""
     problem, free = course.problem, np.array(course.system.free_indices, int)
     options, joints = problem.options, course.system.mechanism.joint_names
@@ -551,7 +534,7 @@ def _interval_response(
     return node[-1][:, :ns], node[-1][:, ns:], slopes.response(node, effort, first)
 
 
-def _bias_slopes(course: LinearizedEpisode, unknowns: SmootherUnknowns) -> Array:
+def _bias_slopes(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> Array:
     """Slopes of all rows by the biases, in units of their reference, shape (r, nb)."""
     reference, found = unknowns.reference[unknowns.driving :], []
     for k, samples in enumerate(course.episode.measurements):

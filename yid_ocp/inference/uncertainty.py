@@ -233,7 +233,7 @@ def _cost_checked_std(problem: EstimationProblem, x: Array, evaluation: Evaluati
     The covariance is that of a parabola at the fit. Where it does not fix a parameter well, the cost is worked out at
     the end of its 95 % interval, the others moved along; where it rises less than the parabola promised, the
     standard deviation is that of a parabola through there, infinite where the cost does not rise at all. Stiffnesses
-    that are small by chance look informed at the fit and are not. Of more than `_MAX_CHECKED_PARAMETERS` parameters none is asked.
+    that are small by chance look informed at the fit and are not. Of more than `_MAX_CHECKED_PARAMETERS` none is asked.
     """
     spread = std_from_covariance(covariance, x)
     lower, upper = problem.bounds
@@ -351,8 +351,7 @@ def with_profile_interval(entry: ParameterEstimate, interval: ConfidenceInterval
     """Estimate with its profile-likelihood interval, and standard deviation and verdict consistent with it.
 
     Open on both sides it is not_identifiable, on one side at best weak and without a ±. An end that is not met before
-    a bound within `scale` is that bound. Else the wider side stands for two standard deviations (`verdict_by_relative_std`), and is
-    the ± where a parabola's would be less than half of it.
+    a bound within `scale` is that bound. Else the wider side is two standard deviations (`verdict_by_relative_std`), and is the ± where a parabola's would be less than half of it.
 
     Parameters
     ----------

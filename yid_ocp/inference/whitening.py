@@ -206,7 +206,7 @@ class WhiteningFilter:
         return white, later
 
 
-def build_whitening_filter(course: NominalTrajectory, errors: InputErrors) -> WhiteningFilter:
+def _build_whitening_filter(course: NominalTrajectory, errors: InputErrors) -> WhiteningFilter:
     """Build the whitening Kalman filter along a trajectory."""
     step, nu, count = course.model_functions.step, len(errors.torque_bias_std), len(course.rollout.torque)
     linear = partial(linearized_steps, step, course.theta, course.rollout)
@@ -330,7 +330,7 @@ def _whitened_episode(
     if isinstance(result, str) or episode.input_errors is None:
         return episode, None
     course = nominal_trajectory(predictor, episode, result, at[0])
-    return episode, build_whitening_filter(course, episode.input_errors)
+    return episode, _build_whitening_filter(course, episode.input_errors)
 
 
 def _about_smoothed(

@@ -90,7 +90,7 @@ def _error(predictor: EpisodePredictor, seen: Sequence[Measurements], start: Ini
 
 
 def _loaded(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:
-    """The episode with the model's own loads on the gears of joints whose efforts are compared; see `denoised_gear_loads`."""
+    """The episode with the model's loads on gears of joints whose efforts are compared (`denoised_gear_loads`)."""
     compared, corrections = (
         [s for s in episode.measurements if s.sensor.effort_joints],
         predictor.model_functions.input_corrections,
@@ -116,7 +116,7 @@ _HELD_OUT_ITERATIONS = 3
 
 
 def estimate_initial_state_offset(predictor: EpisodePredictor, episode: Episode, theta: Array, std: Array) -> Array:
-    """Offset of the initial state from equilibrium, estimated from the first `_HELD_OUT_START_WINDOW` seconds and its prior.
+    """Offset of the initial state from equilibrium, estimated from `_HELD_OUT_START_WINDOW` seconds and its prior.
 
     Zero where the rollout fails; `std` is the prior's, (number of estimated rows,).
     """

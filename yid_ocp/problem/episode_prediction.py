@@ -63,7 +63,7 @@ class EpisodePredictor:
 
     @property
     def estimated_state_indices(self) -> tuple[int, ...]:
-        """Indices of the estimated components of the initial state, in the order of `UnknownVectorLayout.initial_state_names`."""
+        """Indices of the estimated components of the initial state, in the order of `initial_state_names`."""
         joints, n = self.system.mechanism.joint_index, self.system.n_coordinates
         hidden = list(self.system.internal_coordinates)
         split = (name.split(".", 1) for name in self.unknowns.initial_state_names)
@@ -113,7 +113,7 @@ class EpisodePredictor:
         wanted : tuple of str
             Parameters by which to differentiate.
         guess : ndarray, optional, shape (n,)
-            Configuration near the equilibrium; `Episode.equilibrium_guess`, else a search for least energy, when absent.
+            Configuration near the equilibrium; when absent `Episode.equilibrium_guess`, else that of least energy.
         """
         nx, rows = self.step.sizes["nx"], list(self.estimated_state_indices)
         by_offset = np.zeros((nx, len(rows)))

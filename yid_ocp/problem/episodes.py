@@ -181,20 +181,14 @@ class InputErrors:
         )
 
 
-def recorded_input_errors(
+def _recorded_input_errors(
     recording: Recording,
     system: System,
     grid: TimeGrid,
     sensors: Mapping[str, SensorOptions],
     samples: Sequence[Measurements],
 ) -> InputErrors | None:
-    """Error levels of the torques and angles that drive a recording's rollout; None where there are none.
-
-    Parameters
-    ----------
-    samples : sequence of Measurements
-        Of the recording.
-    """
+    """Error levels of the torques and angles that drive a recording's rollout; None where there are none."""
     joints, driven = recording.joints, system.driven
     if joints is None or joints.effort is None or not driven or system.servos:
         return None
@@ -341,7 +335,7 @@ def prepare_episode(functions: ModelFunctions, recording: Recording, options: Pr
         known_parameters=options.parameters_by_recording.get(recording.name, {}),
         input_errors=None
         if options.weighting == "paper"
-        else recorded_input_errors(recording, system, grid, options.sensors, samples),
+        else _recorded_input_errors(recording, system, grid, options.sensors, samples),
         fixed_initial_state=None
         if start is None
         else FixedInitialState(float_array_of_shape("known_start", start, (step.sizes["nx"],))),

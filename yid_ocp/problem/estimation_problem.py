@@ -63,7 +63,7 @@ class EstimationProblem(ReprMixin):
     held_out : sequence of Recording
         Not used by the fit, only predicted by `predict_held_out`.
     may_free : sequence of str, optional
-        Further parameters that `with_free_subset` may be asked for; the model's functions are differentiated by them as well.
+        Further parameters that `with_free_subset` may be asked for.
 
     Attributes
     ----------
@@ -281,8 +281,7 @@ class EstimationProblem(ReprMixin):
         ----------
         x : array_like, shape (nx,)
         equilibrium_guesses : WarmStart, optional
-            `Evaluation.equilibrium_guesses` of a nearby point; without it the equilibrium of least energy is searched, which takes
-            longer.
+            `Evaluation.equilibrium_guesses` of a nearby point; without it the search for least energy takes longer.
 
         Returns
         -------
@@ -389,7 +388,7 @@ class EstimationProblem(ReprMixin):
         """Predict the held-out recordings with the shared parameters of `x`; local ones keep their initial value.
 
         Returns each episode, with its fitted initial state where it has one, and its prediction or an error message.
-        An `estimate_errors` initial state is found from the first `_HELD_OUT_START_WINDOW` seconds and its prior. Derivatives are by
+        An `estimated` initial state is found from the first moments and its prior. Derivatives are by
         (free parameters, initial state offset), the initial state held.
         """
         return [
@@ -464,7 +463,7 @@ class EstimationProblem(ReprMixin):
         whitening_filters: Sequence[ResidualWhitener | None] = (),
         held_out_whitening_filters: Sequence[ResidualWhitener | None] = (),
     ) -> EstimationProblem:
-        """The same problem on other episodes of its model, whitened by sensor noise alone where no filters are given."""
+        """The same problem on other episodes of its model, whitened by sensor noise alone without filters."""
         return self._changed(
             episodes=tuple(episodes),
             held_out=tuple(held_out),
@@ -478,7 +477,7 @@ class EstimationProblem(ReprMixin):
         return any(episode.input_errors is not None for episode in self.episodes)
 
     def held_out_residual(self, i: int, episode: Episode, result: EpisodePrediction) -> ResidualBlock:
-        """Whitened residual of held-out recording `i` from its prediction by `predict_held_out`, without a robust loss."""
+        """Whitened residual of held-out recording `i` from `predict_held_out`, without a robust loss."""
         return whitened_episode_residual(episode, self.held_out_whitening_filters[i], result, np.inf)
 
     def truncated_to(self, duration: float) -> EstimationProblem:

@@ -1,4 +1,4 @@
-"""Measurements of one sensor on the nodes of a rollout: time grid, interpolation, weights, whitening, constant errors."""
+"""Measurements of one sensor on the nodes of a rollout: time grid, interpolation, whitening, constant errors."""
 
 from __future__ import annotations
 
@@ -189,7 +189,7 @@ class Measurements:
         return plain
 
     def whitening_adjoint(self, pull: Array) -> Array:
-        """Adjoint of `whitened_residual`: derivative of a cost by the prediction from that by the residual, shape (M, k)."""
+        """Adjoint of `whitened_residual`: cost derivative by the prediction from that by the residual, shape (M, k)."""
         if self.decorrelation_matrix is not None:
             pull = pull.copy()
             pull[self.is_used] = self.decorrelation_matrix.T @ pull[self.is_used]

@@ -35,7 +35,8 @@ class CorrectedInputs:
     prescribed_path : ndarray, shape (N + 1, nc)
     driven_angles : ndarray, shape (N + 1, nu)
         Angles of the driven joints [rad].
-    torque_sensitivity, first_torque_sensitivity, prescribed_path_sensitivity, driven_angles_sensitivity : ndarray, shape (..., d), or None
+    torque_sensitivity, first_torque_sensitivity : ndarray, shape (..., d), or None
+    prescribed_path_sensitivity, driven_angles_sensitivity : ndarray, shape (..., d), or None
     momentum_shift : ndarray, shape (N, nu), or None
         Momentum that effects add to the driven joints along their measured motion.
     momentum_shift_sensitivity : ndarray, shape (N, nu, d'), or None
@@ -142,7 +143,7 @@ class CorrectedInputs:
 
 
 class InputCorrections:
-    """Maps from recorded to true inputs and times, from `RecordingErrorEffect.corrected_reading` and `.delay` of a system's effects.
+    """Maps from recorded to true inputs and times, by the recording-error effects of a system.
 
     Parameters
     ----------

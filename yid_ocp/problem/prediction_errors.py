@@ -61,7 +61,7 @@ def clamp_displacement_baseline(
 ) -> Array:
     """Baseline prediction: every point moves by the clamped points' mean displacement since the last given frame.
 
-    Parameters and errors as in `constant_position_baseline`; `clamped_at_base` names the points whose path is known throughout.
+    Parameters and errors as in `constant_position_baseline`; the path of the points `clamped` is known throughout.
 
     Returns
     -------

@@ -226,7 +226,7 @@ class FirstOrderLag:
         return followed, total
 
     def node_values_adjoint(self, value: Array, pull: Array) -> tuple[Array, Array]:
-        """Adjoint of `filter_node_values`: cost derivatives by the input and by the parameters from those by the output.
+        """Adjoint of `filter_node_values`: cost derivatives by input and parameters from those by the output.
 
         Parameters
         ----------

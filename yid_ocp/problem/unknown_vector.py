@@ -88,8 +88,7 @@ def stated_prior_std(
 ) -> Array:
     """Standard deviation of each unknown's stated Gaussian prior, infinite where there is none, shape (nx,).
 
-    `joint_mass_matrices` gives the diagonal of the mass matrix for named joints, by which a start's velocity becomes a momentum. An
-    internal coordinate may begin anywhere within its limits; the standard deviation is that of such a uniform prior.
+    `inertia` gives the diagonal of the mass matrix, by which a start's velocity becomes a momentum. An internal coordinate may begin anywhere within its limits; the standard deviation is that of such a uniform prior.
     """
     limits = _unobserved_state_limits(system)
     stds = []
@@ -194,7 +193,7 @@ def check_parameter_bounds(system: System, free: Sequence[str], theta: Array) ->
 
 
 def soft_logarithm(ratio: Array) -> tuple[Array, Array]:
-    """Return log(ratio) and its slope, below `MIN_LOG_RATIO` those of the parabola of equal value and derivatives there.
+    """Return log(ratio) and its slope, below `MIN_LOG_RATIO` those of the parabola that continues it.
 
     Parameters
     ----------
