@@ -27,7 +27,7 @@ model:
     kind: segments
     mount: {{parent_frame: tool0}}
     segments:
-      cable: {{length: 1.0, mass: 0.1, radius: 0.005, links: {links}, joint_axes: xy, {curved}}}}
+      cable: {{length: 1.0, mass: 0.1, radius: 0.005, links: {links}, joint_axes: xy, {curved}}}
   damping: {{shoulder_pan_joint: 0.1, object: 5.0e-4}}
   points: [w_cable, "cable:50%"]
 parameters: {{cable.bend: {{initial: 0.03}}}}
@@ -69,7 +69,7 @@ model:
     kind: segments
     mount: {{parent_frame: gripper}}
     segments:
-      rod: {{length: 0.4, mass: 0.04, radius: 0.003, links: {links}, joint_axes: xy, {curved}}}}
+      rod: {{length: 0.4, mass: 0.04, radius: 0.003, links: {links}, joint_axes: xy, {curved}}}
   damping: {{pan: 0.05, object: 4.0e-4}}
   points: [w_rod, "rod:50%"]
   effects: [{effects}]
