@@ -103,7 +103,7 @@ def run_blind(
     runs : sequence of RunSettings
         Configurations: models, posture and sensors of their first recordings, `diagnosis.candidates`. Each is varied
         (`workflow.blind_experiments.EXPERIMENT_VARIATIONS`) as far as there are cases for it.
-    out : str or Path
+    out : str or PositionFunction
         Folder: `configs/`, `prepared/` (what is detectable in every experiment), `cases/` (recordings),
         `sealed/labels.json`, `commitment.json` (hash of the labels, written before the first diagnosis, and of the
         sources that made the cases), `answers/` and `best/` (results of tasks, see `yid_ocp.parallel`), then
@@ -251,7 +251,7 @@ def _make(
         Task(name, {**experiments[name].task_arguments, "folder": str(folder / _PREPARED_FOLDER), "name": name})
         for name in used
     ]
-    _done(prepare_experiment, tasks, folder / _PREPARED_FOLDER / "tasks", workers, progress)
+    _done(_prepare_experiment, tasks, folder / _PREPARED_FOLDER / "tasks", workers, progress)
     progress.begin_stage(f"making {count} cases")
     tasks = []
     for entry in plan:
@@ -288,7 +288,9 @@ def _done(
     return [value for _, value in sorted(zip(order, found, strict=True), key=lambda pair: pair[0])]
 
 
-def prepare_experiment(config: Path, variation: str, seed: int, purpose: str, folder: str, name: str) -> dict[str, int]:
+def _prepare_experiment(
+    config: Path, variation: str, seed: int, purpose: str, folder: str, name: str
+) -> dict[str, int]:
     """Task: write an experiment's first recording and the detectable size of every candidate."""
     experiment = BlindExperiment(config, variation, seed, purpose)
     first = Path(folder) / f"{name}.h5"
@@ -359,7 +361,7 @@ def diagnose_case_task(
     return found
 
 
-def true_effect_closure(
+def _true_effect_closure(
     config: Path,
     variation: str,
     seed: int,
@@ -399,7 +401,7 @@ def _best(
         if gap and label.category in ("single", "pair"):
             arguments = {key: value for key, value in case.arguments.items() if key != "without"}
             tasks.append(Task(case.name, {**arguments, "label": label.to_dict()}))
-    best = _done(true_effect_closure, tasks, folder / _BEST_FOLDER, workers, progress)
+    best = _done(_true_effect_closure, tasks, folder / _BEST_FOLDER, workers, progress)
     return {task.name: value for task, value in zip(tasks, best, strict=True) if value is not None}
 
 

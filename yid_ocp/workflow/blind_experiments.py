@@ -36,24 +36,8 @@ _TORQUE_NOISE_STD, _TORQUE_OFFSET_STD = 0.1, 0.3
 
 
 @dataclass(frozen=True)
-class ExperimentVariation:
-    """How an experiment of a blind validation differs from its configuration.
-
-    Attributes
-    ----------
-    case_fraction : float
-        Part of a configuration's cases.
-    has_torque_noise : bool
-        Torques with white noise and offsets, both stated.
-    time_step_factor : float
-        Of the engine, over the usual one.
-    n_recordings : int
-        To estimate on.
-    is_without_object : bool
-        The arms alone, without an object: their dampings are estimated.
-    has_prescribed_arms : bool
-        The arms are moved as measured, and only their efforts are compared.
-    """
+class _ExperimentVariation:
+    """How an experiment of a blind validation differs from its configuration."""
 
     case_fraction: float
     description: str
@@ -81,13 +65,13 @@ class ExperimentVariation:
         return tuple(own)
 
 
-EXPERIMENT_VARIATIONS: Mapping[str, ExperimentVariation] = {
-    "as_configured": ExperimentVariation(0.4, "as the configuration has it, torques exact"),
-    "torque_noise": ExperimentVariation(0.2, "torques with noise and offsets", has_torque_noise=True),
-    "several_recordings": ExperimentVariation(0.1, "three recordings to estimate on", n_recordings=3),
-    "finer_integration": ExperimentVariation(0.1, "the other engine's step halved", time_step_factor=0.5),
-    "bare_arm": ExperimentVariation(0.1, "the arms alone, driven", has_torque_noise=True, is_without_object=True),
-    "bare_arm_efforts": ExperimentVariation(
+EXPERIMENT_VARIATIONS: Mapping[str, _ExperimentVariation] = {
+    "as_configured": _ExperimentVariation(0.4, "as the configuration has it, torques exact"),
+    "torque_noise": _ExperimentVariation(0.2, "torques with noise and offsets", has_torque_noise=True),
+    "several_recordings": _ExperimentVariation(0.1, "three recordings to estimate on", n_recordings=3),
+    "finer_integration": _ExperimentVariation(0.1, "the other engine's step halved", time_step_factor=0.5),
+    "bare_arm": _ExperimentVariation(0.1, "the arms alone, driven", has_torque_noise=True, is_without_object=True),
+    "bare_arm_efforts": _ExperimentVariation(
         0.1,
         "the arms alone, moved as measured",
         has_torque_noise=True,

@@ -29,10 +29,6 @@ def clamp_paths(run: RunSettings, cable: CableTopology | None) -> tuple[ClampPat
     )
 
 
-def _clamped_points(paths: Sequence[ClampPath]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(point for path in paths for point in (path.origin_point, path.z_axis_point)))
-
-
 def clamp_mechanism(run: RunSettings) -> Mechanism | None:
     """Mechanism of the clamps that move an object without a robot; None without clamps.
 

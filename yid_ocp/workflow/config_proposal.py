@@ -51,7 +51,7 @@ class BranchDescription:
 
 
 @dataclass(frozen=True)
-class ArmChain:
+class _ArmChain:
     """A chain of recorded joints, base to tip, and the frames at its end, most likely tool first."""
 
     joints: tuple[str, ...]
@@ -59,7 +59,7 @@ class ArmChain:
 
 
 @dataclass(frozen=True)
-class PointPlacement:
+class _PointPlacement:
     """Assignment of a recorded point to a model frame (empty for none), with the reason."""
 
     point: str
@@ -68,7 +68,7 @@ class PointPlacement:
 
 
 @dataclass(frozen=True)
-class GroupNoise:
+class _GroupNoise:
     """Noise standard deviation of a group (None where the recording states it), unit and source."""
 
     std: float | None
@@ -118,15 +118,15 @@ class ConfigProposal:
     joints: tuple[str, ...]
     unused_joints: tuple[str, ...]
     unrecorded_joints: tuple[str, ...]
-    arms: tuple[ArmChain, ...]
+    arms: tuple[_ArmChain, ...]
     holder_frame: str
     grasps: Mapping[str, str]
     arm_mode: str
     arm_mode_reason: str
     initial_state: str
     initial_state_reason: str
-    point_placements: Mapping[str, tuple[PointPlacement, ...]]
-    noise_by_group: Mapping[str, GroupNoise]
+    point_placements: Mapping[str, tuple[_PointPlacement, ...]]
+    noise_by_group: Mapping[str, _GroupNoise]
     time_step: float
     path_cutoff: float
     clock_descriptions: Mapping[str, str] = field(default_factory=dict)
@@ -236,14 +236,14 @@ def _groups(recording: Recording) -> list[tuple[str, JointGroup | PointGroup]]:
 # -- arms -------------------------------------------------------------------------------------------------------------
 
 
-def _arms(tree: Mechanism) -> tuple[ArmChain, ...]:
+def _arms(tree: Mechanism) -> tuple[_ArmChain, ...]:
     arms = []
     for j in range(len(tree.joints)):
         if j in tree.parent_indices:
             continue
         own = [name for name, frame in tree.frames.items() if frame.joint_index == j]
         arms.append(
-            ArmChain(tuple(tree.joint_names[i] for i in tree.ancestor_joints(j)), tuple(sorted(own, key=_tool_rank)))
+            _ArmChain(tuple(tree.joint_names[i] for i in tree.ancestor_joints(j)), tuple(sorted(own, key=_tool_rank)))
         )
     return tuple(arms)
 
@@ -261,7 +261,7 @@ def _travel(recording: Recording, joints: Sequence[str]) -> float:
     return float(sum(np.ptp(group.position[:, group.names.index(name)]) for name in joints if name in group.names))
 
 
-def _holder(tree: Mechanism, arms: Sequence[ArmChain], frame: str | None, standing: bool) -> tuple[str, ArmChain]:
+def _holder(tree: Mechanism, arms: Sequence[_ArmChain], frame: str | None, standing: bool) -> tuple[str, _ArmChain]:
     if frame is None or standing:
         return arms[0].tool_frames[0], arms[0]
     if frame not in tree.frames:
@@ -276,7 +276,7 @@ def _holder(tree: Mechanism, arms: Sequence[ArmChain], frame: str | None, standi
 
 
 def _held(
-    arms: Sequence[ArmChain], own: ArmChain, branches: Sequence[BranchDescription], standing: bool
+    arms: Sequence[_ArmChain], own: _ArmChain, branches: Sequence[BranchDescription], standing: bool
 ) -> dict[str, str]:
     if standing:
         return {arm.tool_frames[0]: end for arm, end in zip(arms, ("w_T2", "w_T3"), strict=False)}
@@ -375,13 +375,13 @@ def rest_split_time(recording: Recording, joints: Sequence[str]) -> float | None
 
 def _places(
     tree: Mechanism, recording: Recording, branches: Sequence[BranchDescription], holder: str, standing: bool
-) -> dict[str, tuple[PointPlacement, ...]]:
+) -> dict[str, tuple[_PointPlacement, ...]]:
     frames = [f"w_{name}" for name in (_Y_TUBES if standing else [branch.name for branch in branches])]
     return {
         group.name: tuple(
             _named(point, frames, branches, tree)
             or (
-                PointPlacement(point, "", "its place is not known")
+                _PointPlacement(point, "", "its place is not known")
                 if standing
                 else _near(tree, recording, group, i, branches, holder)
             )
@@ -393,13 +393,13 @@ def _places(
 
 def _named(
     point: str, frames: Sequence[str], branches: Sequence[BranchDescription], tree: Mechanism
-) -> PointPlacement | None:
+) -> _PointPlacement | None:
     owner, colon, part = point.partition(":")
     names = [branch.name for branch in branches]
     if point in frames or point in tree.frames or (colon and owner in names and part.endswith("%")):
-        return PointPlacement(point, point, "a frame of the model by its name")
+        return _PointPlacement(point, point, "a frame of the model by its name")
     if point in names:
-        return PointPlacement(point, f"w_{point}", "the end of the segment of its name")
+        return _PointPlacement(point, f"w_{point}", "the end of the segment of its name")
     return None
 
 
@@ -410,12 +410,12 @@ def _near(
     column: int,
     branches: Sequence[BranchDescription],
     holder: str,
-) -> PointPlacement:
+) -> _PointPlacement:
     """The place at which a point probably sits, by where it was seen from what holds the object."""
     point = group.names[column]
     seen = np.isfinite(group.position[:, column]).all(axis=1)
     if not seen.any():
-        return PointPlacement(point, "", "it was never seen")
+        return _PointPlacement(point, "", "it was never seen")
     poses = _poses(tree, recording, holder, group.t[seen])
     position = group.position[seen, column]
     from_holder = position - poses[:, :3, 3]
@@ -424,11 +424,13 @@ def _near(
         branch = branches[0]
         part = float(np.linalg.norm(from_holder, axis=1).max()) / branch.length
         if part > 1.2:
-            return PointPlacement(
+            return _PointPlacement(
                 point, "", f"it is {part:.1f} times the length away from {holder}: is it in the same frame?"
             )
         percent = min(100, _POSITION_STEP_PERCENT * round(100 * part / _POSITION_STEP_PERCENT))
-        return PointPlacement(point, _along(branch.name, percent), f"up to {part:.0%} of the length away from {holder}")
+        return _PointPlacement(
+            point, _along(branch.name, percent), f"up to {part:.0%} of the length away from {holder}"
+        )
     local = poses[0, :3, :3].T @ from_holder[0]
     spots = _straight(branches)
     name, distance = min(
@@ -436,10 +438,10 @@ def _near(
     )
     longest = max(branch.length for branch in branches)
     if distance > 0.5 * longest:
-        return PointPlacement(
+        return _PointPlacement(
             point, "", f"{distance:.2g} m away from all of the straight object: is it in the same frame?"
         )
-    return PointPlacement(point, name, f"{1e3 * distance:.0f} mm from there when the object is straight")
+    return _PointPlacement(point, name, f"{1e3 * distance:.0f} mm from there when the object is straight")
 
 
 def _along(name: str, percent: int) -> str:
@@ -474,8 +476,8 @@ def _poses(tree: Mechanism, recording: Recording, frame: str, t: Array) -> Array
 # -- noise and rates --------------------------------------------------------------------------------------------------
 
 
-def _noise(recordings: Sequence[Recording], joints: Sequence[str]) -> dict[str, GroupNoise]:
-    found: dict[str, GroupNoise] = {}
+def _noise(recordings: Sequence[Recording], joints: Sequence[str]) -> dict[str, _GroupNoise]:
+    found: dict[str, _GroupNoise] = {}
     first = recordings[0].joints
     if first is not None:
         at = [first.names.index(name) for name in joints]
@@ -484,11 +486,11 @@ def _noise(recordings: Sequence[Recording], joints: Sequence[str]) -> dict[str, 
             if values is None:
                 continue
             if getattr(first, f"{channel}_std") is not None:
-                found[f"joints.{channel}"] = GroupNoise(None, unit, "the recording states it")
+                found[f"joints.{channel}"] = _GroupNoise(None, unit, "the recording states it")
             else:
                 size = max(_size(first.t, values[:, j]) for j in at)
                 least = 1e-6 if channel == "position" else 1e-3
-                found[f"joints.{channel}"] = GroupNoise(
+                found[f"joints.{channel}"] = _GroupNoise(
                     max(size, least), unit, "from sample to sample in the recording"
                 )
     for group in recordings[0].points:
@@ -496,9 +498,9 @@ def _noise(recordings: Sequence[Recording], joints: Sequence[str]) -> dict[str, 
     return found
 
 
-def _point_noise(group: PointGroup) -> GroupNoise:
+def _point_noise(group: PointGroup) -> _GroupNoise:
     if group.std is not None:
-        return GroupNoise(None, "m", "the recording states it")
+        return _GroupNoise(None, "m", "the recording states it")
     slow = len(group.t) < 2 or 1.0 / mean_sample_rate(group.t) > _SLOW_SAMPLE_PERIOD
     sizes = []
     for i in range(len(group.names)):
@@ -506,8 +508,8 @@ def _point_noise(group: PointGroup) -> GroupNoise:
         sizes += [_size(group.t[seen], column) for column in group.position[seen, i].T]
     if slow or max(sizes, default=0.0) <= 0:
         std = _CAMERA_STD if slow else _MARKER_STD
-        return GroupNoise(std, "m", "a guess: the data are too slow or too clean to show it")
-    return GroupNoise(max(sizes), "m", "from sample to sample in the recording")
+        return _GroupNoise(std, "m", "a guess: the data are too slow or too clean to show it")
+    return _GroupNoise(max(sizes), "m", "from sample to sample in the recording")
 
 
 def _size(t: Array, values: Array) -> float:

@@ -160,7 +160,7 @@ def run_identifiability(
         elsewhere = None
         if workers is not None:
             point = (problem, solution, problem is whole, asked)
-            elsewhere = IdentifiabilityTasks.from_run(workers, folder, run, *point, progress)
+            elsewhere = _IdentifiabilityTasks.from_run(workers, folder, run, *point, progress)
         unknown = information = ranking = None
         if solution is None or solution.status != Status.FAILED:
             progress.begin_stage("Fisher information")
@@ -196,7 +196,7 @@ def _information(
     asked: IdentifiabilityOptions,
     progress: Progress,
     limits: GapCriteria,
-    elsewhere: IdentifiabilityTasks | None,
+    elsewhere: _IdentifiabilityTasks | None,
 ) -> IdentifiabilityResult:
     judged = partial(
         identifiability, problem, solution, start=asked.start_knowledge, grasp_std=asked.grasp_offset_std, limits=limits
@@ -218,7 +218,7 @@ def _ranking(
     solution: Solution | None,
     asked: IdentifiabilityOptions,
     progress: Progress,
-    elsewhere: IdentifiabilityTasks | None,
+    elsewhere: _IdentifiabilityTasks | None,
 ) -> ExperimentRanking:
     other = system_with_second_arm(run, system)
     return what_if(
@@ -297,16 +297,8 @@ def _outcome(entry: ChangedExperimentResult) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class IdentifiabilityTasks:
-    """Workers and common task arguments of the identifiability analysis of one run.
-
-    Attributes
-    ----------
-    results_folder : Path
-        Folder that their results are kept in while the run is not complete.
-    task_arguments : mapping
-        Arguments of every task.
-    """
+class _IdentifiabilityTasks:
+    """Workers and common task arguments of the identifiability analysis of one run."""
 
     workers: WorkerConfig | Executor
     results_folder: Path
@@ -323,16 +315,8 @@ class IdentifiabilityTasks:
         remembers: bool,
         asked: IdentifiabilityOptions,
         progress: Progress,
-    ) -> IdentifiabilityTasks:
-        """Tasks for a run whose folder contains its configuration.
-
-        Parameters
-        ----------
-        solution : Solution or None
-            Point at which to judge; the initial values where None.
-        remembers : bool
-            Whether the problem is the run's, not that of a cable that remembers nothing.
-        """
+    ) -> _IdentifiabilityTasks:
+        """Tasks for a run whose folder contains its configuration."""
         told = {
             "config": folder.path / "config.yaml",
             "inputs": sorted({path.absolute() for name, path in input_files(run).items() if name != "configuration"}),
@@ -341,18 +325,12 @@ class IdentifiabilityTasks:
             "start": asked.start_knowledge,
             "grasp_std": asked.grasp_offset_std,
         }
-        return IdentifiabilityTasks(workers, folder.resume_folder / "tasks", told, progress)
+        return _IdentifiabilityTasks(workers, folder.resume_folder / "tasks", told, progress)
 
     def with_profile_likelihoods(
         self, information: IdentifiabilityResult, names: Sequence[str]
     ) -> IdentifiabilityResult:
-        """The analysis with profile likelihoods of the named parameters, one task per parameter.
-
-        Raises
-        ------
-        WorkerError
-            One could not be worked out.
-        """
+        """The analysis with profile likelihoods of the named parameters, one task per parameter."""
         tasks = [Task(name, {**self.task_arguments, "name": name}) for name in names]
         found = require_task_values(
             run_tasks(profile_parameter, tasks, self._folder(), self.workers, self.progress.report_parts_done)
@@ -378,7 +356,7 @@ class IdentifiabilityTasks:
                 tasks.append(Task(" and ".join(mechanics) or "sensors", arguments))
             self.progress.begin_stage(f"judging {len(sets)} experiments")
             done = require_task_values(
-                run_tasks(change_set_outcomes, tasks, self._folder(), self.workers, self.progress.report_parts_done)
+                run_tasks(_change_set_outcomes, tasks, self._folder(), self.workers, self.progress.report_parts_done)
             )
             found: dict[int, ChangedExperimentResult] = {}
             for members, told in zip(groups.values(), done, strict=True):
@@ -423,7 +401,7 @@ def profile_parameter(
     }
 
 
-def change_set_outcomes(
+def _change_set_outcomes(
     config: Path,
     inputs: Sequence[Path],
     x: Sequence[float] | None,

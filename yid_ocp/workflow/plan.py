@@ -71,7 +71,7 @@ def run_plan(run: RunSettings, out: str | Path | None = None, progress: Progress
         progress.begin_stage("building the model and its compiled step")
         found: MotionPlan | InformativeMotionPlan
         if run.plan.goal == "information":
-            found, source = plan_from_settings(run, progress)
+            found, source = _plan_from_settings(run, progress)
         else:
             step = compile_planning_step(run)
             theta, known, source = identified_parameters(run, step)
@@ -91,7 +91,7 @@ def run_plan(run: RunSettings, out: str | Path | None = None, progress: Progress
         )
         folder.write_text_file("trajectory.json", json.dumps(trajectory, indent=1) + "\n")
         folder.log_event("end", reached=found.is_successful, message=found.message)
-        told = _plan_result(run, found) if isinstance(found, MotionPlan) else information_plan_result(run, found)
+        told = _plan_result(run, found) if isinstance(found, MotionPlan) else _information_plan_result(run, found)
         written = folder.write_result(_motion_result(run, found, source) | told)
         more = {"plan" if isinstance(found, MotionPlan) else "information": found}
         folder.write_report_page(run, written, progress, animations=_scenes(found), section_data=more)
@@ -144,9 +144,9 @@ def identified_parameters(run: RunSettings, step: Step) -> tuple[Array, Paramete
             ParameterCovariance(),
             {"run": None, "parameters": {name: parameters[name].value for name in free}},
         )
-    result, folder = read_parameter_run(run, ("solve",))
+    result, folder = _read_parameter_run(run, ("solve",))
     solved = folder / "trajectories.h5"
-    require_same_effects(run, result["parameters"], parameters.names)
+    _require_same_effects(run, result["parameters"], parameters.names)
     found = {name: entry["value"] for name, entry in result["parameters"].items() if name in parameters}
     for name, value in found.items():
         theta[parameters.index(name)] = value
@@ -236,19 +236,8 @@ def _share(values: Array, limit: float) -> float | None:
 _MAX_DISCRIMINATED_EFFECTS = 3  # effects that one motion is asked to separate, the likeliest ones
 
 
-def read_parameter_run(run: RunSettings, commands: Sequence[str]) -> tuple[dict[str, Any], Path]:
-    """Contents of result.json in the folder of `plan.parameter_run`, and the folder.
-
-    Parameters
-    ----------
-    commands : sequence of str
-        Whose folders may be given.
-
-    Raises
-    ------
-    ConfigError, DataError
-        There is no finished run, it is one of another command, or it failed.
-    """
+def _read_parameter_run(run: RunSettings, commands: Sequence[str]) -> tuple[dict[str, Any], Path]:
+    """Contents of result.json in the folder of `plan.parameter_run`, and the folder."""
     folder = Path(str(run.plan.parameter_run))
     file = folder / "result.json"
     if not file.is_file() or not (folder / "trajectories.h5").is_file():
@@ -271,21 +260,16 @@ def read_parameter_run(run: RunSettings, commands: Sequence[str]) -> tuple[dict[
     return result, folder
 
 
-def plan_from_settings(run: RunSettings, progress: Progress) -> tuple[InformativeMotionPlan, dict[str, Any]]:
-    """The most informative motion, and the source of its parameters: settings or a run folder.
-
-    Raises
-    ------
-    ConfigError, DataError, ModelError, SolverError
-    """
+def _plan_from_settings(run: RunSettings, progress: Progress) -> tuple[InformativeMotionPlan, dict[str, Any]]:
+    """The most informative motion, and the source of its parameters: settings or a run folder."""
     problem = build_problem(run)
     free = {name: float(problem.theta[problem.system.parameters.index(name)]) for name in problem.free}
     sizes: dict[str, dict[str, float]] = {}
     source: dict[str, Any] = {"run": None, "parameters": free}
     if run.plan.parameter_run is not None:
-        result, folder = read_parameter_run(run, ("solve", "diagnose"))
+        result, folder = _read_parameter_run(run, ("solve", "diagnose"))
         found, sizes = parameter_and_effect_values(result)
-        require_same_effects(run, found, problem.system.parameters.names)
+        _require_same_effects(run, found, problem.system.parameters.names)
         known = {name: value for name, value in found.items() if name in problem.system.parameters}
         source = {"run": str(folder), "parameters": free | known}
     with locate_errors(run, "plan"):
@@ -293,7 +277,7 @@ def plan_from_settings(run: RunSettings, progress: Progress) -> tuple[Informativ
     return plan, source
 
 
-def require_same_effects(run: RunSettings, found: Iterable[str], own: Collection[str]) -> None:
+def _require_same_effects(run: RunSettings, found: Iterable[str], own: Collection[str]) -> None:
     """Raise an error where the run has parameters of effects that the plan's model lacks."""
     lacking = sorted({name.rpartition(".")[0] for name in found if "@" in name and name not in own})
     if lacking:
@@ -315,7 +299,7 @@ def parameter_and_effect_values(result: Mapping[str, Any]) -> tuple[dict[str, fl
     return {name: entry["before"] for name, entry in result["absorption"].items()}, sizes
 
 
-def information_plan_result(run: RunSettings, found: InformativeMotionPlan) -> dict[str, Any]:
+def _information_plan_result(run: RunSettings, found: InformativeMotionPlan) -> dict[str, Any]:
     """Entries of `yid-plan/1` for an informative motion."""
     pairs = [
         {"effect": first, "explained_by": second, "before": before, "after": after}

@@ -156,7 +156,7 @@ def run_track(
 class _Filmed:
     """The frames of a run as files, and the truth of virtual ones; `own`: what was made for it."""
 
-    tasks: FrameTasks
+    tasks: _FrameTasks
     made: VirtualFrames | None = None
     own: tuple[Path, ...] = ()
 
@@ -170,10 +170,10 @@ class _Filmed:
 def _filmed(run: RunSettings, system: System, folder: RunFolder, progress: Progress) -> _Filmed:
     settings = run.track
     if settings.frames_path is not None:
-        open_frames(run)  # says in words of the settings what is wrong with the files
+        _open_frames(run)  # says in words of the settings what is wrong with the files
         joints = recording_path(run.recordings.estimate[0]) if run.recordings.estimate else None
         with locate_errors(run, "track", "frames_path"):
-            tasks = FrameTasks.from_run(run, Path(settings.frames_path), joints, folder.resume_folder)
+            tasks = _FrameTasks.from_run(run, Path(settings.frames_path), joints, folder.resume_folder)
         folder.input_hashes[settings.frames_path] = tasks.input_hashes["frames"]
         return _Filmed(tasks)
     progress.begin_stage("simulating a virtual experiment in MuJoCo")
@@ -185,7 +185,7 @@ def _filmed(run: RunSettings, system: System, folder: RunFolder, progress: Progr
     write_recording(recording, joints)
     if settings.keep_frames:
         shutil.copytree(frames, folder.path / "frames")
-    return _Filmed(FrameTasks.from_run(run, frames, joints, folder.resume_folder), made, (frames, joints))
+    return _Filmed(_FrameTasks.from_run(run, frames, joints, folder.resume_folder), made, (frames, joints))
 
 
 def _drawn(frames: Sequence[FrameReport], count: int) -> list[FrameReport]:
@@ -369,32 +369,16 @@ _CONFIG_FILE, _RESULTS_FOLDER = "config.yaml", "done"
 
 
 @dataclass(frozen=True, eq=False)
-class FrameTasks:
-    """Tracking tasks of one run: settings, work folder and input hashes.
-
-    Attributes
-    ----------
-    settings : RunSettings
-        Settings on which frames depend, with files for the frames and the joints.
-    work_folder : Path
-        Of what is done; another one for other settings, frames or joints.
-    input_hashes : dict of str to str
-        SHA-256 of frames and joints.
-    """
+class _FrameTasks:
+    """Tracking tasks of one run: settings, work folder and input hashes."""
 
     settings: RunSettings
     work_folder: Path
     input_hashes: dict[str, str]
 
     @staticmethod
-    def from_run(run: RunSettings, frames: Path, joints: Path | None, partial: Path) -> FrameTasks:
-        """Tracking tasks for frames and joints stored in files.
-
-        Raises
-        ------
-        DataError, OutputError
-            A file that cannot be read, a folder that cannot be made.
-        """
+    def from_run(run: RunSettings, frames: Path, joints: Path | None, partial: Path) -> _FrameTasks:
+        """Tracking tasks for frames and joints stored in files."""
         recordings = RecordingSettings(estimate=() if joints is None else (str(joints),))
         track = replace(run.track, frames_path=str(frames), n_drawn_frames=0, keep_frames=False)
         own = replace(run, track=track, recordings=recordings, output=OutputSettings(), name="", description="")
@@ -410,13 +394,13 @@ class FrameTasks:
         except OSError as error:
             raise OutputError(f"the folder cannot be made ({os_error_reason(error)})", where=str(folder)) from error
         write_text(folder / _CONFIG_FILE, text)
-        return FrameTasks(own, folder, inputs)
+        return _FrameTasks(own, folder, inputs)
 
     def calibrate_sequence(self) -> SequenceCalibration:
         """Sequence calibration common to all frames, computed in this process."""
         task = Task("what is common", {"config": self.work_folder / _CONFIG_FILE, "inputs": self.input_hashes})
         [found] = require_task_values(
-            run_tasks(calibrate_sequence_task, [task], self.work_folder / _RESULTS_FOLDER, InlineExecutor())
+            run_tasks(_calibrate_sequence_task, [task], self.work_folder / _RESULTS_FOLDER, InlineExecutor())
         )
         if "refused" in found:
             raise DataError(**found["refused"])
@@ -429,10 +413,7 @@ class FrameTasks:
         workers: WorkerConfig | Executor | None = None,
         progress: Progress = NULL_PROGRESS,
     ) -> list[FrameReport]:
-        """Tracking results of all frames, ordered by stamp; computed in this process without workers.
-
-        One that ended the process that worked on it is dropped.
-        """
+        """Tracking results of all frames, ordered by stamp; computed in this process without workers."""
         common_to_all = {
             "config": self.work_folder / _CONFIG_FILE,
             "inputs": self.input_hashes,
@@ -442,7 +423,7 @@ class FrameTasks:
         tasks = [Task(names[i], {**common_to_all, "index": i}) for i in tracker.frame_order]
         executor = InlineExecutor() if workers is None else workers
         results = run_tasks(
-            track_frame_task, tasks, self.work_folder / _RESULTS_FOLDER, executor, progress.report_parts_done
+            _track_frame_task, tasks, self.work_folder / _RESULTS_FOLDER, executor, progress.report_parts_done
         )
         ended = [k for k, result in enumerate(results) if "abruptly" in result.error]
         others = require_task_values([result for k, result in enumerate(results) if k not in ended])
@@ -468,13 +449,8 @@ def _but(entries: tuple[int, ...], without: list[int]) -> list[int]:
     return [entry for k, entry in enumerate(entries) if k not in without]
 
 
-def open_frames(run: RunSettings) -> tuple[FrameSequence, Recording | None]:
-    """Frame sequence of `track.frames_path` and its recording, None where none is listed.
-
-    Raises
-    ------
-    ConfigError, DataError
-    """
+def _open_frames(run: RunSettings) -> tuple[FrameSequence, Recording | None]:
+    """Frame sequence of `track.frames_path` and its recording, None where none is listed."""
     assert run.track.frames_path is not None
     recording = None
     if run.recordings.estimate:
@@ -494,7 +470,7 @@ def camera_scene(run: RunSettings, system: System) -> CameraScene:
     return CameraScene(system, run.model.robot, extra_meshes=run.model.extra_meshes)
 
 
-def read_background_frames(run: RunSettings) -> FrameSequence | None:
+def _read_background_frames(run: RunSettings) -> FrameSequence | None:
     """Background frames without robot and object; None where the settings have none."""
     if run.track.background_frames is None:
         return None
@@ -507,7 +483,7 @@ def read_background_frames(run: RunSettings) -> FrameSequence | None:
         )
 
 
-def calibrate_sequence_task(config: Path, inputs: Mapping[str, str]) -> dict[str, Any]:
+def _calibrate_sequence_task(config: Path, inputs: Mapping[str, str]) -> dict[str, Any]:
     """Task: sequence calibration of a run as plain data, or the reason why it failed."""
     del inputs  # they belong to what the result depends on
     try:
@@ -517,7 +493,7 @@ def calibrate_sequence_task(config: Path, inputs: Mapping[str, str]) -> dict[str
     return made
 
 
-def track_frame_task(config: Path, inputs: Mapping[str, str], common: Mapping[str, Any], index: int) -> dict[str, Any]:
+def _track_frame_task(config: Path, inputs: Mapping[str, str], common: Mapping[str, Any], index: int) -> dict[str, Any]:
     """Task: tracking result of one frame as plain data."""
     del inputs
     tracker = _tracker(config.read_text(encoding="utf-8"), config)
@@ -534,6 +510,6 @@ def _tracker(text: str, config: Path) -> FrameTracker:
 
 
 def _frame_tracker(run: RunSettings, system: System) -> tuple[FrameTracker, Recording | None]:
-    sequence, recording = open_frames(run)
-    scene, background = camera_scene(run, system), read_background_frames(run)
+    sequence, recording = _open_frames(run)
+    scene, background = camera_scene(run, system), _read_background_frames(run)
     return FrameTracker(scene, recording, sequence, run.track.options, background), recording

@@ -22,26 +22,26 @@ from yid_ocp.report.terminal import SummaryBlock, SummaryStatement, SummaryTable
 @register_section("verdict", 0, "What was found")
 def verdict_context(findings: ReportData) -> Mapping[str, Any] | None:
     """Template context: conclusions, verdicts and the blocks up to the key table."""
-    blocks = result_blocks(findings)
+    blocks = _result_blocks(findings)
     if not blocks:
         return None
     told = [block for block in blocks if isinstance(block, SummaryStatement)]
     said = [block.text for weight in ("conclusion", "verdict") for block in told if block.kind == weight]
-    return {"verdict": said, "blocks": without_verdicts(blocks[: end_of_key_table(blocks)])}
+    return {"verdict": said, "blocks": _without_verdicts(blocks[: _end_of_key_table(blocks)])}
 
 
-def result_blocks(findings: ReportData) -> list[SummaryBlock]:
+def _result_blocks(findings: ReportData) -> list[SummaryBlock]:
     """Summary blocks of a result; empty for an unknown format."""
     known = SUMMARY_BY_FORMAT.get(str(findings.result.get("format")))
     return [] if known is None else known(findings.result)
 
 
-def end_of_key_table(blocks: list[SummaryBlock]) -> int:
+def _end_of_key_table(blocks: list[SummaryBlock]) -> int:
     """Index after the key table in a list of blocks; 0 without a key table."""
     return next((i + 1 for i, block in enumerate(blocks) if isinstance(block, SummaryTable) and block.is_key_table), 0)
 
 
-def without_verdicts(blocks: list[SummaryBlock]) -> list[SummaryBlock]:
+def _without_verdicts(blocks: list[SummaryBlock]) -> list[SummaryBlock]:
     """The blocks without verdict and conclusion statements."""
     return [block for block in blocks if not (isinstance(block, SummaryStatement) and block.kind != "note")]
 
@@ -49,8 +49,8 @@ def without_verdicts(blocks: list[SummaryBlock]) -> list[SummaryBlock]:
 @register_section("numbers", 60, "In numbers")
 def remaining_tables_context(findings: ReportData) -> Mapping[str, Any] | None:
     """Template context: summary blocks after the key table, without verdicts."""
-    blocks = result_blocks(findings)
-    rest = without_verdicts(blocks[end_of_key_table(blocks) :])
+    blocks = _result_blocks(findings)
+    rest = _without_verdicts(blocks[_end_of_key_table(blocks) :])
     return {"blocks": rest} if rest else None
 
 
