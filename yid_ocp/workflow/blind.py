@@ -103,7 +103,7 @@ def run_blind(
     runs : sequence of RunSettings
         Configurations: models, posture and sensors of their first recordings, `diagnosis.candidates`. Each is varied
         (`workflow.blind_experiments.EXPERIMENT_VARIATIONS`) as far as there are cases for it.
-    out : str or PositionFunction
+    out : str or Path
         Folder: `configs/`, `prepared/` (what is detectable in every experiment), `cases/` (recordings),
         `sealed/labels.json`, `commitment.json` (hash of the labels, written before the first diagnosis, and of the
         sources that made the cases), `answers/` and `best/` (results of tasks, see `yid_ocp.parallel`), then
