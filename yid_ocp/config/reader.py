@@ -142,12 +142,9 @@ def _loaded(text: str, origin: str) -> Any:
 
 
 def _odd(what: str, origin: str, event: Any) -> ConfigError:
-    return ConfigError(
-        what,
-        where=f"{origin}, line {event.start_mark.line + 1}",
-        allowed="keys with numbers, text, true or false, [lists] and sections",
-        hint="write it without",
-    )
+    allowed = "keys with numbers, text, true or false, [lists] and sections"
+    where = f"{origin}, line {event.start_mark.line + 1}"
+    return ConfigError(what, where=where, allowed=allowed, hint="write it without")
 
 
 def _unwrap(node: Any, path: _KeyPath, places: dict[_KeyPath, str], origin: str) -> Any:

@@ -37,26 +37,18 @@ def estimates_figure(
 
     names = list(values)
     figure = go.Figure()
-    figure.add_scatter(
-        x=[values[name][2] for name in names],
-        y=names,
-        mode="markers",
-        name="start",
-        marker={"color": GRID_COLOR, "size": 10, "symbol": "diamond", "line": {"color": TEXT_COLOR, "width": 1}},
-    )
+    marker = {"color": GRID_COLOR, "size": 10, "symbol": "diamond", "line": {"color": TEXT_COLOR, "width": 1}}
+    figure.add_scatter(x=[values[name][2] for name in names], y=names, mode="markers", name="start", marker=marker)
     for found, word, color in (
         (True, "estimate", LINE_COLORS[0]),
         (False, "estimate that cannot be trusted", LINE_COLORS[1]),
     ):
         chosen = [name for name in names if values[name][3] == found]
+        error_x = {"type": "data", "array": [2 * (values[name][1] or 0.0) for name in chosen], "color": color}
+        x = [values[name][0] for name in chosen]
+        marker = {"color": color, "size": 10}
         figure.add_scatter(
-            x=[values[name][0] for name in chosen],
-            y=chosen,
-            mode="markers",
-            name=word,
-            marker={"color": color, "size": 10},
-            error_x={"type": "data", "array": [2 * (values[name][1] or 0.0) for name in chosen], "color": color},
-            showlegend=bool(chosen),
+            x=x, y=chosen, mode="markers", name=word, marker=marker, error_x=error_x, showlegend=bool(chosen)
         )
     largest = max([abs(number) for value, _, initial, _ in values.values() for number in (value, initial)] or [1.0])
     figure = apply_page_style(figure, 110 + 34 * len(names), unit, "")

@@ -75,13 +75,10 @@ def cost_history_figure(costs: Sequence[float], notes: Sequence[str]) -> plotly.
     stages = 0
     for i in range(1, len(costs) + 1):
         if i == len(costs) or notes[i] != notes[begin]:
-            figure.add_scatter(
-                x=list(range(begin, i)),
-                y=list(costs[begin:i]),
-                mode="lines+markers",
-                name=notes[begin] or "whole recordings",
-                line={"color": LINE_COLORS[stages % len(LINE_COLORS)]},
-            )
+            line = {"color": LINE_COLORS[stages % len(LINE_COLORS)]}
+            name = notes[begin] or "whole recordings"
+            x = list(range(begin, i))
+            figure.add_scatter(x=x, y=list(costs[begin:i]), mode="lines+markers", name=name, line=line)
             begin, stages = i, stages + 1
     return apply_page_style(figure, 320, "accepted point", "cost", log_y=True)
 

@@ -96,13 +96,9 @@ def run_check(run: RunSettings, out: str | Path | None = None, progress: Progres
         written = folder.write_result(result)
         if problem is not None and first is not None:
             taken = [episode.recording for episode in (*problem.episodes, *problem.held_out)]
-            folder.write_report_page(
-                run,
-                written,
-                progress,
-                animations=_scenes(problem, first),
-                section_data={"recordings": taken, "system": step.system},
-            )
+            section_data = {"recordings": taken, "system": step.system}
+            animations = _scenes(problem, first)
+            folder.write_report_page(run, written, progress, animations=animations, section_data=section_data)
         else:
             folder.write_report_page(run, written, progress)
     passed = not (run.recordings.strict and warnings)

@@ -475,12 +475,9 @@ def _read_background_frames(run: RunSettings) -> FrameSequence | None:
     if run.track.background_frames is None:
         return None
     with locate_errors(run, "track", "background_frames"):
-        return read_frames(
-            run.track.background_frames,
-            pose=run.track.camera_pose,
-            unit=run.track.length_unit,
-            topic=run.track.frame_topic,
-        )
+        pose = run.track.camera_pose
+        unit = run.track.length_unit
+        return read_frames(run.track.background_frames, pose=pose, unit=unit, topic=run.track.frame_topic)
 
 
 def _calibrate_sequence_task(config: Path, inputs: Mapping[str, str]) -> dict[str, Any]:
