@@ -158,23 +158,34 @@ class _Update:
     white: Array
 
 
+@dataclass(frozen=True)
+class _ForwardPass:
+    """The filter of one recording at given variances: see `_Pass`; its updates where they are kept.
+
+    The determinant is infinite where variances are so large that rounding shows: they are never the best. `begin`
+    (ns + nd, nd) says how state and unknowns of the first interval follow the first disturbances.
+    """
+
+    model: LinearResidualModel
+    begin: Array
+    products: Array
+    log_determinant: float
+    updates: Sequence[_Update]
+
+
 def _filter(model: LinearResidualModel, variance: Array, smooth: bool) -> _Pass:
     """Run through one recording with given variances of the unknowns, shape (nd,)."""
-    updates: list[_Update] = []
-    products, log_determinant, begin = _forwards(model, variance, updates if smooth else None)
-    if not updates or math.isinf(log_determinant):
+    done = _forwards(model, variance, smooth)
+    if not smooth or math.isinf(done.log_determinant):
         empty = np.zeros(0)
-        return _Pass(products, log_determinant, empty, empty, empty, empty, ())
-    return _Pass(products, log_determinant, *_backwards(model, begin, updates))
+        return _Pass(done.products, done.log_determinant, empty, empty, empty, empty, ())
+    return _Pass(done.products, done.log_determinant, *_backwards(done))
 
 
-def _forwards(model: LinearResidualModel, variance: Array, updates: list[_Update] | None) -> tuple[Array, float, Array]:
-    """`products` and `log_determinant` of `_Pass`, and `begin` of `_backwards`; keeps its updates where they are asked.
-
-    The determinant is infinite where variances are so large that rounding shows: they are never the best.
-    """
+def _forwards(model: LinearResidualModel, variance: Array, keep: bool) -> _ForwardPass:
+    """Filter one recording with given variances of the unknowns, shape (nd,)."""
     # nobody asks for the scores of unknowns that are known to be zero
-    used = np.flatnonzero(variance > 0) if updates is None else np.arange(len(variance))
+    used = np.arange(len(variance)) if keep else np.flatnonzero(variance > 0)
     variance = variance[used]
     ns, nd = len(model.initial_state_std), len(variance)
     size, columns = ns + nd, model.intervals[0].negative_residual_jacobian.shape[1]
@@ -184,31 +195,27 @@ def _forwards(model: LinearResidualModel, variance: Array, updates: list[_Update
     p = (begin * variance) @ begin.T
     p[np.arange(ns), np.arange(ns)] += model.initial_state_std**2
     mean = np.zeros((size, columns))
-    products, log_determinant = np.zeros((columns, columns)), 0.0
+    products, log_determinant, updates = np.zeros((columns, columns)), 0.0, []
     for interval in model.intervals:
         design = np.hstack([interval.state_jacobian, interval.unknown_jacobian[:, used]])
         products += interval.unreachable_products
         move = np.hstack([interval.state_transition, interval.unknown_input_matrix[:, used]])
         step, later, own = kalman_step(p, design, Transition(move, np.full(nd, model.interval_correlation)))
         if math.isinf(own):
-            return products, math.inf, begin
+            return _ForwardPass(model, begin, products, math.inf, ())
         white, after = step.update(mean, interval.negative_residual_jacobian)
         products += white.T @ white
         log_determinant += own
-        if updates is not None:
+        if keep:
             updates.append(_Update(step, mean, p, white))
         mean, p = after, later + fresh
         p = (p + p.T) / 2
-    return products, log_determinant, begin
+    return _ForwardPass(model, begin, products, log_determinant, updates)
 
 
-def _backwards(
-    model: LinearResidualModel, begin: Array, updates: Sequence[_Update]
-) -> tuple[Array, Array, Array, Array, tuple[Array, ...]]:
-    """Scores, their variances, smoothed unknowns, their variances and smoothed residuals; see `_Pass`.
-
-    `begin` (ns + nd, nd) says how state and unknowns of the first interval follow the first disturbances.
-    """
+def _backwards(done: _ForwardPass) -> tuple[Array, Array, Array, Array, tuple[Array, ...]]:
+    """Scores, their variances, smoothed unknowns, their variances and smoothed residuals; see `_Pass`."""
+    model, begin, updates = done.model, done.begin, done.updates
     ns, gain = len(model.initial_state_std), math.sqrt(1 - model.interval_correlation**2)
     count, (size, columns) = len(updates), updates[0].mean.shape
     score, information = np.zeros((count, size - ns, columns)), np.zeros((count, size - ns))
@@ -216,15 +223,15 @@ def _backwards(
     left: list[Array] = []
     r, n = np.zeros((size, columns)), np.zeros((size, size))
     for j in reversed(range(count)):
-        done = updates[j]
+        update = updates[j]
         if j + 1 < count:
             score[j + 1], information[j + 1] = gain * r[ns:], gain**2 * np.diag(n)[ns:]
-        noise, r = done.step.backward(done.white, r)
+        noise, r = update.step.backward(update.white, r)
         left.append(noise)
-        n = done.step.backward_information(n)
-        smoothed[j] = (done.mean + done.p @ r)[ns:]
-        own = done.p[ns:]
-        covariance[j] = np.diag(done.p)[ns:] - np.sum((own @ n) * own, axis=1)
+        n = update.step.backward_information(n)
+        smoothed[j] = (update.mean + update.p @ r)[ns:]
+        own = update.p[ns:]
+        covariance[j] = np.diag(update.p)[ns:] - np.sum((own @ n) * own, axis=1)
     score[0], information[0] = begin.T @ r, np.sum(begin * (n @ begin), axis=0)
     return score, information, smoothed, covariance, tuple(reversed(left))
 
@@ -249,12 +256,7 @@ class _State:
 def _run(models: Sequence[LinearResidualModel], variance: Mapping[UnknownGroup, float], smooth: bool = True) -> _State:
     """All recordings at given variances: the parameters' step, its covariance, and the log evidence."""
 
-    def passed(model: LinearResidualModel) -> _Pass:
-        return _filter(
-            model, np.array([variance[s] for s in model.unknown_groups]) + model.torque_noise_variance, smooth
-        )
-
-    passes = tuple(map_in_threads(passed, models))
+    passes = tuple(map_in_threads(lambda model: _filter(model, model.unknown_variance(variance), smooth), models))
     products = np.sum([p.products for p in passes], axis=0)
     evidence, shift, information = _judged(products, sum(p.log_determinant for p in passes))
     return _State(passes, shift, scipy.linalg.cho_solve(information, np.eye(len(shift))), evidence)
@@ -322,7 +324,7 @@ def _selected(
 
         bases = _bases(models, variance) if promising else ()
 
-        def tried(source: UnknownGroup, bases: Sequence[_Base] = bases) -> tuple[float, float]:
+        def tried(source: UnknownGroup, bases: Sequence[_ForwardPass] = bases) -> tuple[float, float]:
             return _largest_evidence(bases, source)
 
         outcomes = map_in_threads(tried, promising)
@@ -335,29 +337,12 @@ def _selected(
     return variance, state
 
 
-@dataclass(frozen=True)
-class _Base:
-    """The filter of one recording at variances to which one group's is to be added."""
-
-    model: LinearResidualModel
-    products: Array
-    log_determinant: float
-    updates: Sequence[_Update]
+def _bases(models: Sequence[LinearResidualModel], variance: Mapping[UnknownGroup, float]) -> tuple[_ForwardPass, ...]:
+    """The filters of all recordings at variances to which one group's is to be added."""
+    return tuple(map_in_threads(lambda model: _forwards(model, model.unknown_variance(variance), True), models))
 
 
-def _bases(models: Sequence[LinearResidualModel], variance: Mapping[UnknownGroup, float]) -> tuple[_Base, ...]:
-    """All recordings at given variances."""
-
-    def passed(model: LinearResidualModel) -> _Base:
-        updates: list[_Update] = []
-        own = np.array([variance[s] for s in model.unknown_groups]) + model.torque_noise_variance
-        products, log_determinant, _ = _forwards(model, own, updates)
-        return _Base(model, products, log_determinant, updates)
-
-    return tuple(map_in_threads(passed, models))
-
-
-def _responses(base: _Base, chosen: NDArray[np.int64]) -> Array:
+def _responses(base: _ForwardPass, chosen: NDArray[np.int64]) -> Array:
     """Innovations by disturbances of unit variance of some unknowns, shape (rows of all intervals, u J).
 
     The filter follows a disturbance as far as its own unknowns let it; those without variance stay at zero.
@@ -387,7 +372,7 @@ def _responses(base: _Base, chosen: NDArray[np.int64]) -> Array:
     return np.vstack(found)
 
 
-def _largest_evidence(bases: Sequence[_Base], source: UnknownGroup) -> tuple[float, float]:
+def _largest_evidence(bases: Sequence[_ForwardPass], source: UnknownGroup) -> tuple[float, float]:
     """The largest log evidence over the variance that one group gets on top, and that variance.
 
     With W the innovations by its disturbances, those of the base have the covariance I + s^2 W W', whose inverse and
@@ -504,8 +489,7 @@ def force_likelihood_terms(
                 unreachable_products=rest,
             )
         )
-    own = np.array([variance[source] for source in model.unknown_groups]) + model.torque_noise_variance
-    products = _filter(replace(model, intervals=tuple(intervals)), own, False).products
+    products = _forwards(replace(model, intervals=tuple(intervals)), model.unknown_variance(variance), False).products
     split = 1 + parameters
     free = products[1:split, 1:split] + np.eye(parameters) / 9.0
     cross = products[split:, 1:split]
@@ -578,7 +562,7 @@ def _instead(
         asked = [s for s, v in variance.items() if not v and scores[s][0] > scores[s][1]]
         bases = _bases(models, less) if asked else ()
 
-        def tried(other: UnknownGroup, bases: Sequence[_Base] = bases) -> float:
+        def tried(other: UnknownGroup, bases: Sequence[_ForwardPass] = bases) -> float:
             return _largest_evidence(bases, other)[0]
 
         lost = max(limits.min_log_bayes_factor, (1 - limits.location_tie) * weight[source])

@@ -13,7 +13,7 @@ what follows is linear in the number of intervals.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Literal
@@ -330,6 +330,10 @@ class LinearResidualModel:
     initial_state_std: Array
     interval_correlation: float
     torque_noise_variance: Array
+
+    def unknown_variance(self, group_variance: Mapping[UnknownGroup, float]) -> Array:
+        """Variance of every unknown from that of its group, shape (nd,) [squared reference]."""
+        return np.array([group_variance[group] for group in self.unknown_groups]) + self.torque_noise_variance
 
 
 def linear_residual_models(

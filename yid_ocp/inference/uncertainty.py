@@ -351,7 +351,8 @@ def with_profile_interval(entry: ParameterEstimate, interval: ConfidenceInterval
     """Estimate with its profile-likelihood interval, and standard deviation and verdict consistent with it.
 
     Open on both sides it is not_identifiable, on one side at best weak and without a ±. An end that is not met before
-    a bound within `scale` is that bound. Else the wider side is two standard deviations (`verdict_by_relative_std`), and is the ± where a parabola's would be less than half of it.
+    a bound within `scale` is that bound. Else the wider side is two standard deviations (`verdict_by_relative_std`),
+    and is the ± where a parabola's would be less than half of it.
 
     Parameters
     ----------

@@ -88,7 +88,8 @@ def stated_prior_std(
 ) -> Array:
     """Standard deviation of each unknown's stated Gaussian prior, infinite where there is none, shape (nx,).
 
-    `inertia` gives the diagonal of the mass matrix, by which a start's velocity becomes a momentum. An internal coordinate may begin anywhere within its limits; the standard deviation is that of such a uniform prior.
+    `inertia` gives the diagonal of the mass matrix, by which a start's velocity becomes a momentum. An internal
+    coordinate may begin anywhere within its limits; the standard deviation is that of such a uniform prior.
     """
     limits = _unobserved_state_limits(system)
     stds = []
