@@ -170,13 +170,13 @@ class InputCorrections:
             for kind, joints in (("torque", system.driven), ("joints.effort", system.prescribed))
         }
         self.lags_torque = self._lags["torque"] is not None
-        chosen = ca.vertcat(ca.SX(0, 1), *(system.parameters[name].symbol for name in names))
-        self._late = ca.Function("delay", [theta], [late, ca.jacobian(late, chosen)])
+        self._chosen = ca.vertcat(ca.SX(0, 1), *(system.parameters[name].symbol for name in names))
+        self._late = ca.Function("delay", [theta], [late, ca.jacobian(late, self._chosen)])
         slope = ca.vertcat(ca.SX(0, 1), *(ca.jacobian(true_effort[i], effort[i]) for i in range(count)))
         outputs = [true_angle, true_effort, ca.densify(slope)]
 
         def compiled(differentiated: bool) -> MappedFunction:
-            slopes = [ca.jacobian(x, chosen) for x in outputs[:2]] if differentiated else []
+            slopes = [ca.jacobian(x, self._chosen) for x in outputs[:2]] if differentiated else []
             function = ca.Function("true", [angle, effort, theta], [*outputs, *slopes])
             return MappedFunction(function, shared_inputs=(2,), use_compiler=use_compiler)
 
@@ -244,17 +244,12 @@ class InputCorrections:
         return None if function is None else self._evaluate(function, theta, wanted)
 
     def _lag_function(self, kind: str, joints: tuple[str, ...]) -> ca.Function | None:
-        theta = self.system.parameters.symbols
         lags = [
             sum((effect.lag_time_constant(f"{kind}.{joint}") for effect in self._effects), ca.SX(0))
             / self.system.recorded_time_scale
             for joint in joints
         ]
-        expression = ca.vertcat(ca.SX(0, 1), *lags)
-        if not _depends(expression, theta):
-            return None
-        chosen = ca.vertcat(ca.SX(0, 1), *(self.system.parameters[name].symbol for name in self._names))
-        return ca.Function("lag", [theta], [expression, ca.jacobian(expression, chosen)])
+        return self._with_jacobian(lags)
 
     def sensor_delay(self, sensor: Sensor, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array] | None:
         """Delay from true to recorded time of each output, shape (k,) [s], and its derivative; None without delays."""
@@ -262,15 +257,15 @@ class InputCorrections:
         return None if found is None else self._evaluate(found, theta, wanted)
 
     def _sensor_delay(self, sensor: Sensor) -> ca.Function | None:
-        camera, theta = sensor.camera_pose is not None, self.system.parameters.symbols
-        late = [
-            self._delay(channel, camera) for channel in sensor.channel_names for _ in range(sensor.outputs_per_channel)
-        ]
-        expression = ca.vertcat(ca.SX(0, 1), *late)
+        camera, width = sensor.camera_pose is not None, sensor.outputs_per_channel
+        return self._with_jacobian([self._delay(c, camera) for c in sensor.channel_names for _ in range(width)])
+
+    def _with_jacobian(self, entries: Sequence[ca.SX]) -> ca.Function | None:
+        """Function of theta with its derivative by the chosen parameters; None where it is the same at every theta."""
+        expression, theta = ca.vertcat(ca.SX(0, 1), *entries), self.system.parameters.symbols
         if not _depends(expression, theta):
             return None
-        chosen = ca.vertcat(ca.SX(0, 1), *(self.system.parameters[name].symbol for name in self._names))
-        return ca.Function("delay", [theta], [expression, ca.jacobian(expression, chosen)])
+        return ca.Function("times", [theta], [expression, ca.jacobian(expression, self._chosen)])
 
     def _evaluate(self, function: ca.Function, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array]:
         value, slope = (np.array(ca.densify(x)) for x in function(theta))
