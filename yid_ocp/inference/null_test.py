@@ -209,7 +209,7 @@ def exceeds_noise(tests: Sequence[NullTestResult], limits: GapCriteria = DEFAULT
 
     Parameters
     ----------
-    tests : sequence of NullTest
+    tests : sequence of NullTestResult
         Of the recordings that were fitted, of those held out, or of both.
     """
     return (

@@ -75,11 +75,11 @@ class SmootherResult:
 
     Attributes
     ----------
-    group_variance : dict of Source to float
+    group_variance : dict of UnknownGroup to float
         Of every group, in units of its squared reference, at the largest evidence.
-    log_evidence_drop : dict of Source to float
+    log_evidence_drop : dict of UnknownGroup to float
         Fall of the log evidence when the group is left out.
-    detectable_std : dict of Source to float
+    detectable_std : dict of UnknownGroup to float
         Smallest standard deviation of every group's unknowns that would be noticed, in units of the reference, from the
         model alone.
     chi2_before, chi2_after : float
@@ -91,7 +91,7 @@ class SmootherResult:
         neither ("none" is 0).
     min_log_bayes_factor : float
         Rise of the log evidence that is more than chance.
-    alternative_groups : dict of Source to tuple of Source
+    alternative_groups : dict of UnknownGroup to tuple of UnknownGroup
         Groups that would do nearly as well in the place of each group at work.
     """
 
@@ -461,7 +461,7 @@ def force_likelihood_terms(
 
     Parameters
     ----------
-    variance : mapping of Source to float
+    variance : mapping of UnknownGroup to float
         Of all groups of unknowns beside it, squared reference.
     unknown : int
         Place among the model's unknowns.

@@ -306,7 +306,7 @@ class LinearResidualModel:
         Beginnings of the intervals and the end [s].
     unknown_names : tuple of str
         Coordinate, grasp or channel of each of the nd unknowns.
-    unknown_groups : tuple of Source
+    unknown_groups : tuple of UnknownGroup
         That each of the nd unknowns belongs to.
     reference_std : ndarray, shape (nd,)
         Reference standard deviation of each; the matrices are by unknowns in this unit.

@@ -53,7 +53,7 @@ class GoodnessOfFit:
     p_value : float
         Probability of a residual this large under noise alone.
     explains : bool
-        By the null test of a diagnosis, at its level and relevance; see `run_null_test.exceeds_noise`.
+        By the null test of a diagnosis, at its level and relevance; see `exceeds_noise`.
     believed : bool
         Whether the data have no grave quality issue; see `ProblemOptions.data_issues`.
     """
@@ -435,7 +435,7 @@ def parameter_estimates(
     evaluation : Evaluation
         At `x`, with its Jacobian.
     covariance : ndarray, shape (nx, nx)
-    fit : Fit, optional
+    fit : GoodnessOfFit, optional
         None where the point is not a fit; misfit and bounds are then ignored.
     """
     known = fit is not None and evaluation.ok and evaluation.jacobian is not None

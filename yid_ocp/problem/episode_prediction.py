@@ -433,7 +433,7 @@ class EpisodePredictor:
 
         Parameters
         ----------
-        result : EpisodeResult
+        result : EpisodePrediction
             At the same unknowns.
         theta : ndarray, shape (ntheta,)
         offset : ndarray

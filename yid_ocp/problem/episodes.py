@@ -49,7 +49,7 @@ class EpisodePrediction:
 
     Attributes
     ----------
-    equilibrium : Rest or None
+    equilibrium : Equilibrium or None
         Equilibrium from which the rollout starts.
     predicted_outputs : tuple of ndarray, shape (M, k) each
         Prediction of every sample, in the sensor's unit.
@@ -93,7 +93,7 @@ class InitialState:
         (q, p, z)
     state_sensitivity : ndarray, shape (nx, d)
         Derivative by (wanted parameters, offset of the start).
-    equilibrium : Rest or None
+    equilibrium : Equilibrium or None
         The equilibrium, where it is one.
     failure_message : str
         What went wrong; empty where all is well.
@@ -239,13 +239,13 @@ class Episode:
         Recorded effort of driven, then prescribed joints, where an effect makes their true angle depend on it.
     smoothed_driven_angles : ndarray, shape (N + 1, nu)
         Measured angles of the driven joints, smooth enough to be differenced; as measured where no filter needs them.
-    tracking_feedback : Feedback or None
+    tracking_feedback : TrackingFeedback or None
         Tracking filter of the driven joints with gains computed at the nominal parameters.
     known_parameters : mapping of str to float
         Known values of parameters that differ from recording to recording.
     input_errors : InputErrors or None
         Of the torques and angles that drive the rollout; None where there are none.
-    fixed_initial_state : FittedStart or None
+    fixed_initial_state : FixedInitialState or None
         Initial state that is given or was fitted to points; None where it is an equilibrium.
     initial_state_shared_with : int, optional
         Index of the estimation episode whose initial state this held-out part of the same recording shares.

@@ -69,7 +69,7 @@ class EstimationProblem(ReprMixin):
     ----------
     theta : ndarray, shape (ntheta,)
         Initial values of free parameters and values of fixed ones.
-    unknowns : Unknowns
+    unknowns : UnknownVectorLayout
         Layout of the unknown vector.
     residual_rows : ResidualRows
         Layout of the residual.
@@ -280,7 +280,7 @@ class EstimationProblem(ReprMixin):
         Parameters
         ----------
         x : array_like, shape (nx,)
-        equilibrium_guesses : WarmStart, optional
+        equilibrium_guesses : EquilibriumGuesses, optional
             `Evaluation.equilibrium_guesses` of a nearby point; without it the search for least energy takes longer.
 
         Returns
@@ -324,7 +324,7 @@ class EstimationProblem(ReprMixin):
         x : array_like, shape (nx,)
         evaluation : Evaluation, optional
             At `x`, where it is known already: the rollout is most of the work.
-        equilibrium_guesses : WarmStart, optional
+        equilibrium_guesses : EquilibriumGuesses, optional
             As in `evaluate`.
 
         Returns

@@ -95,7 +95,7 @@ class CorrectedInputs:
 
         Parameters
         ----------
-        recorded : Motion
+        recorded : DrivenJointMotion
             Its angles are smooth.
         measured : ndarray, shape (N + 1, nu)
             Angles as they were read.
@@ -283,7 +283,7 @@ class _SelectedDerivatives:
 
     Attributes
     ----------
-    all_derivatives : Mapped
+    all_derivatives : MappedFunction
         Its last output has one column for every parameter.
     """
 

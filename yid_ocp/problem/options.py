@@ -91,13 +91,13 @@ class ProblemOptions:
         Free parameters with a value of their own in every recording.
     prior_stds : mapping of parameter to standard deviation
         Gaussian priors about the initial value, in the parameter's unit.
-    multivariate_prior : JointPrior
+    multivariate_prior : MultivariateGaussianPrior
         Correlated prior of several parameters, in place of entries of `prior_stds`.
     parameters_by_recording : mapping of recording to mapping of parameter to value
         Known values of parameters that differ from recording to recording, such as where markers sit.
     known_initial_states : mapping of recording to array_like, shape (nx,)
         State (q, p, z) in which a recording starts, in place of equilibrium or of the fit.
-    data_issues : tuple of Doubt
+    data_issues : tuple of Issue
         Data quality issues found in the recordings.
     """
 

@@ -43,7 +43,7 @@ def mean_step_inputs(
         Name of the recording.
     delay : ndarray, shape (nu,), optional
         How much later than recorded each of them acts [s].
-    servos : mapping of joint to Servo, optional
+    servos : mapping of joint to PositionServo, optional
         Of all driven joints, which then follow commands.
 
     Raises

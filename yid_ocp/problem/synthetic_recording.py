@@ -36,7 +36,7 @@ def recording_from_prediction(
 
     Parameters
     ----------
-    outcome : EpisodeResult
+    outcome : EpisodePrediction
         Of this predictor.
     theta : ndarray, shape (ntheta,)
         At which it was predicted.
