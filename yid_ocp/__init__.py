@@ -62,7 +62,7 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "problem": ("EstimationProblem", "ProblemOptions", "SensorOptions"),
     "solvers.nonlinear_program": ("NonlinearProgram",),
     "solvers.symbolic_transcription": ("transcribe",),
-    "workflow.baseline_runs": ("read_estimates",),
+    "workflow.run_history": ("read_estimates",),
     "workflow.build": ("load_system",),
     "workflow.build_problem": ("load_problem",),
     "solvers": ("GaussNewton", "MultipleShooting", "SingleShooting", "Solution", "Status", "SteepestDescent", "solve"),

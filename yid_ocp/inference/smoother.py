@@ -358,11 +358,9 @@ def _responses(base: _ForwardPass, chosen: NDArray[np.int64]) -> Array:
         unknown[:, :k] *= model.interval_correlation
         unknown[:, k] = math.sqrt(1 - model.interval_correlation**2) if k else 1.0
         left = behind.reshape(len(kept), u * count)
-        shaped, half, move = (
-            update.step.normalized_observation,
-            update.step.projected_covariance,
-            update.step.transition,
-        )
+        shaped = update.step.normalized_observation
+        half = update.step.projected_covariance
+        move = update.step.transition
         rows = shaped[:, kept] @ left
         rows += (shaped[:, ns + chosen][:, :, None] * unknown).reshape(rows.shape)
         found.append(rows)

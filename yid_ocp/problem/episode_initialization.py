@@ -91,10 +91,8 @@ def _error(predictor: EpisodePredictor, seen: Sequence[Measurements], start: Ini
 
 def _loaded(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:
     """The episode with the model's loads on gears of joints whose efforts are compared (`denoised_gear_loads`)."""
-    compared, corrections = (
-        [s for s in episode.measurements if s.sensor.effort_joints],
-        predictor.model_functions.input_corrections,
-    )
+    compared = [s for s in episode.measurements if s.sensor.effort_joints]
+    corrections = predictor.model_functions.input_corrections
     if not compared or not corrections.angles_depend_on_effort:
         return episode
     result = predictor.predict_episode(episode, theta, np.zeros(len(predictor.unknowns.initial_state_names)), False)
@@ -124,11 +122,9 @@ def estimate_initial_state_offset(predictor: EpisodePredictor, episode: Episode,
     if not len(offset):
         return offset
     short = truncate_episode(episode, max(round(_HELD_OUT_START_WINDOW / predictor.step.time_step), 2))
-    weight, guess, limit = (
-        1.0 / std,
-        None,
-        initial_state_limits(predictor.system, predictor.unknowns.initial_state_names),
-    )
+    weight = 1.0 / std
+    guess: Array | None = None
+    limit = initial_state_limits(predictor.system, predictor.unknowns.initial_state_names)
     for _ in range(_HELD_OUT_ITERATIONS):
         result = predictor.predict_episode(short, theta, offset, True, guess)
         if isinstance(result, str) or result.output_sensitivities is None:

@@ -311,10 +311,8 @@ def prepare_episode(functions: ModelFunctions, recording: Recording, options: Pr
     torque = np.zeros((grid.steps, 0))
     if recording.joints is not None:
         read = (recording.joints, system.driven, grid, recording.name)
-        torque, arm = (
-            mean_step_inputs(*read, servos=system.servos),
-            smoothed_joint_angles(*read, LowPassFilter(math.inf)),
-        )
+        torque = mean_step_inputs(*read, servos=system.servos)
+        arm = smoothed_joint_angles(*read, LowPassFilter(math.inf))
         smooth = smoothed_joint_angles(*read, low_pass) if options.feedback == "lqr" else arm
     samples = _samples(step, recording, options, theta, grid)
     known = (*system.driven, *system.prescribed)

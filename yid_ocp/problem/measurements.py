@@ -142,10 +142,8 @@ class Measurements:
         """Nodes at which the sensor function must be evaluated, sorted."""
         if self.node.ndim > 1:
             # with the neighbours that a slope needs
-            low, high = (
-                int(self.node.min(initial=self.predictable_nodes[1])),
-                int(self.node.max(initial=self.predictable_nodes[0])),
-            )
+            low = int(self.node.min(initial=self.predictable_nodes[1]))
+            high = int(self.node.max(initial=self.predictable_nodes[0]))
             return np.arange(max(low - 1, self.predictable_nodes[0]), min(high + 2, self.predictable_nodes[1] + 1))
         after = self.node[self.fraction > 0] + 1
         return np.unique(np.concatenate([self.node, after]))

@@ -218,10 +218,8 @@ def channel_predictions(episode: Episode, result: EpisodePrediction) -> tuple[Ch
     """Measured and predicted samples of every channel of an episode."""
     found = []
     for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
-        sensor, times = (
-            samples.sensor,
-            episode.grid.start_time + episode.grid.time_step * (samples.node + samples.fraction),
-        )
+        sensor = samples.sensor
+        times = episode.grid.start_time + episode.grid.time_step * (samples.node + samples.fraction)
         width = sensor.outputs_per_channel
         for i, channel in enumerate(sensor.channel_names):
             at = slice(i * width, (i + 1) * width)
