@@ -1,4 +1,7 @@
-"""Levenberg-Marquardt for small dense least-squares problems: initial states, shapes, calibrations."""
+"""Levenberg-Marquardt for dense least-squares problems of some dozen coordinates: initial states and shapes of chains.
+
+Measured against SciPy's: docs/design/solvers.md.
+"""
 
 from __future__ import annotations
 
@@ -18,17 +21,7 @@ _FIRST_DAMPING, _MOST_DAMPING = 1e-3, 1e8
 
 @dataclass(frozen=True)
 class LeastSquaresResult:
-    """Result of a least-squares minimisation.
-
-    Attributes
-    ----------
-    x : ndarray, shape (n,)
-    sum_of_squares : float
-        Sum of squares there.
-    jacobian : ndarray, shape (m, n)
-    n_iterations : int
-    has_converged : bool
-    """
+    """Result of `levenberg_marquardt`: minimiser `x` (n,), sum of squares and Jacobian (m, n) there, convergence."""
 
     x: Array
     sum_of_squares: float
@@ -41,12 +34,7 @@ class LeastSquaresResult:
 class LocalQuadraticModel:
     """A local quadratic model of a cost, for costs that are not a plain sum of squares or have many residuals.
 
-    Attributes
-    ----------
-    cost : float
-    gradient : ndarray, shape (n,)
-    hessian : ndarray, shape (n, n)
-        Positive definite, that of Gauss and Newton for example.
+    The Hessian (n, n) is positive definite, that of Gauss and Newton for example.
     """
 
     cost: float
@@ -98,9 +86,9 @@ def levenberg_marquardt(
     ----------
     Nocedal and Wright (2006), Numerical Optimization, section 10.3, doi:10.1007/978-0-387-40065-5.
     """
-    limits = _Limits(max_step, max_iterations, step_tolerance, cost_tolerance, 1e-12)
+    limits = max_step, max_iterations, step_tolerance, cost_tolerance, 1e-12
     x, model, used, converged = _descend(
-        lambda x: _SumOfSquares(*residual_function(x)), initial_guess, projection, limits
+        lambda x: _SumOfSquares(*residual_function(x)), initial_guess, projection, *limits
     )
     return LeastSquaresResult(x, model.cost, model.jacobian, used, converged)
 
@@ -117,27 +105,11 @@ def minimize_by_damped_newton(
 ) -> DampedNewtonResult:
     """Minimise a cost given by local quadratic models, with the loop of `levenberg_marquardt`.
 
-    Parameters
-    ----------
-    quadratic_model : callable
-        From x to the cost about it.
-    initial_guess : ndarray, shape (n,)
-    largest_step, iterations, step_tolerance, cost_tolerance
-        As for `levenberg_marquardt`.
-    min_damping : float
-        Of every step; some damping keeps a search on a robust cost from leaping out of its valley.
+    No step is damped less than `min_damping`: some damping keeps a search on a robust cost from leaping out of its
+    valley.
     """
-    limits = _Limits(max_step, max_iterations, step_tolerance, cost_tolerance, min_damping)
-    return DampedNewtonResult(*_descend(quadratic_model, initial_guess, None, limits))
-
-
-@dataclass(frozen=True)
-class _Limits:
-    largest_step: float
-    iterations: int
-    step_tolerance: float
-    cost_tolerance: float
-    least_damping: float
+    limits = max_step, max_iterations, step_tolerance, cost_tolerance, min_damping
+    return DampedNewtonResult(*_descend(quadratic_model, initial_guess, None, *limits))
 
 
 class _Model(Protocol):
@@ -161,32 +133,37 @@ class _SumOfSquares:
 
     def damped_step(self, damping: float) -> Array:
         scale = np.sqrt(damping) * np.maximum(np.linalg.norm(self.jacobian, axis=0), 1e-9)
-        stacked = np.vstack([self.jacobian, np.diag(scale)])
-        return np.asarray(
-            -np.linalg.lstsq(stacked, np.concatenate([self.residual, np.zeros(len(scale))]), rcond=None)[0]
-        )
+        stacked, target = np.vstack([self.jacobian, np.diag(scale)]), np.append(self.residual, np.zeros(len(scale)))
+        return np.asarray(-np.linalg.lstsq(stacked, target, rcond=None)[0])
 
 
 def _descend(
-    model_at: Callable[[Array], _M], start: Array, project: _Projection | None, limits: _Limits
+    model_at: Callable[[Array], _M],
+    start: Array,
+    project: _Projection | None,
+    max_step: float,
+    max_iterations: int,
+    step_tolerance: float,
+    cost_tolerance: float,
+    min_damping: float,
 ) -> tuple[Array, _M, int, bool]:
     """The minimiser, its model, iterations used, and whether it converged."""
     x = np.array(start, float)
     model, damping = model_at(x), _FIRST_DAMPING
-    for iteration in range(1, limits.iterations + 1):
+    for iteration in range(1, max_iterations + 1):
         change = model.damped_step(damping)
         size = float(np.max(np.abs(change), initial=0.0))
-        change = change * min(1.0, limits.largest_step / max(size, 1e-12))
+        change = change * min(1.0, max_step / max(size, 1e-12))
         trial = x + change if project is None else project(x + change)
         new = model_at(trial)
         if new.cost < model.cost:
-            done = size < limits.step_tolerance or model.cost - new.cost < limits.cost_tolerance * model.cost
+            done = size < step_tolerance or model.cost - new.cost < cost_tolerance * model.cost
             x, model = trial, new
-            damping = max(damping / 10, limits.least_damping)
+            damping = max(damping / 10, min_damping)
             if done:
                 return x, model, iteration, True
         else:
             damping *= 10
-            if size < limits.step_tolerance or damping > _MOST_DAMPING:
-                return x, model, iteration, size < limits.step_tolerance
-    return x, model, limits.iterations, False
+            if size < step_tolerance or damping > _MOST_DAMPING:
+                return x, model, iteration, size < step_tolerance
+    return x, model, max_iterations, False
