@@ -77,7 +77,7 @@ def test_estimates_agree_within_two_standard_deviations_or_half_a_percent(here, 
 )
 def test_a_difference_has_a_likely_reason(status, cost, why):
     best = run(a_b=estimate(10.0, 0.123), c=estimate(5.0))
-    said = differences(run("lifted", cost, status, a_b=estimate(12.3456), c=estimate(5.0)), best)
+    said = differences(run("single_shooting", cost, status, a_b=estimate(12.3456), c=estimate(5.0)), best)
     assert said == [f"a.b = 12.35, while gauss_newton finds 10 +- 0.12: {why}"]
 
 
@@ -87,10 +87,10 @@ def test_parameters_that_are_not_found_need_not_agree():
 
 
 def test_methods_agree_where_nothing_is_said_against_it():
-    runs = (run(), run("lifted"))
+    runs = (run(), run("single_shooting"))
     judged = ("gauss_newton", False, runs[0].solution, [])
-    assert MethodComparison(runs, *judged, {"gauss_newton": [], "lifted": []}, ()).is_consistent
-    assert not MethodComparison(runs, *judged, {"gauss_newton": [], "lifted": ["a differs"]}, ()).is_consistent
+    assert MethodComparison(runs, *judged, {"gauss_newton": [], "single_shooting": []}, ()).is_consistent
+    assert not MethodComparison(runs, *judged, {"gauss_newton": [], "single_shooting": ["a differs"]}, ()).is_consistent
 
 
 # -- what is said -----------------------------------------------------------------------------------------------------
@@ -99,11 +99,11 @@ def test_methods_agree_where_nothing_is_said_against_it():
 def test_parameters_that_are_not_found_are_explained():
     weak, hidden = estimate(10.0, verdict="weak"), estimate(3.0, verdict="not_identifiable")
     best = run(a_b=weak, c=hidden, d=estimate(1.0), e=estimate(2.0, verdict="fixed", free=False))
-    other = run("lifted", a_b=estimate(12.3456), c=estimate(4.5), d=estimate(1.0), e=estimate(2.0))
+    other = run("single_shooting", a_b=estimate(12.3456), c=estimate(4.5), d=estimate(1.0), e=estimate(2.0))
     said = _explanations([best, other], best.solution.parameters, {"a.b": 11.25}, False)
     assert said == [
-        "a.b (truth 11.25) is weakly determined: where it ends is the method's choice (gauss_newton 10, lifted 12.3)",
-        "c cannot be found: where it ends is the method's choice (gauss_newton 3, lifted 4.5)",
+        "a.b (truth 11.25) is weakly determined: where it ends is the method's choice (gauss_newton 10, single_shooting 12.3)",
+        "c cannot be found: where it ends is the method's choice (gauss_newton 3, single_shooting 4.5)",
     ]
 
 
@@ -112,7 +112,7 @@ def test_errors_of_the_papers_method_are_said_where_the_truth_is_known():
     descent = run("steepest_descent", a=estimate(10.5))
     judged = best.solution.parameters
     assert _explanations([best, descent], judged, {}, False) == []
-    said = _explanations([best, descent, run("lifted", a=estimate(99.0))], judged, {"a": 10.0}, False)
+    said = _explanations([best, descent, run("single_shooting", a=estimate(99.0))], judged, {"a": 10.0}, False)
     assert said == ["steepest_descent ended within 10 % of the truth everywhere"]
 
 
@@ -198,7 +198,7 @@ class Problem:
 @pytest.mark.parametrize("weighting", ["whitened", "paper"])
 def test_methods_run_one_by_one_and_the_lowest_cost_is_the_reference(monkeypatch, weighting):
     solved, told = [], []
-    answers = {"lifted": 3.0, "gauss_newton": 2.0, "steepest_descent": 5.0}
+    answers = {"single_shooting": 3.0, "gauss_newton": 2.0, "steepest_descent": 5.0}
 
     def solve(problem, solver, callback, limits, restarts=True):
         solved.append((solver.name, problem.options.weighting))
@@ -209,7 +209,7 @@ def test_methods_run_one_by_one_and_the_lowest_cost_is_the_reference(monkeypatch
     solvers = [SimpleNamespace(name=name) for name in answers]
     problem = Problem(weighting)
     found = compare_methods(problem, solvers, {"a": 2.0}, lambda name, entry: told.append((name, entry)))
-    assert solved == [("lifted", weighting), ("gauss_newton", weighting), ("steepest_descent", "paper")]
+    assert solved == [("single_shooting", weighting), ("gauss_newton", weighting), ("steepest_descent", "paper")]
     assert told == [(name, "step") for name in answers]
     assert found.reference_method == "gauss_newton"
     assert [r.whitened_cost for r in found.method_results] == [3.0, 2.0, 5.0]
@@ -221,7 +221,7 @@ def test_methods_run_one_by_one_and_the_lowest_cost_is_the_reference(monkeypatch
     ]
     assert set(found.disagreements) == set(answers)
     assert found.disagreements["gauss_newton"] == []
-    assert found.disagreements["lifted"]
+    assert found.disagreements["single_shooting"]
     assert len(found.explanations) == 1
     for entry in found.method_results:
         assert 0 <= entry.wall_seconds < 5
@@ -240,25 +240,25 @@ def test_verdicts_count_the_noise_that_drives_the_motion(monkeypatch):
         solved.append((solver.name, problem.has_process_noise, restarts))
         callback("step")
         verdict = "identifiable" if problem.has_process_noise else "not_trusted"
-        value = 10.0 if problem.has_process_noise else {"able": 7.0, "lifted": 7.5}[solver.name]
+        value = 10.0 if problem.has_process_noise else {"able": 7.0, "single_shooting": 7.5}[solver.name]
         return solution(solver.name, a=estimate(value, 0.1, verdict))
 
     monkeypatch.setattr(module, "solve", solve)
-    able, other = SimpleNamespace(name="able", carries_covariance=True), SimpleNamespace(name="lifted")
+    able, other = SimpleNamespace(name="able", carries_covariance=True), SimpleNamespace(name="single_shooting")
     found = compare_methods(Problem(disturbed=True), [other, able], {"a": 10.0}, lambda *entry: told.append(entry))
     # by the sensors' noise alone every fit is poor, from wherever it starts
-    assert solved == [("lifted", False, False), ("able", False, False), ("able", True, True)]
-    assert told == [("lifted", "step"), ("able", "step"), ("all noise", "step")]
+    assert solved == [("single_shooting", False, False), ("able", False, False), ("able", True, True)]
+    assert told == [("single_shooting", "step"), ("able", "step"), ("all noise", "step")]
     assert found.has_process_noise
     assert found.verdict_solution.parameters["a"] == estimate(10.0)
     assert found.verdict_held_out_predictions == [("whitened", 10.0)]
     assert found.reference_method == "able"
     # found by the likelihood, so the methods have to agree on it
     assert not found.is_consistent
-    assert found.disagreements["lifted"][0].startswith("a = 7.5, while able finds 7")
+    assert found.disagreements["single_shooting"][0].startswith("a = 7.5, while able finds 7")
     solved.clear()
     compare_methods(Problem(disturbed=True), [other])
-    assert solved == [("lifted", False, False), ("gauss_newton", True, True)]
+    assert solved == [("single_shooting", False, False), ("gauss_newton", True, True)]
 
 
 def test_the_peak_of_memory_is_what_was_used_in_between():

@@ -144,8 +144,8 @@ def test_a_failed_solve_says_nothing_of_its_parameters():
 def test_a_comparison_without_a_parameter_that_is_found_has_nothing_to_agree_on():
     weak = solved(parameters={"a": parameter("weak")})
     compared = {
-        "methods": {"lifted": weak, "other": weak | {"status": "failed", "whitened_cost": None}},
-        "reference": "lifted", "published": {"a": 1.0}, "truth": {}, "explained": [], "agree": True,
+        "methods": {"single_shooting": weak, "other": weak | {"status": "failed", "whitened_cost": None}},
+        "reference": "single_shooting", "published": {"a": 1.0}, "truth": {}, "explained": [], "agree": True,
         "judged": weak, "disturbed": False, "published_explained": ["a = 1 of the paper: unexplained"],
     }  # fmt: skip
     lines = told("compare_summary", compared)
@@ -156,7 +156,7 @@ def test_a_comparison_without_a_parameter_that_is_found_has_nothing_to_agree_on(
     assert "published" in lines[0]
     assert "truth" not in lines[0]
     assert "a = 1 of the paper: unexplained" in lines
-    found = compared | {"methods": {"lifted": solved()}, "judged": solved()}
+    found = compared | {"methods": {"single_shooting": solved()}, "judged": solved()}
     assert "all methods agree within their uncertainty on the parameters that are found" in told(
         "compare_summary", found
     )
@@ -166,12 +166,12 @@ def test_verdicts_of_a_comparison_weigh_all_noise():
     """The methods themselves do not, so that nothing of theirs is to be trusted."""
     doubtful = solved(parameters={"a": parameter("not_trusted", 7.0)}, fit=BAD)
     compared = {
-        "methods": {"lifted": doubtful}, "reference": "lifted", "published": {}, "truth": {}, "explained": [],
+        "methods": {"single_shooting": doubtful}, "reference": "single_shooting", "published": {}, "truth": {}, "explained": [],
         "agree": True, "judged": solved(parameters={"a": parameter("identifiable", 9.0)}), "disturbed": True,
         "published_explained": [],
     }  # fmt: skip
     lines = told("compare_summary", compared)
-    assert lines[0].split()[:3] == ["parameter", "lifted", "all"]
+    assert lines[0].split()[:3] == ["parameter", "single_shooting", "all"]
     assert line_of(lines, "a").split() == ["a", "7", "±", "0.1", "9", "±", "0.1", "found"]
     assert not any("does not explain" in line for line in lines)
     assert any("compared by the sensors' noise alone" in line for line in lines)
