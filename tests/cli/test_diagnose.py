@@ -13,7 +13,7 @@ def test_a_diagnosis_leaves_a_run_folder(cli, pendulum, tmp_path):
     done = cli("diagnose", pendulum, "--out", tmp_path / "run", *chosen)
     assert done.code == 0, done.err
     result = json.loads((tmp_path / "run" / "result.json").read_text())
-    assert result["format"] == "yid-diagnosis/1"
+    assert result["format"] == "yid-diagnosis/2"
     assert "verdict: no gap" in done.out
     assert result["verdict"] == "no_gap"
     assert {"config.yaml", "log.jsonl", "trajectories.h5"} <= {path.name for path in (tmp_path / "run").iterdir()}

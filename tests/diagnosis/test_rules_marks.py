@@ -15,7 +15,7 @@ from yid_ocp.diagnosis.blind import BlindCase, CaseLabel, answers, score_case, s
 from yid_ocp.virtual.injected import InjectedEffect
 
 # the package's own name `score_ensemble` is the function
-scoring = importlib.import_module("yid_ocp.diagnosis.blind.score_ensemble")
+scoring = importlib.import_module("yid_ocp.diagnosis.blind.score")
 KV, DRY = InjectedEffect("kelvin_voigt", "T1", {"tau": 0.05}), InjectedEffect("joint_coulomb", "elbow", {"tau_c": 2.0})
 DAMPER = effect("kelvin_voigt@T1", amplitude("tau", expected=(0.0, 0.2), unit="s"))
 FRICTION = effect("joint_coulomb@elbow", amplitude("tau_c", expected=(0.0, 3.0)))

@@ -28,7 +28,7 @@ from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.solvers import Status
 
 # the package's own name `refit_with_effects` is the function
-module = importlib.import_module("yid_ocp.diagnosis.refit_with_effects")
+module = importlib.import_module("yid_ocp.diagnosis.refit")
 LIMITS = Thresholds()
 FRICTION = effect("friction@elbow", amplitude(neutral=0.25), shape("s", neutral=0.5))
 A, S = "friction@elbow.a", "friction@elbow.s"

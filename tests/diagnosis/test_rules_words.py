@@ -1,4 +1,4 @@
-"""What a finding says, in sentences and as `yid-diagnosis/1`: rule by rule."""
+"""What a finding says, in sentences and as `yid-diagnosis/2`: rule by rule."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ NO_EFFECT = {"added": (), "fits": ()}
 )
 def test_whether_there_is_a_gap_comes_first(verdict, p_values, said):
     before, held = outcome(p=p_values[0], chi2=1.123), outcome(p=p_values[1], chi2=2.345)
-    made = finding(verdict, before=before, held_out_before=held, **NO_EFFECT)
+    made = finding(verdict, nominal_test=before, nominal_held_out_test=held, **NO_EFFECT)
     assert diagnosis_summary_text(made).startswith(said)
 
 
@@ -89,12 +89,12 @@ def test_insufficient_data_say_why_and_nothing_of_places():
     ids=["one", "two", "at the limit", "three at most", "none above the limit"],
 )
 def test_places_with_much_of_the_gap_are_named(shares, said):
-    made = finding("unknown", where=tuple(place(name, share) for name, share in shares.items()), **NO_EFFECT)
+    made = finding("unknown", gap_locations=tuple(place(name, share) for name, share in shares.items()), **NO_EFFECT)
     assert f"{said} No known effect explains it." in diagnosis_summary_text(made)
 
 
 def test_without_places_nothing_is_said_of_them():
-    assert "It lies" not in diagnosis_summary_text(finding("unknown", where=(), **NO_EFFECT))
+    assert "It lies" not in diagnosis_summary_text(finding("unknown", gap_locations=(), **NO_EFFECT))
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_without_places_nothing_is_said_of_them():
     ],
 )
 def test_the_side_is_said_where_the_evidence_tells(weight, evidence, said):
-    made = finding("unknown", smoothed=smoothed(weight, evidence=evidence), **NO_EFFECT)
+    made = finding("unknown", smoother_result=smoothed(weight, evidence=evidence), **NO_EFFECT)
     assert said in diagnosis_summary_text(made)
 
 
@@ -150,7 +150,7 @@ def test_a_closure_is_said_with_its_interval():
 
 def test_two_effects_close_together():
     both = fit([FRICTION, OFFSET], values={"friction@elbow.a": 0.5, "offset@wrist.a": 0.25})
-    said = diagnosis_summary_text(finding(added=(added(FRICTION), added(OFFSET, fitted=both))))
+    said = diagnosis_summary_text(finding(selected_effects=(added(FRICTION), added(OFFSET, fitted=both))))
     assert "friction@elbow with a = 0.5 ± 0.01 N m; offset@wrist with a = 0.25 ± 0.01 N m together close 90 %" in said
 
 
@@ -216,7 +216,7 @@ def test_six_parameters_at_most_are_said_to_move():
 
 
 def test_an_unknown_gap_names_the_best_attempt():
-    said = diagnosis_summary_text(finding("unknown", fits=(fit([OFFSET]), fit([FRICTION])), added=()))
+    said = diagnosis_summary_text(finding("unknown", single_effect_models=(fit([OFFSET]), fit([FRICTION])), selected_effects=()))
     assert "No known effect explains it (the best, offset@wrist, is not sure to be there and to close a part)." in said
 
 
@@ -226,12 +226,12 @@ def test_blocks_and_the_next_experiment_come_last():
     assert "blocks" not in diagnosis_summary_text(with_effect(FRICTION, 0.5))
 
 
-# -- yid-diagnosis/1 --------------------------------------------------------------------------------------------------
+# -- yid-diagnosis/2 --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("verdict", ["effect", "confusable", "unknown", "no_gap", "insufficient_data"])
 def test_effects_count_only_where_the_verdict_names_them(verdict):
-    made = finding(verdict, added=(added(FRICTION, [OFFSET]),))
+    made = finding(verdict, selected_effects=(added(FRICTION, [OFFSET]),))
     result = made.to_dict()
     named = verdict in ("effect", "confusable")
     assert made.last is (made.added[-1].fit if named else made.nominal)
@@ -245,9 +245,9 @@ def test_effects_count_only_where_the_verdict_names_them(verdict):
 
 def test_numbers_that_are_not_finite_become_null():
     made = finding(
-        closure=closed(0.9, math.nan, math.inf),
-        absorbed=(absorbed("T1.bend", 1.0, 2.0, math.inf),),
-        added=(added(FRICTION, part=closed(math.nan, 0.1, 0.2)),),
+        gap_closure=closed(0.9, math.nan, math.inf),
+        nominal_changes=(absorbed("T1.bend", 1.0, 2.0, math.inf),),
+        selected_effects=(added(FRICTION, part=closed(math.nan, 0.1, 0.2)),),
     )
     result = made.to_dict()
     assert result["gap"]["closure_ci"] == [None, None]
@@ -260,16 +260,16 @@ def test_the_result_holds_what_was_found():
     spoken = smoothed({FORCE: 9.0}, evidence={"plant": 9.0, "both": 9.0})
     made = finding(
         "confusable",
-        added=(added(FRICTION, [OFFSET]), added(OFFSET)),
-        smoothed=spoken,
-        where=(place("T1", 0.7, True, ((0.0, 1.0),)),),
-        remaining_where=(place("T2", 0.3, False),),
-        remaining=outcome(p=0.4, chi2=1.02),
-        visibility=(visible(FRICTION), visible(OFFSET, seen=False)),
-        in_blocks=True,
+        selected_effects=(added(FRICTION, [OFFSET]), added(OFFSET)),
+        smoother_result=spoken,
+        gap_locations=(place("T1", 0.7, True, ((0.0, 1.0),)),),
+        remaining_gap_locations=(place("T2", 0.3, False),),
+        remaining_test=outcome(p=0.4, chi2=1.02),
+        detectability=(visible(FRICTION), visible(OFFSET, seen=False)),
+        is_split_in_blocks=True,
     )
     result = made.to_dict()
-    assert result["format"] == "yid-diagnosis/1"
+    assert result["format"] == "yid-diagnosis/2"
     assert result["gap"]["before"]["chi2_per_dof"] == made.nominal_held_out_test.chi2_per_dof
     assert result["gap"]["after"] | {"unit": None} == {
         "rmse": {"points.tip": 0.01},
@@ -305,10 +305,10 @@ def test_candidates_are_listed_with_what_was_added_first():
     alone = fit([OFFSET], loss(1.3, 1.4), values={"offset@wrist.a": 0.3})
     best = fit([FRICTION], loss(1.0, 1.1), values={"friction@elbow.a": 0.5}, std={"friction@elbow.a": math.inf})
     made = finding(
-        nominal=fit(lost=loss(2.0, 2.0)),
-        fits=(alone, best),
-        added=(added(FRICTION, fitted=best),),
-        scores=(
+        nominal_model=fit(lost=loss(2.0, 2.0)),
+        single_effect_models=(alone, best),
+        selected_effects=(added(FRICTION, fitted=best),),
+        candidate_scores=(
             score(third, p=0.2, statistic=7.0, step={"third@x.a": 0.7}),
             score(OFFSET, p=0.1, statistic=8.0),
             score(FRICTION, p=0.05, statistic=9.0),
@@ -327,13 +327,13 @@ def test_candidates_are_listed_with_what_was_added_first():
 
 
 def test_a_refit_without_a_score_is_listed_as_insignificant():
-    made = finding(scores=(), fits=(fit([OFFSET]),), added=())
+    made = finding(candidate_scores=(), single_effect_models=(fit([OFFSET]),), selected_effects=())
     [entry] = _ranked_candidates(made)
     assert (entry["kind"], entry["score"], entry["p_value"]) == ("offset", 0.0, 1.0)
 
 
 def test_an_unknown_gap_lists_refits_before_scores():
-    made = finding("unknown", fits=(fit([OFFSET]),), scores=(score(FRICTION), score(OFFSET)))
+    made = finding("unknown", single_effect_models=(fit([OFFSET]),), candidate_scores=(score(FRICTION), score(OFFSET)))
     assert [entry["kind"] for entry in _ranked_candidates(made)] == ["offset", "friction"]
 
 
@@ -342,7 +342,7 @@ def test_an_unknown_gap_lists_refits_before_scores():
 
 def nameless(reason, **changed):
     return diagnosis_summary_text(
-        finding("unknown", reason=reason, limits=Thresholds(min_explained_fraction=0.5), **changed)
+        finding("unknown", unknown_reason=reason, thresholds=Thresholds(min_explained_fraction=0.5), **changed)
     )
 
 
@@ -396,12 +396,12 @@ def test_every_reason_has_a_sentence(reason):
 
 
 def test_stand_ins_are_shown_as_such_in_the_result():
-    told = finding("unknown", reason="stand_in", carried=(carried(),)).to_dict()
+    told = finding("unknown", unknown_reason="stand_in", transfer_checks=(carried(),)).to_dict()
     assert told["stand_ins"] == [{"kind": "friction", "location": "elbow"}]
     assert (told["reason"], told["effects"]) == ("stand_in", [])
     [entry] = told["carried_over"]
     assert (entry["value"], entry["again"], entry["agrees"]) == (0.5, 0.9, False)
-    assert finding("unknown", reason="little").to_dict()["stand_ins"] == []
+    assert finding("unknown", unknown_reason="little").to_dict()["stand_ins"] == []
 
 
 # -- places and recordings --------------------------------------------------------------------------------------------
@@ -409,9 +409,9 @@ def test_stand_ins_are_shown_as_such_in_the_result():
 
 def test_places_that_cannot_be_told_apart_are_named_together():
     at = replace(place("T3"), indistinguishable_from=("T1", "T2"))
-    text = diagnosis_summary_text(finding(where=(at,)))
+    text = diagnosis_summary_text(finding(gap_locations=(at,)))
     assert "It lies in T3 or T1 or T2 (100 %)" in text
-    assert finding(where=(at,)).to_dict()["where"][0]["also"] == ["T1", "T2"]
+    assert finding(gap_locations=(at,)).to_dict()["where"][0]["also"] == ["T1", "T2"]
 
 
 @pytest.mark.parametrize(
@@ -422,13 +422,13 @@ def test_places_that_cannot_be_told_apart_are_named_together():
     ],
 )
 def test_a_recording_that_cannot_be_followed_is_named(kept, said):
-    made = finding(cuts=(TruncatedRecording("other", kept, 5.0),))
+    made = finding(truncated_recordings=(TruncatedRecording("other", kept, 5.0),))
     assert said in diagnosis_summary_text(made)
     assert made.to_dict()["gap"]["cut"] == [{"recording": "other", "kept": kept, "whole": 5.0}]
 
 
 def test_blocks_for_want_of_a_recording_that_can_be_followed_are_said():
-    text = diagnosis_summary_text(finding(cuts=(TruncatedRecording("other", 0.0, 5.0),), in_blocks=True))
+    text = diagnosis_summary_text(finding(truncated_recordings=(TruncatedRecording("other", 0.0, 5.0),), is_split_in_blocks=True))
     assert "No held-out recording is left: alternate blocks" in text
 
 
@@ -437,7 +437,7 @@ def test_blocks_for_want_of_a_recording_that_can_be_followed_are_said():
 
 @pytest.mark.parametrize("share", [0.0, 0.004])
 def test_a_place_without_a_share_is_no_place(share):
-    text = diagnosis_summary_text(finding("unknown", where=(place("spring_1", share),)))
+    text = diagnosis_summary_text(finding("unknown", gap_locations=(place("spring_1", share),)))
     assert "spring_1" not in text.replace("Move spring_1", "")
     assert "These data do not tell where it lies." in text
 

@@ -45,7 +45,7 @@ STATE = {
 SCHEMA = {
     "type": "object",
     "properties": {
-        "format": {"const": "yid-diagnosis/1"},
+        "format": {"const": "yid-diagnosis/2"},
         "verdict": {"enum": ["effect", "confusable", "no_gap", "unknown", "insufficient_data"]},
         "gap": {
             "type": "object",

@@ -126,7 +126,7 @@ def test_a_diagnosis_says_what_it_could_not_explain(tmp_path):
     """From made-up trajectories: every kind of unknown, an event, points before and after."""
     rng, run = np.random.default_rng(0), tmp_path / "run"
     run.mkdir()
-    (run / "result.json").write_text(json.dumps({"format": "yid-diagnosis/1", "verdict": "effect"}))
+    (run / "result.json").write_text(json.dumps({"format": "yid-diagnosis/2", "verdict": "effect"}))
     (run / "config.yaml").write_text("")
     names = ["elbow", "T1.push_x", "T1.push_z", "left.x", "left.y", "left.z", "camera.w_T1.y", "wrist"]
     kinds = ["force", "push", "push", "offset", "offset", "offset", "bias", "force"]

@@ -57,7 +57,7 @@ def diagnosed(folder, stiffness, verdict="confusable"):
         for label in PAIR
     ]
     absorption = {"elbow.stiffness": {"before": stiffness, "after": 9.0, "std": 0.1, "unit": "N m/rad"}}
-    result = {"format": "yid-diagnosis/1", "verdict": verdict, "which": which, "absorption": absorption}
+    result = {"format": "yid-diagnosis/2", "verdict": verdict, "which": which, "absorption": absorption}
     (folder / "result.json").write_text(json.dumps(result))
     h5py.File(folder / "trajectories.h5", "w").close()
     return folder
@@ -121,4 +121,4 @@ def test_wrong_input_leaves_nothing(config, refused, settings, words):
 def test_other_goals_do_not_take_a_diagnosis(config, tmp_path, refused):
     folder = diagnosed(tmp_path / "diagnosed", 4.0)
     settings = ["plan.goal=place", "plan.point=tip", "plan.target_offset=[0,0.1,0]", f"plan.parameter_run={folder}"]
-    refused(config, settings, ("run folder of another command (yid-diagnosis/1)",))
+    refused(config, settings, ("run folder of another command (yid-diagnosis/2)",))

@@ -33,7 +33,7 @@ def written_run(folder, effects, run):
     }
     folder.mkdir()
     (folder / "config.yaml").write_text(dump_config(run))
-    result = {"format": "yid-diagnosis/1", "verdict": "effect", "model": {"parameters": parameters, "covariance": {}}}
+    result = {"format": "yid-diagnosis/2", "verdict": "effect", "model": {"parameters": parameters, "covariance": {}}}
     (folder / "result.json").write_text(json.dumps(result))
     return folder
 

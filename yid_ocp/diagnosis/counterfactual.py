@@ -77,7 +77,7 @@ class CounterfactualTest:
     effects_added: PredictionErrors
 
     def to_dict(self) -> dict[str, object]:
-        """Return `predict_counterfactual` of `yid-diagnosis/1`, JSON-compatible."""
+        """Return `predict_counterfactual` of `yid-diagnosis/2`, JSON-compatible."""
         return {name: _entry(part) for name, part in (("removed", self.effects_removed), ("added", self.effects_added))}
 
 

@@ -186,11 +186,7 @@ def _nameless(finding: DiagnosisResult) -> str:
             else _UNKNOWN_REASON_TEXTS["none"].format(best=best.effects[0].label)
         )
     names = " and ".join(entry.effect.label for entry in finding.selected_effects)
-    apart = [
-        f"{entry.effect_label}.{entry.parameter} is {entry.estimation_value:.3g} ± {entry.estimation_std:.2g} {entry.unit} on the recordings to "
-        f"estimate on and {entry.held_out_value:.3g} ± {entry.held_out_std:.2g} on the held-out ones"
-        for entry in failed_transfer_checks(finding.transfer_checks)
-    ]
+    apart = [entry.disagreement for entry in failed_transfer_checks(finding.transfer_checks)]
     count = assumption_count(finding.selected_effects)
     return _UNKNOWN_REASON_TEXTS[finding.unknown_reason].format(
         names=names,

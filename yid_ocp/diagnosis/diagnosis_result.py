@@ -1,4 +1,4 @@
-"""The result of a diagnosis, as a dataclass and as `yid-diagnosis/1`."""
+"""The result of a diagnosis, as a dataclass and as `yid-diagnosis/2`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from yid_ocp.diagnosis.select import (
     rmse_reduction,
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.diagnosis.transfer_check import TransferCheck
+from yid_ocp.diagnosis.transfer_check import TransferCheck, failed_transfer_checks
 from yid_ocp.diagnosis.verdict import UnknownReason, assumption_count
 from yid_ocp.display import ReprMixin, ReprSummary
 from yid_ocp.effects import EffectBase
@@ -36,7 +36,7 @@ from yid_ocp.inference.null_test import ChannelNoiseLevel, NullTestResult, bonfe
 from yid_ocp.inference.smoother import SmootherResult
 from yid_ocp.inference.uncertainty import covariance_and_chi2, covariance_to_dict
 
-_FORMAT = "yid-diagnosis/1"
+_FORMAT = "yid-diagnosis/2"
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ class DiagnosisResult(ReprMixin):
         for entry in _ranked_candidates(self)[:8]:
             values = {name: own for name, own in entry["parameters"].items() if own["value"] is not None}
             known = ", ".join(f"{name} = {own['value']:.3g} {own['unit']}" for name, own in values.items())
-            alone = "" if entry["gap_closure"] is None else f"{100 * entry['gap_closure']:.3g} %"
+            alone = "" if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
             rows.append((f"{entry['kind']}@{entry['location']}", known, alone, f"{entry['p_value']:.2g}"))
         return ReprSummary(", ".join(filter(None, (self.verdict.replace("_", " "), effects, said))), rows)
 
@@ -169,7 +169,7 @@ class DiagnosisResult(ReprMixin):
         return self.selected_effects[-1].refitted_model if self.accepted_effects else self.nominal_model
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the result as `yid-diagnosis/1`, JSON-compatible."""
+        """Return the result as `yid-diagnosis/2`, JSON-compatible."""
         return {
             "format": _FORMAT,
             "verdict": self.verdict,
@@ -194,10 +194,7 @@ class DiagnosisResult(ReprMixin):
                 "where": [_place(p) for p in self.remaining_gap_locations],
             },
             "reason": self.unknown_reason,
-            "stand_ins": [
-                {"kind": e.effect.kind, "location": e.effect.location}
-                for e in (self.selected_effects if self.unknown_reason == "stand_in" else ())
-            ],
+            "rejected_candidates": _rejected_candidates(self),
             "carried_over": [
                 {
                     "effect": c.effect_label,
@@ -300,7 +297,7 @@ def threshold_statistics(finding: DiagnosisResult) -> dict[str, Any]:
         "carried": max(apart, default=None),
     }
     said: dict[str, Any] = {name: None if value is None else _number(value) for name, value in found.items()}
-    return said | {"penalized_chi2_difference": _behind(finding.single_effect_models)}
+    return said | {"behind": _behind(finding.single_effect_models)}
 
 
 def _behind(fits: Sequence[RefitModel]) -> dict[str, Any]:
@@ -389,8 +386,27 @@ def _place(place: GapLocation) -> dict[str, Any]:
         "share": place.gap_share,
         "observable": place.is_observable,
         "windows": [list(window) for window in place.time_windows],
-        "also": list(place.indistinguishable_from),
+        "indistinguishable_from": list(place.indistinguishable_from),
     }
+
+
+def _rejected_candidates(finding: DiagnosisResult) -> list[dict[str, Any]]:
+    """Effects that imitate the gap and are not its cause, each with the closure that it reaches and why it is none."""
+    if finding.unknown_reason != "stand_in":
+        return []
+    failed = failed_transfer_checks(finding.transfer_checks)
+    listed = []
+    for entry in finding.selected_effects:
+        own = [check for check in failed if check.effect_label == entry.effect.label] or failed
+        listed.append(
+            {
+                "kind": entry.effect.kind,
+                "location": entry.effect.location,
+                "closure": _number(entry.cumulative_closure.fraction),
+                "reason": "; ".join(check.disagreement for check in own),
+            }
+        )
+    return listed
 
 
 def _number(value: float) -> float | None:

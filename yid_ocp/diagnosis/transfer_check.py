@@ -43,6 +43,14 @@ class TransferCheck:
     held_out_std: float
     is_consistent: bool
 
+    @property
+    def disagreement(self) -> str:
+        """Both estimates, in words."""
+        return (
+            f"{self.effect_label}.{self.parameter} is {self.estimation_value:.3g} ± {self.estimation_std:.2g} {self.unit} "
+            f"on the recordings to estimate on and {self.held_out_value:.3g} ± {self.held_out_std:.2g} on the held-out ones"
+        )
+
 
 def check_transfer(search: RefitContext, fit: RefitModel) -> tuple[TransferCheck, ...]:
     """Refit the effects on the held-out recordings and compare every amplitude; empty if one recording is split.

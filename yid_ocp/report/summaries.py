@@ -324,7 +324,7 @@ _MAX_CANDIDATES = 15  # candidates that are listed; result.json has them all
 
 
 def diagnose_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
-    """Summary blocks of a `yid-diagnosis/1` result."""
+    """Summary blocks of a `yid-diagnosis/2` result."""
     blocks = [*issue_blocks(result), SummaryStatement(result["summary"], "verdict")]
     blocks += nonempty_tables(SummaryTable(gap_error_rows(result), "Errors on held-out recordings", is_key_table=True))
     rows: TableRows = [("candidate", "parameters", "closure alone", "score", "p")]
@@ -434,7 +434,7 @@ SUMMARY_BY_FORMAT: Mapping[str, Callable[[Mapping[str, Any]], list[SummaryBlock]
     "yid-solve/1": solve_summary,
     "yid-compare/1": compare_summary,
     "yid-identifiability/1": identifiability_summary,
-    "yid-diagnosis/1": diagnose_summary,
+    "yid-diagnosis/2": diagnose_summary,
     "yid-history/1": history_summary,
     "yid-plan/1": plan_summary,
     "yid-track/1": track_summary,

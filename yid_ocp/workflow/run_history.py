@@ -29,7 +29,9 @@ from yid_ocp.workflow.command_runner import CommandResult, run_and_print
 from yid_ocp.workflow.run_folder import local_time_text, new_run_folder
 from yid_ocp.workflow.run_inputs import recording_path
 
-_RUN_FORMATS = ("yid-solve/1", "yid-diagnosis/1")
+_RUN_FORMATS = ("yid-solve/1", "yid-diagnosis/2")
+_OLD_FORMATS = ("yid-diagnosis/1",)
+"""Of earlier versions, which had other keys."""
 _COMPARED_MODEL_SECTIONS = ("robot", "arms", "clamps", "object", "grasp", "springs", "gravity")
 """Sections of `model` in which a baseline's settings must be the same, so that parameters mean the same thing."""
 
@@ -79,6 +81,7 @@ def read_run_result(folder: str | Path) -> dict[str, Any]:
     """Contents of result.json of a successful `solve` or `diagnose`; errors as `read_estimates`."""
     file = Path(folder) / "result.json"
     result = _result(file)
+    require_current_format(result, file)
     if result.get("format") not in _RUN_FORMATS:
         what = f"the run folder is one of another command ({result.get('format')})"
         raise DataError(
@@ -87,6 +90,23 @@ def read_run_result(folder: str | Path) -> dict[str, Any]:
     if result.get("status") == "failed":
         raise DataError(f"the run failed: {result.get('message')}", where=str(file), hint="give one that converged")
     return result
+
+
+def require_current_format(result: Mapping[str, Any], file: Path) -> None:
+    """Raise an error where a result is of an earlier version, whose keys had other names.
+
+    Raises
+    ------
+    DataError
+    """
+    if result.get("format") in _OLD_FORMATS:
+        raise DataError(
+            f"the run is of an earlier version ({result['format']}), whose keys had other names; "
+            "CHANGELOG.md has the table old -> new under Unreleased",
+            where=str(file),
+            allowed=" or ".join(_RUN_FORMATS),
+            hint="diagnose again with this version",
+        )
 
 
 def _result(file: Path) -> dict[str, Any]:

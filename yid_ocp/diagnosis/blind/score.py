@@ -91,7 +91,7 @@ class CaseScore:
 def score_case(
     label: CaseLabel, result: Mapping[str, Any], best: float = math.nan, seconds: float = math.nan
 ) -> CaseScore:
-    """Score a `yid-diagnosis/1` result against its label.
+    """Score a `yid-diagnosis/2` result against its label.
 
     Parameters
     ----------

@@ -45,7 +45,7 @@ class _Chapter:
 def diagnosis_context(findings: ReportData) -> Mapping[str, Any] | None:
     """Template context: chapters on gap, events, locations, candidates, curves and changed parameters."""
     result = findings.result
-    if result.get("format") != "yid-diagnosis/1":
+    if result.get("format") != "yid-diagnosis/2":
         return None
     finding: DiagnosisResult | None = findings.section_data.get("finding")
     chapters: dict[str, _Chapter | None] = {}
