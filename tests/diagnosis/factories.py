@@ -240,7 +240,7 @@ def finding(verdict="effect", **changed) -> DiagnosisResult:
         "candidate_scores": (score(of, p=1e-9, decrease=100.0, statistic=40.0),),
         "smoother_result": None,
         "gap_locations": (place(),),
-        "nominal_model": fit(lost=loss(2.0, 2.2), problem=SimpleNamespace(disturbed=False)),
+        "nominal_model": fit(lost=loss(2.0, 2.2), problem=SimpleNamespace(has_process_noise=False)),
         "single_effect_models": (fit([of], loss(1.0, 1.1), values={f"{of.label}.a": 0.5}),),
         "selected_effects": (added(of, fitted=fit([of], loss(1.0, 1.1), values={f"{of.label}.a": 0.5})),),
         "gap_closure": closed(),
@@ -275,10 +275,10 @@ class Candidates:
     """
 
     def __init__(self, effects, y, column, nominal):
-        self.effects, self.y, self.column = tuple(effects), y, column
-        self.nominal = tuple(nominal)
+        self.candidate_effects, self.y, self.column = tuple(effects), y, column
+        self.nominal_parameters = tuple(nominal)
         self.theta = dict(nominal) | {n: v for of in effects for n, v in of.neutral_values.items()}
-        self.names: tuple[str, ...] = self.nominal
+        self.unknown_names: tuple[str, ...] = self.nominal_parameters
         self.weak, self.fault, self.asked, self.parts, self.warmed = 0, "", [], [], []
 
     @property
@@ -287,7 +287,7 @@ class Candidates:
 
     def told(self, parts, problem):
         """Keep what `residual_channels` was asked of."""
-        self.asked, self.parts = list(problem.names), parts
+        self.asked, self.parts = list(problem.unknown_names), parts
         return parts
 
     def _like(self, **changed):
@@ -295,35 +295,35 @@ class Candidates:
         vars(other).update(changed)
         return other
 
-    def freeing(self, names):
-        return self._like(names=tuple(names))
+    def with_free_subset(self, names):
+        return self._like(unknown_names=tuple(names))
 
-    def placed(self, effects, at):
+    def relinearized_with_effects(self, effects, at):
         """Nothing drives its motion wrong; `places` are what was asked for."""
         self.places = [*getattr(self, "places", []), ([effect.label for effect in effects], dict(at))]
         return self
 
-    def at(self, values):
+    def with_parameter_values(self, values):
         return self._like(theta=self.theta | dict(values))
 
     def vector(self, values):
-        return np.array([values.get(name, self.theta[name]) for name in self.names])
+        return np.array([values.get(name, self.theta[name]) for name in self.unknown_names])
 
     def residual_at(self, values):
         """The data's residual at some values of the unknowns."""
         return self.y + sum(value * self.column(name, self.theta) for name, value in values.items())
 
-    def informing(self, at):
+    def residual_without_weak_priors(self, at):
         count = len(self.y)
         return at.residual[:count], at.jacobian[:count]
 
-    def evaluate(self, x, derivatives=True, warm=None):
-        self.warmed.append(warm)
-        values = dict(zip(self.names, x, strict=True))
+    def evaluate(self, x, derivatives=True, equilibrium_guesses=None):
+        self.warmed.append(equilibrium_guesses)
+        values = dict(zip(self.unknown_names, x, strict=True))
         if self.fault == "fails":
             return evaluation([], ok=False, message="it snaps")
         residual = np.append(self.residual_at(values), np.full(self.weak, 7.0))
-        jacobian = np.stack([self.column(name, self.theta) for name in self.names], axis=1)
+        jacobian = np.stack([self.column(name, self.theta) for name in self.unknown_names], axis=1)
         jacobian = np.vstack([jacobian, np.full((self.weak, len(x)), 5.0)])
         return evaluation(residual, None if self.fault else jacobian)
 
@@ -336,30 +336,30 @@ class Recorded:
         node = np.rint(np.asarray(times) / 0.1).astype(int)
         self._samples = measurements(["a"], node, np.zeros(len(node)), value, weight)
 
-    def predicted(self, prediction, slopes=None):
+    def predicted_outputs(self, prediction, slopes=None):
         """A problem that predicts the recording so, or says why not; `asked` holds the values that it was asked at.
 
         It has one parameter; `slopes` is what moving it adds to the prediction, nothing where absent.
         """
         asked = []
         grid = SimpleNamespace(steps=len(self._samples.node), time_step=0.1)
-        held = SimpleNamespace(name="other", grid=grid, samples=(self._samples,))
+        held = SimpleNamespace(name="other", grid=grid, measurements=(self._samples,))
         result = prediction
         if not isinstance(prediction, str):
-            result = SimpleNamespace(predicted=(np.asarray(prediction, float),))
+            result = SimpleNamespace(predicted_outputs=(np.asarray(prediction, float),))
             by = np.zeros((len(prediction), 1, 1)) if slopes is None else np.asarray(slopes, float)[:, None, None]
         return SimpleNamespace(
             asked=asked,
             held_out=(held,),
             vector=lambda values: asked.append(dict(values)),
-            shared=("k",),
-            validate=lambda x, derivatives=False: [(held, result)],
-            held_out_rows=lambda i, episode, found: self._samples.residual_block(found.predicted[0], by),
-            on=lambda episodes, held_out: SimpleNamespace(
+            shared_parameters=("k",),
+            predict_held_out=lambda x, derivatives=False: [(held, result)],
+            held_out_residual=lambda i, episode, found: self._samples.residual_block(found.predicted_outputs[0], by),
+            with_episodes=lambda episodes, held_out: SimpleNamespace(
                 episodes=episodes,
                 held_out=held_out,
                 options=SimpleNamespace(path_cutoff=math.inf),
-                rows=ResidualRows.from_episodes(episodes, 0, 0),
+                residual_rows=ResidualRows.from_episodes(episodes, 0, 0),
             ),
         )
 

@@ -33,9 +33,9 @@ def test_its_advice_follows_from_its_samples_by_the_rules_as_they_are(kept):
     assert set(rules) == set(_CALIBRATION_RULES)
     for name, rule in _CALIBRATION_RULES.items():
         own = rules[name]
-        assert (own["setting"], own["of"], own["side"], own["limit"]) == (rule.setting, rule.of, rule.side, rule.limit)
+        assert (own["setting"], own["of"], own["side"], own["limit"]) == (rule.setting, rule.of, rule.gap_origin, rule.limit)
         sample = [float("-inf") if value is None else value for value in own["sample"]]
-        value, coverage = _conformal_quantile(sample, rule.side, kept["asked"])
+        value, coverage = _conformal_quantile(sample, rule.gap_origin, kept["asked"])
         assert own["coverage"] == coverage
         assert own["quantile"] == (None if value == float("-inf") else value)
     assert _recommended_settings(rules) == kept["settings"]

@@ -104,11 +104,11 @@ class Problem:
     """Episodes and held-out ones that can change places."""
 
     def __init__(self, episodes=("own",), held_out=("other",), disturbed=False):
-        self.episodes, self.held_out, self.disturbed = episodes, held_out, disturbed
+        self.episodes, self.held_out, self.has_process_noise = episodes, held_out, disturbed
         self.free, self.weighted = ("k",), []
 
-    def on(self, episodes, held_out):
-        return Problem(episodes, held_out, self.disturbed)
+    def with_episodes(self, episodes, held_out):
+        return Problem(episodes, held_out, self.has_process_noise)
 
 
 def test_the_held_out_recordings_are_fitted_with_the_same_effects(monkeypatch):

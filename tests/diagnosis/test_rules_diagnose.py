@@ -68,13 +68,13 @@ def nominal(monkeypatch):
     return made
 
 
-CALM = SimpleNamespace(disturbed=False)
+CALM = SimpleNamespace(has_process_noise=False)
 """Nothing but the sensors' noise."""
 
 
 def solution(value=2.0, evaluated=True):
     return SimpleNamespace(
-        names=("k",), x=np.array([value]), evaluation=evaluation([1.0]) if evaluated else None, message="it snaps"
+        unknown_names=("k",), x=np.array([value]), evaluation=evaluation([1.0]) if evaluated else None, message="it snaps"
     )
 
 
@@ -90,7 +90,7 @@ def solution(value=2.0, evaluated=True):
 )
 def test_the_nominal_fit_begins_at_the_solution_of_all_data(nominal, blocks, given, solved, start):
     nominal.found = solution(3.0)
-    composed, limits = SimpleNamespace(blocks=blocks, problem=CALM), Thresholds(restart_chi2=2.0)
+    composed, limits = SimpleNamespace(is_split_in_blocks=blocks, problem=CALM), Thresholds(restart_chi2=2.0)
     assert module.nominal_fit("problem", composed, given, "store", limits) is nominal.outcome
     assert nominal.starts == [(composed, (), start, "store", limits)]
     assert nominal.solved == [("problem", GaussNewton(max_iterations=30))][:solved]
@@ -98,30 +98,30 @@ def test_the_nominal_fit_begins_at_the_solution_of_all_data(nominal, blocks, giv
 
 def test_where_the_solution_cannot_be_rolled_out_again_the_fit_begins_at_the_start(nominal):
     nominal.outcomes = [None]
-    composed = SimpleNamespace(blocks=False, problem=CALM)
+    composed = SimpleNamespace(is_split_in_blocks=False, problem=CALM)
     assert module.nominal_fit("problem", composed, solution()) is nominal.outcome
     assert [start for _, _, start, _, _ in nominal.starts] == [{"k": 2.0}, {}]
 
 
 def test_a_nominal_fit_that_is_known_is_not_repeated(nominal):
     nominal.known = fit(cost=7.0)
-    assert module.nominal_fit("problem", SimpleNamespace(blocks=False, problem=CALM)) is nominal.known
+    assert module.nominal_fit("problem", SimpleNamespace(is_split_in_blocks=False, problem=CALM)) is nominal.known
     assert nominal.starts == nominal.solved == []
 
 
 def test_a_nominal_model_that_cannot_be_rolled_out_is_said(nominal):
     nominal.found = solution(evaluated=False)
     with pytest.raises(SolverError, match="cannot be fitted: it snaps"):
-        module.nominal_fit("problem", SimpleNamespace(blocks=False, problem=CALM))
+        module.nominal_fit("problem", SimpleNamespace(is_split_in_blocks=False, problem=CALM))
     nominal.outcome = None
     with pytest.raises(SolverError, match="at its fit"):
-        module.nominal_fit("problem", SimpleNamespace(blocks=True, problem=CALM))
+        module.nominal_fit("problem", SimpleNamespace(is_split_in_blocks=True, problem=CALM))
 
 
 def test_the_largest_angles_are_those_of_a_segments_joints_in_all_recordings():
     joints = ("a", "b", "c", "d")
-    segments = (SimpleNamespace(name="T1", links=(("a", "b"), ("c",))), SimpleNamespace(name="T2", links=(("d",),)))
-    system = SimpleNamespace(segments=segments, mechanism=SimpleNamespace(joint_index=joints.index))
+    segments = (SimpleNamespace(name="T1", link_joints=(("a", "b"), ("c",))), SimpleNamespace(name="T2", link_joints=(("d",),)))
+    system = SimpleNamespace(segment_layouts=segments, mechanism=SimpleNamespace(joint_index=joints.index))
     states = [np.array([[0.1, -0.2, 0.3, 9.0], [0.0, -0.7, 0.2, 1.0]]), np.array([[0.5, 0.1, 0.6, -11.0]])]
     episodes = tuple(SimpleNamespace(rollout=SimpleNamespace(state=state)) for state in states)
     fitted = SimpleNamespace(problem=SimpleNamespace(system=system), evaluation=SimpleNamespace(episodes=episodes))
@@ -143,7 +143,7 @@ def test_the_test_on_the_fits_data_leaves_out_what_parameters_took(monkeypatch):
 def test_held_out_data_are_tested_without_any_fit(monkeypatch):
     monkeypatch.setattr(module, "spread_by_noise", lambda problem, found: np.array([[0.0]]))
     measured = Recorded(times=[0.0, 0.1, 0.2], value=[[1.0], [2.0], [math.nan]], weight=[[2.0], [3.0], [0.0]])
-    problem = measured.predicted([[2.0], [4.0], [9.0]])
+    problem = measured.predicted_outputs([[2.0], [4.0], [9.0]])
     found = module.held_out_test(SimpleNamespace(problem=problem, values={"k": 5.0}, evaluation=None), Thresholds())
     assert found.chi2_per_dof == pytest.approx((4.0 + 36.0) / 2)
     assert found.degrees_of_freedom == 2.0
@@ -154,7 +154,7 @@ def test_held_out_data_are_tested_in_units_of_what_parameters_are_unsure_of_too(
     asked = []
     monkeypatch.setattr(module, "spread_by_noise", lambda *given: asked.append(given) or np.array([[0.5]]))
     measured = Recorded(times=[0.0, 0.1], value=[[1.0], [2.0]], weight=[[2.0], [3.0]])
-    problem = measured.predicted([[2.0], [4.0]], slopes=[3.0, 0.0])
+    problem = measured.predicted_outputs([[2.0], [4.0]], slopes=[3.0, 0.0])
     found = module.held_out_test(SimpleNamespace(problem=problem, values={"k": 5.0}, evaluation="fit"), Thresholds())
     # one standard deviation of k moves the first sample by 1.5 in its unit of half, the second not at all
     assert found.chi2_per_dof == pytest.approx((4.0 / (1 + 3.0**2) + 36.0) / 2)
@@ -162,7 +162,7 @@ def test_held_out_data_are_tested_in_units_of_what_parameters_are_unsure_of_too(
 
 
 def test_held_out_data_that_cannot_be_predicted_are_refused():
-    problem = Recorded([0.0], [[1.0]], [[1.0]]).predicted("it snaps")
+    problem = Recorded([0.0], [[1.0]], [[1.0]]).predicted_outputs("it snaps")
     with pytest.raises(DataError, match="cannot be predicted: it snaps"):
         module.held_out_test(SimpleNamespace(problem=problem, values={}), Thresholds())
 
@@ -210,7 +210,7 @@ def test_without_effects_what_is_left_is_what_there_was(left):
     held, (remaining, where, rest) = after(())
     assert remaining is held
     assert where == rest
-    assert [(p.location, p.share) for p in where] == [("T1", 1.0)]
+    assert [(p.location, p.gap_share) for p in where] == [("T1", 1.0)]
     assert after((), found=None)[1][1:] == ((), ())
     assert left.smoothed == []
 
@@ -220,7 +220,7 @@ def test_an_effect_takes_what_it_closes_and_noise_has_no_place(left):
     _, (remaining, where, rest) = after((added(FRICTION, fitted=fitted, part=closed(0.75)),))
     assert remaining is left.held
     assert rest == ()
-    assert [(p.location, p.share) for p in where] == [("elbow", 1.0), ("T1", 0.0)]
+    assert [(p.location, p.gap_share) for p in where] == [("elbow", 1.0), ("T1", 0.0)]
     assert left.smoothed == []
 
 
@@ -233,7 +233,7 @@ def test_a_gap_that_is_left_is_located_again(left):
     assert remaining is left.held
     assert left.smoothed == [(fitted, Thresholds())]
     assert [p.location for p in rest] == ["T1"]
-    assert {p.location: p.share for p in where} == {"elbow": 0.5, "wrist": 0.25, "T1": 0.25}
+    assert {p.location: p.gap_share for p in where} == {"elbow": 0.5, "wrist": 0.25, "T1": 0.25}
     assert where[0].windows == ((0.0, 1.0), (3.0, 3.5))
 
 
@@ -270,7 +270,7 @@ class Steps:
         object.__setattr__(
             self.nominal,
             "problem",
-            SimpleNamespace(episodes=(), shared=("k",), system=SYSTEM, disturbed=self.given["disturbed"]),
+            SimpleNamespace(episodes=(), shared_parameters=("k",), system=SYSTEM, has_process_noise=self.given["disturbed"]),
         )
         monkeypatch.setattr(module, "nominal_fit", self.step("nominal", self.nominal))
         monkeypatch.setattr(module, "largest_angles", lambda of: {"T1": 0.5})
@@ -301,10 +301,10 @@ class Steps:
         return lambda of, limits: before if of is self.nominal else outcome()
 
     @property
-    def names(self):
+    def unknown_names(self):
         return [name for name, _ in self.taken]
 
-    def run(self, **limits):
+    def minimize_cost(self, **limits):
         held = (SimpleNamespace(name="other"),)
         self.effects = [Remembering("friction@elbow"), Remembering("offset@wrist")]
         self.nominal.problem.held_out = held
@@ -412,8 +412,8 @@ def test_what_leads_to_which_step(monkeypatch, given, taken, verdict):
         assert found.effects == ()
     if not found.added:
         assert math.isnan(found.closure.value)
-        assert math.isnan(found.closure.low)
-        assert math.isnan(found.closure.high)
+        assert math.isnan(found.closure.ci_low)
+        assert math.isnan(found.closure.ci_high)
     if "smooth" not in taken:
         assert (found.smoothed, found.where) == (None, ())
 
@@ -435,7 +435,7 @@ class Valleys:
     def __init__(self, monkeypatch, costs):
         self.costs, self.asked = costs, []
         self.problem = SimpleNamespace(
-            positive=np.array([True, False]), start=np.array([2.0, -1.0]), disturbed=False,
+            positive=np.array([True, False]), initial_unknowns=np.array([2.0, -1.0]), has_process_noise=False,
             bounds=(np.array([0.0, -9.0]), np.array([15.0, 9.0])), named=lambda x: dict(zip("kl", x, strict=True)),
         )  # fmt: skip
         monkeypatch.setattr(module, "refit", self.refit)
@@ -447,7 +447,7 @@ class Valleys:
 
     def other(self):
         search = RefitContext(SimpleNamespace(problem=self.problem), Thresholds(), Heard(), "store")
-        return module.elsewhere(search, fit(cost=100.0, values={"k": 2.0, "l": -1.0}))
+        return module.alternative_start(search, fit(cost=100.0, values={"k": 2.0, "l": -1.0}))
 
 
 def test_other_starts_are_multiples_of_what_is_positive_within_bounds(monkeypatch):
@@ -474,7 +474,7 @@ def test_an_effect_that_is_accepted_is_where_the_gap_was(monkeypatch):
     steps.given["added"][0].fit.values.update({"k": 2.0, "l": 3.0})
     steps.given["added"][0].fit.std.update({"k": 0.5})
     found = steps.run()
-    assert found.where[0] == place("elbow", found.where[0].share)
+    assert found.where[0] == place("elbow", found.where[0].gap_share)
     assert (found.nominal_changes[0].after, found.nominal_changes[0].std) == (2.0, 0.5)
     assert found.is_split_in_blocks
     assert found.next_experiment.startswith("Repeat")

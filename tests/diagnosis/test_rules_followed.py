@@ -37,15 +37,15 @@ class Problem:
     episodes: tuple = ("own",)
     held_out: tuple = ()
     tried: list = field(default_factory=list)
-    disturbed: bool = False
+    has_process_noise: bool = False
 
     def vector(self, values):
         return values
 
-    def on(self, episodes, held_out):
+    def with_episodes(self, episodes, held_out):
         return replace(self, episodes=tuple(episodes), held_out=tuple(held_out))
 
-    def validate(self, x):
+    def predict_held_out(self, x):
         self.tried.extend((h.name, h.steps) for h in self.held_out)
         return [(h, "it snaps" if h.steps > h.until else object()) for h in self.held_out]
 
@@ -74,7 +74,7 @@ def test_what_is_lost_on_the_way_is_compared_until_shortly_before():
     # found to a sixty-fourth of 500 steps, less a tenth
     assert 0.9 * (300 - 8) - 1 <= cut_short.steps <= 0.9 * 300
     assert cut == TruncatedRecording("b", cut_short.steps * 0.01, 5.0)
-    assert not composed.blocks
+    assert not composed.is_split_in_blocks
 
 
 def test_too_short_a_beginning_is_left_out():
@@ -87,14 +87,14 @@ def test_too_short_a_beginning_is_left_out():
 
 def test_where_nothing_is_left_the_other_recordings_are_split():
     composed, cuts = followed(Held("b", 500, until=50))
-    assert composed.blocks
+    assert composed.is_split_in_blocks
     assert composed.problem.held_out == ("blocks",)
     assert cuts == (TruncatedRecording("b", 0.0, 5.0),)
 
 
 def test_with_no_margin_nothing_of_it_is_kept():
     composed, [cut] = followed(Held("a", 500), Held("b", 500, until=450), margin=0.0)
-    assert (composed.problem.held_out, cut.kept) == ((Held("a", 500),), 0.0)
+    assert (composed.problem.held_out, cut.kept_duration) == ((Held("a", 500),), 0.0)
 
 
 # -- in a diagnosis ---------------------------------------------------------------------------------------------------
@@ -124,7 +124,7 @@ def test_a_model_that_follows_everything_is_left_alone(monkeypatch):
 
 def test_recordings_are_cut_until_the_model_follows(monkeypatch):
     search, nominal, cuts, margins, said = run(monkeypatch, math.inf, math.inf, 7.0)
-    assert (search.problem.problem, nominal.loss.mean, margins) == ("cut 0.5", 7.0, [0.9, 0.5])
+    assert (search.problem.problem, nominal.held_out_loss.chi2_per_sample, margins) == ("cut 0.5", 7.0, [0.9, 0.5])
     assert cuts == (TruncatedRecording("b", 2.5, 5.0),), "the last cut of a recording counts"
     assert said[0] == "The nominal model follows b for 4.5 of 5 s only; the rest is left out."
 

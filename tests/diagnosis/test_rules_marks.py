@@ -393,4 +393,4 @@ def test_reported_values_are_turned_back_into_parameters():
     ]
     found = answers._internal("a@b", {"stiffness": 4.0, "limit": 2.0, "tau": 0.5}, quantities)
     assert found == {"a@b.compliance": 0.25, "a@b.tightness": 0.25, "a@b.tau": 0.5}
-    assert [quantity.turned(quantity.kept(3.0)) for quantity in quantities] == pytest.approx([3.0] * 4)
+    assert [quantity.turned(quantity.kept_duration(3.0)) for quantity in quantities] == pytest.approx([3.0] * 4)

@@ -38,37 +38,37 @@ class Problem:
     """A problem of one nominal parameter, an initial state and an effect, whose cost is a function of named values."""
 
     def __init__(self, cost, rows=10, names=("k", "k[run]", "start.q.k[run]", A, S)):
-        self.cost, self.rows, self.names, self.nominal = cost, rows, names, ("k",)
+        self.cost, self.rows, self.unknown_names, self.nominal_parameters = cost, rows, names, ("k",)
         self.asked, self.warmed, self.at, self.foreseen = [], [], [], []
-        self.freed, self.innovations = None, ()
+        self.freed, self.whitening_filters = None, ()
 
     @property
     def problem(self):
         return self
 
-    def freeing(self, effects):
+    def with_free_effects(self, effects):
         self.freed = tuple(effects)
         return self
 
-    def placed(self, effects, at):
-        self.at.append(self.named(self.vector(at)))
-        return self.freeing(effects)
+    def relinearized_with_effects(self, effects, at):
+        self.at.append(self.named_values(self.vector(at)))
+        return self.with_free_effects(effects)
 
-    def held_out_placed(self, own, effects, at):
+    def held_out_relinearized(self, own, effects, at):
         assert own is self
         self.foreseen.append(dict(at))
         return self
 
     def vector(self, values):
-        return np.array([values.get(name, 1.0) for name in self.names])
+        return np.array([values.get(name, 1.0) for name in self.unknown_names])
 
-    def named(self, x):
-        return dict(zip(self.names, map(float, x), strict=True))
+    def named_values(self, x):
+        return dict(zip(self.unknown_names, map(float, x), strict=True))
 
-    def evaluate(self, x, derivatives=True, warm=None):
-        self.asked.append(self.named(x))
-        self.warmed.append(warm)
-        cost = self.cost(self.named(x))
+    def evaluate(self, x, derivatives=True, equilibrium_guesses=None):
+        self.asked.append(self.named_values(x))
+        self.warmed.append(equilibrium_guesses)
+        cost = self.cost(self.named_values(x))
         if cost is None:
             return evaluation([], ok=False, message="it snaps")
         return costing(cost, self.rows)
@@ -87,19 +87,19 @@ def solved(monkeypatch):
     made = SimpleNamespace(runs=[], failed=[], losses=[])
 
     def run(problem, x, callback):
-        values = problem.named(x)
+        values = problem.named_values(x)
         failed = problem.cost(values) is None
         (made.failed if failed else made.runs).append(values)
         status = Status.FAILED if failed else Status.STALLED
-        return SimpleNamespace(x=np.asarray(x), message="done", status=status, warm="there")
+        return SimpleNamespace(x=np.asarray(x), message="done", status=status, equilibrium_guesses="there")
 
     def held_out(problem, x):
-        made.losses.append(problem.named(x))
+        made.losses.append(problem.named_values(x))
         return loss(1.5, 1.6)
 
-    monkeypatch.setattr(module, "SOLVER", SimpleNamespace(run=run))
-    monkeypatch.setattr(module, "held_out_loss", held_out)
-    monkeypatch.setattr(module, "refit_covariance", lambda problem, finish, limits: 0.01 * np.eye(len(problem.names)))
+    monkeypatch.setattr(module, "REFIT_SOLVER", SimpleNamespace(minimize_cost=run))
+    monkeypatch.setattr(module, "_held_out_loss", held_out)
+    monkeypatch.setattr(module, "_refit_covariance", lambda problem, finish, limits: 0.01 * np.eye(len(problem.unknown_names)))
     return made
 
 
@@ -110,7 +110,7 @@ def test_filters_are_about_the_torques_that_are_seen_at_the_start(solved):
     problem = Problem(lambda values: 1.0)
     refit_with_effects(problem, [FRICTION], {"k": 2.0, A: 3.0, S: 0.9})
     # and once more where it ended, which is the same
-    assert problem.at == 2 * [{**problem.named(np.ones(5)), "k": 2.0, A: 3.0, S: 0.9}]
+    assert problem.at == 2 * [{**problem.named_values(np.ones(5)), "k": 2.0, A: 3.0, S: 0.9}]
 
 
 def test_held_out_recordings_are_seen_about_the_torques_where_the_best_of_all_runs_ended(solved):
@@ -124,15 +124,15 @@ def test_held_out_recordings_are_seen_about_the_torques_where_the_best_of_all_ru
 
 @pytest.mark.parametrize(("apart", "runs"), [(0.9, 1), (1.0, 2)])
 def test_an_effect_that_takes_much_of_an_offset_is_fitted_once_more(solved, monkeypatch, apart, runs):
-    monkeypatch.setattr(module, "torques_apart", lambda before, after: apart)
+    monkeypatch.setattr(module, "torque_bias_distance", lambda before, after: apart)
     monkeypatch.setattr(module, "_RelinearizedEvaluation", lambda problem: problem.evaluate)
     refit_with_effects(Problem(lambda values: 1.0), [FRICTION], {"k": 2.0, A: 3.0})
     assert len(solved.runs) == runs
 
 
 def test_a_spread_far_beyond_what_one_would_expect_is_no_knowledge():
-    low, high = FRICTION.prior_range[A]
-    std = {"k": 1e9, A: 101 * (high - low), S: 99 * (FRICTION.prior_range[S][1] - FRICTION.prior_range[S][0])}
+    low, high = FRICTION.prior_ranges[A]
+    std = {"k": 1e9, A: 101 * (high - low), S: 99 * (FRICTION.prior_ranges[S][1] - FRICTION.prior_ranges[S][0])}
     assert _mark_uninformative_std([FRICTION], std) == {**std, A: math.inf}
 
 
@@ -203,7 +203,7 @@ def test_a_half_done_refit_is_tried_again_from_the_nominal_initial_values(solved
     assert found.values == again
     assert found.cost == pytest.approx(7.0)
     assert solved.losses == [again]
-    assert found.std == dict.fromkeys(problem.names, 0.1)
+    assert found.std == dict.fromkeys(problem.unknown_names, 0.1)
     assert (found.effects, found.solver_message, found.is_from_store) == ((FRICTION,), "done", False)
     assert problem.warmed == ["there", (), "there"], "the shape at rest is looked for where it was"
 
@@ -245,9 +245,9 @@ def test_a_model_that_cannot_be_rolled_out_at_all_has_no_refit(solved):
 
 
 def test_a_refit_that_ends_where_nothing_can_be_rolled_out_is_none(solved, monkeypatch):
-    away = SimpleNamespace(message="", status=Status.CONVERGED, warm=None)
-    moving = SimpleNamespace(run=lambda p, x, _: SimpleNamespace(**vars(away), x=x + 9))
-    monkeypatch.setattr(module, "SOLVER", moving)
+    away = SimpleNamespace(message="", status=Status.CONVERGED, equilibrium_guesses=None)
+    moving = SimpleNamespace(minimize_cost=lambda p, x, _: SimpleNamespace(**vars(away), x=x + 9))
+    monkeypatch.setattr(module, "REFIT_SOLVER", moving)
     assert refit_with_effects(Problem(lambda values: 5.0 if values["k"] < 9 else None), [FRICTION], START) is None
 
 
@@ -270,7 +270,7 @@ def test_an_amplitude_is_judged_with_its_shape_held():
 
 def test_another_place_is_tried_where_more_than_noise_is_left(solved, monkeypatch):
     # of ten samples chi2 is above 23.2 in one of a hundred, and costs are half of it
-    monkeypatch.setattr(type(FRICTION), "elsewhere", lambda self, start: {A: -start[A]}, raising=False)
+    monkeypatch.setattr(type(FRICTION), "alternative_start", lambda self, start: {A: -start[A]}, raising=False)
     cases = {11.5: (11.5, 0.75), 11.7: (5.0, -0.75), None: (5.0, -0.75)}
     for first, (cost, value) in cases.items():
         there = {0.75: first, -0.75: 5.0}
@@ -294,7 +294,7 @@ def test_a_refit_is_stored_under_its_effects_or_its_name(solved):
     refit_with_effects(Problem(lambda values: 5.0), [FRICTION], START, store, "another")
     assert set(store) == {"friction@elbow", "another"}
     kept = store["another"]
-    assert (kept.values, kept.message) == (START, "done")
+    assert (kept.values, kept.solver_message) == (START, "done")
     assert set(kept.std.values()) == {0.1}
     assert kept.amplitude_std == {A: 0.1}
 
@@ -338,9 +338,9 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
     def one(problem, effects, start, store, name, limits):
         asked.append((problem, [e.kind for e in effects], start, store, name, limits))
         made = fit(effects, loss(1.2345, 1.2345))
-        return None if effects[-1] is third else SimpleNamespace(**vars(made) | {"resumed": effects[-1] is other})
+        return None if effects[-1] is third else SimpleNamespace(**vars(made) | {"is_from_store": effects[-1] is other})
 
-    monkeypatch.setattr(module, "refit", one)
+    monkeypatch.setattr(module, "refit_with_effects", one)
     search = RefitContext("problem", LIMITS, heard, "store")
     tried = [(FRICTION, {A: 0.7}), (other, {"k": 3.0}), (third, {})]
     found = refit_each_candidate(search, (effect("base@x"),), tried, {"k": 2.0})
@@ -367,7 +367,7 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
 
 def episode(name="other", steps=100, time_step=0.01, of=()):
     grid = SimpleNamespace(steps=steps, time_step=time_step)
-    return SimpleNamespace(name=name, grid=grid, samples=tuple(of))
+    return SimpleNamespace(name=name, grid=grid, measurements=tuple(of))
 
 
 @pytest.mark.parametrize(
@@ -394,22 +394,22 @@ def predicting(monkeypatch):
         told["episodes"] = [e.name for e in episodes]
         return {"a": {"rmse": np.float64(0.25), "unit": "m", "n": 3}}
 
-    monkeypatch.setattr(module, "channel_errors", channel_errors)
+    monkeypatch.setattr(module, "rmse_by_channel", channel_errors)
 
     def rows(i, there, result):
-        parts = [group.rows(values).residual for group, values in zip(there.samples, result.predicted, strict=True)]
+        parts = [group.residual_block(values).residual for group, values in zip(there.measurements, result.predicted_outputs, strict=True)]
         return SimpleNamespace(residual=np.concatenate(parts))
 
     return lambda *pairs: (
         SimpleNamespace(
             held_out=[e for e, _ in pairs],
-            validate=lambda x: list(pairs),
-            held_out_rows=rows,
-            disturbed=False,
+            predict_held_out=lambda x: list(pairs),
+            held_out_residual=rows,
+            has_process_noise=False,
             options=ProblemOptions(),
-            shared=(),
-            names=(),
-            start=np.zeros(0),
+            shared_parameters=(),
+            unknown_names=(),
+            initial_unknowns=np.zeros(0),
         ),
         told,
     )
@@ -425,7 +425,7 @@ def test_a_held_out_loss_sums_whitened_squares_block_by_block(predicting):
     more = measured([0.2], [[0, 0]], [[3, 3]])
     predicted = np.array([[2.0, 1.0], [3.0, 9.0], [3.0, 1.0], [4.0, 5.0], [6.0, 6.0]])
     problem, told = predicting(
-        (episode(of=[group, more]), SimpleNamespace(predicted=(predicted, np.array([[1.0, 2.0]]))))
+        (episode(of=[group, more]), SimpleNamespace(predicted_outputs=(predicted, np.array([[1.0, 2.0]]))))
     )
     found = _held_out_loss(problem, np.zeros(1))
     # blocks of half a second: [0, 0.5), [0.5, 1.0) and the last sample
@@ -439,8 +439,8 @@ def test_blocks_without_samples_do_not_count_and_recordings_follow_each_other(pr
     first = measured([0.1, 1.2], [[1, 1], [1, 1]], [[1, 1], [1, 1]])
     second = measured([0.6], [[0, 0]], [[1, 1]])
     pairs = [
-        (episode("one", 150, of=[first]), SimpleNamespace(predicted=(np.array([[2.0, 1.0], [1.0, 4.0]]),))),
-        (episode("two", 100, of=[second]), SimpleNamespace(predicted=(np.array([[1.0, 1.0]]),))),
+        (episode("one", 150, of=[first]), SimpleNamespace(predicted_outputs=(np.array([[2.0, 1.0], [1.0, 4.0]]),))),
+        (episode("two", 100, of=[second]), SimpleNamespace(predicted_outputs=(np.array([[1.0, 1.0]]),))),
     ]
     problem, told = predicting(*pairs)
     found = _held_out_loss(problem, np.zeros(1))
@@ -451,7 +451,7 @@ def test_blocks_without_samples_do_not_count_and_recordings_follow_each_other(pr
 
 def test_a_failed_prediction_is_infinitely_bad_where_it_was_measured(predicting):
     group = measured([0.1, 0.6], [[1, 1], [1, 1]], [[1, 1], [1, 0]])
-    good = SimpleNamespace(predicted=(np.ones((2, 2)),))
+    good = SimpleNamespace(predicted_outputs=(np.ones((2, 2)),))
     problem, told = predicting((episode("one", of=[group]), "it snaps"), (episode("two", of=[group]), good))
     found = _held_out_loss(problem, np.zeros(1))
     np.testing.assert_array_equal(found.block_chi2, [math.inf, math.inf, 0.0, 0.0])

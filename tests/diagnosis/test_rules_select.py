@@ -391,7 +391,7 @@ class Rounds:
         self, monkeypatch, losses, p_values=(1e-9,) * 3, fails=(), absent=(), before=None, pairs=(), left=None
     ):
         self.losses, self.fails, self.refits, self.screens, self.heard = losses, fails, [], [], Heard()
-        self.absent, self.before, self.pairs, self.left = absent, before, pairs, left
+        self.absent, self.before, self.ranked_pairs, self.left = absent, before, pairs, left
         kinds = [score(of, p=p, decrease=9.0 - i) for i, (of, p) in enumerate(zip((A, B, C), p_values, strict=True))]
         self.scores = tuple(kinds)
         monkeypatch.setattr(select, "refit_each_candidate", self.refit_all)
@@ -416,7 +416,7 @@ class Rounds:
         kinds = {of.kind: of for of in (A, B, C) if of.label in among}
         return [
             CandidatePair((kinds[one], kinds[other]), {}, 9.0, 7.0)
-            for one, other in self.pairs
+            for one, other in self.ranked_pairs
             if {one, other} <= set(kinds)
         ]
 
@@ -648,7 +648,7 @@ def test_an_effect_that_others_make_superfluous_is_left_out_again(monkeypatch):
     _, chosen, added = rounds.compose()
     assert chosen == ["b", "c"]
     assert [len(entry.fit.effects) for entry in added] == [1, 2]
-    assert added[1].fit.loss.mean == pytest.approx(1.5)
+    assert added[1].fit.held_out_loss.chi2_per_sample == pytest.approx(1.5)
     assert [entry.closure.value for entry in added] == pytest.approx([1 - 3.1 / 4.1, 1 - 0.5 / 4.1])
     assert rounds.refits[3:] == [
         ("a@x and b@x and c@x without a@x", ["b", "c"], 3.0),
@@ -703,7 +703,7 @@ def test_a_later_effect_shows_what_an_earlier_one_stood_in_for(monkeypatch):
     rounds = Rounds(monkeypatch, losses)
     _, chosen, added = rounds.compose(effects=2)
     assert chosen == ["c", "b"]
-    assert added[-1].fit.loss.mean == pytest.approx(1.25)
+    assert added[-1].fit.held_out_loss.chi2_per_sample == pytest.approx(1.25)
     assert [e.label for e in added[-1].fit.effects] == ["c@x", "b@x"], "in the order in which they stand"
     assert [len(entry.fit.effects) for entry in added] == [1, 2]
     assert "put c@x in the place of a@x" in rounds.heard.stages
@@ -720,7 +720,7 @@ def test_one_that_stands_in_for_two_gives_way_to_both(monkeypatch):
     first, chosen, added = rounds.compose(effects=2)
     assert first[0] == "a", "what alone does best is still said"
     assert chosen == ["b", "c"]
-    assert added[-1].fit.loss.mean == pytest.approx(1.25)
+    assert added[-1].fit.held_out_loss.chi2_per_sample == pytest.approx(1.25)
     assert [len(entry.fit.effects) for entry in added] == [1, 2]
     assert "put b@x and c@x in the place of a@x: 93.9 % of the held-out gap closed" in rounds.heard.stages
     # from the nominal fit, without those that have the best one in them, which others are tried beside anyway

@@ -56,22 +56,22 @@ def screened(bench):
 def test_all_candidates_together_are_the_nominal_model_until_they_are_freed(bench, screened):
     composed, _, _ = screened
     recordings = [episode.recording for episode in composed.problem.episodes]
-    x = composed.problem.start * 1.1
+    x = composed.problem.initial_unknowns * 1.1
     plain = bench.problem(recordings).evaluate(x)
-    together = composed.freeing(()).evaluate(x)
+    together = composed.with_free_effects(()).evaluate(x)
     assert together.residual == pytest.approx(plain.residual, rel=1e-9, abs=1e-9)
     assert together.jacobian == pytest.approx(plain.jacobian, rel=1e-8, abs=1e-8)
 
 
 def test_part_of_the_parameters_is_freed_by_columns_of_the_whole(screened):
     composed, nominal, _ = screened
-    chosen = [effect for effect in composed.effects if effect.kind in ("joint_stribeck", "link_mass")]
-    some = composed.freeing(chosen)
+    chosen = [effect for effect in composed.candidate_effects if effect.kind in ("joint_stribeck", "link_mass")]
+    some = composed.with_free_effects(chosen)
     alone = EstimationProblem(composed.problem.step, [e.recording for e in some.episodes], some.free, some.options)
     x = some.vector(nominal.values) + 0.01
-    assert some.names == alone.unknown_names
+    assert some.unknown_names == alone.unknown_names
     assert some.evaluate(x).jacobian == pytest.approx(alone.evaluate(x).jacobian, rel=1e-9, abs=1e-9)
-    assert composed.problem.free == composed.nominal == ("shoulder.damping", "elbow.damping")
+    assert composed.problem.free == composed.nominal_parameters == ("shoulder.damping", "elbow.damping")
 
 
 def test_p_values_of_matching_noise_are_uniform():
@@ -92,7 +92,7 @@ def test_p_values_of_coloured_noise_are_uniform_when_its_colour_is_known():
     p = np.array([run_null_test([white(rows, colour)], root @ rng.standard_normal(400), 0).p_value for _ in range(300)])
     assert scipy.stats.kstest(p, "uniform").pvalue > 1e-3
     blind = np.array([run_null_test([white(rows)], root @ rng.standard_normal(400), 0).p_value for _ in range(300)])
-    assert np.mean(blind < 0.01) > np.mean(p < 0.01), "taking coloured noise for white raises false alarms"
+    assert np.chi2_per_sample(blind < 0.01) > np.chi2_per_sample(p < 0.01), "taking coloured noise for white raises false alarms"
 
 
 def test_a_burst_is_flagged_where_it_is():
@@ -121,7 +121,7 @@ def test_the_promised_decrease_is_that_of_a_refit_where_the_model_is_linear(scre
     for label in ("joint_coulomb@elbow", "rotor_inertia@elbow", "effort_offset@shoulder"):
         if label not in ranked:
             continue
-        effect = next(e for e in composed.effects if e.label == label)
+        effect = next(e for e in composed.candidate_effects if e.label == label)
         fit = refit_with_effects(composed, (effect,), nominal.values)
         assert 2 * (nominal.cost - fit.cost) == pytest.approx(ranked[label].predicted_chi2_decrease, rel=1e-3, abs=1e-3)
 
@@ -157,7 +157,7 @@ def test_detectable_amplitudes_do_not_depend_on_the_residual_and_fall_with_the_n
 def test_robust_covariance_of_white_scores_is_the_plain_one():
     rng = np.random.default_rng(8)
     x = rng.standard_normal((4000, 2))
-    total = np.mean(
+    total = np.chi2_per_sample(
         [_newey_west_covariance(x, rng.standard_normal(4000), [white(np.arange(4000))]) for _ in range(40)], axis=0
     )
     assert total == pytest.approx(x.T @ x, rel=0.1, abs=300)
@@ -213,7 +213,7 @@ def test_a_rollout_that_failed_never_wins():
 
 def test_the_simplest_within_one_standard_error_wins(screened):
     composed, nominal, _ = screened
-    effects = {e.label: e for e in composed.effects}
+    effects = {e.label: e for e in composed.candidate_effects}
     one = refit_with_effects(composed, (effects["joint_coulomb@elbow"],), nominal.values)
     two = refit_with_effects(
         composed, (effects["joint_coulomb@elbow"], effects["effort_offset@shoulder"]), nominal.values

@@ -121,7 +121,7 @@ def test_a_withheld_effect_is_named_placed_and_measured(bench):
     assert (told["closure_low"], told["assumptions"]) == (low, 1)
     assert told["explained"] == finding.explained > 0.9
     assert told["candidate"] <= len(FRICTION) * result["which"][0]["p_value"]
-    left = finding.fits[0].loss.mean
+    left = finding.fits[0].held_out_loss.chi2_per_sample
     assert told["behind"]["joint_coulomb@elbow"] == {"left": left, "chi2_per_dof": 0.0, "error": 0.0, "squares": 0.0}
     assert min(entry["squares"] for entry in told["behind"].values()) == 0.0, "no other is as likely"
     [apart] = finding.carried

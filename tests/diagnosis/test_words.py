@@ -50,7 +50,7 @@ def test_a_finding_keeps_its_words_and_what_decided_them(finding):
 
 
 def kind(label: str, depends_on: str):
-    return SimpleNamespace(label=label, location=label.partition("@")[2], depends_on=depends_on)
+    return SimpleNamespace(label=label, location=label.partition("@")[2], required_excitation=depends_on)
 
 
 @pytest.mark.parametrize(
@@ -101,15 +101,15 @@ def test_the_next_experiment_follows_the_verdict(verdict, where, unseen, said):
 
 def test_rivals_come_before_all_else():
     rivals = (kind("a@T1", "when it is read"), kind("b@T1", "when it is read"))
-    added = [SimpleNamespace(rivals=rivals[:1]), SimpleNamespace(rivals=rivals)]
+    added = [SimpleNamespace(equivalent_effects=rivals[:1]), SimpleNamespace(equivalent_effects=rivals)]
     assert next_experiment_text("confusable", added, (), ()) == "Vary when it is read over a wider range."
 
 
 def test_a_shortage_says_what_is_needed():
     before, limits = SimpleNamespace(degrees=11.6), Thresholds(min_samples_per_unknown=4.0)
-    seen = [SimpleNamespace(visible=True)]
+    seen = [SimpleNamespace(is_detectable=True)]
     assert insufficient_data_message("effect", before, 5, seen, limits) == ""
     said = insufficient_data_message("insufficient_data", before, 5, seen, limits)
     assert said.startswith("12 effective samples for 5 unknowns, at least 20 are needed")
-    hidden = insufficient_data_message("insufficient_data", before, 5, [SimpleNamespace(visible=False)], limits)
+    hidden = insufficient_data_message("insufficient_data", before, 5, [SimpleNamespace(is_detectable=False)], limits)
     assert hidden == "no candidate of the size that one would expect would show in these recordings."

@@ -95,10 +95,10 @@ def test_a_place_that_does_as_well_is_told(twice):
     state = _run([twice], variance)
     weight = smoother._weights([twice], variance, state)
     assert weight[HERE] > 100
-    found = _instead([twice], variance, state.evidence, weight, Thresholds())
+    found = _instead([twice], variance, state.log_evidence, weight, Thresholds())
     assert found == {HERE: (LIKE,)}
     strict = Thresholds(location_tie=1.0, min_log_bayes_factor=1e-9)
-    assert LIKE not in _instead([twice], variance, state.evidence + 1e3, weight, strict)[HERE]
+    assert LIKE not in _instead([twice], variance, state.log_evidence + 1e3, weight, strict)[HERE]
 
 
 def test_it_is_named_beside_the_place_but_its_own_other_unknowns_are_not():

@@ -116,7 +116,7 @@ class Dense:
         self.inverse = np.linalg.inv(self.total)
 
     @property
-    def evidence(self):
+    def log_evidence(self):
         return -0.5 * (self.y @ self.inverse @ self.y + np.linalg.slogdet(self.total)[1])
 
     @property
@@ -159,7 +159,7 @@ def test_the_evidence_has_parameters_and_all_recordings_in_it(variance, smooth):
     models = [made(1), made(2)]
     at = dict(zip(SOURCES, variance, strict=True))
     state, reference = smoother._run(models, at, smooth), Dense(models, at)
-    assert state.evidence == pytest.approx(reference.evidence, rel=1e-9)
+    assert state.log_evidence == pytest.approx(reference.log_evidence, rel=1e-9)
     np.testing.assert_allclose(state.shift, reference.theta, rtol=1e-8)
     np.testing.assert_allclose(
         state.spread,
@@ -180,7 +180,7 @@ def test_scores_leave_to_parameters_what_they_explain():
 
 
 def test_variances_so_large_that_rounding_shows_are_never_the_best():
-    assert smoother._run([made(1, loose=1e12)], NOTHING, smooth=False).evidence == -math.inf
+    assert smoother._run([made(1, loose=1e12)], NOTHING, smooth=False).log_evidence == -math.inf
 
 
 @pytest.mark.parametrize("column", [0, 1, 2])
@@ -190,9 +190,9 @@ def test_variances_go_to_the_largest_evidence(column):
     variance, state = smoother._refined(models, NOTHING | {source: 0.05})
     assert {s for s, v in variance.items() if v} == {source}
     grid = np.geomspace(0.05, 400, 60)
-    best = max(Dense(models, NOTHING | {source: v}).evidence for v in grid)
-    assert state.evidence == pytest.approx(best, abs=0.15)
-    assert state.evidence == pytest.approx(Dense(models, variance).evidence, rel=1e-9)
+    best = max(Dense(models, NOTHING | {source: v}).log_evidence for v in grid)
+    assert state.log_evidence == pytest.approx(best, abs=0.15)
+    assert state.log_evidence == pytest.approx(Dense(models, variance).log_evidence, rel=1e-9)
 
 
 def test_variances_stay_within_their_range():
@@ -205,12 +205,12 @@ def test_variances_stay_within_their_range():
 def test_the_best_variance_of_a_group_is_searched_over_all_sizes():
     models = [made(3, size=np.array([30.0, 0.0, 0.0])), made(4, size=np.array([20.0, 0.0, 0.0]))]
     evidence, size = smoother._largest_evidence(smoother._bases(models, NOTHING), FORCE)
-    assert evidence == pytest.approx(Dense(models, NOTHING | {FORCE: size}).evidence, rel=1e-9)
-    assert evidence > Dense(models, NOTHING | {FORCE: 4 * size}).evidence
-    assert evidence > Dense(models, NOTHING | {FORCE: size / 4}).evidence
+    assert evidence == pytest.approx(Dense(models, NOTHING | {FORCE: size}).log_evidence, rel=1e-9)
+    assert evidence > Dense(models, NOTHING | {FORCE: 4 * size}).log_evidence
+    assert evidence > Dense(models, NOTHING | {FORCE: size / 4}).log_evidence
     base = NOTHING | {OTHER_FORCE: 1.0}
     more, at = smoother._largest_evidence(smoother._bases(models, base), FORCE)
-    assert more == pytest.approx(Dense(models, base | {FORCE: at}).evidence, rel=1e-9)
+    assert more == pytest.approx(Dense(models, base | {FORCE: at}).log_evidence, rel=1e-9)
     # a group may hold several unknowns, and some of them errors that are known
     both = [
         replace(model, unknown_groups=(FORCE, FORCE, BIAS), torque_noise_variance=np.array([0.0, 0.4, 0.0]))
@@ -218,8 +218,8 @@ def test_the_best_variance_of_a_group_is_searched_over_all_sizes():
     ]
     some = {FORCE: 0.0, BIAS: 0.3}
     most, here = smoother._largest_evidence(smoother._bases(both, some), FORCE)
-    assert most == pytest.approx(smoother._run(both, some | {FORCE: here}, smooth=False).evidence, rel=1e-9)
-    assert most > smoother._run(both, some, smooth=False).evidence + 1
+    assert most == pytest.approx(smoother._run(both, some | {FORCE: here}, smooth=False).log_evidence, rel=1e-9)
+    assert most > smoother._run(both, some, smooth=False).log_evidence + 1
 
 
 @pytest.mark.parametrize("column", [0, 1, 2])
@@ -236,7 +236,7 @@ def test_the_group_that_explains_the_residual_is_taken_in(monkeypatch, column):
     assert found.log_evidence[own] == found.log_evidence["both"] == pytest.approx(reference.evidence - nothing.evidence)
     assert found.log_evidence[own] > found.log_evidence[other] + 5
     assert found.log_evidence["none"] == 0.0
-    assert found.log_evidence_drop == NOTHING | {source: pytest.approx(reference.evidence - nothing.evidence)}
+    assert found.log_evidence_drop == NOTHING | {source: pytest.approx(reference.log_evidence - nothing.log_evidence)}
     assert found.gap_origin == own
     assert found.min_log_bayes_factor == 5.0
 
@@ -245,9 +245,9 @@ def test_several_groups_are_taken_in_while_the_evidence_rises_enough(monkeypatch
     models = [made(7, size=np.array([3.0, 3.0, 3.0])), made(8, size=np.array([3.0, 3.0, 3.0]))]
     found = smoothed(monkeypatch, models)
     assert all(v > 0 for v in found.group_variance.values())
-    full = Dense(models, found.group_variance).evidence
+    full = Dense(models, found.group_variance).log_evidence
     for source in SOURCES:
-        less = Dense(models, found.group_variance | {source: 0.0}).evidence
+        less = Dense(models, found.group_variance | {source: 0.0}).log_evidence
         assert found.log_evidence_drop[source] == pytest.approx(full - less, rel=1e-6)
     assert found.gap_origin == "both"
     assert sum(v > 0 for v in smoothed(monkeypatch, models, max_unknown_groups=2).group_variance.values()) == 2
@@ -326,7 +326,7 @@ def test_known_noise_of_torques_is_as_strong_at_low_frequencies_as_the_unknown_f
         problem=SimpleNamespace(step=SimpleNamespace(time_step=0.005)),
     )
     reference = np.array([2.0, 5.0, 4.0])
-    unknowns = SimpleNamespace(names=("b", "free", "a", "encoder.a"), forced=(1, 2, 0), reference=reference)
+    unknowns = SimpleNamespace(unknown_names=("b", "free", "a", "encoder.a"), forced=(1, 2, 0), reference=reference)
     known = smoother_model._torque_noise(course, unknowns, span, decay)
     # autocovariances of a force with memory, summed over all lags, are those of held white noise
     lags = 1 + 2 * sum(decay**k for k in range(1, 200))
