@@ -11,7 +11,7 @@ from yid_ocp.analysis.estimate_history import RunEstimates
 from yid_ocp.config.reader import load_config
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import write_recording
-from yid_ocp.diagnosis.baseline_comparison import compare_with_baseline, with_baseline_prior
+from yid_ocp.diagnosis.baseline import compare_with_baseline, with_baseline_prior
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.errors import ConfigError

@@ -68,10 +68,7 @@ def test_an_effect_named_first_is_right_and_its_parameters_are_compared():
     [
         (result("confusable", ["density@T1"], ["density@T1"], confusable=[["density@T1", "kelvin_voigt@T1"]]), True),
         (result("confusable", ["density@T1"], ["density@T1"], confusable=[["density@T1", "point_mass@w_T1"]]), False),
-        (
-            result("confusable", ["a@T1"], ["a@T1"], confusable=[["a@T1", "b@T1", "c@T1", "kelvin_voigt@T1"]]),
-            False,
-        ),
+        (result("confusable", ["a@T1"], ["a@T1"], confusable=[["a@T1", "b@T1", "c@T1", "kelvin_voigt@T1"]]), False),
         (result("unknown", ["density@T1"], where=["T1"]), False),
         (result("no_gap"), False),
     ],

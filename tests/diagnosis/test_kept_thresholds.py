@@ -7,9 +7,9 @@ from importlib.resources import files
 
 import pytest
 
-from yid_ocp.diagnosis.blind.threshold_calibration import (
+from yid_ocp.diagnosis.blind.score import (
+    _CALIBRATION_FORMAT,
     _CALIBRATION_RULES,
-    _FORMAT,
     _conformal_quantile,
     _recommended_settings,
 )
@@ -22,7 +22,7 @@ def kept():
 
 
 def test_defaults_are_those_that_it_advises(kept):
-    assert kept["format"] == _FORMAT
+    assert kept["format"] == _CALIBRATION_FORMAT
     assert kept["settings"] == {
         rule.setting: getattr(DEFAULT_THRESHOLDS, rule.setting) for rule in _CALIBRATION_RULES.values()
     }
@@ -33,9 +33,14 @@ def test_its_advice_follows_from_its_samples_by_the_rules_as_they_are(kept):
     assert set(rules) == set(_CALIBRATION_RULES)
     for name, rule in _CALIBRATION_RULES.items():
         own = rules[name]
-        assert (own["setting"], own["of"], own["side"], own["limit"]) == (rule.setting, rule.of, rule.gap_origin, rule.limit)
+        assert (own["setting"], own["of"], own["side"], own["limit"]) == (
+            rule.setting,
+            rule.of,
+            rule.side,
+            rule.limit,
+        )
         sample = [float("-inf") if value is None else value for value in own["sample"]]
-        value, coverage = _conformal_quantile(sample, rule.gap_origin, kept["asked"])
+        value, coverage = _conformal_quantile(sample, rule.side, kept["asked"])
         assert own["coverage"] == coverage
         assert own["quantile"] == (None if value == float("-inf") else value)
     assert _recommended_settings(rules) == kept["settings"]

@@ -112,8 +112,8 @@ def test_a_spring_is_found_at_any_joint_of_either_arm(side, joint, stiffness):
 
 def test_dry_friction_is_told_from_a_spring():
     finding = diagnosed("left", dry("left_e1", 1.5))
-    assert finding.effects[0].label == "joint_coulomb@left_e1"
-    assert finding.where[0].location == "left_e1"
+    assert finding.accepted_effects[0].label == "joint_coulomb@left_e1"
+    assert finding.gap_locations[0].location == "left_e1"
 
 
 def test_an_arm_as_the_model_says_has_no_gap():

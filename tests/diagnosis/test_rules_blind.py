@@ -44,15 +44,18 @@ ABROAD = effect("clock_scale@clock", amplitude())
 
 
 def system(driven=("s0", "s1", "w0"), prescribed=(), segments=("T1", "T2")):
-    parameters = SimpleNamespace(unknown_names=("T1.bend", "T2.bend", "T1.damping"))
-    elastic = [SimpleNamespace(segment="T1", kind="bend"), SimpleNamespace(segment="T2", kind="twist")]
+    parameters = SimpleNamespace(names=("T1.bend", "T2.bend", "T1.damping"))
+    elastic = [
+        SimpleNamespace(segment_name="T1", deformation="bend"),
+        SimpleNamespace(segment_name="T2", deformation="twist"),
+    ]
     named = tuple(SimpleNamespace(name=name, link_joints=(("a",),)) for name in segments)
     return SimpleNamespace(
         driven=driven,
         prescribed=prescribed,
         segment_layouts=named,
         parameters=parameters,
-        elastic=tuple(elastic),
+        elastic_joints=tuple(elastic),
         grasps=(),
     )
 
@@ -130,8 +133,8 @@ def test_what_cannot_be_simulated_is_refused(drawn, given, words):
 def test_what_is_detectable_counts_the_noise_of_torques(drawn, monkeypatch):
     ensemble = drawn()
     composed = AllCandidatesProblem("by the sensors", (DAMPER,), False)
-    monkeypatch.setattr(ensemble, "of", lambda recordings: SimpleNamespace(system="system"))
-    monkeypatch.setattr(module, "AllCandidatesProblem", SimpleNamespace(of=lambda *_: composed))
+    monkeypatch.setattr(ensemble, "nominal_problem", lambda recordings: SimpleNamespace(system="system"))
+    monkeypatch.setattr(module, "AllCandidatesProblem", SimpleNamespace(from_problem=lambda *_: composed))
     weighted = SimpleNamespace(problem="by all noise", values={"k": 1.0})
     monkeypatch.setattr(module, "fit_nominal_model", lambda *_, limits: weighted)
     monkeypatch.setattr(module, "linearize_candidates", lambda of, base, values, grid: of)
@@ -145,21 +148,24 @@ def test_the_truth_is_spread_about_the_start(drawn):
         ratio = np.log([truth[name] / start for truth in found]) / math.log(1.5)
         assert -1 <= ratio.min() < -0.9
         assert 0.9 < ratio.max() <= 1
-        assert abs(np.chi2_per_sample(ratio)) < 0.15
+        assert abs(np.mean(ratio)) < 0.15
     assert set(found[0]) == {"T1.bend", "T2.bend"}
 
 
 def test_a_recording_says_nothing_of_what_is_in_it(drawn):
     ensemble = drawn()
     found = ensemble.simulate_recording({"T1.bend": 7.0}, (KV,), np.random.default_rng(1), "case_001")
-    assert (found.name, found.description, found.source, found.truth) == ("case_001", "", "", {})
+    assert (found.name, found.description, found.source, found.true_parameters) == ("case_001", "", "", {})
     [made] = drawn.made
     assert made["system"] is ensemble.problem.system
     assert (made["truth"], made["injected"]) == ({"T1.bend": 7.0}, (KV,))
-    assert (made["posture"], made["camera"]) == (ensemble.posture, None)
+    assert (made["initial_joint_angles"], made["camera"]) == (ensemble.initial_configuration, None)
     motion = made["motion"]
     assert (motion["of"], motion["truth"]) == (ensemble.problem.system, {"T1.bend": 7.0})
-    assert (motion["posture"], motion["excitation"]) == (ensemble.posture, MultisineOptions(gripper_travel=0.15))
+    assert (motion["initial_joint_angles"], motion["excitation"]) == (
+        ensemble.initial_configuration,
+        MultisineOptions(gripper_travel=0.15),
+    )
     rng = np.random.default_rng(1)
     assert [motion["seed"], made["seed"]] == [int(rng.integers(2**31)) for _ in range(2)]
 
@@ -498,9 +504,11 @@ def test_without_an_object_only_joints_misbehave(drawn):
 
 def chain(links, **values):
     vector = np.array(list(values.values()))
-    parameters = SimpleNamespace(unknown_names=tuple(name.replace("_", ".", 1) for name in values), vector=lambda: vector)
+    parameters = SimpleNamespace(names=tuple(name.replace("_", ".", 1) for name in values), vector=lambda: vector)
     named = {name: SimpleNamespace(name=name, link_joints=((),) * count) for name, count in links.items()}
-    return SimpleNamespace(segment_layouts=tuple(named.values()), parameters=parameters, segment=named.__getitem__)
+    return SimpleNamespace(
+        segment_layouts=tuple(named.values()), parameters=parameters, segment_layout=named.__getitem__
+    )
 
 
 def test_a_finer_chain_has_springs_and_dampers_as_many_times_as_strong():

@@ -11,7 +11,7 @@ import pytest
 
 from yid_ocp.diagnosis import Thresholds
 from yid_ocp.diagnosis.blind import CaseLabel, calibrate_thresholds, permissive_thresholds, score_case
-from yid_ocp.diagnosis.blind.threshold_calibration import _CALIBRATION_RULES, _conformal_quantile
+from yid_ocp.diagnosis.blind.score import _CALIBRATION_RULES, _conformal_quantile
 from yid_ocp.virtual.injected import InjectedEffect
 
 DAMPER = InjectedEffect("kelvin_voigt", "T1", {"tau": 0.05})
@@ -109,9 +109,9 @@ def test_a_candidate_is_surer_than_any_of_clean_recordings() -> None:
     found = calibrate_thresholds(labels, marks, answers)
     assert found["rules"]["candidate"]["quantile"] == 2.345e-5
     assert found["rules"]["candidate"]["effects_beyond"]["3"]["count"] == 1
-    assert found["settings"]["candidate_level"] == 2.3e-5
+    assert found["settings"]["candidate_significance_level"] == 2.3e-5
     few = calibrate_thresholds(labels[:1], marks[:1], answers[:1])
-    assert few["settings"]["candidate_level"] == 1e-4, "no less sure than odds that convince"
+    assert few["settings"]["candidate_significance_level"] == 1e-4, "no less sure than odds that convince"
 
 
 def test_effects_that_were_named_right_set_what_must_be_explained() -> None:
@@ -168,7 +168,7 @@ def test_settings_are_quantiles_within_what_is_of_use(
     named = case("single", "effect", DAMPER, multiple=3.0, statistics={"explained": explained})
     labels, marks, answers = zip(clean, named, strict=True)
     settings = calibrate_thresholds(labels, marks, answers)["settings"]
-    assert (settings["worth"], settings["explained"]) == (worth, asked)
+    assert (settings["min_log_bayes_factor"], settings["min_explained_fraction"]) == (worth, asked)
 
 
 def test_of_two_rules_for_one_setting_the_wider_counts() -> None:
@@ -177,7 +177,7 @@ def test_of_two_rules_for_one_setting_the_wider_counts() -> None:
     behind = {"a@b": same | {"squares": -4.0}, "kelvin_voigt@T1": same | {"squares": 14.0}}
     true = case("single", "effect", DAMPER, multiple=3.0, statistics={"behind": behind})
     labels, marks, answers = zip(clean, true, strict=True)
-    assert calibrate_thresholds(labels, marks, answers)["settings"]["worth"] == 9.0
+    assert calibrate_thresholds(labels, marks, answers)["settings"]["min_log_bayes_factor"] == 9.0
 
 
 def test_cases_that_could_not_be_fitted_do_not_count() -> None:

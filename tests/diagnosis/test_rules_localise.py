@@ -172,5 +172,7 @@ def test_the_map_is_of_one_recording():
 def test_units_of_unknowns_are_those_of_their_joints_or_metres():
     joints = (SimpleNamespace(name="slide", kind="prismatic"), SimpleNamespace(name="hinge", kind="revolute"))
     system = SimpleNamespace(mechanism=SimpleNamespace(joints=joints, joint_names=("slide", "hinge")))
-    made = SimpleNamespace(unknowns=("hinge", "slide", "left.x", "tip.z"), sources=(FORCE, FORCE, OFFSET, BIAS))
+    made = SimpleNamespace(
+        unknown_names=("hinge", "slide", "left.x", "tip.z"), unknown_groups=(FORCE, FORCE, OFFSET, BIAS)
+    )
     assert unknown_units(system, made) == ("N m", "N", "m", "m")

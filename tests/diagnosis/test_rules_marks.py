@@ -11,11 +11,12 @@ from types import SimpleNamespace
 import pytest
 from factories import amplitude, effect, fit, loss
 
-from yid_ocp.diagnosis.blind import BlindCase, CaseLabel, answers, score_case, score_ensemble, seal_labels
+from yid_ocp.diagnosis.blind import BlindCase, CaseLabel, score_case, score_ensemble, seal_labels
 from yid_ocp.virtual.injected import InjectedEffect
 
 # the package's own name `score_ensemble` is the function
 scoring = importlib.import_module("yid_ocp.diagnosis.blind.score")
+ensemble_module = importlib.import_module("yid_ocp.diagnosis.blind.ensemble")
 KV, DRY = InjectedEffect("kelvin_voigt", "T1", {"tau": 0.05}), InjectedEffect("joint_coulomb", "elbow", {"tau_c": 2.0})
 DAMPER = effect("kelvin_voigt@T1", amplitude("tau", expected=(0.0, 0.2), unit="s"))
 FRICTION = effect("joint_coulomb@elbow", amplitude("tau_c", expected=(0.0, 3.0)))
@@ -201,7 +202,7 @@ def marked(category, **changed):
         "closure": 0.9,
         "best": 1.0,
     }
-    return scoring.Mark(**(usual | changed))
+    return scoring.CaseScore(**(usual | changed))
 
 
 def test_rates_are_over_the_cases_that_they_speak_of():
@@ -264,7 +265,7 @@ def test_no_cases_of_a_sort_have_no_rate():
     [(0, 10, 0.0, 0.3085), (10, 10, 0.6915, 1.0), (3, 60, 0.0104, 0.1392), (85, 100, 0.7647, 0.9135)],
 )
 def test_rates_have_binomial_intervals(count, total, low, high):
-    found = scoring.proportion([True] * count + [False] * (total - count))
+    found = scoring.binomial_proportion([True] * count + [False] * (total - count))
     assert (found["count"], found["of"], found["rate"]) == (count, total, count / total)
     assert (found["low"], found["high"]) == (pytest.approx(low, abs=1e-4), pytest.approx(high, abs=1e-4))
 
@@ -278,7 +279,7 @@ def test_what_was_said_of_what_is_counted():
         score_case(label("null"), said("unknown")),
         score_case(label("null"), said("no_gap")),
     ]
-    found = scoring.confusion(marks)
+    found = scoring._confusion_matrix(marks)
     assert (found["true"], found["said"]) == (
         ["kelvin_voigt", "null"],
         ["density", "kelvin_voigt", "no_gap", "unknown"],
@@ -295,7 +296,7 @@ def test_intervals_and_p_values_are_held_against_what_they_promise():
         told = said("no_gap")
         return score_case(label("null"), {**told, "gap": {**told["gap"], "before": {"p_value": p}}})
 
-    found = scoring.calibration([single(0.5), single(-1.5), single(2.1), null(0.03), null(0.4), null(0.9)])
+    found = scoring._calibration_rates([single(0.5), single(-1.5), single(2.1), null(0.03), null(0.4), null(0.9)])
     held = {entry["level"]: entry["count"] for entry in found["intervals"]}
     assert (held[0.5], held[0.8], held[0.9], held[0.95], held[0.99]) == (1, 1, 2, 2, 3)
     assert {entry["level"]: entry["count"] for entry in found["p_values"]} == {0.01: 0, 0.05: 1, 0.1: 1, 0.2: 1, 0.5: 2}
@@ -337,22 +338,17 @@ def test_an_answer_is_given_from_the_recordings_without_what_was_left_out(monkey
         asked.update(problem=problem, choice=choice, held_out=held_out, **more)
         return "finding"
 
-    monkeypatch.setattr(answers, "diagnose", diagnose)
-    ensemble = SimpleNamespace(of=lambda recording: SimpleNamespace(system="system", recording=recording))
-    assert answers.diagnose_case(ensemble, case(), "all", "thresholds", "progress") == "finding"
+    monkeypatch.setattr(ensemble_module, "diagnose", diagnose)
+    ensemble = SimpleNamespace(nominal_problem=lambda recording: SimpleNamespace(system="system", recording=recording))
+    assert ensemble_module.diagnose_case(ensemble, case(), "all", "thresholds", "progress") == "finding"
     assert asked["problem"].recording == "estimate"
-    assert (asked["choice"], asked["leave_out"]) == ("all", ("density",))
+    assert (asked["choice"], asked["exclude"]) == ("all", ("density",))
     assert (asked["held_out"], asked["thresholds"], asked["progress"]) == (["held out"], "thresholds", "progress")
 
 
 @pytest.mark.parametrize(
     ("injected", "refitted", "expected"),
-    [
-        ((KV,), True, 0.75),
-        ((KV,), False, math.nan),
-        ((KV, GUST), True, math.nan),
-        ((), True, 0.75),
-    ],
+    [((KV,), True, 0.75), ((KV,), False, math.nan), ((KV, GUST), True, math.nan), ((), True, 0.75)],
     ids=["the true effect", "cannot be fitted", "one is in no library", "none"],
 )
 def test_the_best_that_could_be_closed_is_that_of_the_true_effects(monkeypatch, injected, refitted, expected):
@@ -361,24 +357,26 @@ def test_the_best_that_could_be_closed_is_that_of_the_true_effects(monkeypatch, 
 
     @dataclass(frozen=True)
     class Composed:
-        effects: tuple
+        candidate_effects: tuple
         held: list
         problem: str
 
-    made = SimpleNamespace(of=lambda problem, effects, held_out: Composed(tuple(effects), held_out, "from the start"))
-    monkeypatch.setattr(answers, "make_candidate_effects", lambda *_: [stiff, FRICTION])
-    monkeypatch.setattr(answers, "AllCandidatesProblem", made)
+    made = SimpleNamespace(
+        from_problem=lambda problem, effects, held_out: Composed(tuple(effects), held_out, "from the start")
+    )
+    monkeypatch.setattr(ensemble_module, "make_candidate_effects", lambda *_: [stiff, FRICTION])
+    monkeypatch.setattr(ensemble_module, "AllCandidatesProblem", made)
     monkeypatch.setattr(
-        answers, "fit_nominal_model", lambda *_: fit(lost=loss(2.0, 2.0), values={"k": 3.0}, problem="settled")
+        ensemble_module, "fit_nominal_model", lambda *_: fit(lost=loss(2.0, 2.0), values={"k": 3.0}, problem="settled")
     )
 
     def refit(composed, chosen, start):
         asked.append((composed.held, composed.problem, [e.kind for e in chosen], dict(start)))
         return fit(chosen, loss(1.25, 1.25)) if refitted else None
 
-    monkeypatch.setattr(answers, "refit_with_effects", refit)
-    ensemble = SimpleNamespace(of=lambda recording: SimpleNamespace(system="system"))
-    found = answers.best_possible_closure(ensemble, case(), CaseLabel("c", "single", injected, 1.0, {}))
+    monkeypatch.setattr(ensemble_module, "refit_with_effects", refit)
+    ensemble = SimpleNamespace(nominal_problem=lambda recording: SimpleNamespace(system="system"))
+    found = ensemble_module.best_possible_closure(ensemble, case(), CaseLabel("c", "single", injected, 1.0, {}))
     assert found == pytest.approx(expected, nan_ok=True)
     at_truth = {"kelvin_voigt@T1.tau": 0.05} if injected else {}
     assert asked == [(["held out"], "settled", ["kelvin_voigt"] if injected else [], {"k": 3.0} | at_truth)]
@@ -386,11 +384,11 @@ def test_the_best_that_could_be_closed_is_that_of_the_true_effects(monkeypatch, 
 
 def test_reported_values_are_turned_back_into_parameters():
     quantities = [
-        replace(amplitude("compliance"), reciprocal="stiffness N/m"),
-        replace(amplitude("tightness"), reciprocal="limit N", power=2),
+        replace(amplitude("compliance"), reported_reciprocal="stiffness N/m"),
+        replace(amplitude("tightness"), reported_reciprocal="limit N", reciprocal_power=2),
         amplitude("tau"),
         amplitude("other"),
     ]
-    found = answers._internal("a@b", {"stiffness": 4.0, "limit": 2.0, "tau": 0.5}, quantities)
+    found = ensemble_module._internal("a@b", {"stiffness": 4.0, "limit": 2.0, "tau": 0.5}, quantities)
     assert found == {"a@b.compliance": 0.25, "a@b.tightness": 0.25, "a@b.tau": 0.5}
-    assert [quantity.turned(quantity.kept_duration(3.0)) for quantity in quantities] == pytest.approx([3.0] * 4)
+    assert [quantity.to_reported(quantity.to_internal(3.0)) for quantity in quantities] == pytest.approx([3.0] * 4)

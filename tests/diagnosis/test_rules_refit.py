@@ -99,7 +99,9 @@ def solved(monkeypatch):
 
     monkeypatch.setattr(module, "REFIT_SOLVER", SimpleNamespace(minimize_cost=run))
     monkeypatch.setattr(module, "_held_out_loss", held_out)
-    monkeypatch.setattr(module, "_refit_covariance", lambda problem, finish, limits: 0.01 * np.eye(len(problem.unknown_names)))
+    monkeypatch.setattr(
+        module, "_refit_covariance", lambda problem, finish, limits: 0.01 * np.eye(len(problem.unknown_names))
+    )
     return made
 
 
@@ -397,7 +399,10 @@ def predicting(monkeypatch):
     monkeypatch.setattr(module, "rmse_by_channel", channel_errors)
 
     def rows(i, there, result):
-        parts = [group.residual_block(values).residual for group, values in zip(there.measurements, result.predicted_outputs, strict=True)]
+        parts = [
+            group.residual_block(values).residual
+            for group, values in zip(there.measurements, result.predicted_outputs, strict=True)
+        ]
         return SimpleNamespace(residual=np.concatenate(parts))
 
     return lambda *pairs: (

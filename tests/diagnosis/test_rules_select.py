@@ -410,7 +410,7 @@ class Rounds:
         if base and self.left is not None:
             left = tuple(replace(s, p_value=self.left) for s in left)
         table = alike([s.effect.label for s in left], np.eye(len(left)))
-        return ScreeningResult((), left, table, SimpleNamespace(pairs=self.promised))
+        return ScreeningResult((), left, table, SimpleNamespace(ranked_pairs=self.promised))
 
     def promised(self, among):
         kinds = {of.kind: of for of in (A, B, C) if of.label in among}
@@ -459,12 +459,9 @@ def test_one_effect_that_leaves_no_gap_is_enough(monkeypatch):
     assert (first, chosen) == (["a", "c", "b"], ["a"])
     assert rounds.refits == [([], ["a", "b", "c"], 0.0)]
     assert [kinds for kinds, *_ in rounds.screens] == [["a"]]
-    assert added[0].closure.value == pytest.approx(1 - 0.05 / 2.1)
+    assert added[0].cumulative_closure.fraction == pytest.approx(1 - 0.05 / 2.1)
     assert [of.kind for of in added[0].equivalent_effects] == ["a"]
-    assert rounds.heard.stages == [
-        "added a@x: 97.6 % of the held-out gap closed",
-        "scoring what is left beside a@x",
-    ]
+    assert rounds.heard.stages == ["added a@x: 97.6 % of the held-out gap closed", "scoring what is left beside a@x"]
 
 
 def test_where_a_fit_has_left_an_earlier_run_candidates_are_tried_from_there_too(monkeypatch):
@@ -505,14 +502,16 @@ def test_effects_are_added_while_the_gap_closes(monkeypatch):
     assert rounds.refits[:3] == [([], ["a", "b", "c"], 0.0), (["a"], ["b", "c"], 1.0), (["a", "b"], ["c"], 2.0)]
     assert [screened[:2] for screened in rounds.screens[:2]] == [(["a"], 1.0), (["a", "b"], 2.0)]
     assert rounds.screens[0][3] == Thresholds()
-    assert [entry.closure.value for entry in added] == pytest.approx([1 - 2.1 / 4.1, 1 - 1.1 / 4.1, 1 - 0.6 / 4.1])
-    assert [len(entry.fit.effects) for entry in added] == [1, 2, 3]
+    assert [entry.cumulative_closure.fraction for entry in added] == pytest.approx(
+        [1 - 2.1 / 4.1, 1 - 1.1 / 4.1, 1 - 0.6 / 4.1]
+    )
+    assert [len(entry.refitted_model.effects) for entry in added] == [1, 2, 3]
     assert "scoring what is left beside a@x, b@x" in rounds.heard.stages
 
 
 def test_no_more_effects_than_allowed_nor_than_are_significant(monkeypatch):
-    assert Rounds(monkeypatch, GROWING).compose(effects=2)[1] == ["a", "b"]
-    assert Rounds(monkeypatch, GROWING).compose(effects=1)[1] == ["a"]
+    assert Rounds(monkeypatch, GROWING).compose(max_effects=2)[1] == ["a", "b"]
+    assert Rounds(monkeypatch, GROWING).compose(max_effects=1)[1] == ["a"]
     rounds = Rounds(monkeypatch, GROWING, p_values=(1e-9, 0.01, 0.009))
     assert rounds.compose()[1] == ["a", "c"]
     assert rounds.refits[0] == ([], ["a", "c"], 0.0)
@@ -531,9 +530,9 @@ def test_what_is_added_to_others_is_of_a_size_to_be_expected(monkeypatch):
 def test_a_rest_below_the_smallest_gap_is_left(monkeypatch):
     losses = {"": (3.0, 3.2), "a": (1.04, 1.14), "b": (2.0, 2.2), "c": (2.5, 2.7), "ab": (1.0, 1.0), "ac": (1.0, 1.0)}
     assert Rounds(monkeypatch, losses, left=1e-3).compose()[1] == ["a"]
-    assert Rounds(monkeypatch, losses, left=1e-3).compose(smallest_gap=0.05)[1] == ["a", "b"]
+    assert Rounds(monkeypatch, losses, left=1e-3).compose(min_excess_chi2=0.05)[1] == ["a", "b"]
     # at the smallest gap another one is tried
-    assert Rounds(monkeypatch, losses, left=1e-3).compose(smallest_gap=0.09)[1] == ["a", "b"]
+    assert Rounds(monkeypatch, losses, left=1e-3).compose(min_excess_chi2=0.09)[1] == ["a", "b"]
 
 
 def test_a_rest_that_shows_along_a_candidate_is_not_left(monkeypatch):
@@ -542,11 +541,11 @@ def test_a_rest_that_shows_along_a_candidate_is_not_left(monkeypatch):
     assert Rounds(monkeypatch, losses, left=4e-5).compose()[1] == ["a", "b"]
     # counted as the best of two
     assert Rounds(monkeypatch, losses, left=6e-5).compose()[1] == ["a"]
-    assert Rounds(monkeypatch, losses, left=6e-5).compose(candidate_level=2e-4)[1] == ["a", "b"]
+    assert Rounds(monkeypatch, losses, left=6e-5).compose(candidate_significance_level=2e-4)[1] == ["a", "b"]
     # all of the rest is closed surely, and r'r falls by 9, not by twice the log odds
     less = losses | {"ab": (0.995, 1.095), "ac": (1.03, 1.13)}
     assert Rounds(monkeypatch, less, left=1e-9).compose()[1] == ["a"]
-    assert Rounds(monkeypatch, less, left=1e-9).compose(worth=4.0)[1] == ["a", "b"]
+    assert Rounds(monkeypatch, less, left=1e-9).compose(min_log_bayes_factor=4.0)[1] == ["a", "b"]
 
 
 @pytest.mark.parametrize(
@@ -566,7 +565,7 @@ def test_a_rest_that_shows_along_a_candidate_is_not_left(monkeypatch):
 def test_an_effect_must_close_a_sure_part_of_the_gap(monkeypatch, nominal, best, chosen):
     worse = tuple(9.0 for _ in nominal)
     rounds = Rounds(monkeypatch, {"": nominal, "a": best, "b": worse, "c": worse})
-    first, found, _ = rounds.compose(effects=1)
+    first, found, _ = rounds.compose(max_effects=1)
     assert (found, first[0]) == (chosen, "a")
 
 
@@ -647,9 +646,9 @@ def test_an_effect_that_others_make_superfluous_is_left_out_again(monkeypatch):
     rounds = Rounds(monkeypatch, losses)
     _, chosen, added = rounds.compose()
     assert chosen == ["b", "c"]
-    assert [len(entry.fit.effects) for entry in added] == [1, 2]
-    assert added[1].fit.held_out_loss.chi2_per_sample == pytest.approx(1.5)
-    assert [entry.closure.value for entry in added] == pytest.approx([1 - 3.1 / 4.1, 1 - 0.5 / 4.1])
+    assert [len(entry.refitted_model.effects) for entry in added] == [1, 2]
+    assert added[1].refitted_model.held_out_loss.chi2_per_sample == pytest.approx(1.5)
+    assert [entry.cumulative_closure.fraction for entry in added] == pytest.approx([1 - 3.1 / 4.1, 1 - 0.5 / 4.1])
     assert rounds.refits[3:] == [
         ("a@x and b@x and c@x without a@x", ["b", "c"], 3.0),
         ("b@x again", ["b"], 2.0),
@@ -668,7 +667,7 @@ def test_the_last_of_three_may_make_both_others_superfluous(monkeypatch):
     monkeypatch.setattr(rounds, "screened", lambda base=(), own=rounds.screened: screened_with(own, base))
     first, chosen, added = rounds.compose()
     assert chosen == ["c"]
-    assert added[0].closure.value == pytest.approx(1 - 0.4 / 4.1)
+    assert added[0].cumulative_closure.fraction == pytest.approx(1 - 0.4 / 4.1)
     assert first == ["c", "a", "b"], "what stays alone is said first, as it ended"
 
 
@@ -693,7 +692,7 @@ def test_an_effect_stays_where_the_others_do_worse_or_cannot_be_fitted(monkeypat
 def test_of_two_effects_the_first_is_tried_without_and_others_in_its_place(monkeypatch):
     losses = GROWING | {"ab": (2.0, 2.2), "b": (3.4, 3.5), "ac": (2.5, 2.7)}
     rounds = Rounds(monkeypatch, losses)
-    assert rounds.compose(effects=2)[1] == ["a", "b"]
+    assert rounds.compose(max_effects=2)[1] == ["a", "b"]
     assert [entry[:2] for entry in rounds.refits[2:]] == [("a@x and b@x without a@x", ["b"]), (["b"], ["c"])]
 
 
@@ -701,11 +700,11 @@ def test_a_later_effect_shows_what_an_earlier_one_stood_in_for(monkeypatch):
     # a looks best alone and b beside it; beside b, c does better than a
     losses = GROWING | {"ab": (2.0, 2.2), "b": (3.4, 3.5), "bc": (1.2, 1.3)}
     rounds = Rounds(monkeypatch, losses)
-    _, chosen, added = rounds.compose(effects=2)
+    _, chosen, added = rounds.compose(max_effects=2)
     assert chosen == ["c", "b"]
-    assert added[-1].fit.held_out_loss.chi2_per_sample == pytest.approx(1.25)
-    assert [e.label for e in added[-1].fit.effects] == ["c@x", "b@x"], "in the order in which they stand"
-    assert [len(entry.fit.effects) for entry in added] == [1, 2]
+    assert added[-1].refitted_model.held_out_loss.chi2_per_sample == pytest.approx(1.25)
+    assert [e.label for e in added[-1].refitted_model.effects] == ["c@x", "b@x"], "in the order in which they stand"
+    assert [len(entry.refitted_model.effects) for entry in added] == [1, 2]
     assert "put c@x in the place of a@x" in rounds.heard.stages
     assert [of.kind for of in added[0].equivalent_effects] == ["c"]
 
@@ -715,13 +714,13 @@ HIDDEN = GROWING | {"b": (9.0, 9.2), "c": (9.1, 9.3), "ab": (1.0, 5.0), "ac": (3
 
 
 def test_one_that_stands_in_for_two_gives_way_to_both(monkeypatch):
-    assert Rounds(monkeypatch, HIDDEN).compose(effects=2)[1] == ["a"]
+    assert Rounds(monkeypatch, HIDDEN).compose(max_effects=2)[1] == ["a"]
     rounds = Rounds(monkeypatch, HIDDEN, pairs=("ab", "bc"))
-    first, chosen, added = rounds.compose(effects=2)
+    first, chosen, added = rounds.compose(max_effects=2)
     assert first[0] == "a", "what alone does best is still said"
     assert chosen == ["b", "c"]
-    assert added[-1].fit.held_out_loss.chi2_per_sample == pytest.approx(1.25)
-    assert [len(entry.fit.effects) for entry in added] == [1, 2]
+    assert added[-1].refitted_model.held_out_loss.chi2_per_sample == pytest.approx(1.25)
+    assert [len(entry.refitted_model.effects) for entry in added] == [1, 2]
     assert "put b@x and c@x in the place of a@x: 93.9 % of the held-out gap closed" in rounds.heard.stages
     # from the nominal fit, without those that have the best one in them, which others are tried beside anyway
     assert rounds.refits[2] == (["bc"], 0.0)
@@ -736,7 +735,7 @@ def test_one_that_stands_in_for_two_gives_way_to_both(monkeypatch):
 
 def test_a_pair_that_is_no_better_is_not_taken(monkeypatch):
     rounds = Rounds(monkeypatch, HIDDEN | {"bc": (3.0, 3.2)}, pairs=("bc",))
-    assert rounds.compose(effects=2)[1] == ["a"]
+    assert rounds.compose(max_effects=2)[1] == ["a"]
     # what one effect explains to the noise is not looked at in pairs
     alone = Rounds(monkeypatch, HIDDEN | {"a": (1.0, 1.1), "bc": (0.9, 0.95)}, pairs=("bc",), left=1e-3)
     assert alone.compose()[1] == ["a"]
@@ -744,16 +743,16 @@ def test_a_pair_that_is_no_better_is_not_taken(monkeypatch):
 
 def test_of_a_pair_either_stays_though_the_model_does_not_run_with_it_alone(monkeypatch):
     rounds = Rounds(monkeypatch, HIDDEN, pairs=("bc",), fails=("b",))
-    _, chosen, added = rounds.compose(effects=2)
+    _, chosen, added = rounds.compose(max_effects=2)
     assert chosen == ["b", "c"]
-    assert [len(entry.fit.effects) for entry in added] == [2, 2]
-    assert added[0].closure.value == pytest.approx(added[1].closure.value)
+    assert [len(entry.refitted_model.effects) for entry in added] == [2, 2]
+    assert added[0].cumulative_closure.fraction == pytest.approx(added[1].cumulative_closure.fraction)
 
 
 @pytest.mark.parametrize("absent", ["b", "c"])
 def test_both_of_a_pair_have_to_be_there(monkeypatch, absent):
     rounds = Rounds(monkeypatch, HIDDEN, pairs=("bc",), absent=(absent,))
-    assert rounds.compose(effects=2)[1] == ["a"]
+    assert rounds.compose(max_effects=2)[1] == ["a"]
 
 
 def test_pairs_that_others_can_stand_in_for_are_not_refitted():
@@ -767,7 +766,7 @@ def test_pairs_that_others_can_stand_in_for_are_not_refitted():
         (), tuple(score(of) for of in kinds.values()), alike([k.label for k in kinds.values()], table), FEW
     )
     asked = []
-    found = replace(found, joint_scores=SimpleNamespace(pairs=lambda among: asked.append(among) or promised))
+    found = replace(found, joint_scores=SimpleNamespace(ranked_pairs=lambda among: asked.append(among) or promised))
     chosen = _pairs_to_refit(found, Thresholds(n_refit_pairs=3), kinds["a"])
     assert asked == [["b@x", "c@x", "d@x", "e@x", "f@x"]]
     assert ["".join(of.kind for of in pair) for pair, _ in chosen] == ["bc", "ef", "bd"]
@@ -780,7 +779,7 @@ PROMISED = ("bc", "cd", "dc", "ef", "bd", "be")
 
 def test_what_does_as_well_beside_the_others_is_a_rival(monkeypatch):
     losses = GROWING | {"ab": (2.0, 2.2), "b": (3.4, 3.5), "bc": (2.001, 2.201)}
-    _, chosen, added = Rounds(monkeypatch, losses).compose(effects=2)
+    _, chosen, added = Rounds(monkeypatch, losses).compose(max_effects=2)
     assert chosen == ["a", "b"]
     assert [of.kind for of in added[0].equivalent_effects] == ["a", "c"]
 

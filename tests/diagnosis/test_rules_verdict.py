@@ -358,7 +358,7 @@ def test_the_side_of_a_gap_by_evidence(weight, evidence, side):
 
 def test_how_much_more_both_must_explain_is_a_threshold():
     evidence = {"plant": 9.0, "sensor": 3.0, "both": 12.0}
-    assert smoothed({FORCE: 9.0, BIAS: 3.0}, evidence=evidence, worth=2.0).gap_origin == "both"
+    assert smoothed({FORCE: 9.0, BIAS: 3.0}, evidence=evidence, min_log_bayes_factor=2.0).gap_origin == "both"
 
 
 @pytest.mark.parametrize(

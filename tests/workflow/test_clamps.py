@@ -12,7 +12,7 @@ from yid_ocp.analysis.estimate_history import RunEstimates
 from yid_ocp.config.reader import load_config
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import write_recording
-from yid_ocp.diagnosis.baseline_comparison import with_baseline_prior
+from yid_ocp.diagnosis.baseline import with_baseline_prior
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.solvers import GaussNewton, MultipleShooting, solve
 from yid_ocp.workflow.build import build_system

@@ -13,8 +13,7 @@ import threadpoolctl
 
 from yid_ocp.analysis.estimate_history import RunEstimates
 from yid_ocp.data.recording import Recording
-from yid_ocp.diagnosis.baseline_comparison import with_baseline_prior
-from yid_ocp.diagnosis.baseline_data import NO_BASELINE, BaselineData
+from yid_ocp.diagnosis.baseline import NO_BASELINE, BaselineData, with_baseline_prior
 from yid_ocp.diagnosis.diagnosis_messages import (
     diagnosis_summary_text,
     insufficient_data_message,
@@ -38,7 +37,14 @@ from yid_ocp.diagnosis.localise import (
     main_gap_locations,
     merge_intervals,
 )
-from yid_ocp.diagnosis.refit import RefitContext, RefitModel, RefitStore, load_stored_refit, refit_with_effects
+from yid_ocp.diagnosis.refit import (
+    KnownFits,
+    RefitContext,
+    RefitModel,
+    RefitStore,
+    load_stored_refit,
+    refit_with_effects,
+)
 from yid_ocp.diagnosis.screening import ScreeningResult, screen_candidates
 from yid_ocp.diagnosis.select import GapClosure, SelectedEffect, gap_closure, select_effects
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
@@ -80,11 +86,9 @@ def diagnose(
     held_out: Sequence[Recording] = (),
     *,
     thresholds: Thresholds | None = None,
-    solution: Solution | None = None,
     progress: Progress | None = None,
-    store: RefitStore | None = None,
-    baseline: RunEstimates | Sequence[RunEstimates] = (),
-    reference_recordings: Sequence[Recording] = (),
+    known_fits: KnownFits | None = None,
+    baseline: RunEstimates | Sequence[RunEstimates] | BaselineData = (),
     exclude: Sequence[str] = (),
 ) -> DiagnosisResult:
     """Diagnose the gap between model and recordings: whether it exists, where, its cause, and how far it closes.
@@ -97,24 +101,15 @@ def diagnose(
         `kind` or `kind@location`.
     held_out : sequence of Recording
         Never touched by a fit; the problem's own where absent. Where there are none, alternate blocks are held out.
-    thresholds : Thresholds, optional
-    solution : Solution, optional
-        Of the nominal problem, where it is known.
     progress : Progress, optional
         Told what is going on; the package's log when absent.
-    store : Store, optional
-        Of refits that an earlier run of the same diagnosis finished; told of every further one.
-    baseline : Estimates or sequence of Estimates, optional
+    known_fits : KnownFits, optional
+    baseline : RunEstimates or sequence of RunEstimates, or BaselineData, optional
         What earlier runs of the same model say of its parameters (`read_estimates`): priors, so that the question is
-        what differs now. A problem that has them already (`with_baseline_prior`) is taken as it is.
-    reference_recordings : sequence of Recording, optional
-        Made without what is looked for: what the effects found are taken out for (`counterfactual`).
+        what differs now. A problem that has them already (`with_baseline_prior`) is taken as it is. A `BaselineData`
+        may have reference recordings too, made without what is looked for; the effects found are taken out for them.
     exclude : sequence of str, optional
         Candidates that are not tried, `kind` or `kind@location`.
-
-    Returns
-    -------
-    Finding
 
     Raises
     ------
@@ -127,15 +122,59 @@ def diagnose(
     """
     # the matrices are small: threads of the linear algebra library cost more than they give
     with threadpoolctl.threadpool_limits(1):
-        clock, told = _Clock(), progress or LoggingProgress(log)
-        runs = (baseline,) if isinstance(baseline, RunEstimates) else tuple(baseline)
-        earlier = BaselineData.from_runs(runs, tuple(reference_recordings))
+        clock, told, known = _Clock(), progress or LoggingProgress(log), known_fits or KnownFits()
+        runs = (baseline,) if isinstance(baseline, RunEstimates) else baseline
+        earlier = runs if isinstance(runs, BaselineData) else BaselineData.from_runs(runs, ())
         if earlier.combined_estimates is not None and not problem.options.multivariate_prior.parameter_names:
             problem = with_baseline_prior(problem, earlier.combined_estimates)
         composed = _composed(problem, candidates, exclude, held_out, told)
         clock.lap("compose")
-        search = RefitContext(composed, thresholds or DEFAULT_THRESHOLDS, told, store)
-        return _diagnosed(problem, search, solution, clock, earlier)
+        search = RefitContext(composed, thresholds or DEFAULT_THRESHOLDS, told, known.store)
+        return _diagnosed(problem, search, known.solution, clock, earlier)
+
+
+@dataclass(frozen=True)
+class _Examined:
+    """The nominal model beside all that is no event: fit, null tests, screening, and whether there is a gap."""
+
+    search: RefitContext
+    nominal: RefitModel
+    truncated: tuple[TruncatedRecording, ...]
+    whole: EstimationProblem
+    events: EventSet
+    smoothed: SmootherResult | None
+    before: NullTestResult
+    held: NullTestResult
+    screened: ScreeningResult
+    has_enough_samples: bool
+    has_gap: bool
+
+
+def _examined(problem: EstimationProblem, search: RefitContext, solution: Solution | None, clock: _Clock) -> _Examined:
+    limits, progress = search.thresholds, search.progress
+    progress.begin_stage("fitting the nominal model")
+    nominal = fit_nominal_model(problem, search.problem, solution, search.store, limits)
+    search, nominal, cuts = _followed(search, nominal)
+    clock.lap("nominal")
+    progress.begin_stage("looking for events")
+    whole = _undivided(search.problem, problem)
+    search, nominal, happened = _without_events(search, nominal, whole)
+    about = nominal
+    clock.lap("events")
+    search, before, held, screened = _tested(search, nominal)
+    clock.lap("screening")
+    enough = before.degrees_of_freedom >= limits.min_samples_per_unknown * len(nominal.values)
+    offsets = _offsets_stated(nominal.problem)
+    gap = has_gap(before, held, limits, screened.candidate_scores, offsets)
+    if gap and enough and before.chi2_per_dof < limits.restart_chi2:
+        other = _better_nominal_fit(search, nominal)
+        if other is not None:
+            search, nominal, cuts = _followed(search, other, cuts)
+            search, before, held, screened = _tested(search, nominal)
+            gap = has_gap(before, held, limits, screened.candidate_scores, offsets)
+    # where nothing happened it was run on all that was fitted already
+    known = happened.smoothed if nominal is about and not search.problem.is_split_in_blocks else None
+    return _Examined(search, nominal, cuts, whole, happened.events, known, before, held, screened, enough, gap)
 
 
 def _diagnosed(
@@ -145,37 +184,16 @@ def _diagnosed(
     clock: _Clock,
     earlier: BaselineData = NO_BASELINE,
 ) -> DiagnosisResult:
-    limits, progress = search.thresholds, search.progress
-    progress.begin_stage("fitting the nominal model")
-    nominal = fit_nominal_model(problem, search.problem, solution, search.store, limits)
-    search, nominal, cuts = _followed(search, nominal)
-    clock.lap("nominal")
-    progress.begin_stage("looking for events")
-    whole = _undivided(search.problem, problem)
-    search, nominal, happened = _without_events(search, nominal, whole)
-    events, about = happened.events, nominal
-    clock.lap("events")
-    search, before, held, screened = _tested(search, nominal)
-    clock.lap("screening")
-    enough = before.degrees_of_freedom >= limits.min_samples_per_unknown * len(nominal.values)
-    offsets = _offsets_stated(nominal.problem)
-    smoothed, trusted, gap = None, None, has_gap(before, held, limits, screened.candidate_scores, offsets)
-    other = (
-        _better_nominal_fit(search, nominal) if gap and enough and before.chi2_per_dof < limits.restart_chi2 else None
-    )
-    if other is not None:
-        search, nominal, cuts = _followed(search, other, cuts)
-        search, before, held, screened = _tested(search, nominal)
-        gap = has_gap(before, held, limits, screened.candidate_scores, offsets)
+    seen = _examined(problem, search, solution, clock)
+    search, nominal, before, held, screened = seen.search, seen.nominal, seen.before, seen.held, seen.screened
+    limits, progress, enough, events = search.thresholds, search.progress, seen.has_enough_samples, seen.events
     changed = earlier.changed_parameters(nominal, limits)
     clock.lap("other_starts")
-    moved = bool(changed) and not gap
-    gap = gap or moved
+    moved = bool(changed) and not seen.has_gap
+    gap, smoothed, trusted = seen.has_gap or moved, None, None
     if gap and enough:
         progress.begin_stage("locating the gap")
-        # where nothing happened it was run on all that was fitted already
-        known = happened.smoothed if nominal is about and not search.problem.is_split_in_blocks else None
-        smoothed = _smooth_about_model(nominal, limits) if known is None else known
+        smoothed = _smooth_about_model(nominal, limits) if seen.smoothed is None else seen.smoothed
         # it knows noise of torques by its spectrum only: too little for a verdict to rest on what it explains
         trusted = None if nominal.problem.has_process_noise else smoothed
         gap = not is_chance_excess(trusted, screened.candidate_scores, before, held, limits)
@@ -188,25 +206,22 @@ def _diagnosed(
     clock.lap("refits")
     carried = check_transfer(search, added[-1].refitted_model) if added else ()
     if carried:
-        added = (
-            *added[:-1],
-            replace(added[-1], refitted_model=inflate_std_by_disagreement(added[-1].refitted_model, carried)),
-        )
+        last = inflate_std_by_disagreement(added[-1].refitted_model, carried)
+        added = (*added[:-1], replace(added[-1], refitted_model=last))
     clock.lap("carry_over")
-    total = (
-        gap_closure(nominal.held_out_loss, added[-1].refitted_model.held_out_loss, limits=limits)
-        if added
-        else GapClosure(np.nan, np.nan, np.nan)
-    )
+    total = GapClosure(np.nan, np.nan, np.nan)
+    if added:
+        total = gap_closure(nominal.held_out_loss, added[-1].refitted_model.held_out_loss, limits=limits)
     explained = compute_explained_fraction(nominal, added, trusted)
     gap = gap and (bool(added) or not moved)  # what parameters explain by moving is no gap
     same = all(entry.is_consistent for entry in carried)
     verdict = decide_verdict(gap, screened.detectability, added, total, limits, enough, explained, same)
     accepted = added if verdict in ("effect", "confusable") else ()
+    final = accepted[-1].refitted_model if accepted else nominal
     remaining, where, rest_where = _after(nominal, accepted, smoothed, before, held, limits)
     if accepted:
         # what a better model explains was no event
-        events = _happened(whole, accepted[-1].refitted_model, limits).events
+        events = _happened(seen.whole, final, limits).events
     clock.lap("remaining")
     finding = DiagnosisResult(
         verdict=verdict,
@@ -224,19 +239,19 @@ def _diagnosed(
         gap_closure=total,
         remaining_test=remaining,
         remaining_gap_locations=rest_where,
-        nominal_changes=nominal_parameter_changes(nominal, accepted[-1].refitted_model if accepted else nominal),
+        nominal_changes=nominal_parameter_changes(nominal, final),
         next_experiment=next_experiment_text(verdict, accepted, where, screened.undetectable_labels),
         held_out_names=tuple(episode.name for episode in nominal.problem.held_out),
         is_split_in_blocks=search.problem.is_split_in_blocks,
         message=insufficient_data_message(verdict, before, len(nominal.values), screened.detectability, limits),
         thresholds=limits,
-        truncated_recordings=cuts,
+        truncated_recordings=seen.truncated,
         unknown_reason=find_unknown_reason(added, total, limits, explained, same) if verdict == "unknown" else "",
         explained_fraction=explained,
         transfer_checks=carried,
         stage_seconds=clock.laps,
         events=events,
-        baseline_comparison=earlier.compare_with_baseline(accepted[-1].refitted_model if accepted else nominal, limits),
+        baseline_comparison=earlier.compare_with_baseline(final, limits),
         counterfactual=earlier.predict_reference_recordings(nominal, accepted, progress),
     )
     return replace(finding, summary=diagnosis_summary_text(finding))
@@ -258,10 +273,7 @@ class _Happened:
 
 
 def _happened(whole: EstimationProblem, fit: RefitModel, limits: Thresholds) -> _Happened:
-    """Events about a fit in all that was recorded; nothing where that cannot be predicted.
-
-    Forces that take little of the gap with them are the largest errors of a model that errs everywhere.
-    """
+    """Events about a fit in all that was recorded; nothing where that cannot be predicted."""
     own, x = fit.problem.with_episodes(whole.episodes, whole.held_out), fit.problem.vector(fit.values)
     smoothed = None
     if own.system.free_indices:
@@ -310,10 +322,7 @@ def _excess(fit: RefitModel, problem: EstimationProblem) -> float:
 def _without_events(
     search: RefitContext, nominal: RefitModel, whole: EstimationProblem
 ) -> tuple[RefitContext, RefitModel, _Happened]:
-    """All that follows without what events explain, the nominal model fitted to that, and the events about it.
-
-    Pushes pull a fit towards them: about a fit without those that were found, others may show.
-    """
+    """All that follows without what events explain, the nominal model fitted to that, and the events about it."""
     composed, limits = search.problem, search.thresholds
     happened = _happened(whole, nominal, limits)
     for round_ in range(_MAX_EVENT_ROUNDS):
@@ -374,11 +383,7 @@ def _offsets_stated(problem: EstimationProblem) -> bool:
 
 
 def _better_nominal_fit(search: RefitContext, nominal: RefitModel) -> RefitModel | None:
-    """Return the nominal model refitted from a start that ends far likelier; None if no start does.
-
-    A parameter that few samples tell of has several valleys, and a wrong one of them costs too little to be noticed in
-    chi2: what candidates gain there, they gain from the parameter's error.
-    """
+    """Return the nominal model refitted from a start that ends far likelier; None if no start does."""
     search.progress.begin_stage("fitting the nominal model from other starts")
     problem, limits = search.problem.problem, search.thresholds
 
@@ -507,13 +512,9 @@ def _nominal_start(
     problem: EstimationProblem, composed: AllCandidatesProblem, solution: Solution | None
 ) -> Mapping[str, float]:
     """Unknowns of the nominal model's solution; nothing where a single recording is both fitted and held out."""
-    found = (
-        solution
-        if solution is not None or composed.is_split_in_blocks
-        else solve(problem, GaussNewton(max_iterations=30))
-    )
-    if found is None:
+    if solution is None and composed.is_split_in_blocks:
         return {}
+    found = solve(problem, GaussNewton(max_iterations=30)) if solution is None else solution
     if found.evaluation is None:
         raise SolverError(f"the nominal model cannot be fitted: {found.message}", where="diagnosis")
     return dict(zip(found.unknown_names, map(float, found.x), strict=True))
@@ -540,16 +541,7 @@ def _estimation_null_test(fit: RefitModel, limits: Thresholds = DEFAULT_THRESHOL
 
 
 def _held_out_null_test(fit: RefitModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> NullTestResult:
-    """Return the null test of a model on the held-out recordings.
-
-    What is held out is predicted by parameters that noise has moved: without a gap the residual has the covariance
-    I + J F F' J', where F F' is that of the parameters (`noise_covariance_factor`). It is tested in units of that.
-
-    Raises
-    ------
-    DataError
-        A held-out recording cannot be predicted by the nominal model.
-    """
+    """Return the null test of a model on the held-out recordings."""
     problem = fit.problem
     residuals, slopes = [], []
     for i, (episode, result) in enumerate(problem.predict_held_out(problem.vector(fit.values), True)):
@@ -570,10 +562,7 @@ def _held_out_null_test(fit: RefitModel, limits: Thresholds = DEFAULT_THRESHOLDS
 
 
 def _smooth_about_model(fit: RefitModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> SmootherResult:
-    """Run the weak-constraint smoother about a fitted model, with torque noise among its unknowns.
-
-    Estimated constant sensor errors are subtracted first.
-    """
+    """Run the weak-constraint smoother about a fitted model, with torque noise among its unknowns."""
     problem, evaluation, x = fit.problem, fit.evaluation, fit.problem.vector(fit.values)
     if problem.has_process_noise:
         problem = whitened_by_sensor_noise(problem)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from yid_ocp.diagnosis.baseline_comparison import BaselineComparison
-from yid_ocp.diagnosis.counterfactual import CounterfactualTest
+from yid_ocp.diagnosis.baseline import BaselineComparison, CounterfactualTest
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.events import DisturbanceEvent, EventSet
 from yid_ocp.diagnosis.hypotheses import TruncatedRecording
@@ -99,12 +98,8 @@ def insufficient_data_message(
 
     Parameters
     ----------
-    verdict : str
-    before : NullTest
+    before : NullTestResult
         Of the nominal model, on the recordings to estimate on.
-    unknowns : int
-    seen : sequence of Visibility
-    limits : Thresholds
     """
     if verdict != "insufficient_data":
         return ""

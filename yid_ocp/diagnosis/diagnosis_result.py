@@ -7,8 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from yid_ocp.diagnosis.baseline_comparison import BaselineComparison
-from yid_ocp.diagnosis.counterfactual import CounterfactualTest
+from yid_ocp.diagnosis.baseline import BaselineComparison, CounterfactualTest
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet
 from yid_ocp.diagnosis.hypotheses import TruncatedRecording
 from yid_ocp.diagnosis.localise import GapLocation
@@ -67,50 +66,23 @@ class DiagnosisResult(ReprMixin):
     ----------
     verdict : str
         effect, confusable, no_gap, unknown or insufficient_data.
-    noise_floor : tuple of Floor
-    nominal_test, nominal_held_out_test : NullTest
+    nominal_test, nominal_held_out_test : NullTestResult
         Nominal model, on the recordings to estimate on and on the held-out ones.
-    detectability : tuple of Visibility
-    confusability : Confusability
-    candidate_scores : tuple of Score
+    candidate_scores : tuple of CandidateScore
         First pass, best first.
-    smoother_result : Smoothed or None
+    smoother_result : SmootherResult or None
         Unknown forces, offsets and biases about the nominal model; None where there is no gap to locate.
-    gap_locations : tuple of Place
-    nominal_model : Fit
-    single_effect_models : tuple of Fit
+    single_effect_models : tuple of RefitModel
         Refits of the first round, best first.
-    selected_effects : tuple of Added
-    gap_closure : Closure
-    remaining_test : NullTest
+    remaining_test : NullTestResult
         Held-out, with the effects added.
-    remaining_gap_locations : tuple of Place
-    nominal_changes : tuple of Absorbed
-    next_experiment : str
-    held_out_names : tuple of str
-        Names of the recordings.
-    is_split_in_blocks : bool
-        Whether one recording was split in blocks.
     message : str
         Why the data are insufficient; empty if they suffice.
-    thresholds : Thresholds
-        Thresholds of the decision.
-    stage_seconds : dict of stage to float
-    baseline_comparison : Since or None
-        Parameter changes since the baseline; None without one.
-    counterfactual : Counterfactual or None
-        Predictions with the effects removed and added; None without effects or reference recordings.
-    summary : str
-        Summary text; see `words.diagnosis_summary_text`.
-    truncated_recordings : tuple of Cut
-        Held-out recordings that the nominal model cannot follow to their end.
-    unknown_reason : str
-        Why the verdict is unknown; see `verdict.UnknownReason`.
     explained_fraction : float
         What the effects explain over what unknown forces, offsets and biases explain.
-    transfer_checks : tuple of Carried
+    transfer_checks : tuple of TransferCheck
         The effects' amplitudes on the held-out recordings.
-    events : Events
+    events : EventSet
         Taken out of the recordings before the rest was judged, as far as that can be done.
     """
 
@@ -176,10 +148,7 @@ class DiagnosisResult(ReprMixin):
             "gap": {
                 "before": _state(self.nominal_model, self.nominal_held_out_test),
                 "after": _state(self.final_model, self.remaining_test),
-                "closure": _number(self.gap_closure.fraction) if self.accepted_effects else None,
-                "closure_ci": [_number(self.gap_closure.ci_low), _number(self.gap_closure.ci_high)]
-                if self.accepted_effects
-                else None,
+                **(_closure(self.gap_closure) if self.accepted_effects else {"closure": None, "closure_ci": None}),
                 "held_out": list(self.held_out_names),
                 "cut": [
                     {"recording": c.recording, "kept": c.kept_duration, "whole": c.full_duration}
@@ -232,8 +201,7 @@ class DiagnosisResult(ReprMixin):
             "steps": [
                 {
                     "added": entry.effect.label,
-                    "closure": _number(entry.cumulative_closure.fraction),
-                    "closure_ci": [_number(entry.cumulative_closure.ci_low), _number(entry.cumulative_closure.ci_high)],
+                    **_closure(entry.cumulative_closure),
                     "chi2_per_dof": entry.refitted_model.held_out_loss.chi2_per_sample,
                     "rmse": {
                         name: value for name, (value, _) in entry.refitted_model.held_out_loss.channel_rmse.items()
@@ -255,10 +223,6 @@ def threshold_statistics(finding: DiagnosisResult) -> dict[str, Any]:
     """Return the statistics compared with `Thresholds`, JSON-compatible, from which these are calibrated.
 
     None where a step was not come to.
-
-    Parameters
-    ----------
-    finding : Finding
 
     Returns
     -------
@@ -409,6 +373,10 @@ def _rejected_candidates(finding: DiagnosisResult) -> list[dict[str, Any]]:
     return listed
 
 
+def _closure(closed: GapClosure) -> dict[str, Any]:
+    return {"closure": _number(closed.fraction), "closure_ci": [_number(closed.ci_low), _number(closed.ci_high)]}
+
+
 def _number(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
@@ -442,7 +410,6 @@ def _ranked_candidates(finding: DiagnosisResult) -> list[dict[str, Any]]:
             },
             "score": 0.0 if score is None else score.lm_statistic,
             "p_value": 1.0 if score is None else score.p_value,
-            "closure": None if closed is None else _number(closed.fraction),
-            "closure_ci": None if closed is None else [_number(closed.ci_low), _number(closed.ci_high)],
+            **({"closure": None, "closure_ci": None} if closed is None else _closure(closed)),
         }
     return list(listed.values())

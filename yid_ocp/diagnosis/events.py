@@ -21,8 +21,13 @@ import threadpoolctl
 from numpy.typing import NDArray
 
 from yid_ocp.data.channel_checks import quantization_step
-from yid_ocp.diagnosis.inverse_dynamics_terms import InverseDynamicsModel
-from yid_ocp.diagnosis.pulse_detection import MAX_EVENT_TIME_FRACTION, DetectedPulse, ForceEstimate, detect_pulses
+from yid_ocp.diagnosis.pulse_detection import (
+    MAX_EVENT_TIME_FRACTION,
+    DetectedPulse,
+    ForceEstimate,
+    InverseDynamicsModel,
+    detect_pulses,
+)
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects.base import robot_joints
 from yid_ocp.inference.null_test import benjamini_hochberg_mask, sample_times
@@ -66,7 +71,6 @@ class DisturbanceEvent:
 
     Attributes
     ----------
-    recording, location : str
     channel : str
         Coordinate on which a force acted, or channel that was wrong.
     kind : "force" or "sample"
@@ -79,8 +83,7 @@ class DisturbanceEvent:
         Integral over time [unit x s].
     impulse_std : float
         Standard deviation of the impulse, counting what the model is allowed to be wrong by.
-    unit : str
-    detected_pulse : Pulse or None
+    detected_pulse : DetectedPulse or None
         Shape of a force.
     """
 
@@ -127,7 +130,6 @@ class EventForceSeries:
 
     Attributes
     ----------
-    recording, channel, unit : str
     t, force, allowed_model_error : ndarray, shape (M,)
         Since the start of the recording [s]; the force beside what the model and the recording have, each point for
         itself, and what the model may be wrong by, in `unit`.
@@ -197,14 +199,13 @@ def find_events(
         Its fit.
     evaluation : Evaluation
         At `x`, with its Jacobian.
-    smoothed : Smoothed or None
+    smoothed : SmootherResult or None
         What the smoother found about that fit; forces that move the model are sought where it found some, in the
         recordings that were estimated on.
-    limits : Thresholds
 
     Returns
     -------
-    Events
+    EventSet
         Those that are more than chance among all windows of all recordings, by the false-discovery rate `level`.
     """
     runs: list[_RecordingRollout] = []
@@ -488,10 +489,7 @@ def _wrong_samples(problem: EstimationProblem, run: _RecordingRollout) -> Iterat
 
 
 def _floor(problem: EstimationProblem, episode: Episode, joint: str, quantity: str) -> float | None:
-    """Noise of what one joint's raw channel says, where the model is moved by it or, smoothed, compared with it.
-
-    None where it is neither. A single effort that the filter of prescribed joints makes nothing of is no event.
-    """
+    """Noise of what one joint's raw channel says, where the model is moved by it or, smoothed, compared with it."""
     joints, options = episode.recording.joints, problem.options
     system = problem.system
     assert joints is not None
@@ -554,11 +552,7 @@ def _alone(t: Array, values: Array, noise: Array, about: tuple[str, str, str, st
 
 
 def _beside_neighbours(t: Array, values: Array) -> Array:
-    """Value less the cubic through four samples about it, the smallest of three such differences, shape (M,).
-
-    No two of the stencils share a sample within a run, so that a wrong sample spoils at most one of its neighbours'
-    three; where they differ in sign, and at both ends, nothing is said.
-    """
+    """Value less the cubic through four samples about it, the smallest of three such differences, shape (M,)."""
     found = np.zeros((len(_STENCIL_STEPS), len(values)))
     for one, step in zip(found, _STENCIL_STEPS, strict=True):
         middle = np.arange(2 * step, len(values) - 2 * step)

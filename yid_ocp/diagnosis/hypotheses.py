@@ -46,7 +46,6 @@ def make_candidate_effects(
     ----------
     system : System
         The nominal one.
-    recordings : sequence of Recording
     choice : "all" or sequence of str
         `kind` (wherever a diagnosis tries it) or `kind@location`.
 
@@ -99,7 +98,6 @@ def exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> l
 
     Parameters
     ----------
-    effects : sequence of EffectBase
     names : sequence of str
         `kind` or `kind@location`.
 
@@ -126,7 +124,6 @@ class TruncatedRecording:
 
     Attributes
     ----------
-    recording : str
     kept_duration : float
         How much of it is compared [s]; 0 where nothing is.
     full_duration : float

@@ -27,7 +27,6 @@ class GapLocation:
 
     Attributes
     ----------
-    location : str
     gap_share : float
         Of the gap that can be located, between 0 and 1; all shares add up to one.
     is_observable : bool
@@ -57,7 +56,6 @@ def localise_gap(
 
     Parameters
     ----------
-    smoothed : Smoothed
     location_z : float
         Standard deviations that an unknown must be away from zero to say when the gap is there.
     """
@@ -132,11 +130,11 @@ def attribute_gap_to_effects(
 
     Parameters
     ----------
-    before : sequence of Place
+    before : sequence of GapLocation
         Of the nominal model.
     closed : mapping of location to float
         Part of the gap that the effects there close.
-    rest : sequence of Place
+    rest : sequence of GapLocation
         Of the model with the effects.
     windows : tuple of (float, float)
         When the residual was more than noise, for locations that the smoother has no unknown for (`world`, `clock`).
@@ -166,8 +164,6 @@ def informed_z_scores(
 
     Parameters
     ----------
-    smoothed : Smoothed
-    recording : int
     informed_fraction : float
         1 - posterior/prior variance from which an unknown's value is informed.
 
@@ -175,7 +171,6 @@ def informed_z_scores(
     -------
     edges : ndarray, shape (J + 1,)
         [s]
-    names : tuple of str, length nd
     values : ndarray, shape (J, nd)
     """
     trace = smoothed.smoothed_unknowns[recording]

@@ -20,18 +20,14 @@ from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EffectBase, ReportedParameter
 from yid_ocp.inference.null_test import sample_times
 from yid_ocp.inference.uncertainty import assess_goodness_of_fit, covariance_of_fit, std_from_covariance
-from yid_ocp.inference.whitening import (
-    relinearized_at_torque_bias,
-    torque_bias_distance,
-    whitened_by_sensor_noise,
-)
+from yid_ocp.inference.whitening import relinearized_at_torque_bias, torque_bias_distance, whitened_by_sensor_noise
 from yid_ocp.parallel import map_with_batched_calls
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
 from yid_ocp.problem.prediction_errors import rmse_by_channel
 from yid_ocp.progress import ParallelProgress, Progress
-from yid_ocp.solvers import GaussNewton, Status
+from yid_ocp.solvers import GaussNewton, Solution, Status
 from yid_ocp.solvers.base import SolverResult
 
 Array = NDArray[np.float64]
@@ -80,7 +76,6 @@ class RefitModel:
 
     Attributes
     ----------
-    effects : tuple of EffectBase
     problem : EstimationProblem
         Of the composed system, with the nominal parameters and those of the effects free.
     values : dict of str to float
@@ -89,9 +84,7 @@ class RefitModel:
         Their standard deviations; see `_refit_covariance`.
     amplitude_std : dict of str to float
         Of the effects' amplitudes, with their shapes held; see `amplitude_std`.
-    cost : float
-    evaluation : Evaluation
-    held_out_loss : Loss
+    held_out_loss : HeldOutLoss
         Held-out.
     solver_message : str
         Why the solver ended.
@@ -130,7 +123,6 @@ class StoredFit:
         Of every unknown.
     amplitude_std : dict of str to float
         Of amplitudes; see `RefitModel`.
-    solver_message : str
     """
 
     values: dict[str, float]
@@ -152,16 +144,29 @@ class RefitStore(Protocol):
 
 
 @dataclass(frozen=True)
+class KnownFits:
+    """What is known before a diagnosis begins.
+
+    Attributes
+    ----------
+    solution : Solution, optional
+        Of the nominal problem.
+    store : RefitStore, optional
+        Of refits that an earlier run of the same diagnosis finished; told of every further one.
+    """
+
+    solution: Solution | None = None
+    store: RefitStore | None = None
+
+
+@dataclass(frozen=True)
 class RefitContext:
     """Problem, thresholds, progress and store shared by all refits of one diagnosis.
 
     Attributes
     ----------
-    problem : CandidateProblem
-    thresholds : Thresholds
     progress : Progress
         Told what is going on.
-    store : Store, optional
     """
 
     problem: AllCandidatesProblem
@@ -182,11 +187,9 @@ def refit_with_effects(
 
     Parameters
     ----------
-    problem : CandidateProblem
-    effects : sequence of EffectBase
     start : mapping of str to float
         Where unknowns begin; a start that cannot be rolled out is drawn back towards neutral effects.
-    store : Store, optional
+    store : RefitStore, optional
         Asked before the solver is, and told what it finds.
     name : str
         In the store; the effects' labels where empty, which do for refits that differ by their effects alone.
@@ -195,7 +198,7 @@ def refit_with_effects(
 
     Returns
     -------
-    Fit or None
+    RefitModel or None
         None where the model cannot be rolled out at all.
     """
     known = load_stored_refit(problem, effects, store, name)
@@ -376,8 +379,6 @@ def refit_each_candidate(
 
     Parameters
     ----------
-    search : Search
-    base : sequence of EffectBase
     tried : sequence of (EffectBase, mapping of parameter to float)
         With the values at which each begins.
     values : mapping of str to float

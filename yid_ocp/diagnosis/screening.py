@@ -43,7 +43,6 @@ class EffectSignature:
 
     Attributes
     ----------
-    effect : EffectBase
     shape_values : dict of str to float
         Values of its shape parameters.
     projected_sensitivity : ndarray, shape (nr, p)
@@ -66,7 +65,7 @@ class CandidateLinearization:
     ----------
     projected_residual : ndarray, shape (nr,)
         P r.
-    signatures : tuple of Signature
+    signatures : tuple of EffectSignature
         One for each candidate and grid value.
     parameter_values : dict of str to float
         Where it was taken.
@@ -83,7 +82,6 @@ class CandidateDetectability:
 
     Attributes
     ----------
-    effect : EffectBase
     detectable_amplitudes : dict of amplitude to float
         Smallest value that would be noticed, in the parameter's unit.
     is_detectable : bool
@@ -101,14 +99,12 @@ class CandidateScore:
 
     Attributes
     ----------
-    effect : EffectBase
     predicted_values : dict of str to float
         Amplitudes to which the linear model would go, and the shape values.
     predicted_chi2_decrease : float
         Promised decrease of r'r.
     lm_statistic : float
         LM with robust covariance.
-    p_value : float
     """
 
     effect: EffectBase
@@ -139,7 +135,6 @@ def linearize_candidates(
 
     Parameters
     ----------
-    problem : CandidateProblem
     base : sequence of EffectBase
         In the model, with all their parameters free.
     values : mapping of str to float
@@ -245,10 +240,7 @@ def _coloured(columns: Array, series: Sequence[ResidualChannel]) -> Array:
 
 
 def _newey_west_covariance(columns: Array, residual: Array, series: Sequence[ResidualChannel]) -> Array:
-    """Return the Newey-West covariance of X' r for a residual of unknown autocorrelation, shape (p, p).
-
-    Bartlett's weights of L = sqrt(M) lags are the mean square of the sums over all windows of that length.
-    """
+    """Return the Newey-West covariance of X' r for a residual of unknown autocorrelation, shape (p, p)."""
     total = np.zeros((columns.shape[1], columns.shape[1]))
     for s in series:
         u = columns[s.residual_indices] * residual[s.residual_indices, None]
@@ -339,7 +331,6 @@ class ConfusabilityMatrix:
 
     Attributes
     ----------
-    labels : tuple of str
     overlap_fractions : ndarray, shape (nj, nj)
         Fraction of row j's signature that column i's can explain, beyond what the nominal parameters can.
     """
@@ -359,7 +350,6 @@ class CandidatePair:
 
     Attributes
     ----------
-    effects : tuple of EffectBase
     predicted_values : dict of str to float
         Amplitudes to which the linear model would go, and the shape values.
     predicted_chi2_decrease : float
@@ -380,7 +370,6 @@ class JointScores:
 
     Attributes
     ----------
-    effects : tuple of EffectBase
     shape_values : tuple of dict of str to float
     information : ndarray, shape (n, n)
         X'X of all signatures side by side.
@@ -468,11 +457,8 @@ class ScreeningResult:
 
     Attributes
     ----------
-    detectability : tuple of Visibility
-    candidate_scores : tuple of Score
+    candidate_scores : tuple of CandidateScore
         Best first.
-    confusability : Confusability
-    joint_scores : Together
     """
 
     detectability: tuple[CandidateDetectability, ...]

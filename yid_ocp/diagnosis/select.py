@@ -57,10 +57,9 @@ class SelectedEffect:
 
     Attributes
     ----------
-    effect : EffectBase
-    refitted_model : Fit
+    refitted_model : RefitModel
         With all effects up to this one.
-    cumulative_closure : Closure
+    cumulative_closure : GapClosure
         Of the whole gap by all effects up to this one.
     equivalent_effects : tuple of EffectBase
         Effects that the data cannot tell from this one, the chosen one first.
@@ -90,12 +89,7 @@ def gap_closure(
 
 
 def _lr_decisive(before: HeldOutLoss, after: HeldOutLoss, limits: Thresholds = DEFAULT_THRESHOLDS) -> bool:
-    """Whether the held-out log likelihood ratio favours `after` by more than `worth`, if both models leave only noise.
-
-    Innovations that are noise are independent, and half the fall of their squares is a log likelihood ratio. What shows
-    in a few of them only, as a constant error of a torque does at the start, differs too much from block to block for
-    `held_out_improvement` to be sure, and hardly moves chi2/n.
-    """
+    """Whether the held-out log likelihood ratio favours `after` by more than `worth`, if both models leave only noise."""
     return (
         _noise_is_left(limits, before, after) and _squares(before) - _squares(after) > 2 * limits.min_log_bayes_factor
     )
@@ -122,16 +116,7 @@ def held_out_improvement(before: HeldOutLoss, after: HeldOutLoss) -> tuple[float
 
 
 def _near_best_models(fits: Sequence[RefitModel], limits: Thresholds = DEFAULT_THRESHOLDS) -> list[RefitModel]:
-    """Models that predict the held-out recordings as well as the best one, the simplest first.
-
-    Their loss is within one standard error of the best one's, or within `tie` of it, or all recordings together are as
-    likely with them (`_lr_equivalent`): about 16 % of equally good models trail the best by more than one standard error.
-    Models far less likely than the best are dropped (`_lr_rejects`). Where model error dominates, simpler models are
-    also accepted by BIC; see `_bic_prefers`. An effect whose shape is far from what
-    an engineer would expect (`_is_shape_outside_prior`) counts only where no other comes near it: a solid that relaxes in a tenth
-    of the shortest time expected is a damper. So does one that is not sure to be there. One whose amplitude is out of
-    its range (`_is_amplitude_outside_prior`) comes last.
-    """
+    """Models that predict the held-out recordings as well as the best one, the simplest first."""
     best = min(fits, key=lambda fit: fit.held_out_loss.chi2_per_sample)
     likely = [fit for fit in fits if not fit.effects or _likely(fit.effects[-1], fit, limits)]
     if (
@@ -161,10 +146,7 @@ def _near_best_models(fits: Sequence[RefitModel], limits: Thresholds = DEFAULT_T
 
 
 def _lr_equivalent(fit: RefitModel, other: RefitModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> bool:
-    """Whether the likelihood ratio of two models over all recordings is within its 95 % bound.
-
-    Where more than noise is left, squares count errors of the model, and their differences say little.
-    """
+    """Whether the likelihood ratio of two models over all recordings is within its 95 % bound."""
     return (
         _noise_is_left(limits, fit.held_out_loss, other.held_out_loss)
         and penalized_chi2_difference(fit, other) <= CHI2_95_TWO_SIDED
@@ -218,10 +200,7 @@ def _is_shape_outside_prior(
     limits: Thresholds = DEFAULT_THRESHOLDS,
     std: Mapping[str, float] | None = None,
 ) -> bool:
-    """Whether a shape parameter lies outside its prior range by more than `shape_range_factor` or `prior_range_margin` widths.
-
-    One that may as well lie within, by `away` standard deviations, does not.
-    """
+    """Whether a shape parameter lies outside its prior range by more than `shape_range_factor` or `prior_range_margin` widths."""
     for name in effect.shape_names:
         low, high = effect.prior_ranges[name]
         room = limits.prior_range_margin * (high - low)
@@ -246,19 +225,13 @@ def _is_amplitude_outside_prior(
 
 
 def _is_significant(effect: EffectBase, fit: RefitModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> bool:
-    """Whether any amplitude is at least `away` standard deviations from neutral.
-
-    The standard deviations hold the shape fixed; see `amplitude_std`.
-    """
+    """Whether any amplitude is at least `away` standard deviations from neutral."""
     neutral, std = effect.neutral_values, fit.amplitude_std
     return any(abs(fit.values[n] - neutral[n]) >= limits.min_z * std.get(n, 0.0) for n in effect.amplitude_names)
 
 
 def _is_rmse_reduced(before: HeldOutLoss, after: HeldOutLoss, limits: Thresholds = DEFAULT_THRESHOLDS) -> bool:
-    """Whether the held-out error, of all channels or of any one, is reduced by at least the fraction `min_rmse_reduction`.
-
-    Held-out recordings that are far likelier need not show it: what tells of a constant error shows in few samples.
-    """
+    """Whether the held-out error, of all channels or of any one, is reduced by at least the fraction `min_rmse_reduction`."""
     if _lr_decisive(before, after, limits) or not np.isfinite(before.chi2_per_sample):
         return True
     return rmse_reduction(before, after) >= limits.min_rmse_reduction
@@ -281,13 +254,7 @@ def rmse_reduction(before: HeldOutLoss, after: HeldOutLoss) -> float:
 def _refit_shortlist(
     scores: Sequence[CandidateScore], alike: ConfusabilityMatrix, limits: Thresholds, places: Sequence[str] = ()
 ) -> list[tuple[EffectBase, Mapping[str, float]]]:
-    """Choose the candidates to refit, with their start values.
-
-    Of those that are significant, the best by what they promise; those that can stand in for them; the best by their
-    statistic, which a promise made far from its end says little about. Beside any of these the best of every place
-    where the gap lies is refitted whether significant or not: in a valley far from its end the linear model of a
-    candidate may say nothing.
-    """
+    """Choose the candidates to refit, with their start values."""
     ranked = [score for score in scores if score.p_value < limits.significance_level]
     if not ranked:
         return []
@@ -338,10 +305,9 @@ def select_effects(
 
     Parameters
     ----------
-    search : Search
-    nominal : Fit
+    nominal : RefitModel
         Without any effect.
-    screened : Screened
+    screened : ScreeningResult
         All candidates at that fit.
     places : sequence of str
         Where the smoother says that the gap lies.
@@ -350,10 +316,9 @@ def select_effects(
 
     Returns
     -------
-    fits : tuple of Fit
+    fits : tuple of RefitModel
         Of single effects in the first round, the chosen one first, then by held-out loss; where one effect alone stays,
         its last fit first.
-    added : tuple of Added
     """
     limits, alone = search.thresholds, screened
     current = nominal
@@ -366,27 +331,10 @@ def select_effects(
             search.progress.begin_stage(f"scoring what is left beside {', '.join(e.label for e in base)}")
             screened = screen_candidates(search.problem, base, current.values, limits)
             # a rest that the residual as a whole does not show may show along a candidate, as a gap does
-            if (
-                _little_is_left(current, limits)
-                and bonferroni_min_p_value(screened.candidate_scores) >= limits.candidate_significance_level
-            ):
+            p_value = bonferroni_min_p_value(screened.candidate_scores)
+            if _little_is_left(current, limits) and p_value >= limits.candidate_significance_level:
                 break
-        # where the gap lay before anything was added asks for no more than the significant afterwards
-        scores = [
-            score for score in screened.candidate_scores if not added or score.p_value < limits.significance_level
-        ]
-        fits = refit_each_candidate(
-            search, base, _refit_shortlist(scores, screened.confusability, limits, places), current.values
-        )
-        if moved and not added:
-            fits = _likelier(fits, _from_before(search))
-        if len(added) == 1:
-            pairs = _pairs_to_refit(alone, limits, base[0])
-            fits += [
-                fit for fit in refit_each_pair(search, pairs, nominal.values) if _firmly(fit.effects[0], fit, limits)
-            ]
-        if added:
-            fits = _of_a_size(fits, limits)
+        fits = _fits_of_round(search, nominal, (alone, screened), current, places, moved)
         if not fits:
             break
         near = _near_best_models(fits, limits)
@@ -420,24 +368,35 @@ def select_effects(
     return first, kept
 
 
+def _fits_of_round(
+    search: RefitContext,
+    nominal: RefitModel,
+    screened: tuple[ScreeningResult, ScreeningResult],
+    current: RefitModel,
+    places: Sequence[str],
+    moved: bool,
+) -> list[RefitModel]:
+    """Refits of a round: candidates beside the effects so far, likely pairs instead of a single one; see `select_effects`.
+
+    `screened` holds all candidates at the nominal fit and beside the effects so far.
+    """
+    limits, base, (alone, beside) = search.thresholds, current.effects, screened
+    # where the gap lay before anything was added asks for no more than the significant afterwards
+    scores = [score for score in beside.candidate_scores if not base or score.p_value < limits.significance_level]
+    chosen = _refit_shortlist(scores, beside.confusability, limits, places)
+    fits = refit_each_candidate(search, base, chosen, current.values)
+    if moved and not base:
+        fits = _likelier(fits, _from_before(search))
+    if len(base) == 1:
+        pairs = refit_each_pair(search, _pairs_to_refit(alone, limits, base[0]), nominal.values)
+        fits += [fit for fit in pairs if _firmly(fit.effects[0], fit, limits)]
+    return _of_a_size(fits, limits) if base else fits
+
+
 def _pairs_to_refit(
     screened: ScreeningResult, limits: Thresholds, without: EffectBase
 ) -> list[tuple[tuple[EffectBase, EffectBase], Mapping[str, float]]]:
-    """Choose the pairs of candidates to refit: best penalized decrease first, without confusable duplicates.
-
-    Parameters
-    ----------
-    screened : Screened
-        At the nominal fit.
-    limits : Thresholds
-    without : EffectBase
-        The best effect alone, with which others are tried anyway: it is in no pair.
-
-    Returns
-    -------
-    list of (pair of EffectBase, mapping of parameter to float)
-        With the values at which both begin.
-    """
+    """Choose the pairs of candidates to refit: best penalized decrease first, without confusable duplicates."""
     alike = screened.confusability
 
     def same(one: EffectBase, other: EffectBase) -> bool:
@@ -473,10 +432,7 @@ def _little_is_left(fit: RefitModel, limits: Thresholds) -> bool:
 
 
 def _worth_adding(current: RefitModel, chosen: RefitModel, limits: Thresholds) -> bool:
-    """Whether the last effect of a fit closes a sure and relevant part of the gap, and is there at all.
-
-    Where little but noise is left, only odds convince: a part of next to nothing is soon closed.
-    """
+    """Whether the last effect of a fit closes a sure and relevant part of the gap, and is there at all."""
     gained, error = held_out_improvement(current.held_out_loss, chosen.held_out_loss)
     part = gained >= limits.min_gap_closed * current.held_out_loss.excess_chi2 and current.held_out_loss.excess_chi2 > 0
     closes = not _little_is_left(current, limits) and gained > error and part
@@ -490,12 +446,7 @@ def _worth_adding(current: RefitModel, chosen: RefitModel, limits: Thresholds) -
 def _reconsidered(
     search: RefitContext, nominal: RefitModel, added: Sequence[SelectedEffect], paired: bool
 ) -> tuple[SelectedEffect, ...]:
-    """Every effect tried for its place again beside the others: without it, and others instead of it.
-
-    What was added first was chosen while the others were missing, and may be there in their stead. The last one, unless
-    it came as one of a pair, was chosen beside all others, as one that was put in another's place: they need no second
-    look until these change.
-    """
+    """Every effect tried for its place again beside the others: without it, and others instead of it."""
     kept = tuple(added)
     seen = {_labels(kept)}
     tried = set() if paired else {_labels(kept[:-1])}

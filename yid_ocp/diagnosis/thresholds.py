@@ -16,78 +16,7 @@ from yid_ocp.options import OptionInfo
 class Thresholds(SmootherThresholds):
     """Thresholds of every step of a diagnosis: null test, screening, refits, selection, localisation and events.
 
-    Attributes
-    ----------
-    significance_level : float
-        Significance below which a residual is more than noise.
-    min_excess_chi2 : float
-        Smallest excess chi2/n - 1 that counts as a gap, even if a smaller one is significant.
-    min_channel_excess_chi2 : float
-        Smallest excess chi2/n - 1 of the worst channel for a significant candidate alone to show a gap.
-    candidate_significance_level : float
-        Bonferroni-corrected significance at which a candidate shows a gap that the null test does not.
-    unexplained_p_factor : float
-        Factor on `significance_level` for the p-value of an excess that no candidate and no unknown explains.
-    min_samples_per_unknown : float
-        Effective samples required for every unknown; with fewer the verdict is insufficient_data.
-    residual_window : float
-        Length of the windows of the null test [s].
-    detection_z : float
-        Detectable amplitude in standard deviations: 90 % power at the 1 % level.
-    shape_grid_size : int
-        Grid values of every shape parameter; the p-value is Bonferroni-corrected for them.
-    n_refit_per_round : int
-        Candidates refitted in a round, plus at most as many that are confusable with them.
-    n_refit_lowest_p : int
-        Number of candidates with the smallest p-values that are always refitted.
-    n_refit_pairs : int
-        Number of candidate pairs refitted if one effect leaves a gap.
-    signature_overlap : float
-        Fraction of a signature explained by another candidate above which both are refitted.
-    restart_chi2, restart_gain : float
-        A refit that ends above chi2/n `restart_chi2` but reduces the excess by at least the fraction `restart_gain` is restarted
-        from the initial values of the nominal parameters.
-    max_effects : int
-        Maximum number of effects added.
-    min_z : float
-        Distance from neutral, in standard deviations, below which an effect is dropped.
-    min_rmse_reduction : float
-        Relative reduction of the held-out error, of all channels or of any one, required of an effect.
-    min_gap_closed : float
-        Smallest fraction of the held-out gap to close: by the lower 95 % bound in total, and by each effect of what is
-        left.
-    chi2_equivalence : float
-        Relative difference of chi2/n below which two models are equivalent, even if it is significant.
-    model_error_chi2 : float
-        chi2/n above which model error dominates, so that blocks of time are the independent samples and BIC weighs
-        parameters against loss.
-    implausible_shape_margin : float
-        Relative improvement of chi2/n over all other models required of an effect with an implausible shape.
-    shape_range_factor : float
-        Factor by which a shape parameter may leave its prior range before the shape is implausible.
-    prior_range_margin : float
-        Widths of its prior range by which an amplitude, or a shape parameter whose range begins at zero or below, may
-        leave it before the value is implausible.
-    transfer_rtol : float
-        Relative tolerance between an effect's amplitudes on the estimation and the held-out recordings.
-    transfer_z_max : float
-        Largest difference of the same amplitudes in standard deviations; smaller ones always agree.
-    min_explained_fraction : float
-        Fraction of the smoother's explained chi2 that the effects are required to explain.
-    location_z : float
-        Distance of an unknown from zero, in standard deviations, at which a time interval belongs to the gap.
-    informed_fraction : float
-        1 - posterior/prior variance above which the data inform an unknown's value.
-    inverse_dynamics_rtol : float
-        Relative error of the inverse dynamics terms (inertia, Coriolis forces, gravity, springs, friction, the torque
-        itself) allowed at any moment without an event.
-    max_event_duration : float
-        Maximum duration of an event [s]; longer disturbances count as model error.
-    min_event_chi2_fraction : float
-        Smallest fraction of the excess of r'r over the number of samples that force events must explain; with less,
-        model error dominates and they are dropped.
-    max_joint_speed : float
-        Joint speed above which the rest of a recording is ignored [rad/s or m/s].
+    What each is stands beside it; the same texts are in the settings' reference (section `diagnosis`).
     """
 
     # is there a gap

@@ -26,12 +26,10 @@ class TransferCheck:
 
     Attributes
     ----------
-    effect_label, parameter, unit : str
     estimation_value, estimation_std : float
         On the recordings to estimate on.
     held_out_value, held_out_std : float
         On the held-out ones.
-    is_consistent : bool
     """
 
     effect_label: str
@@ -82,11 +80,7 @@ def _shared(turned: AllCandidatesProblem, fit: RefitModel) -> dict[str, float]:
 def _compare_amplitudes(
     effect: EffectBase, first: RefitModel, second: RefitModel, limits: Thresholds = DEFAULT_THRESHOLDS
 ) -> list[TransferCheck]:
-    """Compare the amplitudes of one effect in two fits.
-
-    They agree where they differ by no more than `transfer_z_max` standard deviations, those of both together, or than the
-    part `carried` of the effect's size; sizes of several amplitudes are compared in widths of their ranges.
-    """
+    """Compare the amplitudes of one effect in two fits."""
     neutral, found = effect.neutral_values, []
     width = {name: high - low for name, (low, high) in effect.prior_ranges.items()}
     size = max(abs(fit.values[n] - neutral[n]) / width[n] for fit in (first, second) for n in effect.amplitude_names)

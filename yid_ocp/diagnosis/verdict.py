@@ -32,9 +32,7 @@ def has_gap(
 
     Parameters
     ----------
-    before, held_out : NullTest
-    limits : Thresholds
-    ranked : sequence of Score
+    ranked : sequence of CandidateScore
         Of all visible candidates; their smallest p-value counts as the best of that many tries.
     offsets : bool
         Whether the size of torque offsets is stated.
@@ -79,13 +77,10 @@ def decide_verdict(
 
     Parameters
     ----------
-    gap : bool
-    visible : sequence of Visibility
-    added : sequence of Added
+    added : sequence of SelectedEffect
         After composition.
-    total : Closure
+    total : GapClosure
         Of all effects added.
-    limits : Thresholds
     enough : bool
         Whether there are samples enough for the unknowns.
     explained : float

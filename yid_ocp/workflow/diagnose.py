@@ -20,8 +20,9 @@ from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG, load_config
 from yid_ocp.config.settings import RunSettings, dump_config
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis import DiagnosisResult, StoredFit, diagnose
-from yid_ocp.diagnosis.baseline_comparison import with_baseline_prior
+from yid_ocp.diagnosis.baseline import BaselineData, with_baseline_prior
 from yid_ocp.diagnosis.diagnosis_result import final_model_to_dict
+from yid_ocp.diagnosis.refit import KnownFits
 from yid_ocp.errors import OutputError
 from yid_ocp.files import json_sha256, write_json
 from yid_ocp.inference.whitening import whitened_by_sensor_noise
@@ -157,11 +158,9 @@ def _found(
         _with_noise_only_stds(problem, run),
         said.candidates,
         thresholds=said,
-        solution=nominal,
         progress=progress,
-        store=refits,
-        baseline=runs,
-        reference_recordings=without,
+        known_fits=KnownFits(nominal, refits),
+        baseline=BaselineData.from_runs(runs, tuple(without)),
         exclude=said.exclude,
     )
 

@@ -34,6 +34,7 @@ from yid_ocp.workflow.build import build_cable, build_step, parameter_settings
 from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.command_runner import CommandResult, run_and_print
 from yid_ocp.workflow.run_folder import new_run_folder
+from yid_ocp.workflow.run_history import require_current_format
 from yid_ocp.workflow.run_inputs import locate_errors, read_recordings
 
 _RESULT_FORMAT = "yid-plan/1"
@@ -247,11 +248,12 @@ def _read_parameter_run(run: RunSettings, commands: Sequence[str]) -> tuple[dict
         result: dict[str, Any] = dict(json.loads(file.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError, RecursionError) as error:
         raise DataError(f"the result cannot be read ({error})", where=str(file), hint="run it again") from error
-    formats = {"solve": "yid-solve/", "diagnose": "yid-diagnosis/"}
-    if not str(result.get("format", "")).startswith(tuple(formats[command] for command in commands)):
+    require_current_format(result, file)
+    formats = {"solve": "yid-solve/1", "diagnose": "yid-diagnosis/2"}
+    if result.get("format") not in [formats[command] for command in commands]:
         what = f"{folder} is a run folder of another command ({result.get('format')})"
         raise run.config_error(
-            what, "plan", "parameter_run", allowed=" or ".join(f"{formats[command]}1" for command in commands)
+            what, "plan", "parameter_run", allowed=" or ".join(formats[command] for command in commands)
         )
     if result.get("status") == "failed":
         raise DataError(

@@ -8,28 +8,129 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.data.recording import Recording
-from yid_ocp.diagnosis.blind.ensemble_plan import DETECTABLE_MULTIPLES, ENSEMBLE_PURPOSES, PlannedCase
-from yid_ocp.diagnosis.diagnose import fit_nominal_model
+from yid_ocp.diagnosis.diagnose import diagnose, fit_nominal_model
+from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, CandidateChoice, make_candidate_effects
+from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.screening import CandidateLinearization, EffectSignature, linearize_candidates
+from yid_ocp.diagnosis.select import gap_closure
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects.base import EffectBase, ParameterDefinition, segment_springs
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.progress import Progress
 from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperiment
 from yid_ocp.virtual.injected import INJECTABLE_KINDS, InjectedEffect, run_injected_experiment
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 from yid_ocp.virtual.out_of_library_effects import OUT_OF_LIBRARY_EFFECTS
+
+_Key = TypeVar("_Key", str, float)
+DETECTABLE_MULTIPLES = (1.0, 3.0, 10.0)
+"""Multiples of the detectable size."""
+CATEGORY_SHARES: Mapping[str, float] = {
+    "null": 0.2,
+    "single": 0.48,
+    "pair": 0.1,
+    "outside": 0.1,
+    "left_out": 0.06,
+    "finer_chain": 0.06,
+}
+"""Fraction of the cases in every category."""
+ENSEMBLE_PURPOSES = ("report", "calibration")
+"""Purposes of an ensemble; the same seed draws different cases for each."""
+_MIN_CASES_PER_EXPERIMENT = 3
+"""Cases below which an experiment is not worth its compiled step."""
+
+
+@dataclass(frozen=True)
+class PlannedCase:
+    """A planned case: experiment, category and effect size.
+
+    Attributes
+    ----------
+    category : str
+        Of `CATEGORY_SHARES`.
+    multiple : float, optional
+        Of the detectable size; None where that has no meaning.
+    """
+
+    number: int
+    experiment: str
+    category: str
+    multiple: float | None
+
+
+def plan_cases(
+    count: int,
+    seed: int,
+    weights: Mapping[str, float],
+    chains: frozenset[str] = frozenset(),
+    purpose: str = ENSEMBLE_PURPOSES[0],
+) -> list[PlannedCase]:
+    """Return the planned cases of an ensemble, in an order given by the seed.
+
+    Parameters
+    ----------
+    weights : mapping of experiment to float
+        How large a part of the cases each gets; those that would get fewer than `_MIN_CASES_PER_EXPERIMENT` get none, but for the largest.
+    chains : frozenset of str
+        Experiments whose object can be made of finer links.
+    purpose : str
+        Of `ENSEMBLE_PURPOSES`.
+
+    Raises
+    ------
+    ConfigError
+        No case at all.
+    """
+    if count < 1:
+        raise ConfigError(f"an ensemble of {count} cases", where="--cases", allowed="a whole number from 1")
+    total = sum(weights.values())
+    kept = {name: part / total for name, part in weights.items() if count * part / total >= _MIN_CASES_PER_EXPERIMENT}
+    if not kept:
+        kept = {max(weights, key=lambda name: weights[name]): 1.0}
+    slots: list[tuple[str, float | None]] = []
+    for category, number in _dealt(count, CATEGORY_SHARES).items():
+        if category == "single":
+            for size, times in _dealt(number, dict.fromkeys(DETECTABLE_MULTIPLES, 1.0)).items():
+                slots += [(category, size)] * times
+        else:
+            slots += [(category, DETECTABLE_MULTIPLES[-1] if category in ("pair", "left_out") else None)] * number
+    # the experiment that is furthest behind its part gets the next case, so that every sort is spread over all
+    given = dict.fromkeys(kept, 0)
+    cases = []
+    slots.sort(
+        key=lambda slot: slot[0] != "finer_chain"
+    )  # what few can do comes first, so that the rest makes up for it
+    for i, slot in enumerate(slots):
+        able = [name for name in kept if slot[0] != "finer_chain" or name in chains]
+        name = max(able or kept, key=lambda entry: kept[entry] * (i + 1) - given[entry])
+        given[name] += 1
+        cases.append((name, *(slot if able else ("single", DETECTABLE_MULTIPLES[1]))))
+    order = np.random.default_rng([seed, ENSEMBLE_PURPOSES.index(purpose), 2]).permutation(count)
+    return [PlannedCase(number, *cases[int(place)]) for number, place in enumerate(order)]
+
+
+def _dealt(count: int, parts: Mapping[_Key, float]) -> dict[_Key, int]:
+    """So many things in these proportions, by the largest remainders."""
+    total = sum(parts.values())
+    exact = {key: count * part / total for key, part in parts.items()}
+    found = {key: int(value) for key, value in exact.items()}
+    for key in sorted(exact, key=lambda key: found[key] - exact[key])[: count - sum(found.values())]:
+        found[key] += 1
+    return found
+
 
 Array = NDArray[np.float64]
 
@@ -64,10 +165,8 @@ class CaseLabel:
 
     Attributes
     ----------
-    case : str
     category : str
         null, single, pair, outside, left_out or finer_chain.
-    injected : tuple of InjectedEffect
     multiple : float, optional
         Of the detectable size, as made; None where that has no meaning.
     truth : dict of str to float
@@ -101,9 +200,6 @@ class BlindCase:
 
     Attributes
     ----------
-    name : str
-    estimation_recordings : tuple of Recording
-    held_out_recording : Recording
     excluded_kinds : tuple of str
         Kinds that are left out of the library; mostly one that has nothing to do with the case.
     """
@@ -141,8 +237,7 @@ class RecordingConditions:
     ----------
     estimation_count : int
         To estimate on; one more is held out.
-    arm_noise : ArmNoise
-    simulation : Simulation
+    simulation : SimulationOptions
         Duration of each, and the engine's step.
     has_camera : bool
         Whether a camera sees the object.
@@ -163,7 +258,6 @@ class DetectableEffect:
 
     Attributes
     ----------
-    effect : EffectBase
     shape_values : dict of str to float
         Values of its shape parameters.
     sensitivity_factor : ndarray, shape (p, p)
@@ -199,7 +293,6 @@ class CaseGenerator:
     ----------
     problem : EstimationProblem
         Its system, options and free parameters are every case's; its first recording gives the initial posture.
-    seed : int
     finer : callable, optional
         The system with so many times its links.
     candidates : "all" or sequence of str
@@ -208,7 +301,7 @@ class CaseGenerator:
         For the detectable size.
     simulated_system : System, optional
         What moves, where that is not the problem's: the same with its arms driven.
-    conditions : Conditions
+    conditions : RecordingConditions
         Whether there is a camera is seen from the problem's first recording.
 
     Raises
@@ -452,15 +545,12 @@ def simulate_random_motion(
 
     Parameters
     ----------
-    nominal, simulated : System
     posture : mapping of str to float
         Of the driven joints at the start.
     truth, values : mapping of str to float
         Parameters of the nominal and of the simulated system.
-    injected : sequence of InjectedEffect
     rng : numpy.random.Generator
         Of motion and noise.
-    conditions : Conditions
     """
     travel = _GRIPPER_TRAVEL if len(nominal.grasps) < 2 else _SHARED_GRIPPER_TRAVEL
     excitation = MultisineOptions(gripper_travel=travel, duration=conditions.simulation.duration)
@@ -518,3 +608,54 @@ def finer_chain_parameters(nominal: System, finer: System, truth: Mapping[str, f
             if name in start:
                 values[name] = truth.get(name, start[name]) * factor
     return values
+
+
+def diagnose_case(
+    ensemble: CaseGenerator,
+    case: BlindCase,
+    candidates: CandidateChoice = "all",
+    thresholds: Thresholds | None = None,
+    progress: Progress | None = None,
+) -> DiagnosisResult:
+    """Diagnose a blind case from its recordings alone."""
+    problem = ensemble.nominal_problem(case.estimation_recordings)
+    return diagnose(
+        problem,
+        candidates,
+        [case.held_out_recording],
+        thresholds=thresholds,
+        progress=progress,
+        exclude=case.excluded_kinds,
+    )
+
+
+def best_possible_closure(
+    ensemble: CaseGenerator, case: BlindCase, label: CaseLabel, candidates: CandidateChoice = "all"
+) -> float:
+    """Return the held-out closure of the true effects after a refit, the best a diagnosis could reach."""
+    problem = ensemble.nominal_problem(case.estimation_recordings)
+    effects = make_candidate_effects(problem.system, case.estimation_recordings, candidates)
+    composed = AllCandidatesProblem.from_problem(problem, effects, [case.held_out_recording])
+    nominal = fit_nominal_model(problem, composed)
+    true = {entry.label: entry for entry in label.injected}
+    chosen = [effect for effect in composed.candidate_effects if effect.label in true]
+    start = {}
+    for effect in chosen:
+        start.update(_internal(effect.label, true[effect.label].values, effect.definitions))
+    # under the weights of the nominal fit, as all that it is compared with
+    fit = refit_with_effects(replace(composed, problem=nominal.problem), chosen, {**nominal.values, **start})
+    return (
+        math.nan
+        if fit is None or len(chosen) < len(true)
+        else gap_closure(nominal.held_out_loss, fit.held_out_loss).fraction
+    )
+
+
+def _internal(label: str, values: Mapping[str, float], quantities: Sequence[ParameterDefinition]) -> dict[str, float]:
+    """Reported values in the parameters' own unit."""
+    found = {}
+    for quantity in quantities:
+        name, _ = quantity.reported_name_and_unit
+        if name in values:
+            found[f"{label}.{quantity.name}"] = quantity.to_internal(values[name])
+    return found
