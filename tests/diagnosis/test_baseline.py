@@ -27,12 +27,14 @@ model:
     kind: segments
     mount: {rpy: [0.0, 1.5707963267948966, 0.0]}
     segments:
-      beam: {length: 0.1, mass: 0.1, cross_section: [0.03, 0.03], links: 2, stiffness_per_curvature: true, clamped_at_base: true, joint_axes: y}
+      beam: {length: 0.1, mass: 0.1, cross_section: [0.03, 0.03], links: 2, stiffness_per_curvature: true,
+             clamped_at_base: true, joint_axes: y}
 recordings: {estimate: [bare.h5]}
 parameters:
   beam.bend: {free: true, initial: 0.015}
   beam.damping: {free: true, initial: 8.0e-5}
-problem: {time_step: 0.01, use_compiler: false, initial_state: estimated, start_configuration_std: 0.2, start_velocity_std: 3.0}
+problem: {time_step: 0.01, use_compiler: false, initial_state: estimated, start_configuration_std: 0.2,
+          start_velocity_std: 3.0}
 diagnosis: {candidates: [point_mass@w_beam, kelvin_voigt@beam]}
 output: {write_report: false, discretisation_check: none}
 """

@@ -255,7 +255,8 @@ class Valleys:
         self.costs, self.asked = costs, []
         self.problem = SimpleNamespace(
             is_positive=np.array([True, False]), initial_unknowns=np.array([2.0, -1.0]), has_process_noise=False,
-            bounds=(np.array([0.0, -9.0]), np.array([15.0, 9.0])), named_values=lambda x: dict(zip("kl", x, strict=True)),
+            bounds=(np.array([0.0, -9.0]), np.array([15.0, 9.0])),
+            named_values=lambda x: dict(zip("kl", x, strict=True)),
         )  # fmt: skip
         monkeypatch.setattr(module, "refit_with_effects", self.refit)
 

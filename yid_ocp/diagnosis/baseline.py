@@ -1,4 +1,4 @@
-"""Earlier runs: their estimates as priors, how far the parameters have moved, and predictions without the effects found.
+"""Earlier runs: their estimates as priors, how far parameters have moved, predictions without the effects found.
 
 Of a linear model with the prior N(m, C0), the estimate x with the covariance C moves by x - m, which has the covariance
 C0 - C where nothing changed. A misfit that makes the data's noise count k times adds (k - 1) C (1 - C/C0). An effect is
@@ -35,53 +35,27 @@ _MIN_INFORMED_FRACTION = 0.05
 
 @dataclass(frozen=True)
 class ParameterShift:
-    """Change of one parameter from the baseline to the current fit.
-
-    Attributes
-    ----------
-    baseline_value, baseline_std : float
-        By the baseline.
-    current_value, current_std : float
-        By the baseline and the recordings together.
-    z_score : float or None
-        Standard deviations by which it moved; None where the recordings say nothing of it.
-    p_value : float
-        Of so large a move where nothing changed.
-    has_changed : bool
-        At the level of the diagnosis, counting how many parameters were looked at.
-    """
+    """Change of one parameter from the baseline to the current fit."""
 
     name: str
     unit: str
-    baseline_value: float
+    baseline_value: float  # by the baseline
     baseline_std: float
-    current_value: float
+    current_value: float  # by the baseline and the recordings together
     current_std: float
-    z_score: float | None
-    p_value: float
-    has_changed: bool
+    z_score: float | None  # standard deviations by which it moved; None where the recordings say nothing of it
+    p_value: float  # of so large a move where nothing changed
+    has_changed: bool  # at the level of the diagnosis, counting how many parameters were looked at
 
 
 @dataclass(frozen=True)
 class BaselineComparison:
-    """The baseline runs and the shift of every parameter from them.
+    """The baseline runs and the shift of every parameter from them."""
 
-    Attributes
-    ----------
-    baseline_runs : tuple of str
-        Folders or names of the earlier runs.
-    is_baseline_explained : bool
-        Whether the model explained their recordings.
-    baseline_effects : tuple of str
-        Labels of the effects that they had and that the model keeps.
-    between_runs_chi2, between_runs_p_value : float
-        Of the differences between several earlier runs; zero and one for one run.
-    """
-
-    baseline_runs: tuple[str, ...]
-    is_baseline_explained: bool
-    baseline_effects: tuple[str, ...]
-    between_runs_chi2: float
+    baseline_runs: tuple[str, ...]  # folders or names of the earlier runs
+    is_baseline_explained: bool  # whether the model explained their recordings
+    baseline_effects: tuple[str, ...]  # labels of the effects that they had and that the model keeps
+    between_runs_chi2: float  # of the differences between several earlier runs; zero and one for one run
     between_runs_p_value: float
     parameter_shifts: tuple[ParameterShift, ...]
 
@@ -208,21 +182,14 @@ _ParameterValues = Mapping[str, float]
 
 @dataclass(frozen=True)
 class PredictionErrors:
-    """Prediction errors (RMSE by channel) on recordings no fit has used, without diagnosis and counterfactual.
-
-    Attributes
-    ----------
-    rmse_without_diagnosis, rmse_counterfactual : mapping of channel to float
-        Root mean square errors without a diagnosis, and with the effects removed (or added).
-    failure_message : str
-        Why there are none.
-    """
+    """Prediction errors (RMSE by channel) on recordings no fit has used, without diagnosis and counterfactual."""
 
     recordings: tuple[str, ...]
+    # root mean square errors without a diagnosis, and with the effects removed (or added)
     rmse_without_diagnosis: Mapping[str, float]
     rmse_counterfactual: Mapping[str, float]
     channel_units: Mapping[str, str]
-    failure_message: str = ""
+    failure_message: str = ""  # why there are none
 
     @property
     def rmse_by_unit(self) -> dict[str, tuple[float, float]]:
@@ -244,19 +211,13 @@ class PredictionErrors:
 
 @dataclass(frozen=True)
 class CounterfactualTest:
-    """Prediction errors with the effects removed, and with the effects added.
+    """Prediction errors with the effects removed, and with the effects added."""
 
-    Attributes
-    ----------
-    effects_removed : PredictionErrors
-        Recordings made without the effects: by the diagnosed model with its effects taken out, against the nominal
-        model as it was fitted to the recordings with them.
-    effects_added : PredictionErrors
-        Recordings made with the effects: by the model of the world without them with the effects put in, against that
-        model alone.
-    """
-
+    # recordings made without the effects: by the diagnosed model with its effects taken out, against the
+    # nominal model as it was fitted to the recordings with them
     effects_removed: PredictionErrors
+    # recordings made with the effects: by the model of the world without them with the effects put in, against
+    # that model alone
     effects_added: PredictionErrors
 
     def to_dict(self) -> dict[str, object]:
@@ -377,19 +338,11 @@ def _entry(part: PredictionErrors) -> dict[str, object]:
 
 @dataclass(frozen=True)
 class BaselineData:
-    """Combined estimates of earlier runs, and reference recordings made without the effect sought.
+    """Combined estimates of earlier runs, and reference recordings made without the effect sought."""
 
-    Attributes
-    ----------
-    combined_estimates : RunEstimates or None
-        All earlier runs together.
-    between_runs_chi2, between_runs_p_value : float
-        Of the differences between them.
-    """
-
-    combined_estimates: RunEstimates | None
+    combined_estimates: RunEstimates | None  # all earlier runs together
     baseline_runs: tuple[str, ...]
-    between_runs_chi2: float
+    between_runs_chi2: float  # of the differences between them
     between_runs_p_value: float
     reference_recordings: tuple[Recording, ...]
 

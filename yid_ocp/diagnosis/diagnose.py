@@ -76,8 +76,7 @@ from yid_ocp.solvers.base import RESTART_FACTORS
 
 log = logging.getLogger(__name__)
 
-_MAX_EVENT_ROUNDS = 3
-"""Maximum number of refits of the nominal model, each without the events found before it."""
+_MAX_EVENT_ROUNDS = 3  # maximum number of refits of the nominal model, each without the events found before it
 
 
 def diagnose(

@@ -20,19 +20,15 @@ from yid_ocp.effects import EffectBase
 from yid_ocp.effects.base import EXCITATIONS
 from yid_ocp.inference.null_test import NullTestResult
 
-_MIN_RELATIVE_CHANGE = 0.1
-"""Relative change from which a nominal parameter is named."""
-_PRIOR_RANGE_TOLERANCE = 0.25
-"""Part of its range by which an amplitude may leave it unnoticed."""
+_MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is named
+_PRIOR_RANGE_TOLERANCE = 0.25  # part of its range by which an amplitude may leave it unnoticed
 _GAP_ORIGIN_PHRASES = {
     "plant": ", in the mechanics rather than in what sensors read",
     "sensor": ", in what sensors read",
     "either": ", in the mechanics or in what the effort sensor reads, which efforts alone do not tell apart",
 }
-_RUNS_DIFFER_LEVEL = 0.01
-"""Significance below which several runs of a baseline differ."""
-_IMMOVABLE_LOCATIONS = ("world", "clock", "camera", "object", "base")
-"""Locations that cannot be moved by themselves."""
+_RUNS_DIFFER_LEVEL = 0.01  # significance below which several runs of a baseline differ
+_IMMOVABLE_LOCATIONS = ("world", "clock", "camera", "object", "base")  # locations that cannot be moved by themselves
 _NEXT_EXPERIMENT_TEXTS = {
     "insufficient_data": "Record longer and larger motions; more of the object has to be seen.",
     "separate": "Vary {aspects} independently of each other, over a wide range, in one recording.",
@@ -115,7 +111,8 @@ def truncation_message(cut: TruncatedRecording) -> str:
     """Return the sentence on how far the nominal model follows a held-out recording."""
     if cut.kept_duration == 0:
         return f"The nominal model cannot follow {cut.recording} at all, which is left out."
-    return f"The nominal model follows {cut.recording} for {cut.kept_duration:.3g} of {cut.full_duration:.3g} s only; the rest is left out."
+    part = f"{cut.kept_duration:.3g} of {cut.full_duration:.3g} s"
+    return f"The nominal model follows {cut.recording} for {part} only; the rest is left out."
 
 
 def diagnosis_summary_text(finding: DiagnosisResult) -> str:
@@ -207,12 +204,13 @@ def _effects(finding: DiagnosisResult) -> list[str]:
     last, total = finding.final_model, finding.gap_closure
     names = "; ".join(f"{e.label} with {_figures(e, last)}" for e in finding.accepted_effects)
     verb = "closes" if len(finding.accepted_effects) == 1 else "together close"
+    odds = math.exp(finding.thresholds.min_log_bayes_factor)
     text = [
         f"{names} {verb} {100 * total.fraction:.3g} % of it on held-out motions "
         f"(95 % interval {100 * total.ci_low:.3g} to {100 * total.ci_high:.3g} %)."
         if total.ci_low > finding.thresholds.min_gap_closed
-        else f"With {names} the held-out motions are far more likely (more than {math.exp(finding.thresholds.min_log_bayes_factor):.0f} "
-        "times), although so little of chi2 tells of it that no part of the gap can be given."
+        else f"With {names} the held-out motions are far more likely (more than {odds:.0f} times), although so little "
+        "of chi2 tells of it that no part of the gap can be given."
     ]
     for entry in finding.selected_effects:
         others = [r.label for r in entry.equivalent_effects if r.label != entry.effect.label]
@@ -239,7 +237,8 @@ def _since(found: BaselineComparison, effects: bool) -> str:
     said = "Against the baseline" + (f" of {len(found.baseline_runs)} runs" if several else "")
     if found.changed_parameters:
         moved = (
-            f"{e.name} is {e.current_value:.3g} ± {e.current_std:.2g} {e.unit} where it was {e.baseline_value:.3g} ± {e.baseline_std:.2g}"
+            f"{e.name} is {e.current_value:.3g} ± {e.current_std:.2g} {e.unit} where it was "
+            f"{e.baseline_value:.3g} ± {e.baseline_std:.2g}"
             for e in found.changed_parameters[:4]
         )
         text = f"{said}, {'even with that ' if effects else ''}{', '.join(moved)}."
@@ -249,7 +248,8 @@ def _since(found: BaselineComparison, effects: bool) -> str:
             "no parameter has changed." if seen else "these recordings say nothing of the parameters."
         )
     if several and found.between_runs_p_value < _RUNS_DIFFER_LEVEL:
-        text += f" The runs of the baseline differ among themselves (p = {found.between_runs_p_value:.2g}); their ± is wider for it."
+        p_value = f"p = {found.between_runs_p_value:.2g}"
+        text += f" The runs of the baseline differ among themselves ({p_value}); their ± is wider for it."
     if not found.is_baseline_explained:
         text += (
             " The model did not explain the baseline's recordings, so its ± counts that misfit and may be too small."
@@ -315,8 +315,7 @@ def _out_of_range(effect: EffectBase, fit: RefitModel) -> list[str]:
 
 # -- events ---------------------------------------------------------------------------------------------------------
 
-_MAX_EVENTS_LISTED = 8
-"""Maximum number of events listed one by one."""
+_MAX_EVENTS_LISTED = 8  # maximum number of events listed one by one
 
 
 def _event_sentences(events: EventSet) -> str:
@@ -345,6 +344,7 @@ def _said(event: DisturbanceEvent) -> str:
         when = f"at {0.5 * (event.start_time + event.end_time):.3f} s in {event.recording}"
         return f"{event.channel} is off by {event.peak_value:+.3g} {event.unit} {when}"
     return (
-        f"{event.channel} is pushed by up to {event.peak_value:+.2g} {event.unit} from {event.start_time:.2f} to {event.end_time:.2f} "
-        f"s in {event.recording} ({event.impulse:+.2g} ± {event.impulse_std:.1g} {event.unit} s)"
+        f"{event.channel} is pushed by up to {event.peak_value:+.2g} {event.unit} "
+        f"from {event.start_time:.2f} to {event.end_time:.2f} s in {event.recording} "
+        f"({event.impulse:+.2g} ± {event.impulse_std:.1g} {event.unit} s)"
     )

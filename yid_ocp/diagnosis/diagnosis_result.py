@@ -229,12 +229,12 @@ def threshold_statistics(finding: DiagnosisResult) -> dict[str, Any]:
     dict
         `p_value` and `chi2_per_dof` of the null test (of both residuals together), `largest_channel` (chi2/n of the
         worst channel), `candidate` (p-value of the best, as the best of so many), `evidence` (what unknown forces,
-        offsets and biases raise the log evidence by; not where noise that drives the motion is among them), `gap_closure`
-        and `closure_low` (held out, of all that was added, accepted or not), `rmse_reduction` (part of the held-out error that
-        they take away), `explained` (over what the smoother explains), `assumption_count`, `carried` (standard deviations
-        between the values found and those on the held-out recordings, at most), `penalized_chi2_difference` (of every effect that was
-        refitted alone, the held-out chi2/n that it leaves and how far it is behind the first: in held-out chi2/n with
-        its standard error, and in r'r of all recordings).
+        offsets and biases raise the log evidence by; not where noise that drives the motion is among them), `closure`
+        and `closure_low` (held out, of all that was added, accepted or not), `fall` (part of the held-out error that
+        they take away), `explained` (over what the smoother explains), `assumptions` (how many), `carried` (standard
+        deviations between the values found and those on the held-out recordings, at most), `behind` (of every effect
+        that was refitted alone, the held-out chi2/n that it leaves and how far it is behind the first: in held-out
+        chi2/n with its standard error, and in r'r of all recordings).
     """
     tests = (finding.nominal_test, finding.nominal_held_out_test)
     apart = [

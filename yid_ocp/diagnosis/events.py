@@ -2,8 +2,9 @@
 
 A gap that lives in short windows is no effect of the model. Along prescribed joints whose efforts are compared the
 unknown force is measured minus needed torque, sample by sample; elsewhere it is what the smoother's linear model says
-of the force at one coordinate, everything else as the smoother has it. In both cases `detect_pulses` looks for what rises and
-falls beside a rest that follows the load. What a sensor says for one to three samples alone is an event of that sensor.
+of the force at one coordinate, everything else as the smoother has it. In both cases `detect_pulses` looks for
+what rises and falls beside a rest that follows the load. What a sensor says for one to three samples alone is an event
+of that sensor.
 
 What events explain is taken out before anything else is judged: torques act beside the recorded ones, and samples that
 a prescribed joint or a sensor has in an event's window do not count.
@@ -13,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -45,74 +46,41 @@ Array = NDArray[np.float64]
 _RecordingRollout = tuple[Episode, EpisodePrediction, Array]
 """A recording, its prediction and the parameters theta of that."""
 
-_FORCE_INTERVAL = 0.05
-"""Time over which an unknown force is constant where events are sought [s]."""
-_MAX_SPAN_POINTS = 250
-"""Maximum number of points of a force history processed together."""
-_MAX_WRONG_SAMPLES = 3
-"""Wrong samples in a row; more of them are a gap or a stuck channel."""
-_STENCIL_STEPS = (4, 7, 10)
-"""Distances of the samples through which a smooth course is laid beside a wrong one."""
-_NEIGHBOUR_COUNT = 20
-"""Samples on either side with which one is compared."""
-_MIN_NEIGHBOUR_RATIO = 3.0
-"""Times the largest deviation among its neighbours by which a wrong sample stands out."""
-_MIN_RECURRENCE_OVERLAP = 0.5
-"""Part of the longer of two windows by which they overlap where they are the same time."""
+_FORCE_INTERVAL = 0.05  # time over which an unknown force is constant where events are sought [s]
+_MAX_SPAN_POINTS = 250  # maximum number of points of a force history processed together
+_MAX_WRONG_SAMPLES = 3  # wrong samples in a row; more of them are a gap or a stuck channel
+_STENCIL_STEPS = (4, 7, 10)  # distances of the samples through which a smooth course is laid beside a wrong one
+_NEIGHBOUR_COUNT = 20  # samples on either side with which one is compared
+_MIN_NEIGHBOUR_RATIO = 3.0  # times the largest deviation among its neighbours by which a wrong sample stands out
+_MIN_RECURRENCE_OVERLAP = 0.5  # part of the longer of two windows by which they overlap where they are the same time
 _MAX_RECURRING_FRACTION = 0.5
 """Part of all forces that recur from which those that do are the motion's, which a model has to have."""
-_WRONG_SAMPLE_Z = 8.0
-"""Standard deviations of noise, and robust ones of its neighbours, by which it does."""
+_WRONG_SAMPLE_Z = 8.0  # standard deviations of noise, and robust ones of its neighbours, by which it does
 
 
 @dataclass(frozen=True)
 class DisturbanceEvent:
-    """A brief local disturbance: an external force on one coordinate, or wrong samples of one channel.
-
-    Attributes
-    ----------
-    channel : str
-        Coordinate on which a force acted, or channel that was wrong.
-    kind : "force" or "sample"
-    start_time, end_time : float
-        Since the start of the recording [s].
-    peak_value : float
-        Largest value with its sign, in `unit`: a force beside what the model and the recording have, or measured less
-        true.
-    impulse : float
-        Integral over time [unit x s].
-    impulse_std : float
-        Standard deviation of the impulse, counting what the model is allowed to be wrong by.
-    detected_pulse : DetectedPulse or None
-        Shape of a force.
-    """
+    """A brief local disturbance: an external force on one coordinate, or wrong samples of one channel."""
 
     recording: str
     location: str
-    channel: str
-    kind: str
-    start_time: float
+    channel: str  # coordinate on which a force acted, or channel that was wrong
+    kind: str  # "force" or "sample"
+    start_time: float  # since the start of the recording [s]
     end_time: float
+    # largest value with its sign, in `unit`: a force beside what the model and the recording have, or measured
+    # less true
     peak_value: float
-    impulse: float
-    impulse_std: float
+    impulse: float  # integral over time [unit x s]
+    impulse_std: float  # standard deviation of the impulse, counting what the model is allowed to be wrong by
     unit: str
-    detected_pulse: DetectedPulse | None = None
+    detected_pulse: DetectedPulse | None = None  # shape of a force
 
     def to_dict(self) -> dict[str, Any]:
         """As in result.json."""
-        return {
-            "recording": self.recording,
-            "location": self.location,
-            "channel": self.channel,
-            "kind": self.kind,
-            "from": self.start_time,
-            "to": self.end_time,
-            "impulse": self.impulse,
-            "peak": self.peak_value,
-            "unit": self.unit,
-            "std": self.impulse_std,
-        }
+        keys = {"start_time": "from", "end_time": "to", "peak_value": "peak", "impulse_std": "std"}
+        names = [field.name for field in fields(self) if field.name != "detected_pulse"]
+        return {keys.get(name, name): getattr(self, name) for name in names}
 
 
 @dataclass(frozen=True)
@@ -126,18 +94,13 @@ class Overspeed:
 
 @dataclass(frozen=True)
 class EventForceSeries:
-    """Time series of the unknown force at a coordinate with an event, for plots.
-
-    Attributes
-    ----------
-    t, force, allowed_model_error : ndarray, shape (M,)
-        Since the start of the recording [s]; the force beside what the model and the recording have, each point for
-        itself, and what the model may be wrong by, in `unit`.
-    """
+    """Time series of the unknown force at a coordinate with an event, for plots."""
 
     recording: str
     channel: str
     unit: str
+    # shape (M,): since the start of the recording [s]; the force beside what the model and the recording have,
+    # each point for itself, and what the model may be wrong by, in `unit`
     t: Array
     force: Array
     allowed_model_error: Array
@@ -206,7 +169,7 @@ def find_events(
     Returns
     -------
     EventSet
-        Those that are more than chance among all windows of all recordings, by the false-discovery rate `level`.
+        Those that are more than chance among all windows of all recordings, by the false-discovery rate.
     """
     runs: list[_RecordingRollout] = []
     for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episode_predictions, strict=True)):

@@ -28,10 +28,8 @@ from yid_ocp.problem.recorded_inputs import recorded_sensors
 Array = NDArray[np.float64]
 CandidateChoice = Literal["all"] | Sequence[str]
 
-_BLOCK_DURATION = 1.0
-"""Length of the blocks in which a single recording is split [s]."""
-_MIN_PREDICTED_DURATION = 1.0
-"""Shortest beginning of a held-out recording that is worth predicting [s]."""
+_BLOCK_DURATION = 1.0  # length of the blocks in which a single recording is split [s]
+_MIN_PREDICTED_DURATION = 1.0  # shortest beginning of a held-out recording that is worth predicting [s]
 TRUNCATION_FRACTIONS = (0.9, 0.5, 0.0)
 """Parts of what a model can be rolled out on that are kept, one after the other while it still fails: near its end a
 model is lost already, and a fit on less of the recording may fail earlier."""
@@ -120,19 +118,11 @@ def exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> l
 
 @dataclass(frozen=True)
 class TruncatedRecording:
-    """A held-out recording truncated where the nominal model stops following it.
-
-    Attributes
-    ----------
-    kept_duration : float
-        How much of it is compared [s]; 0 where nothing is.
-    full_duration : float
-        Its length [s].
-    """
+    """A held-out recording truncated where the nominal model stops following it."""
 
     recording: str
-    kept_duration: float
-    full_duration: float
+    kept_duration: float  # how much of it is compared [s]; 0 where nothing is
+    full_duration: float  # its length [s]
 
 
 @dataclass(frozen=True)
@@ -140,21 +130,13 @@ class AllCandidatesProblem:
     """Estimation problem of a system with all candidates, any of which can be freed without recompiling.
 
     Sensors, statics and corrections are differentiated by everything once, recordings are placed on the nodes once, and
-    the tracking filter is that of the nominal start, the same for every hypothesis.
+    the tracking filter is that of the nominal start, the same for every hypothesis."""
 
-    Attributes
-    ----------
-    problem : EstimationProblem
-        Of the system with all candidates at their neutral values; frees the nominal parameters.
-    candidate_effects : tuple of EffectBase
-        The candidates that are tried: all of the system's that are neutral, but for those left out.
-    is_split_in_blocks : bool
-        Whether a single recording is both estimated on and held out, in alternate blocks.
-    """
-
+    # of the system with all candidates at their neutral values; frees the nominal parameters
     problem: EstimationProblem
+    # the candidates that are tried: all of the system's that are neutral, but for those left out
     candidate_effects: tuple[EffectBase, ...]
-    is_split_in_blocks: bool
+    is_split_in_blocks: bool  # whether a single recording is both estimated on and held out, in alternate blocks
 
     @staticmethod
     def from_problem(
@@ -237,7 +219,7 @@ class AllCandidatesProblem:
     def held_out_relinearized(
         self, own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]
     ) -> EstimationProblem:
-        """Return a `relinearized_with_effects` problem with the held-out recordings relinearised too, once at the end of a fit."""
+        """Return a `relinearized_with_effects` problem with held-out recordings relinearised too, after a fit."""
         return held_out_relinearized_at_torque_bias(own, *_beside(own, effects, at)) if own.has_process_noise else own
 
 

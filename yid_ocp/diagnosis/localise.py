@@ -15,10 +15,8 @@ from yid_ocp.model.system import System
 
 Array = NDArray[np.float64]
 
-_MIN_NAMED_SHARE = 0.1
-"""Share of the gap from which a place is named."""
-_MAX_NAMED_LOCATIONS = 3
-"""Places that are named at most."""
+_MIN_NAMED_SHARE = 0.1  # share of the gap from which a place is named
+_MAX_NAMED_LOCATIONS = 3  # places that are named at most
 
 
 @dataclass(frozen=True)

@@ -39,27 +39,19 @@ from yid_ocp.problem.signal_filters import effort_filter
 
 Array = NDArray[np.float64]
 
-_STANDSTILL_SPEED = 0.1
-"""Speed below which static friction may act [rad/s or m/s]."""
+_STANDSTILL_SPEED = 0.1  # speed below which static friction may act [rad/s or m/s]
 
 
 @dataclass(frozen=True)
 class TorqueTermSizes:
-    """Magnitude of the inverse dynamics terms of every coordinate at some nodes of a rollout.
+    """Magnitude of the inverse dynamics terms of every coordinate at some nodes of a rollout."""
 
-    Attributes
-    ----------
-    rss_torque : ndarray, shape (M, n)
-        Root of the sum of squares of inertia (of every joint's acceleration by itself), Coriolis and centrifugal
-        forces, gravity, springs, friction, effects' forces and the torque that was applied or needed [N m or N].
-    torque_rate : ndarray, shape (M, n)
-        Of the torque needed [N m/s or N/s].
-    static_friction_limit : ndarray, shape (M, n)
-        What friction may hold at rest, gone above `_STANDSTILL_SPEED` [N m or N].
-    """
-
+    # shape (M, n): root of the sum of squares of inertia (of every joint's acceleration by itself), Coriolis
+    # and centrifugal forces, gravity, springs, friction, effects' forces and the torque that was applied or
+    # needed [N m or N]
     rss_torque: Array
-    torque_rate: Array
+    torque_rate: Array  # shape (M, n): of the torque needed [N m/s or N/s]
+    # shape (M, n): what friction may hold at rest, gone above `_STANDSTILL_SPEED` [N m or N]
     static_friction_limit: Array
 
 
@@ -137,14 +129,10 @@ _MODEL_ERROR_TIME, _SLOW_FORCE_TIME = 0.3, 2.0
 """Times in which the error of a model and the rest forget their values, a and b [s]."""
 _MODEL_ERROR_FACTORS, _NOISE_FLOOR_FACTORS, _SLOW_FORCE_FACTORS = (1.0, 2.0, 4.0), (0.0, 0.5, 1.0), (0.25, 1.0)
 """c, w in units of the robust spread of the history, s in units of its root mean square."""
-_MIN_PULSE_POINTS = 2.5
-"""Points that the shortest pulse covers."""
-_WINDOW_GROWTH = 1.25
-"""From one length of a window to the next."""
-_FLAT_RAMP_FRACTION = 0.5
-"""Part of a flat pulse in which it rises and falls."""
-_MAX_PROFILES = 12
-"""Pulses and what is like them in one history."""
+_MIN_PULSE_POINTS = 2.5  # points that the shortest pulse covers
+_WINDOW_GROWTH = 1.25  # from one length of a window to the next
+_FLAT_RAMP_FRACTION = 0.5  # part of a flat pulse in which it rises and falls
+_MAX_PROFILES = 12  # pulses and what is like them in one history
 MAX_EVENT_TIME_FRACTION = 1 / 3
 """Part of the time from which forces in short windows are none of events: the model errs everywhere."""
 _MIN_PROMINENCE_RATIO = 1.5
@@ -156,35 +144,18 @@ _MAX_PULSE_RANGE_RATIO = 1.5
 
 @dataclass(frozen=True)
 class ForceEstimate:
-    """Gaussian log likelihood of an unknown force at one location over time, g'f - f'L f / 2.
-
-    Attributes
-    ----------
-    recording, location, coordinate, unit : str
-        `coordinate` is the coordinate.
-    t : ndarray, shape (M,)
-        Since the start of the recording, evenly spaced [s].
-    score : ndarray, shape (M,)
-        g
-    information : ndarray, shape (M, M)
-        L
-    model_error_std : ndarray, shape (M,)
-        m, in `unit`.
-    friction_limit : ndarray, shape (M,)
-        h, in `unit`.
-    filter_cutoff : float
-        Of the filter through which a force at these points is seen [Hz]; infinite for none.
-    """
+    """Gaussian log likelihood of an unknown force at one location over time, g'f - f'L f / 2."""
 
     recording: str
     location: str
     coordinate: str
     unit: str
-    t: Array
-    score: Array
-    information: Array
-    model_error_std: Array
-    friction_limit: Array
+    t: Array  # shape (M,): since the start of the recording, evenly spaced [s]
+    score: Array  # shape (M,): g
+    information: Array  # shape (M, M): L
+    model_error_std: Array  # shape (M,): m, in `unit`
+    friction_limit: Array  # shape (M,): h, in `unit`
+    # of the filter through which a force at these points is seen [Hz]; infinite for none
     filter_cutoff: float = math.inf
 
     @property
@@ -207,28 +178,14 @@ class ForceEstimate:
 
 @dataclass(frozen=True)
 class DetectedPulse:
-    """A force pulse that rises and falls within a time window.
+    """A force pulse that rises and falls within a time window."""
 
-    Attributes
-    ----------
-    start_time, end_time : float
-        [s]
-    peak_value : float
-        Largest value, with its sign, in the history's unit.
-    is_flat_topped : bool
-        Whether it stays at its size for half of the time; else it is a sine squared.
-    peak_std : float
-        Standard deviation of the size, counting the rest.
-    p_value : float
-        Of an evidence raised so far by chance in one window.
-    """
-
-    start_time: float
+    start_time: float  # [s]
     end_time: float
-    peak_value: float
-    is_flat_topped: bool
-    peak_std: float
-    p_value: float
+    peak_value: float  # largest value, with its sign, in the history's unit
+    is_flat_topped: bool  # whether it stays at its size for half of the time; else it is a sine squared
+    peak_std: float  # standard deviation of the size, counting the rest
+    p_value: float  # of an evidence raised so far by chance in one window
 
     @property
     def unit_impulse(self) -> float:
@@ -377,7 +334,7 @@ def detect_pulses(history: ForceEstimate, limits: Thresholds = DEFAULT_THRESHOLD
     Parameters
     ----------
     limits : Thresholds
-        `worth` is the rise of the log evidence from which a pulse is looked at, `pulse` the length of the longest.
+        `min_log_bayes_factor` is the rise of the log evidence from which a pulse is looked at.
 
     Returns
     -------
@@ -498,7 +455,7 @@ def _other(history: ForceEstimate, rest: _Rest, window: _Windows, seen: _Filter)
 def _stands_out(
     history: ForceEstimate, bare: _Rest, rest: _Rest, window: _Windows, seen: _Filter, longest: float
 ) -> bool:
-    """Whether a pulse is shorter than the longest, larger than what the history holds everywhere, and there to be seen."""
+    """Whether a pulse is shorter than the longest, larger than what is everywhere in the history, and seen."""
     begin, end = float(window.begin[0]), float(window.end[0])
     length, own = end - begin, seen(window, history.t)
     # at either bound its length is not found but cut off: jumps of friction are shorter, errors of the model longer

@@ -42,21 +42,14 @@ _RELINEARIZE_Z = 1.0
 
 @dataclass(frozen=True)
 class HeldOutLoss:
-    """Whitened squared prediction error of a model on the held-out recordings, by block of time.
+    """Whitened squared prediction error of a model on the held-out recordings, by block of time."""
 
-    Attributes
-    ----------
-    block_chi2, block_sample_counts : ndarray, shape (nb,)
-        Sum of whitened squares and number of samples of every block; infinite where a rollout failed.
-    channel_rmse : dict of channel to (float, str)
-        Root mean square error and its unit.
-    baseline_chi2 : float
-        Squares by which the parameters contradict a baseline; other recordings say that, whatever blocks are drawn.
-    """
-
+    # shape (nb,): sum of whitened squares and number of samples of every block; infinite where a rollout failed
     block_chi2: Array
     block_sample_counts: Array
-    channel_rmse: dict[str, tuple[float, str]]
+    channel_rmse: dict[str, tuple[float, str]]  # root mean square error and its unit
+    # squares by which the parameters contradict a baseline; other recordings say that, whatever blocks are
+    # drawn
     baseline_chi2: float = 0.0
 
     @property
@@ -72,36 +65,18 @@ class HeldOutLoss:
 
 @dataclass(frozen=True)
 class RefitModel:
-    """The nominal model with some effects, fitted again, with its standard deviations and held-out loss.
-
-    Attributes
-    ----------
-    problem : EstimationProblem
-        Of the composed system, with the nominal parameters and those of the effects free.
-    values : dict of str to float
-        Unknowns.
-    std : dict of str to float
-        Their standard deviations; see `_refit_covariance`.
-    amplitude_std : dict of str to float
-        Of the effects' amplitudes, with their shapes held; see `amplitude_std`.
-    held_out_loss : HeldOutLoss
-        Held-out.
-    solver_message : str
-        Why the solver ended.
-    is_from_store : bool
-        Whether it comes from a store instead of the solver.
-    """
+    """The nominal model with some effects, fitted again, with its standard deviations and held-out loss."""
 
     effects: tuple[EffectBase, ...]
-    problem: EstimationProblem
-    values: dict[str, float]
-    std: dict[str, float]
-    amplitude_std: dict[str, float]
+    problem: EstimationProblem  # of the composed system, with the nominal parameters and those of the effects free
+    values: dict[str, float]  # unknowns
+    std: dict[str, float]  # their standard deviations; see `_refit_covariance`
+    amplitude_std: dict[str, float]  # of the effects' amplitudes, with their shapes held; see `amplitude_std`
     cost: float
     evaluation: Evaluation
-    held_out_loss: HeldOutLoss
-    solver_message: str
-    is_from_store: bool = False
+    held_out_loss: HeldOutLoss  # held-out
+    solver_message: str  # why the solver ended
+    is_from_store: bool = False  # whether it comes from a store instead of the solver
 
     @property
     def effect_parameter_count(self) -> int:
@@ -115,19 +90,11 @@ class RefitModel:
 
 @dataclass(frozen=True)
 class StoredFit:
-    """The result of a refit as stored: one evaluation restores its `RefitModel`.
+    """The result of a refit as stored: one evaluation restores its `RefitModel`."""
 
-    Attributes
-    ----------
-    values, std : dict of str to float
-        Of every unknown.
-    amplitude_std : dict of str to float
-        Of amplitudes; see `RefitModel`.
-    """
-
-    values: dict[str, float]
+    values: dict[str, float]  # of every unknown
     std: dict[str, float]
-    amplitude_std: dict[str, float]
+    amplitude_std: dict[str, float]  # of amplitudes; see `RefitModel`
     solver_message: str
 
 
@@ -145,33 +112,20 @@ class RefitStore(Protocol):
 
 @dataclass(frozen=True)
 class KnownFits:
-    """What is known before a diagnosis begins.
+    """What is known before a diagnosis begins."""
 
-    Attributes
-    ----------
-    solution : Solution, optional
-        Of the nominal problem.
-    store : RefitStore, optional
-        Of refits that an earlier run of the same diagnosis finished; told of every further one.
-    """
-
-    solution: Solution | None = None
+    solution: Solution | None = None  # of the nominal problem
+    # of refits that an earlier run of the same diagnosis finished; told of every further one
     store: RefitStore | None = None
 
 
 @dataclass(frozen=True)
 class RefitContext:
-    """Problem, thresholds, progress and store shared by all refits of one diagnosis.
-
-    Attributes
-    ----------
-    progress : Progress
-        Told what is going on.
-    """
+    """Problem, thresholds, progress and store shared by all refits of one diagnosis."""
 
     problem: AllCandidatesProblem
     thresholds: Thresholds
-    progress: Progress
+    progress: Progress  # told what is going on
     store: RefitStore | None = None
 
 

@@ -33,84 +33,45 @@ from yid_ocp.inference.null_test import ResidualChannel, residual_channels
 
 Array = NDArray[np.float64]
 
-_DECREASE_RTOL = 1e-6
-"""Relative difference of promised decreases that rounding can make."""
+_DECREASE_RTOL = 1e-6  # relative difference of promised decreases that rounding can make
 
 
 @dataclass(frozen=True)
 class EffectSignature:
-    """First-order change of the residual by the amplitudes of a candidate.
-
-    Attributes
-    ----------
-    shape_values : dict of str to float
-        Values of its shape parameters.
-    projected_sensitivity : ndarray, shape (nr, p)
-        P J_j, by its amplitudes.
-    score_noise_covariance : ndarray, shape (p, p)
-        Covariance of `columns'` r under the noise's own colour.
-    """
+    """First-order change of the residual by the amplitudes of a candidate."""
 
     effect: EffectBase
-    shape_values: dict[str, float]
-    projected_sensitivity: Array
-    score_noise_covariance: Array
+    shape_values: dict[str, float]  # values of its shape parameters
+    projected_sensitivity: Array  # shape (nr, p): P J_j, by its amplitudes
+    score_noise_covariance: Array  # shape (p, p): covariance of `columns'` r under the noise's own colour
 
 
 @dataclass(frozen=True)
 class CandidateLinearization:
-    """Residual and signatures of all candidates, linearised at one point.
+    """Residual and signatures of all candidates, linearised at one point."""
 
-    Attributes
-    ----------
-    projected_residual : ndarray, shape (nr,)
-        P r.
-    signatures : tuple of EffectSignature
-        One for each candidate and grid value.
-    parameter_values : dict of str to float
-        Where it was taken.
-    """
-
-    projected_residual: Array
-    signatures: tuple[EffectSignature, ...]
-    parameter_values: dict[str, float]
+    projected_residual: Array  # shape (nr,): P r
+    signatures: tuple[EffectSignature, ...]  # one for each candidate and grid value
+    parameter_values: dict[str, float]  # where it was taken
 
 
 @dataclass(frozen=True)
 class CandidateDetectability:
-    """Smallest detectable amplitudes of a candidate, from sensitivity and noise alone.
-
-    Attributes
-    ----------
-    detectable_amplitudes : dict of amplitude to float
-        Smallest value that would be noticed, in the parameter's unit.
-    is_detectable : bool
-        Whether one of them lies within the range that an engineer would expect.
-    """
+    """Smallest detectable amplitudes of a candidate, from sensitivity and noise alone."""
 
     effect: EffectBase
-    detectable_amplitudes: dict[str, float]
-    is_detectable: bool
+    detectable_amplitudes: dict[str, float]  # smallest value that would be noticed, in the parameter's unit
+    is_detectable: bool  # whether one of them lies within the range that an engineer would expect
 
 
 @dataclass(frozen=True)
 class CandidateScore:
-    """Score test (Lagrange multiplier) of a candidate on the residual.
-
-    Attributes
-    ----------
-    predicted_values : dict of str to float
-        Amplitudes to which the linear model would go, and the shape values.
-    predicted_chi2_decrease : float
-        Promised decrease of r'r.
-    lm_statistic : float
-        LM with robust covariance.
-    """
+    """Score test (Lagrange multiplier) of a candidate on the residual."""
 
     effect: EffectBase
-    predicted_values: dict[str, float]
-    predicted_chi2_decrease: float
-    lm_statistic: float
+    predicted_values: dict[str, float]  # amplitudes to which the linear model would go, and the shape values
+    predicted_chi2_decrease: float  # promised decrease of r'r
+    lm_statistic: float  # LM with robust covariance
     p_value: float
 
 
@@ -192,7 +153,7 @@ def _basis(matrix: Array) -> Array:
 def candidate_detectability(
     point: CandidateLinearization, detection_z: float = DEFAULT_THRESHOLDS.detection_z
 ) -> tuple[CandidateDetectability, ...]:
-    """Return the detectability of every candidate: amplitudes of `detection_z` standard deviations, from J and noise."""
+    """Return the detectability of every candidate: amplitudes of `detection_z` standard deviations."""
     found: dict[str, CandidateDetectability] = {}
     for signature in point.signatures:
         effect = signature.effect
@@ -327,15 +288,11 @@ def _values(effect: EffectBase, step: Array) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class ConfusabilityMatrix:
-    """Fractions of each candidate's signature that the others explain.
-
-    Attributes
-    ----------
-    overlap_fractions : ndarray, shape (nj, nj)
-        Fraction of row j's signature that column i's can explain, beyond what the nominal parameters can.
-    """
+    """Fractions of each candidate's signature that the others explain."""
 
     labels: tuple[str, ...]
+    # shape (nj, nj): fraction of row j's signature that column i's can explain, beyond what the nominal
+    # parameters can
     overlap_fractions: Array
 
     def confusable_with(self, label: str, limit: float) -> tuple[str, ...]:
@@ -346,41 +303,22 @@ class ConfusabilityMatrix:
 
 @dataclass(frozen=True)
 class CandidatePair:
-    """First-order decrease of the residual by two candidates together.
-
-    Attributes
-    ----------
-    predicted_values : dict of str to float
-        Amplitudes to which the linear model would go, and the shape values.
-    predicted_chi2_decrease : float
-        Promised decrease of r'r.
-    penalized_chi2_decrease : float
-        The decrease beyond what chance alone brings by so many amplitudes.
-    """
+    """First-order decrease of the residual by two candidates together."""
 
     effects: tuple[EffectBase, EffectBase]
-    predicted_values: dict[str, float]
-    predicted_chi2_decrease: float
-    penalized_chi2_decrease: float
+    predicted_values: dict[str, float]  # amplitudes to which the linear model would go, and the shape values
+    predicted_chi2_decrease: float  # promised decrease of r'r
+    penalized_chi2_decrease: float  # the decrease beyond what chance alone brings by so many amplitudes
 
 
 @dataclass(frozen=True)
 class JointScores:
-    """Joint linear model of the residual in the amplitudes of all candidates, each at one shape value.
-
-    Attributes
-    ----------
-    shape_values : tuple of dict of str to float
-    information : ndarray, shape (n, n)
-        X'X of all signatures side by side.
-    score_vector : ndarray, shape (n,)
-        -X'r.
-    """
+    """Joint linear model of the residual in the amplitudes of all candidates, each at one shape value."""
 
     effects: tuple[EffectBase, ...]
     shape_values: tuple[dict[str, float], ...]
-    information: Array
-    score_vector: Array
+    information: Array  # shape (n, n): X'X of all signatures side by side
+    score_vector: Array  # shape (n,): -X'r
 
     @property
     def effect_columns(self) -> list[slice]:
@@ -453,16 +391,10 @@ def confusability_matrix(everything: JointScores) -> ConfusabilityMatrix:
 
 @dataclass(frozen=True)
 class ScreeningResult:
-    """Detectability, scores and confusability of all candidates at one point.
-
-    Attributes
-    ----------
-    candidate_scores : tuple of CandidateScore
-        Best first.
-    """
+    """Detectability, scores and confusability of all candidates at one point."""
 
     detectability: tuple[CandidateDetectability, ...]
-    candidate_scores: tuple[CandidateScore, ...]
+    candidate_scores: tuple[CandidateScore, ...]  # best first
     confusability: ConfusabilityMatrix
     joint_scores: JointScores
 

@@ -34,8 +34,7 @@ from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
 from yid_ocp.inference.uncertainty import CHI2_95_TWO_SIDED
 
-_N_BOOTSTRAP = 1000
-"""Draws of held-out blocks for the interval of a closure."""
+_N_BOOTSTRAP = 1000  # draws of held-out blocks for the interval of a closure
 
 
 @dataclass(frozen=True)
@@ -53,22 +52,12 @@ class GapClosure:
 
 @dataclass(frozen=True)
 class SelectedEffect:
-    """An effect added by the selection, with the refitted model of its round.
-
-    Attributes
-    ----------
-    refitted_model : RefitModel
-        With all effects up to this one.
-    cumulative_closure : GapClosure
-        Of the whole gap by all effects up to this one.
-    equivalent_effects : tuple of EffectBase
-        Effects that the data cannot tell from this one, the chosen one first.
-    """
+    """An effect added by the selection, with the refitted model of its round."""
 
     effect: EffectBase
-    refitted_model: RefitModel
-    cumulative_closure: GapClosure
-    equivalent_effects: tuple[EffectBase, ...]
+    refitted_model: RefitModel  # with all effects up to this one
+    cumulative_closure: GapClosure  # of the whole gap by all effects up to this one
+    equivalent_effects: tuple[EffectBase, ...]  # effects that the data cannot tell from this one, the chosen one first
 
 
 def gap_closure(
@@ -89,7 +78,7 @@ def gap_closure(
 
 
 def _lr_decisive(before: HeldOutLoss, after: HeldOutLoss, limits: Thresholds = DEFAULT_THRESHOLDS) -> bool:
-    """Whether the held-out log likelihood ratio favours `after` by more than `worth`, if both models leave only noise."""
+    """Whether the held-out log likelihood ratio favours `after` decisively, if both models leave only noise."""
     return (
         _noise_is_left(limits, before, after) and _squares(before) - _squares(after) > 2 * limits.min_log_bayes_factor
     )
@@ -154,7 +143,7 @@ def _lr_equivalent(fit: RefitModel, other: RefitModel, limits: Thresholds = DEFA
 
 
 def _lr_rejects(fit: RefitModel, other: RefitModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> bool:
-    """Whether the log likelihood ratio over all recordings rejects `fit` against `other` by more than `worth`."""
+    """Whether the log likelihood ratio over all recordings rejects `fit` against `other` decisively."""
     return (
         _noise_is_left(limits, fit.held_out_loss, other.held_out_loss)
         and penalized_chi2_difference(fit, other) > 2 * limits.min_log_bayes_factor
@@ -200,7 +189,7 @@ def _is_shape_outside_prior(
     limits: Thresholds = DEFAULT_THRESHOLDS,
     std: Mapping[str, float] | None = None,
 ) -> bool:
-    """Whether a shape parameter lies outside its prior range by more than `shape_range_factor` or `prior_range_margin` widths."""
+    """Whether a shape parameter lies outside its prior range by `shape_range_factor` or `prior_range_margin` widths."""
     for name in effect.shape_names:
         low, high = effect.prior_ranges[name]
         room = limits.prior_range_margin * (high - low)
@@ -225,13 +214,13 @@ def _is_amplitude_outside_prior(
 
 
 def _is_significant(effect: EffectBase, fit: RefitModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> bool:
-    """Whether any amplitude is at least `away` standard deviations from neutral."""
+    """Whether any amplitude is at least `min_z` standard deviations from neutral."""
     neutral, std = effect.neutral_values, fit.amplitude_std
     return any(abs(fit.values[n] - neutral[n]) >= limits.min_z * std.get(n, 0.0) for n in effect.amplitude_names)
 
 
 def _is_rmse_reduced(before: HeldOutLoss, after: HeldOutLoss, limits: Thresholds = DEFAULT_THRESHOLDS) -> bool:
-    """Whether the held-out error, of all channels or of any one, is reduced by at least the fraction `min_rmse_reduction`."""
+    """Whether the held-out error, of all channels or of any one, is reduced by the fraction `min_rmse_reduction`."""
     if _lr_decisive(before, after, limits) or not np.isfinite(before.chi2_per_sample):
         return True
     return rmse_reduction(before, after) >= limits.min_rmse_reduction
@@ -376,7 +365,7 @@ def _fits_of_round(
     places: Sequence[str],
     moved: bool,
 ) -> list[RefitModel]:
-    """Refits of a round: candidates beside the effects so far, likely pairs instead of a single one; see `select_effects`.
+    """Refits of a round: candidates beside the effects so far, and likely pairs instead of a single one.
 
     `screened` holds all candidates at the nominal fit and beside the effects so far.
     """

@@ -16,38 +16,28 @@ from yid_ocp.diagnosis.refit import RefitContext, RefitModel, refit_with_effects
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EffectBase
 
-_DISAGREEMENT_Z = 2.0
-"""Standard deviations beyond which two fits disagree."""
+_DISAGREEMENT_Z = 2.0  # standard deviations beyond which two fits disagree
 
 
 @dataclass(frozen=True)
 class TransferCheck:
-    """One parameter of an effect, estimated on the estimation recordings and again on the held-out ones.
-
-    Attributes
-    ----------
-    estimation_value, estimation_std : float
-        On the recordings to estimate on.
-    held_out_value, held_out_std : float
-        On the held-out ones.
-    """
+    """One parameter of an effect, estimated on the estimation recordings and again on the held-out ones."""
 
     effect_label: str
     parameter: str
     unit: str
-    estimation_value: float
+    estimation_value: float  # on the recordings to estimate on
     estimation_std: float
-    held_out_value: float
+    held_out_value: float  # on the held-out ones
     held_out_std: float
     is_consistent: bool
 
     @property
     def disagreement(self) -> str:
         """Both estimates, in words."""
-        return (
-            f"{self.effect_label}.{self.parameter} is {self.estimation_value:.3g} ± {self.estimation_std:.2g} {self.unit} "
-            f"on the recordings to estimate on and {self.held_out_value:.3g} ± {self.held_out_std:.2g} on the held-out ones"
-        )
+        here = f"{self.estimation_value:.3g} ± {self.estimation_std:.2g} {self.unit} on the recordings to estimate on"
+        there = f"{self.held_out_value:.3g} ± {self.held_out_std:.2g} on the held-out ones"
+        return f"{self.effect_label}.{self.parameter} is {here} and {there}"
 
 
 def check_transfer(search: RefitContext, fit: RefitModel) -> tuple[TransferCheck, ...]:
@@ -99,9 +89,9 @@ def _compare_amplitudes(
 def inflate_std_by_disagreement(fit: RefitModel, entries: Sequence[TransferCheck]) -> RefitModel:
     """Return the fit with amplitude standard deviations inflated by the disagreement between the recordings.
 
-    What a model misses of all of a recording its residual does not show: where two fits differ by more than `_DISAGREEMENT_Z`
-    standard deviations of both together, each is known to the spread of the two, their difference over the square root
-    of two.
+    What a model misses of all of a recording its residual does not show: where two fits differ by more than
+    `_DISAGREEMENT_Z` standard deviations of both together, each is known to the spread of the two, their difference over
+    the square root of two.
     """
     std = dict(fit.std)
     for entry in entries:

@@ -112,9 +112,9 @@ def find_unknown_reason(
 ) -> UnknownReason:
     """Return why a gap has no accepted effect; empty if it has one.
 
-    Effects have to explain the part `required_explained_fraction` of what the smoother explains where the model was fitted. One that
-    single assumption also passes if the lower 95 % bound of its held-out closure reaches `explained`. Of
-    several each further assumption has to explain at least the part `explained` of what could be left: two or three
+    Effects have to explain the part `required_explained_fraction` of what the smoother explains where the model was
+    fitted; a single assumption passes too where the lower 95 % bound of its held-out closure reaches
+    `min_explained_fraction`. Each further assumption has to explain that part of what could be left: two or three
     together imitate almost anything, but only in part.
     """
     if not added:

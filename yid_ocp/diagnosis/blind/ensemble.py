@@ -49,26 +49,17 @@ CATEGORY_SHARES: Mapping[str, float] = {
 """Fraction of the cases in every category."""
 ENSEMBLE_PURPOSES = ("report", "calibration")
 """Purposes of an ensemble; the same seed draws different cases for each."""
-_MIN_CASES_PER_EXPERIMENT = 3
-"""Cases below which an experiment is not worth its compiled step."""
+_MIN_CASES_PER_EXPERIMENT = 3  # cases below which an experiment is not worth its compiled step
 
 
 @dataclass(frozen=True)
 class PlannedCase:
-    """A planned case: experiment, category and effect size.
-
-    Attributes
-    ----------
-    category : str
-        Of `CATEGORY_SHARES`.
-    multiple : float, optional
-        Of the detectable size; None where that has no meaning.
-    """
+    """A planned case: experiment, category and effect size."""
 
     number: int
     experiment: str
-    category: str
-    multiple: float | None
+    category: str  # of `CATEGORY_SHARES`
+    multiple: float | None  # of the detectable size; None where that has no meaning
 
 
 def plan_cases(
@@ -83,7 +74,7 @@ def plan_cases(
     Parameters
     ----------
     weights : mapping of experiment to float
-        How large a part of the cases each gets; those that would get fewer than `_MIN_CASES_PER_EXPERIMENT` get none, but for the largest.
+        How large a part of the cases each gets; fewer than `_MIN_CASES_PER_EXPERIMENT` are none, but for the largest.
     chains : frozenset of str
         Experiments whose object can be made of finer links.
     purpose : str
@@ -136,8 +127,7 @@ Array = NDArray[np.float64]
 
 MAX_CASE_DRAWS = 64
 """Motions, objects and effects drawn for a case until one can be simulated; of 300, one was given up after eight."""
-_STIFFNESS_SPREAD_FACTOR = 1.5
-"""Factor by which true stiffnesses lie above or below the problem's start, at most."""
+_STIFFNESS_SPREAD_FACTOR = 1.5  # factor by which true stiffnesses lie above or below the problem's start, at most
 _OUT_OF_LIBRARY_SIZES: Mapping[str, tuple[str, float, float, str]] = {
     "torque_ripple": ("joint", 0.5, 2.0, ""),
     "saturating_drive": ("joint", 0.75, 0.9, "torque"),
@@ -161,26 +151,14 @@ _GRIPPER_TRAVEL, _SHARED_GRIPPER_TRAVEL = 0.15, 0.08
 
 @dataclass(frozen=True)
 class CaseLabel:
-    """True effects and parameters of a case, sealed until scoring.
-
-    Attributes
-    ----------
-    category : str
-        null, single, pair, outside, left_out or finer_chain.
-    multiple : float, optional
-        Of the detectable size, as made; None where that has no meaning.
-    truth : dict of str to float
-        Nominal parameters.
-    experiment : str
-        In which it was made.
-    """
+    """True effects and parameters of a case, sealed until scoring."""
 
     case: str
-    category: str
+    category: str  # null, single, pair, outside, left_out or finer_chain
     injected: tuple[InjectedEffect, ...]
-    multiple: float | None
-    truth: Mapping[str, float]
-    experiment: str = ""
+    multiple: float | None  # of the detectable size, as made; None where that has no meaning
+    truth: Mapping[str, float]  # nominal parameters
+    experiment: str = ""  # in which it was made
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON."""
@@ -196,17 +174,12 @@ class CaseLabel:
 
 @dataclass(frozen=True)
 class BlindCase:
-    """Recordings and candidate exclusions of a case, as given to the diagnosis.
-
-    Attributes
-    ----------
-    excluded_kinds : tuple of str
-        Kinds that are left out of the library; mostly one that has nothing to do with the case.
-    """
+    """Recordings and candidate exclusions of a case, as given to the diagnosis."""
 
     name: str
     estimation_recordings: tuple[Recording, ...]
     held_out_recording: Recording
+    # kinds that are left out of the library; mostly one that has nothing to do with the case
     excluded_kinds: tuple[str, ...]
 
 
@@ -231,41 +204,23 @@ def open_sealed_labels(text: str, commitment: str) -> list[CaseLabel]:
 
 @dataclass(frozen=True)
 class RecordingConditions:
-    """Settings of the synthetic recordings of an experiment.
+    """Settings of the synthetic recordings of an experiment."""
 
-    Attributes
-    ----------
-    estimation_count : int
-        To estimate on; one more is held out.
-    simulation : SimulationOptions
-        Duration of each, and the engine's step.
-    has_camera : bool
-        Whether a camera sees the object.
-    purpose : str
-        Of `ENSEMBLE_PURPOSES`.
-    """
-
-    estimation_count: int = 1
+    estimation_count: int = 1  # to estimate on; one more is held out
     arm_noise: ArmSensorNoise = field(default_factory=ArmSensorNoise)
-    simulation: SimulationOptions = field(default_factory=SimulationOptions)
-    has_camera: bool = False
-    purpose: str = ENSEMBLE_PURPOSES[0]
+    simulation: SimulationOptions = field(default_factory=SimulationOptions)  # duration of each, and the engine's step
+    has_camera: bool = False  # whether a camera sees the object
+    purpose: str = ENSEMBLE_PURPOSES[0]  # of `ENSEMBLE_PURPOSES`
 
 
 @dataclass(frozen=True)
 class DetectableEffect:
-    """Sensitivity of an experiment to an effect, which gives its detectable size.
-
-    Attributes
-    ----------
-    shape_values : dict of str to float
-        Values of its shape parameters.
-    sensitivity_factor : ndarray, shape (p, p)
-        |columns a| is by how many standard deviations of the data the amplitudes a move the residual.
-    """
+    """Sensitivity of an experiment to an effect, which gives its detectable size."""
 
     effect: EffectBase
-    shape_values: Mapping[str, float]
+    shape_values: Mapping[str, float]  # values of its shape parameters
+    # shape (p, p): |columns a| is by how many standard deviations of the data the amplitudes a move the
+    # residual
     sensitivity_factor: Array
 
     @staticmethod

@@ -22,35 +22,13 @@ _FORMAT = "yid-blind/1"
 _CATEGORIES = tuple(CATEGORY_SHARES)
 OUT_OF_LIBRARY_CATEGORIES = ("outside", "left_out")
 """Categories whose true effect is not among the candidates."""
-_MAX_CONFUSABLE_SET = 3
-"""Largest confusable set that counts as correct."""
+_MAX_CONFUSABLE_SET = 3  # largest confusable set that counts as correct
 _VERDICTS = ("no_gap", "unknown", "insufficient_data", "effect", "confusable")
 
 
 @dataclass(frozen=True)
 class CaseScore:
-    """Score of one diagnosis against its label.
-
-    Attributes
-    ----------
-    gap : bool
-        Whether a gap was reported.
-    kind_first, kind_second, location_first : bool
-        The true kind at the true place is first, or among the first two, of the candidates; the true place comes first.
-    confusable : tuple of str
-        Set that was named as not separable.
-    right : bool
-        As the verdict asks: no_gap of a clean one, the true effect alone or in a set of at most three, each of a pair
-        likewise, unknown at the right place outside the library.
-    closure, best : float
-        Held out, of what was added and of the true effects refitted.
-    errors : dict of str to (float, bool)
-        Relative error of every parameter of the true effect where it was added, and whether its 95 % interval has it.
-    z : mapping of str to float
-        (estimate - truth)/std of the same parameters.
-    p_value : float
-        Of the null test on the held-out recordings.
-    """
+    """Score of one diagnosis against its label."""
 
     case: str
     category: str
@@ -58,19 +36,25 @@ class CaseScore:
     verdict: str
     answer: str
     multiple: float
-    gap: bool
+    gap: bool  # whether a gap was reported
+    # the true kind at the true place is first, or among the first two, of the candidates; the true place comes
+    # first
     kind_first: bool
     kind_second: bool
     location_first: bool
-    confusable: tuple[str, ...]
+    confusable: tuple[str, ...]  # set that was named as not separable
+    # as the verdict asks: no_gap of a clean one, the true effect alone or in a set of at most three, each of a
+    # pair likewise, unknown at the right place outside the library
     right: bool
-    closure: float
+    closure: float  # held out, of what was added and of the true effects refitted
     best: float
+    # relative error of every parameter of the true effect where it was added, and whether its 95 % interval has
+    # it
     errors: Mapping[str, tuple[float, bool]] = field(default_factory=dict)
     seconds: float = math.nan
     experiment: str = ""
-    z: Mapping[str, float] = field(default_factory=dict)
-    p_value: float = math.nan
+    z: Mapping[str, float] = field(default_factory=dict)  # (estimate - truth)/std of the same parameters
+    p_value: float = math.nan  # of the null test on the held-out recordings
 
     @property
     def named(self) -> tuple[str, ...]:
@@ -155,7 +139,7 @@ def score_case(
 
 
 def _found(true: Sequence[str], named: Sequence[str], groups: Sequence[tuple[str, ...]]) -> bool:
-    """Whether every true effect has one of its own among those named: itself, or one in a set of at most `_MAX_CONFUSABLE_SET` with it."""
+    """Whether every true effect has one of its own among those named: itself, or one in a small set with it."""
     if not true:
         return True
     sets = [
@@ -267,8 +251,7 @@ def _calibration_rates(marks: Sequence[CaseScore]) -> dict[str, Any]:
 
 
 _CALIBRATION_FORMAT = "yid-calibration/1"
-_TARGET_COVERAGE = 0.95
-"""Fraction of the cases that a threshold is to leave on their side."""
+_TARGET_COVERAGE = 0.95  # fraction of the cases that a threshold is to leave on their side
 
 _Statistics = Mapping[str, Any]
 
@@ -418,7 +401,7 @@ def calibrate_thresholds(
     marks : sequence of CaseScore
         Of the same cases.
     answers : sequence of mapping
-        `result` of each, with its `threshold_statistics`, and those with open thresholds (`open`) where no gap was seen.
+        `result` of each, with its `statistics`, and those with open thresholds (`open`) where no gap was seen.
     limits : Thresholds
         By which they were given.
 
