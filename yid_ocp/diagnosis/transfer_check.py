@@ -90,7 +90,7 @@ def inflate_std_by_disagreement(fit: RefitModel, entries: Sequence[TransferCheck
     """Return the fit with amplitude standard deviations inflated by the disagreement between the recordings.
 
     What a model misses of all of a recording its residual does not show: where two fits differ by more than
-    `_DISAGREEMENT_Z` standard deviations of both together, each is known to the spread of the two, their difference over
+    `_DISAGREEMENT_Z` standard deviations of both together, each is known to the spread of the two, the difference over
     the square root of two.
     """
     std = dict(fit.std)
