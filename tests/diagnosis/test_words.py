@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 
-from yid_ocp.diagnosis import GapLocation, Thresholds, diagnose
+from yid_ocp.diagnosis import Thresholds, diagnose
 from yid_ocp.diagnosis.diagnosis_messages import (
     _separating_experiment,
     diagnosis_summary_text,
@@ -21,32 +20,6 @@ from yid_ocp.effects import make_effect
 def finding(bench):
     recordings = [bench.recording({"joint_coulomb@elbow": {"tau_c": 0.1}}, seed, duration=2.0) for seed in (1, 2)]
     return diagnose(bench.problem(recordings[:1]), ("joint_coulomb@elbow",), recordings[1:])
-
-
-@pytest.mark.parametrize(
-    ("level", "p_value", "chi2", "noise"),
-    [
-        (0.01, 0.03, 1.2, True),
-        (0.05, 0.03, 1.2, False),
-        (0.05, 0.06, 1.2, True),
-        (0.05, 0.03, 0.9, True),
-        (0.01, 0.003, 1.2, False),
-    ],
-)
-def test_what_remains_is_noise_by_the_level_of_the_diagnosis(finding, level, p_value, chi2, noise):
-    rest = replace(finding.remaining_test, p_value=p_value, chi2_per_dof=chi2)
-    place = GapLocation("elbow", 1.0, True, ())
-    said = diagnosis_summary_text(
-        replace(
-            finding,
-            remaining_test=rest,
-            remaining_gap_locations=(place,),
-            thresholds=Thresholds(significance_level=level),
-        )
-    )
-    assert ("What remains is noise." in said) is noise
-    expected = f"What remains: held-out chi2 per degree of freedom {chi2:.3g}, most of it in elbow."
-    assert (expected in said) is not noise
 
 
 def test_a_finding_keeps_its_words_and_what_decided_them(finding):
@@ -82,26 +55,6 @@ def test_an_aspect_that_the_library_does_not_know_comes_last():
     rivals = [kind("melting@T1", "how hot it is"), kind("density@T1", "how hard it accelerates")]
     assert _separating_experiment(rivals).startswith("Vary how hard it accelerates and how hot it is independently")
     assert _separating_experiment([kind("odd@T1", "")]) == "Record other motions, faster and larger."
-
-
-@pytest.mark.parametrize(
-    ("verdict", "where", "unseen", "said"),
-    [
-        ("insufficient_data", (), (), "Record longer and larger motions; more of the object has to be seen."),
-        (
-            "unknown",
-            (GapLocation("T2", 1.0, True, ()),),
-            (),
-            "Move T2 alone, slowly and fast, and hold it still in several postures.",
-        ),
-        ("no_gap", (), (), "None is needed."),
-        ("no_gap", (), ("a@b",), "None is needed; these motions could not have shown a@b."),
-        ("no_gap", (), tuple("abcde"), "None is needed; these motions could not have shown a, b, c, d, ...."),
-        ("effect", (), (), "Repeat with other motions to see whether the effect's parameters stay."),
-    ],
-)
-def test_the_next_experiment_follows_the_verdict(verdict, where, unseen, said):
-    assert next_experiment_text(verdict, (), where, unseen) == said
 
 
 def test_rivals_come_before_all_else():

@@ -1,0 +1,169 @@
+"""A diagnosis as `yid-diagnosis/2`: rule by rule."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import get_args
+
+import pytest
+from factories import (
+    FORCE,
+    absorbed,
+    added,
+    amplitude,
+    carried,
+    closed,
+    effect,
+    finding,
+    fit,
+    loss,
+    outcome,
+    place,
+    score,
+    smoothed,
+    visible,
+)
+
+from yid_ocp.diagnosis.diagnosis_messages import _UNKNOWN_REASON_TEXTS
+from yid_ocp.diagnosis.diagnosis_result import _ranked_candidates
+from yid_ocp.diagnosis.hypotheses import TruncatedRecording
+from yid_ocp.diagnosis.verdict import UnknownReason
+
+FRICTION, OFFSET = effect("friction@elbow"), effect("offset@wrist", amplitude(lower=-9.0))
+
+
+# -- yid-diagnosis/2 --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("verdict", ["effect", "confusable", "unknown", "no_gap", "insufficient_data"])
+def test_effects_count_only_where_the_verdict_names_them(verdict):
+    made = finding(verdict, selected_effects=(added(FRICTION, [OFFSET]),))
+    result = made.to_dict()
+    named = verdict in ("effect", "confusable")
+    assert made.final_model is (made.selected_effects[-1].refitted_model if named else made.nominal_model)
+    assert result["effects"] == ([{"kind": "friction", "location": "elbow"}] if named else [])
+    assert result["gap"]["closure"] == (0.9 if named else None)
+    assert result["gap"]["closure_ci"] == ([0.8, 0.95] if named else None)
+    assert len(result["confusable"]) == (1 if named else 0)
+    after = result["gap"]["after"]["rmse"]
+    assert after == result["gap"]["before"]["rmse"] == {"points.tip": 0.01}
+
+
+def test_numbers_that_are_not_finite_become_null():
+    made = finding(
+        gap_closure=closed(0.9, math.nan, math.inf),
+        nominal_changes=(absorbed("T1.bend", 1.0, 2.0, math.inf),),
+        selected_effects=(added(FRICTION, part=closed(math.nan, 0.1, 0.2)),),
+    )
+    result = made.to_dict()
+    assert result["gap"]["closure_ci"] == [None, None]
+    assert result["absorption"]["T1.bend"] == {"before": 1.0, "after": 2.0, "std": None, "unit": "N m/rad"}
+    assert result["steps"][0]["closure"] is None
+    assert result["steps"][0]["closure_ci"] == [0.1, 0.2]
+
+
+def test_the_result_holds_what_was_found():
+    spoken = smoothed({FORCE: 9.0}, evidence={"plant": 9.0, "both": 9.0})
+    made = finding(
+        "confusable",
+        selected_effects=(added(FRICTION, [OFFSET]), added(OFFSET)),
+        smoother_result=spoken,
+        gap_locations=(place("T1", 0.7, True, ((0.0, 1.0),)),),
+        remaining_gap_locations=(place("T2", 0.3, False),),
+        remaining_test=outcome(p=0.4, chi2=1.02),
+        detectability=(visible(FRICTION), visible(OFFSET, seen=False)),
+        is_split_in_blocks=True,
+    )
+    result = made.to_dict()
+    assert result["format"] == "yid-diagnosis/2"
+    assert result["gap"]["before"]["chi2_per_dof"] == made.nominal_held_out_test.chi2_per_dof
+    assert result["gap"]["after"] | {"unit": None} == {
+        "rmse": {"points.tip": 0.01},
+        "unit": None,
+        "chi2_per_dof": 1.02,
+        "p_value": 0.4,
+    }
+    assert result["gap"]["before"]["unit"] == {"points.tip": "m"}
+    assert result["where"] == [
+        {"location": "T1", "share": 0.7, "observable": True, "windows": [[0.0, 1.0]], "indistinguishable_from": []}
+    ]
+    assert result["remaining"] == {
+        "p_value": 0.4,
+        "where": [{"location": "T2", "share": 0.3, "observable": False, "windows": [], "indistinguishable_from": []}],
+    }
+    both = [{"kind": "friction", "location": "elbow"}, {"kind": "offset", "location": "wrist"}]
+    assert result["confusable"] == [both]
+    assert [step["added"] for step in result["steps"]] == ["friction@elbow", "offset@wrist"]
+    assert result["steps"][0]["chi2_per_dof"] == 1.0
+    assert result["steps"][0]["rmse"] == {"points.tip": 0.01}
+    assert (result["side"], result["explainable"], result["evidence"]["plant"]) == (
+        "plant",
+        spoken.explainable_fraction,
+        9.0,
+    )
+    assert result["unseen"] == ["offset@wrist"]
+    assert result["noise"] == {"points.tip": {"std": 0.001, "unit": "m", "samples": 100}}
+    assert result["held_out_in_blocks"] is True
+
+
+def test_candidates_are_listed_with_what_was_added_first():
+    third = effect("third@x")
+    alone = fit([OFFSET], loss(1.3, 1.4), values={"offset@wrist.a": 0.3})
+    best = fit([FRICTION], loss(1.0, 1.1), values={"friction@elbow.a": 0.5}, std={"friction@elbow.a": math.inf})
+    made = finding(
+        nominal_model=fit(lost=loss(2.0, 2.0)),
+        single_effect_models=(alone, best),
+        selected_effects=(added(FRICTION, fitted=best),),
+        candidate_scores=(
+            score(third, p=0.2, statistic=7.0, step={"third@x.a": 0.7}),
+            score(OFFSET, p=0.1, statistic=8.0),
+            score(FRICTION, p=0.05, statistic=9.0),
+        ),
+    )
+    listed = _ranked_candidates(made)
+    assert [f"{e['kind']}@{e['location']}" for e in listed] == ["friction@elbow", "offset@wrist", "third@x"]
+    assert [entry["score"] for entry in listed] == [9.0, 8.0, 7.0]
+    assert [entry["p_value"] for entry in listed] == [0.05, 0.1, 0.2]
+    assert listed[0]["parameters"]["a"] == {"value": 0.5, "std": None, "unit": "N m"}
+    assert listed[1]["parameters"]["a"] == {"value": 0.3, "std": 0.01, "unit": "N m"}
+    assert listed[2]["parameters"]["a"] == {"value": 0.7, "std": None, "unit": "N m"}
+    assert [entry["closure"] for entry in listed] == [pytest.approx(0.95), pytest.approx(0.65), None]
+    assert listed[1]["closure_ci"] == [pytest.approx(0.6), pytest.approx(0.7)]
+    assert listed[2]["closure_ci"] is None
+
+
+def test_a_refit_without_a_score_is_listed_as_insignificant():
+    made = finding(candidate_scores=(), single_effect_models=(fit([OFFSET]),), selected_effects=())
+    [entry] = _ranked_candidates(made)
+    assert (entry["kind"], entry["score"], entry["p_value"]) == ("offset", 0.0, 1.0)
+
+
+def test_an_unknown_gap_lists_refits_before_scores():
+    made = finding("unknown", single_effect_models=(fit([OFFSET]),), candidate_scores=(score(FRICTION), score(OFFSET)))
+    assert [entry["kind"] for entry in _ranked_candidates(made)] == ["offset", "friction"]
+
+
+def test_rejected_candidates_say_what_they_close_and_why_they_are_none():
+    told = finding("unknown", unknown_reason="stand_in", transfer_checks=(carried(),)).to_dict()
+    [rejected] = told["rejected_candidates"]
+    assert (rejected["kind"], rejected["location"], rejected["closure"]) == ("friction", "elbow", 0.9)
+    assert rejected["reason"].startswith(
+        "friction@elbow.a is 0.5 ± 0.01 N m on the recordings to estimate on and 0.9 ±"
+    )
+    assert (told["reason"], told["effects"]) == ("stand_in", [])
+    [entry] = told["carried_over"]
+    assert (entry["value"], entry["again"], entry["agrees"]) == (0.5, 0.9, False)
+    assert finding("unknown", unknown_reason="little").to_dict()["rejected_candidates"] == []
+
+
+def test_places_and_recordings_that_are_cut_are_in_the_result():
+    at = replace(place("T3"), indistinguishable_from=("T1", "T2"))
+    made = finding(gap_locations=(at,), truncated_recordings=(TruncatedRecording("other", 1.8, 5.0),)).to_dict()
+    assert made["where"][0]["indistinguishable_from"] == ["T1", "T2"]
+    assert made["gap"]["cut"] == [{"recording": "other", "kept": 1.8, "whole": 5.0}]
+
+
+@pytest.mark.parametrize("reason", get_args(UnknownReason))
+def test_every_reason_has_a_sentence(reason):
+    assert reason == "" or reason in _UNKNOWN_REASON_TEXTS

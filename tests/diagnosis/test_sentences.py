@@ -1,0 +1,153 @@
+"""What a diagnosis says: every sentence in `sentences.json`, one text for each case.
+
+After a change that is meant `PYTHONPATH=.:tests:tests/diagnosis python tests/diagnosis/test_sentences.py` writes the
+file again; its difference is to be read.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+from factories import (
+    BIAS,
+    FORCE,
+    READ_FORCE,
+    absorbed,
+    added,
+    amplitude,
+    carried,
+    closed,
+    effect,
+    finding,
+    fit,
+    loss,
+    outcome,
+    place,
+    smoothed,
+)
+
+from yid_ocp.diagnosis.diagnosis_messages import diagnosis_summary_text, next_experiment_text
+from yid_ocp.diagnosis.hypotheses import TruncatedRecording
+from yid_ocp.diagnosis.thresholds import Thresholds
+
+FILE = Path(__file__).with_name("sentences.json")
+FRICTION, OFFSET = effect("friction@elbow"), effect("offset@wrist", amplitude(lower=-9.0))
+NO_EFFECT = {"selected_effects": (), "single_effect_models": ()}
+
+
+def with_effect(of, value, std=0.02, **changed):
+    """A finding in which this effect was added."""
+    names = of.amplitude_names
+    fitted = fit([of], loss(1.0, 1.1), values=dict.fromkeys(names, value), std=dict.fromkeys(names, std))
+    return finding(**({"selected_effects": (added(of, fitted=fitted),), "single_effect_models": (fitted,)} | changed))
+
+
+def gaps():
+    """Whether there is a gap, by the smaller of two p-values."""
+    for verdict, *p in [
+        ("effect", 1e-3, 0.5), ("effect", 0.5, 2e-3), ("unknown", 1e-12, 0.5), ("unknown", 1.1e-12, 0.5),
+        ("no_gap", 0.4, 0.3), ("no_gap", 0.2, 0.3),
+    ]:  # fmt: skip
+        tests = {"nominal_test": outcome(p[0], chi2=1.123), "nominal_held_out_test": outcome(p[1], chi2=2.345)}
+        yield f"{verdict}, p = {p[0]:g} and {p[1]:g}", finding(verdict, **tests, **NO_EFFECT)
+    yield (
+        "insufficient data",
+        finding("insufficient_data", message="4 samples.", next_experiment="Longer.", **NO_EFFECT),
+    )
+    yield "no gap", finding("no_gap", next_experiment="None is needed.", **NO_EFFECT)
+
+
+def places():
+    """Where it lies, and on which side."""
+    for shares in [
+        {"T1": 0.95, "T2": 0.05}, {"T1": 0.8, "T2": 0.2}, {"T1": 0.9, "T2": 0.1},
+        {"T1": 0.4, "T2": 0.25, "T3": 0.2, "T4": 0.15}, {"T1": 0.06, "T2": 0.05}, {}, {"T1": 0.0}, {"T1": 0.004},
+    ]:  # fmt: skip
+        where = tuple(place(name, share) for name, share in shares.items())
+        yield f"shares {shares}", finding("unknown", gap_locations=where, **NO_EFFECT)
+    together = replace(place("T3"), indistinguishable_from=("T1", "T2"))
+    yield "places that cannot be told apart", finding(gap_locations=(together,))
+    for name, weight, evidence in [
+        ("mechanics", {FORCE: 9.0}, {"plant": 9.0, "both": 9.0}),
+        ("sensors", {BIAS: 9.0}, {"sensor": 9.0, "both": 9.0}),
+        ("mechanics or sensor", {READ_FORCE: 9.0}, {"plant": 9.0, "both": 9.0}),
+        ("both", {FORCE: 9.0, BIAS: 9.0}, {"plant": 9.0, "sensor": 9.0, "both": 20.0}),
+    ]:
+        yield f"side: {name}", finding("unknown", smoother_result=smoothed(weight, evidence=evidence), **NO_EFFECT)
+
+
+def effects():
+    """What was added, how sure it is, what it closes and what is left."""
+    for unit, std in [("N m", 0.0234), ("1", 0.0234), ("N m", math.inf), ("N m", math.nan)]:
+        yield f"a = 0.457, std {std} {unit}", with_effect(effect("friction@elbow", amplitude(unit=unit)), 0.4567, std)
+    yield "closure", with_effect(FRICTION, 0.5, gap_closure=closed(0.9123, 0.8012, 0.9534))
+    yield "no sure closure", with_effect(FRICTION, 0.5, gap_closure=closed(0.9, 0.01, 0.95))
+    both = fit([FRICTION, OFFSET], values={"friction@elbow.a": 0.5, "offset@wrist.a": 0.25})
+    yield "two effects", finding(selected_effects=(added(FRICTION), added(OFFSET, fitted=both)))
+    rivals = (added(FRICTION, [OFFSET, effect("third@x")]),)
+    yield "rivals", with_effect(FRICTION, 0.5, selected_effects=rivals)
+    odd = effect("offset@wrist", amplitude(neutral=9.0, lower=-99.0, upper=99.0, expected=(0.0, 2.0)))
+    for value in (2.5, 2.51, -0.5, -0.51, 9.0):
+        yield f"range 0 to 2, value {value}", with_effect(odd, value)
+    for chi2, p, where in [
+        (1.23, 0.002, (place("T2"),)), (1.23, 0.002, ()), (1.23, 0.02, ()), (1.23, 0.01, ()), (0.9, 0.002, ()),
+        (1.0, 0.002, ()),
+    ]:  # fmt: skip
+        rest = {"remaining_test": outcome(p=p, chi2=chi2), "remaining_gap_locations": where}
+        yield f"remains chi2 {chi2}, p = {p}, {len(where)} places", with_effect(FRICTION, 0.5, **rest)
+    for before, after in [(10.0, 11.1), (10.0, 8.9), (10.0, 11.0), (-10.0, -8.9), (0.0, 1e-9), (0.0, 1e-11)]:
+        moved = (absorbed("T1.bend", before, after),)
+        yield f"moves from {before} to {after}", with_effect(FRICTION, 0.5, nominal_changes=moved)
+    many = tuple(absorbed(f"p{i}", 1.0, 2.0) for i in range(8))
+    yield "eight parameters move", with_effect(FRICTION, 0.5, nominal_changes=many)
+    yield "in blocks", with_effect(FRICTION, 0.5, is_split_in_blocks=True)
+
+
+def unknown():
+    """Why a gap has no name, with the numbers that decide it."""
+    for name, reason, changed in [
+        ("not sure", "unsure", {"gap_closure": closed(0.4, 0.01, 0.7)}),
+        ("little explained", "little", {"explained_fraction": 0.31, "gap_closure": closed(0.4, 0.29, 0.5)}),
+        ("imitates", "stand_in", {"gap_closure": closed(0.91), "transfer_checks": (carried(),)}),
+        ("imitates by one of two", "stand_in", {
+            "transfer_checks": (carried(agrees=True, name="b", values=(3.0, 3.1)), carried(stds=(0.01, 0.02)))}),
+        *((f"two effects, {reason}", reason, {
+            "selected_effects": (added(FRICTION), added(OFFSET)), "explained_fraction": 0.31,
+            "transfer_checks": (carried(),)}) for reason in ("unsure", "little", "stand_in")),
+    ]:  # fmt: skip
+        limits = Thresholds(min_explained_fraction=0.5)
+        yield name, finding("unknown", unknown_reason=reason, thresholds=limits, **changed)
+    best = {"single_effect_models": (fit([OFFSET]), fit([FRICTION])), "selected_effects": ()}
+    yield "the best attempt", finding("unknown", **best)
+    for kept in (1.8, 0.0):
+        yield f"followed for {kept} s", finding(truncated_recordings=(TruncatedRecording("other", kept, 5.0),))
+    lost = (TruncatedRecording("other", 0.0, 5.0),)
+    yield "none can be followed", finding(truncated_recordings=lost, is_split_in_blocks=True)
+
+
+def said() -> dict[str, str]:
+    """Every text by its case."""
+    found = {
+        f"{part.__name__}: {name}": diagnosis_summary_text(made)
+        for part in (gaps, places, effects, unknown)
+        for name, made in part()
+    }
+    for verdict, where, unseen in [
+        ("insufficient_data", (), ()), ("unknown", (place("T2"),), ()), ("unknown", (place("world", 0.8),), ()),
+        ("unknown", (place("camera", 0.8),), ()), ("unknown", (place("spring_1", 0.0),), ()), ("no_gap", (), ()),
+        ("no_gap", (), ("a@b",)), ("no_gap", (), tuple("abcde")), ("effect", (), ()),
+    ]:  # fmt: skip
+        case = f"next experiment: {verdict} {[p.location for p in where]} {len(unseen)} unseen"
+        found[case] = next_experiment_text(verdict, (), where, unseen)
+    return found
+
+
+def test_a_diagnosis_says_what_is_written_down():
+    assert said() == json.loads(FILE.read_text("utf-8"))
+
+
+if __name__ == "__main__":
+    FILE.write_text(json.dumps(said(), indent=1, ensure_ascii=False) + "\n", "utf-8")
