@@ -122,7 +122,6 @@ def _function(system: System, time_step: float) -> ca.Function:
     return ca.Function("torque_terms", [q, v, a, z, system.parameters.symbols], outputs)
 
 
-Array = NDArray[np.float64]
 _SparseMatrix = Any  # scipy.sparse.csc_array or, of few profiles, ndarray; the former has no types
 
 _MODEL_ERROR_TIME, _SLOW_FORCE_TIME = 0.3, 2.0
