@@ -42,9 +42,8 @@ from yid_ocp.report.terminal import aligned_table_lines, terminal_lines
 from yid_ocp.sensors.base import EffortKind
 from yid_ocp.version import source_hash
 from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperiment, baxter_foam_y_system, run_virtual_experiment
-from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
+from yid_ocp.virtual.joint_motion import MultisineMotion, MultisineOptions, grasping_joint_angles, random_multisine
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
-from yid_ocp.virtual.multisine_motion import MultisineMotion, MultisineOptions, random_multisine
 from yid_ocp.workflow.solve import run_solve
 
 PACKAGE = Path(yid_ocp.__file__).parent

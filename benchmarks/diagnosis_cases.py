@@ -34,8 +34,7 @@ from yid_ocp.parallel import Task, WorkerConfig, run_tasks
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.virtual.experiment import VirtualExperiment
 from yid_ocp.virtual.injected import InjectedEffect, run_injected_experiment
-from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
-from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
+from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import build_problem
 

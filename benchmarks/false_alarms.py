@@ -45,7 +45,7 @@ from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.version import source_hash
 from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperiment, baxter_foam_y_system
 from yid_ocp.virtual.injected import InjectedEffect, run_injected_experiment
-from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
+from yid_ocp.virtual.joint_motion import grasping_joint_angles
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.workflow.diagnose import run_diagnose
 

@@ -21,9 +21,8 @@ from yid_ocp.model.rotations import transform_from_xyz_rpy
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.model.y_object import y_segments
 from yid_ocp.virtual.experiment import VirtualExperiment, run_virtual_experiment
-from yid_ocp.virtual.inverse_kinematics import BAXTER_ARM_JOINTS, grasping_joint_angles
+from yid_ocp.virtual.joint_motion import BAXTER_ARM_JOINTS, MultisineOptions, grasping_joint_angles, random_multisine
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
-from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 
 TAU = 0.05
 NOMINAL_DAMPING = 0.05

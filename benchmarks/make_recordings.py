@@ -30,9 +30,8 @@ from yid_ocp.virtual.experiment import (
     baxter_foam_y_system,
     run_virtual_experiment,
 )
-from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
+from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, SimulationResult
-from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 
 # the paper's answer for one arm with vision, the only one of its four in which no stiffness is zero, rounded
 TRUTH = {

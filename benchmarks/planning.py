@@ -38,9 +38,8 @@ from yid_ocp.planning.motion_plan import MotionPlan, PlannedMovement, plan_motio
 from yid_ocp.planning.spline_path import SplinePath
 from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, baxter_foam_y_system
 from yid_ocp.virtual.injected import InjectedEffect, run_injected_experiment
-from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
+from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
-from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 from yid_ocp.workflow.diagnose import run_diagnose
 from yid_ocp.workflow.plan import compile_planning_step, identified_parameters, start_configuration
 from yid_ocp.workflow.solve import run_solve

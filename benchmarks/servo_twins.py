@@ -30,8 +30,8 @@ from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.model.system import System
 from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperiment
 from yid_ocp.virtual.injected import InjectedEffect, run_injected_experiment
+from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
-from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.diagnose import run_diagnose
 from yid_ocp.workflow.solve import run_solve

@@ -27,9 +27,8 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.solvers import GaussNewton, solve
 from yid_ocp.virtual.experiment import baxter_foam_y_system
-from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
+from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, SimulationResult, simulate_in_mujoco
-from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 
 Array = NDArray[np.float64]
 

@@ -30,8 +30,7 @@ from yid_ocp.parallel import Task, WorkerConfig, run_tasks
 from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.version import source_hash
 from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, baxter_foam_y_system, run_virtual_experiment
-from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
-from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
+from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine
 
 ERRORS: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
     "none": ((), ()),

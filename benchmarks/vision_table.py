@@ -37,10 +37,9 @@ from yid_ocp.model.system import Grasp, System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.model.y_object import y_object
 from yid_ocp.report.terminal import aligned_table_lines
-from yid_ocp.virtual.inverse_kinematics import BAXTER_ARM_JOINTS, grasping_joint_angles
+from yid_ocp.virtual.joint_motion import BAXTER_ARM_JOINTS, MultisineOptions, grasping_joint_angles, random_multisine
 from yid_ocp.virtual.mjcf import compile_mjcf, mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
-from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 from yid_ocp.vision import (
     CameraIntrinsics,
     CameraScene,

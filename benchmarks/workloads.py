@@ -22,10 +22,10 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.inference.linearized_residual import bounded_least_squares_step
 from yid_ocp.integrator import compiled
-from yid_ocp.integrator.lqr import lqr_feedback
 from yid_ocp.integrator.statics import EquilibriumSolver
-from yid_ocp.integrator.step import Rollout, SensitivityDirections, Step, TrackingFeedback, compile_step
-from yid_ocp.integrator.step_model import RolloutInputs
+from yid_ocp.integrator.step import Step, compile_step
+from yid_ocp.integrator.step_model import Rollout, RolloutInputs, SensitivityDirections, TrackingFeedback
+from yid_ocp.integrator.tracking_feedback import lqr_feedback
 from yid_ocp.model import System
 from yid_ocp.model.urdf import mechanism_to_urdf
 from yid_ocp.problem import EstimationProblem
@@ -79,7 +79,7 @@ class Bench:
         rest = EquilibriumSolver(step).solve(angles[0], theta)
         feedback = lqr_feedback(step, angles, torque, theta)
         path = np.zeros((len(torque) + 1, 0))
-        trajectory = step.kernel.rollout(theta, rest.state, torque, path, feedback, None)
+        trajectory = step.kernel.rollout(RolloutInputs(theta, rest.state, torque, path, feedback))
         assert trajectory.status.is_converged, trajectory.status.message
         values = dict(zip(system.parameters.names, theta, strict=True))
         tree = mechanism_to_urdf(system.mechanism, {name: values[name] for name in system.mechanism.parameters.names})
@@ -150,7 +150,7 @@ class Bench:
     def rollout(self, steps: int, directions: SensitivityDirections | None = None) -> Rollout:
         """Track the recording over the first steps."""
         torque, path = self.torque[:steps], self.path[: steps + 1]
-        return self.step.kernel.rollout(self.theta, self.start, torque, path, self.feedback, directions)
+        return self.step.kernel.rollout(RolloutInputs(self.theta, self.start, torque, path, self.feedback, directions))
 
 
 def step(bench: Bench) -> int:

@@ -18,6 +18,7 @@ from pendulum_run import pendulum as pendulum
 from pendulum_run import pendulum_data as pendulum_data
 
 from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step_model import RolloutInputs
 from yid_ocp.model import Grasp, System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.model.y_object import y_object
@@ -141,7 +142,7 @@ def roll():
         fixed = list(step.system.prescribed_indices)
         path = np.tile(start[fixed], (steps + 1, 1)) if path is None else path
         start[fixed] = path[0]
-        return step.kernel.rollout(np.asarray(theta, float), start, torque, path, feedback, directions)
+        return step.kernel.rollout(RolloutInputs(np.asarray(theta, float), start, torque, path, feedback, directions))
 
     return rollout
 

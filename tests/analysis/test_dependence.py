@@ -21,6 +21,7 @@ from yid_ocp.analysis.step_symbols import StepSymbols
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step_model import RolloutInputs
 from yid_ocp.model import Segment, System, flexible_object
 from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.servos_and_springs import RobotJointSpring
@@ -162,7 +163,7 @@ def rolled_out(problem, rest, theta, kick=None):
             gain=np.tile(feedback.gain[:1], (STEPS + 1, 1, 1)),
             reference=np.tile(rest.state[feedback.state_indices], (STEPS + 1, 1)),
         )
-    rollout = step.kernel.rollout(theta, rest.state, torque, path, feedback, None)
+    rollout = step.kernel.rollout(RolloutInputs(theta, rest.state, torque, path, feedback))
     assert rollout.status.is_converged
     found = []
     for samples in episode.measurements:

@@ -19,8 +19,8 @@ from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import GaussNewton, solve
 from yid_ocp.virtual.experiment import VirtualExperiment, baxter_foam_y_system, run_virtual_experiment
+from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
-from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 from yid_ocp.workflow.build_problem import load_problem
 
 TRUTH = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T3.bend": 11.5, "T3.twist": 9.7}

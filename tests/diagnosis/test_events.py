@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,14 +21,62 @@ from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.solvers import GaussNewton, solve
-from yid_ocp.virtual.disturbances import DisturbanceTerms, ForcePulse, SnagSpring
 from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperiment, run_virtual_experiment
+from yid_ocp.virtual.joint_motion import MultisineMotion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
-from yid_ocp.virtual.multisine_motion import MultisineMotion
 
 pytest.importorskip("mujoco", reason="twins are made in MuJoCo: pip install 'yid-ocp[blind]'")
 
 JOINTS = ("shoulder", "elbow")
+
+
+@dataclass(frozen=True)
+class ForcePulse:
+    """peak_force sin^2(pi (t - start_time)/(end_time - start_time)) on one coordinate."""
+
+    joint: str
+    start_time: float
+    end_time: float
+    peak_force: float
+
+    @property
+    def impulse(self) -> float:
+        return self.peak_force * (self.end_time - self.start_time) / 2
+
+
+@dataclass(frozen=True)
+class SnagSpring:
+    """A spring that holds one coordinate at its value when the spring sets in."""
+
+    joint: str
+    start_time: float
+    end_time: float
+    stiffness: float
+
+
+class DisturbanceTerms:
+    """Disturbances as `SimulatorTerms`; times are since the motion's beginning."""
+
+    def __init__(self, pushes: Sequence[ForcePulse] = (), snags: Sequence[SnagSpring] = ()) -> None:
+        self.pushes, self.snags, self.start, self.caught = tuple(pushes), tuple(snags), 0.0, {}
+
+    def edit_model(self, model) -> None:
+        pass
+
+    def start_motion(self, data) -> None:
+        self.start, self.caught = float(data.time), {}
+
+    def add_forces(self, model, data) -> None:
+        t = float(data.time) - self.start
+        for push in (p for p in self.pushes if p.start_time < t < p.end_time):
+            wave = np.sin(np.pi * (t - push.start_time) / (push.end_time - push.start_time)) ** 2
+            data.qfrc_passive[model.joint(push.joint).id] += push.peak_force * wave
+        for snag in (s for s in self.snags if s.start_time < t < s.end_time):
+            at = model.joint(snag.joint).id
+            caught = self.caught.setdefault(snag, float(data.qpos[at]))
+            data.qfrc_passive[at] -= snag.stiffness * (float(data.qpos[at]) - caught)
+
+
 DAMPING = {"shoulder": 0.1, "elbow": 0.05}
 PUSHES = (ForcePulse("shoulder", 1.5, 2.0, 1.5), ForcePulse("elbow", 3.0, 3.4, -0.8))
 

@@ -26,10 +26,9 @@ from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera
-from yid_ocp.virtual.injected import InjectedEffect
+from yid_ocp.virtual.injected import OUT_OF_LIBRARY_EFFECTS, InjectedEffect
+from yid_ocp.virtual.joint_motion import MultisineOptions
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
-from yid_ocp.virtual.multisine_motion import MultisineOptions
-from yid_ocp.virtual.out_of_library_effects import OUT_OF_LIBRARY_EFFECTS
 
 KV = InjectedEffect("kelvin_voigt", "T1", {"tau": 0.05})
 

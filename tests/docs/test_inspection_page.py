@@ -9,7 +9,7 @@ import pytest
 
 from yid_ocp.analysis.step_symbols import StepSymbols
 from yid_ocp.config.reader import load_config
-from yid_ocp.export.casadi_functions import _MAX_JACOBIAN_OPERATIONS
+from yid_ocp.export.equations import _MAX_JACOBIAN_OPERATIONS
 from yid_ocp.integrator.discrete import discrete_equations
 from yid_ocp.workflow.build import build_system
 

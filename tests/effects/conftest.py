@@ -15,7 +15,8 @@ from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.effects import SENSOR_KINDS, EffectBase, candidate_effects, make_effect
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.statics import EquilibriumSolver
-from yid_ocp.integrator.step import Rollout, SensitivityDirections, Step, compile_step
+from yid_ocp.integrator.step import Step, compile_step
+from yid_ocp.integrator.step_model import Rollout, SensitivityDirections
 from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object, forward_kinematics
 from yid_ocp.model.cable import CableOptions, CableTopology, cable_system
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement

@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as hnp
 
 from yid_ocp.data import JointGroup, PointGroup, Recording, read_csv
 from yid_ocp.errors import OutputError
-from yid_ocp.export.csv_tables import export_csv
+from yid_ocp.export.signals import export_csv
 
 
 @given(

@@ -13,8 +13,8 @@ from held_rod import held_rod
 
 from yid_ocp.analysis.step_symbols import StepSymbols
 from yid_ocp.errors import OutputError
-from yid_ocp.export import casadi_functions as exported
-from yid_ocp.export.casadi_functions import _exported_step_functions, export_step_functions
+from yid_ocp.export import equations as exported
+from yid_ocp.export.equations import _exported_step_functions, export_step_functions
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model.kinematics import forward_kinematics

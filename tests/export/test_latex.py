@@ -11,7 +11,7 @@ from held_rod import held_rod
 
 from yid_ocp.analysis.step_symbols import StepSymbols
 from yid_ocp.effects import make_effect
-from yid_ocp.export.latex_sheet import write_equation_sheet
+from yid_ocp.export.equations import write_equation_sheet
 from yid_ocp.integrator.discrete import discrete_equations
 from yid_ocp.model import System
 from yid_ocp.model.servos_and_springs import RobotJointSpring
@@ -90,10 +90,7 @@ def test_rules_say_what_the_step_does(symbols, tmp_path):
     assert r"- L_v(q_m, v_m) + h F - D\varphi(q_k)^{T} \lambda_k" in text
     assert "p_{k+1} &= \\tfrac{h}{2} L_q(q_m, v_m) + L_v(q_m, v_m) \\\\\n" in text
     assert "multiplied by it" not in text
-    added = [
-        make_effect("grasp_compliance", "hand", system, {}),
-        make_effect("mount_compliance", "base", system, {}),
-    ]
+    added = [make_effect("grasp_compliance", "hand", system, {}), make_effect("mount_compliance", "base", system, {})]
     soft = StepSymbols.from_equations(discrete_equations(system.with_effects(added)))
     assert soft.equations.constraint_relaxation_gain is not None
     assert soft.equations.system.joint_compliances

@@ -12,7 +12,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from yid_ocp.data import JointGroup, PointGroup, Recording, read_any
 from yid_ocp.errors import OutputError
-from yid_ocp.export.mcap import TopicSignal, export_mcap, signals_from_recording
+from yid_ocp.export.signals import TopicSignal, export_mcap, signals_from_recording
 from yid_ocp.workflow.export import export_run_signals
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from yid_ocp.errors import ResourceError
 from yid_ocp.integrator.step import Step, compile_step
-from yid_ocp.integrator.step_model import TrackingFeedback
+from yid_ocp.integrator.step_model import RolloutInputs, TrackingFeedback
 from yid_ocp.model import (
     Grasp,
     Kinematics,
@@ -206,12 +206,7 @@ def clamped_cable(kind: str, effects=()) -> tuple[System, np.ndarray]:
     segment = Segment("C", 0.6, 0.3, 0.05, links=3, bend=2.0, twist=1.0, damping=0.01)
     objects = [(flexible_object([segment], name="cable"), None, None)]
     system = System.build(
-        clamp,
-        objects=objects,
-        grasps=[grasp],
-        prescribed=clamp.joint_names,
-        driven=["C_1_x", "C_2_z"],
-        effects=effects,
+        clamp, objects=objects, grasps=[grasp], prescribed=clamp.joint_names, driven=["C_1_x", "C_2_z"], effects=effects
     )
     return system, np.concatenate([pose[:3, 3], np.zeros(3), bent])
 
@@ -231,7 +226,7 @@ class Case:
         chosen = [self.theta, self.start, self.torque, self.path]
         given = [theta, start, torque, path]
         values = [old if new is None else new for old, new in zip(chosen, given, strict=True)]
-        return (step or self.step).kernel.rollout(*values, feedback, directions)
+        return (step or self.step).kernel.rollout(RolloutInputs(*values, feedback, directions))
 
 
 def make_case(

@@ -1,6 +1,307 @@
-"""Index tables of the generated kernel."""
+"""Generated code: the order of elimination, and batches, whose members give what they give one by one."""
 
 from __future__ import annotations
+
+import ctypes
+import math
+import shutil
+import subprocess
+from dataclasses import replace
+from importlib import resources
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from yid_ocp.integrator import codegen, compiled, compiler
+from yid_ocp.integrator.codegen import simd_c_source
+from yid_ocp.integrator.step_model import RolloutInputs, SensitivityDirections, TrackingFeedback
+
+pytestmark = pytest.mark.skipif(compiler._compiler_path() is None, reason="this machine has no C compiler")
+
+# Newton stops at 1e-14 in these cases; the rest is rounding of sums in another order
+TOLERANCE = 1e-9
+RESULTS = (
+    "state",
+    "multipliers",
+    "effort",
+    "torque",
+    "state_sensitivity",
+    "multipliers_sensitivity",
+    "effort_sensitivity",
+)
+
+
+@pytest.fixture(autouse=True)
+def at_once(monkeypatch):
+    """Batches from the first question on."""
+    monkeypatch.setattr(compiled, "MIN_STEPS_TO_COMPILE_BATCH", 0)
+
+
+def watched(monkeypatch, kernel):
+    """How many members every call of compiled code had."""
+    calls = []
+    original = kernel._rolled_out
+
+    def counted(library, members):
+        calls.append(len(members))
+        return original(library, members)
+
+    monkeypatch.setattr(kernel, "_rolled_out", counted)
+    return calls
+
+
+def members_of(case, count=8):
+    """Members with their own parameters, lengths, starts, gains and directions, the last without any of the latter."""
+    rng, sizes = np.random.default_rng(3), case.step.sizes
+    names = case.step.system.parameters.names
+    made = []
+    for i in range(count):
+        steps = len(case.torque) - i % 4
+        chosen = tuple(names[i % 3 : i % 3 + 1 + i % 2]) if i < count - 1 else ()
+        width = len(chosen) + i % 3
+        given = [None, None]
+        if i % 2:
+            given = [rng.normal(size=(steps, sizes["nu"], width)), rng.normal(size=(steps + 1, sizes["nc"], width))]
+        directions = SensitivityDirections(chosen, 0.1 * rng.normal(size=(sizes["nx"], width)), *given)
+        theta = case.theta * np.exp(0.02 * rng.normal(size=len(case.theta)))
+        feedback = case.feedback
+        feedback = TrackingFeedback(
+            feedback.state_indices, feedback.gain[:steps] * (1 + 0.02 * i), feedback.reference[:steps]
+        )
+        torque = case.torque[:steps] * (1 + 0.02 * i)
+        made.append(RolloutInputs(theta, case.start, torque, case.path[: steps + 1], feedback, directions))
+    return made
+
+
+def alone(case, member):
+    return case.step.kernel.rollout(member)
+
+
+def assert_same(one, other, tolerance=0.0):
+    assert (one.status.code, one.status.completed_steps) == (other.status.code, other.status.completed_steps)
+    for name in RESULTS:
+        first, second = getattr(one, name), getattr(other, name)
+        if second is None or not second.size:
+            assert first is None or not first.size
+            continue
+        scale = max(float(np.nanmax(np.abs(second), initial=0.0)), 1e-9)
+        np.testing.assert_allclose(first, second, rtol=0, atol=tolerance * scale, err_msg=name)
+
+
+@pytest.mark.parametrize("name", ["closed_loop", "relaxing_cable"])
+def test_a_batch_is_its_members_one_by_one(parts, urdf_folder, monkeypatch, name):
+    case = parts.builders[name](urdf_folder)
+    members = members_of(case)
+    single = [alone(case, member) for member in members]
+    assert all(rollout.status.is_converged for rollout in single)
+    calls = watched(monkeypatch, case.step.kernel)
+    for some in (members, [replace(member, directions=None) for member in members]):
+        together = case.step.kernel.rollout_batch(some)
+        for one, member, other in zip(together, some, single, strict=True):
+            expected = other if member.directions is not None else alone(case, member)
+            assert_same(one, expected, TOLERANCE)
+            # at a tolerance of 1e-14 rounding decides about the last iteration
+            assert abs(one.status.newton_iterations - expected.status.newton_iterations) <= 3
+    width = case.step.kernel._batched(None)[1]
+    assert calls[: 8 // width] == [width] * (8 // width)
+
+
+def test_companions_do_not_matter(parts, urdf_folder):
+    case = parts.builders["closed_loop"](urdf_folder)
+    members = [replace(member, directions=None) for member in members_of(case)]
+    others = [
+        members[0],
+        *(replace(m, theta=m.theta * 1.01, initial_state=m.initial_state + 1e-3) for m in members[1:4]),
+        members[7],
+    ]
+    first, second = case.step.kernel.rollout_batch(members), case.step.kernel.rollout_batch(others)
+    if case.step.kernel._batched(None)[1] == 8:
+        assert_same(first[0], second[0])
+        assert_same(first[7], second[4])
+
+
+def test_a_member_that_fails_fails_as_alone_and_leaves_the_others(parts, urdf_folder, monkeypatch):
+    case = parts.builders["closed_loop"](urdf_folder)
+    good = [replace(member, directions=None) for member in members_of(case)]
+    expected = case.step.kernel.rollout_batch(good)
+    wild = good[2].torque.copy()
+    wild[4] = np.inf
+    lost = replace(good[5], theta=np.full_like(good[5].theta, np.nan))
+    members = [*good[:2], replace(good[2], torque=wild), *good[3:5], lost, *good[6:]]
+    calls = watched(monkeypatch, case.step.kernel)
+    found = case.step.kernel.rollout_batch(members)
+    assert calls.count(1) == 2  # the two that failed were asked again
+    for i in (2, 5):
+        assert not found[i].status.is_converged
+        assert_same(found[i], alone(case, members[i]))
+    assert found[2].status.completed_steps == 4
+    for i in set(range(8)) - {2, 5}:
+        assert_same(found[i], expected[i])
+
+
+def test_without_vectors_members_are_done_one_by_one(parts, urdf_folder, monkeypatch):
+    case = parts.builders["closed_loop"](urdf_folder)
+    members = members_of(case)
+    original = compiler.compile_library
+    monkeypatch.setattr(
+        compiler, "compile_library", lambda text, *make: None if "define BATCHED" in text else original(text, *make)
+    )
+    for one, member in zip(case.step.kernel.rollout_batch(members), members, strict=True):
+        assert_same(one, alone(case, member))
+
+
+def test_few_members_do_not_ask_for_a_batch(parts, urdf_folder, monkeypatch):
+    case = parts.builders["closed_loop"](urdf_folder)
+    monkeypatch.setattr(compiled, "_batched_library", lambda model: pytest.fail("compiled for nothing"))
+    plain = [replace(member, directions=None) for member in members_of(case)]
+    assert len(case.step.kernel.rollout_batch(plain[:2])) == 2
+    monkeypatch.setattr(compiled, "MIN_STEPS_TO_COMPILE_BATCH", 10**9)
+    assert len(case.step.kernel.rollout_batch(plain)) == 8
+
+
+# -- arithmetic --------------------------------------------------------------------------------------------------------
+
+DRIVER = """
+void yid_try(const double *in, double *out, int count) {
+    for (int first = 0; first < count; first += SIMD_WIDTH) {
+        real x[2], y[OUTPUTS], w[PLACES];
+        const real *arg[1] = {x};
+        real *res[1] = {y};
+        for (int entry = 0; entry < SIMD_WIDTH; entry++)
+            for (int i = 0; i < 2; i++) SIMD_ENTRY(x[i], entry) = in[2 * (first + entry) + i];
+        everything(arg, res, 0, w, 0);
+        for (int entry = 0; entry < SIMD_WIDTH; entry++)
+            for (int o = 0; o < OUTPUTS; o++) out[OUTPUTS * (first + entry) + o] = SIMD_ENTRY(y[o], entry);
+    }
+}
+"""
+
+
+def everything():
+    """A function with every operation that has a form."""
+    x = ca.SX.sym("x", 2)
+    a, b = x[0], x[1]
+    one = [ca.sin, ca.cos, ca.tan, ca.exp, ca.tanh, ca.sinh, ca.cosh, ca.atan, ca.asinh, ca.erf, ca.expm1]
+    outputs = [f(a) for f in (*one, ca.floor, ca.ceil, ca.fabs, ca.sign)]
+    outputs += [ca.sqrt(a**2), ca.log(a**2 + 1), ca.log1p(a**2), ca.asin(ca.tanh(a)), ca.acos(ca.tanh(a))]
+    outputs += [ca.atanh(ca.tanh(a) / 2), ca.acosh(1 + a**2), (a**2) ** b, ca.atan2(a, b), ca.fmod(a, 3.0)]
+    outputs += [ca.copysign(a, b), ca.hypot(a, b), ca.remainder(a, 3.0), ca.fmin(a, b), ca.fmax(a, b), a - b, a / b]
+    outputs += [a < b, a <= b, ca.eq(a, b), ca.ne(a, b), ca.logic_and(a, b), ca.logic_or(a, b), ca.logic_not(a)]
+    outputs += [ca.if_else(a < 0.5, a**3, ca.inf), -a * 2, 1 / b, ca.sin(a + b) * ca.cos(a + b)]
+    return ca.Function("everything", [x], [ca.vertcat(*outputs)])
+
+
+MACHINES = {"this": compiler._NATIVE_FLAGS, "avx2": ("-mavx2", "-mfma"), "any": ()}
+
+
+def arithmetic_source(function, batched=True):
+    """C source of a function of two numbers, for members that march together or for one, with what tries it."""
+    body = simd_c_source([function])
+    assert body is not None
+    arithmetic = resources.files("yid_ocp.integrator").joinpath("simd.c").read_text(encoding="utf-8")
+    sizes = f"#define OUTPUTS {function.numel_out(0)}\n#define PLACES {function.sz_w()}"
+    return f"{'#define BATCHED' if batched else ''}\n{sizes}\n{arithmetic}\n{body}\n{DRIVER}"
+
+
+def tried_points():
+    rng = np.random.default_rng(0)
+    scale = 10.0 ** rng.uniform(-3, 2, size=(400, 2))
+    return np.vstack([rng.normal(size=(400, 2)) * scale, [[0, 0], [1, 1], [0.5, -0.0], [np.pi, 0], [3e9, 2]] * 8])
+
+
+def assert_those_of_casadi(found, function, points, tolerance):
+    expected = np.array([np.array(function(point)).ravel() for point in points])
+    usable = np.isfinite(expected)
+    np.testing.assert_array_equal(np.isnan(found), np.isnan(expected))
+    np.testing.assert_allclose(found[usable], expected[usable], rtol=tolerance, atol=1e-16)
+
+
+@pytest.mark.parametrize("machine", MACHINES)
+@pytest.mark.parametrize("program", ["cc", "clang"])
+def test_arithmetic_of_a_batch_is_that_of_one(monkeypatch, machine, program):
+    path = compiler._compiler_path() if program == "cc" else shutil.which(program)
+    if path is None:
+        pytest.skip(f"there is no {program}")
+    if machine == "avx2" and "avx2" not in compiler._machine():
+        pytest.skip("this machine has no AVX2")
+    monkeypatch.setattr(compiler, "_compiler_path", lambda: path)
+    monkeypatch.setattr(compiler, "_NATIVE_FLAGS", MACHINES[machine])
+    function = everything()
+    library = compiler.compile_library(arithmetic_source(function))
+    assert library.yid_simd_width() == (8 if machine == "this" and "avx512f" in compiler._machine() else 4)
+    points = tried_points()
+    found = np.zeros((len(points), function.numel_out(0)))
+    library.yid_try(ctypes.c_void_p(points.ctypes.data), ctypes.c_void_p(found.ctypes.data), len(points))
+    assert_those_of_casadi(found, function, points, 1e-13)
+
+
+@pytest.mark.parametrize("size", [1, 7, 40])
+@pytest.mark.parametrize("batched", [True, False], ids=["many", "one"])
+def test_a_long_function_in_parts_is_the_same(monkeypatch, batched, size):
+    function, points = everything(), tried_points()
+    monkeypatch.setattr(codegen, "_LONG_INSTRUCTION_COUNT", 20)
+    monkeypatch.setattr(codegen, "_PART_INSTRUCTION_COUNT", size)
+    source = arithmetic_source(function, batched)
+    assert source.count("noinline") == math.ceil(function.n_instructions() / size)
+    library = compiler.compile_library(source)
+    if batched and not library.yid_simd_width():
+        pytest.skip("this machine has no vectors")
+    found = np.zeros((len(points), function.numel_out(0)))
+    library.yid_try(ctypes.c_void_p(points.ctypes.data), ctypes.c_void_p(found.ctypes.data), len(points))
+    assert_those_of_casadi(found, function, points, 1e-13)
+
+
+@pytest.mark.parametrize("name", ["closed_loop", "relaxing_cable"])
+def test_a_step_of_long_functions_is_the_same(parts, urdf_folder, monkeypatch, name):
+    case = parts.builders[name](urdf_folder)
+    members = members_of(case)
+    monkeypatch.setattr(codegen, "_LONG_INSTRUCTION_COUNT", 100)
+    monkeypatch.setattr(codegen, "_PART_INSTRUCTION_COUNT", 30)
+    model = case.step.model
+    text = codegen.kernel_source(model.functions, model.index_tables)
+    assert "linear_3(" in text
+    assert "casadi_f0" in text, "short ones are as CasADi writes them"
+    kernel = compiled.CompiledKernel(model, compiler.compile_library(text))
+    for member, found in zip(members, kernel.rollout_batch(members), strict=True):
+        assert_same(found, alone(case, member), TOLERANCE)
+
+
+MAIN = """
+#include <stdio.h>
+#include <stdlib.h>
+int main(int count, char **said) {
+    const int many = atoi(said[1]);
+    double *in = malloc(2 * many * sizeof(double)), *out = malloc(OUTPUTS * many * sizeof(double));
+    if (count != 2 || fread(in, sizeof(double), 2 * many, stdin) != (size_t)(2 * many)) return 1;
+    yid_try(in, out, many);
+    fwrite(out, sizeof(double), OUTPUTS * many, stdout);
+    return yid_simd_width() == 4 ? 0 : 2;
+}
+"""
+
+
+def test_arithmetic_of_a_batch_on_another_processor(tmp_path):
+    """ARM, by a cross compiler and an emulator; its C library rounds here and there otherwise."""
+    cross = shutil.which("aarch64-linux-gnu-gcc")
+    emulator = shutil.which("qemu-aarch64-static") or shutil.which("qemu-aarch64")
+    if cross is None or emulator is None:
+        pytest.skip("there is no cross compiler for ARM (gcc-aarch64-linux-gnu), or no emulator (qemu-user-static)")
+    function, points = everything(), tried_points()
+    text, program = tmp_path / "simd.c", tmp_path / "batch"
+    text.write_text(arithmetic_source(function) + MAIN)
+    flags = [flag for flag in compiler._COMMON_FLAGS if flag not in ("-fPIC", "-shared")]
+    subprocess.run([cross, "-O2", *flags, "-static", str(text), "-o", str(program), "-lm"], check=True)
+    said = subprocess.run(
+        [emulator, program, str(len(points))], input=points.tobytes(), capture_output=True, check=True
+    )
+    found = np.frombuffer(said.stdout).reshape(len(points), function.numel_out(0))
+    assert_those_of_casadi(found, function, points, 1e-12)
+
+
+def test_an_operation_without_a_form_is_refused():
+    x = ca.SX.sym("x")
+    assert simd_c_source([ca.Function("odd", [x], [ca.erfinv(x)])]) is None
 
 
 def test_elimination_fills_no_more_than_the_tree(single_step):

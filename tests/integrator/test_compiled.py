@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -13,7 +14,7 @@ from yid_ocp.integrator import codegen, compiled, compiler
 from yid_ocp.integrator.compiled import CompiledKernel
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.integrator.step_model import SensitivityDirections
+from yid_ocp.integrator.step_model import RolloutInputs, SensitivityDirections
 from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf
 
@@ -34,13 +35,14 @@ def test_no_memory_is_said_by_every_entry_point(poor, step, parts, urdf_folder):
     kernel = CompiledKernel(model, library)
     names = ("spin.mass", "hinge.damping")
     directions = SensitivityDirections(names, np.zeros((step.sizes["nx"], 2)))
-    arguments = (case.theta, case.start, case.torque, case.path, case.feedback)
+    inputs = RolloutInputs(case.theta, case.start, case.torque, case.path, case.feedback)
+    differentiated = replace(inputs, directions=directions)
     plain = case.rollout(feedback=case.feedback, directions=directions)
     assert plain.status.is_converged
 
     # all that a call works with is one block
-    assert poor.grants_needed(lambda: kernel.rollout(*arguments, None)) == 1
-    assert poor.grants_needed(lambda: kernel.rollout(*arguments, directions)) == 1
+    assert poor.grants_needed(lambda: kernel.rollout(inputs)) == 1
+    assert poor.grants_needed(lambda: kernel.rollout(differentiated)) == 1
     by_state = np.ones_like(plain.state)
     assert (
         poor.grants_needed(
@@ -59,7 +61,7 @@ def test_no_memory_is_said_by_every_entry_point(poor, step, parts, urdf_folder):
     )
 
     poor.grants.value = 100
-    again = kernel.rollout(*arguments, directions)
+    again = kernel.rollout(differentiated)
     np.testing.assert_array_equal(again.state, plain.state)
     np.testing.assert_array_equal(again.state_sensitivity, plain.state_sensitivity)
 
@@ -91,7 +93,7 @@ def test_a_rollout_beyond_all_memory(urdf_folder, use_compiler):
         assert word in str(caught.value)
     wide = SensitivityDirections((), np.broadcast_to(0.0, (4, 10**15)))
     with pytest.raises(ResourceError, match=r"3 steps with 1000000000000000 derivatives: it takes 1\.28e\+08 GB"):
-        step.kernel.rollout(theta, start, nothing, np.zeros((4, 0)), None, wide)
+        step.kernel.rollout(RolloutInputs(theta, start, nothing, np.zeros((4, 0)), None, wide))
 
 
 @needs_compiler
@@ -152,7 +154,7 @@ def test_derivatives_are_those_of_their_own_equations(parts, urdf_folder, monkey
         directions = SensitivityDirections(("elbow.damping",), np.zeros((made.sizes["nx"], 1)))
         start = np.concatenate([[0.4, -0.3], np.zeros(made.sizes["nx"] - 2)])
         given = system.parameters.vector(), start, np.full((20, 1), 0.7), np.zeros((21, 0))
-        return made.kernel.rollout(*given, None, directions).state_sensitivity
+        return made.kernel.rollout(RolloutInputs(*given, None, directions)).state_sensitivity
 
     together = [swept(split, "one") for split in ("left", "symmetric")]
     for split, found in zip(("left", "symmetric"), together, strict=True):

@@ -1,4 +1,4 @@
-"""Compiled code: the private cache, its keys, the compiler's absence."""
+"""Compiled code: the private cache, its keys, the compiler's absence, functions at many points at once."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import pytest
 
 from yid_ocp.errors import ConfigError, OutputError
 from yid_ocp.integrator import compiler
+from yid_ocp.integrator.compiler import MappedFunction
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf
@@ -275,3 +276,55 @@ def test_a_function_that_cannot_be_compiled_is_as_it_was(cache, monkeypatch, cap
     monkeypatch.setenv("CC", "none")
     compiler._compiler_path.cache_clear()
     assert compiler.compiled_function(polynomial(3.0)).is_a("SXFunction")
+
+
+# -- functions at many points at once ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("use_compiler", [True, False], ids=["compiled", "interpreted"])
+def test_values_at_every_point(use_compiler):
+    x, y = ca.SX.sym("x", 3), ca.SX.sym("y", 2)
+    sparse = ca.SX(3, 4)
+    sparse[0, 1], sparse[2, 3] = x[0] * y[1], 7
+    dense = x @ y.T
+    function = ca.Function("products", [x, y], [dense, sparse, ca.SX(0, 2)])
+    points, shared = np.arange(12.0).reshape(4, 3), np.array([2.0, 5.0])
+    one, two, none = MappedFunction(function, shared_inputs=(1,), use_compiler=use_compiler)(points, shared)
+    np.testing.assert_array_equal(one, points[:, :, None] * shared)
+    expected = np.zeros((4, 3, 4))
+    expected[:, 0, 1], expected[:, 2, 3] = 5 * points[:, 0], 7
+    np.testing.assert_array_equal(two, expected)
+    assert none.shape == (4, 0, 2)
+    with pytest.raises(AssertionError, match=r"input 1 of products"):
+        MappedFunction(function, use_compiler=use_compiler)(points, shared[None])
+
+
+@needs_compiler
+def test_no_memory_for_a_mapped_function(poor, monkeypatch):
+    libraries, original = [], compiler.compile_library
+
+    def poor_library(source):
+        libraries.append(original(poor.source + source))
+        return libraries[-1]
+
+    monkeypatch.setattr(compiler, "compile_library", poor_library)
+    x = ca.SX.sym("x", 2)
+    double = MappedFunction(ca.Function("double_it", [x], [2 * x]))
+    poor.watch(libraries[0])
+    points = np.arange(6.0).reshape(3, 2)
+    assert poor.grants_needed(lambda: double(points)) == 2
+    poor.grants.value = 2
+    np.testing.assert_array_equal(double(points)[0][:, :, 0], 2 * points)
+
+
+@needs_compiler
+def test_a_function_that_fails_gives_no_result(monkeypatch):
+    original = compiler.compile_library
+
+    def failing_library(source):
+        return original(source.replace("if (fail_it(", "if (1 || fail_it("))
+
+    monkeypatch.setattr(compiler, "compile_library", failing_library)
+    x = ca.SX.sym("x")
+    with pytest.raises(RuntimeError, match="could not evaluate"):
+        MappedFunction(ca.Function("fail_it", [x], [x]))(np.ones((1, 1)))

@@ -55,7 +55,7 @@ def test_equations_are_slot_derivatives_of_the_discrete_lagrangian(
     expected = {
         "momentum_balance": e.p0 + ca.gradient(action, e.q0) + push - pull,
         "p1": ca.gradient(action, e.q1) + e.h * force - push - ca.gradient(moved, e.q1),
-        "constraint": closed(e.q1),
+        "constraint_residual": closed(e.q1),
     }
     pairs = [ca.densify(x) for key, value in expected.items() for x in (getattr(e, key), value)]
     pairs += [ca.densify(x) for x in (e.constraint_impulses.after_jacobian, matrix)]

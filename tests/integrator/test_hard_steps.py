@@ -12,7 +12,13 @@ import pytest
 
 from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.integrator.step_model import _INSTABILITY_HINT, NewtonStatus, SensitivityDirections, StepStatus
+from yid_ocp.integrator.step_model import (
+    _INSTABILITY_HINT,
+    NewtonStatus,
+    RolloutInputs,
+    SensitivityDirections,
+    StepStatus,
+)
 from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.model.system import floating_clamp
 from yid_ocp.model.urdf import read_urdf
@@ -197,11 +203,11 @@ def test_both_kernels_agree(hard):
     names = tuple(hard.system.parameters.names)
     directions = SensitivityDirections(names, np.random.default_rng(1).normal(size=(len(start), len(names))))
     directions.initial_state_tangents[list(hard.system.prescribed_indices)] = 0.0
-    one, two = (step.kernel.rollout(theta, start, torque, path, None, directions) for step in steps)
+    inputs = RolloutInputs(theta, start, torque, path, None, directions)
+    one, two = (step.kernel.rollout(inputs) for step in steps)
     assert (one.status.code, two.status.code) == (hard.code, hard.code)
-    assert (
-        one.status.completed_steps == two.status.completed_steps == (hard.steps if hard.code == NewtonStatus.OK else 0)
-    )
+    done = hard.steps if hard.code == NewtonStatus.OK else 0
+    assert one.status.completed_steps == two.status.completed_steps == done
     assert one.status.message.partition("(")[0] == two.status.message.partition("(")[0]
     if hard.code != NewtonStatus.OK:
         assert all(np.all(np.isnan(r.state_sensitivity[1:])) and np.all(np.isnan(r.multipliers)) for r in (one, two))

@@ -176,22 +176,16 @@ def test_interpreter_equals_compiled(case):
     partial = (weights.state, weights.multipliers, weights.effort)
     back = [s.kernel.adjoint_gradient(case.theta, one, feedback, names, *partial) for s in (case.step, plain)]
     pairs = [(getattr(one, key), getattr(two, key)) for key in ("state", "multipliers", "effort", "torque")]
-    pairs += [
-        (getattr(one, key), getattr(two, key))
-        for key in ("state_sensitivity", "multipliers_sensitivity", "effort_sensitivity")
-    ]
+    differentiated = ("state_sensitivity", "multipliers_sensitivity", "effort_sensitivity")
+    pairs += [(getattr(one, key), getattr(two, key)) for key in differentiated]
     pairs += [(getattr(back[0], key), getattr(back[1], key)) for key in ("by_theta", "by_initial_state", "by_torque")]
     for actual, expected in pairs:
         assert np.all(np.isfinite(actual))
         scale = max(1.0, np.max(np.abs(expected), initial=0.0))
         np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-9 * scale)
-    np.testing.assert_allclose(one.status.internal, two.status.internal, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(
-        one.status.prescribed_effort,
-        two.status.prescribed_effort,
-        rtol=0,
-        atol=1e-9 * scale_of(two.status.prescribed_effort),
-    )
+    np.testing.assert_allclose(one.status.internal_coordinates, two.status.internal_coordinates, rtol=0, atol=1e-9)
+    actual, expected = one.status.prescribed_effort, two.status.prescribed_effort
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-9 * scale_of(expected))
 
 
 def scale_of(array):
@@ -206,7 +200,7 @@ def test_a_rollout_is_its_steps(case):
         pair = (case.path[k], case.path[k + 1]) if s["nc"] else None
         q1, p1, lam, status = case.step(x[:n], x[n : 2 * n], u, case.theta, pair, x[2 * n :])
         assert status.is_converged, status.message
-        after = np.concatenate([q1, p1, status.internal])
+        after = np.concatenate([q1, p1, status.internal_coordinates])
         np.testing.assert_allclose(after, rollout.state[k + 1], rtol=0, atol=1e-9 * scale_of(after))
         np.testing.assert_allclose(lam, rollout.multipliers[k], rtol=0, atol=1e-9)
         np.testing.assert_allclose(
@@ -219,10 +213,14 @@ def test_linearized_steps_are_the_equations_along_any_trajectory(case):
     n, h = s["n"], step.time_step
     rollout = case.rollout()
     exact = step.kernel.linearize(case.theta, rollout.state, rollout.multipliers, rollout.torque, (), False)
-    assert np.max(np.abs(exact.rows[:, step.model.index_tables.unknown_rows])) < 1e-9 * scale_of(rollout.multipliers)
+    assert np.max(np.abs(exact.residual[:, step.model.index_tables.unknown_rows])) < 1e-9 * scale_of(
+        rollout.multipliers
+    )
     np.testing.assert_allclose(exact.p1, rollout.state[1:, n : 2 * n], rtol=0, atol=1e-9)
     fixed = list(step.system.prescribed_indices)
-    np.testing.assert_allclose(-exact.rows[:, fixed] / h, rollout.effort, rtol=0, atol=1e-7 * scale_of(rollout.effort))
+    np.testing.assert_allclose(
+        -exact.residual[:, fixed] / h, rollout.effort, rtol=0, atol=1e-7 * scale_of(rollout.effort)
+    )
 
     rng = np.random.default_rng(8)
     state = rollout.state + 0.01 * rng.normal(size=rollout.state.shape)
@@ -244,16 +242,16 @@ def test_linearized_steps_are_the_equations_along_any_trajectory(case):
 
     epsilon = 1e-6
     plus, minus = at(epsilon), at(-epsilon)
-    for part in ("rows", "p1"):
+    for part in ("residual", "p1"):
         expected = (getattr(plus, part) - getattr(minus, part)) / (2 * epsilon)
         old = np.hstack([moves[1][:-1, :n], moves[1][:-1, 2 * n :]])
         new = np.hstack([moves[1][1:, :n], moves[1][1:, 2 * n :], moves[2]])
         theta = moves[0][[step.system.parameters.index(name) for name in names]]
-        actual = np.einsum("kij,kj->ki", getattr(one, f"{part}_old"), old)
-        actual += np.einsum("kij,kj->ki", getattr(one, f"{part}_new"), new)
-        actual += np.einsum("kij,kj->ki", getattr(one, f"{part}_input"), moves[3])
-        actual += getattr(one, f"{part}_theta") @ theta
-        if part == "rows":
+        actual = np.einsum("kij,kj->ki", getattr(one, f"{part}_by_old"), old)
+        actual += np.einsum("kij,kj->ki", getattr(one, f"{part}_by_new"), new)
+        actual += np.einsum("kij,kj->ki", getattr(one, f"{part}_by_input"), moves[3])
+        actual += getattr(one, f"{part}_by_theta") @ theta
+        if part == "residual":
             actual[:, :n] += moves[1][:-1, n : 2 * n]
         np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-6 * scale_of(expected))
 

@@ -113,7 +113,7 @@ def test_a_maxwell_branch_relaxes_with_its_time_constant(parts, hinge, roll):
         time = np.arange(count + 1) * step.time_step
         expected = angle * (1 - np.exp(-time / tau))
         errors.append(np.max(np.abs(z - expected)))
-        assert rollout.status.internal == pytest.approx([z[-1]])
+        assert rollout.status.internal_coordinates == pytest.approx([z[-1]])
         # torque on the held joint: the spring beside, and what is left of the branch's
         stretch = angle - expected[1:-1]
         np.testing.assert_allclose(rollout.effort[1:, 0], 2.0 * angle + k1 * stretch, rtol=5e-3)
@@ -337,11 +337,15 @@ def test_a_time_step_is_positive(single_arm, time_step):
         compile_step(single_arm, time_step)
 
 
-def test_an_unknown_force_split(hinge):
+@pytest.mark.parametrize(
+    ("option", "value", "allowed"),
+    [("force_split", "right", "symmetric, left"), ("constraint_force", "end", "node, midpoint")],
+)
+def test_an_unknown_rule(hinge, option, value, allowed):
     with pytest.raises(ModelError) as caught:
-        compile_step(hinge(), 0.01, "right")
-    assert "force_split = 'right'" in str(caught.value)
-    assert "symmetric, left" in str(caught.value)
+        compile_step(hinge(), 0.01, **{option: value})
+    assert f"{option} = '{value}'" in str(caught.value)
+    assert allowed in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -383,13 +387,6 @@ def test_inputs_are_left_as_they_were(single_step, golden, theta_golden):
     single_step.jacobians(*arguments, names=["T1.bend"])
     for actual, expected in zip(arguments, (trep.q[3], trep.p[3], trep.u[3], theta), strict=True):
         np.testing.assert_array_equal(actual, expected)
-
-
-def test_an_unknown_constraint_force(hinge):
-    with pytest.raises(ModelError) as caught:
-        compile_step(hinge(), 0.01, constraint_force="end")
-    assert "constraint_force = 'end'" in str(caught.value)
-    assert "node, midpoint" in str(caught.value)
 
 
 @pytest.mark.parametrize("use_compiler", [True, False])

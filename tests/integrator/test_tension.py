@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from yid_ocp.data import read_recording
-from yid_ocp.integrator.lqr import lqr_feedback
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.tracking_feedback import lqr_feedback
 
 TRUTH = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T3.bend": 11.5, "T3.twist": 9.7}
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 from yid_ocp.integrator import codegen, compiler
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.integrator.step_model import SensitivityDirections
+from yid_ocp.integrator.step_model import RolloutInputs, SensitivityDirections
 
 THREADS = 4
 
@@ -63,11 +64,12 @@ def test_rollouts_adjoints_and_linearizations(parts, urdf_folder, monkeypatch, t
     system = case.step.system
     names = tuple(system.parameters.names[::2])
     directions = SensitivityDirections(names, np.random.default_rng(1).normal(size=(len(case.start), len(names))))
+    inputs = RolloutInputs(case.theta, case.start, case.torque, case.path, case.feedback, directions)
     thetas = [case.theta * (1 + 0.02 * i) for i in range(THREADS)]
 
     def everything(step):
         def run(theta):
-            rollout = step.kernel.rollout(theta, case.start, case.torque, case.path, case.feedback, directions)
+            rollout = step.kernel.rollout(replace(inputs, theta=theta))
             assert rollout.status.is_converged, rollout.status.message
             back = step.kernel.adjoint_gradient(
                 theta, rollout, case.feedback, names, np.ones_like(rollout.state), None, None

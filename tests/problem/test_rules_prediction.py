@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from small_problems import PENDULUM, STEPS, H, pendulum_step, taken
 
-from yid_ocp.integrator.step import TrackingFeedback
+from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import truncate_episode
 from yid_ocp.problem.model_functions import CorrectedInputs

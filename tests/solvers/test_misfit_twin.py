@@ -12,8 +12,8 @@ from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.solvers import GaussNewton, Status, solve
 from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, run_virtual_experiment
+from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
-from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 
 pytest.importorskip("mujoco")
 

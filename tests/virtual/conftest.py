@@ -5,8 +5,8 @@ from functools import cache
 import pytest
 from virtual_examples import SEEDS, SYSTEMS, TRUTH, Runs
 
+from yid_ocp.virtual.joint_motion import random_multisine
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, SimulationResult, simulate_in_mujoco
-from yid_ocp.virtual.multisine_motion import random_multisine
 
 
 @pytest.fixture(scope="session")

@@ -15,7 +15,7 @@ from yid_ocp.model.kinematics import forward_kinematics, rigid_body_derivatives
 from yid_ocp.model.system import Grasp, System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.model.y_object import y_object
-from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
+from yid_ocp.virtual.joint_motion import grasping_joint_angles, random_multisine
 from yid_ocp.virtual.mjcf import compile_mjcf, mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import (
     MujocoScene,
@@ -24,7 +24,6 @@ from yid_ocp.virtual.mujoco_simulation import (
     settle_to_equilibrium,
     simulate_in_mujoco,
 )
-from yid_ocp.virtual.multisine_motion import random_multisine
 
 mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
 

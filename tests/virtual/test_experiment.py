@@ -21,9 +21,8 @@ from yid_ocp.virtual.experiment import (
     baxter_foam_y_system,
     run_virtual_experiment,
 )
-from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
+from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
-from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 
 mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
 

@@ -13,21 +13,20 @@ from yid_ocp.effects import EFFECTS, make_effect
 from yid_ocp.errors import ConfigError
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import MidpointState
-from yid_ocp.virtual.experiment import VirtualExperiment, baxter_foam_y_system
+from yid_ocp.virtual.experiment import VirtualExperiment, baxter_foam_y_system, with_sensor_error
 from yid_ocp.virtual.injected import (
     _FORCE_KINDS,
     _MUJOCO_MODEL_KINDS,
     _SENSOR_ERROR_KINDS,
     INJECTABLE_KINDS,
+    OUT_OF_LIBRARY_EFFECTS,
     InjectedEffect,
     _InjectedTerms,
-    _with_sensor_error,
     run_injected_experiment,
 )
+from yid_ocp.virtual.joint_motion import random_multisine
 from yid_ocp.virtual.mjcf import mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
-from yid_ocp.virtual.multisine_motion import random_multisine
-from yid_ocp.virtual.out_of_library_effects import OUT_OF_LIBRARY_EFFECTS
 
 mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
 
@@ -162,7 +161,7 @@ def reading(duration=1.0) -> Recording:
 def test_errors_of_joint_sensors_are_those_of_the_table(label, values, channel, expected):
     kind, _, place = label.partition("@")
     recording = reading()
-    wrong = _with_sensor_error(recording, SYSTEM, InjectedEffect(kind, place, values))
+    wrong = with_sensor_error(recording, SYSTEM, kind, place, values)
     assert getattr(wrong.joints, channel)[:, 1] == pytest.approx(expected(recording))
     other = getattr(wrong.joints, channel)[:, 2]
     assert other == pytest.approx(getattr(recording.joints, channel)[:, 2])
@@ -170,7 +169,7 @@ def test_errors_of_joint_sensors_are_those_of_the_table(label, values, channel, 
 
 def test_what_is_recorded_late_acts_later():
     recording = reading()
-    wrong = _with_sensor_error(recording, SYSTEM, InjectedEffect("effort_delay", "left", {"delay": 0.05}))
+    wrong = with_sensor_error(recording, SYSTEM, "effort_delay", "left", {"delay": 0.05})
     assert wrong.joints.effort[:-6] == pytest.approx(recording.joints.effort[5:-1], abs=1e-9)
 
 
@@ -179,7 +178,7 @@ def test_errors_of_cameras_are_those_of_the_table():
     true = recording.points[0].position
 
     def seen(kind, **values):
-        return _with_sensor_error(recording, SYSTEM, InjectedEffect(kind, "camera", values)).points[0]
+        return with_sensor_error(recording, SYSTEM, kind, "camera", values).points[0]
 
     assert seen("camera_translation", x=0.01, y=0.0, z=-0.01).position == pytest.approx(
         true + np.array([0.01, 0.0, -0.01])

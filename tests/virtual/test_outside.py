@@ -8,11 +8,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.virtual.experiment import VirtualExperiment, baxter_foam_y_system
-from yid_ocp.virtual.injected import InjectedEffect, _InjectedTerms, run_injected_experiment
-from yid_ocp.virtual.mjcf import mujoco_xml
-from yid_ocp.virtual.mujoco_simulation import SimulationOptions
-from yid_ocp.virtual.multisine_motion import random_multisine
-from yid_ocp.virtual.out_of_library_effects import (
+from yid_ocp.virtual.injected import (
     _CORD_LENGTH,
     _CREASE_ANGLE,
     _DRIFT_TIME,
@@ -22,7 +18,13 @@ from yid_ocp.virtual.out_of_library_effects import (
     _WALL_DISTANCE,
     _WARM_UP_TIME,
     OUT_OF_LIBRARY_EFFECTS,
+    InjectedEffect,
+    _InjectedTerms,
+    run_injected_experiment,
 )
+from yid_ocp.virtual.joint_motion import random_multisine
+from yid_ocp.virtual.mjcf import mujoco_xml
+from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
 mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
 

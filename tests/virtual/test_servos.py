@@ -8,7 +8,7 @@ import pytest
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ModelError
-from yid_ocp.export.format_support import effect_support, parameter_support
+from yid_ocp.export.models import effect_support, parameter_support
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
 from yid_ocp.model.servos_and_springs import TORQUE_LIMIT_POWER, PositionServoOptions
@@ -16,10 +16,10 @@ from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperiment
 from yid_ocp.virtual.injected import InjectedEffect, run_injected_experiment
+from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine
 from yid_ocp.virtual.mjcf import mujoco_xml
 from yid_ocp.virtual.mujoco_replay import replay_in_mujoco
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
-from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 
 mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
 

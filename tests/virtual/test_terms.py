@@ -11,13 +11,12 @@ import pytest
 
 from yid_ocp.effects import EFFECTS, make_effect
 from yid_ocp.errors import ModelError
-from yid_ocp.export.format_support import effect_support
+from yid_ocp.export.models import effect_support
 from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_derivatives
 from yid_ocp.model.system import MidpointState
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.virtual.mjcf import compile_mjcf, mujoco_xml
-from yid_ocp.virtual.rigid_body_terms import ParameterEvaluator, joint_dynamics
+from yid_ocp.virtual.mjcf import ParameterEvaluator, compile_mjcf, joint_dynamics, mujoco_xml
 
 mujoco = pytest.importorskip("mujoco", reason="exported models need MuJoCo: pip install 'yid-ocp[blind]'")
 

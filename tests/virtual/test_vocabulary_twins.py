@@ -70,10 +70,7 @@ def agrees(found: tuple[float, float], true: float, rel: float = 0.0) -> bool:
 @pytest.mark.parametrize("mode", [pytest.param("driven", marks=pytest.mark.slow), "prescribed"])
 @pytest.mark.parametrize(
     "values",
-    [
-        {"mass": 0.4, "mx": 0.02, "my": -0.03, "mz": 0.02},
-        {"mass": -0.3, "mx": 0.0, "my": -0.003, "mz": 0.03},
-    ],
+    [{"mass": 0.4, "mx": 0.02, "my": -0.03, "mz": 0.02}, {"mass": -0.3, "mx": 0.0, "my": -0.003, "mz": 0.03}],
     ids=["added", "taken away"],
 )
 def test_a_payload_is_found_with_its_place(values, mode) -> None:

@@ -69,9 +69,8 @@ def shape(system):
 def run(system):
     """Three seconds in MuJoCo."""
     pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo")
-    from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
+    from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine
     from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
-    from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 
     posture = grasping_joint_angles(system, TRUTH)
     motion = random_multisine(

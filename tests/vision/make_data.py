@@ -13,9 +13,8 @@ import numpy as np
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.virtual.experiment import baxter_foam_y_system
-from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
+from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
-from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 from yid_ocp.vision import (
     CameraScene,
     CloudFilterOptions,

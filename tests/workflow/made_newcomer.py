@@ -11,8 +11,8 @@ import numpy as np
 from yid_ocp.config.reader import load_config
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperiment, run_virtual_experiment
+from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
-from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 from yid_ocp.workflow.build import build_system
 
 START = 1_700_000_000 * 10**9

@@ -29,7 +29,7 @@ from made_newcomer import (
 
 from yid_ocp.cli import main
 from yid_ocp.config.reader import load_config
-from yid_ocp.virtual.multisine_motion import MultisineOptions
+from yid_ocp.virtual.joint_motion import MultisineOptions
 from yid_ocp.workflow.build_problem import load_problem
 
 UR5_NUMBERS = ("--object", "cable", "--length", "1", "--mass", "0.1", "--radius", "0.005")

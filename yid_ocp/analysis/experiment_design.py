@@ -27,9 +27,8 @@ from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.sensors import recorded_camera_pose
 from yid_ocp.sensors.joints import POSITION_GROUP, PositionSensor, is_measured_by_arm
-from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
+from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
-from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.analysis.step_symbols import StepSymbols
-from yid_ocp.integrator.step import Step, TrackingFeedback
-from yid_ocp.integrator.step_model import StepLinearization
+from yid_ocp.integrator.step import Step
+from yid_ocp.integrator.step_model import StepLinearization, TrackingFeedback
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.sensors import sensor_function
 

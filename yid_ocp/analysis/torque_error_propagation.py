@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from yid_ocp.errors import SolverError
 from yid_ocp.inference.whitening import NominalTrajectory, nominal_trajectory
-from yid_ocp.integrator.linearized_steps import linearized_steps
-from yid_ocp.integrator.momentum_shift import torque_error_feedthrough
+from yid_ocp.integrator.rollout import linearized_steps
+from yid_ocp.integrator.tracking_feedback import torque_error_feedthrough
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import InputErrors
 from yid_ocp.problem.evaluation import Evaluation

@@ -1,1 +1,1 @@
-"""Export of recordings, models and equations; one file per format."""
+"""Export of models, equations and signals."""

@@ -11,7 +11,7 @@ import scipy.linalg
 import scipy.optimize
 from numpy.typing import NDArray
 
-from yid_ocp.integrator.step import Rollout, TrackingFeedback
+from yid_ocp.integrator.step_model import Rollout, TrackingFeedback
 from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.estimation_problem import EstimationProblem

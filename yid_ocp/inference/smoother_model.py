@@ -27,8 +27,7 @@ from numpy.typing import NDArray
 
 from yid_ocp.effects.base import grasp_names, robot_joints
 from yid_ocp.inference.linearized_residual import NominalTrajectory, ResidualSlopes, nominal_trajectory
-from yid_ocp.integrator.linearized_steps import AdditionalLoads, active_state_mask, linearized_steps
-from yid_ocp.integrator.rollout import applied_joint_torque
+from yid_ocp.integrator.rollout import AdditionalLoads, active_state_mask, applied_joint_torque, linearized_steps
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.options import OptionInfo

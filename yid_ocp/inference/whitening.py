@@ -39,9 +39,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.inference.kalman import KalmanStep, Transition, kalman_step
 from yid_ocp.inference.linearized_residual import NominalTrajectory, ResidualSlopes, nominal_trajectory
-from yid_ocp.integrator.linearized_steps import LinearizedStep, active_state_mask, linearized_steps
-from yid_ocp.integrator.momentum_shift import torque_error_feedthrough
-from yid_ocp.integrator.step import TrackingFeedback
+from yid_ocp.integrator.rollout import LinearizedStep, active_state_mask, linearized_steps
+from yid_ocp.integrator.step_model import TrackingFeedback
+from yid_ocp.integrator.tracking_feedback import torque_error_feedthrough
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EquilibriumGuesses, EstimationProblem
 from yid_ocp.problem.episode_prediction import EpisodePredictor

@@ -1,39 +1,51 @@
-"""From symbolic step equations to CasADi functions, index tables and generated C."""
+"""From symbolic step equations to CasADi functions, index tables and generated C.
+
+Functions of several members at once, and long ones, are written in the arithmetic of `simd.c`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.integrator.discrete import DiscreteEquations
-from yid_ocp.integrator.simd_codegen import is_long_function, simd_c_source
 
-Indices = NDArray[np.int32]
+_Indices = NDArray[np.int32]
 
 
 @dataclass(frozen=True)
 class StepFunctions:
     """CasADi functions of one step, all with the arguments of `DiscreteEquations.arguments`.
 
+    What is at the midpoint and after it is empty where the constraints pull at the node.
+
     Attributes
     ----------
-    residual : (balance, internal, constraint, p1, share of Dphi(q_m)), balance and p1 without the constraints' pull
-    jacobian_parts : (pair vectors, rest Jacobian, rest Jacobian of p1, constraint Jacobian, curvature), the last four as
-        nonzeros; the curvature is the derivative of the midpoint's pull by q_k, which is that by q_{k+1}
-    before_constraint_jacobian : share of Dphi(q_k) in the balance, which does not depend on the unknowns
-    after_constraint_jacobian : share of Dphi(q_{k+1}) in p1
-    constraint_force_derivatives : (derivative of the pull of `before_constraint_jacobian` by (q_k, z_k), that of `after_constraint_jacobian` by q_{k+1})
-    row_scale_and_time_step : (row scale, h)
-    internal_residual_at_rest : (equations of the internal coordinates at rest, their derivative by (q, z, lam, u), nodes being one)
-    sparsity_patterns : sparsity of rest, rest of p1, constraint Jacobian, matrix (also of the other shares of Dphi), pull,
-        curvature and that at the end, derivative at rest
-
-    What is at the midpoint and after it is empty where the constraints pull at the node.
+    equations : DiscreteEquations
+    residual : casadi.Function
+        (balance, internal, constraint, p1, share of Dphi(q_m)), balance and p1 without the constraints' pull.
+    jacobian_parts : casadi.Function
+        (pair vectors, rest Jacobian, rest Jacobian of p1, constraint Jacobian, curvature), the last four as nonzeros;
+        the curvature is the derivative of the midpoint's pull by q_k, which is that by q_{k+1}.
+    before_constraint_jacobian : casadi.Function
+        Share of Dphi(q_k) in the balance, which does not depend on the unknowns.
+    after_constraint_jacobian : casadi.Function
+        Share of Dphi(q_{k+1}) in p1.
+    constraint_force_derivatives : casadi.Function
+        Derivatives of the pull of the first of these two by (q_k, z_k), of the second by q_{k+1}.
+    row_scale_and_time_step : casadi.Function
+        (row scale, h)
+    internal_residual_at_rest : casadi.Function
+        (equations of the internal coordinates at rest, their derivative by (q, z, lam, u), nodes being one)
+    sparsity_patterns : dict of str to casadi.Sparsity
+        Of rest, rest of p1, constraint Jacobian, matrix (also of the other shares of Dphi), pull, curvature and that at
+        the end, derivative at rest.
     """
 
     equations: DiscreteEquations
@@ -49,15 +61,7 @@ class StepFunctions:
     @property
     def all_functions(self) -> tuple[ca.Function, ...]:
         """All functions, in the order of code generation."""
-        return (
-            self.residual,
-            self.jacobian_parts,
-            self.before_constraint_jacobian,
-            self.after_constraint_jacobian,
-            self.constraint_force_derivatives,
-            self.row_scale_and_time_step,
-            self.internal_residual_at_rest,
-        )
+        return tuple(value for value in vars(self).values() if isinstance(value, ca.Function))
 
 
 def step_functions(equations: DiscreteEquations) -> StepFunctions:
@@ -67,32 +71,29 @@ def step_functions(equations: DiscreteEquations) -> StepFunctions:
     (`RigidBodyDerivatives`), everything else as sparse nonzeros from automatic differentiation.
     """
     e = equations
-    bodies = [
-        e.row_scale * (e.h / 2 * e.rigid_body_terms.lagrangian_by_q + sign * e.rigid_body_terms.lagrangian_by_v)
-        for sign in (-1, 1)
-    ]
+    rigid, pulls = e.rigid_body_terms, e.constraint_impulses
+    bodies = [e.row_scale * (e.h / 2 * rigid.lagrangian_by_q + sign * rigid.lagrangian_by_v) for sign in (-1, 1)]
     if e.closed_form_impulses is not None:
         bodies = [part + push for part, push in zip(bodies, e.closed_form_impulses, strict=True)]
     balance, p1 = e.balance_remainder + e.p0 + bodies[0], e.p1_remainder + bodies[1]
     rest, rest_p, by_unknown = _rest_jacobians(e, *bodies)
-    pulls = e.constraint_impulses
     by_z = ca.jacobian(pulls.before_jacobian.T @ e.lam, e.z0)
     pull = ca.sparsify(pulls.start_share * ca.horzcat(pulls.before_force_by_q, by_z))
     moving = [pulls.middle_jacobian, pulls.after_jacobian, pulls.middle_force_by_q / 2, pulls.after_force_by_q]
     by_node = [[ca.jacobian(e.internal_residual_at_rest, x) for x in pair] for pair in ((e.q0, e.q1), (e.z0, e.z1))]
     by_held = [ca.jacobian(e.internal_residual_at_rest, x) for x in (e.lam, e.u)]
     at_rest = ca.sparsify(ca.horzcat(*(first + second for first, second in by_node), *by_held))
-    middle, after, curve, after_curve = (
-        pulls.midpoint_share * x if pulls.midpoint_share else ca.SX(*x.shape) for x in moving
-    )
+    share = pulls.midpoint_share
+    middle, after, curve, after_curve = (share * x if share else ca.SX(*x.shape) for x in moving)
 
     def function(name: str, *outputs: ca.SX) -> ca.Function:
         return ca.Function(name, e.arguments, ca.cse(list(outputs)))
 
-    def nonzeros(matrix: ca.SX) -> ca.SX:
-        values: ca.SX = matrix.nz[:]
-        return values
+    def nonzeros(matrix: ca.SX) -> Any:
+        return matrix.nz[:]
 
+    matrices = {"rest": rest, "rest_p": rest_p, "constraint": by_unknown, "matrix": pulls.before_jacobian, "pull": pull}
+    matrices |= {"curve": curve, "after_curve": after_curve, "resting": at_rest}
     return StepFunctions(
         e,
         function("residual", balance, e.internal_residual, e.constraint_residual, p1, nonzeros(middle)),
@@ -102,16 +103,7 @@ def step_functions(equations: DiscreteEquations) -> StepFunctions:
         function("pull", nonzeros(pull), nonzeros(after_curve)),
         function("scales", e.row_scale, e.h),
         function("resting", e.internal_residual_at_rest, nonzeros(at_rest)),
-        {
-            "rest": rest.sparsity(),
-            "rest_p": rest_p.sparsity(),
-            "constraint": by_unknown.sparsity(),
-            "matrix": pulls.before_jacobian.sparsity(),
-            "pull": pull.sparsity(),
-            "curve": curve.sparsity(),
-            "after_curve": after_curve.sparsity(),
-            "resting": at_rest.sparsity(),
-        },
+        {name: matrix.sparsity() for name, matrix in matrices.items()},
     )
 
 
@@ -127,10 +119,7 @@ def _pairs(e: DiscreteEquations) -> ca.SX:
 
 
 def _rest_jacobians(e: DiscreteEquations, bodies: ca.SX, bodies_p: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """What the pairs leave out, sparse: of the rows and of p1 by (unknowns, old, input), of the constraint by unknowns.
-
-    `bodies` and `bodies_p` are the bodies' part of the balance and of p1.
-    """
+    """What the pairs leave out, sparse: rows and p1 by (unknowns, old, input), the constraint by unknowns."""
     unknown, old = ca.vertcat(e.q1, e.z1, e.lam), ca.vertcat(e.q0, e.z0)
     inputs = ca.vertcat(unknown, old, e.u)
     m, n = e.lam.numel(), e.q0.numel()
@@ -147,10 +136,8 @@ def _rest_jacobians(e: DiscreteEquations, bodies: ca.SX, bodies_p: ca.SX) -> tup
     by_q1, pulls = e.constraint_impulses.after_jacobian, e.constraint_impulses
     if pulls.midpoint_share:
         # what the curvatures of `StepFunctions` leave out: grasps may depend on internal coordinates
-        middle, right = (
-            -e.row_scale * (part.T @ e.lam)
-            for part in (pulls.midpoint_share * pulls.middle_jacobian, pulls.right_jacobian)
-        )
+        parts = (pulls.midpoint_share * pulls.middle_jacobian, pulls.right_jacobian)
+        middle, right = (-e.row_scale * (part.T @ e.lam) for part in parts)
         rest += by_internal(ca.vertcat(middle, ca.SX(e.z0.numel() + m, 1)))
         rest_p += by_internal(right)
     if e.constraint_relaxation_gain is not None:
@@ -180,21 +167,23 @@ class StepIndexTables:
 
     Attributes
     ----------
-    unknown_rows : (ny,)
+    unknown_rows : ndarray of int, shape (ny,)
         Full row (balance, internal, constraint) of each unknown (free q1, z1, lam).
-    elimination_order : (ny,)
-        Elimination order: internal coordinates, tips before roots, multipliers last.
-    fill_in : list of (k,) arrays
+    elimination_order : ndarray of int, shape (ny,)
+        Internal coordinates, tips before roots, multipliers last.
+    fill_in : tuple of ndarray of int
         For each pivot, the later positions that its row and column fill.
+    joint_ancestors, residual_old_columns, p1_old_columns, p1_new_columns : tuple of ndarray of int
+        For each joint its ancestors; for each row of a Jacobian its columns that are not always zero.
     """
 
-    unknown_rows: Indices
-    elimination_order: Indices
-    fill_in: tuple[Indices, ...]
-    joint_ancestors: tuple[Indices, ...]
-    residual_old_columns: tuple[Indices, ...]
-    p1_old_columns: tuple[Indices, ...]
-    p1_new_columns: tuple[Indices, ...]
+    unknown_rows: _Indices
+    elimination_order: _Indices
+    fill_in: tuple[_Indices, ...]
+    joint_ancestors: tuple[_Indices, ...]
+    residual_old_columns: tuple[_Indices, ...]
+    p1_old_columns: tuple[_Indices, ...]
+    p1_new_columns: tuple[_Indices, ...]
 
 
 def step_index_tables(functions: StepFunctions) -> StepIndexTables:
@@ -203,6 +192,10 @@ def step_index_tables(functions: StepFunctions) -> StepIndexTables:
     system = e.system
     n, nz, m = system.n_coordinates, e.z0.numel(), e.lam.numel()
     nt, nqz = n + nz + m, n + nz
+
+    def at(key: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        return nonzero_indices(functions.sparsity_patterns[key])
+
     related = np.zeros((n, n), bool)
     ancestors = tuple(np.array(system.mechanism.ancestor_joints(j), np.int32) for j in range(n))
     for j, chain in enumerate(ancestors):
@@ -211,24 +204,21 @@ def step_index_tables(functions: StepFunctions) -> StepIndexTables:
     p1_new, p1_old = np.zeros((n, nt), bool), np.zeros((n, nqz), bool)
     rows_new[:n, :n] = rows_old[:n, :n] = p1_new[:, :n] = p1_old[:, :n] = related
     for key, new, old in (("rest", rows_new, rows_old), ("rest_p", p1_new, p1_old)):
-        row, column = nonzero_indices(functions.sparsity_patterns[key])
+        row, column = at(key)
         inside = column < nt
         new[row[inside], column[inside]] = True
         inside = (column >= nt) & (column < nt + nqz)
         old[row[inside], column[inside] - nt] = True
-    row, column = nonzero_indices(functions.sparsity_patterns["constraint"])
+    row, column = at("constraint")
     rows_new[n + nz + row, column] = True
-    row, column = nonzero_indices(functions.sparsity_patterns["matrix"])
+    row, column = at("matrix")
     rows_new[column, n + nz + row] = True
     if e.constraint_impulses.midpoint_share:
         p1_new[column, n + nz + row] = True
-    row, column = nonzero_indices(functions.sparsity_patterns["curve"])
     for matrix in (rows_new, rows_old, p1_new, p1_old):
-        matrix[row, column] = True
-    row, column = nonzero_indices(functions.sparsity_patterns["after_curve"])
-    p1_new[row, column] = True
-    row, column = nonzero_indices(functions.sparsity_patterns["pull"])
-    rows_old[row, column] = True
+        matrix[at("curve")] = True
+    p1_new[at("after_curve")] = True
+    rows_old[at("pull")] = True
 
     free = np.array(system.free_indices, np.int32)
     unknown_row = np.concatenate([free, np.arange(n, nt, dtype=np.int32)]).astype(np.int32)
@@ -243,12 +233,11 @@ def step_index_tables(functions: StepFunctions) -> StepIndexTables:
         pattern[np.ix_(later, later)] = True
         fill.append(later.astype(np.int32))
 
-    def columns(matrix: NDArray[np.bool_]) -> tuple[Indices, ...]:
+    def columns(matrix: NDArray[np.bool_]) -> tuple[_Indices, ...]:
         return tuple(np.flatnonzero(line).astype(np.int32) for line in matrix)
 
-    return StepIndexTables(
-        unknown_row, order, tuple(fill), ancestors, columns(rows_old), columns(p1_old), columns(p1_new)
-    )
+    varying = (columns(matrix) for matrix in (rows_old, p1_old, p1_new))
+    return StepIndexTables(unknown_row, order, tuple(fill), ancestors, *varying)
 
 
 def kernel_source(functions: StepFunctions, tables: StepIndexTables, batched: bool = False) -> str | None:
@@ -257,33 +246,28 @@ def kernel_source(functions: StepFunctions, tables: StepIndexTables, batched: bo
     Parameters
     ----------
     functions : StepFunctions
-    tables : Structure
+    tables : StepIndexTables
     batched : bool
-        Whether the code handles several rollouts at once, as many as `yid_lanes` returns; None where a function has
-        no SIMD form.
+        Whether the code handles several rollouts at once, as many as `yid_simd_width` returns; None where a function
+        has no SIMD form.
     """
-    e = functions.equations
-    system = e.system
-    n, nz, m = system.n_coordinates, e.z0.numel(), e.lam.numel()
-    patterns = functions.sparsity_patterns
-    sizes = {
-        "N": n,
-        "NZ": nz,
-        "M": m,
-        "NU": e.u.numel(),
-        "NC": len(system.prescribed),
-        "NF": n - len(system.prescribed),
-        "NY": len(tables.elimination_order),
-        "NT": n + nz + m,
-        "NTHETA": e.theta.numel(),
-        "NNZ_REST": patterns["rest"].nnz(),
-        "NNZ_REST_P": patterns["rest_p"].nnz(),
-        "NNZ_CONSTRAINT": patterns["constraint"].nnz(),
-        "NNZ_MATRIX": patterns["matrix"].nnz(),
-        "NNZ_PULL": patterns["pull"].nnz(),
-        "NNZ_CURVE": patterns["curve"].nnz(),
-        "NNZ_AFTER_CURVE": patterns["after_curve"].nnz(),
-        "NNZ_RESTING": patterns["resting"].nnz(),
+    made = simd_c_source(functions.all_functions) if batched else _step_source(functions.all_functions)
+    if made is None:
+        return None
+    sizes = [f"#define {name} {value}" for name, value in _kernel_sizes(functions, tables).items()]
+    folder = resources.files("yid_ocp.integrator")
+    arithmetic, kernel = (folder.joinpath(name).read_text(encoding="utf-8") for name in ("simd.c", "kernel.c"))
+    parts = ["#define BATCHED" if batched else "", arithmetic, made, *sizes, *_kernel_tables(functions, tables), kernel]
+    return "\n".join(parts)
+
+
+def _kernel_sizes(functions: StepFunctions, tables: StepIndexTables) -> dict[str, float]:
+    e, system = functions.equations, functions.equations.system
+    n, nz, m, nc = system.n_coordinates, e.z0.numel(), e.lam.numel(), len(system.prescribed)
+    return {
+        **{"N": n, "NZ": nz, "M": m, "NU": e.u.numel(), "NC": nc, "NF": n - nc},
+        **{"NY": len(tables.elimination_order), "NT": n + nz + m, "NTHETA": e.theta.numel()},
+        **{f"NNZ_{key.upper()}": pattern.nnz() for key, pattern in functions.sparsity_patterns.items()},
         "SZ_W": max(f.sz_w() for f in functions.all_functions),
         "SZ_IW": max(f.sz_iw() for f in functions.all_functions),
         "ROW_SCALED": int(bool(system.joint_compliances)),
@@ -292,56 +276,43 @@ def kernel_source(functions: StepFunctions, tables: StepIndexTables, batched: bo
         "CLOSED_LEFT": e.closed_form_force_shares[0],
         "CLOSED_RIGHT": e.closed_form_force_shares[1],
     }
-    lines = [f"#define {name} {value}" for name, value in sizes.items()]
+
+
+def _kernel_tables(functions: StepFunctions, tables: StepIndexTables) -> list[str]:
+    system = functions.equations.system
+    lines: list[str] = []
 
     def table(name: str, values: Sequence[int] | NDArray[np.integer]) -> None:
         entries = ", ".join(str(int(v)) for v in values) or "0"
         lines.append(f"static const int {name}[] = {{{entries}}};")
 
-    def runs(name: str, lists: Sequence[Indices], gap: int) -> None:
-        starts, flat = [0], []
-        for entries in lists:
-            for first, last in _runs(entries, gap):
-                flat += [first, last]
-            starts.append(len(flat) // 2)
-        table(f"{name}_start", starts)
-        table(f"{name}_run", flat)
-
-    def ragged(name: str, lists: Sequence[Indices]) -> None:
-        table(f"{name}_start", np.concatenate([[0], np.cumsum([len(entries) for entries in lists])]))
-        table(f"{name}_col", np.concatenate(lists) if lists else [])
+    def ragged(name: str, suffix: str, lists: Sequence[Sequence[int] | _Indices], width: int = 1) -> None:
+        table(f"{name}_start", np.concatenate([[0], np.cumsum([len(entries) // width for entries in lists])]))
+        table(f"{name}_{suffix}", np.concatenate(lists) if lists else [])
 
     table("free_index", system.free_indices)
     table("prescribed_index", system.prescribed_indices)
     table("unknown_row", tables.unknown_rows)
     table("order", tables.elimination_order)
-    runs("ancestor", tables.joint_ancestors, 0)
-    runs("fill", tables.fill_in, 0)
-    ragged("rows_old", tables.residual_old_columns)
-    ragged("p1_old", tables.p1_old_columns)
-    ragged("p1_new", tables.p1_new_columns)
-    for key in ("rest", "rest_p", "constraint", "matrix", "pull", "curve", "after_curve", "resting"):
-        row, column = nonzero_indices(patterns[key])
+    ragged("ancestor", "run", [_runs(entries) for entries in tables.joint_ancestors], 2)
+    ragged("fill", "run", [_runs(entries) for entries in tables.fill_in], 2)
+    ragged("rows_old", "col", tables.residual_old_columns)
+    ragged("p1_old", "col", tables.p1_old_columns)
+    ragged("p1_new", "col", tables.p1_new_columns)
+    for key, pattern in functions.sparsity_patterns.items():
+        row, column = nonzero_indices(pattern)
         table(f"{key}_row", row)
         table(f"{key}_col", column)
-    made = simd_c_source(functions.all_functions) if batched else _step_source(functions.all_functions)
-    if made is None:
-        return None
-    arithmetic, kernel = (
-        resources.files("yid_ocp.integrator").joinpath(name).read_text(encoding="utf-8")
-        for name in ("simd.c", "kernel.c")
-    )
-    return "\n".join(["#define BATCHED" if batched else "", arithmetic, made, *lines, kernel])
+    return lines
 
 
 def _step_source(functions: Sequence[ca.Function]) -> str:
     """C source of a step's functions: CasADi's own, but for long ones, which no compiler takes whole."""
-    long = [function for function in functions if is_long_function(function)]
+    long = [function for function in functions if _is_long_function(function)]
     ours = simd_c_source(long)
     if not long or ours is None:
         return casadi_c_source("step", functions)
-    short = [function for function in functions if not is_long_function(function)]
-    return "\n".join([casadi_c_source("step", short), ours])
+    return "\n".join([casadi_c_source("step", [f for f in functions if not _is_long_function(f)]), ours])
 
 
 def casadi_c_source(name: str, functions: Sequence[ca.Function]) -> str:
@@ -358,11 +329,149 @@ def nonzero_indices(sparsity: ca.Sparsity) -> tuple[NDArray[np.int64], NDArray[n
     return np.array(row, np.int64), np.array(column, np.int64)
 
 
-def _runs(entries: Indices, gap: int) -> list[tuple[int, int]]:
-    result: list[tuple[int, int]] = []
+def _runs(entries: _Indices) -> list[int]:
+    """First and one past the last of every run of consecutive numbers."""
+    result: list[int] = []
     for value in map(int, entries):
-        if result and value <= result[-1][1] + gap:
-            result[-1] = (result[-1][0], value + 1)
+        if result and value == result[-1]:
+            result[-1] = value + 1
         else:
-            result.append((value, value + 1))
+            result += [value, value + 1]
     return result
+
+
+# libm's functions of one member after another
+_ONE = (
+    *("exp", "log", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh"),
+    *("floor", "ceil", "erf", "log1p", "expm1"),
+)
+_TWO = ("pow", "constpow", "atan2", "fmod", "remainder", "copysign", "hypot")
+_FORMS = {
+    ca.OP_ASSIGN: "{0}",
+    ca.OP_ADD: "{0} + {1}",
+    ca.OP_SUB: "{0} - {1}",
+    ca.OP_MUL: "{0} * {1}",
+    ca.OP_DIV: "{0} / {1}",
+    ca.OP_NEG: "-{0}",
+    ca.OP_SQ: "{0} * {0}",
+    ca.OP_TWICE: "{0} + {0}",
+    ca.OP_INV: "1.0 / {0}",
+    ca.OP_SQRT: "root({0})",
+    ca.OP_FABS: "magnitude({0})",
+    ca.OP_SIGN: "sign_of({0})",
+    ca.OP_FMIN: "lesser({0}, {1})",
+    ca.OP_FMAX: "larger({0}, {1})",
+    ca.OP_LT: "truth({0} < {1})",
+    ca.OP_LE: "truth({0} <= {1})",
+    ca.OP_EQ: "truth({0} == {1})",
+    ca.OP_NE: "truth({0} != {1})",
+    ca.OP_NOT: "truth({0} == 0)",
+    ca.OP_AND: "truth(({0} != 0) & ({1} != 0))",
+    ca.OP_OR: "truth(({0} != 0) | ({1} != 0))",
+    ca.OP_IF_ELSE_ZERO: "choose({0} != 0, {1}, (real)ALL(0.0))",
+    **{getattr(ca, f"OP_{name.upper()}"): f"each({name}, {{0}})" for name in _ONE},
+    **{getattr(ca, f"OP_{name.upper()}"): f"each_pair({name.removeprefix('const')}, {{0}}, {{1}})" for name in _TWO},
+}
+_TURNS = {ca.OP_SIN: "sine", ca.OP_COS: "cosine"}
+_KNOWN = {ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST, *_FORMS, *_TURNS}
+
+_LONG_INSTRUCTION_COUNT = 80_000
+"""Number of instructions above which a function is split into parts, since compile time grows superlinearly."""
+_PART_INSTRUCTION_COUNT = 300
+"""Instructions per part; with 300 a step of 151 variables compiles in half the time of 4000 and runs as fast."""
+
+
+def _is_long_function(function: ca.Function) -> bool:
+    """Whether a function is so long that its C code is split into parts."""
+    return int(function.n_instructions()) > _LONG_INSTRUCTION_COUNT
+
+
+def simd_c_source(functions: Sequence[ca.Function]) -> str | None:
+    """SIMD C source of SX functions with CasADi's signatures; None if one uses an operation without a SIMD form.
+
+    A long one is written as functions of `_PART_INSTRUCTION_COUNT` instructions, which hand on what later ones need in
+    the work vector.
+    """
+    sources = [_source(function) for function in functions]
+    return None if None in sources else "\n".join(source for source in sources if source is not None)
+
+
+@dataclass(frozen=True)
+class _Instruction:
+    code: int
+    inputs: list[int]  # argument and entry, or the instructions whose values it takes
+    outputs: list[int]  # the place of CasADi's work vector, or result and entry
+    constant: float
+
+
+def _source(function: ca.Function) -> str | None:
+    instructions = _instructions(function)
+    if any(instruction.code not in _KNOWN for instruction in instructions):
+        return None
+    size = _PART_INSTRUCTION_COUNT if _is_long_function(function) else max(len(instructions), 1)
+    needed = [0] * len(instructions)  # the last part that takes its value
+    for k, instruction in enumerate(instructions):
+        for of in instruction.inputs if instruction.code != ca.OP_INPUT else ():
+            needed[of] = k // size
+    signature, name = "const real **arg, real **res, long long *iw, real *restrict w, int mem", function.name()
+    parts = [_part(instructions, first, size, needed) for first in range(0, max(len(instructions), 1), size)]
+    if len(parts) == 1:
+        return "\n".join([f"static void {name}({signature}) {{", *parts[0], "}"])
+    head = "static __attribute__((noinline)) void"
+    written = ["\n".join([f"{head} {name}_{i}({signature}) {{", *lines, "}"]) for i, lines in enumerate(parts)]
+    calls = [f"{name}_{i}(arg, res, iw, w, mem);" for i in range(len(parts))]
+    return "\n".join([*written, f"static void {name}({signature}) {{", *calls, "}"])
+
+
+def _instructions(function: ca.Function) -> list[_Instruction]:
+    """What a function does, in order; of an operation without a form no input is looked up."""
+    held: dict[int, int] = {}  # the instruction whose value stands in a place now
+    found = []
+    for k in range(function.n_instructions()):
+        code, inputs = function.instruction_id(k), function.instruction_input(k)
+        outputs = function.instruction_output(k)
+        if code in _KNOWN and code != ca.OP_INPUT:
+            inputs = [held[place] for place in inputs]
+        constant = function.instruction_constant(k) if code == ca.OP_CONST else 0.0
+        found.append(_Instruction(code, inputs, outputs, constant))
+        if code != ca.OP_OUTPUT:
+            held.update(dict.fromkeys(outputs, k))
+    return found
+
+
+def _part(instructions: Sequence[_Instruction], first: int, size: int, needed: Sequence[int]) -> list[str]:
+    """Some instructions, each value a constant of its own; those that later parts need go to the work vector."""
+    lines: list[str] = []
+    known: dict[int, str] = {}  # values of this part, and those that it has read from the work vector
+    turned: dict[int, str] = {}  # sine and cosine of a value are worked out together
+
+    def value(of: int) -> str:
+        if of not in known:
+            known[of] = f"v{of}"
+            lines.append(f"const real v{of} = w[{instructions[of].outputs[0]}];")
+        return known[of]
+
+    own = range(first, min(first + size, len(instructions)))
+    for k in own:
+        told, name = instructions[k], f"v{k}"
+        if told.code == ca.OP_OUTPUT:
+            result = value(told.inputs[0])
+            lines.append(f"res[{told.outputs[0]}][{told.outputs[1]}] = {result};")
+            continue
+        if told.code == ca.OP_CONST:
+            constant = repr(told.constant).replace("inf", "INFINITY").replace("nan", "NAN")
+            lines.append(f"const real {name} = ALL({constant});")
+        elif told.code == ca.OP_INPUT:
+            lines.append(f"const real {name} = arg[{told.inputs[0]}][{told.inputs[1]}];")
+        elif told.code in _TURNS:
+            of, angle = told.inputs[0], value(told.inputs[0])
+            if of not in turned:
+                turned[of] = f"t{k}"
+                lines.append(f"const Turn t{k} = turn({angle});")
+            name = f"{turned[of]}.{_TURNS[told.code]}"
+        else:
+            operands = [value(of) for of in told.inputs]
+            lines.append(f"const real {name} = {_FORMS[told.code].format(*operands)};")
+        known[k] = name
+    kept = sorted((instructions[k].outputs[0], k) for k in own if needed[k] > first // size)
+    return [*lines, *(f"w[{place}] = {known[k]};" for place, k in kept)]

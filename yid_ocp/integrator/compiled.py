@@ -6,7 +6,7 @@ import ctypes
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -22,7 +22,6 @@ from yid_ocp.integrator.step_model import (
     NewtonStatus,
     Rollout,
     RolloutInputs,
-    SensitivityDirections,
     StepLinearization,
     StepModel,
     TrackingFeedback,
@@ -49,86 +48,58 @@ class _Struct(ctypes.Structure):
     kept: object = None
 
 
+def _fields(kind: Any, names: str) -> tuple[tuple[str, Any], ...]:
+    return tuple((name, kind) for name in names.split())
+
+
+def _pointers(names: str) -> tuple[tuple[str, Any], ...]:
+    return _fields(ctypes.c_void_p, names)
+
+
 class _Directions(_Struct):
     _fields_ = (
-        ("count", ctypes.c_int),
-        ("theta_count", ctypes.c_int),
-        ("by_theta", ctypes.c_void_p),
-        ("rows_pattern", ctypes.c_void_p),
-        ("p1_pattern", ctypes.c_void_p),
-        ("effort_pattern", ctypes.c_void_p),
-        ("rows_nz", ctypes.c_void_p),
-        ("p1_nz", ctypes.c_void_p),
-        ("effort_nz", ctypes.c_void_p),
-        ("w", ctypes.c_void_p),
-        ("iw", ctypes.c_void_p),
+        *_fields(ctypes.c_int, "count theta_count"),
+        *_pointers("by_theta rows_pattern p1_pattern effort_pattern rows_nz p1_nz effort_nz w iw"),
     )
 
 
 class _Feedback(_Struct):
-    _fields_ = (
-        ("count", ctypes.c_int),
-        ("index", ctypes.c_void_p),
-        ("gain", ctypes.c_void_p),
-        ("reference", ctypes.c_void_p),
-    )
+    _fields_ = (*_fields(ctypes.c_int, "count"), *_pointers("index gain reference"))
 
 
 class _Motion(_Struct):
     _fields_ = (
-        ("steps", ctypes.c_int),
-        ("limit", ctypes.c_int),
-        ("time_step", ctypes.c_double),
-        ("tolerance", ctypes.c_double),
-        ("theta", ctypes.c_void_p),
-        ("torque", ctypes.c_void_p),
-        ("path", ctypes.c_void_p),
-        ("feedback", ctypes.c_void_p),
-        ("directions", ctypes.c_void_p),
+        *_fields(ctypes.c_int, "steps limit"),
+        *_fields(ctypes.c_double, "time_step tolerance"),
+        *_pointers("theta torque path feedback directions"),
     )
 
 
 class _Trajectory(_Struct):
-    _fields_ = tuple((name, ctypes.c_void_p) for name in ("state", "multipliers", "effort", "applied"))
+    _fields_ = _pointers("state multipliers effort applied")
 
 
 class _Sensitivities(_Struct):
-    _fields_ = tuple((name, ctypes.c_void_p) for name in ("state", "multipliers", "effort", "torque", "path"))
+    _fields_ = _pointers("state multipliers effort torque path")
 
 
 class _Partials(_Struct):
-    _fields_ = tuple((name, ctypes.c_void_p) for name in ("state", "multipliers", "effort"))
+    _fields_ = _pointers("state multipliers effort")
 
 
 class _Gradient(_Struct):
-    _fields_ = tuple((name, ctypes.c_void_p) for name in ("theta", "start", "torque", "path"))
-
-
-# In the order of the struct.
-_LINEARIZATION_MATRICES = (
-    "residual_by_new",
-    "residual_by_old",
-    "residual_by_input",
-    "p1_by_new",
-    "p1_by_old",
-    "p1_by_input",
-    "residual_by_theta",
-    "p1_by_theta",
-)
+    _fields_ = _pointers("theta start torque path")
 
 
 class _Linearization(_Struct):
-    _fields_ = tuple((name, ctypes.c_void_p) for name in ("residual", "p1", *_LINEARIZATION_MATRICES))
+    _fields_ = _pointers("rows p1 rows_new rows_old rows_input p1_new p1_old p1_input rows_theta p1_theta")
 
 
 class _Outcome(_Struct):
     _fields_ = (
-        ("step", ctypes.c_int),
-        ("status", ctypes.c_int),
-        ("error", ctypes.c_double),
-        ("iterations", ctypes.c_longlong),
-        ("factorisations", ctypes.c_longlong),
-        ("memory", ctypes.c_longlong),
+        *_fields(ctypes.c_int, "step status"),
+        *_fields(ctypes.c_double, "error"),
+        *_fields(ctypes.c_longlong, "iterations factorisations memory"),
     )
 
 
@@ -137,13 +108,13 @@ _StructType = TypeVar("_StructType", bound=_Struct)
 
 def _filled(kind: type[_StructType], *values: object) -> _StructType:
     """A struct from numbers and from the addresses of arrays and other structs; None becomes a null pointer."""
-    entries: list[object] = []
-    for value in values:
+
+    def entry(value: object) -> object:
         if isinstance(value, np.ndarray):
-            entries.append(value.ctypes.data)
-        else:
-            entries.append(ctypes.addressof(value) if isinstance(value, _Struct) else value)
-    struct = kind(*entries)
+            return value.ctypes.data
+        return ctypes.addressof(value) if isinstance(value, _Struct) else value
+
+    struct = kind(*map(entry, values))
     struct.kept = values
     return struct
 
@@ -154,7 +125,7 @@ def _doubles(array: ArrayLike | None) -> Array | None:
 
 @dataclass(frozen=True)
 class _ThetaColumns:
-    """The compiled derivatives by some parameters: address, sparsity in CasADi's compressed columns, work size."""
+    """Compiled derivatives by some parameters; patterns are CasADi's compressed columns."""
 
     address: int
     patterns: tuple[NDArray[np.int64], ...]
@@ -169,12 +140,8 @@ class CompiledKernel:
         self._model = model
         self._library = library
         self._wished = 0  # steps for which a batch would have been the better way
-        self._batched: LockedCache[None, tuple[ctypes.CDLL, int] | None] = LockedCache(
-            lambda _: _batched_library(model)
-        )
-        self._theta_columns: LockedCache[tuple[str, ...], _ThetaColumns] = LockedCache(
-            lambda names: _theta_columns(model, library, names)
-        )
+        self._batched = LockedCache[None, tuple[ctypes.CDLL, int] | None](lambda _: _batched_library(model))
+        self._theta_columns = LockedCache[tuple[str, ...], _ThetaColumns](lambda x: _theta_columns(model, library, x))
 
     def with_model(self, model: StepModel) -> CompiledKernel:
         """A compiled kernel of the same library with another step model."""
@@ -182,17 +149,9 @@ class CompiledKernel:
         other._theta_columns, other._batched = self._theta_columns, self._batched
         return other
 
-    def rollout(
-        self,
-        theta: Array,
-        start: Array,
-        torque: Array,
-        path: Array,
-        feedback: TrackingFeedback | None,
-        wanted: SensitivityDirections | None,
-    ) -> Rollout:
+    def rollout(self, inputs: RolloutInputs) -> Rollout:
         """Simulate one rollout in C."""
-        return self._rolled_out(self._library, [RolloutInputs(theta, start, torque, path, feedback, wanted)])[0]
+        return self._rolled_out(self._library, [inputs])[0]
 
     def rollout_batch(self, members: Sequence[RolloutInputs]) -> list[Rollout]:
         """Simulate all members in C, in SIMD batches where that is faster."""
@@ -201,17 +160,14 @@ class CompiledKernel:
     def _rollouts(self, members: Sequence[RolloutInputs]) -> list[Rollout]:
         alike: dict[Hashable, list[int]] = {}
         for i, member in enumerate(members):
-            alike.setdefault(_sort(member), []).append(i)
+            alike.setdefault(_batch_key(member), []).append(i)
         # a batch takes as many columns and steps as its widest and longest member
         for group in alike.values():
             group.sort(key=lambda i: (_width(members[i]), len(members[i].torque)), reverse=True)
         batches = [part for group in alike.values() for part in self._split(group, members)]
-
-        def one(batch: Sequence[int]) -> list[Rollout]:
-            return self._together([members[i] for i in batch])
-
+        made = map_in_threads(lambda batch: self._together([members[i] for i in batch]), batches)
         found: dict[int, Rollout] = {}
-        for batch, rollouts in zip(batches, map_in_threads(one, batches), strict=True):
+        for batch, rollouts in zip(batches, made, strict=True):
             found |= zip(batch, rollouts, strict=True)
         return [found[i] for i in range(len(members))]
 
@@ -253,15 +209,8 @@ class CompiledKernel:
             if m.directions is not None and out.state_sensitivity is not None:
                 out.state_sensitivity[0] = m.directions.initial_state_tangents
                 given = _doubles(m.directions.torque_tangents), _doubles(m.directions.prescribed_tangents)
-                sensitivities.append(
-                    _filled(
-                        _Sensitivities,
-                        out.state_sensitivity,
-                        out.multipliers_sensitivity,
-                        out.effort_sensitivity,
-                        *given,
-                    )
-                )
+                own = (out.state_sensitivity, out.multipliers_sensitivity, out.effort_sensitivity)
+                sensitivities.append(_filled(_Sensitivities, *own, *given))
                 directions = self._directions(m.directions.parameter_names, m.directions.count)
             motions.append(self._motion(len(m.torque), m.theta, m.torque, m.prescribed_path, m.feedback, directions))
             trajectories.append(_filled(_Trajectory, out.state, out.multipliers, out.effort, out.torque))
@@ -312,24 +261,21 @@ class CompiledKernel:
         return gradient
 
     def linearize(
-        self,
-        theta: Array,
-        state: Array,
-        multipliers: Array,
-        torque: Array,
-        names: tuple[str, ...],
-        derivatives: bool,
+        self, theta: Array, state: Array, multipliers: Array, torque: Array, names: tuple[str, ...], derivatives: bool
     ) -> StepLinearization:
         """Residuals and Jacobians of many steps, evaluated in C."""
         out = allocate_linearization(self._model.sizes, len(torque), len(names), derivatives)
         along = [_doubles(a) for a in (state, multipliers, None, torque)]
-        matrices = [getattr(out, name) if derivatives else None for name in _LINEARIZATION_MATRICES]
+        # in the order of the struct
+        matrices = [out.residual_by_new, out.residual_by_old, out.residual_by_input, out.p1_by_new, out.p1_by_old]
+        matrices += [out.p1_by_input, out.residual_by_theta, out.p1_by_theta]
+        given = [out.residual, out.p1, *(matrices if derivatives else [None] * len(matrices))]
         outcome = _Outcome()
         directions = self._directions(names, len(names)) if derivatives else None
         code = self._library.yid_linearize(
             ctypes.byref(self._motion(len(torque), theta, None, None, None, directions)),
             ctypes.byref(_filled(_Trajectory, *along)),
-            ctypes.byref(_filled(_Linearization, out.residual, out.p1, *matrices)),
+            ctypes.byref(_filled(_Linearization, *given)),
             ctypes.byref(outcome),
         )
         self._check(code, outcome)
@@ -400,7 +346,7 @@ class CompiledKernel:
             raise out_of_memory_error("the work on one step", outcome.memory)
 
 
-def _sort(member: RolloutInputs) -> Hashable:
+def _batch_key(member: RolloutInputs) -> Hashable:
     """What members of one batch have in common."""
     feedback, wanted = member.feedback, member.directions
     return None if feedback is None else tuple(np.asarray(feedback.state_indices).tolist()), wanted is None
@@ -415,15 +361,15 @@ def _batched_library(model: StepModel) -> tuple[ctypes.CDLL, int] | None:
     """The kernel of a batch and how many members it takes; None where compiler or machine have no vectors for it."""
     source = codegen.kernel_source(model.functions, model.index_tables, batched=True)
     library = None if source is None else compiler.compile_library(source)
-    count = 0 if library is None else int(library.yid_lanes())
+    count = 0 if library is None else int(library.yid_simd_width())
     return None if library is None or not count else (library, count)
 
 
 def _theta_columns(model: StepModel, kernel: ctypes.CDLL, names: tuple[str, ...]) -> _ThetaColumns:
     """Compile the derivatives by some parameters and make sure that they fit the kernel, which does not look.
 
-    They follow from the kernel's equations and the places of the parameters: to differentiate again what is in the
-    cache takes longer than all that a diagnosis does with it.
+    To differentiate again what is in the cache would take longer than all that a diagnosis does with it; they follow
+    from the kernel's equations and the places of the parameters.
     """
 
     def source() -> str:

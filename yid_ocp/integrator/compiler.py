@@ -1,4 +1,4 @@
-"""The C compiler and the private cache of compiled libraries."""
+"""The C compiler, the private cache of compiled libraries, and CasADi functions compiled one by one."""
 
 from __future__ import annotations
 
@@ -13,16 +13,21 @@ import shutil
 import stat
 import subprocess
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
+import numpy as np
 import platformdirs
+from numpy.typing import NDArray
 
 from yid_ocp.errors import ConfigError, DataError, OutputError
 from yid_ocp.files import file_sha256
+from yid_ocp.integrator.codegen import casadi_c_source, nonzero_indices
+from yid_ocp.integrator.step_model import NewtonStatus, out_of_memory_error
 
-log = logging.getLogger(__name__)
+_LOG = logging.getLogger(__name__)
 
 _COMMON_FLAGS = ("-ftree-vectorize", "-ffp-contract=fast", "-fopenmp-simd", "-fPIC", "-shared")
 _NATIVE_FLAGS = ("-march=native",)
@@ -37,21 +42,15 @@ _OPTIMIZATION_FLAG = "-O1"
 # three seconds, for code that is still two or three times as fast as CasADi's own machine.
 _NO_OPTIMIZATION_FLAG = "-O0"
 
-
 # Ten times what the longest of our functions takes; a compiler that hangs would hang the run.
 _COMPILE_TIMEOUT, _VERSION_TIMEOUT = 900.0, 30.0  # [s]
 _MARKER_SYMBOL = "yid_compiled"
+_NOT_LOADED = "compiled code cannot be loaded (%s); going on without it"
 
 
 @functools.cache
 def _compiler_path() -> str | None:
-    """Path of the C compiler, or None with one log message; the environment variable CC selects it, `none` disables.
-
-    Raises
-    ------
-    ConfigError
-        CC names a program that is not there.
-    """
+    """Path of the C compiler, or None with one log message; the environment variable CC selects it, `none` disables."""
     wanted = os.environ.get("CC")
     names = () if wanted == "none" else (wanted,) if wanted else ("cc", "gcc", "clang")
     path = next((found for name in names if (found := shutil.which(name))), None)
@@ -63,27 +62,19 @@ def _compiler_path() -> str | None:
             hint="unset CC to have cc, gcc or clang found",
         )
     if path is None:
-        log.warning("no C compiler: everything works without compiled code, about ten times slower")
+        _LOG.warning("no C compiler: everything works without compiled code, about ten times slower")
     return path
 
 
 def _cache_folder() -> Path:
-    """Path of the private folder of compiled code, created if absent; YID_OCP_CACHE overrides it.
-
-    Raises
-    ------
-    OutputError
-        It cannot be made, or others could write to it.
-    """
+    """Path of the private folder of compiled code, created if absent; YID_OCP_CACHE overrides it."""
     folder = Path(os.environ.get("YID_OCP_CACHE") or platformdirs.user_cache_dir("yid_ocp"))
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(
-            f"the cache of compiled code cannot be made: {error.strerror}",
-            where=str(folder),
-            hint="set YID_OCP_CACHE to a folder of your own, or CC=none to do without compiled code",
-        ) from error
+        what = f"the cache of compiled code cannot be made: {error.strerror}"
+        hint = "set YID_OCP_CACHE to a folder of your own, or CC=none to do without compiled code"
+        raise OutputError(what, where=str(folder), hint=hint) from error
     info = folder.stat()
     if hasattr(os, "getuid") and (info.st_uid != os.getuid() or info.st_mode & (stat.S_IWGRP | stat.S_IWOTH)):
         raise OutputError(
@@ -110,10 +101,8 @@ def _machine() -> str:
     processor = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.is_file():
-        wanted = ("model name", "flags", "Features")
-        processor += "".join(
-            sorted({line for line in info.read_text(errors="replace").splitlines() if line.startswith(wanted)})
-        )
+        lines = set(info.read_text(errors="replace").splitlines())
+        processor += "".join(sorted(line for line in lines if line.startswith(("model name", "flags", "Features"))))
     version = _version(_compiler_path() or "none")
     return f"{version}|{platform.system()}|{processor}"
 
@@ -135,27 +124,22 @@ def compile_library(source: str, make: Callable[[], str] | None = None) -> ctype
     try:
         return ctypes.CDLL(str(target))
     except OSError as error:
-        log.warning("compiled code cannot be loaded (%s); going on without it", error)
+        _LOG.warning(_NOT_LOADED, error)
         return None
 
 
 def compiled_function(function: ca.Function) -> ca.Function:
     """The function compiled to C, or unchanged if no compiler works; it cannot be differentiated.
 
-    Parameters
-    ----------
-    function : casadi.Function
-        Compiled without optimisation: for functions of many operations with a total run time of seconds.
+    Without optimisation: for functions of many operations with a total run time of seconds.
     """
-    generator = ca.CodeGenerator(function.name(), {"with_header": False, "indent": 0})
-    generator.add(function)
-    target = _library_file(generator.dump(), _NO_OPTIMIZATION_FLAG)
+    target = _library_file(casadi_c_source(function.name(), (function,)), _NO_OPTIMIZATION_FLAG)
     if target is None:
         return function
     try:
         return ca.external(function.name(), str(target))
     except RuntimeError as error:
-        log.warning("compiled code cannot be loaded (%s); going on without it", error)
+        _LOG.warning(_NOT_LOADED, error)
         return function
 
 
@@ -165,33 +149,27 @@ def _library_file(source: str, level: str, make: Callable[[], str] | None = None
     if path is None:
         return None
     flags = _flags(path)
-    key = hashlib.sha256(
-        "\0".join([source, level, *flags, *_NATIVE_FLAGS, _machine(), ca.CasadiMeta.version()]).encode()
-    ).hexdigest()[:32]
-    folder = _cache_folder()
-    kept = _kept(folder, key)
-    if kept is not None:
+    told = [source, level, *flags, *_NATIVE_FLAGS, _machine(), ca.CasadiMeta.version()]
+    folder, key = _cache_folder(), hashlib.sha256("\0".join(told).encode()).hexdigest()[:32]
+    if (kept := _kept(folder, key)) is not None:
         return kept
     said = ""
     try:
         with tempfile.TemporaryDirectory(dir=folder) as work:
             text, built = Path(work) / "source.c", Path(work) / "library.so"
-            text.write_text(
-                f"{source if make is None else make()}\nint {_MARKER_SYMBOL}(void) {{ return 1; }}\n", encoding="utf-8"
-            )
-            for told in ((*flags, *_NATIVE_FLAGS), flags):
-                good, said = _said([path, level, *told, str(text), "-o", str(built), "-lm"], _COMPILE_TIMEOUT)
+            code = source if make is None else make()
+            text.write_text(f"{code}\nint {_MARKER_SYMBOL}(void) {{ return 1; }}\n", encoding="utf-8")
+            for own in ((*flags, *_NATIVE_FLAGS), flags):
+                good, said = _said([path, level, *own, str(text), "-o", str(built), "-lm"], _COMPILE_TIMEOUT)
                 if good and _is_ours(built):
                     target = folder / f"{key}-{file_sha256(built)[:32]}.so"
                     os.replace(built, target)
                     return target
     except OSError as error:
-        hint = "set YID_OCP_CACHE to a folder with room, or CC=none"
-        log.warning(
-            "compiled code cannot be kept in %s (%s); going on without it: %s", folder, error.strerror or error, hint
-        )
+        message = "compiled code cannot be kept in %s (%s); going on without it: %s"
+        _LOG.warning(message, folder, error.strerror or error, "set YID_OCP_CACHE to a folder with room, or CC=none")
         return None
-    log.warning("the C compiler %s failed; going on without compiled code:\n%s", path, said[:2000])
+    _LOG.warning("the C compiler %s failed; going on without compiled code:\n%s", path, said[:2000])
     return None
 
 
@@ -201,7 +179,7 @@ def _kept(folder: Path, key: str) -> Path | None:
         with contextlib.suppress(OSError, DataError):
             if path.stem.partition("-")[2] == file_sha256(path)[:32]:
                 return path
-        log.warning("compiled code in the cache is damaged or cannot be read, and is made again: %s", path)
+        _LOG.warning("compiled code in the cache is damaged or cannot be read, and is made again: %s", path)
         with contextlib.suppress(OSError):
             path.unlink()
     return None
@@ -210,15 +188,9 @@ def _kept(folder: Path, key: str) -> Path | None:
 def _said(command: list[str], patience: float) -> tuple[bool, str]:
     """Whether a program ended well, and what it said."""
     try:
-        run = subprocess.run(
-            command,
-            capture_output=True,
-            text=True,
-            errors="replace",
-            check=False,
-            timeout=patience,
-            stdin=subprocess.DEVNULL,
-        )
+        options: dict[str, Any] = {"capture_output": True, "text": True, "errors": "replace"}
+        options["stdin"] = subprocess.DEVNULL
+        run = subprocess.run(command, check=False, timeout=patience, **options)
     except subprocess.TimeoutExpired:
         return False, f"it did not end within {patience:g} s"
     except OSError as error:
@@ -232,3 +204,94 @@ def _is_ours(built: Path) -> bool:
         return bool(getattr(ctypes.CDLL(str(built)), _MARKER_SYMBOL)() == 1)
     except (OSError, AttributeError):
         return False
+
+
+class MappedFunction:
+    """A CasADi function evaluated at many points at once, compiled where possible.
+
+    Parameters
+    ----------
+    function : casadi.Function
+        Inputs are dense columns.
+    shared_inputs : sequence of int
+        Positions of the inputs that are the same at every point.
+    use_compiler : bool
+    """
+
+    def __init__(self, function: ca.Function, shared_inputs: Sequence[int] = (), use_compiler: bool = True) -> None:
+        self.function = function
+        self.shared_inputs = frozenset(shared_inputs)
+        self._inputs = [function.numel_in(i) for i in range(function.n_in())]
+        self._outputs = [function.nnz_out(i) for i in range(function.n_out())]
+        self._library = compile_library(self._source()) if use_compiler else None
+
+    def _source(self) -> str:
+        name, f = self.function.name(), self.function
+        strides = ", ".join("0" if i in self.shared_inputs else str(size) for i, size in enumerate(self._inputs)) or "0"
+        widths = ", ".join(str(size) for size in self._outputs) or "0"
+        return f"""{casadi_c_source(name, (f,))}
+#include <stdlib.h>
+#ifndef YID_ALLOCATE
+#define YID_ALLOCATE calloc
+#define YID_FREE free
+#endif
+int yid_map(int count, const double **in, double **out) {{
+    static const int stride[] = {{{strides}}}, width[] = {{{widths}}};
+    const double *arg[{max(f.sz_arg(), 1)}];
+    double *res[{max(f.sz_res(), 1)}];
+    double *w = YID_ALLOCATE({max(f.sz_w(), 1)}, sizeof(double));
+    long long *iw = YID_ALLOCATE({max(f.sz_iw(), 1)}, sizeof(long long));
+    int status = w && iw ? {NewtonStatus.OK.value} : {NewtonStatus.OUT_OF_MEMORY.value};
+    for (int k = 0; k < count && !status; k++) {{
+        for (int i = 0; i < {len(self._inputs)}; i++) arg[i] = in[i] + (size_t)k * stride[i];
+        for (int o = 0; o < {len(self._outputs)}; o++) res[o] = out[o] + (size_t)k * width[o];
+        if ({name}(arg, res, iw, w, 0)) status = {NewtonStatus.NOT_FINITE.value};
+    }}
+    YID_FREE(w);
+    YID_FREE(iw);
+    return status;
+}}
+"""
+
+    def __call__(self, *inputs: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """Evaluate the function at all points.
+
+        Parameters
+        ----------
+        *inputs : ndarray, shape (count, size) or, where shared, (size,)
+
+        Returns
+        -------
+        list of ndarray, shape (count, rows, columns)
+            Dense, one for each output.
+        """
+        count = next((len(x) for i, x in enumerate(inputs) if i not in self.shared_inputs), 1)
+        arrays = [np.ascontiguousarray(x, dtype=float) for x in inputs]
+        for i, array in enumerate(arrays):
+            expected = (self._inputs[i],) if i in self.shared_inputs else (count, self._inputs[i])
+            assert array.shape == expected, f"input {i} of {self.function.name()}: {array.shape}, not {expected}"
+        values = [np.zeros((count, size)) for size in self._outputs]
+        if self._library is not None:
+            pointers = (ctypes.c_void_p * max(len(arrays), 1))(*(a.ctypes.data for a in arrays))
+            targets = (ctypes.c_void_p * len(values))(*(v.ctypes.data for v in values))
+            code = self._library.yid_map(ctypes.c_int(count), pointers, targets)
+            if code == NewtonStatus.OUT_OF_MEMORY:
+                raise out_of_memory_error(self.function.name(), 8 * (self.function.sz_w() + self.function.sz_iw()))
+            if code != NewtonStatus.OK:
+                raise RuntimeError(f"CasADi could not evaluate {self.function}")
+        else:
+            for k in range(count):
+                point = [a if i in self.shared_inputs else a[k] for i, a in enumerate(arrays)]
+                for target, result in zip(values, self.function.call(point), strict=True):
+                    target[k] = np.array(result.nonzeros())
+        dense = []
+        for o, value in enumerate(values):
+            sparsity = self.function.sparsity_out(o)
+            if sparsity.is_dense():
+                dense.append(value.reshape(count, sparsity.size2(), sparsity.size1()).transpose(0, 2, 1))
+                continue
+            full = np.zeros((count, *sparsity.shape))
+            row, column = nonzero_indices(sparsity)
+            full[:, row, column] = value
+            dense.append(full)
+        return dense

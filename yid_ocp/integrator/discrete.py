@@ -84,12 +84,8 @@ class DiscreteEquations:
 
     Attributes
     ----------
-    system : System
-    force_split : "symmetric" or "left"
-    constraint_force : "node" or "midpoint"
-    q0, q1 : casadi.SX, shape (n, 1)
-        q_k and q_{k+1}.
-    z0, z1 : casadi.SX, shape (nz, 1)
+    q0, q1, z0, z1 : casadi.SX, shape (n, 1) and (nz, 1)
+        Coordinates and internal coordinates at the two nodes.
     p0 : casadi.SX, shape (n, 1)
         p_k [N m s].
     lam : casadi.SX, shape (m, 1)
@@ -97,30 +93,26 @@ class DiscreteEquations:
     u : casadi.SX, shape (nu, 1)
         Motor torques held over the step [N m], or what servos are commanded [rad or m].
     theta : casadi.SX, shape (ntheta, 1)
-    time_step : casadi.SX
-        Recorded step [s]; the step in the equations is this times `System.recorded_time_scale`.
-    momentum_balance : casadi.SX, shape (n, 1)
-        Left side of the DEL equation.
-    internal_residual : casadi.SX, shape (nz, 1)
-        Midpoint equations of the internal coordinates.
-    internal_residual_at_rest : casadi.SX, shape (nz, 1)
-        Equations of the internal coordinates in a static equilibrium.
+    time_step, h : casadi.SX
+        Recorded step [s], and the step in the equations: this times `System.recorded_time_scale`.
+    momentum_balance, p1 : casadi.SX, shape (n, 1)
+        Left side of the DEL equation; p_{k+1}.
+    internal_residual, internal_residual_at_rest : casadi.SX, shape (nz, 1)
+        Midpoint equations of the internal coordinates, and those in a static equilibrium.
     constraint_residual : casadi.SX, shape (m, 1)
         phi(q_{k+1}) - C lam / h.
     constraint_relaxation_gain : casadi.SX or None, shape (m, 1)
-        Where a grasp relaxes: 1 + T/h, the factor on phi(q_{k+1}) in `constraint_residual`; phi(q_k) then has 1 minus it.
-    p1 : casadi.SX, shape (n, 1)
-        p_{k+1}.
-    rigid_body_terms : RigidBody
+        Where a grasp relaxes: 1 + T/h, the factor on phi(q_{k+1}) in `constraint_residual`; phi(q_k) has 1 minus it.
+    rigid_body_terms : RigidBodyDerivatives
         Closed-form derivatives of the bodies' Lagrangian at the midpoint.
     balance_remainder, p1_remainder : casadi.SX, shape (n, 1)
         `momentum_balance` and `p1` without the bodies' Lagrangian, p_k, the constraint impulses and the closed force;
         this gives the Jacobians without differentiating the tree.
-    closed_form_force : ClosedForce or None
+    closed_form_force : ForceWithDerivatives or None
         Sum of the forces that effects give with their slopes, at the midpoint.
     closed_form_force_shares : (float, float)
         Parts of its impulse h F in `momentum_balance` and in `p1`.
-    constraint_impulses : ConstraintPulls
+    constraint_impulses : ConstraintImpulses
         The constraints' part of `momentum_balance` and of `p1`, before `row_scale`.
     row_scale : casadi.SX, shape (n, 1)
         Factor on each row of the bodies' part, in the balance and in p1 (1, or the compliance of a compliant one).
@@ -161,19 +153,16 @@ class DiscreteEquations:
     @property
     def residual(self) -> ca.SX:
         """Residual of the step's unknowns: free rows of the balance, internal and constraint equations."""
-        return ca.vertcat(
-            self.momentum_balance[list(self.system.free_indices), 0], self.internal_residual, self.constraint_residual
-        )
+        balance = self.momentum_balance[list(self.system.free_indices), 0]
+        return ca.vertcat(balance, self.internal_residual, self.constraint_residual)
 
     @property
     def closed_form_impulses(self) -> tuple[ca.SX, ca.SX] | None:
         """Impulse of the closed force in `momentum_balance` and in `p1`, shape (n, 1) [N m s]; None without one."""
         if self.closed_form_force is None:
             return None
-        first, second = (
-            part * self.h * self.row_scale * self.closed_form_force.force for part in self.closed_form_force_shares
-        )
-        return first, second
+        force, (left, right) = self.closed_form_force.force, self.closed_form_force_shares
+        return left * self.h * self.row_scale * force, right * self.h * self.row_scale * force
 
     @property
     def constraint_violation(self) -> ca.SX:
@@ -191,7 +180,7 @@ class DiscreteEquations:
 def discrete_equations(
     system: System, force_split: ForceSplit = "symmetric", constraint_force: ConstraintForcePlacement = "midpoint"
 ) -> DiscreteEquations:
-    """Build the DEL equations of one step.
+    """The DEL equations of one step.
 
     Parameters
     ----------
@@ -200,10 +189,6 @@ def discrete_equations(
         Distribution of the force of a step between its two ends.
     constraint_force : "node" or "midpoint"
         Configuration at which the constraint forces act.
-
-    Returns
-    -------
-    DiscreteEquations
 
     Raises
     ------
@@ -218,11 +203,10 @@ def discrete_equations(
     if force_split not in get_args(ForceSplit):
         raise ModelError(f"force_split = '{force_split}'", allowed=", ".join(get_args(ForceSplit)))
     if constraint_force not in get_args(ConstraintForcePlacement):
-        raise ModelError(
-            f"constraint_force = '{constraint_force}'", allowed=", ".join(get_args(ConstraintForcePlacement))
-        )
-    at = _Symbols.of(system)
-    q0, q1, z0, z1, lam, h, qm, vm = at.q0, at.q1, at.z0, at.z1, at.lam, at.h, at.qm, at.vm
+        allowed = ", ".join(get_args(ConstraintForcePlacement))
+        raise ModelError(f"constraint_force = '{constraint_force}'", allowed=allowed)
+    at = _Symbols.from_system(system)
+    lam, h, qm, vm = at.lam, at.h, at.qm, at.vm
     kinematics = forward_kinematics(system.mechanism, qm)
     rigid = rigid_body_derivatives(kinematics, vm, system.gravity)
     terms = _summed_terms(system, at, kinematics)
@@ -235,33 +219,22 @@ def discrete_equations(
     constraint, gain = _constraint(system, at)
     balance_rest = scale * (h / 2 * extra_q - extra_v + share * push) - spring
     p1_rest = scale * (h / 2 * extra_q + extra_v + (1 - share) * push) - spring
-    balance = (
-        at.p0
-        + scale * (h / 2 * rigid.lagrangian_by_q - rigid.lagrangian_by_v - pulls.left_jacobian.T @ lam)
-        + balance_rest
-    )
-    p1 = scale * (h / 2 * rigid.lagrangian_by_q + rigid.lagrangian_by_v - pulls.right_jacobian.T @ lam) + p1_rest
-    if terms.closed is not None:
-        balance += share * h * scale * terms.closed.force
-        p1 += (1 - share) * h * scale * terms.closed.force
-    fields = ("lagrangian_by_q", "lagrangian_by_v", "kinetic_energy", "potential_energy", "S", "D", "F", "B", "G")
+    by_q, by_v = rigid.lagrangian_by_q, rigid.lagrangian_by_v
+    balance = at.p0 + scale * (h / 2 * by_q - by_v - pulls.left_jacobian.T @ lam) + balance_rest
+    p1 = scale * (h / 2 * by_q + by_v - pulls.right_jacobian.T @ lam) + p1_rest
     closed = terms.closed
     if closed is not None:
+        balance += share * h * scale * closed.force
+        p1 += (1 - share) * h * scale * closed.force
         closed = ForceWithDerivatives(at.placed(closed.force), at.placed(closed.A), at.placed(closed.T))
+    fields = ("lagrangian_by_q", "lagrangian_by_v", "kinetic_energy", "potential_energy", "S", "D", "F", "B", "G")
+    symbols = {name: getattr(at, name) for name in ("q0", "q1", "z0", "z1", "p0", "lam", "u", "time_step", "h")}
     return DiscreteEquations(
         system=system,
         force_split=force_split,
         constraint_force=constraint_force,
-        q0=q0,
-        q1=q1,
-        z0=z0,
-        z1=z1,
-        p0=at.p0,
-        lam=lam,
-        u=at.u,
+        **symbols,
         theta=system.parameters.symbols,
-        time_step=at.time_step,
-        h=h,
         momentum_balance=at.placed(balance),
         internal_residual=at.placed(terms.internal),
         internal_residual_at_rest=at.placed(terms.internal_at_rest),
@@ -299,20 +272,20 @@ class _Symbols:
     internal: ca.SX
 
     @staticmethod
-    def of(system: System) -> _Symbols:
-        n, m, internal = system.n_coordinates, system.n_constraints, system.internal_coordinates
-        sizes = {"q0": n, "q1": n, "p0": n, "z0": len(internal), "z1": len(internal), "lam": m, "u": len(system.driven)}
-        sizes |= {"time_step": 1, "qm": n, "vm": n, "zm": len(internal), "z_rate": len(internal), "pull_rate": m}
+    def from_system(system: System) -> _Symbols:
+        internal = system.internal_coordinates
+        n, m, nz = system.n_coordinates, system.n_constraints, len(internal)
+        sizes = {"q0": n, "q1": n, "p0": n, "z0": nz, "z1": nz, "lam": m, "u": len(system.driven), "time_step": 1}
+        sizes |= {"qm": n, "vm": n, "zm": nz, "z_rate": nz, "pull_rate": m}
         symbols = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
         own = ca.vertcat(*internal.values()) if internal else ca.SX(0, 1)
         return _Symbols(**symbols, h=symbols["time_step"] * system.recorded_time_scale, internal=own)
 
     def placed(self, expression: ca.SX, dense: bool = True) -> ca.SX:
         """An expression of the midpoint as one of the two nodes."""
-        h, z = self.h, (self.z0 + self.z1) / 2
         midpoint = ca.vertcat(self.qm, self.vm, self.zm, self.z_rate, self.pull_rate, self.internal)
-        q, v = (self.q0 + self.q1) / 2, (self.q1 - self.q0) / h
-        values = ca.vertcat(q, v, z, (self.z1 - self.z0) / h, self.lam / h, z)
+        (q, v), (z, z_rate) = (((a + b) / 2, (b - a) / self.h) for a, b in ((self.q0, self.q1), (self.z0, self.z1)))
+        values = ca.vertcat(q, v, z, z_rate, self.lam / self.h, z)
         placed = ca.substitute(expression, midpoint, values)
         return ca.densify(placed) if dense else placed
 
@@ -389,9 +362,8 @@ def _constraint_pulls(system: System, at: _Symbols, middle: Kinematics, share_m:
     parts: dict[str, ca.SX] = {}
     for name, q, z in (("before", at.q0, at.z0), ("after", at.q1, at.z1)):
         found = _constraint_derivatives(system, forward_kinematics(system.mechanism, q), q, at.lam)
-        parts[f"{name}_jacobian"], parts[f"{name}_force_by_q"] = (
-            ca.substitute(expression, at.internal, z) for expression in found
-        )
+        jacobian, by_q = (ca.substitute(expression, at.internal, z) for expression in found)
+        parts |= {f"{name}_jacobian": jacobian, f"{name}_force_by_q": by_q}
     found = _constraint_derivatives(system, middle, at.qm, at.lam)
     parts["middle_jacobian"], parts["middle_force_by_q"] = (at.placed(expression, dense=False) for expression in found)
     jacobians = ("before_jacobian", "middle_jacobian", "after_jacobian")
@@ -485,7 +457,7 @@ class EquilibriumEquations:
         (unknowns: free coordinates, internal ones, forces of constraints), known coordinates (driven, then prescribed),
         held torque, holding spring's stiffness, theta, time step.
     residual : casadi.SX
-        Zero at rest: balance of the free coordinates [N m], internal equations, constraints [m].
+        Balance of the free coordinates [N m], internal equations, constraints [m].
     state : casadi.SX, shape (nx, 1)
         (q, p, z) at rest.
     """

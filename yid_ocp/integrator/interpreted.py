@@ -127,20 +127,14 @@ class InterpretedKernel:
                 return NewtonStatus.OK, largest(further), iteration
         return NewtonStatus.NOT_CONVERGED, error, NEWTON_ITERATION_LIMIT
 
-    def rollout(
-        self,
-        theta: Array,
-        start: Array,
-        torque: Array,
-        path: Array,
-        feedback: TrackingFeedback | None,
-        wanted: SensitivityDirections | None,
-    ) -> Rollout:
+    def rollout(self, inputs: RolloutInputs) -> Rollout:
         """Simulate one rollout step by step."""
+        theta, torque, path = inputs.theta, inputs.torque, inputs.prescribed_path
+        feedback, wanted = inputs.feedback, inputs.directions
         (value, slope, slopes), n, lam = self._evaluators(), self._model.sizes["n"], np.zeros(self._model.sizes["m"])
         out = allocate_rollout(self._model.sizes, len(torque), None if wanted is None else wanted.count)
         state, by = out.state, [getattr(out, f"{name}_sensitivity") for name in ("state", "multipliers", "effort")]
-        state[0] = start
+        state[0] = inputs.initial_state
         if wanted is not None:
             by[0][0] = wanted.initial_state_tangents
         code, error, total, done = NewtonStatus.OK, 0.0, 0, 0
@@ -198,10 +192,7 @@ class InterpretedKernel:
 
     def rollout_batch(self, members: Sequence[RolloutInputs]) -> list[Rollout]:
         """Simulate all members, one after another."""
-        return [
-            self.rollout(m.theta, m.initial_state, m.torque, m.prescribed_path, m.feedback, m.directions)
-            for m in members
-        ]
+        return [self.rollout(member) for member in members]
 
     def adjoint_gradient(
         self,
@@ -299,24 +290,9 @@ class InterpretedKernel:
 def damped_newton(
     function: Callable[[Array], Sequence[ca.DM]], w: Array, tolerance: float
 ) -> tuple[Array, float, bool]:
-    """Find a root by Newton's iteration with the natural monotonicity test (Deuflhard 2011, section 3.3).
+    """A root, its error, and whether it is one: Newton, natural monotonicity test (Deuflhard 2011, section 3.3).
 
-    A damped step is also accepted if it reduces the residual.
-
-    Parameters
-    ----------
-    function : callable
-        Residual and its Jacobian at a point.
-    w : ndarray, shape (n,)
-        Initial point.
-    tolerance : float
-
-    Returns
-    -------
-    w : ndarray, shape (n,)
-    error : float
-        Largest residual there.
-    converged : bool
+    A damped step is also accepted if it reduces the residual; `function` gives the residual and its Jacobian.
     """
     if len(w) == 0:
         return w, 0.0, True

@@ -8,7 +8,7 @@
  *   NT = N + NZ + M rows, NY = NF + NZ + M unknowns of a step, NX = 2 N + NZ state (q, p, z).
  * All matrices are row-major. compiled.py declares the structs of the entry points at the end once more.
  *
- * Everything is compiled for one member, and once more for a batch of `LANES` members that march together, see simd.c.
+ * Everything is compiled for one member, and once more for a batch of `SIMD_WIDTH` members that march together, see simd.c.
  * What only one member can do (damped steps, adjoint, equilibria) is left out of a batch.
  */
 #define NX (2 * N + NZ)
@@ -21,7 +21,7 @@
 #define YID_FREE free
 #endif
 
-/* The values of StepCode in step_model.py. */
+/* The values of NewtonStatus in step_model.py. */
 enum { OK = 0, NOT_CONVERGED = 1, SINGULAR = 2, NOT_FINITE = 3, OUT_OF_MEMORY = 4 };
 
 typedef int (*theta_function)(const double **, double **, long long *, double *, int);
@@ -40,7 +40,7 @@ typedef struct {
     real R1[ONE(NT)][ONE(NT)], R0[ONE(NT)][ONE(NQZ)], Ru[ONE(NT)][ONE(NU)];
     real P1[ONE(N)][ONE(NT)], P0[ONE(N)][ONE(NQZ)], Pu[ONE(N)][ONE(NU)];
     Factors factors;
-    Factors fresh[LANES > 1]; /* what only some members of a batch take over */
+    Factors fresh[SIMD_WIDTH > 1]; /* what only some members of a batch take over */
     real row_scale[ONE(N)], h;
     real r[ONE(NY)], delta[ONE(NY)], y[ONE(NY)];
     real *w, *room;
@@ -259,7 +259,7 @@ static mask eliminate(const Work *k, Factors *f) {
                 real *target = f->A[i];
                 const real factor = target[p] * inverse;
                 f->LT[p][i] = factor;
-                if (LANES == 1 && !any(factor != 0)) continue;
+                if (SIMD_WIDTH == 1 && !any(factor != 0)) continue;
                 for (int cr = fill_start[p]; cr < fill_start[p + 1]; cr++) {
                     const int last = fill_run[2 * cr + 1];
                     SIMD
@@ -284,7 +284,7 @@ static void take_factors(Factors *to, const Factors *from, mask m) {
 
 /* Factors of the rows' Jacobian for some members, which the others of those at work must not notice; which are good. */
 static mask factorise(Work *k, mask wanted, mask at_work) {
-    const int apart = LANES > 1 && any(at_work & NOT(wanted));
+    const int apart = SIMD_WIDTH > 1 && any(at_work & NOT(wanted));
     Factors *f = apart ? k->fresh : &k->factors;
     const mask good = eliminate(k, f) & wanted;
     if (apart) take_factors(&k->factors, f, wanted);
@@ -315,7 +315,7 @@ static void solve(Work *k, const real *b, real *x) {
 
 /* Sensitivities are worked on in blocks of columns that fit into registers: of one member side by side, of a batch one
  * column of all members beside another. */
-#if LANES == 1
+#if SIMD_WIDTH == 1
 typedef double Wide __attribute__((vector_size(64), aligned(8), may_alias));
 #define BLOCK 16
 #else
@@ -422,7 +422,7 @@ static mask newton_chord(Work *k, const Point *a, real tolerance, int limit, mas
     return good;
 }
 
-#if LANES == 1
+#if SIMD_WIDTH == 1
 /* Full Newton, damped by the natural monotonicity test (Deuflhard 2011, section 3.3). */
 static int newton_damped(Work *k, const Point *a, double tolerance, int limit, double *error) {
     double q_keep[ONE(N)], z_keep[ONE(NZ)], lam_keep[ONE(M)], step[ONE(NY)], trial[ONE(NY)], previous = INFINITY;
@@ -480,7 +480,7 @@ static mask one_step(Work *k, const Point *a, real tolerance, int limit, mask at
         *status = any(good) ? OK : NOT_FINITE;
         return good & at_work;
     }
-#if LANES == 1
+#if SIMD_WIDTH == 1
     double q_guess[ONE(N)], z_guess[ONE(NZ)], lam_guess[ONE(M)];
     memcpy(q_guess, a->q1, sizeof(double) * N);
     memcpy(z_guess, a->z1, sizeof(double) * NZ);
@@ -491,7 +491,7 @@ static mask one_step(Work *k, const Point *a, real tolerance, int limit, mask at
         k->age = 0;
     }
     mask good = newton_chord(k, a, tolerance, 20, at_work, error);
-#if LANES == 1
+#if SIMD_WIDTH == 1
     for (int attempt = 0; !good && attempt < 2; attempt++) {
         for (int i = 0; i < N; i++) a->q1[i] = q_guess[i];
         if (attempt)
@@ -599,27 +599,27 @@ typedef struct {
     long long iterations, factorisations, memory;
 } Outcome;
 
-/* C += nz in one member's lane. */
-static void add_sparse(const double *nz, const long long *pattern, real *C, int d, int lane) {
+/* C += nz in one member's entries. */
+static void add_sparse(const double *nz, const long long *pattern, real *C, int d, int entry) {
     const long long columns = pattern[1], *offset = pattern + 2, *row = pattern + 3 + columns;
     for (long long c = 0; c < columns; c++)
-        for (long long e = offset[c]; e < offset[c + 1]; e++) LANE(C[(size_t)row[e] * d + c], lane) += nz[e];
+        for (long long e = offset[c]; e < offset[c + 1]; e++) SIMD_ENTRY(C[(size_t)row[e] * d + c], entry) += nz[e];
 }
 
 /* One member's entries of something, one after another. */
-static const double *member(const real *x, int count, int lane, double *room) {
-    if (LANES == 1) return (const double *)x;
-    for (int i = 0; i < count; i++) room[i] = LANE(x[i], lane);
+static const double *member(const real *x, int count, int entry, double *room) {
+    if (SIMD_WIDTH == 1) return (const double *)x;
+    for (int i = 0; i < count; i++) room[i] = SIMD_ENTRY(x[i], entry);
     return room;
 }
 
 /* Derivatives by one member's parameters, which need not be those of another. */
-static void theta_columns(const Motion *motion, const Point *a, int lane) {
+static void theta_columns(const Motion *motion, const Point *a, int entry) {
     const Directions *dir = motion->directions;
     double q0[ONE(N)], q1[ONE(N)], p0[ONE(N)], z0[ONE(NZ)], z1[ONE(NZ)], lam[ONE(M)], u[ONE(NU)];
     const double *args[9] = {
-        member(a->q0, N, lane, q0),   member(a->q1, N, lane, q1), member(a->p0, N, lane, p0), member(a->z0, NZ, lane, z0),
-        member(a->z1, NZ, lane, z1), member(a->lam, M, lane, lam), member(a->u, NU, lane, u), motion->theta,
+        member(a->q0, N, entry, q0),   member(a->q1, N, entry, q1), member(a->p0, N, entry, p0), member(a->z0, NZ, entry, z0),
+        member(a->z1, NZ, entry, z1), member(a->lam, M, entry, lam), member(a->u, NU, entry, u), motion->theta,
         &motion->time_step,
     };
     double *res[3] = {dir->rows_nz, dir->p1_nz, dir->effort_nz};
@@ -650,12 +650,12 @@ static void sensitivity_step(Work *k, const Point *a, int d, int members, const 
     for (int i = 0; i < N * d; i++) rows[i] += X0[(size_t)N * d + i];
     real *p1 = X1 + (size_t)N * d;
     memset(p1, 0, sizeof(real) * N * d);
-    for (int lane = 0; lane < members; lane++) {
-        const Directions *dir = motion[lane].directions;
+    for (int entry = 0; entry < members; entry++) {
+        const Directions *dir = motion[entry].directions;
         if (!dir || !dir->theta_count) continue;
-        theta_columns(motion + lane, a, lane);
-        add_sparse(dir->rows_nz, dir->rows_pattern, rows, d, lane);
-        add_sparse(dir->p1_nz, dir->p1_pattern, p1, d, lane);
+        theta_columns(motion + entry, a, entry);
+        add_sparse(dir->rows_nz, dir->rows_pattern, rows, d, entry);
+        add_sparse(dir->p1_nz, dir->p1_pattern, p1, d, entry);
     }
     const int loads = columns->loads, loaded = d - loads;
     for (int r = 0; r < NT; r++)
@@ -696,9 +696,9 @@ static void sensitivity_step(Work *k, const Point *a, int d, int members, const 
     multiply_rows(&k->P1[0][0], ONE(NT), p1_new_start, p1_new_col, N, joined, d, p1);
     if (effort) {
         memset(effort, 0, sizeof(real) * NC * d);
-        for (int lane = 0; lane < members; lane++) {
-            const Directions *dir = motion[lane].directions;
-            if (dir && dir->theta_count) add_sparse(dir->effort_nz, dir->effort_pattern, effort, d, lane);
+        for (int entry = 0; entry < members; entry++) {
+            const Directions *dir = motion[entry].directions;
+            if (dir && dir->theta_count) add_sparse(dir->effort_nz, dir->effort_pattern, effort, d, entry);
         }
         for (int j = 0; j < NC; j++) {
             const int at = prescribed_index[j];
@@ -759,7 +759,7 @@ static void guess(real *const x[3], int step, const real *prescribed, real *q1, 
 }
 
 #define ALIGNMENT 64
-#define EACH for (int lane = 0; lane < LANES; lane++)
+#define EACH for (int entry = 0; entry < SIMD_WIDTH; entry++)
 
 /* Room for one step's work and so many numbers more (`room`), in one block; NULL where there is not so much memory. */
 static Work *work_new(size_t numbers, Outcome *outcome) {
@@ -780,24 +780,24 @@ static Work *work_new(size_t numbers, Outcome *outcome) {
 /* `count` entries of an array of every member, side by side; members beyond the last are like it. */
 static void gather(const double *const *from, size_t count, real *to) {
     EACH
-        for (size_t i = 0; i < count; i++) LANE(to[i], lane) = from[lane][i];
+        for (size_t i = 0; i < count; i++) SIMD_ENTRY(to[i], entry) = from[entry][i];
 }
 
 /* Entries of one member back into its own array. */
-static void scatter(const real *from, size_t count, int lane, double *to) {
-    for (size_t i = 0; i < count; i++) to[i] = LANE(from[i], lane);
+static void scatter(const real *from, size_t count, int entry, double *to) {
+    for (size_t i = 0; i < count; i++) to[i] = SIMD_ENTRY(from[i], entry);
 }
 
 /* One member's rows of `own` columns, among those of `d` columns of all. */
-static void gather_columns(const double *from, size_t rows, size_t own, size_t d, int lane, real *to) {
+static void gather_columns(const double *from, size_t rows, size_t own, size_t d, int entry, real *to) {
     for (size_t i = 0; i < rows; i++)
-        for (size_t c = 0; c < own; c++) LANE(to[i * d + c], lane) = from[i * own + c];
+        for (size_t c = 0; c < own; c++) SIMD_ENTRY(to[i * d + c], entry) = from[i * own + c];
 }
 
-static void scatter_columns(const real *from, size_t rows, size_t own, size_t d, int lane, double *to) {
+static void scatter_columns(const real *from, size_t rows, size_t own, size_t d, int entry, double *to) {
     if ((const void *)from == (const void *)to) return;
     for (size_t i = 0; i < rows; i++)
-        for (size_t c = 0; c < own; c++) to[i * own + c] = LANE(from[i * d + c], lane);
+        for (size_t c = 0; c < own; c++) to[i * own + c] = SIMD_ENTRY(from[i * d + c], entry);
 }
 
 /* What a batch is given and carries from step to step; states are those of this node and of the two before. */
@@ -815,9 +815,9 @@ int yid_rollout(int members, const Motion *motions, const Trajectory *outs, cons
     const int feeds = feedback ? feedback->count : 0;
     const int *fed = feeds ? feedback->index : NULL;
     size_t d = 0; /* columns of the member with the most; those that others lack stay zero */
-    for (int lane = 0; lane < members && motions->directions; lane++)
-        if ((size_t)motions[lane].directions->count > d) d = motions[lane].directions->count;
-    const size_t apart = LANES == 1 ? 0 : d; /* a single member's columns are worked out where they are wanted */
+    for (int entry = 0; entry < members && motions->directions; entry++)
+        if ((size_t)motions[entry].directions->count > d) d = motions[entry].directions->count;
+    const size_t apart = SIMD_WIDTH == 1 ? 0 : d; /* a single member's columns are worked out where they are wanted */
     memset(outcomes, 0, sizeof(Outcome) * members);
     Work *k = work_new(3 * NX + NTHETA + (NU + 1) * (size_t)feeds + NU + NC + d * (2 * NT + NY + NU + NQZ) +
                            apart * (2 * NX + M + 2 * NC) + BLOCK,
@@ -843,33 +843,33 @@ int yid_rollout(int members, const Motion *motions, const Trajectory *outs, cons
     columns.input_room = columns.Y + NY * d;
     columns.start = columns.input_room + NU * d;
 
-    /* lanes beyond the last member do what the first one does, and nobody looks */
-    const Motion *motion[LANES];
-    const Trajectory *out[LANES];
-    const Sensitivities *by[LANES];
-    const double *from[LANES];
+    /* entries beyond the last member do what the first one does, and nobody looks */
+    const Motion *motion[SIMD_WIDTH];
+    const Trajectory *out[SIMD_WIDTH];
+    const Sensitivities *by[SIMD_WIDTH];
+    const double *from[SIMD_WIDTH];
     int most = 0;
     EACH {
-        const int who = lane < members ? lane : 0;
-        motion[lane] = motions + who;
-        out[lane] = outs + who;
-        by[lane] = bys + who;
-        if (motion[lane]->steps > most) most = motion[lane]->steps;
-        LANE(m.running, lane) = ONES(lane < members);
-        LANE(m.time_step, lane) = motion[lane]->time_step;
-        LANE(m.tolerance, lane) = motion[lane]->tolerance;
+        const int who = entry < members ? entry : 0;
+        motion[entry] = motions + who;
+        out[entry] = outs + who;
+        by[entry] = bys + who;
+        if (motion[entry]->steps > most) most = motion[entry]->steps;
+        SIMD_ENTRY(m.running, entry) = ONES(entry < members);
+        SIMD_ENTRY(m.time_step, entry) = motion[entry]->time_step;
+        SIMD_ENTRY(m.tolerance, entry) = motion[entry]->tolerance;
     }
-    EACH from[lane] = motion[lane]->theta;
+    EACH from[entry] = motion[entry]->theta;
     gather(from, NTHETA, m.theta);
-    EACH from[lane] = out[lane]->state;
+    EACH from[entry] = out[entry]->state;
     gather(from, NX, m.x[0]);
-    size_t own[LANES];
+    size_t own[SIMD_WIDTH];
     int moves = 0, fed_forward = 0;
     EACH {
-        own[lane] = d ? (size_t)motion[lane]->directions->count : 0;
-        moves |= d && by[lane]->path;
-        fed_forward |= d && by[lane]->torque;
-        if (apart) gather_columns(by[lane]->state, NX, own[lane], d, lane, X[0]);
+        own[entry] = d ? (size_t)motion[entry]->directions->count : 0;
+        moves |= d && by[entry]->path;
+        fed_forward |= d && by[entry]->torque;
+        if (apart) gather_columns(by[entry]->state, NX, own[entry], d, entry, X[0]);
     }
     prepare(k, m.theta, &m.time_step);
 
@@ -878,22 +878,22 @@ int yid_rollout(int members, const Motion *motions, const Trajectory *outs, cons
     m.error = (real){0};
     for (int step = 0; step < most && any(m.running); step++) {
         mask at_work = m.running;
-        int row[LANES], status;
+        int row[SIMD_WIDTH], status;
         EACH {
-            const int last = motion[lane]->steps - 1;
-            row[lane] = step < last ? step : last;
-            LANE(at_work, lane) &= ONES(step <= last);
+            const int last = motion[entry]->steps - 1;
+            row[entry] = step < last ? step : last;
+            SIMD_ENTRY(at_work, entry) &= ONES(step <= last);
         }
-        EACH from[lane] = motion[lane]->path + (size_t)(row[lane] + 1) * NC;
+        EACH from[entry] = motion[entry]->path + (size_t)(row[entry] + 1) * NC;
         gather(from, NC, m.prescribed);
         if (NU) {
-            EACH from[lane] = motion[lane]->torque + (size_t)row[lane] * NU;
+            EACH from[entry] = motion[entry]->torque + (size_t)row[entry] * NU;
             gather(from, NU, m.nominal);
         }
         if (feeds) {
-            EACH from[lane] = motion[lane]->feedback->gain + (size_t)row[lane] * NU * feeds;
+            EACH from[entry] = motion[entry]->feedback->gain + (size_t)row[entry] * NU * feeds;
             gather(from, (size_t)NU * feeds, m.gain);
-            EACH from[lane] = motion[lane]->feedback->reference + (size_t)row[lane] * feeds;
+            EACH from[entry] = motion[entry]->feedback->reference + (size_t)row[entry] * feeds;
             gather(from, feeds, m.reference);
         }
         const real *x = m.x[0];
@@ -904,18 +904,18 @@ int yid_rollout(int members, const Motion *motions, const Trajectory *outs, cons
         const mask good = one_step(k, &a, m.tolerance, motions->limit, at_work, &error, &status);
         m.error = choose(at_work, error, m.error);
         effort_of(k, effort);
-        for (int lane = 0; lane < members; lane++) {
-            if (!LANE(at_work, lane)) continue;
-            double *state = outs[lane].state + (size_t)(step + 1) * NX;
-            scatter(u, NU, lane, outs[lane].applied + (size_t)step * NU);
-            scatter(q1, N, lane, state);
-            scatter(k->p1, N, lane, state + N);
-            scatter(z1, NZ, lane, state + 2 * N);
-            outcomes[lane].step = step;
-            outcomes[lane].status = LANE(good, lane) ? OK : LANES == 1 ? status : NOT_CONVERGED;
-            if (!LANE(good, lane)) continue;
-            scatter(lam, M, lane, outs[lane].multipliers + (size_t)step * M);
-            scatter(effort, NC, lane, outs[lane].effort + (size_t)step * NC);
+        for (int entry = 0; entry < members; entry++) {
+            if (!SIMD_ENTRY(at_work, entry)) continue;
+            double *state = outs[entry].state + (size_t)(step + 1) * NX;
+            scatter(u, NU, entry, outs[entry].applied + (size_t)step * NU);
+            scatter(q1, N, entry, state);
+            scatter(k->p1, N, entry, state + N);
+            scatter(z1, NZ, entry, state + 2 * N);
+            outcomes[entry].step = step;
+            outcomes[entry].status = SIMD_ENTRY(good, entry) ? OK : SIMD_WIDTH == 1 ? status : NOT_CONVERGED;
+            if (!SIMD_ENTRY(good, entry)) continue;
+            scatter(lam, M, entry, outs[entry].multipliers + (size_t)step * M);
+            scatter(effort, NC, entry, outs[entry].effort + (size_t)step * NC);
         }
         /* those that have ended, well or not, stay where they are */
         for (int i = 0; i < N; i++) next[i] = choose(good, q1[i], x[i]);
@@ -929,7 +929,7 @@ int yid_rollout(int members, const Motion *motions, const Trajectory *outs, cons
             columns.before = X[step % 2];
             columns.after = X[1 - step % 2];
             columns.input = columns.path = NULL;
-            if (LANES == 1) {
+            if (SIMD_WIDTH == 1) {
                 columns.before = (real *)bys->state + (size_t)step * NX * d;
                 columns.after = (real *)bys->state + (size_t)(step + 1) * NX * d;
                 columns.multipliers = (real *)bys->multipliers + (size_t)step * M * d;
@@ -939,27 +939,27 @@ int yid_rollout(int members, const Motion *motions, const Trajectory *outs, cons
                 columns.input = columns.input_room;
                 memset(columns.input_room, 0, sizeof(real) * NU * d);
                 EACH {
-                    const double *given = by[lane]->torque ? by[lane]->torque + row[lane] * NU * own[lane] : NULL;
-                    if (given) gather_columns(given, NU, own[lane], d, lane, columns.input_room);
+                    const double *given = by[entry]->torque ? by[entry]->torque + row[entry] * NU * own[entry] : NULL;
+                    if (given) gather_columns(given, NU, own[entry], d, entry, columns.input_room);
                 }
                 feed_columns(feeds, fed, m.gain, (int)d, columns.before, columns.input_room);
             }
             if (moves) {
-                columns.path = LANES == 1 ? (const real *)bys->path + (size_t)(step + 1) * NC * d : moved_path;
+                columns.path = SIMD_WIDTH == 1 ? (const real *)bys->path + (size_t)(step + 1) * NC * d : moved_path;
                 EACH {
-                    const double *given = by[lane]->path ? by[lane]->path + (row[lane] + 1) * NC * own[lane] : NULL;
-                    if (given && LANES > 1) gather_columns(given, NC, own[lane], d, lane, moved_path);
+                    const double *given = by[entry]->path ? by[entry]->path + (row[entry] + 1) * NC * own[entry] : NULL;
+                    if (given && SIMD_WIDTH > 1) gather_columns(given, NC, own[entry], d, entry, moved_path);
                 }
             }
             if (any(solvable)) sensitivity_step(k, &a, (int)d, members, motions, &columns);
-            for (int lane = 0; lane < members; lane++) {
-                if (!LANE(good, lane)) continue;
-                if (!LANE(solvable, lane)) outcomes[lane].status = SINGULAR;
+            for (int entry = 0; entry < members; entry++) {
+                if (!SIMD_ENTRY(good, entry)) continue;
+                if (!SIMD_ENTRY(solvable, entry)) outcomes[entry].status = SINGULAR;
                 else {
-                    const size_t of = own[lane], at = step;
-                    scatter_columns(columns.after, NX, of, d, lane, bys[lane].state + (at + 1) * NX * of);
-                    scatter_columns(columns.multipliers, M, of, d, lane, bys[lane].multipliers + at * M * of);
-                    scatter_columns(columns.effort, NC, of, d, lane, bys[lane].effort + at * NC * of);
+                    const size_t of = own[entry], at = step;
+                    scatter_columns(columns.after, NX, of, d, entry, bys[entry].state + (at + 1) * NX * of);
+                    scatter_columns(columns.multipliers, M, of, d, entry, bys[entry].multipliers + at * M * of);
+                    scatter_columns(columns.effort, NC, of, d, entry, bys[entry].effort + at * NC * of);
                 }
             }
             m.running &= solvable | NOT(good);
@@ -968,18 +968,18 @@ int yid_rollout(int members, const Motion *motions, const Trajectory *outs, cons
         m.x[1] = m.x[0];
         m.x[0] = next;
     }
-    for (int lane = 0; lane < members; lane++) {
-        if (outcomes[lane].status == OK) outcomes[lane].step = motions[lane].steps;
-        outcomes[lane].error = LANE(m.error, lane);
-        outcomes[lane].iterations = LANE(k->iterations, lane);
-        outcomes[lane].factorisations = LANE(k->factorisations, lane);
+    for (int entry = 0; entry < members; entry++) {
+        if (outcomes[entry].status == OK) outcomes[entry].step = motions[entry].steps;
+        outcomes[entry].error = SIMD_ENTRY(m.error, entry);
+        outcomes[entry].iterations = SIMD_ENTRY(k->iterations, entry);
+        outcomes[entry].factorisations = SIMD_ENTRY(k->factorisations, entry);
     }
     work_free(k);
     return OK;
 }
 
 /* What follows does one member alone. */
-#if LANES == 1
+#if SIMD_WIDTH == 1
 
 static void solve_transposed(Work *k, const double *b, double *x) {
     double *y = k->y;

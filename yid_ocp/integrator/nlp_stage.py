@@ -26,26 +26,20 @@ class NlpStage:
 
     Attributes
     ----------
-    equations : DiscreteEquations
     time_step : float
         h [s]
     x0, x1 : casadi.SX, shape (nx, 1)
         States (q, p, z) at the two nodes.
-    lam : casadi.SX, shape (m, 1)
-        Multipliers [N s].
-    u : casadi.SX, shape (nu, 1)
-        Torques that act over the step [N m].
-    theta : casadi.SX, shape (ntheta, 1)
+    lam, u, theta : casadi.SX
+        As in `DiscreteEquations`.
     residual : casadi.SX, shape (nr, 1)
         Constraint residual, zero if the step equations hold.
     residual_names : tuple of str
         Names of the rows: `del[JOINT]`, `internal[NAME]`, `constraint[GRASP.x]`, `p1[JOINT]`.
-    residual_jacobians : mapping of str to casadi.SX
-        Derivatives of `residual` by `x0`, `x1`, `lam` and `u`, sparse.
     prescribed_effort : casadi.SX, shape (nc, 1)
         Effort of the prescribed coordinates at the first node [N m].
-    effort_jacobians : mapping of str to casadi.SX
-        Derivatives of `prescribed_effort` by `x0`, `x1`, `lam` and `u`, sparse.
+    residual_jacobians, effort_jacobians : mapping of str to casadi.SX
+        Derivatives of the two by `x0`, `x1`, `lam` and `u`, sparse.
     """
 
     equations: DiscreteEquations
@@ -69,21 +63,13 @@ class NlpStage:
 
 
 def nlp_stage(equations: DiscreteEquations, time_step: float) -> NlpStage:
-    """The constraint rows of one step and their derivatives.
+    """The constraint rows of one step and their derivatives for a time step [s].
 
-    The bodies' second derivatives have a closed form (`RigidBodyDerivatives`) with a quarter of the operations of automatic
-    differentiation, which gives all others.
-
-    Parameters
-    ----------
-    equations : DiscreteEquations
-    time_step : float
-        [s]
+    The bodies' second derivatives have a closed form (`RigidBodyDerivatives`) with a quarter of the operations of
+    automatic differentiation, which gives all others.
     """
-    e, h = equations, time_step
-    system = e.system
-    free = list(system.free_indices)
-    fixed = list(system.prescribed_indices)
+    e, h, system = equations, time_step, equations.system
+    free, fixed = list(system.free_indices), list(system.prescribed_indices)
     p1 = ca.SX.sym("p1", e.p0.numel())
     x0, x1 = ca.vertcat(e.q0, e.p0, e.z0), ca.vertcat(e.q1, p1, e.z1)
     names = [f"del[{system.mechanism.joint_names[i]}]" for i in free]
@@ -115,7 +101,8 @@ def _slopes(e: DiscreteEquations) -> tuple[dict[str, ca.SX], dict[str, ca.SX]]:
     h/4 L_qq + b/2 L_qv + a (1/2 L_vq + b/h L_vv)  with q_k (b = -1) and with q_{k+1} (b = 1).
     """
     n, h, scale, pulls = e.q0.numel(), e.h, e.row_scale, e.constraint_impulses
-    L_qq, L_qv, L_vv = lagrangian_second_derivatives(e.rigid_body_terms, e.system.mechanism)
+    rigid = e.rigid_body_terms
+    L_qq, L_qv, L_vv = lagrangian_second_derivatives(rigid, e.system.mechanism)
     bent = pulls.midpoint_share * pulls.middle_force_by_q / 2
     curves = {
         -1: {"q0": pulls.start_share * pulls.before_force_by_q + bent, "q1": bent},
@@ -123,20 +110,15 @@ def _slopes(e: DiscreteEquations) -> tuple[dict[str, ca.SX], dict[str, ca.SX]]:
     }
     impulses = e.closed_form_impulses or (ca.SX(n, 1), ca.SX(n, 1))
     found = []
-    parts = (
-        (-1, e.balance_remainder, impulses[0], pulls.left_jacobian),
-        (1, e.p1_remainder, impulses[1], pulls.right_jacobian),
-    )
-    for side, rest, impulse, rows in parts:
+    apart_and_rows = (e.balance_remainder, pulls.left_jacobian), (e.p1_remainder, pulls.right_jacobian)
+    for side, impulse, (rest, rows) in zip((-1, 1), impulses, apart_and_rows, strict=True):
         apart = rest + impulse
         by = {name: ca.jacobian(apart, getattr(e, name)) for name in ("q0", "q1", "z0", "z1", "u")}
         for name, sign in (("q0", -1), ("q1", 1)):
             bodies = h / 4 * L_qq + sign / 2 * L_qv + side * (L_qv.T / 2 + sign * L_vv / h)
             by[name] += ca.mtimes(ca.diag(scale), bodies - curves[side][name])
         # placements, masses and grasps may depend on internal coordinates
-        whole = scale * (
-            h / 2 * e.rigid_body_terms.lagrangian_by_q + side * e.rigid_body_terms.lagrangian_by_v - rows.T @ e.lam
-        )
+        whole = scale * (h / 2 * rigid.lagrangian_by_q + side * rigid.lagrangian_by_v - rows.T @ e.lam)
         for name in ("z0", "z1"):
             by[name] += ca.jacobian(whole, getattr(e, name))
         by["lam"] = -ca.mtimes(ca.diag(scale), rows.T)

@@ -1,8 +1,9 @@
-"""Rollouts of a system: simulation, forward sensitivities and the adjoint gradient."""
+"""Rollouts of a system: simulation, forward sensitivities, the adjoint gradient, and their single steps linearized."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -14,6 +15,12 @@ from yid_ocp.integrator.step_model import CostGradient, Rollout, RolloutInputs, 
 from yid_ocp.parallel import CASADI_LOCK
 
 Array = NDArray[np.float64]
+
+_STEPS_PER_CHUNK = 50
+"""Number of steps linearised at once, limited because their matrices are dense."""
+_MIN_SLOPE = 1e-12
+"""Smallest derivative by an internal state that is not regarded as rounding error."""
+_ALL_STEPS = slice(None)
 
 
 def simulate(
@@ -42,8 +49,8 @@ def simulate(
         Nominal motor torque of every step [N m]; zero when absent.
     path : array_like, shape (N + 1, nc), optional
         Prescribed coordinates at every node; held at their initial value when absent.
-    feedback : Feedback, optional
-    directions : Directions, optional
+    feedback : TrackingFeedback, optional
+    directions : SensitivityDirections, optional
 
     Returns
     -------
@@ -59,18 +66,7 @@ def simulate(
 
 
 def simulate_batch(step: Step, members: Sequence[RolloutInputs]) -> list[Rollout]:
-    """Simulate several rollouts, in batches where that is faster; equal to `simulate` of each but for rounding.
-
-    Parameters
-    ----------
-    step : Step
-    members : sequence of Member
-        From `rollout_inputs`.
-
-    Returns
-    -------
-    list of Rollout
-    """
+    """Simulate several `rollout_inputs`, in batches where that is faster; equal to `simulate` but for rounding."""
     return step.kernel.rollout_batch(members)
 
 
@@ -85,36 +81,26 @@ def rollout_inputs(
     directions: SensitivityDirections | None = None,
 ) -> RolloutInputs:
     """The inputs of one rollout with checked shapes; arguments and errors as in `simulate`."""
-    sizes = step.sizes
+    sizes, check = step.sizes, float_array_of_shape
+    nx, nu, nc = sizes["nx"], sizes["nu"], sizes["nc"]
     if steps < 1:
         raise ModelError(f"steps = {steps}", allowed="a whole number from 1")
-    begin = float_array_of_shape("start", start, (sizes["nx"],)).copy()
+    begin = check("start", start, (nx,)).copy()
     fixed = list(step.system.prescribed_indices)
-    inputs = (
-        np.zeros((steps, sizes["nu"]))
-        if torque is None
-        else float_array_of_shape("torque", torque, (steps, sizes["nu"]))
-    )
-    course = (
-        np.tile(begin[fixed], (steps + 1, 1))
-        if path is None
-        else float_array_of_shape("path", path, (steps + 1, sizes["nc"]))
-    )
+    inputs = np.zeros((steps, nu)) if torque is None else check("torque", torque, (steps, nu))
+    course = np.tile(begin[fixed], (steps + 1, 1)) if path is None else check("path", path, (steps + 1, nc))
     begin[fixed] = course[0]
     if directions is not None:
-        d = directions.count
-        float_array_of_shape("directions.start", directions.initial_state_tangents, (sizes["nx"], d))
+        d, along = directions.count, directions.prescribed_tangents
+        check("directions.start", directions.initial_state_tangents, (nx, d))
         if directions.torque_tangents is not None:
-            float_array_of_shape("directions.torque", directions.torque_tangents, (steps, sizes["nu"], d))
-        if directions.prescribed_tangents is not None:
-            float_array_of_shape("directions.path", directions.prescribed_tangents, (steps + 1, sizes["nc"], d))
-            if fixed:
-                first = directions.initial_state_tangents.copy()
-                first[fixed] = directions.prescribed_tangents[0]
-                directions = SensitivityDirections(
-                    directions.parameter_names, first, directions.torque_tangents, directions.prescribed_tangents
-                )
-    values = float_array_of_shape("theta", theta, (sizes["ntheta"],))
+            check("directions.torque", directions.torque_tangents, (steps, nu, d))
+        if along is not None:
+            check("directions.path", along, (steps + 1, nc, d))
+            first = directions.initial_state_tangents.copy()
+            first[fixed] = along[0]
+            directions = replace(directions, initial_state_tangents=first)
+    values = check("theta", theta, (sizes["ntheta"],))
     return RolloutInputs(values, begin, inputs, course, feedback, directions)
 
 
@@ -158,35 +144,20 @@ def adjoint_gradient(
         Partial derivatives of the cost by the state at every node.
     by_multipliers : array_like, shape (N, m), optional
     by_effort : array_like, shape (N, nc), optional
-    feedback : Feedback, optional
-
-    Returns
-    -------
-    Gradient
+    feedback : TrackingFeedback, optional
     """
-    sizes, steps = step.sizes, len(rollout.multipliers)
-    outer = float_array_of_shape("by_state", by_state, (steps + 1, sizes["nx"]))
-    last = (
-        None if by_multipliers is None else float_array_of_shape("by_multipliers", by_multipliers, (steps, sizes["m"]))
-    )
-    effort = None if by_effort is None else float_array_of_shape("by_effort", by_effort, (steps, sizes["nc"]))
-    values = float_array_of_shape("theta", theta, (sizes["ntheta"],))
+    sizes, steps, check = step.sizes, len(rollout.multipliers), float_array_of_shape
+    outer = check("by_state", by_state, (steps + 1, sizes["nx"]))
+    last = None if by_multipliers is None else check("by_multipliers", by_multipliers, (steps, sizes["m"]))
+    effort = None if by_effort is None else check("by_effort", by_effort, (steps, sizes["nc"]))
+    values = check("theta", theta, (sizes["ntheta"],))
     return step.kernel.adjoint_gradient(values, rollout, feedback, tuple(names), outer, last, effort)
 
 
 def generalized_momentum(step: Step, q: ArrayLike, v: ArrayLike, theta: ArrayLike) -> Array:
-    """Generalized momentum dL/dv at (q, v) [N m s], of a compliant coordinate times its compliance.
+    """Generalized momentum dL/dv at (q, v) [N m s], of a compliant coordinate times its compliance, shape of q.
 
-    Parameters
-    ----------
-    step : Step
-    q, v : array_like, shape (n,) or (K, n)
-        Configurations and velocities.
-    theta : array_like, shape (ntheta,)
-
-    Returns
-    -------
-    ndarray, of the shape of q
+    `q` and `v` have the shape (n,) or (K, n).
     """
     e, s = step.equations, step.sizes
     half = np.atleast_2d(np.asarray(v, float)) * step.time_step / 2
@@ -194,9 +165,89 @@ def generalized_momentum(step: Step, q: ArrayLike, v: ArrayLike, theta: ArrayLik
     with CASADI_LOCK:
         function = ca.Function("momentum", e.arguments, [e.row_scale * e.rigid_body_terms.lagrangian_by_v])
     none = [np.zeros(s[key]) for key in ("n", "nz", "nz", "m", "nu")]
-    values = np.asarray(theta, float)
-    rows = [
-        np.array(function(m - d, m + d, *none, values, step.time_step)).ravel()
-        for m, d in zip(middle, half, strict=True)
-    ]
+    last, pairs = (np.asarray(theta, float), step.time_step), zip(middle, half, strict=True)
+    rows = [np.array(function(m - d, m + d, *none, *last)).ravel() for m, d in pairs]
     return np.array(rows).reshape(np.shape(q))
+
+
+@dataclass(frozen=True)
+class LinearizedStep:
+    """Jacobians A_k, B_k, E_k of one step by the implicit function theorem, at the applied torque.
+
+    Attributes
+    ----------
+    state_by_state, state_by_torque, state_by_load : ndarray, shape (nx, nx), (nx, nu) and (nx, e)
+        A_k = dx_{k+1}/dx_k, B_k = dx_{k+1}/du_k, E_k = dx_{k+1}/d(additional loads).
+    effort_by_state, effort_by_torque, effort_by_load : ndarray, shape (nc, nx), (nc, nu) and (nc, e)
+        Of the effort that the prescribed coordinates need at node k.
+    """
+
+    state_by_state: Array
+    state_by_torque: Array
+    state_by_load: Array
+    effort_by_state: Array
+    effort_by_torque: Array
+    effort_by_load: Array
+
+
+@dataclass(frozen=True)
+class AdditionalLoads:
+    """First-order effect of e additional loads on the equations of every step, one column each.
+
+    Attributes
+    ----------
+    residual : ndarray, shape (nt, e)
+        Added to the balance, internal and constraint equations.
+    next_momentum : ndarray, shape (n, e)
+        Added to p_{k+1}.
+    """
+
+    residual: Array
+    next_momentum: Array
+
+
+def active_state_mask(
+    step: Step, steps: Sequence[LinearizedStep], seen: NDArray[np.bool_] | None = None
+) -> NDArray[np.bool_]:
+    """Mask of the states that move and that affect others, efforts or sensors, shape (nx,).
+
+    Internal states of a neutral effect are excluded. `steps` are a representative sample, `seen` (nx,) says which
+    states sensors depend on.
+    """
+    by_state = np.max([np.abs(one.state_by_state) for one in steps], axis=0)
+    by_input = np.max([np.abs(np.hstack([one.state_by_torque, one.state_by_load])) for one in steps], axis=0)
+    moved = np.any(by_state > 0, axis=1) | np.any(by_input > 0, axis=1)
+    moved[list(step.system.prescribed_indices)] = False
+    felt = np.arange(len(moved)) < 2 * step.sizes["n"]
+    felt |= False if seen is None else seen
+    felt |= np.any([np.any(np.abs(one.effort_by_state) > _MIN_SLOPE, axis=0) for one in steps], axis=0)
+    while np.any(more := ~felt & np.any(by_state[felt] > _MIN_SLOPE, axis=0)):
+        felt |= more
+    return moved & felt
+
+
+def linearized_steps(
+    step: Step, theta: Array, rollout: Rollout, loads: AdditionalLoads | None = None, chosen: slice = _ALL_STEPS
+) -> Iterator[LinearizedStep]:
+    """Iterate over the linearized steps of a finished rollout, with prescribed coordinates unchanged.
+
+    `chosen` is a slice of steps in a row; all by default.
+    """
+    sizes = step.sizes
+    if loads is None:
+        loads = AdditionalLoads(np.zeros((sizes["n"] + sizes["nz"] + sizes["m"], 0)), np.zeros((sizes["n"], 0)))
+    begin, end, _ = chosen.indices(len(rollout.torque))
+    for first in range(begin, end, _STEPS_PER_CHUNK):
+        yield from _chunk(step, theta, rollout, loads, slice(first, min(first + _STEPS_PER_CHUNK, end)))
+
+
+def _chunk(step: Step, theta: Array, rollout: Rollout, loads: AdditionalLoads, span: slice) -> list[LinearizedStep]:
+    nx, nu = step.sizes["nx"], step.sizes["nu"]
+    state = rollout.state[span.start : span.stop + 1]
+    along = (theta, state, rollout.multipliers[span], rollout.torque[span])
+    after, effort = step.kernel.step_jacobians(*along, loads.residual, loads.next_momentum)
+    parts = (slice(0, nx), slice(nx, nx + nu), slice(nx + nu, after.shape[2]))
+    return [
+        LinearizedStep(*(a[:, part] for part in parts), *(e[:, part] for part in parts))
+        for a, e in zip(after, effort, strict=True)
+    ]

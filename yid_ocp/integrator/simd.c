@@ -8,14 +8,14 @@
 
 #ifndef BATCHED
 
-#define LANES 1
+#define SIMD_WIDTH 1
 typedef double real;
 typedef int mask;
 typedef long long whole;
 #define EVERY 1
 #define NOT(m) (!(m))
 #define ONES(m) (m)
-#define LANE(x, lane) (x)
+#define SIMD_ENTRY(x, entry) (x)
 #define ALL(x) (x)
 #define SIMD _Pragma("omp simd")
 #define SIMD_SUM _Pragma("omp simd reduction(- : sum)")
@@ -26,45 +26,45 @@ static inline real magnitude(real x) { return fabs(x); }
 #else
 
 #ifdef __AVX512F__
-#define LANES 8
+#define SIMD_WIDTH 8
 #define ALL(x) {x, x, x, x, x, x, x, x}
 #else
-#define LANES 4
+#define SIMD_WIDTH 4
 #define ALL(x) {x, x, x, x}
 #endif
-typedef double real __attribute__((vector_size(8 * LANES), may_alias));
-typedef long long mask __attribute__((vector_size(8 * LANES), may_alias));
+typedef double real __attribute__((vector_size(8 * SIMD_WIDTH), may_alias));
+typedef long long mask __attribute__((vector_size(8 * SIMD_WIDTH), may_alias));
 typedef mask whole;
 #define EVERY ((mask)ALL(-1))
 #define NOT(m) (~(m))
 #define ONES(m) (-(m))
-#define LANE(x, lane) (x)[lane]
+#define SIMD_ENTRY(x, entry) (x)[entry]
 #define SIMD
 #define SIMD_SUM
 static inline int any(mask m) {
     long long found = 0;
-    for (int lane = 0; lane < LANES; lane++) found |= m[lane];
+    for (int entry = 0; entry < SIMD_WIDTH; entry++) found |= m[entry];
     return found != 0;
 }
 static inline real choose(mask m, real a, real b) { return (real)(((mask)a & m) | ((mask)b & ~m)); }
 static inline real magnitude(real x) { return (real)((mask)x & (mask)ALL(0x7fffffffffffffff)); }
 #endif
 
-/* What our functions use, beside operators (lane_functions.py). */
+/* What our functions use, beside operators (codegen.py). */
 static inline real truth(mask m) { return choose(m, (real)ALL(1.0), (real)ALL(0.0)); }
 static inline real lesser(real a, real b) { return choose((a < b) | (b != b), a, b); }
 static inline real larger(real a, real b) { return choose((a > b) | (b != b), a, b); }
 static inline real sign_of(real x) { return choose(x < 0, (real)ALL(-1.0), choose(x > 0, (real)ALL(1.0), x)); }
 static real each(double (*function)(double), real x) {
-    for (int lane = 0; lane < LANES; lane++) LANE(x, lane) = function(LANE(x, lane));
+    for (int entry = 0; entry < SIMD_WIDTH; entry++) SIMD_ENTRY(x, entry) = function(SIMD_ENTRY(x, entry));
     return x;
 }
 static real each_pair(double (*function)(double, double), real x, real y) {
-    for (int lane = 0; lane < LANES; lane++) LANE(x, lane) = function(LANE(x, lane), LANE(y, lane));
+    for (int entry = 0; entry < SIMD_WIDTH; entry++) SIMD_ENTRY(x, entry) = function(SIMD_ENTRY(x, entry), SIMD_ENTRY(y, entry));
     return x;
 }
 static inline real root(real x) {
-    for (int lane = 0; lane < LANES; lane++) LANE(x, lane) = sqrt(LANE(x, lane));
+    for (int entry = 0; entry < SIMD_WIDTH; entry++) SIMD_ENTRY(x, entry) = sqrt(SIMD_ENTRY(x, entry));
     return x;
 }
 typedef struct {
@@ -105,10 +105,10 @@ static Turn turn(real x) {
     t.sine = (real)((mask)t.sine ^ ((quarter & 2) << 62));
     t.cosine = (real)((mask)t.cosine ^ (((quarter + 1) & 2) << 62));
     const mask known = magnitude(x) < MANY;
-    for (int lane = 0; lane < LANES && any(~known); lane++)
-        if (!known[lane]) {
-            t.sine[lane] = sin(x[lane]);
-            t.cosine[lane] = cos(x[lane]);
+    for (int entry = 0; entry < SIMD_WIDTH && any(~known); entry++)
+        if (!known[entry]) {
+            t.sine[entry] = sin(x[entry]);
+            t.cosine[entry] = cos(x[entry]);
         }
     return t;
 }
@@ -116,22 +116,22 @@ static Turn turn(real x) {
 static inline double places(double a, double b) { return fabs(a - b) / (0x1p-52 * fabs(b) + 0x1p-105); }
 
 /* Number of members of a batch; 0 where this compiler and this machine do not get the arithmetic right. */
-int yid_lanes(void) {
+int yid_simd_width(void) {
     int bad = 0;
     for (int i = -400; i <= 400; i++) {
         real x;
-        for (int lane = 0; lane < LANES; lane++) x[lane] = 0.0137 * i * (1 + lane) + 1e-3 * lane;
+        for (int entry = 0; entry < SIMD_WIDTH; entry++) x[entry] = 0.0137 * i * (1 + entry) + 1e-3 * entry;
         const Turn t = turn(x);
         const real less = lesser(x, -x), more = larger(x, x * x), sign = sign_of(x), size = magnitude(x);
         const real kind = choose(x < 0.5, x, truth(x >= 1.0));
-        for (int lane = 0; lane < LANES; lane++) {
-            const double v = x[lane];
-            bad |= !(places(t.sine[lane], sin(v)) < 4 && places(t.cosine[lane], cos(v)) < 4);
-            bad |= less[lane] != -fabs(v) || more[lane] != fmax(v, v * v) || size[lane] != fabs(v);
-            bad |= sign[lane] != (v > 0) - (v < 0) || kind[lane] != (v < 0.5 ? v : v >= 1.0 ? 1.0 : 0.0);
+        for (int entry = 0; entry < SIMD_WIDTH; entry++) {
+            const double v = x[entry];
+            bad |= !(places(t.sine[entry], sin(v)) < 4 && places(t.cosine[entry], cos(v)) < 4);
+            bad |= less[entry] != -fabs(v) || more[entry] != fmax(v, v * v) || size[entry] != fabs(v);
+            bad |= sign[entry] != (v > 0) - (v < 0) || kind[entry] != (v < 0.5 ? v : v >= 1.0 ? 1.0 : 0.0);
         }
     }
-    return bad ? 0 : LANES;
+    return bad ? 0 : SIMD_WIDTH;
 }
 #endif
 

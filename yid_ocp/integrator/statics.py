@@ -77,14 +77,7 @@ _MAX_HOLD_DEFLECTION = 0.02
 class EquilibriumSolver:
     """Solver for the static equilibrium of a system with driven joints held and prescribed joints given.
 
-    Parameters
-    ----------
-    step : Step
-
-    Attributes
-    ----------
-    known_coordinates, free_coordinates : tuple of int
-        Indices of given coordinates (driven, then prescribed) and of the coordinates to solve for.
+    `known_coordinates` and `free_coordinates` are indices of those given (driven, then prescribed) and sought.
     """
 
     def __init__(self, step: Step) -> None:
@@ -92,7 +85,7 @@ class EquilibriumSolver:
         system, e = step.system, step.equations
         self.known_coordinates = (*system.driven_indices, *system.prescribed_indices)
         self.free_coordinates = system.free_indices
-        self._equations: LockedCache[None, EquilibriumEquations] = LockedCache(lambda _: equilibrium_equations(e))
+        self._equations = LockedCache[None, EquilibriumEquations](lambda _: equilibrium_equations(e))
         self._inner_slopes: LockedCache[None, ca.Function] = LockedCache(
             lambda _: ca.Function("inner", e.arguments, [ca.jacobian(e.internal_residual_at_rest, e.theta)])
         )
@@ -132,23 +125,21 @@ class EquilibriumSolver:
 
         Returns
         -------
-        Rest
-            `converged` is False, with the best point found, where Newton's iteration does not succeed.
+        Equilibrium
+            `is_converged` is False, with the best point found, where Newton's iteration does not succeed.
         """
         step, system = self.step, self.step.system
         given = float_array_of_shape("posture", posture, (len(self.known_coordinates),))
         theta = float_array_of_shape("theta", theta, (len(system.parameters),))
         stiffness = holding_spring_stiffness(system, torque is not None)
-        held = (
-            np.zeros(step.sizes["nu"])
-            if torque is None
-            else float_array_of_shape("torque", torque, (step.sizes["nu"],))
-        )
+        nu, nz = step.sizes["nu"], step.sizes["nz"]
+        held = np.zeros(nu) if torque is None else float_array_of_shape("torque", torque, (nu,))
         hold = _Hold(given, held, stiffness)
+        count = len(self.free_coordinates) + nz
         best: tuple[bool, float, float, Array] | None = None
         for start in self._guesses(given, guess):
             w, error, converged = step.kernel.find_equilibrium(theta, start, given, held, stiffness, tolerance)
-            inner = w[len(self.free_coordinates) : len(self.free_coordinates) + step.sizes["nz"]]
+            inner = w[count - nz : count]
             energy = float(self._energy(ca.DM(self._configuration(w, given)), inner, hold, theta))
             found = (not converged, energy if converged else error, error, w)
             if best is None or found[:2] < best[:2]:
@@ -171,12 +162,10 @@ class EquilibriumSolver:
             failed = True
             # with a torque given, any of the three may be wrong
             parts = "posture does not fit the grasp" if torque is None else "posture, torques and grasp do not balance"
-            message = (
-                f"the measured {parts} at rest: {system.driven[joint]} would have to move by {abs(give[joint]):.3g} rad"
-            )
-        count = len(self.free_coordinates) + step.sizes["nz"]
+            far = f"{system.driven[joint]} would have to move by {abs(give[joint]):.3g} rad"
+            message = f"the measured {parts} at rest: {far}"
         # torque and posture enter together, as the torque plus the holding spring's stiffness times the posture
-        by_torque = by_posture[:, : step.sizes["nu"]] / stiffness
+        by_torque = by_posture[:, :nu] / stiffness
         return Equilibrium(
             state, held + stiffness * give, w[count:], by_theta, by_posture, by_torque, not failed, error, message
         )
@@ -191,15 +180,11 @@ class EquilibriumSolver:
         first = np.zeros(size)
         q = np.zeros(system.n_coordinates)
         q[list(self.known_coordinates)] = given
-        if guess is not None:
-            q[:] = np.asarray(guess, float)
+        q = q if guess is None else np.asarray(guess, float)
         first[: len(self.free_coordinates)] = q[list(self.free_coordinates)]
         starts = [first]
-        elastic = {
-            system.mechanism.joint_index(spring.joint_name)
-            for spring in system.elastic_joints
-            if spring.deformation == "bend"
-        }
+        bends = (spring.joint_name for spring in system.elastic_joints if spring.deformation == "bend")
+        elastic = set(map(system.mechanism.joint_index, bends))
         bendable = [row for row, index in enumerate(self.free_coordinates) if index in elastic]
         for seed in range(4 if bendable and system.grasps else 0):
             bent = first.copy()
@@ -244,11 +229,8 @@ class EquilibriumSolver:
             scale = 1.0 / max(float(ca.norm_inf(function(0, *known))), 1e-6)
             search = {"print_level": 0, "sb": "yes", "max_iter": _ENERGY_ITERATION_LIMIT, "tol": 1e-8}
             options: dict[str, Any] = {"print_time": False, "error_on_fail": False, "ipopt": search}
-            program = {
-                "x": x,
-                "f": scale * self._energy(q, np.zeros(self.step.sizes["nz"]), hold, theta),
-                "g": residual[-m:],
-            }
+            energy = self._energy(q, np.zeros(self.step.sizes["nz"]), hold, theta)
+            program = {"x": x, "f": scale * energy, "g": residual[-m:]}
             solver = ca.nlpsol("lowest", "ipopt", program, options)
         for start in self._guesses(given, None):
             found = np.array(solver(x0=start[:size], lbg=0.0, ubg=0.0)["x"]).ravel()
@@ -265,11 +247,8 @@ class EquilibriumSolver:
         """
         step = self.step
         n, nz, m, nu = (step.sizes[key] for key in ("n", "nz", "m", "nu"))
-        free, driven, fixed = (
-            len(self.free_coordinates),
-            list(step.system.driven_indices),
-            list(step.system.prescribed_indices),
-        )
+        free, system = len(self.free_coordinates), step.system
+        driven, fixed = list(system.driven_indices), list(system.prescribed_indices)
         z, u = w[free : free + nz], hold.held + hold.stiffness * hold.give(q, step.system)
         none = np.zeros(n)
         h = float(step.functions.row_scale_and_time_step(q, q, none, z, z, np.zeros(m), u, theta, step.time_step)[1])
@@ -299,7 +278,7 @@ class EquilibriumSolver:
             slopes[row, column] = np.array(step.functions.internal_residual_at_rest(*at)[1]).ravel()
             rows[inner], push[inner] = slopes[:, : n + nz + m], slopes[:, n + nz + m :]
             rows[inner, driven] -= hold.stiffness * push[inner]
-            chosen = [step.system.parameters.index(name) for name in names]
+            chosen = [system.parameters.index(name) for name in names]
             others[inner] = np.array(ca.densify(self._inner_slopes(None)(*at)))[:, chosen]
         rows[:n] /= h
         push[:n] /= h

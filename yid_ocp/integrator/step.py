@@ -15,10 +15,16 @@ from yid_ocp.integrator import codegen, compiler
 from yid_ocp.integrator.compiled import CompiledKernel
 from yid_ocp.integrator.discrete import ConstraintForcePlacement, DiscreteEquations, ForceSplit
 from yid_ocp.integrator.interpreted import InterpretedKernel
-from yid_ocp.integrator.step_model import Rollout as Rollout
-from yid_ocp.integrator.step_model import SensitivityDirections as SensitivityDirections
-from yid_ocp.integrator.step_model import StepKernel, StepModel, StepStatus, build_step_model, newton_tolerance
-from yid_ocp.integrator.step_model import TrackingFeedback as TrackingFeedback
+from yid_ocp.integrator.step_model import (
+    Rollout,
+    RolloutInputs,
+    SensitivityDirections,
+    StepKernel,
+    StepModel,
+    StepStatus,
+    build_step_model,
+    newton_tolerance,
+)
 from yid_ocp.model.system import System
 
 Array = NDArray[np.float64]
@@ -26,16 +32,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Step(ReprMixin):
-    """Step map of a system over one time step; made by `compile_step`.
-
-    Attributes
-    ----------
-    model : StepModel
-        Its equations, functions, sizes, time step and tolerance.
-    kernel : Kernel
-    is_compiled : bool
-        Whether generated C code is used.
-    """
+    """Step map of a system over one time step; made by `compile_step`. `is_compiled`: by generated C code."""
 
     model: StepModel
     kernel: StepKernel
@@ -160,26 +157,22 @@ class Step(ReprMixin):
         internal: ArrayLike | None,
         wanted: SensitivityDirections | None,
     ) -> Rollout:
-        sizes = self.sizes
-        z0 = np.zeros(sizes["nz"]) if internal is None else float_array_of_shape("internal", internal, (sizes["nz"],))
-        start = np.concatenate(
-            [float_array_of_shape("q0", q0, (sizes["n"],)), float_array_of_shape("p0", p0, (sizes["n"],)), z0]
-        )
+        sizes, check = self.sizes, float_array_of_shape
+        z0 = np.zeros(sizes["nz"]) if internal is None else check("internal", internal, (sizes["nz"],))
+        start = np.concatenate([check("q0", q0, (sizes["n"],)), check("p0", p0, (sizes["n"],)), z0])
         if prescribed is None:
             if sizes["nc"]:
-                raise ModelError(
-                    f"{sizes['nc']} coordinates are prescribed", where="step", hint="pass prescribed=(s0, s1)"
-                )
+                what = f"{sizes['nc']} coordinates are prescribed"
+                raise ModelError(what, where="step", hint="pass prescribed=(s0, s1)")
             path = np.zeros((2, 0))
         else:
             if len(prescribed) != 2:
                 raise ModelError(f"prescribed has {len(prescribed)} entries", allowed="the pair (s0, s1)")
-            path = np.stack([float_array_of_shape("prescribed", s, (sizes["nc"],)) for s in prescribed])
+            path = np.stack([check("prescribed", s, (sizes["nc"],)) for s in prescribed])
         start[list(self.system.prescribed_indices)] = path[0]
-        torque = float_array_of_shape("u", u, (sizes["nu"],))[None, :]
-        return self.kernel.rollout(
-            float_array_of_shape("theta", theta, (sizes["ntheta"],)), start, torque, path, None, wanted
-        )
+        torque = check("u", u, (sizes["nu"],))[None, :]
+        values = check("theta", theta, (sizes["ntheta"],))
+        return self.kernel.rollout(RolloutInputs(values, start, torque, path, None, wanted))
 
 
 def compile_step(
@@ -207,10 +200,6 @@ def compile_step(
         Whether to generate and compile C; without a compiler on the machine the interpreter is used with one notice.
     tolerance : float, optional
         Newton's, on the coordinates [rad or m]; follows from the time step when absent.
-
-    Returns
-    -------
-    Step
 
     Raises
     ------

@@ -33,18 +33,8 @@ _COORDINATE_TOLERANCE, _VELOCITY_TOLERANCE, _ROUNDING_FLOOR = 1e-12, 1e-10, 1e-1
 class StepModel:
     """Equations, functions and index tables of one step, from which a kernel is built.
 
-    Attributes
-    ----------
-    system : System
-    equations : DiscreteEquations
-    functions : StepFunctions
-    index_tables : Structure
-    sizes : dict of str to int
-        n, nz, m, nu, nc, nx and ntheta.
-    time_step : float
-        h [s]
-    tolerance : float
-        Newton's, on the coordinates [rad or m].
+    `sizes` holds n, nz, m, nu, nc, nx and ntheta, `time_step` is h [s], `tolerance` Newton's on the coordinates
+    [rad or m].
     """
 
     system: System
@@ -67,15 +57,8 @@ def build_step_model(
     e = discrete_equations(system, force_split, constraint_force)
     functions = codegen.step_functions(e)
     n, nz = system.n_coordinates, e.z0.numel()
-    sizes = {
-        "n": n,
-        "nz": nz,
-        "m": e.lam.numel(),
-        "nu": e.u.numel(),
-        "nc": len(system.prescribed),
-        "nx": 2 * n + nz,
-        "ntheta": e.theta.numel(),
-    }
+    sizes = {"n": n, "nz": nz, "m": e.lam.numel(), "nu": e.u.numel(), "nc": len(system.prescribed)}
+    sizes |= {"nx": 2 * n + nz, "ntheta": e.theta.numel()}
     if tolerance is None:
         tolerance = newton_tolerance(time_step)
     return StepModel(system, e, functions, codegen.step_index_tables(functions), sizes, float(time_step), tolerance)
@@ -99,11 +82,11 @@ class NewtonStatus(IntEnum):
 _STATUS_MESSAGES = {
     NewtonStatus.OK: "converged",
     NewtonStatus.NOT_CONVERGED: "Newton did not converge; try a smaller time step, more damping, or a fitting start",
-    NewtonStatus.SINGULAR: "the step's equations are singular; look for redundant grasps or a coordinate without inertia",
+    NewtonStatus.SINGULAR: "the step's equations are singular; "
+    "look for redundant grasps or a coordinate without inertia",
     NewtonStatus.NOT_FINITE: "the state is no longer finite; the motion is unstable open loop: add feedback or damping",
     NewtonStatus.OUT_OF_MEMORY: "there is not enough memory",
 }
-
 
 _LONG_ROLLOUT_STEPS = 100
 """Number of steps after which a failure is attributed to the integration method, not to the initial state."""
@@ -119,9 +102,8 @@ class StepStatus:
 
     Attributes
     ----------
-    code : StepCode
+    code : NewtonStatus
     completed_steps : int
-        Steps completed.
     last_correction : float
         Last Newton correction [rad or m].
     newton_iterations, factorisations : int
@@ -150,14 +132,11 @@ class StepStatus:
         """The status as a sentence with the step, the last correction and a remedy."""
         if self.is_converged:
             return _STATUS_MESSAGES[self.code]
-        said = (
-            f"step {self.completed_steps}: {_STATUS_MESSAGES[self.code]} (last correction {self.last_correction:.2g})"
-        )
-        late = (
-            self.code in (NewtonStatus.NOT_CONVERGED, NewtonStatus.NOT_FINITE)
-            and self.completed_steps >= _LONG_ROLLOUT_STEPS
-        )
-        return f"{said}; {_INSTABILITY_HINT}" if late else said
+        step, what = self.completed_steps, _STATUS_MESSAGES[self.code]
+        said = f"step {step}: {what} (last correction {self.last_correction:.2g})"
+        is_late = step >= _LONG_ROLLOUT_STEPS
+        unstable = is_late and self.code in (NewtonStatus.NOT_CONVERGED, NewtonStatus.NOT_FINITE)
+        return f"{said}; {_INSTABILITY_HINT}" if unstable else said
 
 
 @dataclass(frozen=True)
@@ -183,9 +162,8 @@ class SensitivityDirections:
 
     def __post_init__(self) -> None:
         if self.count < len(self.parameter_names):
-            raise ModelError(
-                f"{self.count} directions for {len(self.parameter_names)} parameters", allowed="one or more each"
-            )
+            what = f"{self.count} directions for {len(self.parameter_names)} parameters"
+            raise ModelError(what, allowed="one or more each")
 
     @property
     def count(self) -> int:
@@ -225,8 +203,8 @@ class RolloutInputs:
         Nominal motor torque of every step [N m].
     prescribed_path : ndarray, shape (N + 1, nc)
         Prescribed coordinates at every node.
-    feedback : Feedback, optional
-    directions : Directions, optional
+    feedback : TrackingFeedback, optional
+    directions : SensitivityDirections, optional
     """
 
     theta: Array
@@ -275,7 +253,6 @@ class CostGradient:
     ----------
     by_theta : ndarray, shape (len(names),)
     by_initial_state : ndarray, shape (nx,)
-        By the initial state.
     by_torque : ndarray, shape (N, nu)
         By the nominal torque.
     by_prescribed_path : ndarray, shape (N + 1, nc)
@@ -327,23 +304,12 @@ class StepKernel(Protocol):
 
     def with_model(self, model: StepModel) -> StepKernel:
         """A kernel of the same equations with another step model, which differs in the time step."""
-        ...
 
-    def rollout(
-        self,
-        theta: Array,
-        start: Array,
-        torque: Array,
-        path: Array,
-        feedback: TrackingFeedback | None,
-        wanted: SensitivityDirections | None,
-    ) -> Rollout:
-        """Simulate len(torque) steps from the state `start`."""
-        ...
+    def rollout(self, inputs: RolloutInputs) -> Rollout:
+        """Simulate one rollout."""
 
     def rollout_batch(self, members: Sequence[RolloutInputs]) -> list[Rollout]:
         """Simulate all members, in batches where that is faster; equal to `rollout` of each but for rounding."""
-        ...
 
     def adjoint_gradient(
         self,
@@ -356,33 +322,18 @@ class StepKernel(Protocol):
         by_effort: Array | None,
     ) -> CostGradient:
         """Gradient of a cost whose partial derivatives along the rollout are given."""
-        ...
 
     def linearize(
-        self,
-        theta: Array,
-        state: Array,
-        multipliers: Array,
-        torque: Array,
-        names: tuple[str, ...],
-        derivatives: bool,
+        self, theta: Array, state: Array, multipliers: Array, torque: Array, names: tuple[str, ...], derivatives: bool
     ) -> StepLinearization:
         """Residuals of len(torque) steps along a trajectory and, with `derivatives`, their Jacobians."""
-        ...
 
     def step_jacobians(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, load_rows: Array, load_momentum: Array
     ) -> tuple[Array, Array]:
         """Jacobians of the single steps of a finished rollout by the implicit function theorem.
 
-        Parameters
-        ----------
-        theta : ndarray, shape (ntheta,)
-        state : ndarray, shape (N + 1, nx)
-        multipliers : ndarray, shape (N, m)
-        torque : ndarray, shape (N, nu)
-        load_rows, load_momentum : ndarray, shape (nt, e) and (n, e)
-            What e additional loads add to the residual and to p_{k+1} of every step.
+        `load_rows` (nt, e) and `load_momentum` (n, e) are what e additional loads add to the residual and to p_{k+1}.
 
         Returns
         -------
@@ -394,54 +345,37 @@ class StepKernel(Protocol):
         numpy.linalg.LinAlgError
             A step's equations are singular.
         """
-        ...
 
     def find_equilibrium(
         self, theta: Array, unknowns: Array, given: Array, held: Array, stiffness: float, tolerance: float
     ) -> tuple[Array, float, bool]:
-        """Solve `EquilibriumEquations` for a static equilibrium by Newton's iteration.
-
-        Parameters
-        ----------
-        theta : ndarray, shape (ntheta,)
-        unknowns : ndarray, shape (ny,)
-            Where it begins.
-        given : ndarray, shape (nu + nc,)
-        held : ndarray, shape (nu,)
-        stiffness : float
-        tolerance : float
-            Largest imbalance [N m] and constraint violation [m] that counts as rest.
+        """Solve `EquilibriumEquations` by Newton's iteration, beginning at `unknowns`.
 
         Returns
         -------
         unknowns : ndarray, shape (ny,)
             The last point.
         error : float
-            Largest imbalance or violation there.
+            Largest imbalance [N m] or violation of a constraint [m] there, which counts as rest up to `tolerance`.
         converged : bool
         """
-        ...
 
 
 def allocate_rollout(sizes: dict[str, int], steps: int, count: int | None) -> Rollout:
     """A rollout filled with NaN, with `count` directions or none, for a kernel to write into."""
-    shapes: dict[str, tuple[int, ...]] = {
-        "state": (steps + 1, sizes["nx"]),
-        "multipliers": (steps, sizes["m"]),
-        "effort": (steps, sizes["nc"]),
-        "torque": (steps, sizes["nu"]),
-    }
+    shapes: dict[str, tuple[int, ...]] = {"state": (steps + 1, sizes["nx"]), "multipliers": (steps, sizes["m"])}
+    shapes |= {"effort": (steps, sizes["nc"]), "torque": (steps, sizes["nu"])}
+    differentiated = ("state", "multipliers", "effort")
     if count is not None:
-        shapes |= {f"by_{name}": (*shapes[name], count) for name in ("state", "multipliers", "effort")}
+        shapes |= {f"{name}_sensitivity": (*shapes[name], count) for name in differentiated}
     arrays = _arrays(f"a rollout of {steps} steps with {count or 0} derivatives", shapes, math.nan)
-    by_state, by_multipliers, by_effort = (arrays.pop(f"by_{name}", None) for name in list(shapes)[:3])
-    status = StepStatus(NewtonStatus.OK, 0, 0.0, 0, 0)
+    by_state, by_multipliers, by_effort = (arrays.pop(f"{name}_sensitivity", None) for name in differentiated)
     return Rollout(
         **arrays,
         state_sensitivity=by_state,
         multipliers_sensitivity=by_multipliers,
         effort_sensitivity=by_effort,
-        status=status,
+        status=StepStatus(NewtonStatus.OK, 0, 0.0, 0, 0),
     )
 
 
@@ -474,7 +408,7 @@ def out_of_memory_error(what: str, size: int) -> ResourceError:
 def rollout_with_status(
     rollout: Rollout, sizes: dict[str, int], code: int, step: int, error: float, counts: tuple[int, int]
 ) -> Rollout:
-    """A copy of the rollout with its `StepStatus`; `block_sample_counts` are Newton iterations and factorisations."""
+    """A copy of the rollout with its `StepStatus`; `counts` are Newton iterations and factorisations."""
     last = rollout.effort[step - 1] if step else np.zeros(sizes["nc"])
     inner = rollout.state[step, 2 * sizes["n"] :]
     return replace(rollout, status=StepStatus(NewtonStatus(code), step, error, *counts, last, inner))

@@ -33,7 +33,7 @@ from yid_ocp.planning.plan_constraints import PlanResidualsAndLimits
 from yid_ocp.planning.plan_shooting import PlanShooting, PlanShootingResult, has_rollout_failed
 from yid_ocp.planning.spline_path import SplinePath
 from yid_ocp.progress import NULL_PROGRESS, Progress
-from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
+from yid_ocp.virtual.joint_motion import grasping_joint_angles
 
 Array = NDArray[np.float64]
 

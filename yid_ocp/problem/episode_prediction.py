@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.integrator.momentum_shift import DrivenJointMotion
 from yid_ocp.integrator.rollout import adjoint_gradient, rollout_inputs, simulate_batch
 from yid_ocp.integrator.statics import Equilibrium
-from yid_ocp.integrator.step import Rollout, SensitivityDirections, Step
-from yid_ocp.integrator.step_model import RolloutInputs
+from yid_ocp.integrator.step import Step
+from yid_ocp.integrator.step_model import Rollout, RolloutInputs, SensitivityDirections
+from yid_ocp.integrator.tracking_feedback import DrivenJointMotion
 from yid_ocp.model.system import System
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, InitialState

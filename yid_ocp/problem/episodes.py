@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError
-from yid_ocp.integrator.lqr import lqr_feedback, proportional_feedback
 from yid_ocp.integrator.rollout import generalized_momentum
 from yid_ocp.integrator.statics import Equilibrium
-from yid_ocp.integrator.step import Rollout, Step, TrackingFeedback, float_array_of_shape
+from yid_ocp.integrator.step import Step, float_array_of_shape
+from yid_ocp.integrator.step_model import Rollout, TrackingFeedback
+from yid_ocp.integrator.tracking_feedback import lqr_feedback, proportional_feedback
 from yid_ocp.model.system import System
 from yid_ocp.problem.initial_state_fit import FixedInitialState
 from yid_ocp.problem.measurements import Measurements, TimeGrid, make_time_grid, place_on_grid, with_paper_weights

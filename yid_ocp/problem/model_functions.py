@@ -9,11 +9,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.integrator.lqr import arms_only_step
-from yid_ocp.integrator.mapped_function import MappedFunction
-from yid_ocp.integrator.momentum_shift import DrivenJointMotion, MomentumShift
+from yid_ocp.integrator.compiler import MappedFunction
 from yid_ocp.integrator.statics import Equilibrium, EquilibriumSolver
-from yid_ocp.integrator.step import Step, TrackingFeedback
+from yid_ocp.integrator.step import Step
+from yid_ocp.integrator.step_model import TrackingFeedback
+from yid_ocp.integrator.tracking_feedback import DrivenJointMotion, MomentumShift, arms_only_step
 from yid_ocp.model.system import RecordingErrorEffect, System
 from yid_ocp.parallel import LockedCache
 from yid_ocp.problem.initial_state_fit import InitialStateFitter

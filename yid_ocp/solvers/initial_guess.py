@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference.linearized_residual import bounded_least_squares_step, predicted_reduction
-from yid_ocp.integrator.lqr import lqr_feedback
 from yid_ocp.integrator.rollout import generalized_momentum, simulate
-from yid_ocp.integrator.step import Rollout, TrackingFeedback
+from yid_ocp.integrator.step_model import Rollout, TrackingFeedback
+from yid_ocp.integrator.tracking_feedback import lqr_feedback
 from yid_ocp.problem.episodes import Episode, InitialState
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation

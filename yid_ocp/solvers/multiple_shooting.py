@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from yid_ocp.errors import SolverError
 from yid_ocp.inference.linearized_residual import bounded_least_squares_step, predicted_reduction
 from yid_ocp.integrator.rollout import simulate
-from yid_ocp.integrator.step import Rollout, SensitivityDirections
+from yid_ocp.integrator.step_model import Rollout, SensitivityDirections
 from yid_ocp.options import OptionInfo, check_option_bounds
 from yid_ocp.problem.episodes import InitialState
 from yid_ocp.problem.estimation_problem import EstimationProblem

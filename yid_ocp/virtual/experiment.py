@@ -1,23 +1,31 @@
-"""Virtual experiments: a robot moves a flexible object in MuJoCo, recorded with known sensor noise."""
+"""Virtual experiments: a robot moves a flexible object in MuJoCo, recorded with known noise and errors of sensors."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate_recording
-from yid_ocp.errors import ConfigError
+from yid_ocp.effects.base import joints_by_arm
+from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model.system import Grasp, System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.model.y_object import y_object
-from yid_ocp.virtual.inverse_kinematics import BAXTER_ARM_JOINTS, grasping_joint_angles
-from yid_ocp.virtual.mjcf import import_mujoco
+from yid_ocp.virtual.joint_motion import (
+    BAXTER_ARM_JOINTS,
+    MultisineMotion,
+    MultisineOptions,
+    grasping_joint_angles,
+    random_multisine,
+)
+from yid_ocp.virtual.mjcf import ParameterEvaluator, import_mujoco
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, SimulationResult, SimulatorTerms, simulate_in_mujoco
-from yid_ocp.virtual.multisine_motion import MultisineMotion, MultisineOptions, random_multisine
 
 Array = NDArray[np.float64]
 _Generators = Mapping[str, np.random.Generator]
@@ -30,20 +38,8 @@ _TRUE_QUANTITIES = ("bend", "twist", "damping", "twist_damping", "mass")
 def baxter_foam_y_system(arms: int) -> System:
     """The paper's system: Baxter with one or two arms that hold the foam Y by point grasps.
 
-    Parameters
-    ----------
-    arms : int
-        1: the left arm holds the tip of T2 (43 coordinates); 2: the right one holds that of T3 as well (50).
-
-    Returns
-    -------
-    System
-        Every arm joint driven; viscous damping 0.05 N m s/rad on every coordinate.
-
-    Raises
-    ------
-    ConfigError
-        Another number of arms.
+    The left arm holds the tip of T2 (43 coordinates), the right one that of T3 (50); every arm joint is driven, viscous
+    damping is 0.05 N m s/rad on every coordinate. `ConfigError` of another number of arms.
     """
     if arms not in (1, 2):
         raise ConfigError(f"arms = {arms}", where="paper_system", allowed="1 or 2")
@@ -112,16 +108,15 @@ class VirtualExperiment:
 
     Attributes
     ----------
-    motion : Motion, optional
+    motion : MultisineMotion, optional
         `random_multisine` with `seed` where absent.
     initial_joint_angles : mapping of str to float, optional
         Initial angles [rad or m]; `grasping_joint_angles` where absent.
-    simulation : Simulation
-        Duration, rate of joints and arm points, rate of the controller, step of the simulator.
-    arm_noise : ArmNoise
+    simulation : SimulationOptions
+    arm_noise : ArmSensorNoise
     camera : PointCamera, optional
         None for no camera.
-    injected_terms : EngineTerms, optional
+    injected_terms : SimulatorTerms, optional
         Forces and model changes that are not in the system's description.
     seed : int
         Seed of all noise; each sensor has its own stream, so that leaving one out changes no other.
@@ -172,9 +167,9 @@ def run_virtual_experiment(
     seeds = np.random.SeedSequence(chosen.seed).spawn(len(_STREAMS))
     streams = {name: np.random.default_rng(seed) for name, seed in zip(_STREAMS, seeds, strict=True)}
     duration = chosen.simulation.duration
-    posture = (
-        grasping_joint_angles(system, values) if chosen.initial_joint_angles is None else chosen.initial_joint_angles
-    )
+    posture = chosen.initial_joint_angles
+    if posture is None:
+        posture = grasping_joint_angles(system, values)
     motion = chosen.motion
     if motion is None:
         excitation = MultisineOptions(duration=duration)
@@ -184,19 +179,9 @@ def run_virtual_experiment(
     times = np.empty(0)
     if chosen.camera is not None and visible:
         times = _frame_times(streams["frames"], duration, chosen.camera)
-    run = simulate_in_mujoco(
-        system,
-        values,
-        motion,
-        chosen.simulation,
-        initial_joint_angles=posture,
-        frame_times=times,
-        injected=chosen.injected_terms,
-        gear_play=chosen.gear_play,
-    )
-    groups = []
-    if held:
-        groups.append(_arm_points(system, held, run, chosen.arm_noise, streams))
+    options: dict[str, Any] = {"injected": chosen.injected_terms, "gear_play": chosen.gear_play, "frame_times": times}
+    run = simulate_in_mujoco(system, values, motion, chosen.simulation, initial_joint_angles=posture, **options)
+    groups = [_arm_points(system, held, run, chosen.arm_noise, streams)] if held else []
     if chosen.camera is not None and len(run.frame_times):
         groups.append(_camera_points(system, visible, run, chosen.camera, streams))
     theta = system.parameters.vector(values)
@@ -204,11 +189,8 @@ def run_virtual_experiment(
     truth = {n: float(theta[i]) for i, n in enumerate(names) if n.rpartition(".")[2] in _TRUE_QUANTITIES}
     made = _how_it_was_made(chosen, system, seen=len(run.frame_times) > 0)
     joints = _joints(system, run, chosen, streams)
-    text = f"{chosen.description} {made}".strip()
-    source = "yid_ocp virtual experiment"
-    return validate_recording(
-        Recording(joints, tuple(groups), text, source, chosen.recording_name, true_parameters=truth)
-    )
+    about = f"{chosen.description} {made}".strip(), "yid_ocp virtual experiment", chosen.recording_name
+    return validate_recording(Recording(joints, tuple(groups), *about, true_parameters=truth))
 
 
 def _visible(system: System, held: tuple[str, ...], camera: PointCamera) -> tuple[str, ...]:
@@ -222,33 +204,22 @@ def _visible(system: System, held: tuple[str, ...], camera: PointCamera) -> tupl
 
 def _joints(system: System, run: SimulationResult, experiment: VirtualExperiment, streams: _Generators) -> JointGroup:
     driven, noise = list(system.driven_indices), experiment.arm_noise
-    white, bias = (
-        _by_joint(std, len(driven), f"ArmNoise.{name}")
-        for name, std in (("effort", noise.effort_std), ("effort_bias", noise.effort_bias_std))
-    )
+    names = ("effort_std", "effort_bias_std")
+    white, bias = (_by_joint(getattr(noise, name), len(driven), f"ArmSensorNoise.{name}") for name in names)
     offset = bias * streams["effort_bias"].standard_normal(len(driven))
-    if system.servos:
-        return JointGroup(
-            names=tuple(system.driven),
-            t=run.t,
-            position=_noisy(run.q[:, driven], noise.position_std, streams["position"]),
-            velocity=_noisy(run.v[:, driven], noise.velocity_std, streams["velocity"]),
-            position_command=run.effort,
-            position_std=noise.position_std,
-            velocity_std=noise.velocity_std,
-        )
-    return JointGroup(
+    joints = JointGroup(
         names=tuple(system.driven),
         t=run.t,
         position=_noisy(run.q[:, driven], noise.position_std, streams["position"]),
         velocity=_noisy(run.v[:, driven], noise.velocity_std, streams["velocity"]),
-        effort=_noisy(run.effort, white, streams["effort"]) + offset,
         position_std=noise.position_std,
         velocity_std=noise.velocity_std,
-        effort_std=white if noise.records_effort_std else None,
-        effort_bias_std=bias if noise.records_effort_std else None,
-        effort_kind=experiment.simulation.effort_kind,
     )
+    if system.servos:
+        return replace(joints, position_command=run.effort)
+    stds = (white, bias) if noise.records_effort_std else (None, None)
+    joints = replace(joints, effort_std=stds[0], effort_bias_std=stds[1], effort_kind=experiment.simulation.effort_kind)
+    return replace(joints, effort=_noisy(run.effort, white, streams["effort"]) + offset)
 
 
 def _by_joint(std: float | tuple[float, ...], joints: int, where: str) -> Array:
@@ -279,10 +250,8 @@ def _camera_points(
 
 def _how_it_was_made(experiment: VirtualExperiment, system: System, seen: bool) -> str:
     simulation, noise, camera = experiment.simulation, experiment.arm_noise, experiment.camera
-    held, sampled = (
-        1e3 / (simulation.sample_rate * simulation.controller_periods_per_sample),
-        1e3 / simulation.sample_rate,
-    )
+    sampled = 1e3 / simulation.sample_rate
+    held = 1e3 / (simulation.sample_rate * simulation.controller_periods_per_sample)
     input_, efforts = f"commands of position servos held over each {held:g} ms, recorded every {sampled:g} ms", ""
     if not system.servos:
         input_ = f"torque held over each {held:g} ms and recorded as {simulation.effort_kind} every {sampled:g} ms"
@@ -331,3 +300,61 @@ def _camera_pose(target: Array) -> Array:
     pose[:3, :3] = np.column_stack([right, np.cross(-away, right), -away])
     pose[:3, 3] = target + 2.0 * away
     return pose
+
+
+def with_sensor_error(
+    recording: Recording, system: System, kind: str, place: str, values: Mapping[str, float]
+) -> Recording:
+    """The recording as sensors with one error, an effect of the library, would have measured it."""
+    if kind.startswith("camera") or kind == "surface_offset":
+        last = recording.duration
+        points = (g if g.pose is None else _camera_error(g, system, kind, values, last) for g in recording.points)
+        return replace(recording, points=tuple(points))
+    joints = recording.joints
+    assert joints is not None
+    if joints.effort is None:
+        raise ModelError("the recording has no efforts", where=f"{kind}@{place}", allowed="arms that torques move")
+    position, effort = joints.position.copy(), joints.effort.copy()
+    if kind == "effort_delay":
+        # what is recorded now acts only after the delay
+        for name in joints_by_arm(system)[place]:
+            column = joints.names.index(name)
+            effort[:, column] = np.interp(joints.t + values["delay"], joints.t, joints.effort[:, column])
+        return replace(recording, joints=replace(joints, effort=effort))
+    at = joints.names.index(place)
+    if kind == "effort_gain":
+        effort[:, at] *= values["scale"]
+    elif kind == "effort_offset":
+        effort[:, at] += values["offset"]
+    elif kind == "encoder_offset":
+        position[:, at] += values["offset"]
+    elif kind == "series_elasticity":
+        position[:, at] += joints.effort[:, at] / values["stiffness"]
+    elif kind == "backlash":
+        position[:, at] += values["width"] / 2 * np.tanh(joints.effort[:, at] / 0.2)
+    return replace(recording, joints=replace(joints, position=position, effort=effort))
+
+
+def _camera_error(
+    group: PointGroup, system: System, kind: str, size: Mapping[str, float], duration: float
+) -> PointGroup:
+    assert group.pose is not None
+    position, centre = group.position, np.asarray(group.pose)[:3, 3]
+    if kind == "camera_translation":
+        return replace(group, position=position + np.array([size["x"], size["y"], size["z"]]))
+    if kind == "camera_rotation":
+        turn = Rotation.from_euler("xyz", [size["rx"], size["ry"], size["rz"]]).as_matrix()
+        return replace(group, position=centre + (position - centre) @ turn.T)
+    if kind == "camera_scale":
+        return replace(group, position=centre + size["scale"] * (position - centre))
+    if kind == "camera_latency":
+        late = group.t + size["delay"]
+        inside = late <= duration
+        std = None if group.std is None else group.std[inside]
+        return replace(group, t=late[inside], position=position[inside], std=std)
+    value = ParameterEvaluator(system, {})
+    radius = {s.name: float(value(s.radius)[0]) for s in system.segment_layouts}
+    own = np.array([radius.get(name.removeprefix("w_").partition(":")[0], 0.0) for name in group.names])
+    ray = centre - position
+    away = ray / np.linalg.norm(ray, axis=2, keepdims=True)
+    return replace(group, position=position + size["fraction"] * own[:, None] * away)

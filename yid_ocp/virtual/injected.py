@@ -3,13 +3,14 @@
 Whatever MuJoCo has a term of its own for (joint damping, armature, inertias, sites) is set in its model; other forces
 are worked out here in NumPy at every inner step; errors of sensors and clocks are put into the finished recording. None
 of the equations of `yid_ocp.effects` take part, except for effects that only change the description of the system
-(masses, lengths, rest angles, gravity, where a grasp sits).
+(masses, lengths, rest angles, gravity, where a grasp sits). Effects outside the library, whose correct verdict is
+`unknown`, exist here alone.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -17,83 +18,452 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.data.recording import Recording
 from yid_ocp.effects import make_effect
-from yid_ocp.effects.base import joints_by_arm, object_joints
+from yid_ocp.effects.base import object_joints
 from yid_ocp.errors import ConfigError, ModelError, unknown_name_details
 from yid_ocp.model.system import System
-from yid_ocp.virtual.experiment import VirtualExperiment, run_virtual_experiment
-from yid_ocp.virtual.mjcf import import_mujoco
-from yid_ocp.virtual.out_of_library_effects import OUT_OF_LIBRARY_EFFECTS, EffectContext, ForceCallback
-from yid_ocp.virtual.rigid_body_terms import ParameterEvaluator
+from yid_ocp.virtual.experiment import VirtualExperiment, run_virtual_experiment, with_sensor_error
+from yid_ocp.virtual.mjcf import ParameterEvaluator, import_mujoco
 
 Array = NDArray[np.float64]
+_ForceCallback = Callable[[Any, Any], None]  # of MuJoCo's model and data; adds to `qfrc_passive`
+_Values = Mapping[str, float]
 
-_AIR_DENSITY = 1.2
-"""[kg/m^3]"""
-_FRICTION_SMOOTHING_SPEED = 0.02
-"""v_s of dry friction [rad/s]."""
-_MAX_PAYLOAD_DISTANCE = 1.0
-"""Distance of a payload's mass from its frame [m]."""
+_AIR_DENSITY = 1.2  # [kg/m^3]
+_FRICTION_SMOOTHING_SPEED = 0.02  # v_s of dry friction [rad/s]
+_MAX_PAYLOAD_DISTANCE = 1.0  # of a payload's mass from its frame [m]
+_CREASED_LINK, _CREASE_ANGLE = 1, 0.03  # link before which a tube is creased; angle beyond which it softens [rad]
+_CORD_LENGTH = 0.3  # of a tether [m]
+_MAGNET_DISTANCE, _MAGNET_POLE_SIZE = 0.06, 0.04  # of a magnet from the tip at rest, and of its pole [m]
+_DRIFT_TIME = 5.0  # over which a drifting stiffness decreases [s]
+_SLIP_TIMES, _SLIP_DURATION = (1.5, 3.5), 0.05  # of a grasp [s]
+_LOAD_SLIDE_ANGLE, _LOAD_SLIDE_TIME = 0.02, 0.2  # joint angle after which a loose load slides [rad], time constant [s]
+_WALL_DISTANCE = 0.01  # of a soft wall from the tip at rest [m]
+_WARM_UP_TIME = 1.5  # time constant with which a cold gear loses its friction [s]
 
 # a change of the system's description; servos are MuJoCo's own actuators, which delay and clip
 _DESCRIPTION_KINDS: tuple[str, ...] = (
-    "density",
-    "point_mass",
-    "length_scale",
-    "link_mass",
-    "rest_curvature",
-    "bend_anisotropy",
-    "gravity_tilt",
-    "grasp_offset",
-    "servo_gain",
-    "servo_delay",
-    "servo_saturation",
+    *("density", "point_mass", "length_scale", "link_mass", "rest_curvature", "bend_anisotropy", "gravity_tilt"),
+    *("grasp_offset", "servo_gain", "servo_delay", "servo_saturation"),
 )
 # a term that MuJoCo's own model has
 _MUJOCO_MODEL_KINDS: tuple[str, ...] = ("kelvin_voigt", "joint_viscous", "rotor_inertia", "payload")
-# a force that is worked out here
-_FORCE_KINDS: tuple[str, ...] = (
-    "cubic_stiffness",
-    "standard_linear_solid",
-    "hysteresis",
-    "aerodynamic_drag",
-    "gravity_scale",
-    "joint_spring",
-    "joint_coulomb",
-    "joint_stribeck",
-    "joint_presliding",
-    "effort_lag",
-)
 # an error of a sensor or clock
 _SENSOR_ERROR_KINDS: tuple[str, ...] = (
-    "effort_gain",
-    "effort_offset",
-    "effort_delay",
-    "encoder_offset",
-    "series_elasticity",
-    "backlash",
-    "camera_translation",
-    "camera_rotation",
-    "camera_scale",
-    "camera_latency",
-    "surface_offset",
+    *("effort_gain", "effort_offset", "effort_delay", "encoder_offset", "series_elasticity", "backlash"),
+    *("camera_translation", "camera_rotation", "camera_scale", "camera_latency", "surface_offset"),
 )
+
+
+@dataclass
+class _EffectContext:
+    """What forces read of the experiment; until the motion has begun the object comes to rest."""
+
+    system: System
+    value: ParameterEvaluator
+    joint_stiffness: Mapping[str, float]  # [N m/rad], elastic joints only
+    rest_angles: Mapping[str, float]  # [rad]
+    has_motion_begun: bool = False
+
+    @staticmethod
+    def from_system(system: System, values: Mapping[str, float]) -> _EffectContext:
+        value, springs = ParameterEvaluator(system, values), system.elastic_joints
+        stiffness = {s.joint_name: float(value(s.stiffness)[0]) for s in springs}
+        return _EffectContext(system, value, stiffness, {s.joint_name: float(value(s.rest_angle)[0]) for s in springs})
+
+    def segment_springs(self, model: Any, segment: str) -> tuple[Array, Array, Array]:
+        """Ids, stiffnesses and rest angles of a segment's elastic joints."""
+        links = self.system.segment_layout(segment).link_joints
+        joints = [joint for link in links for joint in link if joint in self.joint_stiffness]
+        return (
+            np.array([model.joint(j).id for j in joints]),
+            np.array([self.joint_stiffness[j] for j in joints]),
+            np.array([self.rest_angles[j] for j in joints]),
+        )
+
+    def bend_joint_ids(self, model: Any, segment: str) -> tuple[Array, Array]:
+        """Ids of the joints that bend a segment about x and about y."""
+        links = self.system.segment_layout(segment).link_joints
+        x, y = (np.array([model.joint(link[axis]).id for link in links]) for axis in (0, 1))
+        return x, y
+
+    def link_body_ids(self, model: Any, segment: str) -> list[int]:
+        """Ids of the bodies of a segment's links."""
+        links = self.system.segment_layout(segment).link_joints
+        return [int(model.jnt_bodyid[model.joint(link[-1]).id]) for link in links]
+
+    def end_body_id(self, model: Any, place: str) -> int:
+        """Id of the body at the end of a segment, or of the body on an arm's joint."""
+        named = {segment.name: segment.link_joints[-1][-1] for segment in self.system.segment_layouts}
+        return int(model.jnt_bodyid[model.joint(named.get(place, place)).id])
+
+
+def _joint_force(at: Any, law: Callable[[Any, Any, float], Any]) -> _ForceCallback:
+    """A force law(q, v, t) at some joints by their angles and speeds and the time."""
+
+    def push(_: Any, data: Any) -> None:
+        data.qfrc_passive[at] += law(data.qpos[at], data.qvel[at], data.time)
+
+    return push
+
+
+def _body_force(body: int, force: Array | Callable[[Any], Array]) -> _ForceCallback:
+    """A force [N] on the centre of a body, in the world, constant or by MuJoCo's data."""
+    mujoco = import_mujoco()
+
+    def push(model: Any, data: Any) -> None:
+        now = force(data) if callable(force) else force
+        mujoco.mj_applyFT(model, data, now, np.zeros(3), data.xipos[body], body, data.qfrc_passive)
+
+    return push
+
+
+def _in_turn(forces: Sequence[_ForceCallback], only_in_motion_of: _EffectContext | None = None) -> _ForceCallback:
+    def push(model: Any, data: Any) -> None:
+        if only_in_motion_of is None or only_in_motion_of.has_motion_begun:
+            for force in forces:
+                force(model, data)
+
+    return push
+
+
+def _force_with_memory(
+    scene: _EffectContext, at: Any, start: Callable[[Any], Any], advance: Callable[..., Any], law: Callable[..., Any]
+) -> _ForceCallback:
+    """A force law(q, z) at some joints; z = start(q) when the motion begins, then advance(z, q, v, step)."""
+    state: dict[str, Any] = {"t": 0.0}
+
+    def push(_: Any, data: Any) -> None:
+        if not scene.has_motion_begun:
+            return
+        q, v, now = np.array(data.qpos[at]), np.array(data.qvel[at]), float(data.time)
+        if "z" not in state:
+            state["z"], state["t"] = start(q), now
+        step = now - state["t"]
+        if step > 0:
+            state["z"], state["t"] = advance(state["z"], q, v, step), now
+        data.qfrc_passive[at] += law(q, state["z"])
+
+    return push
+
+
+# -- effects of the library -------------------------------------------------------------------------------------------
+
+
+def _cubic_stiffness(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
+    at, _, rest = scene.segment_springs(model, place)
+    return _joint_force(at, lambda q, v, t: -size["k3"] * (q - rest) ** 3)
+
+
+def _standard_linear_solid(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
+    at, stiffness, _ = scene.segment_springs(model, place)
+    branch, time = size["ratio"] * stiffness, size["relaxation_time"]
+
+    def advance(z: Array, q: Array, v: Array, step: float) -> Array:
+        return q + (z - q) * math.exp(-step / time)
+
+    return _force_with_memory(scene, at, np.copy, advance, lambda q, z: -branch * (q - z))
+
+
+def _hysteresis(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
+    at, _, _ = scene.segment_springs(model, place)
+
+    def advance(z: Array, q: Array, v: Array, step: float) -> Array:
+        return z + step * (v - np.abs(v) * z / size["yield_angle"])
+
+    return _force_with_memory(scene, at, np.zeros_like, advance, lambda q, z: -size["stiffness"] * z)
+
+
+def _aerodynamic_drag(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
+    mujoco, segment = import_mujoco(), scene.system.segment_layout(place)
+    radius = float(scene.value(segment.radius)[0])
+
+    def drag(body: int, length: float) -> _ForceCallback:
+        scale, found = _AIR_DENSITY * size["cd"] * radius * length, np.zeros(6)
+
+        def force(data: Any) -> Array:
+            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, found, 0)
+            along = data.xmat[body].reshape(3, 3)[:, 2]
+            normal = found[3:] - along * (along @ found[3:])
+            return np.asarray(-scale * np.linalg.norm(normal) * normal)
+
+        return _body_force(body, force)
+
+    lengths = [float(scene.value(x)[0]) for x in segment.link_lengths]
+    return _in_turn([drag(*link) for link in zip(scene.link_body_ids(model, place), lengths, strict=True)])
+
+
+def _gravity_scale(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
+    bodies = sorted({int(model.jnt_bodyid[model.joint(joint).id]) for joint in object_joints(scene.system)})
+    gravity = np.array(model.opt.gravity)
+    return _in_turn([_body_force(body, size["fraction"] * model.body_mass[body] * gravity) for body in bodies])
+
+
+def _joint_spring(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
+    # not MuJoCo's own spring, whose rest angle the search for the equilibrium uses to hold the arm
+    return _joint_force(model.joint(place).id, lambda q, v, t: -size["stiffness"] * (q - size["rest_angle"]))
+
+
+def _joint_coulomb(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
+    at = model.joint(place).id
+    return _joint_force(at, lambda q, v, t: -size["tau_c"] * math.tanh(v / _FRICTION_SMOOTHING_SPEED))
+
+
+def _joint_stribeck(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
+    def friction(q: float, v: float, t: float) -> float:
+        fall = math.exp(-((v / size["v_stribeck"]) ** 2))
+        return -size["tau_s"] * fall * math.tanh(v / _FRICTION_SMOOTHING_SPEED)
+
+    return _joint_force(model.joint(place).id, friction)
+
+
+def _joint_presliding(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
+    def advance(s: float, q: float, v: float, step: float) -> float:
+        way = math.copysign(1.0, v)
+        return way + (s - way) * math.exp(-abs(v) * step / size["yield_angle"])
+
+    return _force_with_memory(scene, model.joint(place).id, lambda q: 0.0, advance, lambda q, s: -size["tau_c"] * s)
+
+
+def _effort_lag(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
+    at, apart = model.joint(place).id, int(import_mujoco().mjtDisableBit.mjDSBL_EQUALITY)
+    state: dict[str, Any] = {"z": None, "command": 0.0, "t": 0.0}
+
+    def push(model: Any, data: Any) -> None:
+        # the controller works with a model of its own, whose grasps are off: there no torque is applied
+        if not scene.has_motion_begun or model.opt.disableflags & apart:
+            return
+        command, step = float(data.qfrc_applied[at]), float(data.time) - state["t"]
+        if state["z"] is None:
+            state["z"] = command
+        elif step > 0:
+            # until now the command was the one before
+            held = state["command"]
+            state["z"] = held + (state["z"] - held) * math.exp(-step / size["time_constant"])
+        state["t"], state["command"] = float(data.time), command
+        data.qfrc_passive[at] += state["z"] - command
+
+    return push
+
+
+def _weigh(scene: _EffectContext, model: Any, place: str, size: _Values) -> None:
+    """Put a point of some mass, or take it, at (mx, my, mz)/mass in a frame."""
+    mujoco, value, where = import_mujoco(), scene.value, f"payload@{place}"
+    frame, reach = scene.system.mechanism.frame(place), np.array([size.get(f"m{a}", 0.0) for a in "xyz"])
+    body = int(model.jnt_bodyid[model.joint(scene.system.mechanism.joints[frame.joint_index].name).id])
+    turn = value(frame.placement.rotation).reshape(3, 3, order="F")
+    mass = size["mass"]
+    if not np.linalg.norm(reach) <= _MAX_PAYLOAD_DISTANCE * abs(mass):
+        allowed = f"within {_MAX_PAYLOAD_DISTANCE:g} m"
+        raise ModelError("its mass sits too far from its frame", where=where, allowed=allowed)
+    point = value(frame.placement.translation) + turn @ reach / mass
+    own, centre = float(model.body_mass[body]), np.array(model.body_ipos[body])
+    w, x, y, z = model.body_iquat[body]
+    axes = Rotation.from_quat([x, y, z, w]).as_matrix()
+    apart = point - centre
+    tensor = axes @ np.diag(model.body_inertia[body]) @ axes.T
+    tensor += own * mass / (own + mass) * (apart @ apart * np.eye(3) - np.outer(apart, apart))
+    moments, axes = np.linalg.eigh(tensor)
+    if own + mass <= 0 or moments[0] <= 0:
+        raise ModelError("more is taken away than the link has there", where=where, hint="less mass, or nearer by")
+    axes[:, 2] *= np.linalg.det(axes)
+    x, y, z, w = Rotation.from_matrix(axes).as_quat()
+    model.body_mass[body] = own + mass
+    model.body_ipos[body] = (own * centre + mass * point) / (own + mass)
+    model.body_inertia[body], model.body_iquat[body] = moments, [w, x, y, z]
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+# a force that is worked out here
+_FORCES: Mapping[str, Callable[[_EffectContext, Any, str, _Values], _ForceCallback]] = {
+    made.__name__.removeprefix("_"): made
+    for made in (
+        *(_cubic_stiffness, _standard_linear_solid, _hysteresis, _aerodynamic_drag, _gravity_scale, _joint_spring),
+        *(_joint_coulomb, _joint_stribeck, _joint_presliding, _effort_lag),
+    )
+}
+_FORCE_KINDS = tuple(_FORCES)
 INJECTABLE_KINDS = (*_DESCRIPTION_KINDS, *_MUJOCO_MODEL_KINDS, *_FORCE_KINDS, *_SENSOR_ERROR_KINDS)
 """Effect kinds of the library that can be simulated in MuJoCo."""
 
 
+# -- effects outside the library --------------------------------------------------------------------------------------
+
+
+def _torque_ripple(scene: _EffectContext, model: Any, joint: str, size: float) -> _ForceCallback:
+    """Torque that ripples with the joint's angle [N m]."""
+    return _joint_force(model.joint(joint).id, lambda q, v, t: size * math.sin(60.0 * q))
+
+
+def _cross_stiffness(scene: _EffectContext, model: Any, segment: str, size: float) -> _ForceCallback:
+    """A spring that couples the two bends [N m/rad]."""
+    both = np.concatenate(scene.bend_joint_ids(model, segment))
+    return _joint_force(both, lambda q, v, t: -size * np.roll(q, len(q) // 2))
+
+
+def _quadratic_stiffness(scene: _EffectContext, model: Any, segment: str, size: float) -> _ForceCallback:
+    """Springs that are stiffer one way than the other [N m/rad^2]."""
+    return _joint_force(np.concatenate(scene.bend_joint_ids(model, segment)), lambda q, v, t: -size * q**2)
+
+
+def _gusts(scene: _EffectContext, model: Any, segment: str, size: float) -> _ForceCallback:
+    """Wind that comes and goes, spread over the segment's links [N]."""
+    rng = np.random.default_rng(int(1e6 * abs(size)) % 2**32)
+    rates, phases = rng.uniform(0.4, 1.6, 3), rng.uniform(0, 2 * math.pi, 3)
+    bodies = scene.link_body_ids(model, segment)
+
+    def wind(data: Any) -> Array:
+        gust = size * float(np.sum(np.sin(2 * math.pi * rates * data.time + phases)))
+        return np.array([gust, 0.5 * gust, 0.0]) / len(bodies)
+
+    return _in_turn([_body_force(body, wind) for body in bodies], scene)
+
+
+def _crease(scene: _EffectContext, model: Any, segment: str, size: float) -> _ForceCallback:
+    """A tube that gives way at one place once it is bent there: stiffness lost beyond an angle [N m/rad]."""
+    joints = scene.system.segment_layout(segment).link_joints[_CREASED_LINK][:2]
+    at, rest = np.array([model.joint(j).id for j in joints]), np.array([scene.rest_angles.get(j, 0.0) for j in joints])
+
+    def law(q: Array, v: Array, t: float) -> Array:
+        angle = float(np.linalg.norm(q - rest))
+        return size * (angle - _CREASE_ANGLE) * (q - rest) / angle if angle > _CREASE_ANGLE else 0 * q
+
+    return _joint_force(at, law)
+
+
+def _tether(scene: _EffectContext, model: Any, place: str, size: float) -> _ForceCallback:
+    """A cord from the floor side to a tip, or from above to an arm's link, that is taut beyond its length [N/m]."""
+    body = scene.end_body_id(model, place)
+    above = all(segment.name != place for segment in scene.system.segment_layouts)
+    hung = np.array([0.0, 0.0, _CORD_LENGTH if above else -_CORD_LENGTH])
+
+    def pull(at: Array, anchor: Array) -> Array:
+        distance = float(np.linalg.norm(at - anchor))
+        return size * max(distance - _CORD_LENGTH, 0.0) * (anchor - at) / distance
+
+    return _attached(body, hung, pull)
+
+
+def _magnet(scene: _EffectContext, model: Any, segment: str, size: float) -> _ForceCallback:
+    """A pole beside the tip that draws it, the more the nearer it is [N]."""
+
+    def pull(at: Array, anchor: Array) -> Array:
+        away = anchor - at
+        return size * _MAGNET_POLE_SIZE * away / (float(away @ away) + _MAGNET_POLE_SIZE**2)
+
+    return _attached(scene.end_body_id(model, segment), np.array([_MAGNET_DISTANCE, 0.0, 0.0]), pull)
+
+
+def _wall(scene: _EffectContext, model: Any, segment: str, size: float) -> _ForceCallback:
+    """A soft wall that the tip runs into [N/m]."""
+
+    def pull(at: Array, anchor: Array) -> Array:
+        return np.array([0.0, -size * max(at[1] - anchor[1], 0.0), 0.0])
+
+    return _attached(scene.end_body_id(model, segment), np.array([0.0, _WALL_DISTANCE, 0.0]), pull)
+
+
+def _attached(body: int, offset: Array, pull: Callable[[Array, Array], Array]) -> _ForceCallback:
+    """A force on a body's centre by where it is and a point of the world, `offset` from where the body began."""
+    anchors: list[Array] = []
+
+    def force(data: Any) -> Array:
+        at = np.array(data.xipos[body])
+        if not anchors:
+            anchors.append(at + offset)
+        return pull(at, anchors[0])
+
+    return _body_force(body, force)
+
+
+def _stiffness_drift(scene: _EffectContext, model: Any, segment: str, size: float) -> _ForceCallback:
+    """Springs that soften while the motion lasts, by this fraction in all."""
+    at, stiffness, rest = scene.segment_springs(model, segment)
+
+    def lost(q: Array, v: Array, t: float) -> Array:
+        return size * t / _DRIFT_TIME * stiffness * (q - rest) if scene.has_motion_begun else 0 * q
+
+    return _joint_force(at, lost)
+
+
+def _one_way_damping(scene: _EffectContext, model: Any, segment: str, size: float) -> _ForceCallback:
+    """Bends that are damped one way only [N m s/rad].
+
+    MuJoCo is told of it as its own damping, which it integrates implicitly: a light branch under so much explicit
+    damping bursts.
+    """
+    both = np.concatenate(scene.bend_joint_ids(model, segment))
+    usual = model.dof_damping[both].copy()
+
+    def push(_: Any, data: Any) -> None:
+        now = usual + size * (data.qvel[both] > 0)
+        data.qfrc_passive[both] -= (now - model.dof_damping[both]) * data.qvel[both]
+        model.dof_damping[both] = now
+
+    return push
+
+
+def _saturating_drive(scene: _EffectContext, model: Any, joint: str, size: float) -> _ForceCallback:
+    """A drive that gives no more torque than this, whatever is commanded and recorded [N m]."""
+    at = model.joint(joint).id
+
+    def push(_: Any, data: Any) -> None:
+        torque = float(data.qfrc_applied[at])
+        data.qfrc_passive[at] -= torque - float(np.clip(torque, -size, size))
+
+    return push
+
+
+def _warming_gear(scene: _EffectContext, model: Any, joint: str, size: float) -> _ForceCallback:
+    """Viscous friction that fades while the gear warms up [N m s/rad]."""
+
+    def friction(q: float, v: float, t: float) -> float:
+        return -size * math.exp(-t / _WARM_UP_TIME) * v if scene.has_motion_begun else 0.0
+
+    return _joint_force(model.joint(joint).id, friction)
+
+
+def _shifting_load(scene: _EffectContext, model: Any, joint: str, size: float) -> _ForceCallback:
+    """A loose load that slides to the other side once the joint has turned [N m]."""
+
+    def advance(memory: Array, q: float, v: float, step: float) -> Array:
+        begin, s = memory
+        goal = math.tanh((q - begin) / _LOAD_SLIDE_ANGLE)
+        return np.array([begin, s + step / _LOAD_SLIDE_TIME * (goal - s)])
+
+    at = model.joint(joint).id
+    return _force_with_memory(scene, at, lambda q: np.array([q, 0.0]), advance, lambda q, memory: size * memory[1])
+
+
+def _slipping_grasp(scene: _EffectContext, model: Any, grasp: str, size: float) -> _ForceCallback:
+    """A grasp that holds, lets the tube slip along itself, and holds again [m a slip]."""
+    site = model.site(f"grasp_{grasp}_held").id
+    begin = np.array(model.site_pos[site])
+
+    def push(model: Any, data: Any) -> None:
+        if scene.has_motion_begun:
+            done = sum(float(np.clip((data.time - t) / _SLIP_DURATION, 0.0, 1.0)) for t in _SLIP_TIMES)
+            model.site_pos[site] = begin - np.array([0.0, 0.0, size * done])
+
+    return push
+
+
+OUT_OF_LIBRARY_EFFECTS: Mapping[str, Callable[[_EffectContext, Any, str, float], _ForceCallback]] = {
+    made.__name__.removeprefix("_"): made
+    for made in (
+        *(_torque_ripple, _cross_stiffness, _quadratic_stiffness, _gusts, _crease, _tether, _magnet, _wall),
+        *(_stiffness_drift, _one_way_damping, _saturating_drive, _warming_gear, _shifting_load, _slipping_grasp),
+    )
+}
+"""Effects outside the library by kind: forces by the scene, MuJoCo's model, a place and a size."""
+
+
 @dataclass(frozen=True)
 class InjectedEffect:
-    """An effect present in the data and absent from the model.
+    """An effect present in the data and absent from the model, of `INJECTABLE_KINDS` or `OUT_OF_LIBRARY_EFFECTS`.
 
-    Attributes
-    ----------
-    kind : str
-        Of `INJECTABLE_KINDS` or `OUT_OF_LIBRARY_EFFECTS`.
-    location : str
-    values : mapping of quantity to float
-        As in the vocabulary; for those outside it `size`, in the unit of the force that it makes.
+    `values` are as in the vocabulary; for kinds outside it `size`, in the unit of the force that it makes.
     """
 
     kind: str
@@ -114,20 +484,8 @@ def run_injected_experiment(
 ) -> Recording:
     """Simulate a virtual experiment with effects that are absent from the system's description.
 
-    Parameters
-    ----------
-    system : System
-        Nominal, with driven joints.
-    values : mapping of str to float
-        True parameter values.
-    effects : sequence of InjectedEffect
-    experiment : VirtualExperiment, optional
-        Its own `injected` is replaced.
-
-    Returns
-    -------
-    Recording
-        `truth` is that of the nominal parameters.
+    `system` is nominal, with driven joints; `true_parameters` of the recording are those `values`, and the experiment's
+    own `injected_terms` are replaced.
 
     Raises
     ------
@@ -141,11 +499,8 @@ def run_injected_experiment(
     known = (*INJECTABLE_KINDS, *OUT_OF_LIBRARY_EFFECTS)
     for effect in effects:
         if effect.kind not in known:
-            raise ConfigError(
-                f"{effect.kind} cannot be done in MuJoCo here",
-                where=effect.label,
-                **unknown_name_details(effect.kind, known),
-            )
+            what, details = f"{effect.kind} cannot be done in MuJoCo here", unknown_name_details(effect.kind, known)
+            raise ConfigError(what, where=effect.label, **details)
     described = [make_effect(e.kind, e.location, system, e.values) for e in effects if e.kind in _DESCRIPTION_KINDS]
     changed = system.with_effects(described) if described else system
     # a servo acts on what its encoder reads: gears with play are part of the mechanics
@@ -156,52 +511,37 @@ def run_injected_experiment(
     made = run_virtual_experiment(changed, values, chosen)
     for effect in effects:
         if effect.kind in _SENSOR_ERROR_KINDS and effect.location not in play:
-            made = _with_sensor_error(made, system, effect)
+            made = with_sensor_error(made, system, effect.kind, effect.location, effect.values)
     return made
 
 
 class _InjectedTerms:
     """Effects as MuJoCo terms: `edit_model` edits the model, MuJoCo calls `add_forces` at every step.
 
-    Parameters
-    ----------
-    system : System
-    values : mapping of str to float
-    effects : sequence of InjectedEffect
-        Of `_MUJOCO_MODEL_KINDS`, `_FORCE_KINDS` or `OUT_OF_LIBRARY_EFFECTS`.
+    `effects` are of `_MUJOCO_MODEL_KINDS`, `_FORCE_KINDS` or `OUT_OF_LIBRARY_EFFECTS`.
     """
 
     def __init__(self, system: System, values: Mapping[str, float], effects: Sequence[InjectedEffect]) -> None:
-        self._system, self._effects = system, tuple(effects)
-        self._value = value = ParameterEvaluator(system, values)
-        self._scene = EffectContext(
-            system,
-            {s.joint_name: float(value(s.stiffness)[0]) for s in system.elastic_joints},
-            {s.joint_name: float(value(s.rest_angle)[0]) for s in system.elastic_joints},
-        )
-        self._shape = {
-            s.name: (float(value(s.radius)[0]), [float(value(x)[0]) for x in s.link_lengths])
-            for s in system.segment_layouts
-        }
-        self._forces: list[ForceCallback] = []
+        self._effects, self._forces = tuple(effects), list[_ForceCallback]()
+        self._scene = _EffectContext.from_system(system, values)
 
     def edit_model(self, model: Any) -> None:
         """Edit a compiled `mujoco.MjModel` and work out the forces."""
         for effect in self._effects:
-            size, place = effect.values, effect.location
+            size, place, scene = effect.values, effect.location, self._scene
             if effect.kind == "kelvin_voigt":
-                at, stiffness, _ = self._scene.segment_springs(model, place)
+                at, stiffness, _ = scene.segment_springs(model, place)
                 model.dof_damping[at] += size["tau"] * stiffness
             elif effect.kind == "joint_viscous":
                 model.dof_damping[model.joint(place).id] += size["b"]
             elif effect.kind == "rotor_inertia":
                 model.dof_armature[model.joint(place).id] += size["armature"]
-            elif effect.kind in OUT_OF_LIBRARY_EFFECTS:
-                self._forces.append(OUT_OF_LIBRARY_EFFECTS[effect.kind](self._scene, model, place, size["size"]))
             elif effect.kind == "payload":
-                self._weigh(model, place, size)
+                _weigh(scene, model, place, size)
+            elif effect.kind in OUT_OF_LIBRARY_EFFECTS:
+                self._forces.append(OUT_OF_LIBRARY_EFFECTS[effect.kind](scene, model, place, size["size"]))
             else:
-                self._forces.append(getattr(self, f"_{effect.kind}")(model, place, size))
+                self._forces.append(_FORCES[effect.kind](scene, model, place, size))
 
     def start_motion(self, data: Any) -> None:
         """Start the memory of effects that have one."""
@@ -211,243 +551,3 @@ class _InjectedTerms:
         """Add the forces to `qfrc_passive`."""
         for push in self._forces:
             push(model, data)
-
-    # -- effects of the vocabulary ------------------------------------------------------------------------------------
-
-    def _cubic_stiffness(self, model: Any, place: str, size: Mapping[str, float]) -> ForceCallback:
-        at, _, rest = self._scene.segment_springs(model, place)
-        k3 = size["k3"]
-
-        def push(_: Any, data: Any) -> None:
-            data.qfrc_passive[at] -= k3 * (data.qpos[at] - rest) ** 3
-
-        return push
-
-    def _standard_linear_solid(self, model: Any, place: str, size: Mapping[str, float]) -> ForceCallback:
-        at, stiffness, _ = self._scene.segment_springs(model, place)
-        branch, time = size["ratio"] * stiffness, size["relaxation_time"]
-        state: dict[str, Any] = {"z": None, "t": 0.0}
-
-        def push(_: Any, data: Any) -> None:
-            if not self._scene.has_motion_begun:
-                return
-            q = np.array(data.qpos[at])
-            if state["z"] is None:
-                state["z"], state["t"] = q.copy(), float(data.time)
-            step = float(data.time) - state["t"]
-            if step > 0:
-                state["z"] = q + (state["z"] - q) * math.exp(-step / time)
-                state["t"] = float(data.time)
-            data.qfrc_passive[at] -= branch * (q - state["z"])
-
-        return push
-
-    def _hysteresis(self, model: Any, place: str, size: Mapping[str, float]) -> ForceCallback:
-        at, _, _ = self._scene.segment_springs(model, place)
-        stiffness, angle = size["stiffness"], size["yield_angle"]
-        state: dict[str, Any] = {"z": np.zeros(len(at)), "t": 0.0}
-
-        def push(_: Any, data: Any) -> None:
-            if not self._scene.has_motion_begun:
-                return
-            v = np.array(data.qvel[at])
-            step = float(data.time) - state["t"]
-            if step > 0:
-                state["z"] = state["z"] + step * (v - np.abs(v) * state["z"] / angle)
-                state["t"] = float(data.time)
-            data.qfrc_passive[at] -= stiffness * state["z"]
-
-        return push
-
-    def _aerodynamic_drag(self, model: Any, place: str, size: Mapping[str, float]) -> ForceCallback:
-        mujoco = import_mujoco()
-        segment = self._system.segment_layout(place)
-        bodies = [int(model.jnt_bodyid[model.joint(link[-1]).id]) for link in segment.link_joints]
-        radius, lengths = self._shape[place]
-        factor = [_AIR_DENSITY * size["cd"] * radius * length for length in lengths]
-        found = np.zeros(6)
-
-        def push(model: Any, data: Any) -> None:
-            for body, scale in zip(bodies, factor, strict=True):
-                mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, found, 0)
-                along = data.xmat[body].reshape(3, 3)[:, 2]
-                normal = found[3:] - along * (along @ found[3:])
-                drag = -scale * np.linalg.norm(normal) * normal
-                mujoco.mj_applyFT(model, data, drag, np.zeros(3), data.xipos[body], body, data.qfrc_passive)
-
-        return push
-
-    def _gravity_scale(self, model: Any, place: str, size: Mapping[str, float]) -> ForceCallback:
-        mujoco = import_mujoco()
-        bodies = sorted({int(model.jnt_bodyid[model.joint(joint).id]) for joint in object_joints(self._system)})
-        weights = [size["fraction"] * model.body_mass[body] * np.array(model.opt.gravity) for body in bodies]
-
-        def push(model: Any, data: Any) -> None:
-            for body, weight in zip(bodies, weights, strict=True):
-                mujoco.mj_applyFT(model, data, weight, np.zeros(3), data.xipos[body], body, data.qfrc_passive)
-
-        return push
-
-    def _joint_spring(self, model: Any, place: str, size: Mapping[str, float]) -> ForceCallback:
-        # not MuJoCo's own spring, whose rest angle the search for the equilibrium uses to hold the arm
-        at = model.joint(place).id
-
-        def push(_: Any, data: Any) -> None:
-            data.qfrc_passive[at] -= size["stiffness"] * (data.qpos[at] - size["rest_angle"])
-
-        return push
-
-    def _joint_coulomb(self, model: Any, place: str, size: Mapping[str, float]) -> ForceCallback:
-        at = model.joint(place).id
-
-        def push(_: Any, data: Any) -> None:
-            data.qfrc_passive[at] -= size["tau_c"] * math.tanh(data.qvel[at] / _FRICTION_SMOOTHING_SPEED)
-
-        return push
-
-    def _joint_stribeck(self, model: Any, place: str, size: Mapping[str, float]) -> ForceCallback:
-        at = model.joint(place).id
-
-        def push(_: Any, data: Any) -> None:
-            v = float(data.qvel[at])
-            fall = math.exp(-((v / size["v_stribeck"]) ** 2))
-            data.qfrc_passive[at] -= size["tau_s"] * fall * math.tanh(v / _FRICTION_SMOOTHING_SPEED)
-
-        return push
-
-    def _joint_presliding(self, model: Any, place: str, size: Mapping[str, float]) -> ForceCallback:
-        at = model.joint(place).id
-        state = {"s": 0.0, "t": 0.0}
-
-        def push(_: Any, data: Any) -> None:
-            if not self._scene.has_motion_begun:
-                return
-            v, step = float(data.qvel[at]), float(data.time) - state["t"]
-            if step > 0:
-                way = math.copysign(1.0, v)
-                state["s"] = way + (state["s"] - way) * math.exp(-abs(v) * step / size["yield_angle"])
-                state["t"] = float(data.time)
-            data.qfrc_passive[at] -= size["tau_c"] * state["s"]
-
-        return push
-
-    def _effort_lag(self, model: Any, place: str, size: Mapping[str, float]) -> ForceCallback:
-        at, apart = model.joint(place).id, int(import_mujoco().mjtDisableBit.mjDSBL_EQUALITY)
-        state: dict[str, Any] = {"z": None, "command": 0.0, "t": 0.0}
-
-        def push(model: Any, data: Any) -> None:
-            # the controller works with a model of its own, whose grasps are off: there no torque is applied
-            if not self._scene.has_motion_begun or model.opt.disableflags & apart:
-                return
-            command, step = float(data.qfrc_applied[at]), float(data.time) - state["t"]
-            if state["z"] is None:
-                state["z"] = command
-            elif step > 0:
-                # until now the command was the one before
-                held = state["command"]
-                state["z"] = held + (state["z"] - held) * math.exp(-step / size["time_constant"])
-            state["t"], state["command"] = float(data.time), command
-            data.qfrc_passive[at] += state["z"] - command
-
-        return push
-
-    def _weigh(self, model: Any, place: str, size: Mapping[str, float]) -> None:
-        """Put a point of some mass, or take it, at (mx, my, mz)/mass in a frame."""
-        mujoco, value, where = import_mujoco(), self._value, f"payload@{place}"
-        frame, reach = self._system.mechanism.frame(place), np.array([size.get(f"m{a}", 0.0) for a in "xyz"])
-        body = int(model.jnt_bodyid[model.joint(self._system.mechanism.joints[frame.joint_index].name).id])
-        turn = value(frame.placement.rotation).reshape(3, 3, order="F")
-        mass = size["mass"]
-        if not np.linalg.norm(reach) <= _MAX_PAYLOAD_DISTANCE * abs(mass):
-            raise ModelError(
-                "its mass sits too far from its frame", where=where, allowed=f"within {_MAX_PAYLOAD_DISTANCE:g} m"
-            )
-        point = value(frame.placement.translation) + turn @ reach / mass
-        own, centre = float(model.body_mass[body]), np.array(model.body_ipos[body])
-        w, x, y, z = model.body_iquat[body]
-        axes = Rotation.from_quat([x, y, z, w]).as_matrix()
-        apart = point - centre
-        tensor = axes @ np.diag(model.body_inertia[body]) @ axes.T
-        tensor += own * mass / (own + mass) * (apart @ apart * np.eye(3) - np.outer(apart, apart))
-        moments, axes = np.linalg.eigh(tensor)
-        if own + mass <= 0 or moments[0] <= 0:
-            raise ModelError("more is taken away than the link has there", where=where, hint="less mass, or nearer by")
-        axes[:, 2] *= np.linalg.det(axes)
-        x, y, z, w = Rotation.from_matrix(axes).as_quat()
-        model.body_mass[body] = own + mass
-        model.body_ipos[body] = (own * centre + mass * point) / (own + mass)
-        model.body_inertia[body], model.body_iquat[body] = moments, [w, x, y, z]
-        mujoco.mj_setConst(model, mujoco.MjData(model))
-
-
-# -- sensors and clocks -----------------------------------------------------------------------------------------------
-
-
-def _with_sensor_error(recording: Recording, system: System, effect: InjectedEffect) -> Recording:
-    """The recording as sensors with one given error would have measured it.
-
-    Parameters
-    ----------
-    recording : Recording
-    system : System
-    effect : InjectedEffect
-        Of `_SENSOR_ERROR_KINDS`.
-    """
-    if effect.kind.startswith("camera") or effect.kind == "surface_offset":
-        points = tuple(
-            g if g.pose is None else _camera_error(g, system, effect, recording.duration) for g in recording.points
-        )
-        return replace(recording, points=points)
-    joints = recording.joints
-    assert joints is not None
-    if joints.effort is None:
-        raise ModelError("the recording has no efforts", where=effect.label, allowed="arms that torques move")
-    return replace(recording, joints=_joint_error(joints, system, effect))
-
-
-def _joint_error(joints: JointGroup, system: System, effect: InjectedEffect) -> JointGroup:
-    assert joints.effort is not None
-    position, effort = joints.position.copy(), joints.effort.copy()
-    size = effect.values
-    if effect.kind == "effort_delay":
-        # what is recorded now acts only after the delay
-        for name in joints_by_arm(system)[effect.location]:
-            column = joints.names.index(name)
-            effort[:, column] = np.interp(joints.t + size["delay"], joints.t, joints.effort[:, column])
-        return replace(joints, effort=effort)
-    at = joints.names.index(effect.location)
-    if effect.kind == "effort_gain":
-        effort[:, at] *= size["scale"]
-    elif effect.kind == "effort_offset":
-        effort[:, at] += size["offset"]
-    elif effect.kind == "encoder_offset":
-        position[:, at] += size["offset"]
-    elif effect.kind == "series_elasticity":
-        position[:, at] += joints.effort[:, at] / size["stiffness"]
-    elif effect.kind == "backlash":
-        position[:, at] += size["width"] / 2 * np.tanh(joints.effort[:, at] / 0.2)
-    return replace(joints, position=position, effort=effort)
-
-
-def _camera_error(group: PointGroup, system: System, effect: InjectedEffect, duration: float) -> PointGroup:
-    assert group.pose is not None
-    size, position = effect.values, group.position
-    centre = np.asarray(group.pose)[:3, 3]
-    if effect.kind == "camera_translation":
-        return replace(group, position=position + np.array([size["x"], size["y"], size["z"]]))
-    if effect.kind == "camera_rotation":
-        turn = Rotation.from_euler("xyz", [size["rx"], size["ry"], size["rz"]]).as_matrix()
-        return replace(group, position=centre + (position - centre) @ turn.T)
-    if effect.kind == "camera_scale":
-        return replace(group, position=centre + size["scale"] * (position - centre))
-    if effect.kind == "camera_latency":
-        late = group.t + size["delay"]
-        inside = late <= duration
-        std = None if group.std is None else group.std[inside]
-        return replace(group, t=late[inside], position=position[inside], std=std)
-    value = ParameterEvaluator(system, {})
-    radius = {s.name: float(value(s.radius)[0]) for s in system.segment_layouts}
-    own = np.array([radius.get(name.removeprefix("w_").partition(":")[0], 0.0) for name in group.names])
-    ray = centre - position
-    away = ray / np.linalg.norm(ray, axis=2, keepdims=True)
-    return replace(group, position=position + size["fraction"] * own[:, None] * away)

@@ -1,13 +1,18 @@
-"""A system as a MuJoCo model (MJCF), for virtual experiments and for export."""
+"""A system in the terms of a rigid-body engine, and as a MuJoCo model (MJCF), for virtual experiments and for export.
+
+An effect is classified by the parts of the description it changes and by its equations, so kinds from outside the
+package are treated like those of the library.
+"""
 
 from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
+from xml.etree.ElementTree import Element, SubElement
 
 import casadi as ca
 import numpy as np
@@ -15,35 +20,255 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from yid_ocp.errors import ConfigError, DataError, ModelError
+from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, merge_bodies
 from yid_ocp.model.servos_and_springs import TORQUE_LIMIT_POWER, UNLIMITED_EFFORT
-from yid_ocp.model.system import System
-from yid_ocp.virtual.rigid_body_terms import (
-    MODEL_ASPECTS,
-    JointDynamics,
-    ParameterEvaluator,
-    actuator_responses,
-    effect_terms_and_aspects,
-    joint_dynamics,
-)
+from yid_ocp.model.system import Effect, MidpointState, RecordingErrorEffect, System
 
 Array = NDArray[np.float64]
 
+MODEL_ASPECTS: Mapping[str, str] = {
+    "stiffness": "stiffness of joints",
+    "rest": "angles at which springs are relaxed",
+    "damping": "viscous damping of joints",
+    "geometry": "places of joints and points",
+    "inertia": "masses and inertias",
+    "weight": "weight that is not mass times gravity",
+    "gravity": "the gravity vector",
+    "grasp": "where and how a grasp holds",
+    "grasp_compliance": "springs in place of a rigid grasp",
+    "sprung_joint": "joints with springs where the nominal model is rigid",
+    "armature": "rotor inertia at a joint",
+    "dry_friction": "dry friction at a joint",
+    "cubic_stiffness": "springs that stiffen with the cube of the angle",
+    "torque_gain": "true over recorded torque",
+    "torque_offset": "constant part of a recorded torque that does not act",
+    "torque_delay": "torque that acts later than recorded",
+    "torque_lag": "torque that follows its record",
+    "servo": "gain, damping, delay and limit of position servos",
+    "clock": "a clock that runs fast or slow",
+    "reading": "what a sensor reads; the motion does not depend on it",
+    "memory": "forces with a memory",
+    "force": "forces that no joint, spring or damper makes",
+}
+"""Aspects of a model that an engine may or may not represent, with their descriptions."""
+
+# kinds that are smoothed dry friction, and the parameter with their friction torque [N m]
+_DRY_FRICTION_PARAMETERS: Mapping[str, str] = {"joint_coulomb": "tau_c", "joint_presliding": "tau_c"}
+
+_POINTS = 3  # at which equations are compared
+_ROUNDING = 1e-9
+# aspects of an effect for which MuJoCo has an equivalent term
 _NATIVE_ASPECTS = frozenset(
     {
         *("stiffness", "rest", "damping", "geometry", "inertia", "weight"),
         *("gravity", "grasp", "sprung_joint", "armature", "cubic_stiffness", "servo"),
     }
 )
-"""Aspects of an effect for which MuJoCo has an equivalent term."""
 EMULATED_ASPECTS = frozenset({"dry_friction", "grasp_compliance"})
 """Aspects that MuJoCo can only approximate."""
+# aspects of sensors and recorded torques that do not enter the mechanics
 _IGNORED_ASPECTS = frozenset({"reading", "torque_gain", "torque_offset", "torque_delay", "torque_lag"})
-"""Aspects of sensors and recorded torques that do not enter the mechanics."""
 
 _JOINTS_PER_BODY = 6  # as many as MuJoCo allows
 _ROTOR = 5e-4  # [kg m^2] of a motor behind play, as little as lets it rest at a stop
 _AXIS_LEVER = 0.1  # [m] between the two points that keep two axes parallel
+
+
+@dataclass(frozen=True)
+class JointDynamics:
+    """Spring, damping, inertia and friction at one joint, in SI units of its coordinate.
+
+    Attributes
+    ----------
+    stiffness, constant_force : float
+        Force -stiffness q + pull.
+    cubic_stiffness, damping, armature, dry_friction : float
+        Force -cubic q^3, force -damping v, inertia, dry friction.
+    """
+
+    stiffness: float = 0.0
+    constant_force: float = 0.0
+    cubic_stiffness: float = 0.0
+    damping: float = 0.0
+    armature: float = 0.0
+    dry_friction: float = 0.0
+
+    def __add__(self, other: JointDynamics) -> JointDynamics:
+        return JointDynamics(*(getattr(self, name) + getattr(other, name) for name in vars(self)))
+
+
+@dataclass(frozen=True)
+class _ActuatorResponse:
+    """Applied torque of a driven joint from the recorded one: gain x recorded - offset, delay [s], first-order lag [s].
+
+    With a position servo it is the commanded position instead.
+    """
+
+    gain: float = 1.0
+    subtracted_offset: float = 0.0
+    delay: float = 0.0
+    lag_time: float = 0.0
+
+
+class ParameterEvaluator:
+    """Evaluator of expressions in a system's parameters, nominal where absent; values are flattened by columns."""
+
+    def __init__(self, system: System, values: Mapping[str, float] | None = None) -> None:
+        self._symbols, self._theta = system.parameters.symbols, system.parameters.vector(values)
+
+    def __call__(self, expression: ca.SX) -> Array:
+        """Values of an expression that depends on parameters only."""
+        return np.array(ca.densify(ca.Function("value", [self._symbols], [expression])(self._theta))).ravel(order="F")
+
+    def is_zero(self, expression: ca.SX) -> bool:
+        """Whether an expression is zero for all values of its other symbols."""
+        return bool(ca.sparsify(self.with_parameter_values(expression)).is_zero())
+
+    def with_parameter_values(self, expression: ca.SX) -> ca.SX:
+        """The expression with parameters replaced by their values."""
+        return ca.substitute(expression, self._symbols, ca.DM(self._theta))
+
+
+def aspects_of_parameters(system: System, symbols: ca.SX) -> set[str]:
+    """Keys of `MODEL_ASPECTS` for the parts of the description that depend on given parameters."""
+    tree, held = system.mechanism, system.grasps
+    bodies = [body for joint in tree.joints for body in joint.bodies]
+    placements = [*(joint.placement for joint in tree.joints), *(frame.placement for frame in tree.frames.values())]
+    entered: Mapping[str, Iterable[ca.SX]] = {
+        "stiffness": (spring.stiffness for spring in system.elastic_joints),
+        "rest": (spring.rest_angle for spring in system.elastic_joints),
+        "damping": (*(spring.damping for spring in system.elastic_joints), *system.joint_damping.values()),
+        "geometry": (part for placement in placements for part in (placement.rotation, placement.translation)),
+        "inertia": (part for body in bodies for part in (body.mass, body.center_of_mass, body.inertia_about_com)),
+        "weight": (body.gravity_fraction for body in bodies if body.gravity_fraction is not None),
+        "gravity": (system.gravity,),
+        "grasp": (part for grasp in held for part in (grasp.held_orientation, grasp.holder_offset, grasp.axial_slip)),
+        "grasp_compliance": (
+            part for grasp in held for part in (grasp.compliance, grasp.relaxation_time) if part is not None
+        ),
+        "sprung_joint": system.joint_compliances.values(),
+        "servo": (part for servo in system.servos.values() for part in servo.coefficients),
+        "clock": (system.recorded_time_scale,),
+    }
+    return {name for name, parts in entered.items() if any(_depends(part, symbols) for part in parts)}
+
+
+def effect_terms_and_aspects(
+    system: System, effect: Effect, value: ParameterEvaluator
+) -> tuple[dict[str, JointDynamics], set[str]]:
+    """Terms that the equations of a system's effect add at single joints, and the `MODEL_ASPECTS` it changes."""
+    aspects = aspects_of_parameters(system, effect.parameters.symbols)
+    terms: dict[str, JointDynamics] = {}
+    if effect.kind in _DRY_FRICTION_PARAMETERS:
+        size = effect.parameters[f"{effect.kind}@{effect.location}.{_DRY_FRICTION_PARAMETERS[effect.kind]}"].symbol
+        terms = {effect.location: JointDynamics(dry_friction=float(value(size)[0]))}
+        aspects.add("dry_friction")
+    elif effect.internal_coordinates:
+        aspects.add("memory")
+    else:
+        found = _joint_terms(system, effect, value)
+        if found is None:
+            aspects.add("force")
+        else:
+            terms = found
+            # an aspect is called as the term is, but for the angle at which a spring is relaxed
+            sizes = ((name, size) for entry in terms.values() for name, size in vars(entry).items())
+            aspects |= {"rest" if name == "constant_force" else name for name, size in sizes if size}
+    for joint in system.driven:
+        own = _actuation(system, (effect,), joint, value)
+        changed = {"torque_gain": own.gain != 1, "torque_offset": own.subtracted_offset != 0}
+        changed |= {"torque_lag": own.lag_time != 0, "torque_delay": own.delay > 0, "reading": own.delay < 0}
+        aspects |= {name for name, does in changed.items() if does}
+    return terms, aspects or {"reading"}
+
+
+def joint_dynamics(system: System, value: ParameterEvaluator) -> dict[str, JointDynamics]:
+    """Springs, dampers, rotor inertia and friction by joint, from the description and from effects.
+
+    Of other effects only these parts are included; the aspects of `effect_terms_and_aspects` show what is missing.
+    """
+    found: dict[str, JointDynamics] = {}
+
+    def add(joint: str, own: JointDynamics) -> None:
+        found[joint] = found.get(joint, JointDynamics()) + own
+
+    for joint, coefficient in system.joint_damping.items():
+        add(joint, JointDynamics(damping=float(value(coefficient)[0])))
+    for spring in system.elastic_joints:
+        stiffness, rest, damping = (float(value(x)[0]) for x in (spring.stiffness, spring.rest_angle, spring.damping))
+        add(spring.joint_name, JointDynamics(stiffness, stiffness * rest, damping=damping))
+    for joint, compliance in system.joint_compliances.items():
+        if not value.is_zero(compliance):
+            stiffness = 1 / float(value(compliance)[0])
+            add(joint, JointDynamics(stiffness, damping=system.joint_relaxation_times.get(joint, 0.0) * stiffness))
+    for effect in system.effects:
+        for joint, own in effect_terms_and_aspects(system, effect, value)[0].items():
+            add(joint, own)
+    return found
+
+
+def _actuation(system: System, effects: Iterable[Effect], joint: str, value: ParameterEvaluator) -> _ActuatorResponse:
+    """As the estimation has it: the last effect is the nearest to the reading."""
+    reading, known = ca.SX.sym("reading"), [e for e in effects if isinstance(e, RecordingErrorEffect)]
+    true, servo = reading, system.servos.get(joint)
+    channel = f"joints.{'effort' if servo is None else 'position'}.{joint}"
+    for effect in reversed(known):
+        true = effect.corrected_reading(channel, true, true)
+    late = sum((effect.added_delay(f"torque.{joint}", False) for effect in known), ca.SX(0))
+    lag = sum((effect.lag_time_constant(f"torque.{joint}") for effect in known), ca.SX(0))
+    gain = ca.jacobian(true, reading)
+    numbers = [ca.substitute(part, reading, 0) for part in (gain, true)] + [late, lag]
+    one, none, delay, constant = (float(value(number)[0]) for number in numbers)
+    return _ActuatorResponse(one, -none, delay, constant)
+
+
+def _joint_terms(system: System, effect: Effect, value: ParameterEvaluator) -> dict[str, JointDynamics] | None:
+    """Springs, dampers and rotors that an effect's equations are, by joint; None where they are something else."""
+    n = system.n_coordinates
+    q, v = ca.SX.sym("q", n), ca.SX.sym("v", n)
+    u, reaction = ca.SX.sym("u", len(system.driven)), ca.SX.sym("reaction", system.n_constraints)
+    none, h = ca.SX(0, 1), ca.SX.sym("h")
+    kinematics = forward_kinematics(system.mechanism, q)
+    terms = effect.step_terms(MidpointState(system, kinematics, q, v, none, none, u, reaction, {}, h))
+    energy, closed = value.with_parameter_values(terms.lagrangian), terms.force_with_derivatives
+    force = ca.gradient(energy, q)
+    for part in (terms.generalized_force, terms.dissipative_force, None if closed is None else closed.force):
+        if part is not None:
+            force += value.with_parameter_values(ca.densify(part))
+    if ca.sparsify(ca.vertcat(energy, force)).is_zero():
+        return {}
+    momentum = ca.gradient(energy, v)
+    if _depends(ca.vertcat(force, momentum), ca.vertcat(u, reaction, h)):
+        return None
+    ones = ca.SX.ones(n)
+    by_q, by_v, inertia = ca.jacobian(force, q), ca.jacobian(force, v), ca.jacobian(momentum, v)
+    second = ca.jtimes(ca.diag(by_q), q, ones)
+    third = ca.jtimes(second, q, ones)
+    slopes = [ca.diag(by_v), ca.diag(inertia), third]
+    mixed = [ca.jacobian(momentum, q), *(full - ca.diag(ca.diag(full)) for full in (by_q, by_v, inertia))]
+    at = ca.Function("at", [q, v], [ca.densify(x) for x in (force, ca.diag(by_q), second, *slopes, *mixed)])
+    rng = np.random.default_rng(0)
+    found = [[np.array(x) for x in at(*rng.uniform(-1.0, 1.0, (2, n)))] for _ in range(_POINTS)]
+    rest = [np.array(x).ravel() for x in at(np.zeros(n), np.zeros(n))[:6]]
+    pull, slope, curve, damping, armature, twisted = rest
+    scale = _ROUNDING * max(1.0, *(float(np.abs(x).max(initial=0.0)) for x in rest))
+    moved = [np.abs(entry[i].ravel() - rest[i]).max() for entry in found for i in range(3, 3 + len(slopes))]
+    constant = all(size <= scale for size in moved)
+    apart = all(np.abs(x).max(initial=0.0) <= scale for entry in found for x in entry[6:])
+    springs = np.abs(curve).max() <= scale and damping.max() <= scale and armature.min() >= -scale
+    loose = (np.abs(slope) <= scale) & (np.abs(pull) > scale)  # a constant torque is no spring
+    if not (constant and apart and springs) or np.any(loose):
+        return None
+    return {
+        joint: JointDynamics(-slope[i], pull[i], -twisted[i] / 6, -damping[i], armature[i])
+        for i, joint in enumerate(system.mechanism.joint_names)
+        if np.any(np.abs([slope[i], pull[i], twisted[i], damping[i], armature[i]]) > scale)
+    }
+
+
+def _depends(expression: ca.SX, symbols: ca.SX) -> bool:
+    return expression.numel() > 0 and symbols.numel() > 0 and bool(ca.depends_on(expression, symbols))
 
 
 def mujoco_xml(
@@ -83,11 +308,6 @@ def mujoco_xml(
     gear_play : mapping of joint name to float, optional
         Backlash of gears, full width [rad]: the joint is then the motor's side, and a joint `NAME_play` follows it.
 
-    Returns
-    -------
-    str
-        XML text.
-
     Raises
     ------
     ModelError
@@ -102,29 +322,24 @@ def mujoco_xml(
     value = ParameterEvaluator(system, values)
     _refuse_inexpressible(system, value, emulate)
 
-    root = ElementTree.Element("mujoco", model=tree.name)
-    ElementTree.SubElement(root, "compiler", angle="radian", autolimits="false", inertiafromgeom="false")
-    option = ElementTree.SubElement(
-        root,
-        "option",
-        timestep=_text([time_step]),
-        integrator=integrator,
-        gravity=_text(value(system.gravity)),
-        iterations="100",
-        tolerance="1e-14",
-        jacobian="dense",  # the Newton solver of MuJoCo 4.0 does not converge on fine chains in its sparse form
-    )
-    ElementTree.SubElement(option, "flag", contact="disable")
+    root = Element("mujoco", model=tree.name)
+    SubElement(root, "compiler", angle="radian", autolimits="false", inertiafromgeom="false")
+    # the Newton solver of MuJoCo 4.0 does not converge on fine chains in its sparse form
+    search = {"iterations": "100", "tolerance": "1e-14", "jacobian": "dense"}
+    rules = {"timestep": xml_numbers([time_step]), "integrator": integrator}
+    rules["gravity"] = xml_numbers(value(system.gravity))
+    option = SubElement(root, "option", {**rules, **search})
+    SubElement(option, "flag", contact="disable")
     sites = _sites(system, tree, value)
-    base = ElementTree.SubElement(ElementTree.SubElement(root, "worldbody"), "body", name="world_base")
-    ElementTree.SubElement(base, "inertial", pos="0 0 0", mass="0", diaginertia="0 0 0")  # Pinocchio asks for one
+    base = SubElement(SubElement(root, "worldbody"), "body", name="world_base")
+    SubElement(base, "inertial", pos="0 0 0", mass="0", diaginertia="0 0 0")  # Pinocchio asks for one
     gears = {name: _play_attributes(width, time_step) for name, width in (gear_play or {}).items()}
     elements = _bodies(tree, weights, joint_dynamics(system, value), sites, base, gears)
     for name, frame in sites:
-        ElementTree.SubElement(elements[frame.joint_index], "site", {"name": name, **_pose(frame.placement)})
+        SubElement(elements[frame.joint_index], "site", {"name": name, **_pose(frame.placement)})
     _add_grasps(system, value, root, time_step)
     if actuators or system.servos:
-        _add_actuators(system, value, ElementTree.SubElement(root, "actuator"), time_step)
+        _add_actuators(system, value, SubElement(root, "actuator"), time_step)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
@@ -134,15 +349,15 @@ def _bodies(
     weights: Mapping[str, float],
     terms: Mapping[str, JointDynamics],
     sites: list[tuple[str, Frame]],
-    world: ElementTree.Element,
+    world: Element,
     gears: Mapping[str, Mapping[str, str]],
-) -> dict[int, ElementTree.Element]:
+) -> dict[int, Element]:
     """Add bodies with their joints and masses; the body of every joint by its index, -1 for the world.
 
     `gears` has attributes of the joint between a motor and what it moves, by the motor's joint.
     """
     carried = {frame.joint_index: name for name, frame in reversed(sites)}
-    elements: dict[int, ElementTree.Element] = {-1: world}
+    elements: dict[int, Element] = {-1: world}
     for j, joint in enumerate(tree.joints):
         if _shares_body(tree, j):
             elements[j] = elements[joint.parent_index]
@@ -150,36 +365,31 @@ def _bodies(
                 what = f"frame '{carried[joint.parent_index]}' sits on a joint that carries no mass"
                 raise ModelError(what, where=f"joint {joint.name}")
         else:
-            elements[j] = ElementTree.SubElement(
-                elements[joint.parent_index], "body", {"name": f"{joint.name}_body", **_pose(joint.placement)}
-            )
+            place = {"name": f"{joint.name}_body", **_pose(joint.placement)}
+            elements[j] = SubElement(elements[joint.parent_index], "body", place)
         attributes = _joint_attributes(joint, terms.get(joint.name, JointDynamics()))
-        moved = ElementTree.SubElement(elements[j], "joint", attributes)
+        moved = SubElement(elements[j], "joint", attributes)
         if joint.name in gears:
             motor, name = elements[j], joint.name
             motor.set("name", f"{name}_motor")
-            moved.attrib.setdefault("armature", _text([_ROTOR]))
-            ElementTree.SubElement(motor, "inertial", pos="0 0 0", mass="1e-6", diaginertia="1e-9 1e-9 1e-9")
-            elements[j] = ElementTree.SubElement(motor, "body", {"name": f"{name}_body"})
+            moved.attrib.setdefault("armature", xml_numbers([_ROTOR]))
+            SubElement(motor, "inertial", pos="0 0 0", mass="1e-6", diaginertia="1e-9 1e-9 1e-9")
+            elements[j] = SubElement(motor, "body", {"name": f"{name}_body"})
             kind = {"name": f"{name}_play", "type": attributes["type"], "axis": attributes["axis"]}
-            ElementTree.SubElement(elements[j], "joint", {**kind, **gears[name]})
+            SubElement(elements[j], "joint", {**kind, **gears[name]})
         if len(elements[j].findall("joint")) > _JOINTS_PER_BODY:
-            raise ModelError(
-                "more than six joints without mass sit at one place",
-                where=f"joint {joint.name}",
-                allowed="up to six; a body with mass on the last of them",
-            )
+            what = "more than six joints without mass sit at one place"
+            allowed = "up to six; a body with mass on the last of them"
+            raise ModelError(what, where=f"joint {joint.name}", allowed=allowed)
         body = merge_bodies(joint.bodies)
         if body is not None:
             if joint.name in weights:
-                elements[j].set("gravcomp", _text([1 - weights[joint.name]]))
-            ElementTree.SubElement(elements[j], "inertial", _inertial(body))
+                elements[j].set("gravcomp", xml_numbers([1 - weights[joint.name]]))
+            SubElement(elements[j], "inertial", _inertial(body))
         elif not any(_shares_body(tree, k) and tree.joints[k].parent_index == j for k in range(len(tree.joints))):
-            raise ModelError(
-                f"nothing that '{joint.name}' moves has a mass",
-                where=f"joint {joint.name}",
-                allowed="a body with mass on every joint, or several joints at one place with a body on the last",
-            )
+            allowed = "a body with mass on every joint, or several joints at one place with a body on the last"
+            what = f"nothing that '{joint.name}' moves has a mass"
+            raise ModelError(what, where=f"joint {joint.name}", allowed=allowed)
     return elements
 
 
@@ -197,57 +407,57 @@ def _weighed(tree: Mechanism) -> tuple[Mechanism, dict[str, float]]:
 
 
 def _joint_attributes(joint: Joint, terms: JointDynamics) -> dict[str, str]:
-    attributes = {"name": joint.name, "axis": _text(joint.axis), "damping": _text([terms.damping])}
+    attributes = {"name": joint.name, "axis": xml_numbers(joint.axis), "damping": xml_numbers([terms.damping])}
     attributes["type"] = "hinge" if joint.kind == "revolute" else "slide"
     if terms.stiffness > 0:
-        attributes["stiffness"] = _text([terms.stiffness])
-        attributes["springref"] = _text([terms.constant_force / terms.stiffness])
+        attributes["stiffness"] = xml_numbers([terms.stiffness])
+        attributes["springref"] = xml_numbers([terms.constant_force / terms.stiffness])
     if terms.cubic_stiffness:
         if terms.constant_force or not hasattr(import_mujoco().MjModel, "jnt_stiffnesspoly"):
             what = f"the spring at '{joint.name}' has a cubic part"
             allowed = "none beside a rest angle, and MuJoCo with polynomial stiffness (3.6 or newer)"
             raise ModelError(what, where="mujoco_xml", allowed=allowed)
-        attributes["stiffness"] = _text([terms.stiffness, 0.0, terms.cubic_stiffness])
+        attributes["stiffness"] = xml_numbers([terms.stiffness, 0.0, terms.cubic_stiffness])
     if terms.armature:
-        attributes["armature"] = _text([terms.armature])
+        attributes["armature"] = xml_numbers([terms.armature])
     if terms.dry_friction:
-        attributes["frictionloss"] = _text([terms.dry_friction])
+        attributes["frictionloss"] = xml_numbers([terms.dry_friction])
     return attributes
 
 
 def _play_attributes(width: float, time_step: float) -> dict[str, str]:
     """A joint with stops at half the width either way."""
-    ends = {"limited": "true", "range": _text([-width / 2, width / 2])}
-    return {**ends, "solreflimit": _text([5 * time_step, 1.0]), "solimplimit": "0.99 0.999 0.0001 0.5 2"}
+    ends = {"limited": "true", "range": xml_numbers([-width / 2, width / 2])}
+    return {**ends, "solreflimit": xml_numbers([5 * time_step, 1.0]), "solimplimit": "0.99 0.999 0.0001 0.5 2"}
 
 
-def _add_grasps(system: System, value: ParameterEvaluator, root: ElementTree.Element, time_step: float) -> None:
-    equality = ElementTree.SubElement(root, "equality")
-    firm = {"solref": _text([2 * time_step, 1.0]), "solimp": "0.9999 0.9999 0.001 0.5 2"}
+def _add_grasps(system: System, value: ParameterEvaluator, root: Element, time_step: float) -> None:
+    equality = SubElement(root, "equality")
+    firm = {"solref": xml_numbers([2 * time_step, 1.0]), "solimp": "0.9999 0.9999 0.001 0.5 2"}
     for grasp in system.grasps:
         ends = [f"grasp_{grasp.name}_{end}" for end in ("holder", "held")]
         compliance = float(value(grasp.compliance)[0])
         if compliance > 0:
             # a tendon of no length pulls with its stiffness, and damps, along the line between both ends
             relaxation = 0.0 if grasp.relaxation_time is None else float(value(grasp.relaxation_time)[0])
-            sizes = {"stiffness": _text([1 / compliance]), "damping": _text([relaxation / compliance])}
+            sizes = {"stiffness": xml_numbers([1 / compliance]), "damping": xml_numbers([relaxation / compliance])}
             tendons = root.find("tendon")
-            tendons = ElementTree.SubElement(root, "tendon") if tendons is None else tendons
-            spring = ElementTree.SubElement(
-                tendons, "spatial", {"name": f"grasp_{grasp.name}", "springlength": "0", **sizes}
-            )
+            tendons = SubElement(root, "tendon") if tendons is None else tendons
+            attributes = {"name": f"grasp_{grasp.name}", "springlength": "0", **sizes}
+            spring = SubElement(tendons, "spatial", attributes)
             for end in ends:
-                ElementTree.SubElement(spring, "site", site=end)
+                SubElement(spring, "site", site=end)
             continue
         kind = "weld" if grasp.kind == "weld" else "connect"
         for suffix in ("", "_ahead") if grasp.kind == "axis" else ("",):
             sites = {"site1": ends[0] + suffix, "site2": ends[1] + suffix}
-            ElementTree.SubElement(equality, kind, {"name": f"grasp_{grasp.name}{suffix}", **sites, **firm})
+            SubElement(equality, kind, {"name": f"grasp_{grasp.name}{suffix}", **sites, **firm})
 
 
-def _add_actuators(system: System, value: ParameterEvaluator, actuator: ElementTree.Element, time_step: float) -> None:
+def _add_actuators(system: System, value: ParameterEvaluator, actuator: Element, time_step: float) -> None:
     """Actuators from recorded torques to those that act, and position servos."""
-    for joint, found in actuator_responses(system, value).items():
+    for joint in system.driven:
+        found = _actuation(system, system.effects, joint, value)
         attributes, servo = {"name": joint, "joint": joint}, system.servos.get(joint)
         gain, bias, delay, between = found.gain, [-found.subtracted_offset, 0.0, 0.0], found.delay, "linear"
         if servo is not None:
@@ -256,19 +466,19 @@ def _add_actuators(system: System, value: ParameterEvaluator, actuator: ElementT
             between = "zoh" if servo.command_interpolation == "held" else "linear"
             limit = tightness ** (-1 / TORQUE_LIMIT_POWER) if tightness > 0 else math.inf
             if limit < UNLIMITED_EFFORT:
-                attributes |= {"forcelimited": "true", "forcerange": _text([-limit, limit])}
-        attributes["gainprm"] = _text([gain])
+                attributes |= {"forcelimited": "true", "forcerange": xml_numbers([-limit, limit])}
+        attributes["gainprm"] = xml_numbers([gain])
         if any(bias):
-            attributes |= {"biastype": "affine", "biasprm": _text(bias)}
+            attributes |= {"biastype": "affine", "biasprm": xml_numbers(bias)}
         if found.lag_time > 0:
-            attributes |= {"dyntype": "filterexact", "dynprm": _text([found.lag_time])}
+            attributes |= {"dyntype": "filterexact", "dynprm": xml_numbers([found.lag_time])}
         if delay > 0:
             if not hasattr(import_mujoco().MjModel, "actuator_delay"):
                 what, allowed = f"the torque of '{joint}' acts late", "MuJoCo with delays of actuators (3.5 or newer)"
                 raise ModelError(what, where="mujoco_xml", allowed=allowed)
             samples = math.ceil(delay / time_step) + 1
-            attributes |= {"delay": _text([delay]), "nsample": str(samples), "interp": between}
-        ElementTree.SubElement(actuator, "general", attributes)
+            attributes |= {"delay": xml_numbers([delay]), "nsample": str(samples), "interp": between}
+        SubElement(actuator, "general", attributes)
 
 
 def import_mujoco() -> ModuleType:
@@ -276,9 +486,8 @@ def import_mujoco() -> ModuleType:
     try:
         import mujoco
     except ImportError as error:
-        raise DataError(
-            "virtual experiments need MuJoCo, which is not installed", hint="pip install 'yid-ocp[blind]'"
-        ) from error
+        what = "virtual experiments need MuJoCo, which is not installed"
+        raise DataError(what, hint="pip install 'yid-ocp[blind]'") from error
     return mujoco
 
 
@@ -294,12 +503,9 @@ def _refuse_inexpressible(system: System, value: ParameterEvaluator, emulate: bo
     able = _NATIVE_ASPECTS | EMULATED_ASPECTS if emulate else _NATIVE_ASPECTS
     for effect in system.effects:
         for aspect in sorted(effect_terms_and_aspects(system, effect, value)[1] - able - _IGNORED_ASPECTS):
-            raise ModelError(
-                f"effect '{effect.kind}@{effect.location}' has what MuJoCo cannot express: {MODEL_ASPECTS[aspect]}",
-                where="mujoco_xml",
-                allowed="effects that change "
-                + ", ".join(MODEL_ASPECTS[name] for name in MODEL_ASPECTS if name in able),
-            )
+            what = f"effect '{effect.kind}@{effect.location}' has what MuJoCo cannot express: {MODEL_ASPECTS[aspect]}"
+            allowed = ", ".join(words for name, words in MODEL_ASPECTS.items() if name in able)
+            raise ModelError(what, where="mujoco_xml", allowed=f"effects that change {allowed}")
     for grasp in system.grasps:
         if not value.is_zero(grasp.compliance) and not (emulate and grasp.kind == "point"):
             allowed = "rigid grasps" if not emulate else "rigid grasps, and springs in place of point grasps"
@@ -331,12 +537,10 @@ def _sites(system: System, tree: Mechanism, value: ParameterEvaluator) -> list[t
             "held": (held, _along(-value(grasp.axial_slip)[0])),
         }
         for end, (frame, local) in ends.items():
-            placement = frame.placement @ local
-            sites.append((f"grasp_{grasp.name}_{end}", Frame(frame.joint_index, placement)))
+            name, placement = f"grasp_{grasp.name}_{end}", frame.placement @ local
+            sites.append((name, Frame(frame.joint_index, placement)))
             if grasp.kind == "axis":
-                sites.append(
-                    (f"grasp_{grasp.name}_{end}_ahead", Frame(frame.joint_index, placement @ _along(_AXIS_LEVER)))
-                )
+                sites.append((f"{name}_ahead", Frame(frame.joint_index, placement @ _along(_AXIS_LEVER))))
     return sites
 
 
@@ -346,15 +550,16 @@ def _along(z: float) -> Placement:
 
 def _pose(placement: Placement) -> dict[str, str]:
     x, y, z, w = Rotation.from_matrix(np.array(ca.DM(placement.rotation))).as_quat()
-    return {"pos": _text(np.array(ca.DM(placement.translation)).ravel()), "quat": _text([w, x, y, z])}
+    return {"pos": xml_numbers(np.array(ca.DM(placement.translation)).ravel()), "quat": xml_numbers([w, x, y, z])}
 
 
 def _inertial(body: Inertia) -> dict[str, str]:
     tensor = np.array(ca.DM(body.inertia_about_com))
     full = [tensor[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
     com = np.array(ca.DM(body.center_of_mass)).ravel()
-    return {"pos": _text(com), "mass": _text([float(body.mass)]), "fullinertia": _text(full)}
+    return {"pos": xml_numbers(com), "mass": xml_numbers([float(body.mass)]), "fullinertia": xml_numbers(full)}
 
 
-def _text(numbers: Iterable[float]) -> str:
+def xml_numbers(numbers: Iterable[float]) -> str:
+    """Numbers with all their digits, for an attribute."""
     return " ".join(f"{float(number):.17g}" for number in numbers)

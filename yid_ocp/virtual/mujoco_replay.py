@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,24 +57,16 @@ class ReplayMismatch:
 
 
 def replay_in_mujoco(text: str, system: System, recording: Recording) -> dict[str, ReplayMismatch]:
-    """Replay a recording with an exported model and return its deviations by channel.
+    """Replay a recording with the MJCF text of a system, from `mujoco_xml` with actuators.
 
     Driven joints get the recorded torque as the control of their actuators, and beside it a weak pull to the recorded
-    angles (`REPLAY_BANDWIDTH`), without which any error of a torque lets an arm drift away. Position servos get what they were
-    commanded and nothing else. Prescribed joints follow the recorded angles; the torque that this takes is compared
-    with the recorded one.
-
-    Parameters
-    ----------
-    text : str
-        MJCF, from `mujoco_xml` with actuators.
-    system : System
-        Of the names in it.
-    recording : Recording
+    angles (`REPLAY_BANDWIDTH`), without which any error of a torque lets an arm drift away. Position servos get what
+    they were commanded and nothing else. Prescribed joints follow the recorded angles; the torque that this takes is
+    compared with the recorded one.
 
     Returns
     -------
-    dict of str to Error
+    dict of str to ReplayMismatch
         `joints.position` of driven joints [rad] or `joints.effort` of prescribed ones [N m], all joints together, and
         `GROUP.POINT` of every point of the model [m].
 
@@ -102,8 +95,8 @@ def replay_in_mujoco(text: str, system: System, recording: Recording) -> dict[st
     scene.data.qpos[scene.moved_joint_ids] = position[:_START].mean(axis=0)
     if system.servos:
         assert joints.position_command is not None
-        played = _commanded(scene, system, t, joints.position_command[:, columns])
-        return _errors(system, recording, joints, columns, played)
+        commanded = _commanded(scene, system, t, joints.position_command[:, columns])
+        return _errors(system, recording, joints, columns, commanded)
     balance = settle_to_equilibrium(scene, np.array(model.dof_damping))
     noisy = joints.position_std is not None and bool(np.any(np.asarray(joints.position_std) > 0))
     path = _Path(moved, t, position, _SMOOTHED if noisy else 0.0)
@@ -135,50 +128,59 @@ class _Played:
     points: Array
 
 
+def _step_times(scene: MujocoScene, end: float) -> Array:
+    step = scene.model.opt.timestep
+    return np.asarray(np.arange(round(end / step)) * step)
+
+
+def _played(scene: MujocoScene, end: float, control: Callable[[int, float], Array | None]) -> _Played:
+    """Step to a time; `control` sets inputs at a step and its time, and may return the values of the moved joints."""
+    mujoco, model, data, at = scene.mujoco, scene.model, scene.data, scene.moved_joint_ids
+    times = _step_times(scene, end)
+    values, points = np.empty((len(times), len(at))), np.empty((len(times), len(scene.point_site_ids), 3))
+    for k, t in enumerate(times):
+        mujoco.mj_kinematics(model, data)
+        values[k], points[k] = data.qpos[at], data.site_xpos[scene.point_site_ids]
+        own = control(k, t)
+        if own is not None:
+            values[k] = own
+        mujoco.mj_step(model, data)
+    return _Played(times, values, points)
+
+
 def _driven(scene: MujocoScene, path: _Path, t: Array, effort: Array | None) -> _Played:
     assert effort is not None
     mujoco, model, data, at = scene.mujoco, scene.model, scene.data, scene.moved_joint_ids
-    steps = round(t[-1] / model.opt.timestep)
     start = np.array(data.qpos[at])
-    values, points = np.empty((steps, len(at))), np.empty((steps, len(scene.point_site_ids), 3))
     if model.na:  # torques that follow are what they were before
         data.act[:] = effort[0][np.array(model.actuator_actnum) > 0]
     initialize_actuator_history(scene, effort[0])
     inertia = np.zeros((model.nv, model.nv))
-    last = np.searchsorted(t, np.arange(steps) * model.opt.timestep + 1e-9, side="right") - 1
-    for k in range(steps):
-        mujoco.mj_kinematics(model, data)
-        values[k], points[k] = data.qpos[at], data.site_xpos[scene.point_site_ids]
+
+    def control(k: int, now: float) -> None:
         if k % _INERTIA_EVERY == 0:
             mujoco.mj_forward(model, data)
             _full_inertia(mujoco, model, data, inertia)
-            arm = inertia[np.ix_(at, at)]
-        offset, velocity, _ = path.offset_and_derivatives(k * model.opt.timestep)
-        demand = REPLAY_BANDWIDTH**2 * (start + offset - data.qpos[at]) + 2 * REPLAY_BANDWIDTH * (
-            velocity - data.qvel[at]
-        )
-        data.ctrl[:] = effort[last[k]]
-        data.qfrc_applied[at] = arm @ demand
-        mujoco.mj_step(model, data)
-    return _Played(np.arange(steps) * model.opt.timestep, values, points)
+        offset, velocity, _ = path.offset_and_derivatives(now)
+        demand = REPLAY_BANDWIDTH**2 * (start + offset - data.qpos[at])
+        demand += 2 * REPLAY_BANDWIDTH * (velocity - data.qvel[at])
+        data.ctrl[:] = effort[np.searchsorted(t, now + 1e-9, side="right") - 1]
+        data.qfrc_applied[at] = inertia[np.ix_(at, at)] @ demand
+
+    return _played(scene, t[-1], control)
 
 
 def _commanded(scene: MujocoScene, system: System, t: Array, commands: Array) -> _Played:
-    mujoco, model, data, at = scene.mujoco, scene.model, scene.data, scene.moved_joint_ids
-    settle_under_servos(scene, np.array(model.dof_damping), commands[0])
-    steps = round(t[-1] / model.opt.timestep)
-    times = np.arange(steps) * model.opt.timestep
+    settle_under_servos(scene, np.array(scene.model.dof_damping), commands[0])
+    times = _step_times(scene, t[-1])
     held = commands[np.searchsorted(t, times + 1e-9, side="right") - 1]
-    given = np.where(
-        [system.servos[name].command_interpolation == "held" for name in system.driven], held, _at(times, t, commands)
-    )
-    values, points = np.empty((steps, len(at))), np.empty((steps, len(scene.point_site_ids), 3))
-    for k in range(steps):
-        mujoco.mj_kinematics(model, data)
-        values[k], points[k] = data.qpos[at], data.site_xpos[scene.point_site_ids]
-        data.ctrl[:] = given[k]
-        mujoco.mj_step(model, data)
-    return _Played(times, values, points)
+    is_held = [system.servos[name].command_interpolation == "held" for name in system.driven]
+    given = np.where(is_held, held, _at(times, t, commands))
+
+    def control(k: int, now: float) -> None:
+        scene.data.ctrl[:] = given[k]
+
+    return _played(scene, t[-1], control)
 
 
 def _full_inertia(mujoco: Any, model: Any, data: Any, full: Array) -> None:
@@ -190,17 +192,10 @@ def _full_inertia(mujoco: Any, model: Any, data: Any, full: Array) -> None:
 
 
 def _prescribed(scene: MujocoScene, path: _Path, t: Array, balance: Array) -> _Played:
-    mujoco, model, data, at = scene.mujoco, scene.model, scene.data, scene.moved_joint_ids
-    steps = round(t[-1] / model.opt.timestep)
-    values, points = np.empty((steps, len(at))), np.empty((steps, len(scene.point_site_ids), 3))
     controller = TrackingController(scene, path, balance)
-    data.qvel[at] = path.offset_and_derivatives(0.0)[1]  # a recording may begin in motion
-    for k in range(steps):
-        mujoco.mj_kinematics(model, data)
-        values[k], points[k] = controller.compute_torque(k * model.opt.timestep), data.site_xpos[scene.point_site_ids]
-        data.qfrc_applied[at] = values[k]
-        mujoco.mj_step(model, data)
-    return _Played(np.arange(steps) * model.opt.timestep, values, points)
+    # a recording may begin in motion
+    scene.data.qvel[scene.moved_joint_ids] = path.offset_and_derivatives(0.0)[1]
+    return _played(scene, t[-1], lambda k, now: controller.apply_input(now))
 
 
 def _errors(
@@ -224,10 +219,10 @@ def _errors(
         found[name] = ReplayMismatch(error, float(np.sqrt(np.mean(level**2))), unit)
     for group in recording.points:
         for i, point in enumerate(group.names):
-            if point in system.point_frames:
-                error_of = _point_error(group, i, joints.t[0], played, system.point_frames.index(point))
-                if error_of is not None:
-                    found[f"{group.name}.{point}"] = error_of
+            known = point in system.point_frames
+            own = _point_error(group, i, joints.t[0], played, system.point_frames.index(point)) if known else None
+            if own is not None:
+                found[f"{group.name}.{point}"] = own
     return found
 
 

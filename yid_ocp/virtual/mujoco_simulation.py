@@ -20,12 +20,11 @@ from numpy.typing import ArrayLike, NDArray
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model.system import System
 from yid_ocp.sensors.base import EffortKind
-from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
+from yid_ocp.virtual.joint_motion import JointMotion, grasping_joint_angles
 from yid_ocp.virtual.mjcf import compile_mjcf, import_mujoco, mujoco_xml
-from yid_ocp.virtual.multisine_motion import JointMotion
 
 Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
+_Integers = NDArray[np.int64]
 
 DEFAULT_SIMULATOR_STEP = 1e-4
 """Default time step of the simulator [s]."""
@@ -46,15 +45,12 @@ class SimulatorTerms(Protocol):
 
     def edit_model(self, model: Any) -> None:
         """Edit the compiled `mujoco.MjModel`."""
-        ...
 
     def start_motion(self, data: Any) -> None:
         """Called once when the motion begins, at rest."""
-        ...
 
     def add_forces(self, model: Any, data: Any) -> None:
         """Add generalized forces to `data.qfrc_passive`; called at every inner step."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -70,10 +66,9 @@ class SimulationOptions:
     time_step : float
         Of the simulator [s]; must divide the controller's period.
     controller_rate : float, optional
-        Rate at which torques are computed, held in between [Hz], a multiple of `sample_rate`; `sample_rate` where absent.
+        Rate at which torques are computed, held in between [Hz], a multiple of `sample_rate`, which it is where absent.
     effort_kind : {'sample', 'mean', 'command'}
-        What is recorded of the torque, as in `JointGroup`: a `command` is held from sample to sample, so it needs a
-        controller that is no faster than the recording.
+        What is recorded of the torque: a `command` needs a controller that is no faster than the recording.
     """
 
     duration: float = 5.0
@@ -83,29 +78,22 @@ class SimulationOptions:
     effort_kind: EffortKind = "command"
 
     def __post_init__(self) -> None:
-        controller, periods, inner = (
-            self._controller_rate,
-            self.controller_periods_per_sample,
-            self.simulator_steps_per_period,
-        )
+        controller, periods = self._controller_rate, self.controller_periods_per_sample
+        inner = self.simulator_steps_per_period
         if periods < 1 or abs(periods * self.sample_rate / controller - 1.0) > 1e-9:
-            raise ConfigError(
-                f"controller_rate = {controller:g} Hz is no multiple of the recording's {self.sample_rate:g} Hz",
-                allowed="rate k, k whole",
-            )
+            what = f"controller_rate = {controller:g} Hz is no multiple of the recording's {self.sample_rate:g} Hz"
+            raise ConfigError(what, allowed="rate k, k whole")
         if inner < 1 or abs(inner * self.time_step * controller - 1.0) > 1e-9:
-            raise ConfigError(
-                f"time_step = {self.time_step:g} s does not divide the period of {controller:g} Hz",
-                allowed="1/(controller's rate k), k whole",
-            )
+            what = f"time_step = {self.time_step:g} s does not divide the period of {controller:g} Hz"
+            raise ConfigError(what, allowed="1/(controller's rate k), k whole")
         if self.effort_kind not in get_args(EffortKind):
             raise ConfigError(f"effort_kind = '{self.effort_kind}'", allowed=", ".join(get_args(EffortKind)))
         if self.effort_kind == "command" and periods > 1:
-            raise ConfigError(
-                f"a command of a controller at {controller:g} Hz is not held over a sample of {self.sample_rate:g} Hz",
-                where="effort_kind",
-                allowed="sample or mean, or a controller as fast as the recording",
+            what = (
+                f"a command of a controller at {controller:g} Hz is not held over a sample of {self.sample_rate:g} Hz"
             )
+            allowed = "sample or mean, or a controller as fast as the recording"
+            raise ConfigError(what, where="effort_kind", allowed=allowed)
 
     @property
     def _controller_rate(self) -> float:
@@ -136,16 +124,14 @@ class SimulationResult:
     t : ndarray, shape (N + 1,)
         [s]
     q, v : ndarray, shape (N + 1, n)
-        In configuration order [rad or m].
+        [rad or m]
     effort : ndarray, shape (N + 1, nu)
         Torque at t_k, or its mean from t_k to t_{k+1}, as `effort_kind` says [N m], or what servos were commanded at
         t_k; the last row was computed and not applied.
-    point_positions : ndarray, shape (N + 1, np, 3)
-        Positions of `system.points` in the world [m].
     frame_times : ndarray, shape (M,)
         Times of the camera's frames, rounded to the simulator's step [s].
-    frame_point_positions : ndarray, shape (M, np, 3)
-        Positions of the points at `frame_times` [m].
+    point_positions, frame_point_positions : ndarray, shape (N + 1, np, 3) and (M, np, 3)
+        Positions of `system.point_frames` in the world, at `t` and at `frame_times` [m].
     grasp_separation : ndarray, shape (N + 1, number of grasps)
         Distance between the two ends of each grasp [m].
     """
@@ -179,15 +165,15 @@ def simulate_in_mujoco(
     ----------
     system : System
     values : mapping of str to float or None
-        Parameter values; nominal where absent.
-    motion : Movement
+        Nominal where absent.
+    motion : JointMotion
         Of exactly the driven joints.
-    simulation : Simulation, optional
+    simulation : SimulationOptions, optional
     initial_joint_angles : mapping of str to float, optional
         Initial angles [rad or m]; `grasping_joint_angles` where absent.
     frame_times : array_like, shape (M,)
         When a camera looks [s], increasing, in [0, duration].
-    injected : EngineTerms, optional
+    injected : SimulatorTerms, optional
         What is at work beside the system's description. MuJoCo knows one such callback for the whole process: no other
         simulation may run meanwhile in another thread.
     gear_play : mapping of joint to float, optional
@@ -203,11 +189,9 @@ def simulate_in_mujoco(
     """
     chosen = simulation or SimulationOptions()
     if tuple(motion.joints) != tuple(system.driven) or not system.driven or system.prescribed:
-        raise ModelError(
-            "the motion is not one of the driven joints",
-            where=f"motion of {', '.join(motion.joints) or 'nothing'}",
-            allowed=f"the driven joints ({', '.join(system.driven) or 'none'}), nothing prescribed",
-        )
+        allowed = f"the driven joints ({', '.join(system.driven) or 'none'}), nothing prescribed"
+        where = f"motion of {', '.join(motion.joints) or 'nothing'}"
+        raise ModelError("the motion is not one of the driven joints", where=where, allowed=allowed)
     mujoco = import_mujoco()
     model = compile_mjcf(mujoco_xml(system, values, time_step=chosen.time_step, gear_play=gear_play))
     nominal_damping = np.array(model.dof_damping)
@@ -239,8 +223,8 @@ class MujocoScene:
     mujoco: ModuleType
     model: Any
     data: Any
-    joint_ids: Integers
-    moved_joint_ids: Integers
+    joint_ids: _Integers
+    moved_joint_ids: _Integers
     point_site_ids: list[int]
     grasp_site_ids: list[list[int]]
 
@@ -302,23 +286,14 @@ def _lost(scene: MujocoScene) -> bool:
 
 def _refuse_lost(scene: MujocoScene) -> None:
     if _lost(scene):
-        raise ModelError(
-            "the simulation diverged before the motion began",
-            where="MuJoCo",
-            hint="take a shorter time_step, or a posture whose grippers are nearer to what they hold",
-        )
+        hint = "take a shorter time_step, or a posture whose grippers are nearer to what they hold"
+        raise ModelError("the simulation diverged before the motion began", where="MuJoCo", hint=hint)
 
 
 class TrackingController:
     """Computed-torque controller: the arms' inverse dynamics along the motion, the grasps' load at rest, feedback.
 
-    Parameters
-    ----------
-    scene : Scene
-        At rest, before the motion.
-    motion : Movement
-    balance : ndarray, shape (nu,)
-        Torques that hold the scene at rest [N m].
+    The scene is at rest, before the motion; `balance` (nu,) are the torques that hold it there [N m].
     """
 
     def __init__(self, scene: MujocoScene, motion: JointMotion, balance: Array) -> None:
@@ -354,14 +329,7 @@ class TrackingController:
 
 
 class _ServoCommander:
-    """Controller that commands position servos along a motion about the scene's present joint angles.
-
-    Parameters
-    ----------
-    scene : Scene
-        In the posture that is commanded first.
-    motion : Movement
-    """
+    """Controller that commands position servos along a motion about the scene's present joint angles."""
 
     def __init__(self, scene: MujocoScene, motion: JointMotion) -> None:
         self._scene, self._motion = scene, motion
@@ -424,26 +392,21 @@ def _calming(scene: MujocoScene, held: Any) -> Iterator[float]:
         _refuse_lost(scene)
         yield (calm := float(np.abs(data.qvel).max()))
         step(held, data, nstep=block)
-    raise ModelError(
-        f"the object does not come to rest in {_SETTLING_LIMIT:g} s (largest velocity {calm:.2g} rad/s)",
-        where="settling before the motion",
-        hint="give every coordinate some damping and enough stiffness to stand",
-    )
+    what = f"the object does not come to rest in {_SETTLING_LIMIT:g} s (largest velocity {calm:.2g} rad/s)"
+    hint = "give every coordinate some damping and enough stiffness to stand"
+    raise ModelError(what, where="settling before the motion", hint=hint)
 
 
 def _play(
     scene: MujocoScene,
     controller: TrackingController | _ServoCommander,
     simulation: SimulationOptions,
-    frames: Integers,
+    frames: _Integers,
 ) -> SimulationResult:
     """Simulate period by period of the controller, the torque held in each; `frames` count the simulator's steps."""
     mujoco, model, data = scene.mujoco, scene.model, scene.data
-    inner, steps, periods = (
-        simulation.simulator_steps_per_period,
-        simulation.sample_periods,
-        simulation.controller_periods_per_sample,
-    )
+    steps, periods = simulation.sample_periods, simulation.controller_periods_per_sample
+    inner = simulation.simulator_steps_per_period
     q, v, torques, points, error, seen = [], [], [], [], [], []
     for tick in range(steps * periods + 1):
         mujoco.mj_kinematics(model, data)

@@ -18,10 +18,15 @@ from yid_ocp.data import read_recording
 from yid_ocp.data.hdf5_io import open_checked_hdf5
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import ConfigError, DataError, ModelError
-from yid_ocp.export.csv_tables import export_csv
-from yid_ocp.export.format_support import EXPORT_FORMAT, FormatSupport, effect_support, parameter_support
-from yid_ocp.export.mcap import TopicSignal, export_mcap, signals_from_recording
-from yid_ocp.export.urdf_sdf import system_to_sdf, system_to_urdf
+from yid_ocp.export.models import (
+    EXPORT_FORMAT,
+    FormatSupport,
+    effect_support,
+    parameter_support,
+    system_to_sdf,
+    system_to_urdf,
+)
+from yid_ocp.export.signals import TopicSignal, export_csv, export_mcap, signals_from_recording
 from yid_ocp.files import file_sha256, to_json_types, write_json, write_text
 from yid_ocp.model.system import System
 from yid_ocp.progress import NULL_PROGRESS, Progress

@@ -33,8 +33,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.hdf5_io import create_hdf5_atomically
 from yid_ocp.errors import ModelError
-from yid_ocp.export.casadi_functions import export_step_functions
-from yid_ocp.export.latex_sheet import write_equation_sheet
+from yid_ocp.export.equations import export_step_functions, write_equation_sheet
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import Step
 from yid_ocp.integrator.step_model import StepLinearization

@@ -19,8 +19,7 @@ from yid_ocp.data.hdf5_io import open_checked_hdf5
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate_recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.errors import DataError
-from yid_ocp.export.csv_tables import export_csv
-from yid_ocp.export.ros_trajectory import joint_trajectory_message
+from yid_ocp.export.signals import export_csv, joint_trajectory_message
 from yid_ocp.integrator.step import Step
 from yid_ocp.planning.information_plan import InformativeMotionPlan, plan_informative_motion
 from yid_ocp.planning.motion_plan import MotionPlan, ParameterCovariance, plan_motion

@@ -325,9 +325,8 @@ def simulate_frames(
     ConfigError, DataError, ModelError
     """
     from yid_ocp.virtual.experiment import VirtualExperiment, run_virtual_experiment
-    from yid_ocp.virtual.inverse_kinematics import grasping_joint_angles
+    from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine
     from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
-    from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
 
     for name in settings.grasp_start_offsets:
         if name not in [grasp.name for grasp in system.grasps]:

@@ -30,10 +30,9 @@ from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import Progress
 from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperiment
-from yid_ocp.virtual.injected import INJECTABLE_KINDS, InjectedEffect, run_injected_experiment
+from yid_ocp.virtual.injected import INJECTABLE_KINDS, OUT_OF_LIBRARY_EFFECTS, InjectedEffect, run_injected_experiment
+from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
-from yid_ocp.virtual.multisine_motion import MultisineOptions, random_multisine
-from yid_ocp.virtual.out_of_library_effects import OUT_OF_LIBRARY_EFFECTS
 
 _Key = TypeVar("_Key", str, float)
 DETECTABLE_MULTIPLES = (1.0, 3.0, 10.0)

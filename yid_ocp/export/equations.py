@@ -1,8 +1,11 @@
-"""LaTeX document of a step's equations with parameter values filled in."""
+"""Export of a step's equations: CasADi functions with their C and names, and a LaTeX document."""
 
 from __future__ import annotations
 
+import json
+import os
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import casadi as ca
@@ -12,11 +15,18 @@ from numpy.typing import NDArray
 from yid_ocp.analysis.formula_text import FormulaText, count_operations, format_expressions
 from yid_ocp.analysis.step_diagnostics import with_numeric_parameters
 from yid_ocp.analysis.step_symbols import StepSymbols, SymbolBlock, escape_latex
-from yid_ocp.files import write_text
+from yid_ocp.errors import OutputError
+from yid_ocp.files import atomic_write, write_text
+from yid_ocp.integrator.codegen import casadi_c_source, parameter_jacobian_function
+from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_derivatives
 from yid_ocp.model.mechanism import merge_bodies
 from yid_ocp.model.system import System
 
 Array = NDArray[np.float64]
+
+_FORMAT = "yid-equations/1"
+_MAX_JACOBIAN_OPERATIONS = 60_000  # operations; longer C keeps a compiler busy for minutes
+_ARGUMENT_NAMES = ("q0", "q1", "p0", "z0", "z1", "lam", "u", "theta", "time_step")
 
 _MAX_ROW_OPERATIONS = 120  # operations up to which a row is written out; beyond, the bodies' part stays a letter
 _LATEX_PREAMBLE = r"""\documentclass[a4paper,10pt]{article}
@@ -40,20 +50,79 @@ _FORCE_AND_CONSTRAINT_TERMS = {
 """LaTeX of force and constraint terms in the balance and in p1, by `force_split` and `constraint_force`."""
 
 
+def _exported_step_functions(symbols: StepSymbols) -> tuple[ca.Function, ...]:
+    """The CasADi functions of a step that `export_step_functions` writes.
+
+    `rows` (del, internal, constraint, p1) and `rows_by_theta` of `_ARGUMENT_NAMES`, `rows_by_unknowns` (by q1, z1, lam)
+    where it is not too large, `points` (q, theta) to the places of the sensors' points [m], and `mechanics` (q, v,
+    theta) to mass matrix, dL/dq and dL/dv of the bodies. Placements and masses that depend on internal coordinates take
+    them at zero in the last two.
+    """
+    e, system = symbols.equations, symbols.equations.system
+    blocks = [block.expressions for block in symbols.row_blocks]
+    names = [block.name for block in symbols.row_blocks]
+    rows = ca.Function("rows", e.arguments, ca.cse(blocks), list(_ARGUMENT_NAMES), names)
+    by_rows, by_p1, _ = parameter_jacobian_function(e, system.parameters.names)(*e.arguments)
+    theta = ca.Function("rows_by_theta", e.arguments, [ca.vertcat(by_rows, by_p1)], list(_ARGUMENT_NAMES), ["slope"])
+    slope = ca.cse([ca.jacobian(ca.vertcat(*blocks), ca.vertcat(e.q1, e.z1, e.lam))])
+    made = [rows, theta]
+    if count_operations([slope[0].nz[:]], ca.vertcat(*e.arguments)) <= _MAX_JACOBIAN_OPERATIONS:
+        made.append(ca.Function("rows_by_unknowns", e.arguments, slope, list(_ARGUMENT_NAMES), ["slope"]))
+    q, v = ca.SX.sym("q", system.n_coordinates), ca.SX.sym("v", system.n_coordinates)
+    kinematics = forward_kinematics(system.mechanism, q)
+    rigid = rigid_body_derivatives(kinematics, v, system.gravity)
+    places = [kinematics.frame_position(name) for name in system.point_frames]
+    mechanics = [mass_matrix(rigid, system.mechanism), rigid.lagrangian_by_q, rigid.lagrangian_by_v]
+    internal = ca.vertcat(*system.internal_coordinates.values()) if system.internal_coordinates else ca.SX(0, 1)
+    still = [ca.substitute(x, internal, ca.SX.zeros(internal.numel())) for x in (*places, *mechanics)]
+    if places:
+        outputs = [name.replace(":", "_").replace("%", "") for name in system.point_frames]
+        made.append(ca.Function("points", [q, e.theta], ca.cse(still[: len(places)]), ["q", "theta"], outputs))
+    matrices = ca.cse(still[len(places) :])
+    made.append(ca.Function("mechanics", [q, v, e.theta], matrices, ["q", "v", "theta"], ["mass", "L_q", "L_v"]))
+    return tuple(made)
+
+
+def export_step_functions(
+    symbols: StepSymbols, folder: str | os.PathLike[str], theta: Array, time_step: float
+) -> tuple[Path, ...]:
+    """Write `NAME.casadi` for each of `_exported_step_functions`, all of them as `equations.c`, and `names.json`.
+
+    `names.json` gives the values of theta beside the parameters' names, and the time step [s]. Returns the files
+    written; `OutputError` where the folder, made if absent, or a file cannot be written.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"the folder cannot be made ({error.strerror})", where=str(folder)) from error
+    functions = _exported_step_functions(symbols)
+    written = []
+    for function in functions:
+        written.append(folder / f"{function.name()}.casadi")
+        with atomic_write(written[-1]) as temporary:
+            function.save(str(temporary))
+    source = folder / "equations.c"
+    write_text(source, casadi_c_source("equations", functions))
+    parameters = symbols.equations.system.parameters
+    values = {p.name: {"value": float(value), "unit": p.unit} for p, value in zip(parameters, theta, strict=True)}
+    names = {
+        "format": _FORMAT,
+        "functions": {f.name(): {"arguments": f.name_in(), "results": f.name_out()} for f in functions},
+        "rows": {block.name: list(block.full_names) for block in symbols.row_blocks},
+        "columns": {block.name: list(block.full_names) for block in symbols.column_blocks},
+        "parameters": values,
+        "time_step": time_step,
+    }
+    listed = folder / "names.json"
+    write_text(listed, json.dumps(names, indent=1) + "\n")
+    return (*written, source, listed)
+
+
 def write_equation_sheet(path: Path, symbols: StepSymbols, theta: Array, free: Sequence[str], time_step: float) -> None:
     """Write the LaTeX document of a step's equations; `OutputError` if the file cannot be written.
 
-    Parameters
-    ----------
-    path : Path
-        `.tex` file.
-    symbols : StepSymbols
-    theta : ndarray, shape (ntheta,)
-        Values filled in for all parameters but the free ones.
-    free : sequence of str
-        Parameters that stay symbols; a table lists their values.
-    time_step : float
-        h [s]
+    Values `theta` are filled in for all parameters but the `free` ones, which stay symbols; a table lists their values.
     """
     system = symbols.equations.system
     values = dict(zip(system.parameters.names, map(float, theta), strict=True))
@@ -111,7 +180,7 @@ def _tree_tables(system: System, values: dict[str, float]) -> list[str]:
         axis, role = f"${_vector(joint.axis)}$", roles.get(joint.name, "free")
         joints.append((name, joint.kind, parent, role, axis, place, turned))
         # what gravity pulls at may differ from the mass; only inertia is listed
-        body = merge_bodies(b.__class__(b.mass, b.center_of_mass, b.inertia_about_com) for b in joint.bodies)
+        body = merge_bodies(replace(b, gravity_fraction=None) for b in joint.bodies)
         if body is not None:
             com = np.array(ca.DM(body.center_of_mass)).ravel()
             tensor = np.array(ca.DM(body.inertia_about_com))
@@ -133,8 +202,11 @@ def _rows(symbols: StepSymbols, block: SymbolBlock, values: dict[str, float], fr
     old = ca.vertcat(*(p.symbol for p in fixed)) if fixed else ca.SX(0, 1)
     new = ca.SX(ca.DM([values[p.name] for p in fixed])) if fixed else ca.SX(0, 1)
     rest = {"del": e.p0 + e.balance_remainder, "p1": e.p1_remainder}.get(block.name)
-    title = rf"\subsection*{{{escape_latex(block.name)}: {block.meaning}}}"
-    lines = [title]
+    lines = [rf"\subsection*{{{escape_latex(block.name)}: {block.meaning}}}"]
+
+    def formula(expression: ca.SX) -> FormulaText:
+        return format_expressions([expression], symbols.column_symbols, symbols.column_display_names, latex=True)
+
     if rest is not None:
         sign = "-" if block.name == "del" else "+"
         pull = "" if not e.lam.numel() else ", $G$ the pull of the grasps"
@@ -147,20 +219,15 @@ def _rows(symbols: StepSymbols, block: SymbolBlock, values: dict[str, float], fr
         whole = ca.substitute(block.expressions[i], old, new)
         count = count_operations([whole], symbols.column_symbols)
         if count <= _MAX_ROW_OPERATIONS:
-            made = format_expressions([whole], symbols.column_symbols, symbols.column_display_names, latex=True)
+            made = formula(whole)
             lines.append(_equation(letter, made.expression_texts[0], made))
         elif rest is not None:
-            made = format_expressions(
-                [ca.substitute(rest[i], old, new)], symbols.column_symbols, symbols.column_display_names, latex=True
-            )
+            made = formula(ca.substitute(rest[i], old, new))
             bodies = rf"B_{{\mathrm{{{escape_latex(label)}}}}}"
             pulled = "" if not e.lam.numel() else rf" - G_{{\mathrm{{{escape_latex(label)}}}}}"
             lost = "" if e.closed_form_force is None else r" + \text{drag}"
-            added = (
-                made.expression_texts[0]
-                if made.expression_texts[0].startswith("-")
-                else f"+ {made.expression_texts[0]}"
-            )
+            [text] = made.expression_texts
+            added = text if text.startswith("-") else f"+ {text}"
             lines.append(_equation(letter, f"{bodies}{pulled}{lost} {added}", made))
         else:
             lines.append(rf"${letter}$: {count} operations, in \texttt{{rows.casadi}} and \texttt{{equations.c}}")

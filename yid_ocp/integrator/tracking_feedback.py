@@ -1,4 +1,4 @@
-"""Change of the discrete momentum of a known motion of the driven joints due to effects.
+"""The tracking filter of driven arms: feedback about the measured motion, gains from an LQR, and what effects do to it.
 
 The discrete momentum contains half the impulse of the previous step, so a torque other than the recorded one, or an
 effect, changes the momentum of the same motion.
@@ -6,21 +6,191 @@ effect, changes the momentum of the same motion.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
+import scipy.linalg
+from numpy.typing import ArrayLike, NDArray
 
-from yid_ocp.integrator.mapped_function import MappedFunction
-from yid_ocp.integrator.step import Step
-from yid_ocp.model.system import Effect
+from yid_ocp.errors import ModelError
+from yid_ocp.integrator.compiler import MappedFunction
+from yid_ocp.integrator.step import Step, compile_step_like
+from yid_ocp.integrator.step_model import NEWTON_ITERATION_LIMIT, TrackingFeedback
+from yid_ocp.model.system import System
 from yid_ocp.parallel import LockedCache
 
 Array = NDArray[np.float64]
+_Wanted = Sequence[tuple[int, int]]  # a column of derivatives, and which of the parameters it is by
 _NEWTON_ITERATIONS = 5
 """Newton iterations for a law of an internal coordinate that is nonlinear in its next value."""
+
+
+def proportional_feedback(step: Step, measured: ArrayLike, gains: ArrayLike) -> TrackingFeedback:
+    """Feedback u_k = ubar_k - K (q_k - qbar_k) with a constant diagonal K on the driven joints.
+
+    Parameters
+    ----------
+    step : Step
+    measured : array_like, shape (N + 1, nu)
+        Measured angles qbar of the driven joints at every node [rad].
+    gains : array_like, shape (nu,) or scalar
+        [N m/rad]
+
+    Raises
+    ------
+    ModelError
+        A negative gain, or a number of gains that is neither one nor nu.
+    """
+    reference = np.asarray(measured, float)
+    nu = step.sizes["nu"]
+    values = np.atleast_1d(np.asarray(gains, float))
+    if values.size not in (1, nu) and nu % max(values.size, 1):
+        raise ModelError(f"{values.size} gains for {nu} driven joints", allowed=f"one, {nu}, or one arm's worth")
+    values = np.resize(values, nu)
+    if np.any(values < 0):
+        raise ModelError(f"a tracking gain is negative: {values.min():g} N m/rad", allowed="0 or more")
+    steps = len(reference) - 1
+    gain = np.broadcast_to(np.diag(values), (steps, nu, nu)).copy()
+    return TrackingFeedback(np.array(step.system.driven_indices, np.int32), gain, reference[:-1])
+
+
+def lqr_feedback(
+    step: Step,
+    measured: ArrayLike,
+    torque: ArrayLike,
+    theta: ArrayLike,
+    angle_std: ArrayLike = 0.02,
+    rate_std: float = 0.3,
+    torque_std: ArrayLike = 1.0,
+    arms: Step | None = None,
+) -> TrackingFeedback:
+    """Feedback of a finite-horizon LQR of the driven arms, linearised about their measured motion.
+
+    Minimises the sum of |dq|^2/angle_std^2 + |M^-1 dp|^2/rate_std^2 + |du|^2/torque_std^2 over the recording for the
+    arms without the object; the gains act on the arms' angles and momenta. The reference momentum follows from the
+    measured angles and torques by the arms' own DEL equations, so that it means the same as the model's.
+
+    Parameters
+    ----------
+    step : Step
+    measured : array_like, shape (N + 1, nu)
+        Angles of the driven joints at every node [rad], smooth enough to be differenced.
+    torque : array_like, shape (N, nu)
+        Measured torques [N m].
+    theta : array_like, shape (ntheta,)
+    angle_std, rate_std, torque_std : float or array_like
+        Standard deviations that weigh the same [rad], [rad/s], [N m].
+    arms : Step, optional
+        From `arms_only_step`; made when absent.
+
+    References
+    ----------
+    Anderson and Moore (1990), Optimal Control: Linear Quadratic Methods, section 2.4.
+    """
+    reference, torques = np.asarray(measured, float), np.asarray(torque, float)
+    system = step.system
+    arm_step = arms_only_step(step) if arms is None else arms
+    values = dict(zip(system.parameters.names, np.asarray(theta, float), strict=True))
+    parameters = arm_step.system.parameters
+    arm_theta = parameters.vector({name: values[name] for name in parameters.names})
+    nu = len(system.driven)
+    momenta = _reference_momentum(arm_step, reference, torques, arm_theta)
+    steps = len(reference) - 1
+
+    weight_u = np.diag(1.0 / np.broadcast_to(np.asarray(torque_std, float), (nu,)) ** 2)
+    weight_q = np.diag(1.0 / np.broadcast_to(np.asarray(angle_std, float), (nu,)) ** 2)
+    gain = np.zeros((steps, nu, 2 * nu))
+    cost: Array | None = None
+    states = np.hstack([reference, momenta])[:-1]
+    by_state, by_torque = _one_step_each(arm_step, states, torques, reference[1:], arm_theta)
+    for k in reversed(range(steps)):
+        a, b = by_state[k], by_torque[k]
+        rate = a[:nu, nu:] / step.time_step
+        stage = scipy.linalg.block_diag(weight_q, rate.T @ rate / rate_std**2)
+        cost = stage if cost is None else cost
+        inner = weight_u + b.T @ cost @ b
+        gain[k] = np.linalg.solve(inner, b.T @ cost @ a)
+        closed = a - b @ gain[k]
+        cost = stage + closed.T @ cost @ closed + gain[k].T @ weight_u @ gain[k]
+        cost = 0.5 * (cost + cost.T)
+    n = system.n_coordinates
+    index = np.concatenate([np.array(system.driven_indices), n + np.array(system.driven_indices)])
+    return TrackingFeedback(index.astype(np.int32), gain, np.hstack([reference[:-1], momenta[:-1]]))
+
+
+def arms_only_step(step: Step) -> Step:
+    """The step of a system of the driven joints only, without the object and everything else.
+
+    Raises
+    ------
+    ModelError
+        The driven joints do not come first in the configuration.
+    """
+    return compile_step_like(step, _arms_only(step.system))
+
+
+def _arms_only(system: System) -> System:
+    mechanism = system.mechanism
+    keep = [mechanism.joint_index(name) for name in system.driven]
+    if sorted(keep) != list(range(len(keep))):
+        what = "the LQR filter needs the driven joints to come first in the configuration"
+        raise ModelError(what, where=", ".join(system.driven), hint="use proportional gains instead")
+    frames = {name: frame for name, frame in mechanism.frames.items() if frame.joint_index < len(keep)}
+    arms = replace(mechanism, joints=mechanism.joints[: len(keep)], frames=frames, link_chains={})
+    wanted: Sequence[str] = system.driven
+    return replace(
+        system,
+        mechanism=arms,
+        elastic_joints=(),
+        grasps=(),
+        prescribed=(),
+        joint_compliances={},
+        segment_layouts=(),
+        point_frames=(),
+        effects=(),
+        joint_damping={name: value for name, value in system.joint_damping.items() if name in wanted},
+    )
+
+
+def _reference_momentum(arm_step: Step, measured: Array, torque: Array, theta: Array) -> Array:
+    """p_k = D2 L_d(q_{k-1}, q_k) + f+ of the measured motion, shape (N + 1, nu); the first from a standing start."""
+    angles, torques = np.vstack([measured[:1], measured]), np.vstack([torque[:1], torque])
+    state = np.hstack([angles, np.zeros_like(angles)])
+    none = np.zeros((len(torques), 0))
+    return arm_step.kernel.linearize(theta, state, none, torques, (), False).p1
+
+
+def _one_step_each(arm_step: Step, start: Array, torque: Array, guess: Array, theta: Array) -> tuple[Array, Array]:
+    """A_k (N, 2 nu, 2 nu) and B_k (N, 2 nu, nu) of one step from each state, by Newton's iteration of all at once.
+
+    `guess` (N, nu) says where about the steps lead; NaN where that has no answer.
+    """
+    count, nu = torque.shape
+    # the kernel takes states in a row: each start and what follows it; the steps between them mean nothing
+    state, torques = np.repeat(start, 2, axis=0), np.repeat(torque, 2, axis=0)[:-1]
+    state[1::2, :nu] = guess
+    none, own = np.zeros((2 * count - 1, 0)), slice(None, None, 2)
+    try:
+        for _ in range(NEWTON_ITERATION_LIMIT):
+            found = arm_step.kernel.linearize(theta, state, none, torques, (), True)
+            change = np.linalg.solve(found.residual_by_new[own], found.residual[own, :, None])[:, :, 0]
+            if not np.max(np.abs(change), initial=0.0) > arm_step.model.tolerance:
+                break
+            state[1::2, :nu] -= change
+        else:
+            raise np.linalg.LinAlgError
+        known = np.broadcast_to(np.eye(nu), (count, nu, nu))
+        moved = -np.linalg.solve(
+            found.residual_by_new[own],
+            np.concatenate([found.residual_by_old[own], known, found.residual_by_input[own]], axis=2),
+        )
+    except np.linalg.LinAlgError:
+        return np.full((count, 2 * nu, 2 * nu), np.nan), np.full((count, 2 * nu, nu), np.nan)
+    momenta = np.concatenate([found.p1_by_old[own], 0 * known, found.p1_by_input[own]], axis=2)
+    after = np.concatenate([moved, found.p1_by_new[own] @ moved + momenta], axis=1)
+    return after[:, :, : 2 * nu], after[:, :, 2 * nu :]
 
 
 @dataclass(frozen=True)
@@ -86,12 +256,14 @@ class MomentumShift:
         z0, z1 = (ca.SX(ca.DM.zeros(e.z0.numel())) for _ in range(2))
         z0[self._kept], z1[self._kept] = (x[self._kept] for x in (e.z0, e.z1))
         known = [*whole, z0, z1, ca.SX(ca.DM.zeros(e.lam.numel()))]
-        [momentum, law] = ca.substitute(
-            [ca.densify(e.p1[driven]), e.internal_residual[self._kept]], [e.q0, e.q1, e.z0, e.z1, e.lam], known
-        )
+        wanted = [ca.densify(e.p1[driven]), e.internal_residual[self._kept]]
+        [momentum, law] = ca.substitute(wanted, [e.q0, e.q1, e.z0, e.z1, e.lam], known)
         last, then = e.z0[self._kept], e.z1[self._kept]
         self._time_step = np.array([step.time_step])
-        neutral = {name: value for effect in system.effects for name, value in _neutral(effect).items()}
+        # an effect that does not say with what values it is absent is taken as it stands
+        neutral: dict[str, float] = {}
+        for effect in system.effects:
+            neutral |= getattr(effect, "neutral_values", {})
         at = {i: neutral[name] for i, name in enumerate(system.parameters.names) if name in neutral}
         columns = [i for i in _columns(ca.vertcat(momentum, law), e.theta) if i in at]
         self._columns, self._neutral = np.array(columns, int), np.array([at[i] for i in columns])
@@ -106,19 +278,14 @@ class MomentumShift:
 
         self._maps: LockedCache[bool, MappedFunction] = LockedCache(compiled)
         self._impulse = ca.Function("impulse", inputs, [ca.densify(ca.jacobian(momentum, e.u))])
-        rows = {name: row for row, name in enumerate(system.internal_coordinates)}
-        self._memories = tuple(
-            (
-                [i for i, name in enumerate(self.parameter_names) if name in effect.parameters.names],
-                _Memory(step, [before, now, last, then, e.theta, e.time_step], law, own, columns),
-            )
-            for effect in system.effects
-            if (
-                own := [
-                    self._kept.index(row) for name in effect.internal_coordinates if (row := rows[name]) in self._kept
-                ]
-            )
-        )
+        at_row = {name: row for row, name in enumerate(system.internal_coordinates)}
+        symbols = [before, now, last, then, e.theta, e.time_step]
+        self._memories: list[tuple[list[int], _Memory]] = []
+        for effect in system.effects:
+            rows = [self._kept.index(at_row[x]) for x in effect.internal_coordinates if at_row[x] in self._kept]
+            own = [i for i, name in enumerate(self.parameter_names) if name in effect.parameters.names]
+            if rows:
+                self._memories.append((own, _Memory(step, symbols, law, rows, columns)))
 
     def momentum_by_torque(self, theta: Array) -> Array:
         """Derivative of the momentum by the torques of the previous step, shape (nu, nu) [s]."""
@@ -132,7 +299,7 @@ class MomentumShift:
 
         Parameters
         ----------
-        recorded, true : Motion
+        recorded, true : DrivenJointMotion
             The recorded motion, and the motion corrected for effects; only the latter's derivatives are used.
         theta : ndarray, shape (ntheta,)
         names : sequence of str
@@ -165,7 +332,7 @@ class MomentumShift:
         return (value - plain)[:, :, 0], total
 
     def _remembered(
-        self, motion: DrivenJointMotion, theta: Array, wanted: Sequence[tuple[int, int]], width: int
+        self, motion: DrivenJointMotion, theta: Array, wanted: _Wanted, width: int
     ) -> tuple[Array, Array | None]:
         """What joints remember at every node but the last, (N, nk), and its derivatives, (N, nk, d), or None."""
         steps = len(motion.torque)
@@ -194,26 +361,14 @@ def torque_error_feedthrough(gain: Array, by_torque: Array) -> Array:
     """Derivative of the applied torque by an error of the recorded torque, feedback included, (nu, nu).
 
     The feedback's reference momenta follow from the recorded torque; the error is assumed equal in the previous step.
-
-    Parameters
-    ----------
-    gain : ndarray, shape (nu, nb)
-        Feedback gain of one step.
-    by_torque : ndarray, shape (nu, nu)
-        See `MomentumShift.momentum_by_torque`.
+    `gain` (nu, nb) is that of one step, `by_torque` is `MomentumShift.momentum_by_torque`.
     """
     nu = len(by_torque)
     return np.eye(nu) + gain[:, nu:] @ by_torque if gain.shape[1] > nu else np.eye(nu)
 
 
 class _Memory:
-    """The internal coordinates of one effect of driven joints, along a motion.
-
-    Attributes
-    ----------
-    rows : list of int
-        Among all that the momentum depends on.
-    """
+    """The internal coordinates of one effect along a motion; `rows` among those that the momentum depends on."""
 
     def __init__(
         self, step: Step, inputs: Sequence[ca.SX], law: ca.SX, rows: list[int], columns: Sequence[int]
@@ -231,9 +386,8 @@ class _Memory:
         self._many: LockedCache[int, ca.Function] = LockedCache(advance.mapaccum)
         outputs = [ca.densify(x) for x in (*(ca.jacobian(after, x) for x in (old, before, now)), by_theta)]
         function = ca.Function("remembering", [old, before, now, theta, symbol], outputs)
-        self._maps: LockedCache[None, MappedFunction] = LockedCache(
-            lambda _: MappedFunction(function, shared_inputs=(3, 4), use_compiler=step.is_compiled)
-        )
+        compiled = step.is_compiled
+        self._maps = LockedCache[None, MappedFunction](lambda _: MappedFunction(function, (3, 4), compiled))
 
     def along(self, motion: DrivenJointMotion, start: Array, theta: Array) -> Array:
         """Values at every node but the last, shape (N, k)."""
@@ -245,19 +399,13 @@ class _Memory:
         return np.stack(found)
 
     def slopes(
-        self,
-        motion: DrivenJointMotion,
-        values: Array,
-        start: list[int],
-        theta: Array,
-        wanted: Sequence[tuple[int, int]],
-        width: int,
+        self, motion: DrivenJointMotion, values: Array, start: list[int], theta: Array, columns: _Wanted, width: int
     ) -> Array:
         """Derivatives of the values, shape (N, k, d)."""
         before, now = motion.angles_before_and_after
         by_old, by_before, by_now, by_theta = self._maps(None)(_one_before(values), before, now, theta, self._time_step)
         total = np.zeros((*values.shape, width))
-        for column, own in wanted:
+        for column, own in columns:
             total[1:, :, column] = by_theta[1:, :, own]
         if motion.angles_sensitivity is not None:
             turned = motion.angles_sensitivity[:-1]
@@ -278,8 +426,3 @@ def _columns(expression: ca.SX, theta: ca.SX) -> list[int]:
 def _one_before(values: Array) -> Array:
     """Every entry but the last moved by one; the first stands twice."""
     return np.concatenate([values[:1], values[:-1]])
-
-
-def _neutral(effect: Effect) -> Mapping[str, float]:
-    """Values with which an effect is absent; one that does not say so is taken as it stands."""
-    return dict(getattr(effect, "neutral_values", {}))

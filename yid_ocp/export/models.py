@@ -1,0 +1,232 @@
+"""Export of models: a system's tree as URDF or SDF, and what a format has for each parameter and effect."""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+from xml.etree.ElementTree import Element, SubElement
+
+import casadi as ca
+import numpy as np
+
+from yid_ocp.model.mechanism import Inertia, Joint, Mechanism, Placement, merge_bodies
+from yid_ocp.model.rotations import rpy_from_rotation
+from yid_ocp.model.system import System
+from yid_ocp.model.urdf import mechanism_to_urdf
+from yid_ocp.virtual.mjcf import (
+    EMULATED_ASPECTS,
+    MODEL_ASPECTS,
+    JointDynamics,
+    ParameterEvaluator,
+    aspects_of_parameters,
+    effect_terms_and_aspects,
+    joint_dynamics,
+    xml_numbers,
+)
+
+_SupportStatus = Literal["native", "emulated", "not representable"]
+_ORDER: tuple[_SupportStatus, ...] = ("native", "emulated", "not representable")
+
+EXPORT_FORMAT = "yid-export/1"
+
+_MIN_LINK_MASS, _MIN_LINK_INERTIA = 1e-9, 1e-12
+"""Mass [kg] and inertia [kg m^2] given to massless links, for engines that require them."""
+
+
+def system_to_urdf(system: System, values: Mapping[str, float]) -> str:
+    """The URDF text of a system: joints with damping and friction, links with inertias; no springs, no grasps.
+
+    A `mujoco` element gives MuJoCo the least masses that it asks for; others read over it.
+    """
+    tree, terms = _tree(system, values)
+    root = ElementTree.fromstring(mechanism_to_urdf(tree))
+    mujoco = Element("mujoco")
+    sizes = {"boundmass": xml_numbers([_MIN_LINK_MASS]), "boundinertia": xml_numbers([_MIN_LINK_INERTIA])}
+    sizes["fusestatic"] = "false"
+    SubElement(mujoco, "compiler", sizes)
+    root.insert(0, mujoco)
+    for joint in root.findall("joint"):
+        own = terms.get(joint.get("name", ""))
+        if own is not None and joint.get("type") != "fixed":
+            sizes = {"damping": xml_numbers([own.damping]), "friction": xml_numbers([own.dry_friction])}
+            SubElement(joint, "dynamics", sizes)
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def system_to_sdf(system: System, values: Mapping[str, float]) -> str:
+    """The SDF 1.10 world text of a system: joints with springs, damping, friction, links with inertias; no grasps."""
+    tree, terms = _tree(system, values)
+    root = Element("sdf", version="1.10")
+    world = SubElement(root, "world", name="world")
+    gravity = SubElement(world, "gravity")
+    gravity.text = xml_numbers(ParameterEvaluator(system, values)(system.gravity))
+    model = SubElement(world, "model", name="model")
+    for i, joint in enumerate(tree.joints):
+        _sdf_link(model, tree, i)
+        _sdf_joint(model, tree, joint, terms.get(joint.name, JointDynamics()))
+    for name, frame in tree.frames.items():
+        on = "world" if frame.joint_index < 0 else f"{tree.joints[frame.joint_index].name}_link"
+        # what stands in the world is placed from the model, which stands at its origin
+        attached = {} if frame.joint_index < 0 else {"attached_to": on}
+        element = SubElement(model, "frame", {"name": f"frame_{name}", **attached})
+        _sdf_pose(element, frame.placement)
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _tree(system: System, values: Mapping[str, float]) -> tuple[Mechanism, dict[str, JointDynamics]]:
+    """The tree in numbers, its bodies without weights of their own, and what its joints have."""
+    tree = replace(system.mechanism, parameters=system.parameters).with_numeric_values(values)
+    joints = tuple(replace(j, bodies=tuple(replace(b, gravity_fraction=None) for b in j.bodies)) for j in tree.joints)
+    return replace(tree, joints=joints), joint_dynamics(system, ParameterEvaluator(system, values))
+
+
+def _sdf_link(model: Element, tree: Mechanism, index: int) -> None:
+    joint = tree.joints[index]
+    link = SubElement(model, "link", name=f"{joint.name}_link")
+    above = {} if joint.parent_index < 0 else {"relative_to": f"{tree.joints[joint.parent_index].name}_link"}
+    _sdf_pose(link, joint.placement, above)
+    body = merge_bodies(joint.bodies)
+    if body is None:
+        body = Inertia.from_values(_MIN_LINK_MASS, np.zeros(3), _MIN_LINK_INERTIA * np.eye(3))
+    inertial = SubElement(link, "inertial")
+    _sdf_pose(inertial, Placement(ca.SX(ca.DM.eye(3)), body.center_of_mass))
+    _sdf_number(inertial, "mass", float(body.mass))
+    tensor, inertia = np.array(ca.DM(body.inertia_about_com)), SubElement(inertial, "inertia")
+    for key, at in {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}.items():
+        _sdf_number(inertia, key, tensor[at])
+
+
+def _sdf_joint(model: Element, tree: Mechanism, joint: Joint, terms: JointDynamics) -> None:
+    element = SubElement(model, "joint", name=joint.name, type=joint.kind)
+    parent = "world" if joint.parent_index < 0 else f"{tree.joints[joint.parent_index].name}_link"
+    for tag, text in (("parent", parent), ("child", f"{joint.name}_link")):
+        SubElement(element, tag).text = text
+    axis = SubElement(element, "axis")
+    SubElement(axis, "xyz").text = xml_numbers(joint.axis)
+    limit = SubElement(axis, "limit")
+    for key in ("lower", "upper", "effort", "velocity"):
+        size = getattr(joint, f"{key}_limit")
+        if math.isfinite(size):
+            _sdf_number(limit, key, size)
+    dynamics = SubElement(axis, "dynamics")
+    _sdf_number(dynamics, "damping", terms.damping)
+    _sdf_number(dynamics, "friction", terms.dry_friction)
+    if terms.stiffness > 0:
+        _sdf_number(dynamics, "spring_reference", terms.constant_force / terms.stiffness)
+        _sdf_number(dynamics, "spring_stiffness", terms.stiffness)
+
+
+def _sdf_pose(element: Element, placement: Placement, attributes: Mapping[str, str] | None = None) -> None:
+    turn, at = np.array(ca.DM(placement.rotation)), np.array(ca.DM(placement.translation)).ravel()
+    pose = SubElement(element, "pose", dict(attributes or {}))
+    pose.text = xml_numbers([*at, *rpy_from_rotation(turn)])
+
+
+def _sdf_number(element: Element, tag: str, value: float) -> None:
+    SubElement(element, tag).text = xml_numbers([value])
+
+
+@dataclass(frozen=True)
+class FormatSupport:
+    """Support of a format for one parameter or effect, with its means or the reason against."""
+
+    status: _SupportStatus
+    how: str
+
+    @staticmethod
+    def worst_of(parts: Iterable[FormatSupport]) -> FormatSupport:
+        """The worst status of several parts that belong together, with the explanations of those that have it."""
+        known = list(parts)
+        status = max((part.status for part in known), key=_ORDER.index)
+        return FormatSupport(status, "; ".join(dict.fromkeys(part.how for part in known if part.status == status)))
+
+
+# what each format calls the aspects that it has; others it has not
+_MJCF = {
+    "stiffness": "stiffness of joints",
+    "rest": "springref of joints",
+    "damping": "damping of joints",
+    "geometry": "places of bodies and sites",
+    "inertia": "inertials",
+    "weight": "gravcomp of bodies",
+    "gravity": "gravity of the option",
+    "grasp": "equality constraints between sites",
+    "grasp_compliance": "a tendon without length, which damps along its pull alone",
+    "sprung_joint": "joints with stiffness and damping",
+    "armature": "armature of joints",
+    "dry_friction": "frictionloss of joints, which sticks at rest where the model creeps",
+    "cubic_stiffness": "polynomial stiffness of joints",
+    "servo": "position actuators: gainprm, biasprm, forcerange and delay",
+    "torque_gain": "gainprm of actuators",
+    "torque_offset": "biasprm of actuators",
+    "torque_delay": "delay of actuators",
+    "torque_lag": "filterexact actuators",
+}
+_URDF = {
+    "damping": "damping of joints",
+    "geometry": "origins of joints",
+    "inertia": "inertials",
+    "dry_friction": "friction of joints, which engines take in ways of their own",
+}
+_SDF = {
+    **_URDF,
+    "stiffness": "spring_stiffness of axes",
+    "rest": "spring_reference of axes",
+    "geometry": "poses of links and frames",
+    "sprung_joint": "spring_stiffness and damping of axes",
+    "gravity": "gravity of the world",
+}
+_SUPPORT_BY_FORMAT: Mapping[str, Mapping[str, FormatSupport]] = {
+    name: {
+        aspect: FormatSupport("not representable", f"{name.upper()} has nothing for {words}")
+        if aspect not in table
+        else FormatSupport("emulated" if aspect in EMULATED_ASPECTS else "native", table[aspect])
+        for aspect, words in MODEL_ASPECTS.items()
+    }
+    for name, table in (("mjcf", _MJCF), ("urdf", _URDF), ("sdf", _SDF))
+}
+
+_READING = FormatSupport("not representable", f"{MODEL_ASPECTS['reading']}: correct the readings instead")
+_NEUTRAL = FormatSupport("native", "neutral: it changes nothing and is left out")
+_UNUSED = FormatSupport("native", "it enters nothing in this model")
+
+
+def effect_support(system: System, values: Mapping[str, float], form: str) -> dict[str, FormatSupport]:
+    """Support of a format (`mjcf`, `urdf` or `sdf`) for every effect of a system, by label."""
+    value, found = ParameterEvaluator(system, values), dict[str, FormatSupport]()
+    theta = dict(zip(system.parameters.names, system.parameters.vector(values), strict=True))
+    for effect in system.effects:
+        label = f"{effect.kind}@{effect.location}"
+        amplitudes = _neutral(effect)
+        if amplitudes and all(theta[name] == neutral for name, neutral in amplitudes.items()):
+            found[label] = _NEUTRAL
+            continue
+        _, aspects = effect_terms_and_aspects(system, effect, value)
+        parts = (_READING if x == "reading" else _SUPPORT_BY_FORMAT[form][x] for x in sorted(aspects))
+        found[label] = FormatSupport.worst_of(parts)
+    return found
+
+
+def _neutral(effect: Any) -> dict[str, float]:
+    """Neutral value of the parameters whose neutral value makes an effect vanish."""
+    neutral: Mapping[str, float] = getattr(effect, "neutral_values", {})
+    return {name: neutral[name] for name in getattr(effect, "amplitude_names", ())}
+
+
+def parameter_support(system: System, effects: Mapping[str, FormatSupport], form: str) -> dict[str, FormatSupport]:
+    """Support of a format for every parameter; an effect's parameters have the support of the effect."""
+    found = {}
+    for entry in system.parameters:
+        owner = entry.name.rpartition(".")[0]
+        if owner in effects:
+            found[entry.name] = effects[owner]
+            continue
+        aspects = aspects_of_parameters(system, entry.symbol)
+        parts = [_SUPPORT_BY_FORMAT[form][aspect] for aspect in sorted(aspects)] or [_UNUSED]
+        found[entry.name] = FormatSupport.worst_of(parts)
+    return found

@@ -1,0 +1,212 @@
+"""Export of signals: CSV tables, ROS 2 messages in one MCAP file for bag readers, and joint trajectories for ROS."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.data import JointGroup, Recording
+from yid_ocp.errors import OutputError
+from yid_ocp.files import atomic_write, os_error_reason
+
+Array = NDArray[np.float64]
+_SignalKind = Literal["joints", "point", "vector", "wrench"]
+_MESSAGE_TYPES: Mapping[_SignalKind, str] = {
+    "joints": "sensor_msgs/msg/JointState",
+    "point": "geometry_msgs/msg/PointStamped",
+    "vector": "geometry_msgs/msg/Vector3Stamped",
+    "wrench": "geometry_msgs/msg/WrenchStamped",
+}
+_WORLD_FRAME = "world"
+_AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class TopicSignal:
+    """Time series of one ROS topic.
+
+    Attributes
+    ----------
+    topic : str
+    kind : "joints", "point", "vector" or "wrench"
+    t : ndarray, shape (M,)
+        [s]
+    values : mapping of str to ndarray, shape (M, n)
+        Of joints `position`, `velocity` and `effort`, as many as there are; of all else `xyz`, shape (M, 3), the forces
+        of a wrench. Messages without a number are left out.
+    names : sequence of str
+        Of the joints.
+    frame : str
+        Coordinate frame of points and vectors.
+    """
+
+    topic: str
+    kind: _SignalKind
+    t: Array
+    values: Mapping[str, Array]
+    names: Sequence[str] = field(default=())
+    frame: str = _WORLD_FRAME
+
+
+def export_mcap(signals: Sequence[TopicSignal], path: str | os.PathLike[str]) -> float:
+    """Write signals into one MCAP file, with the definitions of their messages, in the order of time.
+
+    Parameters
+    ----------
+    signals : sequence of TopicSignal
+    path : path-like
+        File to write.
+
+    Returns
+    -------
+    float
+        Shift added to all times because stamps cannot be negative: whole seconds, usually zero [s].
+
+    Raises
+    ------
+    OutputError
+        `rosbags` is not installed, there is nothing to write, or the file cannot be written.
+    """
+    path = Path(path)
+    try:
+        from rosbags.rosbag2 import StoragePlugin, Writer
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        hint = "pip install 'yid-ocp[bags]'"
+        raise OutputError("writing MCAP needs the package rosbags", where=str(path), hint=hint) from None
+    if not any(len(signal.t) for signal in signals):
+        raise OutputError("there is nothing to write", where=str(path))
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    first = min(float(np.min(signal.t)) for signal in signals if len(signal.t))
+    shift = float(max(0.0, -np.floor(first)))
+    made = [(stamp, k, told) for k, signal in enumerate(signals) for stamp, told in _messages(signal, shift, store)]
+    made.sort(key=lambda entry: entry[:2])
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # a bag is a folder; its one file is all that is wanted
+        with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+            bag = Path(folder) / "bag"
+            with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+                connections = [writer.add_connection(s.topic, _MESSAGE_TYPES[s.kind], typestore=store) for s in signals]
+                for stamp, k, message in made:
+                    writer.write(connections[k], stamp, store.serialize_cdr(message, _MESSAGE_TYPES[signals[k].kind]))
+            [file] = bag.glob("*.mcap")
+            with atomic_write(path) as temporary:
+                os.replace(file, temporary)
+    except OSError as error:
+        raise OutputError(f"the file cannot be written: {os_error_reason(error)}", where=str(path)) from error
+    return shift
+
+
+def signals_from_recording(recording: Recording) -> list[TopicSignal]:
+    """The signals of a recording: `/joint_states`, `/joint_commands`, `/external_efforts` and `/points/GROUP/POINT`."""
+    found: list[TopicSignal] = []
+    for group in recording.groups:
+        if isinstance(group, JointGroup):
+            own = group.channels
+            parts = {
+                "/joint_states": {name: name for name in ("position", "velocity", "effort")},
+                "/joint_commands": {name: f"{name}_command" for name in ("position", "velocity")},
+                "/external_efforts": {"effort": "external_effort"},
+            }
+            for topic, channels in parts.items():
+                values = {name: own[channel] for name, channel in channels.items() if channel in own}
+                if values:
+                    found.append(TopicSignal(topic, "joints", group.t, values, group.names))
+            continue
+        for i, name in enumerate(group.names):
+            topic, place = f"/points/{group.name}/{name}", {"xyz": group.position[:, i]}
+            found.append(TopicSignal(topic, "point", group.t, place, frame=group.frame or _WORLD_FRAME))
+    return found
+
+
+def _messages(signal: TopicSignal, shift: float, store: Any) -> Iterator[tuple[int, Any]]:
+    """Stamp [ns] and message of every time at which there is a number."""
+    types = store.types
+
+    def content(i: int) -> list[Any]:
+        if signal.kind == "joints":
+            # none at all of what is not known
+            known = (signal.values.get(name) for name in ("position", "velocity", "effort"))
+            rows = (np.zeros(0) if values is None else np.ascontiguousarray(values[i], float) for values in known)
+            return [list(signal.names), *rows]
+        xyz = _vector(types, "Point" if signal.kind == "point" else "Vector3", signal.values["xyz"][i])
+        no_torque = _vector(types, "Vector3", np.zeros(3))
+        return [types["geometry_msgs/msg/Wrench"](xyz, no_torque) if signal.kind == "wrench" else xyz]
+
+    known = np.any([np.isfinite(values).any(axis=1) for values in signal.values.values()], axis=0)
+    for i in np.flatnonzero(known):
+        stamp = round(1e9 * (float(signal.t[i]) + shift))
+        time = types["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9)
+        header = types["std_msgs/msg/Header"](time, signal.frame)
+        yield stamp, types[_MESSAGE_TYPES[signal.kind]](header, *content(int(i)))
+
+
+def _vector(types: Any, kind: str, xyz: Array) -> Any:
+    return types[f"geometry_msgs/msg/{kind}"](*map(float, xyz))
+
+
+def export_csv(recording: Recording, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
+    """Write one table per group, `<group>.csv`, with the columns that `read_csv` knows and all digits.
+
+    Standard deviations, the kind of effort, sensor, frame, pose and clock are not in the tables; a point not seen is an
+    empty cell.
+
+    Returns the files written, joints first; `OutputError` where the folder or a file cannot be written.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"the folder cannot be made ({error.strerror})", where=str(folder)) from error
+    written = []
+    for group in recording.groups:
+        if isinstance(group, JointGroup):
+            stem, columns = "joints", [f"{channel}_{name}" for channel in group.channels for name in group.names]
+            table = np.column_stack([group.t, *group.channels.values()])
+        else:
+            stem, columns = group.name, [f"{name}_{axis}" for name in group.names for axis in _AXES]
+            table = np.column_stack([group.t, group.position.reshape(len(group.t), -1)])
+        written.append(folder / f"{stem}.csv")
+        with atomic_write(written[-1]) as temporary, temporary.open("x", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(["t", *columns])
+            writer.writerows([["" if math.isnan(value) else repr(value) for value in row] for row in table.tolist()])
+    return tuple(written)
+
+
+def joint_trajectory_message(
+    names: Sequence[str], t: Array, position: Array, velocity: Array, acceleration: Array, effort: Array
+) -> dict[str, Any]:
+    """A joint trajectory as a dict in the form of ROS's trajectory_msgs/JointTrajectory.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Of nj joints.
+    t : ndarray, shape (N,)
+        Since the start [s].
+    position, velocity, acceleration, effort : ndarray, shape (N, nj)
+
+    References
+    ----------
+    https://docs.ros.org/en/api/trajectory_msgs/html/msg/JointTrajectory.html
+    """
+    points = []
+    for i, time in enumerate(t):
+        second = math.floor(time)
+        since = {"sec": second, "nanosec": min(round(1e9 * (time - second)), 999_999_999)}
+        rates = {"velocities": velocity[i].tolist(), "accelerations": acceleration[i].tolist()}
+        own = {"positions": position[i].tolist(), **rates, "effort": effort[i].tolist()}
+        points.append({**own, "time_from_start": since})
+    header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
+    return {"header": header, "joint_names": list(names), "points": points}

@@ -1,0 +1,312 @@
+"""Motions of the driven joints: the angles at which grippers meet what they hold, and random multisines from there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import least_squares
+
+from yid_ocp.errors import ModelError
+from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_derivatives
+from yid_ocp.model.mechanism import Mechanism, Placement
+from yid_ocp.model.system import System
+from yid_ocp.virtual.mjcf import ParameterEvaluator
+
+Array = NDArray[np.float64]
+
+BAXTER_ARM_JOINTS = ("s0", "s1", "e0", "e1", "w0", "w1", "w2")
+_ELBOW_UP_ANGLES: Mapping[str, float] = {
+    f"{side}_{joint}": sign * value if joint in ("s0", "e0", "w0", "w2") else value
+    for side, sign in (("left", 1.0), ("right", -1.0))
+    for joint, value in zip(BAXTER_ARM_JOINTS, (-0.40, -1.13, -0.15, 1.19, -0.08, 1.13, 0.0), strict=True)
+}
+"""Initial guess of Baxter's joint angles [rad]: elbow above the hand, the right arm mirrored."""
+
+_PULL = 1e-5  # [m/rad]; moves the gripper by less than 1e-9 m
+
+
+class JointMotion(Protocol):
+    """Interface of a motion of the driven joints about their initial angles, from rest."""
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints."""
+
+    def offset_and_derivatives(self, t: float) -> tuple[Array, Array, Array]:
+        """Offset from the initial angles, velocity and acceleration at time t [s], three arrays of shape (nj,)."""
+
+
+@dataclass(frozen=True)
+class MultisineMotion:
+    """A multisine motion of the driven joints about their initial angles, starting at rest.
+
+    offset_j(t) = r(t) sum_i amplitude_ji sin(2 pi frequency_ji t + phase_ji), with the ramp
+    r = 10 s^3 - 15 s^4 + 6 s^5, s = min(t / ramp, 1), twice continuously differentiable.
+
+    Attributes
+    ----------
+    joints : tuple of str, length nj
+    amplitude, frequency, phase : ndarray, shape (nj, nf)
+        [rad or m], [Hz], [rad]
+    ramp_time : float
+        Duration of the ramp [s].
+    """
+
+    joints: tuple[str, ...]
+    amplitude: Array
+    frequency: Array
+    phase: Array
+    ramp_time: float = 1.0
+
+    def offset_and_derivatives(self, t: float) -> tuple[Array, Array, Array]:
+        """Offset from the initial angles, velocity and acceleration at time t [s], three arrays of shape (nj,)."""
+        omega = 2 * math.pi * self.frequency
+        angle = omega * t + self.phase
+        sine, cosine = self.amplitude * np.sin(angle), self.amplitude * np.cos(angle)
+        wave, rate, bend = sine.sum(1), (omega * cosine).sum(1), -(omega**2 * sine).sum(1)
+        s = min(t / self.ramp_time, 1.0)
+        r = s**3 * (10 - 15 * s + 6 * s**2)
+        dr = 30 * s**2 * (1 - s) ** 2 / self.ramp_time
+        ddr = 60 * s * (1 - s) * (1 - 2 * s) / self.ramp_time**2
+        return r * wave, dr * wave + r * rate, ddr * wave + 2 * dr * rate + r * bend
+
+
+@dataclass(frozen=True)
+class MultisineOptions:
+    """Amplitude, speed and frequency limits of a random multisine motion.
+
+    Attributes
+    ----------
+    gripper_travel : float
+        Largest distance of a gripper from its start [m]; every arm is scaled to it by itself. Much more than the
+        default, on two arms, lets the foam Y snap from one shape to another.
+    max_joint_speed : float
+        Largest joint speed [rad/s]; an arm that would exceed it travels less.
+    sines_per_joint : int
+        One in each of as many equal parts (in log frequency) of `frequency_band`, and as many that shake.
+    frequency_band, shake_frequency_band : (float, float)
+        Lowest and highest frequency [Hz]; those that shake well below half the rate of what records the torque.
+    ramp_time, duration : float
+        [s]
+    shake_torque_rms : float
+        Root mean square of the torque that each joint's own inertia takes beside its travel [N m], in sines of equal
+        torque, none faster than `max_shake_speed`. Zero leaves torques as gentle as the travel.
+    max_shake_speed : float
+        Largest velocity of one of these sines [rad/s]; what light wrists reach first.
+    """
+
+    gripper_travel: float = 0.11
+    max_joint_speed: float = 1.4
+    sines_per_joint: int = 3
+    frequency_band: tuple[float, float] = (0.2, 2.0)
+    ramp_time: float = 1.0
+    duration: float = 5.0
+    shake_torque_rms: float = 0.0
+    shake_frequency_band: tuple[float, float] = (4.0, 9.0)
+    max_shake_speed: float = 0.15
+
+
+def random_multisine(
+    system: System,
+    values: Mapping[str, float] | None = None,
+    *,
+    seed: int,
+    initial_joint_angles: Mapping[str, float] | None = None,
+    excitation: MultisineOptions | None = None,
+) -> MultisineMotion:
+    """A random multisine motion, scaled to the requested travel of the grippers.
+
+    Amplitudes fall in inverse proportion to the frequency and towards the base. Where absent, parameter values are
+    nominal and initial angles [rad or m] those of `grasping_joint_angles`.
+    """
+    chosen = excitation or MultisineOptions()
+    rng = np.random.default_rng(seed)
+    motion = _drawn(system, chosen, rng)
+    times = np.linspace(0.0, chosen.duration, 251)
+    start = grasping_joint_angles(system, values) if initial_joint_angles is None else initial_joint_angles
+    tree = replace(system.mechanism, parameters=system.parameters).with_numeric_values(values)
+    q0 = np.zeros(system.n_coordinates)
+    q0[[tree.joint_index(name) for name in start]] = list(start.values())
+    holders = [tree.frame(grasp.holder_frame) for grasp in system.grasps]
+    chains = [tree.ancestor_joints(frame.joint_index) for frame in holders]
+    arms = [[i for i, j in enumerate(system.driven_indices) if j in chain] for chain in chains]
+    for arm in arms:  # the same angle near the base moves the hand further
+        motion = _scaled(motion, arm, np.linspace(0.5, 1.0, len(arm)))
+    q = ca.SX.sym("q", system.n_coordinates)
+    kinematics = forward_kinematics(tree, q)
+    for frame, arm in zip(holders, arms, strict=True):
+        tip = ca.Function("tip", [q], [kinematics.frame_position(frame)]).map(len(times))
+        waves = np.array([motion.offset_and_derivatives(t)[:2] for t in times])[:, :, arm]
+        scale = _scale(chosen, tip, q0, [system.driven_indices[i] for i in arm], waves)
+        motion = _scaled(motion, arm, np.full(len(arm), scale))
+    if not holders:
+        fastest = max(float(np.abs(motion.offset_and_derivatives(t)[1]).max()) for t in times)
+        joints = range(len(motion.joints))
+        motion = _scaled(motion, joints, np.full(len(joints), chosen.max_joint_speed / fastest))
+    if chosen.shake_torque_rms == 0.0:
+        return motion
+    rigid = rigid_body_derivatives(kinematics, ca.SX(ca.DM.zeros(system.n_coordinates)), ca.SX(ca.DM.zeros(3)))
+    inertia = np.diag(np.array(ca.densify(ca.Function("M", [q], [mass_matrix(rigid, tree)])(q0))))
+    return _shaken(motion, chosen, inertia[list(system.driven_indices)], rng)
+
+
+def _scaled(motion: MultisineMotion, joints: Sequence[int], factors: Array) -> MultisineMotion:
+    amplitude = motion.amplitude.copy()
+    amplitude[list(joints)] *= factors[:, None]
+    return replace(motion, amplitude=amplitude)
+
+
+def _drawn(system: System, excitation: MultisineOptions, rng: np.random.Generator) -> MultisineMotion:
+    """Frequencies, phases and relative amplitudes at random."""
+    shape = len(system.driven), excitation.sines_per_joint
+    frequency = _drawn_frequencies(excitation.frequency_band, shape, rng)
+    phase = rng.uniform(0.0, 2 * math.pi, shape)
+    amplitude = rng.uniform(0.7, 1.3, shape) / frequency
+    return MultisineMotion(system.driven, amplitude, frequency, phase, excitation.ramp_time)
+
+
+def _drawn_frequencies(band: tuple[float, float], shape: tuple[int, int], rng: np.random.Generator) -> Array:
+    """One frequency in each of as many equal parts, in log frequency, of a band."""
+    edges = np.linspace(math.log(band[0]), math.log(band[1]), shape[1] + 1)
+    return np.exp(rng.uniform(edges[:-1], edges[1:], shape))
+
+
+def _shaken(
+    motion: MultisineMotion, excitation: MultisineOptions, inertia: Array, rng: np.random.Generator
+) -> MultisineMotion:
+    """The motion with fast sines added; `inertia` of the driven joints, shape (nj,) [kg m^2]."""
+    shape = motion.frequency.shape
+    frequency = _drawn_frequencies(excitation.shake_frequency_band, shape, rng)
+    omega = 2 * math.pi * frequency
+    torque = excitation.shake_torque_rms * math.sqrt(2.0 / shape[1])
+    amplitude = np.minimum(torque / (inertia[:, None] * omega**2), excitation.max_shake_speed / omega)
+    phase = np.hstack([motion.phase, rng.uniform(0.0, 2 * math.pi, shape)])
+    amplitude, frequency = np.hstack([motion.amplitude, amplitude]), np.hstack([motion.frequency, frequency])
+    return replace(motion, amplitude=amplitude, frequency=frequency, phase=phase)
+
+
+def _scale(excitation: MultisineOptions, tip: ca.Function, q0: Array, columns: Sequence[int], waves: Array) -> float:
+    """Factor with which an arm's waves (N, 2, nj), offset and velocity, take the tip as far as wanted."""
+
+    def distance(scale: float) -> float:
+        path = np.tile(q0, (len(waves), 1))
+        path[:, columns] += scale * waves[:, 0]
+        positions = np.array(tip(path.T))
+        return float(np.linalg.norm(positions - positions[:, :1], axis=0).max())
+
+    low, high = 0.0, excitation.max_joint_speed / float(np.abs(waves[:, 1]).max())
+    if distance(high) > excitation.gripper_travel:
+        for _ in range(40):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if distance(middle) < excitation.gripper_travel else (low, middle)
+    return high
+
+
+def grasping_joint_angles(
+    system: System,
+    values: Mapping[str, float] | None = None,
+    *,
+    start_angles: Mapping[str, float] | None = None,
+    offsets: Mapping[str, ArrayLike] | None = None,
+) -> dict[str, float]:
+    """Arm joint angles at which every gripper meets the end of the undeformed object, or a point beside it.
+
+    Only positions are matched; of several solutions one near the initial guess is returned.
+
+    Parameters
+    ----------
+    system : System
+        Those joints are sought that carry a grasp's holder and are not elastic.
+    values : mapping of str to float, optional
+        Parameter values; nominal where absent.
+    start_angles : mapping of str to float, optional
+        Start of the search by joint name [rad or m]. Where absent: elbow up for Baxter, else the middle of the joint's
+        range (zero when it has none).
+    offsets : mapping of grasp to array_like, shape (3,), optional
+        Where each gripper stands beside the undeformed tube end, in the world [m]. Two arms that hold a straight Y are
+        at its full stretch, a singular posture: moving them towards it makes the start well defined.
+
+    Returns
+    -------
+    dict of str to float
+        Angle of every driven joint and every joint sought [rad or m], in configuration order.
+
+    Raises
+    ------
+    ModelError
+        The grasped points cannot be reached within the joint limits.
+    """
+    tree = replace(system.mechanism, parameters=system.parameters).with_numeric_values(values)
+    value = ParameterEvaluator(system, values)
+    posture = _undeformed(system, tree, value, {**_ELBOW_UP_ANGLES, **(start_angles or {})})
+    elastic = {spring.joint_name for spring in system.elastic_joints}
+    holding = {j for grasp in system.grasps for j in tree.ancestor_joints(tree.frame(grasp.holder_frame).joint_index)}
+    sought = [j for j, joint in enumerate(tree.joints) if j in holding and joint.name not in elastic]
+    if sought:
+        gap = _gap_function(system, tree, value, offsets or {}, sought)
+        posture = _reached(system, tree, posture, sought, gap)
+    wanted = sorted(set(sought) | set(system.driven_indices))
+    return {tree.joints[j].name: float(posture[j]) for j in wanted}
+
+
+def _undeformed(system: System, tree: Mechanism, value: ParameterEvaluator, start: Mapping[str, float]) -> Array:
+    """Configuration with the object at rest and the other joints where the search starts, shape (n,)."""
+    posture, elastic = np.zeros(system.n_coordinates), {spring.joint_name for spring in system.elastic_joints}
+    for spring in system.elastic_joints:
+        posture[tree.joint_index(spring.joint_name)] = value(spring.rest_angle)[0]
+    for j, joint in enumerate(tree.joints):
+        if joint.name not in elastic:
+            bounded = math.isfinite(joint.lower_limit) and math.isfinite(joint.upper_limit)
+            middle = 0.5 * (joint.lower_limit + joint.upper_limit) if bounded else 0.0
+            posture[j] = np.clip(start.get(joint.name, middle), joint.lower_limit, joint.upper_limit)
+    return posture
+
+
+def _gap_function(
+    system: System, tree: Mechanism, value: ParameterEvaluator, offsets: Mapping[str, ArrayLike], sought: Sequence[int]
+) -> ca.Function:
+    """From q to the gaps between grippers and what they hold [m], and their derivatives by the joints sought."""
+    q = ca.SX.sym("q", system.n_coordinates)
+    kinematics = forward_kinematics(tree, q)
+    gaps = []
+    for grasp in system.grasps:
+        offset = Placement(ca.SX(ca.DM.eye(3)), ca.SX(ca.DM(value(grasp.holder_offset))))
+        beside = ca.DM(np.asarray(offsets.get(grasp.name, np.zeros(3)), float))
+        held = kinematics.frame_position(grasp.held_frame) + beside
+        gaps.append((kinematics.frame_pose(grasp.holder_frame) @ offset).translation - held)
+    gap = ca.vertcat(*gaps)
+    return ca.Function("gap", [q], [gap, ca.jacobian(gap, q)[:, list(sought)]])
+
+
+def _reached(system: System, tree: Mechanism, posture: Array, sought: Sequence[int], gap: ca.Function) -> Array:
+    """The posture with the joints sought where they close all gaps."""
+
+    def at(x: Array) -> Array:
+        full = posture.copy()
+        full[sought] = x
+        return full
+
+    lower = np.array([tree.joints[j].lower_limit for j in sought])
+    upper = np.array([tree.joints[j].upper_limit for j in sought])
+    near = np.clip(posture[sought], lower + 1e-6, upper - 1e-6)
+    # The pull towards the start keeps joints that do not move the gripper where they are.
+    result = least_squares(
+        lambda x: np.append(np.array(gap(at(x))[0]), _PULL * (x - near)),
+        near,
+        jac=lambda x: np.vstack([np.array(ca.densify(gap(at(x))[1])), _PULL * np.eye(len(x))]),
+        bounds=(lower, upper),
+        **dict.fromkeys(("xtol", "ftol", "gtol"), 1e-15),
+    )
+    miss = np.abs(result.fun[: gap.numel_out(0)]).max()
+    if miss > 1e-7:
+        where = ", ".join(f"{grasp.holder_frame} -> {grasp.held_frame}" for grasp in system.grasps)
+        allowed, hint = "grasps within reach and within the joint limits", "move the object, or give another seed"
+        what = f"the arms miss the grasped points by {1e3 * miss:.3g} mm"
+        raise ModelError(what, where=where, allowed=allowed, hint=hint)
+    return at(result.x)
