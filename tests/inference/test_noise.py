@@ -15,7 +15,7 @@ from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.evaluation import _sensor_whitened_residual
 
 TORQUE, BIAS, ANGLE = 0.3, 0.2, 2e-3
-TRACKED = {"feedback": "proportional", "gains": (9.0,)}
+TRACKED = {"feedback": "proportional", "proportional_gains": (9.0,)}
 
 
 def problem_of(folder, *, encoders, period=1, feedback=TRACKED, effects=(), size=1.0, angle=ANGLE, **more):
@@ -119,7 +119,7 @@ def test_with_encoders_the_outcome_does_not_depend_on_the_tracking_filter(urdf_f
     """Encoders are measurements and the filter only says where to linearise: gains move chi2 by what is not linear."""
     costs = []
     for g in (9.0, gain):
-        feedback = {"feedback": "proportional", "gains": (g,)}
+        feedback = {"feedback": "proportional", "proportional_gains": (g,)}
         problem = small_gap(problem_of(urdf_folder, encoders=True, feedback=feedback, size=0.1), size=0.1)
         weighted = whitened_at(problem, problem.start)
         rows = problem.residual_rows.data

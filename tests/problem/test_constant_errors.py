@@ -35,7 +35,7 @@ def arm(folder, bias, free, recordings=2, **how):
     recorded = [taken(step, seed) for seed in range(recordings)]
     if bias is not None:
         return EstimationProblem(step, recorded, free, options(bias), held_out=[taken(step, 9)])
-    local = options(local=tuple(OFFSETS), priors=OFFSETS)
+    local = options(local_parameters=tuple(OFFSETS), prior_stds=OFFSETS)
     return EstimationProblem(step, recorded, (*free, *OFFSETS), local)
 
 

@@ -75,7 +75,7 @@ def test_residuals_of_a_right_model_are_white_among_joints(urdf_folder):
         problem = arm(step, *noisy)
         evaluation = problem.evaluate(problem.initial_unknowns, derivatives=False)
         [samples], [predicted] = (
-            problem.episode_predictions[0].measurements,
+            problem.episodes[0].measurements,
             evaluation.episode_predictions[0].predicted_outputs,
         )
         found.append(evaluation.residual.reshape(-1, 2))

@@ -35,13 +35,13 @@ def misfit(problem):
 
 def test_an_estimated_start_is_estimated_in_held_out_recordings_too(swinging):
     at_rest = misfit(swinging(initial_state="equilibrium"))
-    estimated = misfit(swinging(initial_state="estimated", configuration_std=0.2, velocity_std=1.0))
+    estimated = misfit(swinging(initial_state="estimated", start_configuration_std=0.2, start_velocity_std=1.0))
     assert at_rest > 100
     assert estimated < 4
 
 
 def test_only_the_first_moments_count(swinging):
-    problem = swinging(initial_state="estimated", configuration_std=0.2, velocity_std=1.0)
+    problem = swinging(initial_state="estimated", start_configuration_std=0.2, start_velocity_std=1.0)
     episode = problem.held_out[0]
     found = problem.held_out_evaluation_points(problem.initial_unknowns)[0][2]
     assert np.any(found)

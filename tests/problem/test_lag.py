@@ -80,7 +80,13 @@ def test_of_a_negative_time_constant_the_value_follows() -> None:
 
 @pytest.mark.parametrize(
     ("form", "size"),
-    [("of_steps", 0.02), ("of_steps", 1e-3), ("of_nodes", 0.02), ("of_nodes", 1e-3), ("of_nodes", -0.02)],
+    [
+        ("filter_step_means", 0.02),
+        ("filter_step_means", 1e-3),
+        ("filter_node_values", 0.02),
+        ("filter_node_values", 1e-3),
+        ("filter_node_values", -0.02),
+    ],
 )
 def test_derivatives_agree_with_differences(form, size) -> None:
     """By the time constant directly, and through what is followed."""

@@ -156,7 +156,7 @@ def test_the_residual_says_what_its_rows_are(pendulum):
     assert [part.start for part in parts] == [0, rows.data.stop, rows.stated_priors.stop]
     assert rows.weak_priors.stop == len(evaluation.residual)
     for episode, groups, result in zip(
-        problem.episode_predictions, rows.measurements, evaluation.episode_predictions, strict=True
+        problem.episodes, rows.measurements, evaluation.episode_predictions, strict=True
     ):
         for samples, part, predicted in zip(episode.measurements, groups, result.predicted_outputs, strict=True):
             np.testing.assert_array_equal(

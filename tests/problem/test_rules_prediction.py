@@ -22,12 +22,12 @@ DELAYED = (("effort_delay", "gripper", {"delay": 0.0137}), ("effort_offset", "sh
 SOFT = (("joint_coulomb", "elbow", {"tau_c": 0.05}), ("gravity_tilt", "world", {"rx": 0.03, "ry": 0.02}))
 STICKING = (("joint_presliding", "shoulder", {"tau_c": 0.3, "yield_angle": 0.02}),)
 
-TRACKED = {"feedback": "proportional", "gains": (9.0,)}
+TRACKED = {"feedback": "proportional", "proportional_gains": (9.0,)}
 FILTERED = {"feedback": "lqr"}
 CASES = {
     "free": ((), {}, {}),
     "estimated start": ((), {}, {"initial_state": "estimated"}),
-    "local": (SOFT, {}, {"local": ("elbow.stiffness",)}),
+    "local": (SOFT, {}, {"local_parameters": ("elbow.stiffness",)}),
     "robust": (LATE, {}, {"huber_threshold": 1.5}),
     "prescribed": (MISREAD + LATE, {"prescribed": ("shoulder",)}, {}),
     "prescribed gears": (GEARS + HEAVY, {"prescribed": ("shoulder",)}, {}),

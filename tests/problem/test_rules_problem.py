@@ -81,7 +81,7 @@ def test_blocks_and_values_find_their_places():
 
 
 def test_a_recording_has_its_own_values_and_start(make):
-    problem = make(local=("elbow.rest",), initial_state="estimated")
+    problem = make(local_parameters=("elbow.rest",), initial_state="estimated")
     x = np.arange(1.0, 1 + len(problem.unknown_names))
     theta, offset = problem.split(x, 1)
     names = problem.system.parameters.names
@@ -128,7 +128,7 @@ def test_joints_are_coupled_by_the_inertia_of_every_configuration(momentum, free
 
 def test_an_estimated_start_has_a_prior_in_angles_and_momenta(make, momentum, free_step):
     """The momentum's prior is that of a velocity times the inertia at the joint."""
-    problem = make(initial_state="estimated", configuration_std=0.07, velocity_std=0.3, seeds=(1,))
+    problem = make(initial_state="estimated", start_configuration_std=0.07, start_velocity_std=0.3, seeds=(1,))
     theta = free_step.system.parameters.vector()
     inertia = [momentum(free_step, np.zeros(2), velocity, theta)[i] for i, velocity in enumerate(np.eye(2))]
     # two rods: 1/3 m l^2 and more about the shoulder
@@ -149,7 +149,7 @@ def test_without_estimated_starts_there_are_none(make):
 
 
 def test_stated_priors_are_gaussian_about_the_start(make):
-    problem = make(priors={"elbow.stiffness": 0.5, "elbow.rest": 0.02}, weak_prior_factor=0.0)
+    problem = make(prior_stds={"elbow.stiffness": 0.5, "elbow.rest": 0.02}, weak_prior_factor=0.0)
     x = np.array([7.0, 4.0, 0.14])
     residual, rows = problem.prior_residual(x)
     np.testing.assert_allclose(residual, [2.0, 2.0])
@@ -159,7 +159,7 @@ def test_stated_priors_are_gaussian_about_the_start(make):
 
 
 def test_weak_priors_are_log_normal_and_only_of_positive_unknowns_without_another(make):
-    problem = make(priors={"shoulder.stiffness": 2.0}, weak_prior_factor=10.0)
+    problem = make(prior_stds={"shoulder.stiffness": 2.0}, weak_prior_factor=10.0)
     x = np.array([7.0, 30.0, 0.5])
     residual, rows = problem.prior_residual(x)
     np.testing.assert_allclose(residual, [0.5, 1.0])
@@ -196,7 +196,7 @@ def test_some_problems_have_no_weak_prior(make, options):
 
 def test_an_unknown_is_as_large_as_its_start_its_prior_or_a_tenth_of_its_range(make):
     values = {"shoulder.stiffness": 0.0, "elbow.stiffness": 0.0, "elbow.rest": 0.0}
-    problem = make(values=values, priors={"elbow.stiffness": 0.25}, initial_state="estimated", seeds=(1,))
+    problem = make(values=values, prior_stds={"elbow.stiffness": 0.25}, initial_state="estimated", seeds=(1,))
     np.testing.assert_allclose(problem.unknown_scales[:2], [1.0, 0.25])
     np.testing.assert_allclose(problem.unknown_scales[3:], problem.initial_state_prior_std)
     lower, upper = problem.bounds
@@ -209,7 +209,7 @@ def test_an_unknown_is_as_large_as_its_start_its_prior_or_a_tenth_of_its_range(m
 
 
 def test_the_residual_is_made_of_measurements_then_priors(make):
-    problem = make(priors={"elbow.stiffness": 1.0}, weak_prior_factor=5.0)
+    problem = make(prior_stds={"elbow.stiffness": 1.0}, weak_prior_factor=5.0)
     evaluation = problem.evaluate(problem.initial_unknowns + np.array([1.0, 2.0, 0.1]))
     rows = problem.residual_rows
     assert [[part.stop - part.start for part in group] for group in rows.measurements] == [[75, 39], [75, 39]]
@@ -227,7 +227,7 @@ def test_the_residual_is_made_of_measurements_then_priors(make):
 def test_the_papers_rows_are_metres_and_inform_in_units_of_the_noise(make, stated):
     names = () if stated is None else sorted({s.sensor.group_name for s in make().episodes[0].measurements})
     sensors = {name: SensorOptions(std=stated) for name in names}
-    problem = make(weighting="paper", priors={"elbow.stiffness": 1.0}, sensors=sensors)
+    problem = make(weighting="paper", prior_stds={"elbow.stiffness": 1.0}, sensors=sensors)
     evaluation = problem.evaluate(problem.initial_unknowns + np.array([0.0, 2.0, 0.0]))
     # 75 coordinates of 2 cm and 39 of 5 cm in each recording
     noise = stated or math.sqrt((75 * 0.02**2 + 39 * 0.05**2) / 114)
@@ -333,7 +333,7 @@ def test_a_held_out_start_balances_its_prior_and_its_first_moments(make, held, c
 
 
 def test_held_out_recordings_are_predicted_with_shared_parameters_only(make, held):
-    problem = make(held_out=held, local=("elbow.rest",), initial_state="estimated")
+    problem = make(held_out=held, local_parameters=("elbow.rest",), initial_state="estimated")
     x = problem.vector({"elbow.stiffness": 4.0, "elbow.rest[run_1]": 0.7})
     found = problem.predict_held_out(x)
     assert [episode.name for episode, _ in found] == ["run_8", "run_9"]
@@ -380,7 +380,7 @@ def test_the_first_moments_are_at_least_two_steps_of_a_fifth_of_a_second(make, h
 
 
 def test_problems_that_free_other_parameters_share_all_else(make):
-    problem = make(may_free=("elbow.damping",), local=("elbow.rest",))
+    problem = make(may_free=("elbow.damping",), local_parameters=("elbow.rest",))
     other = problem.with_free_subset(("elbow.damping", "shoulder.stiffness"))
     assert other.unknown_names == ("elbow.damping", "shoulder.stiffness")
     assert other.episodes is problem.episodes
@@ -396,7 +396,9 @@ def test_problems_that_free_other_parameters_share_all_else(make):
 
 
 def test_problems_prepared_anew_keep_what_is_not_changed(make, held):
-    problem = make(held_out=held, values={"elbow.damping": 0.7}, priors={"elbow.rest": 0.1}, local=("elbow.rest",))
+    problem = make(
+        held_out=held, values={"elbow.damping": 0.7}, prior_stds={"elbow.rest": 0.1}, local_parameters=("elbow.rest",)
+    )
     index = problem.system.parameters.index
     shorter = problem.truncated_to(0.1)
     assert (shorter.episodes[0].grid.steps, shorter.held_out, shorter.free) == (10, (), FREE)
@@ -425,7 +427,7 @@ def test_a_problem_cannot_be_changed_through_its_parameters(make):
     [
         ({"free": ("elbow.stiffness", "elbow.stiffness")}, "named twice"),
         ({"free": ("elbow.stiff",)}, "elbow.stiffness"),
-        ({"local": ("elbow.damping",)}, "'elbow.damping' is not free"),
+        ({"local_parameters": ("elbow.damping",)}, "'elbow.damping' is not free"),
         ({"priors": {"elbow.damping": 0.1}}, "'elbow.damping' is not free"),
         ({"values": {"elbow.stiffness": -1.0}}, "elbow.stiffness"),
     ],
