@@ -298,7 +298,12 @@ def test_errors_are_euclidean_for_points_and_plain_for_efforts():
         "joints.effort.j": {"rmse": pytest.approx(math.sqrt(12.5)), "unit": "N m", "n": 4},
     }
     hidden = measured(efforts("j"), [0], [0.0], [[NAN]])
-    assert rmse_by_channel([SimpleNamespace(predicted=(np.zeros((1, 1)),))], [SimpleNamespace(samples=(hidden,))]) == {}
+    assert (
+        rmse_by_channel(
+            [SimpleNamespace(predicted_outputs=(np.zeros((1, 1)),))], [SimpleNamespace(measurements=(hidden,))]
+        )
+        == {}
+    )
 
 
 def test_errors_of_points_in_all_recordings(step):

@@ -26,7 +26,7 @@ def test_what_is_simulated_is_what_is_found(problem):
     truth = {"elbow.stiffness": 4.2, "elbow.damping": 0.31}
     made = problem.simulate_recording(truth)
     assert made.name == "run_1_simulated"
-    assert {name: made.truth[name] for name in FREE} == truth
+    assert {name: made.true_parameters[name] for name in FREE} == truth
     assert np.array_equal(made.points[0].t, problem.episodes[0].recording.points[0].t)
     again = EstimationProblem(problem.step, [made], FREE, problem.options)
     solution = yid.solve(again)
