@@ -260,7 +260,7 @@ COMMANDS: tuple[CliCommand, ...] = (
         _blind,
     ),
     CliCommand("batch", "solve or diagnose many recordings or robots, one table and report of all", "batch", _batch),
-    CliCommand("report", "compare runs of one model: what drifted, which run to distrust", "report", _report),
+    CliCommand("report", "compare runs of one model: what drifted, which run to distrust", "run_history", _report),
     CliCommand("plan", "plan a motion of the arms with the identified model", "plan", _configured),
     CliCommand("simulate", "write what the model says would be recorded", "simulate", _simulate),
     CliCommand("check", "validate a configuration, its recordings and the model before a long run", "check", _doubting),

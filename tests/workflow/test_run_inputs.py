@@ -16,30 +16,30 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.effects import EFFECTS
 from yid_ocp.errors import ConfigError
 from yid_ocp.files import file_sha256
-from yid_ocp.workflow import plugins
+from yid_ocp.workflow import run_inputs
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.run_folder import software_versions
 
 EFFECT = """
-from yid_ocp.effects.base import EFFECTS, EffectBase, Quantity, on_joint, robot_joints
-from yid_ocp.model.system import Terms
+from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, force_on_joint, robot_joints
+from yid_ocp.model.system import StepTerms
 
 
 @EFFECTS.register("{kind}")
 class Constant(EffectBase):
     equation = "F = push"
-    depends_on = "how it stands against gravity"
+    required_excitation = "how it stands against gravity"
 
     @classmethod
-    def locations(cls, system):
+    def possible_locations(cls, system):
         return robot_joints(system)
 
     @classmethod
-    def quantities_at(cls, location, system):
-        return (Quantity("push", "N m", 0.0, -5.0, 5.0, (-1.0, 1.0), "constant torque"),)
+    def parameter_definitions(cls, location, system):
+        return (ParameterDefinition("push", "N m", 0.0, -5.0, 5.0, (-1.0, 1.0), "constant torque"),)
 
-    def terms(self, state):
-        return Terms(force=on_joint(state.system, self.location, self["push"]))
+    def step_terms(self, state):
+        return StepTerms(generalized_force=force_on_joint(state.system, self.location, self["push"]))
 """
 
 
@@ -47,7 +47,7 @@ class Constant(EffectBase):
 def kinds(monkeypatch):
     """Kinds that a test registers are forgotten after it."""
     before = set(EFFECTS)
-    monkeypatch.setattr(plugins, "_loaded", {})
+    monkeypatch.setattr(run_inputs, "_loaded", {})
     yield before
     EFFECTS.unregister(set(EFFECTS) - before)
 
@@ -103,16 +103,16 @@ def test_a_file_that_is_missing_or_changed(kinds, pendulum) -> None:
 def test_distributions_are_found_by_their_entry_point(kinds, pendulum, monkeypatch) -> None:
     (pendulum.parent / "constant_effect.py").write_text(EFFECT.format(kind="constant"))
     monkeypatch.syspath_prepend(str(pendulum.parent))
-    entry = metadata.EntryPoint("constant", "constant_effect", plugins._ENTRY_POINT_GROUP)
+    entry = metadata.EntryPoint("constant", "constant_effect", run_inputs._ENTRY_POINT_GROUP)
     found = replace_dist(entry, SimpleNamespace(name="my-effects", version="1.2"))
-    monkeypatch.setattr(plugins, "_installed", lambda: [found])
+    monkeypatch.setattr(run_inputs, "_installed", lambda: [found])
     assert software_versions()["entry point constant"] == "my-effects 1.2"
     build_system(load_config(pendulum))
     assert "constant" in EFFECTS
-    plugins._loaded.clear()  # as if a script had imported it before
+    run_inputs._loaded.clear()  # as if a script had imported it before
     build_system(load_config(pendulum))
-    broken = replace_dist(metadata.EntryPoint("gone", "no_such_module", plugins._ENTRY_POINT_GROUP), found.dist)
-    monkeypatch.setattr(plugins, "_installed", lambda: [broken])
+    broken = replace_dist(metadata.EntryPoint("gone", "no_such_module", run_inputs._ENTRY_POINT_GROUP), found.dist)
+    monkeypatch.setattr(run_inputs, "_installed", lambda: [broken])
     with pytest.raises(ConfigError, match=r"entry point gone raised ModuleNotFoundError(.|\n)*my-effects 1.2"):
         build_system(load_config(pendulum))
 
