@@ -101,7 +101,7 @@ def _registering(
         yield
         unchanged = all(set(registry) == known for registry, known in zip(_REGISTRIES, before, strict=True))
         if unchanged and not nothing_new:
-            decorators = "@EFFECTS.register(NAME) or @SENSORS.register(NAME)"
+            decorators = "@EFFECTS.register(NAME) or @SENSOR_READERS.register(NAME)"
             raise ConfigError(
                 f"the {name} registers nothing", where=where, allowed=f"a class or function under {decorators}"
             )
