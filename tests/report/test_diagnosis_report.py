@@ -114,11 +114,11 @@ def test_the_words_beside_the_pictures_say_what_is_seen(found, tmp_path):
 
 def test_a_map_without_a_sure_value_shows_what_was_expected_beforehand(found, tmp_path):
     finding = found["effect"]
-    smoothed = finding.smoothed
+    smoothed = finding.smoother_result
     trace = smoothed.smoothed_unknowns[0]
-    prior = np.sqrt([smoothed.variance[source] for source in trace.sources])
-    vague = replace(trace, std=np.broadcast_to(0.9 * prior, trace.std.shape))
-    page = page_of(replace(finding, smoothed=replace(smoothed, traces=(vague,))), tmp_path / "r.html")
+    prior = np.sqrt([smoothed.group_variance[source] for source in trace.unknown_groups])
+    vague = replace(trace, posterior_std=np.broadcast_to(0.9 * prior, trace.posterior_std.shape))
+    page = page_of(replace(finding, smoother_result=replace(smoothed, smoothed_unknowns=(vague,))), tmp_path / "r.html")
     assert "value in standard deviations expected beforehand" in page
     assert "take the picture for a hint only" in text_of(page)
 
