@@ -348,13 +348,13 @@ class JointScores:
             at = np.array([[*columns[i], *columns[j]] for i, j in members])
             information, slope = self.information[at[:, :, None], at[:, None, :]], self.score_vector[at]
             steps, decrease = _promised(information, slope, lower[at], upper[at])
-            worth = decrease - at.shape[1]
-            found += [(w, d, *both, s) for w, d, both, s in zip(worth, decrease, members, steps, strict=True)]
-        for worth, promised, i, j, step in sorted(found, key=lambda entry: -entry[0]):
+            penalized = decrease - at.shape[1]
+            found += [(w, d, *both, s) for w, d, both, s in zip(penalized, decrease, members, steps, strict=True)]
+        for penalized, promised, i, j, step in sorted(found, key=lambda entry: -entry[0]):
             (one, other), width = (self.effects[i], self.effects[j]), len(columns[i])
             values = _values(one, step[:width]) | _values(other, step[width:])
             yield CandidatePair(
-                (one, other), values | self.shape_values[i] | self.shape_values[j], float(promised), float(worth)
+                (one, other), values | self.shape_values[i] | self.shape_values[j], float(promised), float(penalized)
             )
 
 

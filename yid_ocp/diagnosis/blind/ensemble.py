@@ -161,8 +161,7 @@ class CaseLabel:
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON."""
-        own: dict[str, Any] = asdict(self)
-        return own | {"injected": [asdict(effect) for effect in self.injected]}
+        return asdict(self)
 
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> CaseLabel:
@@ -225,19 +224,13 @@ class DetectableEffect:
     @staticmethod
     def from_signature(signature: EffectSignature) -> DetectableEffect:
         """Build from a candidate's signature on a clean recording."""
-        return DetectableEffect(
-            signature.effect,
-            signature.shape_values,
-            np.asarray(np.linalg.qr(signature.projected_sensitivity, mode="r")),
-        )
+        factor = np.asarray(np.linalg.qr(signature.projected_sensitivity, mode="r"))
+        return DetectableEffect(signature.effect, signature.shape_values, factor)
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON."""
-        return {
-            "effect": self.effect.label,
-            "shape": dict(self.shape_values),
-            "columns": self.sensitivity_factor.tolist(),
-        }
+        columns = self.sensitivity_factor.tolist()
+        return {"effect": self.effect.label, "shape": dict(self.shape_values), "columns": columns}
 
 
 class CaseGenerator:
@@ -249,14 +242,10 @@ class CaseGenerator:
         Its system, options and free parameters are every case's; its first recording gives the initial posture.
     finer : callable, optional
         The system with so many times its links.
-    candidates : "all" or sequence of str
-        The library.
     limits : Thresholds
         For the detectable size.
     simulated_system : System, optional
         What moves, where that is not the problem's: the same with its arms driven.
-    conditions : RecordingConditions
-        Whether there is a camera is seen from the problem's first recording.
 
     Raises
     ------
@@ -333,9 +322,8 @@ class CaseGenerator:
         clean = tuple(self.simulate_recording(self.draw_true_parameters(rng), (), rng, name) for name in names)
         problem = self.nominal_problem(clean)
         effects = make_candidate_effects(problem.system, clean, self._candidates)
-        composed = AllCandidatesProblem.from_problem(
-            problem, effects, [self.simulate_recording(self.draw_true_parameters(rng), (), rng, "other")]
-        )
+        other = self.simulate_recording(self.draw_true_parameters(rng), (), rng, "other")
+        composed = AllCandidatesProblem.from_problem(problem, effects, [other])
         nominal = fit_nominal_model(problem, composed, limits=self._limits)
         # weighted by all noise, that of torques too
         composed = replace(composed, problem=nominal.problem)
@@ -355,9 +343,9 @@ class CaseGenerator:
         by_label = {effect.label: effect for effect in self._effects}
         self._detectable = tuple(
             DetectableEffect(
-                by_label[entry["effect"]], dict(entry["shape"]), np.atleast_2d(np.array(entry["columns"], float))
+                by_label[own["effect"]], dict(own["shape"]), np.atleast_2d(np.array(own["columns"], float))
             )
-            for entry in detectable
+            for own in detectable
         )
 
     def nominal_problem(self, recordings: Sequence[Recording]) -> EstimationProblem:
@@ -503,8 +491,6 @@ def simulate_random_motion(
         Of the driven joints at the start.
     truth, values : mapping of str to float
         Parameters of the nominal and of the simulated system.
-    rng : numpy.random.Generator
-        Of motion and noise.
     """
     travel = _GRIPPER_TRAVEL if len(nominal.grasps) < 2 else _SHARED_GRIPPER_TRAVEL
     excitation = MultisineOptions(gripper_travel=travel, duration=conditions.simulation.duration)
@@ -598,11 +584,9 @@ def best_possible_closure(
         start.update(_internal(effect.label, true[effect.label].values, effect.definitions))
     # under the weights of the nominal fit, as all that it is compared with
     fit = refit_with_effects(replace(composed, problem=nominal.problem), chosen, {**nominal.values, **start})
-    return (
-        math.nan
-        if fit is None or len(chosen) < len(true)
-        else gap_closure(nominal.held_out_loss, fit.held_out_loss).fraction
-    )
+    if fit is None or len(chosen) < len(true):
+        return math.nan
+    return gap_closure(nominal.held_out_loss, fit.held_out_loss).fraction
 
 
 def _internal(label: str, values: Mapping[str, float], quantities: Sequence[ParameterDefinition]) -> dict[str, float]:
