@@ -313,9 +313,13 @@ class Candidates:
         """The data's residual at some values of the unknowns."""
         return self.y + sum(value * self.column(name, self.theta) for name, value in values.items())
 
-    def residual_without_weak_priors(self, at):
-        count = len(self.y)
-        return at.residual[:count], at.jacobian[:count]
+    data_noise_unit = 1.0
+
+    @property
+    def residual_rows(self):
+        """The data come first, weak priors after them."""
+        data = slice(0, len(self.y))
+        return SimpleNamespace(data=data, without_weak_priors=data)
 
     def evaluate(self, x, derivatives=True, equilibrium_guesses=None):
         self.warmed.append(equilibrium_guesses)

@@ -33,7 +33,7 @@ from yid_ocp.solvers.base import SolverResult
 Array = NDArray[np.float64]
 
 REFIT_SOLVER = GaussNewton(max_iterations=25, step_tolerance=1e-3, cost_tolerance=1e-5)
-"""A refit starts near its end and must be good to a small part of its standard deviation, and of `chi2_equivalence`, only."""
+"""A refit starts near its end and must be good to a small part of its std and of `chi2_equivalence` only."""
 _UNINFORMATIVE_STD_RATIO = 100.0
 """A standard deviation so many times the range in which an engineer would expect a parameter tells nothing of it."""
 _RELINEARIZE_Z = 1.0
