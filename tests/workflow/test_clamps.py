@@ -185,6 +185,7 @@ def test_the_baselines_effects_stay_in_the_model(tmp_path):
     ("change", "words"),
     [
         ({"format": "yid-plan/1"}, "another command"),
+        ({"format": "yid-diagnosis/1"}, "CHANGELOG.md has the table"),
         ({"status": "failed", "message": "no"}, "the run failed"),
         ({"covariance": {}}, "how sure its parameters are"),
         ({"covariance": {"names": [], "matrix": []}}, "found no parameter"),
