@@ -25,9 +25,8 @@ from yid_ocp.vision import (
     render_virtual_frames,
     track_object,
 )
-from yid_ocp.vision.camera_intrinsics import CameraIntrinsics
 from yid_ocp.vision.fit import ShapeFitter
-from yid_ocp.vision.frames import import_open3d
+from yid_ocp.vision.frames import CameraIntrinsics, import_open3d
 
 DATA = Path(__file__).parent / "data"
 TRUTH = {

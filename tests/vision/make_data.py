@@ -25,8 +25,8 @@ from yid_ocp.vision import (
     render_virtual_frames,
     write_frame_folder,
 )
-from yid_ocp.vision.filters import ObjectRegion, is_not_outlier, is_not_robot, voxel_averages
 from yid_ocp.vision.fit import ShapeFitter
+from yid_ocp.vision.point_cloud import ObjectRegion, is_not_outlier, is_not_robot, voxel_averages
 from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, load_robot_meshes, numeric_mechanism
 
 FOLDER = Path(__file__).parent / "data"

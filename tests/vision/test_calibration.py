@@ -12,7 +12,13 @@ from scipy.spatial.transform import Rotation
 from yid_ocp.errors import DataError
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.vision import CameraCalibrationOptions, CameraClockOptions, CameraIntrinsics, look_at_pose
-from yid_ocp.vision.calibration import calibrate_camera, calibration_as_given
+from yid_ocp.vision.calibration import (
+    calibrate_camera,
+    calibration_as_given,
+    estimate_stamp_delay,
+    _find_on_time_frames,
+    is_stamped_late,
+)
 from yid_ocp.vision.camera_registration import (
     CLOCK_DRIFT_INDEX,
     CLOCK_OFFSET_INDEX,
@@ -20,13 +26,12 @@ from yid_ocp.vision.camera_registration import (
     STATE_SIZE,
     TRANSLATION_SLICE,
     ArmSurface,
-    CalibrationEquations,
+    _CalibrationEquations,
     CalibrationFrame,
     CameraState,
     _at_least,
     evaluate_robust_cost,
 )
-from yid_ocp.vision.clock import estimate_stamp_delay, find_on_time_frames, is_stamped_late
 from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, load_robot_meshes
 
 ARM = """<robot name="arm"><link name="base"><visual><geometry><box size="0.3 0.3 0.2"/></geometry></visual></link>
@@ -204,7 +209,7 @@ def rows_of(errors, places):
     """Frames of points that all have the slope one by the first unknown."""
     slope = np.eye(1, STATE_SIZE)
     return [
-        CalibrationEquations(
+        _CalibrationEquations(
             np.repeat(slope, len(error), axis=0), error, np.column_stack([place, np.zeros((len(place), 3), int)])
         )
         for error, place in zip(errors, places, strict=True)
@@ -285,7 +290,7 @@ def test_frames_stamped_late_do_not_pull(robot):
         )
         assert own.delay == pytest.approx(by, abs=max(4 * own.std, 0.01))
         assert is_stamped_late(own, CameraClockOptions()) is expected
-    assert find_on_time_frames([None]).frame_indices == ()
+    assert _find_on_time_frames([None]).frame_indices == ()
 
 
 # -- a pose that is kept ----------------------------------------------------------------------------------------------

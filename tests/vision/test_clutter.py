@@ -18,8 +18,8 @@ from yid_ocp.vision import (
     look_at_pose,
     track_object,
 )
-from yid_ocp.vision.clutter import BackgroundPoints, extra_meshes_by_joint, group_foreign_objects
-from yid_ocp.vision.filters import has_any_colour
+from yid_ocp.vision.point_cloud import has_any_colour
+from yid_ocp.vision.sequence_calibration import BackgroundPoints, extra_meshes_by_joint, group_foreign_objects
 from yid_ocp.vision.shape_evidence import ForeignCluster, TubeLinks
 from yid_ocp.vision.surface_meshes import numeric_mechanism
 

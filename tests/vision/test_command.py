@@ -11,7 +11,7 @@ import pytest
 from yid_ocp.cli import main
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.vision.track import FrameTracker
-from yid_ocp.vision.track_figures import _STAGE_NAMES
+from yid_ocp.vision.track_result import _STAGE_NAMES
 from yid_ocp.workflow import track as command
 
 CONFIG = """\

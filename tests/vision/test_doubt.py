@@ -10,7 +10,7 @@ from yid_ocp.errors import DataError
 from yid_ocp.model.system import System
 from yid_ocp.model.y_object import y_object
 from yid_ocp.vision import CameraScene, CloudFilterOptions, TrackOptions, track_object
-from yid_ocp.vision.dimension_check import DimensionCheck
+from yid_ocp.vision.sequence_calibration import DimensionCheck
 
 FRAMES = 5
 NAMES = ["w_T1", "w_T2", "w_T3"]

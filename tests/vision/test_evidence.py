@@ -5,9 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from yid_ocp.vision.occlusion import OcclusionMap
-from yid_ocp.vision.shape_evidence import CloudObservation, TubeLinks, assess_shape, tube_like_nodes_and_points
-from yid_ocp.vision.surface_residuals import line_of_sight_residuals, nearest_surface_residuals
+from yid_ocp.vision.frames import OcclusionMap
+from yid_ocp.vision.shape_evidence import (
+    CloudObservation,
+    TubeLinks,
+    assess_shape,
+    line_of_sight_residuals,
+    nearest_surface_residuals,
+    tube_like_nodes_and_points,
+)
 
 CAMERA = np.zeros(3)
 RADIUS, NEAR = 0.02, 0.045

@@ -5,7 +5,7 @@ import pytest
 
 from yid_ocp.errors import ConfigError
 from yid_ocp.vision import CloudFilterOptions
-from yid_ocp.vision.filters import (
+from yid_ocp.vision.point_cloud import (
     ObjectRegion,
     WeightedCloud,
     is_not_outlier,

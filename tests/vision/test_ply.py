@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.errors import DataError
-from yid_ocp.vision.ply_reader import read_ply_points
+from yid_ocp.vision.frame_folder import _read_ply_points
 
 CLOUD = np.random.default_rng(0).normal(size=(7, 3))
 COLUMNS = [("red", "u1"), ("x", "f4"), ("nx", "f8"), ("y", "f4"), ("z", "f4")]
@@ -46,7 +46,7 @@ SOUND = {
 @pytest.mark.parametrize("kind", SOUND)
 def test_points_are_read(tmp_path, kind):
     (tmp_path / "a.ply").write_bytes(SOUND[kind])
-    assert np.allclose(read_ply_points(tmp_path / "a.ply"), CLOUD, atol=1e-6)
+    assert np.allclose(_read_ply_points(tmp_path / "a.ply"), CLOUD, atol=1e-6)
 
 
 WRONG = {
@@ -73,7 +73,7 @@ def test_damage_is_said(tmp_path, kind):
     data, message = WRONG[kind]
     (tmp_path / "a.ply").write_bytes(data)
     with pytest.raises(DataError, match=message):
-        read_ply_points(tmp_path / "a.ply")
+        _read_ply_points(tmp_path / "a.ply")
 
 
 def test_whatever_is_damaged_is_read_or_refused(tmp_path):
@@ -85,4 +85,4 @@ def test_whatever_is_damaged_is_read_or_refused(tmp_path):
                 made[at] = int(rng.integers(256))
             path.write_bytes(bytes(made))
             with contextlib.suppress(DataError):
-                assert read_ply_points(path).shape[1] == 3
+                assert _read_ply_points(path).shape[1] == 3

@@ -22,7 +22,7 @@ from yid_ocp.vision import (
     track_object,
     write_frame_folder,
 )
-from yid_ocp.vision.root_selection import is_self_touching
+from yid_ocp.vision.frame_selection import is_self_touching
 
 MILLIMETRE = 1e-3
 RADIUS = 0.006

@@ -5,8 +5,7 @@ import pytest
 
 from yid_ocp.errors import ConfigError
 from yid_ocp.vision import SkeletonOptions
-from yid_ocp.vision.filters import WeightedCloud
-from yid_ocp.vision.skeleton import _spanning_forest, _thin_to_nodes, extract_skeleton
+from yid_ocp.vision.point_cloud import WeightedCloud, _spanning_forest, _thin_to_nodes, extract_skeleton
 
 FOOT, FORK = np.zeros(3), np.array([0.0, 0.0, 0.8])
 ENDS = (np.array([0.0, 0.4, 1.2]), np.array([0.0, -0.5, 1.3]))

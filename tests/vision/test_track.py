@@ -20,7 +20,7 @@ from yid_ocp.vision import (
     track_object,
 )
 from yid_ocp.vision.camera_registration import CLOCK_OFFSET_INDEX, CameraState
-from yid_ocp.vision.track_figures import _STAGE_NAMES, draw_frame_stages, draw_track
+from yid_ocp.vision.track_result import _STAGE_NAMES, draw_frame_stages, draw_track
 
 MILLIMETRE = 1e-3
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.vision import CameraIntrinsics
-from yid_ocp.vision.occlusion import OcclusionMap
+from yid_ocp.vision.frames import OcclusionMap
 
 POSE = np.eye(4)  # at the origin, looking along z
 PLACE, RADIUS = np.array([[0.0, 0.0, 2.0]]), np.array([0.02])

@@ -168,7 +168,7 @@ class CalibrationFrame:
 
 
 @dataclass(frozen=True, eq=False)
-class CalibrationEquations:
+class _CalibrationEquations:
     """Linearised calibration equations of one frame's points near the arm.
 
     Attributes
@@ -237,7 +237,7 @@ class ArmSurface:
             result &= np.linalg.norm(points - held, axis=1) > self.grasp_exclusion_radius
         return np.asarray(result)
 
-    def match_points(self, points: Array, origin: Array, t: float, reach: float, along: bool) -> SurfaceMatches:
+    def match_points(self, points: Array, origin: Array, t: float, reach: float, along: bool) -> _SurfaceMatches:
         """Matches of world points to the arm's surface, along camera rays or at the nearest surface."""
         q = self.configuration_at(t)
         if along:
@@ -258,11 +258,11 @@ class ArmSurface:
         moved = np.einsum("nij,nj->ni", later[:, :3, :3] - behind[:, :3, :3], local)
         velocity = (moved + later[:, :3, 3] - behind[:, :3, 3]) / (2 * _STEP)
         rate = np.einsum("ni,ni->n", normal[chosen], velocity)
-        return SurfaceMatches(chosen, error, normal[chosen], rate, part[chosen], local)
+        return _SurfaceMatches(chosen, error, normal[chosen], rate, part[chosen], local)
 
     def calibration_equations(
         self, state: CameraState, glimpse: CalibrationFrame, reach: float, along: bool
-    ) -> CalibrationEquations:
+    ) -> _CalibrationEquations:
         """Linearised equations of a frame's points within reach of the arm."""
         points = state.to_world(glimpse.points)
         met = self.match_points(points, state.pose[:3, 3], float(state.to_joint_time(glimpse.stamp)), reach, along)
@@ -273,7 +273,7 @@ class ArmSurface:
         # a later offset takes the surface back along its velocity, away from the point
         slope[:, CLOCK_OFFSET_INDEX] = met.normal_velocity
         slope[:, CLOCK_DRIFT_INDEX] = met.normal_velocity * (glimpse.stamp - state.clock_reference_stamp)
-        return CalibrationEquations(
+        return _CalibrationEquations(
             slope,
             met.normal_distance,
             np.column_stack([met.part, np.floor(met.part_coordinates / _PATCH).astype(np.int64)]),
@@ -281,7 +281,7 @@ class ArmSurface:
 
 
 @dataclass(frozen=True, eq=False)
-class SurfaceMatches:
+class _SurfaceMatches:
     """Points matched to the arm: indices, normal distance e [m], normal, normal velocity [m/s], part, local place."""
 
     point_indices: Integers
@@ -337,7 +337,7 @@ class RobustCost:
         return np.asarray(bread @ (weight**2 * self.score_covariance + precision) @ bread)
 
 
-def evaluate_robust_cost(rows: Sequence[CalibrationEquations], reach: float) -> RobustCost:
+def evaluate_robust_cost(rows: Sequence[_CalibrationEquations], reach: float) -> RobustCost:
     """Robust cost over all points of all frames, scaled by their median error."""
     size = np.abs(np.concatenate([r.residuals for r in rows]))
     sigma = max(_TO_SIGMA * float(np.median(size)) if len(size) else reach, _LEAST_SIGMA)

@@ -32,15 +32,17 @@ from yid_ocp.options import OptionInfo, check_option_bounds
 from yid_ocp.vision.initial_shapes import EndAnchor, InitialShapeFinder
 from yid_ocp.vision.shape_evidence import (
     CloudObservation,
+    DimensionEquations,
+    FrameShapeFit,
     ShapeEvidence,
     TubeLinks,
     assess_shape,
+    line_of_sight_residuals,
     nearest_on_tubes,
+    nearest_surface_residuals,
     tube_like_nodes_and_points,
 )
-from yid_ocp.vision.shape_fit_result import DimensionEquations, FrameShapeFit
 from yid_ocp.vision.surface_meshes import numeric_mechanism
-from yid_ocp.vision.surface_residuals import line_of_sight_residuals, nearest_surface_residuals
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]

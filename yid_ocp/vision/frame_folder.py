@@ -1,4 +1,6 @@
-"""A folder of clouds or depth images with time stamps and the camera (`yid-frames/1`): read and written."""
+"""A folder of clouds or depth images with time stamps and the camera (`yid-frames/1`), and the files in it.
+
+PLY files are read without a library in C: damage must not end the process. Turk (1994), The PLY polygon file format."""
 
 from __future__ import annotations
 
@@ -6,8 +8,11 @@ import csv
 import json
 import math
 import os
+import re
+import warnings
+import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -15,20 +20,277 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import DataError, OutputError, unknown_name_details
-from yid_ocp.files import atomic_write
-from yid_ocp.vision.camera_intrinsics import CameraIntrinsics
-from yid_ocp.vision.frame_files import (
-    CLOUD_SUFFIXES,
-    DEPTH_IMAGE_SUFFIX,
-    read_cloud,
-    read_colours,
-    read_depth_image,
-    write_cloud,
-    write_depth_image,
-)
-from yid_ocp.vision.frames import Colours, FrameSequence, validated_pose
+from yid_ocp.files import atomic_write, is_file
+from yid_ocp.vision.frames import CameraIntrinsics, Colours, FrameSequence, import_open3d, validated_pose
 
 Array = NDArray[np.float64]
+
+_CLOUD_SUFFIXES = (".ply", ".pcd", ".npz", ".xyz")
+_DEPTH_IMAGE_SUFFIX = ".png"
+_POINTS_ARRAY, _COLOURS_ARRAY = "points", "colours"
+"""Arrays of an NPZ file."""
+
+_PCD_HEADER_BYTES = 10_000  # [bytes]; where a PCD file says how many points it has
+_COUNT = re.compile(rb"^POINTS\s+(\d{1,18})\b", re.MULTILINE)
+_LARGEST_DEPTH = 65.535  # [m]; what sixteen bits of millimetres hold
+_AGAIN = "copy or record it again"
+
+
+def _read_cloud(path: Path) -> Array:
+    """Points of a cloud, shape (N, 3), in the file's unit.
+
+    Parameters
+    ----------
+    path : Path
+        PLY; PCD; NPZ with the array `points`, shape (N, 3); or XYZ: text, a point a row, its first three columns.
+
+    Raises
+    ------
+    DataError
+        The file is missing, empty or damaged.
+    """
+    return _read_ply_points(_there(path)) if path.suffix.lower() == ".ply" else _read(path)[0]
+
+
+def _read_colours(path: Path) -> Colours | None:
+    """Red, green and blue of the points that `_read_cloud` gives, shape (N, 3), None where the file has none.
+
+    PLY: `red`, `green`, `blue`; PCD: `rgb`; NPZ: the array `colours`, shape (N, 3); XYZ: the fourth to sixth of six or
+    more columns, from 0 to 255.
+
+    Raises
+    ------
+    DataError
+        As `_read_cloud`.
+    """
+    return _read_ply_colours(_there(path)) if path.suffix.lower() == ".ply" else _read(path)[1]
+
+
+def _there(path: Path) -> Path:
+    if not is_file(path):
+        raise DataError("the file of the cloud is missing", where=str(path))
+    return path
+
+
+def _read(path: Path) -> tuple[Array, Colours | None]:
+    match _there(path).suffix.lower():
+        case ".npz":
+            points, colours = _read_npz(path)
+        case ".xyz":
+            points, colours = _read_xyz(path)
+        case _:
+            points, colours = _read_pcd(path)
+    if not len(points):
+        raise DataError("the cloud is empty or cannot be read", where=str(path))
+    return points, colours
+
+
+def _read_npz(path: Path) -> tuple[Array, Colours | None]:
+    allowed = f"the array `{_POINTS_ARRAY}` of numbers, shape (N, 3), and `{_COLOURS_ARRAY}` of whole numbers"
+    allowed += " from 0 to 255 if wanted"
+    try:
+        with np.load(path, allow_pickle=False) as held:
+            arrays: dict[str, Any] = {name: held[name] for name in (_POINTS_ARRAY, _COLOURS_ARRAY) if name in held}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, MemoryError) as error:
+        raise DataError(f"the cloud is damaged ({error})", where=str(path), allowed=allowed, hint=_AGAIN) from error
+    points, colours = arrays.get(_POINTS_ARRAY), arrays.get(_COLOURS_ARRAY)
+    if points is None or points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
+        raise DataError(f"the file has no array `{_POINTS_ARRAY}` of points", where=str(path), allowed=allowed)
+    if colours is not None and (colours.shape != points.shape or colours.dtype != np.uint8):
+        raise DataError(f"the array `{_COLOURS_ARRAY}` is no colour for every point", where=str(path), allowed=allowed)
+    return points.astype(np.float64), colours
+
+
+def _read_xyz(path: Path) -> tuple[Array, Colours | None]:
+    try:
+        with warnings.catch_warnings():  # of an empty file, which is said below
+            warnings.simplefilter("ignore", UserWarning)
+            rows = np.loadtxt(path, ndmin=2, comments=("#", "//"))
+    except (OSError, ValueError, UnicodeDecodeError) as error:
+        raise DataError(f"the cloud cannot be read ({error})", where=str(path), allowed="x y z in every row") from error
+    if rows.shape[0] and rows.shape[1] < 3:
+        raise DataError(f"the cloud has {rows.shape[1]} columns", where=str(path), allowed="x y z in every row")
+    seen = rows[:, 3:6]
+    coloured = seen.shape[1] == 3 and bool(((seen >= 0) & (seen <= 255) & (seen == np.rint(seen))).all())
+    return rows[:, :3].copy(), seen.astype(np.uint8) if coloured else None
+
+
+def _read_pcd(path: Path) -> tuple[Array, Colours | None]:
+    o3d = import_open3d()
+    with path.open("rb") as file:
+        declared = _COUNT.search(file.read(_PCD_HEADER_BYTES))
+    if declared is not None and int(declared[1]) > path.stat().st_size:  # each takes several bytes
+        what = f"the cloud is damaged: it declares {int(declared[1]):.3g} points in {path.stat().st_size} bytes"
+        raise DataError(what, where=str(path), hint=_AGAIN)
+    # Open3D says what is wrong on the standard output and returns an empty cloud
+    try:
+        with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+            cloud = o3d.io.read_point_cloud(str(path))
+    except (MemoryError, RuntimeError) as error:
+        what = f"the cloud is damaged: it declares more points than fit into memory ({error})"
+        raise DataError(what, where=str(path), hint=_AGAIN) from error
+    colours = np.rint(255 * np.asarray(cloud.colors)).astype(np.uint8) if cloud.has_colors() else None
+    return np.asarray(cloud.points, dtype=np.float64), colours
+
+
+def _write_cloud(path: Path, points: Array) -> None:
+    """Write a binary PLY file; `OutputError` where that cannot be."""
+    o3d = import_open3d()
+    # float32 keeps 0.2 um at 2 m in half the space
+    cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(np.ascontiguousarray(points, dtype=np.float32)))
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        if not o3d.t.io.write_point_cloud(str(path), cloud):
+            raise OutputError("the cloud cannot be written", where=str(path))
+
+
+def _read_depth_image(path: Path) -> Array:
+    """A depth image in the file's unit, shape (height, width); `DataError` where it is no grey PNG of 16 bits."""
+    o3d = import_open3d()
+    if not is_file(path):
+        raise DataError("the file of the depth image is missing", where=str(path))
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        image = np.asarray(o3d.io.read_image(str(path)))
+    if image.ndim != 2 or image.dtype != np.uint16:
+        raise DataError(
+            "the depth image is empty, damaged or not one channel of 16 bits",
+            where=str(path),
+            allowed="16-bit grey PNG",
+        )
+    return image.astype(np.float64)
+
+
+def _write_depth_image(path: Path, depth: Array) -> None:
+    """Write a depth image [m] as millimetres; `OutputError` where that cannot be."""
+    o3d = import_open3d()
+    good = np.isfinite(depth) & (depth > 0) & (depth < _LARGEST_DEPTH)
+    image = np.where(good, np.rint(1e3 * np.where(good, depth, 0.0)), 0.0).astype(np.uint16)
+    if not o3d.io.write_image(str(path), o3d.geometry.Image(np.ascontiguousarray(image))):
+        raise OutputError("the depth image cannot be written", where=str(path))
+
+
+_MAX_HEADER_BYTES = 100_000
+"""A longer head is none [bytes]."""
+_TYPES = {
+    **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2"},
+    **{"uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"},
+    **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
+}
+_AXIS_PROPERTIES, _COLOUR_PROPERTIES = ("x", "y", "z"), ("red", "green", "blue")
+_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+@dataclass(frozen=True)
+class _Element:
+    """A table of a PLY file: its name, its number of rows, its columns with NumPy's names of their types."""
+
+    name: str
+    count: int
+    columns: tuple[tuple[str, str], ...]
+
+
+def _read_ply_points(path: Path) -> Array:
+    """Positions of the vertices, shape (N, 3), in the file's unit; other properties and later elements are left out.
+
+    Parameters
+    ----------
+    path : Path
+
+    Raises
+    ------
+    DataError
+        No PLY file, a damaged one, or one whose vertices have no x, y and z.
+    """
+    return _columns(path, _AXIS_PROPERTIES)
+
+
+def _read_ply_colours(path: Path) -> NDArray[np.uint8] | None:
+    """Red, green and blue of the vertices, shape (N, 3), None where they have none; errors as `_read_ply_points`."""
+    colours = _columns(path, _COLOUR_PROPERTIES)
+    return colours.astype(np.uint8) if colours.shape[1] else None
+
+
+def _columns(path: Path, wanted: Sequence[str]) -> Array:
+    """Columns of the vertices, shape (N, number of them), or (N, 0) where the file does not have all of them."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"the cloud cannot be read ({error.strerror})", where=str(path)) from error
+    head, end, body = data.partition(b"end_header")
+    line, _, body = body.partition(b"\n")
+    if not end or len(head) > _MAX_HEADER_BYTES or line.strip() or not head.startswith(b"ply"):
+        raise _damaged(path, "it has no head")
+    order, elements = _head(path, head.decode("latin-1"))
+    for element in elements:
+        if element.name == "vertex":
+            return _vertices(path, element, order, body, wanted)
+        body = _rest(path, element, order, body)
+    raise _damaged(path, "it has no vertices")
+
+
+def _damaged(path: Path, why: str) -> DataError:
+    return DataError(f"the cloud is empty or cannot be read: {why}", where=str(path), hint="copy or record it again")
+
+
+def _head(path: Path, text: str) -> tuple[str, list[_Element]]:
+    """Byte order (empty for ASCII), and the elements in the order of the file."""
+    order: str | None = None
+    found: list[_Element] = []
+    for line in text.splitlines()[1:]:
+        match line.split():
+            case [] | ["comment" | "obj_info", *_]:
+                continue
+            case ["format", name, _] if name in _ORDERS:
+                order = _ORDERS[name]
+            case ["element", name, count] if count.isascii() and count.isdigit() and len(count) <= 18:
+                found.append(_Element(name, int(count), ()))
+            case ["property", "list", _, _, name] if found:
+                found[-1] = _Element(found[-1].name, found[-1].count, (*found[-1].columns, (name, "")))
+            case ["property", kind, name] if found and kind in _TYPES:
+                found[-1] = _Element(found[-1].name, found[-1].count, (*found[-1].columns, (name, _TYPES[kind])))
+            case _:
+                raise _damaged(path, f"its head says {line[:60]!r}")
+    if order is None:
+        raise _damaged(path, "its head does not say the format")
+    return order, found
+
+
+def _rest(path: Path, element: _Element, order: str, body: bytes) -> bytes:
+    """What follows an element; in a list's rows there is no telling how far they go."""
+    if any(not kind for _, kind in element.columns):
+        raise _damaged(path, f"lists of '{element.name}' stand before the vertices")
+    if order:
+        return body[element.count * sum(np.dtype(kind).itemsize for _, kind in element.columns) :]
+    return b"\n".join(body.split(b"\n")[min(element.count, len(body)) :])
+
+
+def _vertices(path: Path, element: _Element, order: str, body: bytes, wanted: Sequence[str]) -> Array:
+    names = [name for name, _ in element.columns]
+    kinds = [kind for _, kind in element.columns]
+    if len(set(names)) < len(names) or not set(_AXIS_PROPERTIES) <= set(names) or "" in kinds:
+        raise _damaged(path, "its vertices have no x, y and z, or lists")
+    size = sum(np.dtype(kind).itemsize for kind in kinds) if order else 2 * len(names)
+    if element.count * size > len(body) + (not order):  # the last line of a text may end without a newline
+        raise DataError(
+            f"the cloud is damaged: it declares {element.count:.3g} points in {len(body)} bytes",
+            where=str(path),
+            hint="copy or record it again",
+        )
+    if not element.count:
+        raise _damaged(path, "it has no vertices")
+    if not set(wanted) <= set(names):
+        return np.empty((element.count, 0))
+    if order:
+        rows = np.frombuffer(body, [(n, order + k) for n, k in element.columns], element.count)
+        return np.stack([rows[name].astype(np.float64) for name in wanted], axis=1)
+    try:
+        lines = [line.split() for line in body.split(b"\n", element.count)[: element.count]]
+        values = np.array([[float(row[names.index(name)]) for name in wanted] for row in lines])
+    except (ValueError, IndexError) as error:
+        raise _damaged(path, f"a vertex is not what its head says ({error})") from error
+    if len(values) < element.count:
+        raise _damaged(path, "vertices are missing")
+    return values
+
 
 _FRAMES_FORMAT = "yid-frames/1"
 _CAMERA_FILE, STAMP_FILE = "camera.json", "timestamps.csv"
@@ -84,16 +346,16 @@ def read_frame_folder(
 
     def load(index: int) -> Array:
         file = path / names[index]
-        if file.suffix.lower() == DEPTH_IMAGE_SUFFIX:
+        if file.suffix.lower() == _DEPTH_IMAGE_SUFFIX:
             assert intrinsics is not None
-            return intrinsics.points_from_depth(read_depth_image(file) * depth_unit)
-        points = read_cloud(file) * METRES_PER_UNIT[given]
+            return intrinsics.points_from_depth(_read_depth_image(file) * depth_unit)
+        points = _read_cloud(file) * METRES_PER_UNIT[given]
         if frame == "world":
             points = (points - camera[:3, 3]) @ camera[:3, :3]
         return points
 
     def colours(index: int) -> Colours | None:
-        return None if names[index].lower().endswith(DEPTH_IMAGE_SUFFIX) else read_colours(path / names[index])
+        return None if names[index].lower().endswith(_DEPTH_IMAGE_SUFFIX) else _read_colours(path / names[index])
 
     return FrameSequence(times, names, camera, load, intrinsics, str(path), colours)
 
@@ -123,13 +385,13 @@ def write_frame_folder(
         raise OutputError(f"the folder cannot be made: {error.strerror}", where=str(path)) from error
     if depth is not None and sequence.intrinsics is None:
         raise OutputError("depth images need the camera's intrinsics", where=str(path))
-    ending = CLOUD_SUFFIXES[0] if depth is None else DEPTH_IMAGE_SUFFIX
+    ending = _CLOUD_SUFFIXES[0] if depth is None else _DEPTH_IMAGE_SUFFIX
     names = [f"{i:06d}{ending}" for i in range(len(sequence))]
     for i, name in enumerate(names):
         if depth is None:
-            write_cloud(path / name, sequence.load_cloud(i))
+            _write_cloud(path / name, sequence.load_cloud(i))
         else:
-            write_depth_image(path / name, np.asarray(depth[i], float))
+            _write_depth_image(path / name, np.asarray(depth[i], float))
     head: dict[str, Any] = {
         "format": _FRAMES_FORMAT,
         "pose": sequence.camera_pose.tolist(),
@@ -167,13 +429,13 @@ def _read_camera(path: Path) -> dict[str, Any]:
 def _check_kinds(names: Sequence[str], folder: Path, intrinsics: CameraIntrinsics | None) -> None:
     for name in names:
         kind = Path(name).suffix.lower()
-        if kind not in (*CLOUD_SUFFIXES, DEPTH_IMAGE_SUFFIX):
+        if kind not in (*_CLOUD_SUFFIXES, _DEPTH_IMAGE_SUFFIX):
             what, allowed = (
                 f"'{name}' is neither a cloud nor a depth image",
-                ", ".join((*CLOUD_SUFFIXES, DEPTH_IMAGE_SUFFIX)),
+                ", ".join((*_CLOUD_SUFFIXES, _DEPTH_IMAGE_SUFFIX)),
             )
             raise DataError(what, where=str(folder / STAMP_FILE), allowed=allowed)
-        if kind == DEPTH_IMAGE_SUFFIX and intrinsics is None:
+        if kind == _DEPTH_IMAGE_SUFFIX and intrinsics is None:
             raise DataError(
                 "there are depth images but the camera's intrinsics are missing",
                 where=str(folder / _CAMERA_FILE),

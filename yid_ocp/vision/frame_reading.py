@@ -1,22 +1,318 @@
-"""Opening of frame sequences: a folder of files, a bag, or an Azure Kinect recording."""
+"""Frame sequences from a folder, a bag of ROS 1 or ROS 2, an MCAP file, a RealSense or an Azure Kinect recording.
+
+Of a bag, `sensor_msgs/PointCloud2`, or `sensor_msgs/Image` with depth and its `sensor_msgs/CameraInfo`: a sequence
+keeps where its messages stand; they are read when they are needed."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+import struct
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from yid_ocp.errors import DataError
-from yid_ocp.vision.bag_frames import read_bag_frames
-from yid_ocp.vision.camera_intrinsics import CameraIntrinsics
-from yid_ocp.vision.frame_folder import STAMP_FILE, read_frame_folder
-from yid_ocp.vision.frames import Colours, FrameSequence, import_open3d, validated_pose
+from yid_ocp.errors import DataError, unknown_name_details
+from yid_ocp.vision.frame_folder import METRES_PER_UNIT, STAMP_FILE, read_frame_folder
+from yid_ocp.vision.frames import CameraIntrinsics, Colours, FrameSequence, import_open3d, validated_pose
 
 Array = NDArray[np.float64]
+
+_CLOUD_MESSAGE, _IMAGE_MESSAGE, _CAMERA_INFO_MESSAGE = (
+    "sensor_msgs/msg/PointCloud2",
+    "sensor_msgs/msg/Image",
+    "sensor_msgs/msg/CameraInfo",
+)
+_JOINT_STATE_MESSAGE = "sensor_msgs/msg/JointState"
+_DEPTH_ENCODINGS = {"16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3), "32FC1": ("f4", 1.0)}
+"""Encodings of depth images: type of a pixel and its unit [m]; REP 118. RealSense's files say `mono16`."""
+_POINT_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""Types of the fields of a PointCloud2."""
+_PER_METRE = "/option/Depth_Units/value"  # topic of RealSense's files with the unit of their depth images [m]
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where a message stands: its connection, time of recording [ns], and how many of that time stand before it."""
+
+    connection: Any
+    logged: int
+    before: int
+
+
+def _read_bag_frames(
+    path: Path, *, pose: ArrayLike | None = None, unit: str | None = None, topic: str | None = None
+) -> FrameSequence:
+    """Open the frames in a bag.
+
+    Times are the headers' stamps (the times of recording if one has none), in seconds since the first joint states of
+    the bag, as in a recording that `yid-ocp import` makes of it; where it has none, since the first frame. An image of
+    a topic with `rect` in its name is taken for rectified: its lens has the camera's projection and no distortion.
+
+    Parameters
+    ----------
+    path : Path
+        ROS 1 `.bag`, RealSense `.bag`, ROS 2 folder, `.db3` or `.mcap`.
+    pose : array_like, shape (4, 4)
+        Camera (its optical frame: x right, y down, z ahead) in the world.
+    unit : str, optional
+        Unit of the clouds; metres when absent.
+    topic : str, optional
+        Of the clouds or depth images; needed where there are several.
+
+    Returns
+    -------
+    FrameSequence
+
+    Raises
+    ------
+    DataError
+        `rosbags` is not installed, the bag cannot be read, has no or several such topics, or a depth image without the
+        camera's intrinsics.
+    """
+    camera = validated_pose(pose, f"{path}: give track.camera_pose")
+    bag = _Bag(path)
+    given = unit or "m"
+    if given not in METRES_PER_UNIT:
+        raise DataError(f"the unit is '{given}'", where=str(path), **unknown_name_details(given, METRES_PER_UNIT))
+    name = _topic(bag, topic)
+    kind = bag.kinds[name]
+    places, stamps = bag.frames(name)
+    if not places:
+        raise DataError(f"there is no message on the topic '{name}'", where=str(path))
+    lens, per_metre = (None, 1.0) if kind == _CLOUD_MESSAGE else (_lens(bag, name), bag.depth_unit(name))
+    where = f"{path}: {name}"
+
+    def load(index: int) -> Array:
+        content = bag.message(places[index])
+        if lens is None:
+            return _points(content, where) * METRES_PER_UNIT[given]
+        return lens.points_from_depth(_depth(content, per_metre, where))
+
+    def colours(index: int) -> Colours | None:
+        return None if lens is not None else _colours(bag.message(places[index]), where)
+
+    names = tuple(f"{name} {i}" for i in range(len(places)))
+    return FrameSequence(stamps, names, camera, load, lens, str(path), colours)
+
+
+class _Bag:
+    """An open bag; what is wrong with it or with a message is a `DataError`."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            from rosbags.highlevel import AnyReader
+            from rosbags.typesys import Stores, get_typestore
+        except ImportError as error:
+            hint = "pip install 'yid-ocp[bags]'"
+            raise DataError("reading bags needs the package rosbags", where=str(path), hint=hint) from error
+        self.path = path
+        try:
+            # older ROS 2 bags do not hold the definitions of their messages; these have not changed since
+            self.reader: Any = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+            self.reader.open()
+        except Exception as error:  # rosbags lets through whatever a damaged file makes struct, sqlite3 or zstd raise
+            raise self._damaged(error) from error
+        self.kinds: dict[str, str] = {c.topic: c.msgtype for c in self.reader.connections}
+
+    def _damaged(self, error: Exception) -> DataError:
+        return DataError(
+            f"the bag cannot be read ({type(error).__name__}: {error})",
+            where=str(self.path),
+            allowed="a ROS 1 .bag, a ROS 2 folder with metadata.yaml, or an .mcap or .db3 file of ROS 2",
+            hint="check with `ros2 bag info` or `rosbag info`; a bag cut off by a crash needs `ros2 bag reindex`",
+        )
+
+    def _of(self, topic: str) -> list[Any]:
+        return [c for c in self.reader.connections if c.topic == topic]
+
+    def frames(self, topic: str) -> tuple[list[_Place], Array]:
+        """Where the messages of a topic stand, and their times [s]."""
+        places: list[_Place] = []
+        stamps, logs = [], []
+        try:
+            for connection, logged, data in self.reader.messages(self._of(topic)):
+                before = sum(1 for place in reversed(places[-8:]) if place.logged == logged)
+                places.append(_Place(connection, logged, before))
+                stamps.append(_stamp(self.reader, data))
+                logs.append(logged)
+            first = [_first(self.reader, c) for c in self.reader.connections if c.msgtype == _JOINT_STATE_MESSAGE]
+        except Exception as error:
+            raise self._damaged(error) from error
+        joints = [entry for entry in first if entry is not None]
+        # one message without a stamp makes the two clocks incomparable, so then no stamp is used
+        stamped = all(stamp > 0 for stamp in [*stamps, *(stamp for _, stamp in joints)])
+        chosen = stamps if stamped else logs
+        # nanoseconds since 1970 do not fit into a float: integers first
+        origin = min(([stamp if stamped else logged for logged, stamp in joints] or chosen), default=0)
+        return places, np.array([1e-9 * (value - origin) for value in chosen])
+
+    def message(self, place: _Place) -> Any:
+        """A message, decoded."""
+        try:
+            found = self.reader.messages([place.connection], start=place.logged, stop=place.logged + 1)
+            for number, (connection, _, data) in enumerate(found):
+                if number == place.before:
+                    return self.reader.deserialize(data, connection.msgtype)
+        except Exception as error:
+            raise self._damaged(error) from error
+        raise DataError("the bag has changed since it was opened", where=str(self.path))
+
+    def first(self, topic: str) -> Any:
+        """The first message of a topic, decoded."""
+        try:
+            for connection, _, data in self.reader.messages(self._of(topic)):
+                return self.reader.deserialize(data, connection.msgtype)
+        except Exception as error:
+            raise self._damaged(error) from error
+        raise DataError(f"there is no message on the topic '{topic}'", where=str(self.path))
+
+    def depth_unit(self, topic: str) -> float:
+        """Factor on the usual unit of depth images, from the file of a RealSense camera; 1 where it says nothing."""
+        for name in self.kinds:
+            if name.endswith(_PER_METRE) and name.split("/")[:3] == topic.split("/")[:3]:
+                return float(self.first(name).data) / _DEPTH_ENCODINGS["mono16"][1]
+        return 1.0
+
+
+def _stamp(reader: Any, data: bytes) -> int:
+    """Stamp of a message whose first field is a header [ns], without decoding the rest."""
+    order = "<" if not reader.is2 or data[1] == 1 else ">"  # of ROS 2, the head of CDR says which
+    seconds, nanoseconds = struct.unpack_from(f"{order}II", data, 4)
+    return int(seconds) * 10**9 + int(nanoseconds)
+
+
+def _first(reader: Any, connection: Any) -> tuple[int, int] | None:
+    """Time of recording and stamp of a connection's first message [ns]."""
+    for _, logged, data in reader.messages([connection]):
+        return logged, _stamp(reader, data)
+    return None
+
+
+def _topic(bag: _Bag, wanted: str | None) -> str:
+    usable = sorted(name for name, kind in bag.kinds.items() if kind in (_CLOUD_MESSAGE, _IMAGE_MESSAGE))
+    if wanted is not None:
+        if wanted not in usable:
+            what = f"there are no clouds or depth images on the topic '{wanted}'"
+            raise DataError(what, where=str(bag.path), **unknown_name_details(wanted, usable))
+        return wanted
+    deep = [name for name in usable if bag.kinds[name] == _CLOUD_MESSAGE or _is_depth(bag, name)]
+    if len(deep) == 1:
+        return deep[0]
+    if deep:
+        hint = "say which one with track.frame_topic"
+        what = f"the bag has {len(deep)} topics of clouds or depth images"
+        raise DataError(what, where=str(bag.path), allowed=", ".join(deep), hint=hint)
+    held = ", ".join(f"{name} ({kind})" for name, kind in sorted(bag.kinds.items())) or "no topics at all"
+    raise DataError(
+        "the bag has no clouds and no depth images",
+        where=str(bag.path),
+        allowed=f"{_CLOUD_MESSAGE}, or {_IMAGE_MESSAGE} with the encoding {' or '.join(_DEPTH_ENCODINGS)}, "
+        "not compressed",
+        hint=f"it holds {held}",
+    )
+
+
+def _is_depth(bag: _Bag, topic: str) -> bool:
+    try:
+        return str(bag.first(topic).encoding) in _DEPTH_ENCODINGS
+    except DataError:
+        return False
+
+
+def _lens(bag: _Bag, topic: str) -> CameraIntrinsics:
+    """Intrinsics from the camera's messages that stand nearest to an image's topic."""
+    infos = [name for name, kind in bag.kinds.items() if kind == _CAMERA_INFO_MESSAGE]
+    beside = {name: _shared(name.split("/"), topic.split("/")) for name in infos}
+    nearest = [name for name in infos if beside[name] == max(beside.values())]
+    if len(nearest) != 1:
+        allowed = f"one topic of {_CAMERA_INFO_MESSAGE} beside {topic}"
+        what = f"the camera's intrinsics are not known: the bag has {len(nearest)} topics that may hold them"
+        hint = f"record {topic.rpartition('/')[0]}/camera_info as well"
+        raise DataError(what, where=str(bag.path), allowed=allowed, hint=hint)
+    info = bag.first(nearest[0])
+    matrix, projection, bent = (_field(info, name) for name in ("k", "p", "d"))
+    if "rect" in topic and projection[0] > 0:
+        return CameraIntrinsics(
+            int(info.width), int(info.height), projection[0], projection[5], projection[2], projection[6]
+        )
+    if not (matrix[0] > 0 and matrix[4] > 0):
+        hint = "calibrate the camera, or write a folder of frames with camera.json"
+        raise DataError("the camera is not calibrated: its focal length is 0", where=nearest[0], hint=hint)
+    model = str(info.distortion_model) or "plumb_bob"
+    if model == "fisheye":
+        model = "equidistant"
+    return CameraIntrinsics(
+        int(info.width), int(info.height), matrix[0], matrix[4], matrix[2], matrix[5], model, tuple(bent)
+    )
+
+
+def _field(info: Any, name: str) -> list[float]:
+    """A field of CameraInfo, which ROS 1 spells with a capital."""
+    return [float(value) for value in getattr(info, name, getattr(info, name.upper(), ()))]
+
+
+def _shared(one: Sequence[str], other: Sequence[str]) -> int:
+    count = 0
+    for a, b in zip(one, other, strict=False):
+        if a != b:
+            break
+        count += 1
+    return count
+
+
+def _depth(content: Any, per_metre: float, where: str) -> Array:
+    encoding = str(content.encoding)
+    if encoding not in _DEPTH_ENCODINGS:
+        raise DataError(f"the image is encoded as '{encoding}'", where=where, allowed=", ".join(_DEPTH_ENCODINGS))
+    kind, size = _DEPTH_ENCODINGS[encoding]
+    pixel = np.dtype((">" if content.is_bigendian else "<") + kind)
+    height, width, step = int(content.height), int(content.width), int(content.step)
+    data = np.asarray(content.data, np.uint8).tobytes()
+    if step < width * pixel.itemsize or len(data) < height * step:
+        raise DataError(f"the image has {len(data)} bytes for {width} x {height} pixels", where=where)
+    image = np.ndarray((height, width), pixel, data, strides=(step, pixel.itemsize))
+    return image.astype(np.float64) * (size * per_metre)
+
+
+def _cloud_columns(content: Any, names: Iterable[str], where: str) -> list[NDArray[Any]] | None:
+    """Some fields of a PointCloud2, each shape (N,); None where one is missing."""
+    fields = {str(field.name): field for field in content.fields}
+    height, width, step, row = (int(getattr(content, k)) for k in ("height", "width", "point_step", "row_step"))
+    data = np.asarray(content.data, np.uint8).tobytes()
+    order, found = ">" if content.is_bigendian else "<", []
+    for name in names:
+        if name not in fields:
+            return None
+        kind = np.dtype(order + _POINT_FIELD_TYPES.get(int(fields[name].datatype), "u1"))
+        offset = int(fields[name].offset)
+        if offset + kind.itemsize > step or row < width * step or len(data) < height * row:
+            what = f"the cloud has {len(data)} bytes for {width} x {height} points of {step}"
+            raise DataError(what, where=where)
+        column = np.ndarray((height, width), kind, data, offset, (row, step))
+        found.append(column.ravel())
+    return found
+
+
+def _points(content: Any, where: str) -> Array:
+    axes = _cloud_columns(content, "xyz", where)
+    if axes is None:
+        names = ", ".join(str(field.name) for field in content.fields)
+        raise DataError(f"the cloud has the fields {names}", where=where, allowed="x, y, z among them")
+    return np.stack([axis.astype(np.float64) for axis in axes], axis=1)
+
+
+def _colours(content: Any, where: str) -> Colours | None:
+    for name in ("rgb", "rgba"):
+        found = _cloud_columns(content, (name,), where)
+        if found is not None and found[0].itemsize == 4:
+            packed = np.ascontiguousarray(found[0]).view(found[0].dtype.byteorder + "u4").astype(np.uint32)
+            return np.stack([(packed >> shift) & 0xFF for shift in (16, 8, 0)], axis=1).astype(np.uint8)
+    return None
+
 
 _BAG_SUFFIXES, _AZURE_KINECT_SUFFIX = (".bag", ".mcap", ".db3"), ".mkv"
 _MILLIMETRE, _MICROSECOND = 1e-3, 1e-6
@@ -34,7 +330,7 @@ def read_frames(
     Parameters
     ----------
     path : path-like
-        A folder (`read_frame_folder`); a bag of ROS 1 or ROS 2, an MCAP file or a RealSense file (`read_bag_frames`);
+        A folder (`read_frame_folder`); a bag of ROS 1 or ROS 2, an MCAP file or a RealSense file (`_read_bag_frames`);
         or an Azure Kinect's `.mkv`, where the build of Open3D reads it.
     pose : array_like, shape (4, 4), optional
         Camera in the world, instead of the folder's; others do not say it.
@@ -59,12 +355,12 @@ def read_frames(
             file.name == "metadata.yaml" or file.suffix in _BAG_SUFFIXES for file in place.iterdir()
         )
         return (
-            read_bag_frames(place, pose=pose, unit=unit, topic=topic)
+            _read_bag_frames(place, pose=pose, unit=unit, topic=topic)
             if bag
             else read_frame_folder(place, pose=pose, unit=unit)
         )
     if place.is_file() and ending in _BAG_SUFFIXES:
-        return read_bag_frames(place, pose=pose, unit=unit, topic=topic)
+        return _read_bag_frames(place, pose=pose, unit=unit, topic=topic)
     if place.is_file() and ending == _AZURE_KINECT_SUFFIX:
         return _read_film(place, pose)
     if place.exists():

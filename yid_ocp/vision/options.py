@@ -8,12 +8,10 @@ from typing import Annotated, Literal
 from annotated_types import Ge, Gt, Le
 
 from yid_ocp.options import OptionInfo, check_option_bounds
-from yid_ocp.vision.calibration import CameraCalibrationOptions
-from yid_ocp.vision.clock import CameraClockOptions
-from yid_ocp.vision.dimension_check import DimensionKind
-from yid_ocp.vision.filters import CloudFilterOptions, Coordinates
+from yid_ocp.vision.calibration import CameraCalibrationOptions, CameraClockOptions
 from yid_ocp.vision.fit import ShapeFitOptions
-from yid_ocp.vision.skeleton import SkeletonOptions
+from yid_ocp.vision.point_cloud import CloudFilterOptions, Coordinates, SkeletonOptions
+from yid_ocp.vision.sequence_calibration import DimensionKind
 from yid_ocp.vision.surface_meshes import MeshKind
 
 _RootPlacement = Literal["model", "fixed", "free"]

@@ -1,12 +1,495 @@
-"""Calibration shared by all frames of a sequence, estimated from a subset of them."""
+"""Calibration shared by all frames of a sequence: camera, the object's dimensions, and background.
+
+Dimensions:
+Every frame has a least cost about the sizes x (logarithms of lengths and radii, relative to the model's), the bends
+following: g_f'x + x'S_f x/2 (`DimensionEquations`). Together, with a wide prior P,
+
+    x = -(S + P)^-1 g,    cov x = (S + P)^-1 + (S + P)^-1 (sum_f r_f r_f') (S + P)^-1 + diag(b^2),    r_f = g_f + S_f x
+
+found by Gauss and Newton's method, the frames fitted anew at every x. The second term is the scatter between frames,
+however alike the errors within one are. b is what all frames share: an end is seen no better than a point is and stands
+where the camera's pose has it; noise along the sight makes a tube thinner or thicker by as much as its square over the
+radius."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
 
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from yid_ocp.errors import ConfigError, ModelError, nearest_name_hint
+from yid_ocp.files import is_file
+from yid_ocp.model.mechanism import Mechanism
+from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
+from yid_ocp.model.system import System
 from yid_ocp.vision.calibration import CameraCalibration
-from yid_ocp.vision.clutter import BackgroundPoints
-from yid_ocp.vision.dimension_check import DimensionCheck
+from yid_ocp.vision.shape_evidence import ForeignCluster, FrameShapeFit, TubeLinks
+from yid_ocp.vision.shape_evidence import nearest_on_tubes as nearest_place
+from yid_ocp.vision.surface_meshes import ExtraMesh, TriangleMesh, load_mesh_file
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_NOISE_STDS = 3.0  # of a point, within which it is the background's
+_MOST = 0.5  # of the frames, in which what stands still must be seen: arm and object hide it from time to time
+_ALIKE = 1.0  # of a thing's size, within which it is the same thing in another frame
+_STILL = 0.3  # of its size, by which a still thing's middle wanders at most
+_FOLLOWS = 0.5  # of how far it wanders in the world, below which it moves with a link
+_FEWEST = 2  # frames in which a thing is worth a word
+_TO_SIGMA = 1.4826
+
+
+@dataclass(frozen=True, eq=False)
+class BackgroundPoints:
+    """Background points that do not belong to the object.
+
+    Attributes
+    ----------
+    points : ndarray, shape (N, 3)
+        In the world [m].
+    match_distance : float
+        Distance at which a point belongs to it [m].
+    """
+
+    points: Array = field(default_factory=lambda: np.empty((0, 3)))
+    match_distance: float = 0.0
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.points)
+
+    def contains(self, points: Array, beyond: float = 0.0) -> Mask:
+        """Whether points, shape (N, 3), lie within `within + beyond` [m] of the background, shape (N,)."""
+        if not len(self.points) or not len(points):
+            return np.zeros(len(points), bool)
+        reach = self.match_distance + beyond
+        return np.asarray(np.isfinite(self._tree.query(points, distance_upper_bound=reach)[0]))
+
+    @staticmethod
+    def from_empty_scene(clouds: Sequence[Array], voxel: float, noise: float) -> BackgroundPoints:
+        """Background from clouds of the scene without robot and object, in the world [m]."""
+        if not clouds:
+            return BackgroundPoints()
+        cells = np.unique(np.floor(np.concatenate(clouds) / voxel).astype(np.int64), axis=0)
+        return BackgroundPoints(
+            np.asarray((cells + 0.5) * voxel), _NOISE_STDS * noise + 0.5 * math.sqrt(3.0) * voxel
+        )
+
+    @staticmethod
+    def from_static_points(
+        clouds: Sequence[Array], shapes: Sequence[TubeLinks], voxel: float, noise: float, near: float
+    ) -> BackgroundPoints:
+        """Background from points that stay in most frames away from every fitted shape.
+
+        Parameters
+        ----------
+        clouds : sequence of ndarray, each (N, 3)
+            In the world, without the robot [m].
+        shapes : sequence of Tubes
+            All that were fitted.
+        voxel : float
+            Edge of the cubes that are counted [m].
+        noise : float
+            Standard deviation of a point [m].
+        near : float
+            From the tubes' surface; what ever was so near may be the object's [m].
+        """
+        if not clouds or not shapes:
+            return BackgroundPoints()
+        cells = [np.unique(np.floor(cloud / voxel).astype(np.int64), axis=0) for cloud in clouds]
+        place, count = np.unique(np.concatenate(cells), axis=0, return_counts=True)
+        points: Array = np.asarray((place[count >= max(2.0, _MOST * len(clouds))] + 0.5) * voxel)
+        for tubes in shapes:
+            if len(points):
+                link, _, _, distance = nearest_place(tubes.link_ends, tubes.radius, points)
+                points = points[distance > tubes.radius[link] + near]
+        return BackgroundPoints(points, _NOISE_STDS * noise + 0.5 * math.sqrt(3.0) * voxel)
+
+
+def extra_meshes_by_joint(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> dict[int, list[TriangleMesh]]:
+    """Meshes that the URDF does not have, by the index of the joint that carries them, -1 for the world.
+
+    Raises
+    ------
+    ConfigError
+        No such link, or not exactly one shape.
+    ModelError
+        A file that cannot be read.
+    """
+    made: dict[int, list[TriangleMesh]] = {}
+    for number, entry in enumerate(extra):
+        where = f"model: extra_meshes: {number}"
+        mesh = _shape(entry, where)
+        pose = homogeneous_transform(rotation_from_rpy(*entry.rpy), entry.xyz)
+        joint = -1
+        if entry.parent_frame is not None:
+            if entry.parent_frame not in mechanism.frames:
+                hint = nearest_name_hint(entry.parent_frame, list(mechanism.frames))
+                raise ConfigError(f"there is no link '{entry.parent_frame}'", where=where, hint=hint)
+            frame = mechanism.frames[entry.parent_frame]
+            joint, pose = frame.joint_index, np.array(ca.DM(frame.placement.homogeneous_matrix())) @ pose
+        made.setdefault(joint, []).append(mesh.transformed(pose))
+    return made
+
+
+def _shape(entry: ExtraMesh, where: str) -> TriangleMesh:
+    given = [kind for kind in ("mesh", "box", "cylinder", "sphere") if getattr(entry, kind) is not None]
+    if len(given) != 1:
+        found = " and ".join(given) or "no shape"
+        raise ConfigError(f"there is {found}", where=where, allowed="one of mesh, box, cylinder, sphere")
+    if entry.box is not None:
+        return TriangleMesh.box(entry.box)
+    if entry.cylinder is not None:
+        radius, length = entry.cylinder
+        return TriangleMesh.cylinder(radius, -0.5 * length, 0.5 * length)
+    if entry.sphere is not None:
+        return TriangleMesh.sphere(entry.sphere)
+    path = Path(str(entry.mesh))
+    if not is_file(path):
+        raise ModelError(
+            f"there is no mesh '{path}'", where=where, hint="give a file that trimesh reads: STL, OBJ, DAE"
+        )
+    return load_mesh_file(path)
+
+
+@dataclass(frozen=True, eq=False)
+class ForeignObject:
+    """Foreign object seen in several frames.
+
+    Attributes
+    ----------
+    centre : ndarray, shape (3,)
+        In the world, in the median frame [m].
+    size : ndarray, shape (3,)
+        [m]
+    frames : int
+        In which it was seen.
+    moving : bool
+    link : str
+        Of the robot, with which it moves; empty for none.
+    text : str
+        Where it is and what helps.
+    """
+
+    centre: Array
+    size: Array
+    frames: int
+    moving: bool
+    link: str
+    text: str
+
+
+def group_foreign_objects(
+    things: Sequence[tuple[float, Sequence[ForeignCluster]]],
+    total: int,
+    noise: float,
+    box: tuple[Array, Array],
+    links: Callable[[float], Mapping[str, Array]],
+    coloured: bool,
+    background: bool = False,
+) -> tuple[ForeignObject, ...]:
+    """Group the foreign clusters of all frames into foreign objects, each with advice.
+
+    Parameters
+    ----------
+    things : sequence of (float, sequence of Thing)
+        Of each frame: its time on the joints' clock [s] and what it saw.
+    total : int
+        Number of frames.
+    noise : float
+        Standard deviation of a point [m].
+    box : (ndarray, ndarray), each (3,)
+        In which the object ever was: lower and upper corner [m].
+    links : callable
+        From a time to the poses of the robot's links in the world, shape (4, 4) each.
+    coloured : bool
+        Whether clouds have colours.
+    background : bool
+        Whether what stands still in the frames is left out already.
+    """
+    groups: list[list[tuple[float, ForeignCluster]]] = []
+    for t, seen in things:
+        for thing in seen:
+            home = min(groups, key=lambda group: _apart(group[-1][1], thing), default=None)
+            if home is not None and home[-1][0] < t and _apart(home[-1][1], thing) < 1.0:
+                home.append((t, thing))
+            else:
+                groups.append([(t, thing)])
+    groups = [group for group in groups if len(group) >= min(_FEWEST, total)]
+    groups.sort(key=lambda group: -sum(thing.n_points for _, thing in group))
+    return tuple(_named(group, total, noise, box, links, coloured, background) for group in groups)
+
+
+def _apart(one: ForeignCluster, other: ForeignCluster) -> float:
+    """Distance of two things, in shares of their size in which they pass for the same."""
+    size = max(float(np.linalg.norm(one.extent)), float(np.linalg.norm(other.extent)), 1e-6)
+    return float(np.linalg.norm(one.centre - other.centre)) / (_ALIKE * size)
+
+
+def _wandering(places: Array) -> float:
+    return _TO_SIGMA * float(np.median(np.linalg.norm(places - np.median(places, axis=0), axis=1)))
+
+
+def _named(
+    group: Sequence[tuple[float, ForeignCluster]],
+    total: int,
+    noise: float,
+    box: tuple[Array, Array],
+    links: Callable[[float], Mapping[str, Array]],
+    coloured: bool,
+    background: bool,
+) -> ForeignObject:
+    places = np.array([thing.centre for _, thing in group])
+    centre = np.median(places, axis=0)
+    size = np.median([thing.extent for _, thing in group], axis=0)
+    far = _wandering(places)
+    # as arm and object hide parts of a still thing, the middle of the rest wanders within it
+    span = np.ptp(places, axis=0)
+    moving = bool(
+        (span > np.maximum(2 * _NOISE_STDS * noise, _STILL * np.max([x.extent for _, x in group], axis=0))).any()
+    )
+    link = ""
+    if moving:
+        poses = [links(t) for t, _ in group]
+        inside = {
+            name: _wandering(
+                np.array([(p - at[name][:3, 3]) @ at[name][:3, :3] for p, at in zip(places, poses, strict=True)])
+            )
+            for name in poses[0]
+        }
+        if inside:
+            best = min(inside, key=lambda name: inside[name])
+            link = best if inside[best] < _FOLLOWS * far else ""
+    low, high = places.min(axis=0) - 0.5 * size, places.max(axis=0) + 0.5 * size
+    beside = bool(((low > box[1]) | (high < box[0])).any())
+    where = ", ".join(f"{value:.2f}" for value in centre)
+    big = " x ".join(f"{value:.2f}" for value in size)
+    how = f"moving with {link}" if link else "moving" if moving else "still"
+    text = f"something of {big} m at ({where}) m is not the object, {how}, in {len(group)} of {total} frames: "
+    if link:
+        text += f"give its shape under model.extra_meshes with parent_frame: {link}"
+    elif moving:
+        text += (
+            "take it out of view" if not beside else "leave it out with track.options.filters.box_lower and box_upper"
+        )
+        text += ", or give the object's colour under track.options.filters.object_colours" if coloured else ""
+    else:
+        text += "" if background else "set track.options.background_estimation: frames, or "
+        text += "film the scene without object and robot for track.background_frames"
+        text += "; or leave it out with track.options.filters.box_lower and box_upper" if beside else ""
+        text += "; if it is another arm, lock its joints (model.arms.locked_joints)" if links(group[0][0]) else ""
+    return ForeignObject(centre, size, len(group), moving, link, text)
+
+
+DimensionKind = Literal["length", "radius"]
+_DIMENSION_KINDS: tuple[DimensionKind, ...] = ("length", "radius")
+
+_PRIOR = (0.2, 0.4)  # standard deviations of the logarithms of lengths and radii
+_SIGMAS = 3.0  # from the model's value, beyond which that is doubted
+_CLEAR = 2.0  # from there, within which a first look finds nothing to doubt
+_KNOWN = 0.1  # standard deviation of a logarithm, above which nothing can be said of a size
+_ROUNDS, _SETTLED, _LONGEST_STEP = 8, 0.004, 0.15
+_LEAST_FRAMES = 3
+_APART = 3.0  # robust standard deviations from the other frames' ends, at which a frame's end is a wrong one
+
+
+@dataclass(frozen=True, eq=False)
+class DimensionCheck:
+    """Tube lengths and radii estimated from the frames, compared with the model.
+
+    Attributes
+    ----------
+    names : tuple of str
+        `T1.length` and so on: lengths of all segments, then their radii.
+    model_values : ndarray, shape (2 s,)
+        The model's values [m].
+    log_ratio : ndarray, shape (2 s,)
+        Logarithm of the value that fits over the model's.
+    covariance : ndarray, shape (2 s, 2 s)
+        Of `log_ratio`.
+    is_estimated : tuple of bool
+        Which of them the fit uses in place of the model's.
+    n_frames : int
+        That were asked; 0 where nothing could be said.
+    """
+
+    names: tuple[str, ...]
+    model_values: Array
+    log_ratio: Array
+    covariance: Array
+    is_estimated: tuple[bool, ...]
+    n_frames: int
+
+    @property
+    def log_ratio_std(self) -> Array:
+        """Standard deviation of `log_ratio`, shape (2 s,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def is_determined(self) -> NDArray[np.bool_]:
+        """Which dimensions the frames determine, shape (2 s,)."""
+        return np.asarray((self.log_ratio_std < _KNOWN) & (self.n_frames > 0))
+
+    @property
+    def is_contradicted(self) -> NDArray[np.bool_]:
+        """Which of the model's values contradict the frames, shape (2 s,)."""
+        return np.asarray(self.is_determined & (np.abs(self.log_ratio) > _SIGMAS * self.log_ratio_std))
+
+    @property
+    def contradiction_message(self) -> str:
+        """Which of the model's values contradict the frames and have no estimate in their place; empty for none."""
+        values, fitting = 1e3 * self.model_values, 1e3 * self.model_values * np.exp(self.log_ratio)
+        wrong = [
+            f"{self.names[i]} {values[i]:.4g} mm where {fitting[i]:.4g} mm fits"
+            for i in np.flatnonzero(self.is_contradicted & ~np.array(self.is_estimated))
+        ]
+        return f"the object seems to be other than the model says ({', '.join(wrong)})" if wrong else ""
+
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """Of every size that is doubted or estimated: the value that fits, with its interval."""
+        lines = []
+        for i, name in enumerate(self.names):
+            value = self.model_values[i] * math.exp(self.log_ratio[i])
+            two = 2 * value * self.log_ratio_std[i]
+            found = f"{1e3 * value:.4g} mm ± {1e3 * two:.2g} mm (two standard deviations) fits {self.n_frames} frames"
+            if self.is_estimated[i]:
+                lines.append(f"{name} is estimated: {found}; the model says {1e3 * self.model_values[i]:.4g} mm")
+            elif self.is_contradicted[i]:
+                kind = name.rpartition(".")[2]
+                lines.append(
+                    f"{name} seems to be wrong: {found}, the model says {1e3 * self.model_values[i]:.4g} mm. "
+                    f"Measure it again, or estimate it: track.options.estimated_dimensions: [{kind}]"
+                )
+        return tuple(lines)
+
+    def point_std(self, points: Array) -> Array:
+        """Standard deviations of points due to wrong and uncertain dimensions.
+
+        Parameters
+        ----------
+        points : ndarray, shape (np, 3, 2 s)
+            How they move with the sizes (`DimensionEquations`) [m].
+
+        Returns
+        -------
+        ndarray, shape (np, 3)
+            Standard deviations [m]: the whole displacement of what is doubted and yet used, and what remains uncertain
+            of what is estimated.
+        """
+        used = np.array(self.is_estimated)
+        wrong = np.where(self.is_contradicted & ~used, self.log_ratio, 0.0)
+        chosen = points[..., used]
+        spread = np.einsum("ijk,kl,ijl->ij", chosen, self.covariance[np.ix_(used, used)], chosen)
+        return np.asarray(np.sqrt((points @ wrong) ** 2 + np.maximum(spread, 0.0)))
+
+    def parameter_values(self, system: System, given: Mapping[str, float] | None) -> dict[str, float]:
+        """Parameter values with the estimated sizes in place of the model's."""
+        return _changed(system, given, np.where(self.is_estimated, self.log_ratio, 0.0))
+
+
+def check_dimensions(
+    system: System,
+    given: Mapping[str, float] | None,
+    estimate: Sequence[DimensionKind],
+    std: tuple[float, float],
+    fitted: Callable[[Mapping[str, float], Sequence[Array]], list[FrameShapeFit]],
+) -> DimensionCheck:
+    """Estimate the tubes' dimensions from some frames and compare them with the model.
+
+    Parameters
+    ----------
+    system : System
+    given : mapping of str to float, optional
+        Parameter values; nominal where absent.
+    estimate : sequence of "length" and "radius"
+        What the fit is to use in place of the model's values, where the frames tell it.
+    std : (float, float)
+        Standard deviations of a point's distance from the surface, and of the error of places that all frames share
+        with the camera's pose [m].
+    fitted : callable
+        From parameter values and the configurations of the round before, empty in the first, to the fits of the frames
+        that can be used.
+
+    Returns
+    -------
+    Sizes
+    """
+    told = _told(system, given)
+    count, many = len(told), len(told) // 2
+    names = tuple(f"{s.name}.{kind}" for kind in _DIMENSION_KINDS for s in system.segment_layouts)
+    prior = np.diag(np.repeat(1.0 / np.square(_PRIOR), many))
+    change, starts = np.zeros(count), list[Array]()
+    nothing = DimensionCheck(names, told, change, np.asarray(np.linalg.inv(prior)), (False,) * count, 0)
+    wanted = np.array([kind in estimate for kind in _DIMENSION_KINDS for _ in range(many)])
+    shared = np.concatenate([math.hypot(*std) / told[:many], std[0] ** 2 / (2 * told[many:] ** 2)])
+    covariance, frames = nothing.covariance, 0
+    for turn in range(_ROUNDS):
+        fits = fitted(_changed(system, given, change), starts)
+        chosen = _believed(fits)
+        if len(chosen) < _LEAST_FRAMES:
+            return nothing
+        starts, frames = [fit.q for fit in fits], len(chosen)
+        gradient = np.array([fit.dimension_equations.gradient for fit in chosen])
+        curvature = np.array([fit.dimension_equations.hessian for fit in chosen])
+        inverse = np.linalg.inv(curvature.sum(axis=0) + prior)
+        step = -inverse @ (gradient.sum(axis=0) + prior @ change)
+        left = gradient + curvature @ step
+        scatter = inverse @ (left.T @ left) @ inverse * frames / (frames - 1)
+        covariance = np.asarray(inverse + scatter + np.diag(shared**2))
+        change = change + np.clip(step, -_LONGEST_STEP, _LONGEST_STEP)
+        if turn == 0 and not wanted.any() and (np.abs(change) < _CLEAR * np.sqrt(np.diag(covariance))).all():
+            break  # nothing to doubt
+        if np.abs(step).max() < _SETTLED:
+            break
+    known = np.sqrt(np.diag(covariance)) < _KNOWN
+    return DimensionCheck(names, told, change, covariance, tuple(bool(x) for x in wanted & known), frames)
+
+
+def _believed(fits: Sequence[FrameShapeFit]) -> list[FrameShapeFit]:
+    """Fits whose free ends stand where those of the others do, as seen from the shape's."""
+    if not fits:
+        return []
+    ends = np.array([fit.end_offsets for fit in fits])
+    keep = np.ones(len(fits), bool)
+    for column in ends.T:
+        seen = np.isfinite(column)
+        if seen.any():
+            middle = float(np.median(column[seen]))
+            spread = _TO_SIGMA * float(np.median(np.abs(column[seen] - middle)))
+            usual = max(spread, float(np.median([fit.noise_std for fit in fits])))
+            keep &= ~seen | (np.abs(column - middle) < _APART * usual)
+    return [fit for fit, good in zip(fits, keep, strict=True) if good]
+
+
+def _symbols(system: System) -> list[list[str]]:
+    """Parameters that each size is made of."""
+    found = [[x.name() for x in ca.symvar(ca.vertcat(*s.link_lengths))] for s in system.segment_layouts]
+    return found + [[x.name() for x in ca.symvar(s.radius)] for s in system.segment_layouts]
+
+
+def _told(system: System, given: Mapping[str, float] | None) -> Array:
+    symbols, theta = system.parameters.symbols, system.parameters.vector(given)
+    sums = [ca.sum1(ca.vertcat(*s.link_lengths)) for s in system.segment_layouts] + [
+        s.radius for s in system.segment_layouts
+    ]
+    return np.array(ca.Function("told", [symbols], [ca.densify(ca.vertcat(*sums))])(theta)).ravel()
+
+
+def _changed(system: System, given: Mapping[str, float] | None, change: Array) -> dict[str, float]:
+    values = dict(zip(system.parameters.names, system.parameters.vector(given).tolist(), strict=True))
+    for i, names in enumerate(_symbols(system)):
+        for name in names:
+            values[name] *= math.exp(float(change[i]))
+    return values
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,8 +3,7 @@
 Points within three standard deviations of the tubes' surface lie on the shape. Of the others, those that hang together
 and are as many as a piece of tube as long as it is wide would have are a thing. Where a thing's surface goes on from
 the shape's, nobody can tell whose the points are: within two tubes' reach of there they are contested and say nothing.
-A station of a tube that no own point lies on is hidden, or it is empty although the camera sees it.
-"""
+A station of a tube that no own point lies on is hidden, or it is empty although the camera sees it."""
 
 from __future__ import annotations
 
@@ -19,9 +18,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from yid_ocp.vision.filters import weighted_median
+from yid_ocp.vision.frames import OcclusionMap
 from yid_ocp.vision.initial_shapes import EndAnchor
-from yid_ocp.vision.occlusion import OcclusionMap
+from yid_ocp.vision.point_cloud import weighted_median
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -108,7 +107,7 @@ def nearest_on_tubes(
     return link, along, normal / np.maximum(distance, 1e-9)[:, None], distance
 
 
-def faces_away_from_camera(normal: Array, sight: Array) -> Mask:
+def _faces_away_from_camera(normal: Array, sight: Array) -> Mask:
     """Whether surface normals (N, 3) face away from the camera, by lines of sight (N, 3)."""
     return np.asarray(np.einsum("ij,ij->i", normal, sight) > -_AWAY * np.linalg.norm(sight, axis=1))
 
@@ -238,7 +237,7 @@ def assess_shape(tubes: TubeLinks, seen: CloudObservation, near: float) -> Shape
     Evidence
     """
     link, along, normal, distance = nearest_on_tubes(tubes.link_ends, tubes.radius, seen.points)
-    away = faces_away_from_camera(normal, seen.points - seen.camera_position)
+    away = _faces_away_from_camera(normal, seen.points - seen.camera_position)
     error = np.where(away, -distance, distance) - tubes.radius[link]
     size = np.abs(error)
     close = size < near
@@ -447,3 +446,161 @@ class _Slices:
             return math.nan
         inside = along[(along > edges[last - 1]) & (along <= edges[last])]
         return float(inside.max()) if len(inside) else float(edges[last])
+
+
+_RIM = 0.85  # of the radius to either side, within which a tube's depth is compared
+
+
+@dataclass(frozen=True, eq=False)
+class _SurfaceResiduals:
+    """Signed distances of points from the tubes' surface, with derivatives.
+
+    Attributes
+    ----------
+    point_indices : ndarray of int, shape (M,)
+        Of the points that are compared.
+    link_indices : ndarray of int, shape (M,)
+    signed_distance : ndarray, shape (M,)
+        Positive outside of the surface [m].
+    jacobian_by_link_ends : ndarray, shape (M, 6)
+        Derivative by the start and the end of the link's centre line.
+    derivative_by_radius : ndarray, shape (M,)
+        By the radius of the tube.
+    """
+
+    point_indices: Integers
+    link_indices: Integers
+    signed_distance: Array
+    jacobian_by_link_ends: Array
+    derivative_by_radius: Array
+
+
+def nearest_surface_residuals(
+    corners: Array, radius: Array, points: Array, camera: Array, share: float = 1.0
+) -> _SurfaceResiduals:
+    """Residuals along the nearest way to the surface,  e = |p - c| - f r.
+
+    Parameters
+    ----------
+    corners : ndarray, shape (K, 2, 3)
+        [m]
+    radius : ndarray, shape (K,)
+        [m]
+    points : ndarray, shape (N, 3)
+        [m]
+    camera : ndarray, shape (3,)
+        [m]; a point that only the far side of a tube is near to counts from the near side.
+    share : float
+        f, of the radius, at which points lie.
+    """
+    link, along, normal, distance = nearest_on_tubes(corners, radius, points, share)
+    sign = np.where(_faces_away_from_camera(normal, points - camera), -1.0, 1.0)
+    error = sign * distance - share * radius[link]
+    # e falls as the centre line moves along the normal: de = -n'((1 - t) da + t db)
+    direction = -sign[:, None] * normal
+    rows = np.concatenate([direction * (1 - along)[:, None], direction * along[:, None]], axis=1)
+    return _SurfaceResiduals(np.arange(len(points)), link, error, rows, np.full(len(points), -share))
+
+
+def line_of_sight_residuals(corners: Array, radius: Array, points: Array, camera: Array) -> _SurfaceResiduals:
+    """Residuals along the lines of sight, where the camera's noise is; parameters as of `nearest_surface_residuals`.
+
+    Across the sight a point stands where its pixel does, by u from the axis; towards the camera the surface lies at
+    sqrt(r^2 - u^2). The nearest way turns with the noise, which does little to where a tube is found, but makes it
+    appear thinner by several times noise^2/r. Points near the rim, where depth says little, are not compared.
+    """
+    link, along, normal, distance = nearest_on_tubes(corners, radius, points)
+    edge = corners[:, 1] - corners[:, 0]
+    axis = (edge / np.linalg.norm(edge, axis=1)[:, None])[link]
+    sight = camera - points
+    front = sight - np.einsum("ij,ij->i", sight, axis)[:, None] * axis
+    front /= np.maximum(np.linalg.norm(front, axis=1), 1e-12)[:, None]
+    side = np.cross(axis, front)
+    offset = normal * distance[:, None]
+    across = np.einsum("ij,ij->i", offset, side)
+    index = np.flatnonzero((np.abs(across) < _RIM * radius[link]) & (along > 0) & (along < 1))
+    link, along, front, side, across = link[index], along[index], front[index], side[index], across[index]
+    deep = np.sqrt(radius[link] ** 2 - across**2)
+    error = np.einsum("ij,ij->i", offset[index], front) - deep
+    direction = -front - (across / deep)[:, None] * side
+    rows = np.concatenate([direction * (1 - along)[:, None], direction * along[:, None]], axis=1)
+    return _SurfaceResiduals(index, link, error, rows, -radius[link] / deep)
+
+
+@dataclass(frozen=True, eq=False)
+class DimensionEquations:
+    """Quadratic cost of the tubes' dimensions in one frame, minimised over the bends.
+
+    The sizes are the logarithms of all lengths and then of all radii, segment by segment, relative to the values of the
+    fit. About these the least cost is  g'x + x'Sx/2.
+
+    Attributes
+    ----------
+    gradient : ndarray, shape (2 s,)
+    hessian : ndarray, shape (2 s, 2 s)
+    point_jacobian : ndarray, shape (np, 3, 2 s)
+        How the system's points move with them [m].
+    """
+
+    gradient: Array
+    hessian: Array
+    point_jacobian: Array
+
+
+@dataclass(frozen=True, eq=False)
+class FrameShapeFit:
+    """Fitted shape of one frame with its uncertainty and quality.
+
+    Attributes
+    ----------
+    q : ndarray, shape (n,)
+        Configuration, twists at rest.
+    point_positions : ndarray, shape (np, 3)
+        The system's points there [m].
+    point_std : ndarray, shape (np, 3)
+        Standard deviation of each coordinate by the curvature of the cost [m].
+    mean_distance : float
+        Mean of |e_i| over the points near the shape that belong to no other thing [m].
+    noise_std : float
+        Standard deviation of e_i of the points on the shape [m].
+    covered_fraction, visibly_empty_fraction : ndarray, shape (K,)
+        Share of each link's length on which there are points, and on which the camera sees that there are none.
+    is_point_seen : ndarray of bool, shape (np,)
+        Whether there are points enough about each of the system's points, or a gripper that holds it.
+    grasp_gaps : ndarray, shape (grasps, 3)
+        From what each gripper holds to the gripper [m].
+    end_offsets : ndarray, shape (E,)
+        By how much each free tube's end lies further along than the shape has it, NaN where that is not seen [m].
+    contested_fraction : float
+        Share of the points on the shape that may belong to a thing which touches it; they are left out.
+    foreign_clusters : tuple of Thing
+        What else there is.
+    dimension_equations : SizeRows
+        What the frame says of lengths and radii.
+    n_iterations : int
+    link_ends : ndarray, shape (K, 2, 3)
+        Start and end of every link [m].
+    """
+
+    q: Array
+    point_positions: Array
+    point_std: Array
+    mean_distance: float
+    noise_std: float
+    covered_fraction: Array
+    visibly_empty_fraction: Array
+    is_point_seen: NDArray[np.bool_]
+    grasp_gaps: Array
+    end_offsets: Array
+    contested_fraction: float
+    foreign_clusters: tuple[ForeignCluster, ...]
+    dimension_equations: DimensionEquations
+    n_iterations: int
+    link_ends: Array
+
+    @property
+    def visible_coverage(self) -> float:
+        """Fraction of the shape's visible length that has points."""
+        lengths = np.linalg.norm(self.link_ends[:, 1] - self.link_ends[:, 0], axis=1)
+        there, bare = float(lengths @ self.covered_fraction), float(lengths @ self.visibly_empty_fraction)
+        return there / max(there + bare, 1e-12)

@@ -25,8 +25,7 @@ from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import resolve_urdf_path
 from yid_ocp.options import OptionInfo
-from yid_ocp.vision.camera_intrinsics import CameraIntrinsics
-from yid_ocp.vision.frames import import_open3d
+from yid_ocp.vision.frames import CameraIntrinsics, import_open3d
 
 Array = NDArray[np.float64]
 MeshKind = Literal["visual", "collision"]

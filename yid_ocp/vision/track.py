@@ -19,30 +19,45 @@ from scipy.spatial import cKDTree
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import ConfigError, DataError, ModelError, nearest_name_hint
 from yid_ocp.model.system import System
-from yid_ocp.vision.calibration import CameraCalibration, calibrate_camera, calibration_as_given
+from yid_ocp.vision.calibration import (
+    CameraCalibration,
+    calibrate_camera,
+    calibration_as_given,
+    estimate_stamp_delay,
+    is_stamped_late,
+)
 from yid_ocp.vision.camera_registration import ArmSurface, CalibrationFrame
-from yid_ocp.vision.centerline import trace_centerline
-from yid_ocp.vision.clock import estimate_stamp_delay, is_stamped_late
-from yid_ocp.vision.clutter import BackgroundPoints, ForeignObject, extra_meshes_by_joint, group_foreign_objects
-from yid_ocp.vision.dimension_check import DimensionCheck, check_dimensions
-from yid_ocp.vision.filters import (
+from yid_ocp.vision.fit import ShapeFitter
+from yid_ocp.vision.frame_selection import (
+    choose_root_ends,
+    is_self_touching,
+    reject_outlying_frames,
+    rejection_reason,
+    tracked_points,
+)
+from yid_ocp.vision.frames import FrameSequence, OcclusionMap
+from yid_ocp.vision.initial_shapes import InitialShapeFinder, trace_centerline, with_free_root
+from yid_ocp.vision.options import TrackOptions
+from yid_ocp.vision.point_cloud import (
+    CloudSkeleton,
     ObjectRegion,
     WeightedCloud,
+    extract_skeleton,
     has_any_colour,
     is_not_outlier,
     is_not_robot,
     voxel_averages,
 )
-from yid_ocp.vision.fit import ShapeFitter
-from yid_ocp.vision.frames import FrameSequence
-from yid_ocp.vision.initial_shapes import InitialShapeFinder, with_free_root
-from yid_ocp.vision.occlusion import OcclusionMap
-from yid_ocp.vision.options import TrackOptions
-from yid_ocp.vision.root_selection import choose_root_ends, is_self_touching
-from yid_ocp.vision.sequence_calibration import SequenceCalibration
-from yid_ocp.vision.shape_evidence import CloudObservation
-from yid_ocp.vision.shape_fit_result import FrameShapeFit
-from yid_ocp.vision.skeleton import CloudSkeleton, extract_skeleton
+from yid_ocp.vision.sequence_calibration import (
+    BackgroundPoints,
+    DimensionCheck,
+    ForeignObject,
+    SequenceCalibration,
+    check_dimensions,
+    extra_meshes_by_joint,
+    group_foreign_objects,
+)
+from yid_ocp.vision.shape_evidence import CloudObservation, FrameShapeFit
 from yid_ocp.vision.surface_meshes import (
     ArticulatedSurfaces,
     CameraScene,
@@ -50,7 +65,6 @@ from yid_ocp.vision.surface_meshes import (
     load_robot_meshes,
     numeric_mechanism,
 )
-from yid_ocp.vision.track_quality import reject_outlying_frames, rejection_reason, tracked_points
 from yid_ocp.vision.track_result import FrameReport, FrameStages, TrackResult
 
 Array = NDArray[np.float64]

@@ -27,7 +27,6 @@ from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.animation import ModelTrajectory, make_animation
 from yid_ocp.report.summaries import track_summary
 from yid_ocp.vision.calibration import CameraCalibration
-from yid_ocp.vision.camera import DepthCamera, FrameTiming, VirtualCamera, VirtualFrames, render_virtual_frames
 from yid_ocp.vision.camera_registration import (
     CLOCK_DRIFT_INDEX,
     CLOCK_OFFSET_INDEX,
@@ -36,18 +35,23 @@ from yid_ocp.vision.camera_registration import (
     ROTATION_SLICE,
     TRANSLATION_SLICE,
 )
-from yid_ocp.vision.clutter import ForeignObject
-from yid_ocp.vision.dimension_check import DimensionCheck
 from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.frame_folder import write_frame_folder
 from yid_ocp.vision.frame_reading import read_frames
 from yid_ocp.vision.frames import FrameSequence, look_at_pose
-from yid_ocp.vision.sequence_calibration import SequenceCalibration
-from yid_ocp.vision.serialization import from_plain_data, to_plain_data
+from yid_ocp.vision.sequence_calibration import DimensionCheck, ForeignObject, SequenceCalibration
 from yid_ocp.vision.surface_meshes import CameraScene
 from yid_ocp.vision.track import FrameTracker
-from yid_ocp.vision.track_figures import draw_frame_stages, draw_track
-from yid_ocp.vision.track_result import FrameReport, TrackResult, count_drop_reasons
+from yid_ocp.vision.track_result import (
+    FrameReport,
+    TrackResult,
+    count_drop_reasons,
+    draw_frame_stages,
+    draw_track,
+    from_plain_data,
+    to_plain_data,
+)
+from yid_ocp.vision.virtual_camera import DepthCamera, FrameTiming, VirtualCamera, VirtualFrames, render_virtual_frames
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.command_runner import CommandResult, run_and_print, workers_from_arguments
 from yid_ocp.workflow.recording_issues import issues_result, single_recording_issues

@@ -21,8 +21,7 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
 from yid_ocp.errors import ConfigError
-from yid_ocp.vision.camera_intrinsics import XTION_INTRINSICS, CameraIntrinsics
-from yid_ocp.vision.frames import FrameSequence, validated_pose
+from yid_ocp.vision.frames import XTION_INTRINSICS, CameraIntrinsics, FrameSequence, validated_pose
 from yid_ocp.vision.surface_meshes import (
     ArticulatedSurfaces,
     CameraScene,
