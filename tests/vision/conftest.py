@@ -29,14 +29,7 @@ from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.frames import CameraIntrinsics, import_open3d
 
 DATA = Path(__file__).parent / "data"
-TRUTH = {
-    "T1.bend": 22.0,
-    "T1.twist": 13.6,
-    "T2.bend": 10.7,
-    "T2.twist": 8.2,
-    "T3.bend": 11.5,
-    "T3.twist": 9.7,
-}
+TRUTH = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T3.bend": 11.5, "T3.twist": 9.7}
 POSE = look_at_pose([2.6, 0.0, 0.45], [0.85, 0.0, -0.1])
 LATENCY = 0.06
 

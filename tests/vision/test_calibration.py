@@ -13,10 +13,10 @@ from yid_ocp.errors import DataError
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.vision import CameraCalibrationOptions, CameraClockOptions, CameraIntrinsics, look_at_pose
 from yid_ocp.vision.calibration import (
+    _find_on_time_frames,
     calibrate_camera,
     calibration_as_given,
     estimate_stamp_delay,
-    _find_on_time_frames,
     is_stamped_late,
 )
 from yid_ocp.vision.camera_registration import (
@@ -26,10 +26,10 @@ from yid_ocp.vision.camera_registration import (
     STATE_SIZE,
     TRANSLATION_SLICE,
     ArmSurface,
-    _CalibrationEquations,
     CalibrationFrame,
     CameraState,
     _at_least,
+    _CalibrationEquations,
     evaluate_robust_cost,
 )
 from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, load_robot_meshes

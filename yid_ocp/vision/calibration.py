@@ -91,17 +91,7 @@ class CameraClockOptions:
 
 @dataclass(frozen=True)
 class _StampDelay:
-    """Delay of one frame's time stamp beyond the common clock offset.
-
-    Attributes
-    ----------
-    delay : float
-        Its offset beyond the common one [s].
-    std : float
-        Of that; infinite where too few points lie on the arm [s].
-    mean_square_distance : float
-        Mean square of its points' distances from the arm there [m^2].
-    """
+    """Delay of one frame's time stamp beyond the common clock offset."""
 
     delay: float
     std: float
@@ -109,25 +99,17 @@ class _StampDelay:
 
 
 def estimate_stamp_delay(
-    arm: ArmSurface,
-    state: CameraState,
-    stamp: float,
-    points: Array,
-    rng: np.random.Generator,
-    usual: float = 0.0,
+    arm: ArmSurface, state: CameraState, stamp: float, points: Array, rng: np.random.Generator, usual: float = 0.0
 ) -> _StampDelay | None:
     """Estimate the delay of one frame's time stamp beyond the common offset.
 
     Parameters
     ----------
-    arm : Arm
     state : CameraState
         Of the sequence.
-    stamp : float
-        [s]
+    stamp : float [s]
     points : ndarray, shape (N, 3)
         Of the frame in the world, the robot's among them [m].
-    rng : Generator
     usual : float
         Misfit of other frames [m^2]; where this one's is not much larger, its offset is looked for nearby only.
 
@@ -154,11 +136,7 @@ def estimate_stamp_delay(
 
 
 def _nearby(arm: ArmSurface, origin: Array, t: float, points: Array, start: float) -> _StampDelay:
-    """The offset not far from a start, by Gauss and Newton's method within one reach after the other.
-
-    A shift of the frame is a further unknown, since the calibration is not exact: an arm that moves slowly tells a
-    shift from a delay as little as it should.
-    """
+    """The offset not far from a start, by Gauss and Newton's method within one reach after the other."""
     x = np.array([start, 0.0, 0.0, 0.0])
     hessian, sigma = np.zeros((4, 4)), _OFF_ARM_DISTANCE
     for share in _NARROWING:
@@ -190,15 +168,7 @@ def _mean_square(error: Array, count: int) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _OnTimeFrames:
-    """Frames that agree on one clock offset, and their median misfit.
-
-    Attributes
-    ----------
-    frame_indices : tuple of int
-        Those that agree on one offset.
-    median_square_distance : float
-        Median of theirs [m^2].
-    """
+    """Frames that agree on one clock offset, and their median misfit."""
 
     frame_indices: tuple[int, ...]
     median_square_distance: float
@@ -294,7 +264,6 @@ class CameraCalibration:
     ----------
     camera_state : CameraState
         What is used: pose, depth, clock.
-    prior_state : CameraState
     on_time_frames : Usual or None
         Of frames by themselves; None where the clock was not compared.
     state_covariance : ndarray, shape (10, 10)
@@ -330,10 +299,8 @@ class CameraCalibration:
         ----------
         points : ndarray, shape (N, 3)
             In the world [m].
-        velocity : ndarray, shape (N, 3)
-            [m/s]
-        stamps : ndarray, shape (N,)
-            [s]
+        velocity : ndarray, shape (N, 3) [m/s]
+        stamps : ndarray, shape (N,) [s]
 
         Returns
         -------
@@ -374,20 +341,12 @@ def calibrate_camera(
 
     Parameters
     ----------
-    arm : Arm
     glimpses : sequence of Glimpse
         Thinned, the robot and what is about it among the points.
     pose : ndarray, shape (4, 4)
         Camera in the world, as far as known.
-    rng : Generator
-    options : CalibrationOptions
-    clock : ClockOptions
     source : str
         Where the frames come from, for messages.
-
-    Returns
-    -------
-    Calibration
 
     Raises
     ------

@@ -169,17 +169,7 @@ class CalibrationFrame:
 
 @dataclass(frozen=True, eq=False)
 class _CalibrationEquations:
-    """Linearised calibration equations of one frame's points near the arm.
-
-    Attributes
-    ----------
-    jacobian : ndarray, shape (N, 10)
-        Derivatives of `residuals`.
-    residuals : ndarray, shape (N,)
-        [m]
-    patch_indices : ndarray of int, shape (N, 4)
-        Part of the robot, and the patch of it.
-    """
+    """Linearised calibration equations of one frame's points near the arm."""
 
     jacobian: Array
     residuals: Array
@@ -191,7 +181,6 @@ class ArmSurface:
 
     Parameters
     ----------
-    robot_surfaces : Surfaces
     configuration_at : callable
         From a time on the joints' clock to a configuration.
     grasp_positions_at : callable
@@ -400,9 +389,6 @@ def initial_camera_states(
 
     Parameters
     ----------
-    arm : Arm
-    glimpses : sequence of Glimpse
-    told : CameraState
     search : float
         How far from its offset others are tried [s].
     most : int
@@ -441,19 +427,7 @@ def initial_camera_states(
 
 @dataclass(frozen=True, eq=False)
 class _Field:
-    """Cost of a surface's point by its place in the camera's frame, and the arm's visible points.
-
-    Attributes
-    ----------
-    cost : ndarray, shape (cells,)
-        min(distance to the cloud, capture)^2, of capture^2; `_HIDDEN` out of the cloud's view.
-    low : ndarray, shape (3,)
-        Corner of the grid [m].
-    shape : tuple of int
-    points : ndarray, shape (N, 3)
-        In the world at the told state [m].
-    part : ndarray of int, shape (N,)
-    """
+    """Cost of a surface's point by its place in the camera's frame, and the arm's visible points."""
 
     cost: NDArray[np.float32]
     low: Array
@@ -515,7 +489,8 @@ class _Field:
 @dataclass(frozen=True)
 class SurfaceVisibility:
     """Of the arm's surface that should be seen: shares where a cloud has it, where something is before it, and where
-    the camera saw through it; in how many samples."""
+    the camera saw through it; in how many samples.
+    """
 
     there: float
     covered: float
@@ -524,12 +499,7 @@ class SurfaceVisibility:
 
 
 class CloudSearchTrees:
-    """Search trees of some frames, to measure how much of the arm they show.
-
-    Parameters
-    ----------
-    glimpses : sequence of Glimpse
-    """
+    """Search trees of some frames, to measure how much of the arm they show."""
 
     def __init__(self, glimpses: Sequence[CalibrationFrame]) -> None:
         self._glimpses = glimpses

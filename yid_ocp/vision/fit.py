@@ -118,8 +118,6 @@ class ShapeFitter:
 
     Parameters
     ----------
-    system : System
-    options : FitOptions, optional
     values : mapping of str to float, optional
         Parameter values (lengths, radii, stiffnesses for the prior); nominal where absent.
     loose : sequence of str
@@ -203,26 +201,16 @@ class ShapeFitter:
         apart = np.linalg.norm(corners[:, 1][:, None] - taken, axis=2).min(axis=1)
         return reach, tuple(int(k) for k in np.flatnonzero(apart > _TOUCHING))
 
-    def fit_frame(
-        self,
-        sight: CloudObservation,
-        q_known: Array,
-        starts: Sequence[Array] = (),
-    ) -> FrameShapeFit:
+    def fit_frame(self, sight: CloudObservation, q_known: Array, starts: Sequence[Array] = ()) -> FrameShapeFit:
         """Fit the shape in one frame.
 
         Parameters
         ----------
-        sight : Sight
         q_known : ndarray, shape (n,)
             Configuration whose robot part is right; the object's part is not used.
         starts : sequence of ndarray, each (n,)
             Where the search for the object's part begins; at rest where absent. The passes on the nodes, which cost
             little, run from all of them, the others from the best that was found.
-
-        Returns
-        -------
-        Fit
 
         Raises
         ------
@@ -266,10 +254,7 @@ class ShapeFitter:
         return np.array([owner in tubes for owner in self.link_segments])
 
     def _rivals(self, best: _Attempt, sight: CloudObservation) -> list[Array]:
-        """Other shapes that the cloud speaks for as much: where a thing touches a tube, that may go on along the thing.
-
-        Everything is tried that is left without the points on which the tube lies from the contact on.
-        """
+        """Other shapes that the cloud speaks for as much, where a thing touches a tube."""
         if not best.evidence.is_contested.any() or not self.options.surface_loss_scales:
             return []
         tubes = self.tubes_at(best.minimum.q)

@@ -37,32 +37,12 @@ _AGAIN = "copy or record it again"
 
 
 def _read_cloud(path: Path) -> Array:
-    """Points of a cloud, shape (N, 3), in the file's unit.
-
-    Parameters
-    ----------
-    path : Path
-        PLY; PCD; NPZ with the array `points`, shape (N, 3); or XYZ: text, a point a row, its first three columns.
-
-    Raises
-    ------
-    DataError
-        The file is missing, empty or damaged.
-    """
+    """Points of a cloud, shape (N, 3), in the file's unit."""
     return _read_ply_points(_there(path)) if path.suffix.lower() == ".ply" else _read(path)[0]
 
 
 def _read_colours(path: Path) -> Colours | None:
-    """Red, green and blue of the points that `_read_cloud` gives, shape (N, 3), None where the file has none.
-
-    PLY: `red`, `green`, `blue`; PCD: `rgb`; NPZ: the array `colours`, shape (N, 3); XYZ: the fourth to sixth of six or
-    more columns, from 0 to 255.
-
-    Raises
-    ------
-    DataError
-        As `_read_cloud`.
-    """
+    """Red, green and blue of the points that `_read_cloud` gives, shape (N, 3), None where the file has none."""
     return _read_ply_colours(_there(path)) if path.suffix.lower() == ".ply" else _read(path)[1]
 
 
@@ -189,17 +169,7 @@ class _Element:
 
 
 def _read_ply_points(path: Path) -> Array:
-    """Positions of the vertices, shape (N, 3), in the file's unit; other properties and later elements are left out.
-
-    Parameters
-    ----------
-    path : Path
-
-    Raises
-    ------
-    DataError
-        No PLY file, a damaged one, or one whose vertices have no x, y and z.
-    """
+    """Positions of the vertices, shape (N, 3), in the file's unit; other properties and later elements are left out."""
     return _columns(path, _AXIS_PROPERTIES)
 
 
@@ -312,15 +282,10 @@ def read_frame_folder(
 
     Parameters
     ----------
-    folder : path-like
     pose : array_like, shape (4, 4), optional
         Camera in the world, instead of the folder's.
     unit : str, optional
         Unit of the clouds, instead of the folder's.
-
-    Returns
-    -------
-    FrameSequence
 
     Raises
     ------
@@ -367,7 +332,6 @@ def write_frame_folder(
 
     Parameters
     ----------
-    sequence : FrameSequence
     folder : path-like
         Made where it does not exist.
     depth : sequence of array_like, each (height, width), optional

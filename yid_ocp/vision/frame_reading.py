@@ -46,33 +46,7 @@ class _Place:
 def _read_bag_frames(
     path: Path, *, pose: ArrayLike | None = None, unit: str | None = None, topic: str | None = None
 ) -> FrameSequence:
-    """Open the frames in a bag.
-
-    Times are the headers' stamps (the times of recording if one has none), in seconds since the first joint states of
-    the bag, as in a recording that `yid-ocp import` makes of it; where it has none, since the first frame. An image of
-    a topic with `rect` in its name is taken for rectified: its lens has the camera's projection and no distortion.
-
-    Parameters
-    ----------
-    path : Path
-        ROS 1 `.bag`, RealSense `.bag`, ROS 2 folder, `.db3` or `.mcap`.
-    pose : array_like, shape (4, 4)
-        Camera (its optical frame: x right, y down, z ahead) in the world.
-    unit : str, optional
-        Unit of the clouds; metres when absent.
-    topic : str, optional
-        Of the clouds or depth images; needed where there are several.
-
-    Returns
-    -------
-    FrameSequence
-
-    Raises
-    ------
-    DataError
-        `rosbags` is not installed, the bag cannot be read, has no or several such topics, or a depth image without the
-        camera's intrinsics.
-    """
+    """Open the frames in a bag."""
     camera = validated_pose(pose, f"{path}: give track.camera_pose")
     bag = _Bag(path)
     given = unit or "m"
@@ -319,11 +293,7 @@ _MILLIMETRE, _MICROSECOND = 1e-3, 1e-6
 
 
 def read_frames(
-    path: str | os.PathLike[str],
-    *,
-    pose: ArrayLike | None = None,
-    unit: str | None = None,
-    topic: str | None = None,
+    path: str | os.PathLike[str], *, pose: ArrayLike | None = None, unit: str | None = None, topic: str | None = None
 ) -> FrameSequence:
     """Open the frames of a camera, which are then read one at a time.
 
@@ -338,10 +308,6 @@ def read_frames(
         Unit of clouds, instead of the folder's.
     topic : str, optional
         Of a bag: of the clouds or depth images.
-
-    Returns
-    -------
-    FrameSequence
 
     Raises
     ------
@@ -422,10 +388,7 @@ class _Film:
 
 
 def _read_film(path: Path, pose: ArrayLike | None) -> FrameSequence:
-    """Depth registered to the colour camera, as Open3D gives it.
-
-    Open3D does not say when a frame was taken: they are counted and lie evenly in the film's length.
-    """
+    """Depth registered to the colour camera, as Open3D gives it."""
     camera, film = validated_pose(pose, f"{path}: give track.camera_pose"), _Film(path)
     metadata = film.reader.get_metadata()
     inner = metadata.intrinsics

@@ -73,16 +73,7 @@ def _compared(frame: FrameReport, usual: float, gap: Array, options: TrackOption
 
 @dataclass(frozen=True, eq=False)
 class _TrackedPoints:
-    """Tracked points of the good frames.
-
-    Attributes
-    ----------
-    t : ndarray, shape (M,)
-        [s]
-    q : ndarray, shape (M, n)
-    position, std, shared_std : ndarray, shape (M, np, 3)
-        [m]; NaN where a point was not seen well enough.
-    """
+    """Tracked points of the good frames."""
 
     t: Array
     q: Array
@@ -107,10 +98,8 @@ def tracked_points(
         All of them, judged.
     columns : sequence of int
         Of the system's points, those that are wanted.
-    common : Common
     things : sequence of Foreign
         That stood about the object.
-    options : TrackOptions
     source : str
         Where the frames come from.
 
@@ -285,8 +274,7 @@ def is_self_touching(centre_line: Array, radius: Array) -> bool:
     ----------
     centre_line : ndarray, shape (K, 2, 3)
         Start and end of every link [m].
-    radius : ndarray, shape (K,)
-        [m]
+    radius : ndarray, shape (K,) [m]
     """
     corners = centre_line.reshape(-1, 3)
     near = np.linalg.norm(corners[:, None] - corners, axis=2)

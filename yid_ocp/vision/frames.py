@@ -44,8 +44,7 @@ class CameraIntrinsics:
 
     Attributes
     ----------
-    width, height : int
-        [pixels]
+    width, height : int [pixels]
     fx, fy, cx, cy : float
         Focal lengths and principal point [pixels]:  u = fx x/z + cx,  v = fy y/z + cy  without distortion.
     model : str
@@ -230,12 +229,10 @@ class FrameSequence:
     ----------
     stamps : ndarray, shape (M,)
         Time stamps as the camera gave them, in the order of the frames: neither sorted nor unique [s].
-    frame_names : tuple of str
     camera_pose : ndarray, shape (4, 4)
         Camera (x right, y down, z ahead) in the world [m].
     load_cloud : callable
         From a frame's index to its cloud in the camera's frame, shape (N, 3) [m]; `DataError` where it cannot be read.
-    intrinsics : Pinhole, optional
     source : str
         Where the frames come from, for messages.
     load_colours : callable, optional
@@ -277,13 +274,11 @@ class FrameSequence:
 
         Parameters
         ----------
-        t : array_like, shape (M,)
-            [s]
+        t : array_like, shape (M,) [s]
         clouds : sequence of array_like, each (N, 3)
             In the camera's frame [m].
         pose : array_like, shape (4, 4)
             Camera in the world.
-        source : str
         """
         arrays = [np.asarray(cloud, float).reshape(-1, 3) for cloud in clouds]
         names = tuple(f"frame {i}" for i in range(len(arrays)))
@@ -428,10 +423,7 @@ class OcclusionMap:
         return _BASELINE / float(depth.min()) if len(depth) else 0.0
 
     def _about(self, asked: Array, wide: Array) -> tuple[cKDTree, Array]:
-        """Points of the picture round about the places: where in the picture, and how deep.
-
-        One frame asks again and again for much the same: what was found stays while it is enough.
-        """
+        """Points of the picture round about the places: where in the picture, and how deep."""
         reach, narrow = max(float(wide.max()), self._shadow), float(wide.min())
         low, high = asked.min(0) - reach, asked.max(0) + reach
         for lower, upper, least, tree, depth in self._kept:

@@ -44,19 +44,7 @@ _MOST = 2500  # points
 
 @dataclass(frozen=True, eq=False)
 class _Centerline:
-    """_Centerline of an object in a cloud, as a tree of nodes.
-
-    Attributes
-    ----------
-    nodes : ndarray, shape (V, 3)
-        Means of connected slices [m].
-    edges : ndarray of int, shape (V - 1, 2)
-        A tree.
-    loop_positions : ndarray, shape (L, 3)
-        Where cycles that were cut open closed, which are too long to be the object's surface [m].
-    slice_width : float
-        Of a slice [m].
-    """
+    """_Centerline of an object in a cloud, as a tree of nodes."""
 
     nodes: Array
     edges: Integers
@@ -260,8 +248,7 @@ class EndAnchor:
         Unit vector along the object.
     position : ndarray, shape (3,)
         The corner lies in the plane through this place across it [m].
-    position_std : float
-        [m]
+    position_std : float [m]
     """
 
     link_end_index: int
@@ -284,13 +271,11 @@ def with_free_root(system: System, values: Mapping[str, float] | None = None) ->
 
     Parameters
     ----------
-    system : System
     values : mapping of str to float, optional
         Parameter values; nominal where absent.
 
     Returns
     -------
-    System
     tuple of str
         The six joints: the root's place [m], then its turns about x, y and z [rad].
     """
@@ -320,7 +305,6 @@ class InitialShapeFinder:
 
     Parameters
     ----------
-    system : System
     tree : Mechanism
         The system's, with numbers in place of its parameters.
     rest : ndarray, shape (n,)
@@ -379,10 +363,6 @@ class InitialShapeFinder:
 
     def find_initial_shapes(self, trace: _Centerline) -> list[_InitialShape]:
         """Initial shapes that follow a centerline whose ends are as far apart as the object's.
-
-        Parameters
-        ----------
-        trace : Trace
 
         Raises
         ------

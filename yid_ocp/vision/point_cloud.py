@@ -129,21 +129,7 @@ class CloudFilterOptions:
 
 @dataclass(frozen=True, eq=False)
 class _RegionBounds:
-    """Bounds of the region that the object can reach.
-
-    Attributes
-    ----------
-    lower, upper : ndarray, shape (3,)
-        Box in the world [m].
-    root_position : ndarray, shape (3,)
-        The object's root [m].
-    max_reach : float
-        How far it reaches from there [m].
-    camera_to_robot_direction : ndarray, shape (3,)
-        Horizontal direction from the camera to the robot, zero where nothing is behind it.
-    max_distance_along_direction : float
-        Points with  ahead . p > limit  are behind the robot [m].
-    """
+    """Bounds of the region that the object can reach."""
 
     lower: Array
     upper: Array
@@ -170,8 +156,6 @@ class ObjectRegion:
 
     Parameters
     ----------
-    system : System
-    options : FilterOptions
     values : mapping of str to float, optional
         Parameter values; nominal where absent.
     anywhere : bool
@@ -239,8 +223,7 @@ def voxel_averages(points: Array, size: float) -> WeightedCloud:
 
     Parameters
     ----------
-    points : ndarray, shape (N, 3)
-        [m]
+    points : ndarray, shape (N, 3) [m]
     size : float
         Edge of the cubes [m].
 
@@ -273,10 +256,8 @@ def is_not_outlier(cloud: WeightedCloud, neighbours: int, ratio: float, asked: M
 
     Parameters
     ----------
-    cloud : Cloud
     neighbours : int
         Of every point.
-    ratio : float
     asked : ndarray, shape (N,), optional
         Points to judge; all when absent. What is usual is told by points all over the cloud, whichever are asked.
 
@@ -399,31 +380,7 @@ def _thin_to_nodes(
     options: SkeletonOptions | None = None,
     down: ArrayLike = (0.0, 0.0, -1.0),
 ) -> tuple[Array, Array, Integers]:
-    """Thin a cloud to nodes, segment by segment.
-
-    The seed is the lowest point. Its k1 nearest neighbours have a centroid; the k1 nearest neighbours of that centroid
-    are the centred segment, whose centroid becomes a node where the segment has points enough. The segment is removed.
-    The remaining point that is nearest to its centre is the next seed; where none is within the radius, a point drawn
-    at random. It ends when no point is left.
-
-    Parameters
-    ----------
-    cloud : Cloud
-    rng : Generator
-        For the points drawn at random.
-    options : WalkOptions, optional
-    down : array_like, shape (3,)
-        Direction of gravity in the frame of the points.
-
-    Returns
-    -------
-    nodes : ndarray, shape (K, 3)
-        [m]
-    size : ndarray, shape (K,)
-        Weight of each node's points.
-    label : ndarray of int, shape (N,)
-        Node of every point, -1 where its segment gave none.
-    """
+    """Thin a cloud to nodes, segment by segment."""
     chosen = options or SkeletonOptions()
     label = np.full(len(cloud), -1)
     alive = np.arange(len(cloud))
@@ -468,21 +425,7 @@ def _near(points: Array, centre: Array, options: SkeletonOptions) -> Integers:
 
 
 def _spanning_forest(nodes: Array, options: SkeletonOptions | None = None) -> tuple[Integers, Integers]:
-    """Join nodes to their nearest neighbours and keep the shortest edges that connect them.
-
-    Parameters
-    ----------
-    nodes : ndarray, shape (K, 3)
-        [m]
-    options : WalkOptions, optional
-
-    Returns
-    -------
-    edges : ndarray of int, shape (E, 2)
-        Minimum spanning forest.
-    part : ndarray of int, shape (K,)
-        Connected part of each node.
-    """
+    """Join nodes to their nearest neighbours and keep the shortest edges that connect them."""
     chosen = options or SkeletonOptions()
     count = len(nodes)
     if count < 2:
@@ -509,9 +452,6 @@ def extract_skeleton(
 
     Parameters
     ----------
-    cloud : Cloud
-    rng : Generator
-    options : WalkOptions, optional
     down : array_like, shape (3,)
 
     Returns

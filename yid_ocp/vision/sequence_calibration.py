@@ -79,9 +79,7 @@ class BackgroundPoints:
         if not clouds:
             return BackgroundPoints()
         cells = np.unique(np.floor(np.concatenate(clouds) / voxel).astype(np.int64), axis=0)
-        return BackgroundPoints(
-            np.asarray((cells + 0.5) * voxel), _NOISE_STDS * noise + 0.5 * math.sqrt(3.0) * voxel
-        )
+        return BackgroundPoints(np.asarray((cells + 0.5) * voxel), _NOISE_STDS * noise + 0.5 * math.sqrt(3.0) * voxel)
 
     @staticmethod
     def from_static_points(
@@ -168,11 +166,9 @@ class ForeignObject:
     ----------
     centre : ndarray, shape (3,)
         In the world, in the median frame [m].
-    size : ndarray, shape (3,)
-        [m]
+    size : ndarray, shape (3,) [m]
     frames : int
         In which it was seen.
-    moving : bool
     link : str
         Of the robot, with which it moves; empty for none.
     text : str
@@ -407,7 +403,6 @@ def check_dimensions(
 
     Parameters
     ----------
-    system : System
     given : mapping of str to float, optional
         Parameter values; nominal where absent.
     estimate : sequence of "length" and "radius"
@@ -418,10 +413,6 @@ def check_dimensions(
     fitted : callable
         From parameter values and the configurations of the round before, empty in the first, to the fits of the frames
         that can be used.
-
-    Returns
-    -------
-    Sizes
     """
     told = _told(system, given)
     count, many = len(told), len(told) // 2

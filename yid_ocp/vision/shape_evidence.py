@@ -48,8 +48,7 @@ class TubeLinks:
     ----------
     link_ends : ndarray, shape (K, 2, 3)
         Start and end of every link's centre line [m].
-    radius : ndarray, shape (K,)
-        [m]
+    radius : ndarray, shape (K,) [m]
     free_end_links : tuple of int
         Links whose end nothing holds and nothing grows on.
     tube_lengths : ndarray, shape (K,)
@@ -76,10 +75,8 @@ def nearest_on_tubes(
     ----------
     corners : ndarray, shape (K, 2, 3)
         Start and end of every link [m].
-    radius : ndarray, shape (K,)
-        [m]
-    points : ndarray, shape (N, 3)
-        [m]
+    radius : ndarray, shape (K,) [m]
+    points : ndarray, shape (N, 3) [m]
     share : float
         Of the radius, at which points lie from the centre line.
 
@@ -122,7 +119,6 @@ class ForeignCluster:
         Median of its points in the world [m].
     extent : ndarray, shape (3,)
         Extents along the world's axes [m].
-    n_points : int
     """
 
     centre: Array
@@ -182,8 +178,7 @@ class CloudObservation:
     point_weights : ndarray, shape (N,)
     skeleton_nodes : ndarray, shape (K, 3)
         Of their skeleton [m].
-    camera_position : ndarray, shape (3,)
-        [m]
+    camera_position : ndarray, shape (3,) [m]
     occlusion_map : View, optional
         Everything that the camera saw; without it no place counts as hidden.
     is_filtered_out : callable, optional
@@ -227,14 +222,8 @@ def assess_shape(tubes: TubeLinks, seen: CloudObservation, near: float) -> Shape
 
     Parameters
     ----------
-    tubes : Tubes
-    seen : Seen
     near : float
         Distance from the surface beyond which a point says nothing of the shape [m].
-
-    Returns
-    -------
-    Evidence
     """
     link, along, normal, distance = nearest_on_tubes(tubes.link_ends, tubes.radius, seen.points)
     away = _faces_away_from_camera(normal, seen.points - seen.camera_position)
@@ -295,7 +284,6 @@ def tube_like_nodes_and_points(sight: CloudObservation, radius: float) -> tuple[
 
     Parameters
     ----------
-    sight : Sight
     radius : float
         Of the thickest tube [m].
 
@@ -341,10 +329,7 @@ def _large(part: Integers, least: float) -> Integers:
 
 
 def _contacts(tree: cKDTree, seen: CloudObservation, shape: Mask, foreign: Mask, within: float) -> Mask:
-    """Points of the shape from which a thing's surface goes on: about them it is nearly as much there as the shape's.
-
-    A few pixels that mix a tube's edge with what stands behind it do not make the two touch.
-    """
+    """Points of the shape from which a thing's surface goes on, nearly as dense as the shape's."""
     contact = np.zeros(len(shape), bool)
     if not foreign.any():
         return contact
@@ -425,10 +410,7 @@ class _Slices:
         return np.asarray((along > low) & (along <= high) & (across < (self.radius + gate) ** 2))
 
     def end(self, seen: CloudObservation, gate: float) -> float:
-        """Where the points end along the axis, from the tip [m]; NaN where that cannot be seen.
-
-        Of all places it is the one with the least empty slices before it and filled ones beyond.
-        """
+        """Where the points end along the axis, from the tip [m]; NaN where that cannot be seen."""
         edges = self.edges
         mine = self.within(seen.points, gate, edges[0], edges[-1])
         along = (seen.points[mine] - self.tip) @ self.axis
@@ -453,20 +435,7 @@ _RIM = 0.85  # of the radius to either side, within which a tube's depth is comp
 
 @dataclass(frozen=True, eq=False)
 class _SurfaceResiduals:
-    """Signed distances of points from the tubes' surface, with derivatives.
-
-    Attributes
-    ----------
-    point_indices : ndarray of int, shape (M,)
-        Of the points that are compared.
-    link_indices : ndarray of int, shape (M,)
-    signed_distance : ndarray, shape (M,)
-        Positive outside of the surface [m].
-    jacobian_by_link_ends : ndarray, shape (M, 6)
-        Derivative by the start and the end of the link's centre line.
-    derivative_by_radius : ndarray, shape (M,)
-        By the radius of the tube.
-    """
+    """Signed distances of points from the tubes' surface, with derivatives."""
 
     point_indices: Integers
     link_indices: Integers
@@ -482,12 +451,9 @@ def nearest_surface_residuals(
 
     Parameters
     ----------
-    corners : ndarray, shape (K, 2, 3)
-        [m]
-    radius : ndarray, shape (K,)
-        [m]
-    points : ndarray, shape (N, 3)
-        [m]
+    corners : ndarray, shape (K, 2, 3) [m]
+    radius : ndarray, shape (K,) [m]
+    points : ndarray, shape (N, 3) [m]
     camera : ndarray, shape (3,)
         [m]; a point that only the far side of a tube is near to counts from the near side.
     share : float
@@ -577,7 +543,6 @@ class FrameShapeFit:
         What else there is.
     dimension_equations : SizeRows
         What the frame says of lengths and radii.
-    n_iterations : int
     link_ends : ndarray, shape (K, 2, 3)
         Start and end of every link [m].
     """

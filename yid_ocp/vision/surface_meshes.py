@@ -53,16 +53,8 @@ class ExtraMesh:
         tuple[_PositiveLength, _PositiveLength] | None, OptionInfo("the same: radius and length along z", "m")
     ] = None
     sphere: Annotated[float | None, Gt(0), OptionInfo("the same: radius", "m")] = None
-    xyz: Annotated[tuple[float, float, float], OptionInfo("of its middle in the link", "m")] = (
-        0.0,
-        0.0,
-        0.0,
-    )
-    rpy: Annotated[tuple[float, float, float], OptionInfo("roll, pitch and yaw in the link", "rad")] = (
-        0.0,
-        0.0,
-        0.0,
-    )
+    xyz: Annotated[tuple[float, float, float], OptionInfo("of its middle in the link", "m")] = (0.0, 0.0, 0.0)
+    rpy: Annotated[tuple[float, float, float], OptionInfo("roll, pitch and yaw in the link", "rad")] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -71,7 +63,6 @@ class CameraScene:
 
     Attributes
     ----------
-    system : System
     robot_urdf : str or Path, optional
         File of the robot, for its meshes (`package:baxter`); None for the object alone.
     parameter_values : mapping of str to float, optional
@@ -275,7 +266,6 @@ class ArticulatedSurfaces:
         points : ndarray, shape (N, 3)
             In the world [m].
         q : array_like, shape (n,)
-        reach : float
         """
         result = np.zeros(len(points), bool)
         for part, pose in enumerate(self.part_poses_at(q)):
@@ -339,7 +329,6 @@ class ArticulatedSurfaces:
 
         Parameters
         ----------
-        pinhole : Pinhole
         pose : array_like, shape (4, 4)
             Camera in the world.
         q : array_like, shape (n,)
@@ -440,7 +429,6 @@ def load_robot_meshes(urdf: str | Path, mechanism: Mechanism, kind: MeshKind = "
         The URDF file, or `package:baxter`.
     mechanism : Mechanism
         That was read from it, alone or joined with others; numeric.
-    kind : "visual" or "collision"
 
     Returns
     -------
@@ -505,13 +493,7 @@ def load_mesh_file(file: Path) -> TriangleMesh:
 
 
 def _resolve_mesh_path(name: str, urdf: Path) -> Path:
-    """Path of a mesh file named in a URDF: `package://`, `file://`, absolute or beside the URDF.
-
-    Raises
-    ------
-    ModelError
-        There is no such file.
-    """
+    """Path of a mesh file named in a URDF: `package://`, `file://`, absolute or beside the URDF."""
     bare = name.removeprefix("file://")
     package = bare.removeprefix("package://")
     candidates = [Path(bare), urdf.parent / bare]
@@ -530,7 +512,6 @@ def tube_meshes_by_joint(system: System, values: Mapping[str, float] | None = No
 
     Parameters
     ----------
-    system : System
     values : mapping of str to float, optional
         Parameter values (lengths, radii); nominal where absent.
 

@@ -99,18 +99,12 @@ def track_object(
         self-filter and no clock offset.
     recording : Recording or None
         Joint angles, for the self-filter, the grasps and the clock; None where the model has no robot.
-    sequence : FrameSequence
-    options : TrackOptions, optional
     stages : sequence of int
         Frames of the frame sequence of which all stages are kept for pictures, as far as they can be read.
     empty : FrameSequence, optional
         Frames of the scene without robot and object, by the same camera: a background.
     progress : callable, optional
         Called with frames done, frames in all and what is being done.
-
-    Returns
-    -------
-    Track
 
     Raises
     ------

@@ -41,7 +41,6 @@ class FrameReport:
     ----------
     index : int
         Of the sequence.
-    name : str
     stamp : float
         As the camera gave it [s].
     joint_time : float
@@ -89,16 +88,13 @@ class FrameStages:
 
     Attributes
     ----------
-    frame_name : str
     drop_reason : str
         Why the frame was dropped; empty for a good one.
-    camera_position : ndarray, shape (3,)
-        [m]
+    camera_position : ndarray, shape (3,) [m]
     raw_points : ndarray, shape (N, 3)
         In the world [m].
     filtered_points : ndarray, shape (N, 3), optional
         What the filters left [m].
-    skeleton : Skeleton, optional
     shape_fit : Fit, optional
     """
 
@@ -128,7 +124,6 @@ class TrackResult:
         from the camera's pose, depth and clock.
     frame_reports : tuple of FrameReport
         All of them, by time stamp.
-    camera_calibration : Calibration
     dimensions : Sizes
         What the frames say of the object's lengths and radii.
     foreign_objects : tuple of Foreign
@@ -214,7 +209,6 @@ def draw_frame_stages(stages: FrameStages, folder: str | os.PathLike[str]) -> li
 
     Parameters
     ----------
-    stages : Stages
     folder : path-like
         Made where it does not exist.
 

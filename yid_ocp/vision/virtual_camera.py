@@ -40,7 +40,6 @@ class DepthCamera:
 
     Attributes
     ----------
-    intrinsics : Pinhole
     baseline : float
         Between projector and camera, along x [m].
     min_depth, max_depth : float
@@ -93,7 +92,6 @@ class DepthCamera:
         ----------
         depth, cosine : ndarray, shape (height, width)
             True depth [m], infinite where there is nothing; cosine of ray and normal.
-        rng : Generator
 
         Returns
         -------
@@ -160,7 +158,6 @@ class FrameTiming:
         Standard deviation of the latency from frame to frame [s].
     late_fraction : float
         Share of frames that are stamped `late_stamp_delay` [s] too late.
-    late_stamp_delay : float
     """
 
     mean_rate: float = 3.0
@@ -192,7 +189,6 @@ class VirtualFrames:
 
     Attributes
     ----------
-    sequence : FrameSequence
     capture_times : ndarray, shape (M,)
         Time of every picture on the simulator's clock [s].
     true_configurations : ndarray, shape (M, n)
@@ -265,7 +261,6 @@ class VirtualCamera:
         Camera in the world (x right, y down, z ahead) [m].
     depth_camera : DepthCamera
         An Asus Xtion Pro Live where absent.
-    timing : FrameTiming
     background : Background, optional
         A floor under the paper's Y and a wall behind Baxter where absent; nothing where there is no robot either.
     seed : int
@@ -286,11 +281,9 @@ def render_virtual_frames(scene: CameraScene, t: ArrayLike, q: ArrayLike, camera
     ----------
     scene : Scene
         The object, and the robot whose meshes are seen where a URDF is given.
-    t : array_like, shape (N,)
-        [s]
+    t : array_like, shape (N,) [s]
     q : array_like, shape (N, n)
         Configurations at these times, from whatever simulator; interpolated by a cubic spline in between.
-    camera : VirtualCamera
 
     Returns
     -------
