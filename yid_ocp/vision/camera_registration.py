@@ -42,22 +42,15 @@ Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-ROTATION_SLICE, TRANSLATION_SLICE, DEPTH_SCALE_INDEX, DEPTH_OFFSET_INDEX, CLOCK_OFFSET_INDEX, CLOCK_DRIFT_INDEX = (
-    slice(0, 3),
-    slice(3, 6),
-    6,
-    7,
-    8,
-    9,
-)
+ROTATION_SLICE, TRANSLATION_SLICE = slice(0, 3), slice(3, 6)
+DEPTH_SCALE_INDEX, DEPTH_OFFSET_INDEX, CLOCK_OFFSET_INDEX, CLOCK_DRIFT_INDEX = 6, 7, 8, 9
 """Positions of the parts of a `CameraState` change in its vector."""
 STATE_SIZE = 10
 MIN_ARM_POINTS = 40
 """Fewest points of the arm in a usable frame."""
 
-_LOOK = CameraIntrinsics.from_field_of_view(
-    160, 120, math.radians(80.0)
-)  # through which the robot's visible surface is sampled
+# through which the robot's visible surface is sampled
+_LOOK = CameraIntrinsics.from_field_of_view(160, 120, math.radians(80.0))
 _SAMPLES = 150  # of it, in every frame
 _CELL = 0.02  # of the field of distances in which starts are tried [m]
 _SIDEWAYS, _AHEAD, _EVERY = 12, 10, 2  # cells to either side of starts tried, and between them
@@ -76,30 +69,14 @@ _LEAST_CURVATURE = 0.2  # of the robust sum, of that of its weights
 
 @dataclass(frozen=True, eq=False)
 class CameraState:
-    """Estimated camera state: pose, depth scale and offset, clock offset and drift.
+    """Estimated camera state: pose, depth scale and offset, clock offset and drift."""
 
-    Attributes
-    ----------
-    pose : ndarray, shape (4, 4)
-        Camera in the world, R and t.
-    depth_scale : float
-        On a measured depth, g.
-    depth_offset : float
-        Added to that, o [m].
-    clock_offset : float
-        Stamp minus joint time at the stamp `clock_reference_stamp`, tau0 [s].
-    clock_drift : float
-        Growth of that per second, beta.
-    clock_reference_stamp : float
-        s0 [s]
-    """
-
-    pose: Array
-    depth_scale: float = 1.0
-    depth_offset: float = 0.0
-    clock_offset: float = 0.0
-    clock_drift: float = 0.0
-    clock_reference_stamp: float = 0.0
+    pose: Array  # (4, 4), camera in the world, R and t
+    depth_scale: float = 1.0  # on a measured depth, g
+    depth_offset: float = 0.0  # added to that, o [m]
+    clock_offset: float = 0.0  # stamp minus joint time at the stamp `clock_reference_stamp`, tau0 [s]
+    clock_drift: float = 0.0  # growth of that per second, beta
+    clock_reference_stamp: float = 0.0  # s0 [s]
 
     def to_world(self, points: Array) -> Array:
         """Measured points in the world, both shape (N, 3) [m]."""
@@ -149,14 +126,9 @@ class CameraState:
     def difference_from(self, other: CameraState) -> Array:
         """Difference from another state (this minus other), shape (10,)."""
         turn = Rotation.from_matrix(self.pose[:3, :3] @ other.pose[:3, :3].T).as_rotvec()
-        rest = (
-            self.depth_offset - other.depth_offset,
-            self.clock_offset - other.clock_offset,
-            self.clock_drift - other.clock_drift,
-        )
-        return np.array(
-            [*turn, *(self.pose[:3, 3] - other.pose[:3, 3]), math.log(self.depth_scale / other.depth_scale), *rest]
-        )
+        moved, scale = self.pose[:3, 3] - other.pose[:3, 3], math.log(self.depth_scale / other.depth_scale)
+        clock = self.clock_offset - other.clock_offset, self.clock_drift - other.clock_drift
+        return np.array([*turn, *moved, scale, self.depth_offset - other.depth_offset, *clock])
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,12 +169,8 @@ class ArmSurface:
         grasps: Callable[[Array], Array],
         around: float,
     ) -> None:
-        self.robot_surfaces, self.configuration_at, self.grasp_positions_at, self.grasp_exclusion_radius = (
-            robot,
-            posture,
-            grasps,
-            around,
-        )
+        self.robot_surfaces, self.configuration_at = robot, posture
+        self.grasp_positions_at, self.grasp_exclusion_radius = grasps, around
         self._moving = np.array([joint >= 0 for joint in robot.part_joints])
 
     def part_poses_at(self, t: float) -> Array:
@@ -211,9 +179,8 @@ class ArmSurface:
 
     def visible_points(self, state: CameraState, stamp: float) -> tuple[Array, Integers]:
         """Points of moving surfaces that the camera sees if nothing is before the robot, in the world; their parts."""
-        depth, cosine, part = self.robot_surfaces.render_depth_image(
-            _LOOK, state.pose, self.configuration_at(float(state.to_joint_time(stamp)))
-        )
+        q = self.configuration_at(float(state.to_joint_time(stamp)))
+        depth, cosine, part = self.robot_surfaces.render_depth_image(_LOOK, state.pose, q)
         seen = np.isfinite(depth) & (cosine > _GRAZING) & (part >= 0) & self._moving[part]
         points = _LOOK.pixel_rays[seen] * depth[seen][:, None]
         return points @ state.pose[:3, :3].T + state.pose[:3, 3], part[seen]
@@ -256,17 +223,13 @@ class ArmSurface:
         points = state.to_world(glimpse.points)
         met = self.match_points(points, state.pose[:3, 3], float(state.to_joint_time(glimpse.stamp)), reach, along)
         slope = np.empty((len(met.point_indices), STATE_SIZE))
-        slope[:, :CLOCK_OFFSET_INDEX] = np.einsum(
-            "ni,nij->nj", met.normal, state.point_jacobian(points[met.point_indices])
-        )
+        by_camera = state.point_jacobian(points[met.point_indices])
+        slope[:, :CLOCK_OFFSET_INDEX] = np.einsum("ni,nij->nj", met.normal, by_camera)
         # a later offset takes the surface back along its velocity, away from the point
         slope[:, CLOCK_OFFSET_INDEX] = met.normal_velocity
         slope[:, CLOCK_DRIFT_INDEX] = met.normal_velocity * (glimpse.stamp - state.clock_reference_stamp)
-        return _CalibrationEquations(
-            slope,
-            met.normal_distance,
-            np.column_stack([met.part, np.floor(met.part_coordinates / _PATCH).astype(np.int64)]),
-        )
+        patch = np.column_stack([met.part, np.floor(met.part_coordinates / _PATCH).astype(np.int64)])
+        return _CalibrationEquations(slope, met.normal_distance, patch)
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,34 +244,17 @@ class _SurfaceMatches:
     part_coordinates: Array
 
 
-# -- the robust sum ---------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class RobustCost:
-    """Quadratic model of the robust cost at a camera state.
+    """Quadratic model of the robust cost at a camera state."""
 
-    Attributes
-    ----------
-    gradient : ndarray, shape (10,)
-    hessian : ndarray, shape (10, 10)
-        Of Gauss and Newton.
-    curvature_ratio : float
-        Of the sum, as a share of that.
-    score_covariance : ndarray, shape (10, 10)
-        Outer products of gradients summed over frames and over patches, less those of each patch in each frame, which
-        both have, and no less than these (two-way clusters of Cameron, Gelbach and Miller 2011).
-    point_error_std : float
-        Standard deviation of a point's error [m].
-    n_points : int
-        Points.
-    """
-
-    gradient: Array
-    hessian: Array
-    curvature_ratio: float
+    gradient: Array  # (10,)
+    hessian: Array  # (10, 10), of Gauss and Newton
+    curvature_ratio: float  # of the sum, as a share of that
+    # (10, 10), outer products of gradients summed over frames and over patches, less those of each patch in each
+    # frame, which both have, and no less than these (two-way clusters of Cameron, Gelbach and Miller 2011)
     score_covariance: Array
-    point_error_std: float
+    point_error_std: float  # standard deviation of a point's error [m]
     n_points: int
 
     def weighted_normal_equations(self, precision: Array) -> tuple[Array, Array, float]:
@@ -331,13 +277,8 @@ def evaluate_robust_cost(rows: Sequence[_CalibrationEquations], reach: float) ->
     size = np.abs(np.concatenate([r.residuals for r in rows]))
     sigma = max(_TO_SIGMA * float(np.median(size)) if len(size) else reach, _LEAST_SIGMA)
     scale = min(_CUT * sigma, reach)
-    gradient, hessian, blocks = (
-        np.zeros(STATE_SIZE),
-        np.zeros((STATE_SIZE, STATE_SIZE)),
-        np.zeros((STATE_SIZE, STATE_SIZE)),
-    )
-    scores = []
-    bent, straight = 0.0, 0.0
+    gradient, (hessian, blocks) = np.zeros(STATE_SIZE), np.zeros((2, STATE_SIZE, STATE_SIZE))
+    scores, bent, straight = [], 0.0, 0.0
     for r in rows:
         square = (r.residuals / scale) ** 2
         weight = 1 / (1 + square) ** 2 / sigma**2
@@ -379,9 +320,6 @@ def gauss_newton_step(
     return state.with_change(step), step
 
 
-# -- where to begin ---------------------------------------------------------------------------------------------------
-
-
 def initial_camera_states(
     arm: ArmSurface, glimpses: Sequence[CalibrationFrame], told: CameraState, search: float, most: int
 ) -> list[CameraState]:
@@ -413,11 +351,8 @@ def initial_camera_states(
         change[TRANSLATION_SLICE] = -told.pose[:3, :3] @ (_CELL * cells[cell])
         change[CLOCK_OFFSET_INDEX] = delays[delay]
         trial = told.with_change(change)
-        apart = [
-            np.linalg.norm(trial.difference_from(other)[TRANSLATION_SLICE])
-            + 0.5 * abs(trial.clock_offset - other.clock_offset)
-            for other in result
-        ]
+        between = [trial.difference_from(other) for other in result]
+        apart = [np.linalg.norm(d[TRANSLATION_SLICE]) + 0.5 * abs(d[CLOCK_OFFSET_INDEX]) for d in between]
         if min(apart, default=math.inf) >= _APART:
             result.append(trial)
         if len(result) == most:
@@ -481,9 +416,6 @@ class _Field:
         strides = np.array([self.shape[1] * self.shape[2], self.shape[2], 1])
         cost = self.cost[(index @ strides)[None, :] + (cells @ strides)[:, None]]
         return np.asarray(cost.mean(axis=1), float)
-
-
-# -- how much of the arm is there -------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -190,9 +190,7 @@ class ShapeFitter:
 
     def _ends(self, corners: Array, tree: Mechanism) -> tuple[Array, tuple[int, ...]]:
         """Length of the tube that each link belongs to, and the links after which nothing comes."""
-        reach = np.array(
-            [self._lengths[[name == other for other in self.link_segments]].sum() for name in self.link_segments]
-        )
+        reach = np.array([self._lengths[self._links_of({name})].sum() for name in self.link_segments])
         q = ca.SX.sym("q", self.system.n_coordinates)
         kinematics = forward_kinematics(tree, q)
         held = [kinematics.frame_position(grasp.held_frame) for grasp in self.system.grasps]
@@ -244,9 +242,8 @@ class ShapeFitter:
     def _rested(self, q: Array, tubes: Collection[str]) -> Array:
         """A configuration with some tubes as at rest."""
         trial = q.copy()
-        again = [
-            index for index, owner in zip(self.free_joints, self.free_joint_segments, strict=True) if owner in tubes
-        ]
+        owners = zip(self.free_joints, self.free_joint_segments, strict=True)
+        again = [index for index, owner in owners if owner in tubes]
         trial[again] = self.rest_configuration[again]
         return trial
 
@@ -272,17 +269,15 @@ class ShapeFitter:
 
     def _covered(self, evidence: ShapeEvidence) -> float:
         """Share of the visible length that has points of its own."""
-        filled, empty = (
-            float(self._lengths @ evidence.covered_fraction),
-            float(self._lengths @ evidence.visibly_empty_fraction),
-        )
+        filled = float(self._lengths @ evidence.covered_fraction)
+        empty = float(self._lengths @ evidence.visibly_empty_fraction)
         return filled / max(filled + empty, 1e-12)
 
     def _failed(self, evidence: ShapeEvidence) -> set[str]:
         """Tubes of which too much is seen to be empty."""
         failed = set()
         for name in dict.fromkeys(self.link_segments):
-            mine = self._lengths * np.array([name == owner for owner in self.link_segments])
+            mine = self._lengths * self._links_of({name})
             filled, empty = float(mine @ evidence.covered_fraction), float(mine @ evidence.visibly_empty_fraction)
             if empty > 0 and filled < self.options.min_tube_coverage * (filled + empty):
                 failed.add(name)
@@ -293,17 +288,15 @@ class ShapeFitter:
         tubes = self.tubes_at(attempt.minimum.q)
         link = nearest_on_tubes(tubes.link_ends, tubes.radius, sight.points)[0]
         wrong = links[link] & (attempt.evidence.is_own | attempt.evidence.is_contested)
-        node_link, _, _, distance = nearest_on_tubes(
-            tubes.link_ends, tubes.radius, sight.skeleton_nodes, _NODE_RADIUS_FRACTION
-        )
+        nodes = sight.skeleton_nodes
+        node_link, _, _, distance = nearest_on_tubes(tubes.link_ends, tubes.radius, nodes, _NODE_RADIUS_FRACTION)
         return _Left(~(links[node_link] & (distance < 2 * tubes.radius[node_link])), ~wrong)
 
     def _attempt(self, sight: CloudObservation, starts: Sequence[Array], left: _Left) -> _Attempt:
         """The best shape through some of the nodes and points, then through those that are surely its own."""
         on_nodes, on_points = self._tasks(sight, left)
-        tried = [
-            self._minimise(_Minimum(start, np.eye(len(self.free_joints)), math.inf, 0), on_nodes) for start in starts
-        ]
+        unit = np.eye(len(self.free_joints))
+        tried = [self._minimise(_Minimum(start, unit, math.inf, 0), on_nodes) for start in starts]
         best = min(tried, key=lambda minimum: minimum.cost)
         last = self._minimise(best, on_points)
         iterations = sum(minimum.iterations for minimum in tried) + last.iterations - best.iterations
@@ -329,12 +322,10 @@ class ShapeFitter:
         # nodes weigh together as much as the points, which share their errors
         node_weight = np.full(len(nodes), weight.sum() / max(len(nodes), 1)) * factor
         anchors = sight.end_anchors
+        at_nodes, on_surface = (nodes, node_weight, _NODE_RADIUS_FRACTION), (points, weight * factor, 1.0)
         return (
-            [
-                _Task(nodes, node_weight, _NODE_RADIUS_FRACTION, scale, camera, anchors)
-                for scale in options.node_loss_scales
-            ],
-            [_Task(points, weight * factor, 1.0, scale, camera, anchors) for scale in options.surface_loss_scales],
+            [_Task(*at_nodes, scale, camera, anchors) for scale in options.node_loss_scales],
+            [_Task(*on_surface, scale, camera, anchors) for scale in options.surface_loss_scales],
         )
 
     def _minimise(self, start: _Minimum, tasks: Sequence[_Task]) -> _Minimum:
@@ -424,13 +415,9 @@ class ShapeFitter:
         gradient = by_q.T @ pull.ravel()
         hessian = by_q.T @ np.matmul(stiff, chain).reshape(by_q.shape)
         for anchor in task.anchors:
-            off = (
-                float(anchor.direction @ (corners.reshape(-1, 3)[anchor.link_end_index] - anchor.position))
-                / anchor.position_std
-            )
-            by_off = (
-                anchor.direction @ by_q[3 * anchor.link_end_index : 3 * anchor.link_end_index + 3] / anchor.position_std
-            )
+            end, towards = anchor.link_end_index, anchor.direction / anchor.position_std
+            off = float(towards @ (corners.reshape(-1, 3)[end] - anchor.position))
+            by_off = towards @ by_q[3 * end : 3 * end + 3]
             cost += 0.5 * off**2
             gradient += by_off * off
             hessian += np.outer(by_off, by_off)
@@ -447,19 +434,14 @@ class ShapeFitter:
         apart = np.linalg.norm(corners[:, :, None] - places, axis=3).min(axis=1)
         failed = self._failed(evidence)
         sure = evidence.covered_fraction >= self.options.min_link_coverage
-        sure &= np.array([owner not in failed for owner in self.link_segments])
+        sure &= ~self._links_of(failed)
         covered = (apart < _TOUCHING) & sure[:, None]
         held = {grasp.held_frame for grasp in self.system.grasps}
         return np.asarray(covered.any(axis=0) | np.array([name in held for name in self.system.point_frames]))
 
     def initial_shape_finder(self) -> InitialShapeFinder:
         """Finder of initial shapes for a system with a free root (`initial_shapes.with_free_root`)."""
-        lengths = np.linalg.norm(
-            np.diff(np.array(self._corners(self.rest_configuration)[0]).reshape(-1, 2, 3), axis=1)[:, 0], axis=1
-        )
-        by_owner = {
-            name: lengths[[name == owner for owner in self.link_segments]] for name in dict.fromkeys(self.link_segments)
-        }
+        by_owner = {name: self._lengths[self._links_of({name})] for name in dict.fromkeys(self.link_segments)}
         return InitialShapeFinder(self.system, self._tree, self.rest_configuration, self.bend_joints, by_owner)
 
     def _swath_std(self, corners: Array, places: Array, evidence: ShapeEvidence, camera: Array) -> Array:
@@ -502,11 +484,8 @@ class ShapeFitter:
                 axis = (tip - start) / np.linalg.norm(tip - start)
                 rows = np.zeros((1, total))
                 rows[0, : free + many] = -axis @ chain[6 * k + 3 : 6 * k + 6]
-                add(
-                    rows,
-                    np.array([offset]),
-                    np.array([1.0 / max(self.options.surface_noise_std, evidence.noise_std) ** 2]),
-                )
+                noise = max(self.options.surface_noise_std, evidence.noise_std)
+                add(rows, np.array([offset]), np.array([1.0 / noise**2]))
         held, by_held = (np.array(x) for x in self._held(q))
         add(np.hstack([by_held, held_by_length, np.zeros((len(held), many))]), held.ravel(), np.ones(len(held)))
         gradient[:free] += (q - self.rest_configuration)[list(self.free_joints)] * self._prior**2
@@ -582,10 +561,8 @@ def _expressions(system: System, kinematics: Kinematics, options: ShapeFitOption
     corners = []
     for segment in system.segment_layouts:
         for i, names in enumerate(segment.link_joints):
-            corners += [
-                kinematics.joint_origins[tree.joint_index(names[0])],
-                kinematics.frame_position(f"{segment.name}_{i}_tip"),
-            ]
+            start = kinematics.joint_origins[tree.joint_index(names[0])]
+            corners += [start, kinematics.frame_position(f"{segment.name}_{i}_tip")]
     rows, gaps = [ca.SX(0, 1)], [ca.SX(0, 1)]
     for grasp in system.grasps:
         residual, alignment = grasp.constraint_residual(kinematics), grasp.axis_misalignment(kinematics)

@@ -333,23 +333,12 @@ _LEAST_DEPTH = 0.05  # [m]; nearer to the camera's plane there is no picture
 
 @dataclass(frozen=True, eq=False)
 class OcclusionMap:
-    """Occlusion map of a frame, from all points that the camera saw.
+    """Occlusion map of a frame, from all points that the camera saw."""
 
-    Attributes
-    ----------
-    points : ndarray, shape (N, 3)
-        In the world, before anything is left out [m].
-    camera_pose : ndarray, shape (4, 4)
-        Camera (x right, y down, z ahead) in the world.
-    intrinsics : Pinhole, optional
-        Without it the picture ends where points stand along most of a side.
-    expected_points : ndarray, shape (M, 3), optional
-        Points about which will be asked, so that what stands before them is sorted once [m].
-    """
-
-    points: Array
-    camera_pose: Array
-    intrinsics: CameraIntrinsics | None = None
+    points: Array  # (N, 3), in the world, before anything is left out [m]
+    camera_pose: Array  # (4, 4), camera (x right, y down, z ahead) in the world
+    intrinsics: CameraIntrinsics | None = None  # without it the picture ends where points stand along most of a side
+    # (M, 3), points about which will be asked, so that what stands before them is sorted once [m]
     expected_points: Array | None = None
     _kept: list[tuple[Array, Array, float, cKDTree, Array]] = field(default_factory=list, repr=False)
 

@@ -238,22 +238,11 @@ _WHOLE = 0.08  # of the object, by which a course may be off that shows all of i
 
 @dataclass(frozen=True, eq=False)
 class EndAnchor:
-    """Observed position of one end of an object along its own direction.
+    """Observed position of one end of an object along its own direction."""
 
-    Attributes
-    ----------
-    link_end_index : int
-        Among the links' starts and ends, in this order link by link.
-    direction : ndarray, shape (3,)
-        Unit vector along the object.
-    position : ndarray, shape (3,)
-        The corner lies in the plane through this place across it [m].
-    position_std : float [m]
-    """
-
-    link_end_index: int
-    direction: Array
-    position: Array
+    link_end_index: int  # among the links' starts and ends, in this order link by link
+    direction: Array  # (3,), unit vector along the object
+    position: Array  # (3,), the corner lies in the plane through this place across it [m]
     position_std: float
 
 

@@ -32,18 +32,10 @@ _TO_SIGMA = 1.4826  # from the median absolute deviation of a normal distributio
 
 @dataclass(frozen=True, eq=False)
 class WeightedCloud:
-    """Point cloud with weights.
+    """Point cloud with weights."""
 
-    Attributes
-    ----------
-    points : ndarray, shape (N, 3)
-        In the world [m].
-    point_weights : ndarray, shape (N,)
-        How many of the camera's points each one stands for.
-    """
-
-    points: Array
-    point_weights: Array
+    points: Array  # (N, 3), in the world [m]
+    point_weights: Array  # (N,), how many of the camera's points each one stands for
 
     def __len__(self) -> int:
         return len(self.points)
@@ -346,27 +338,13 @@ class SkeletonOptions:
 
 @dataclass(frozen=True, eq=False)
 class CloudSkeleton:
-    """Nodes of a cloud and the graph between them.
+    """Nodes of a cloud and the graph between them."""
 
-    Attributes
-    ----------
-    nodes : ndarray, shape (K, 3)
-        Centroids of the kept segments, in the order of the walk [m].
-    node_weights : ndarray, shape (K,)
-        Points (weights) of each segment.
-    node_of_point : ndarray of int, shape (N,)
-        Node to which each point of the cloud belongs, -1 for none.
-    edges : ndarray of int, shape (E, 2)
-        Minimum spanning forest of the graph of nearest neighbours.
-    component_of_node : ndarray of int, shape (K,)
-        Connected part of each node, the one with most points first.
-    """
-
-    nodes: Array
-    node_weights: Array
-    node_of_point: Integers
-    edges: Integers
-    component_of_node: Integers
+    nodes: Array  # (K, 3), centroids of the kept segments, in the order of the walk [m]
+    node_weights: Array  # (K,), points (weights) of each segment
+    node_of_point: Integers  # (N,), node to which each point of the cloud belongs, -1 for none
+    edges: Integers  # (E, 2), minimum spanning forest of the graph of nearest neighbours
+    component_of_node: Integers  # (K,), connected part of each node, the one with most points first
 
     @property
     def has_node(self) -> NDArray[np.bool_]:

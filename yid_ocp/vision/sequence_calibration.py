@@ -49,18 +49,10 @@ _TO_SIGMA = 1.4826
 
 @dataclass(frozen=True, eq=False)
 class BackgroundPoints:
-    """Background points that do not belong to the object.
+    """Background points that do not belong to the object."""
 
-    Attributes
-    ----------
-    points : ndarray, shape (N, 3)
-        In the world [m].
-    match_distance : float
-        Distance at which a point belongs to it [m].
-    """
-
-    points: Array = field(default_factory=lambda: np.empty((0, 3)))
-    match_distance: float = 0.0
+    points: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3), in the world [m]
+    match_distance: float = 0.0  # distance at which a point belongs to it [m]
 
     @cached_property
     def _tree(self) -> cKDTree:
@@ -160,27 +152,14 @@ def _shape(entry: ExtraMesh, where: str) -> TriangleMesh:
 
 @dataclass(frozen=True, eq=False)
 class ForeignObject:
-    """Foreign object seen in several frames.
+    """Foreign object seen in several frames."""
 
-    Attributes
-    ----------
-    centre : ndarray, shape (3,)
-        In the world, in the median frame [m].
-    size : ndarray, shape (3,) [m]
-    frames : int
-        In which it was seen.
-    link : str
-        Of the robot, with which it moves; empty for none.
-    text : str
-        Where it is and what helps.
-    """
-
-    centre: Array
-    size: Array
-    frames: int
+    centre: Array  # (3,), in the world, in the median frame [m]
+    size: Array  # (3,) [m]
+    frames: int  # in which it was seen
     moving: bool
-    link: str
-    text: str
+    link: str  # of the robot, with which it moves; empty for none
+    text: str  # where it is and what helps
 
 
 def group_foreign_objects(
@@ -299,30 +278,14 @@ _APART = 3.0  # robust standard deviations from the other frames' ends, at which
 
 @dataclass(frozen=True, eq=False)
 class DimensionCheck:
-    """Tube lengths and radii estimated from the frames, compared with the model.
+    """Tube lengths and radii estimated from the frames, compared with the model."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        `T1.length` and so on: lengths of all segments, then their radii.
-    model_values : ndarray, shape (2 s,)
-        The model's values [m].
-    log_ratio : ndarray, shape (2 s,)
-        Logarithm of the value that fits over the model's.
-    covariance : ndarray, shape (2 s, 2 s)
-        Of `log_ratio`.
-    is_estimated : tuple of bool
-        Which of them the fit uses in place of the model's.
-    n_frames : int
-        That were asked; 0 where nothing could be said.
-    """
-
-    names: tuple[str, ...]
-    model_values: Array
-    log_ratio: Array
-    covariance: Array
-    is_estimated: tuple[bool, ...]
-    n_frames: int
+    names: tuple[str, ...]  # `T1.length` and so on: lengths of all segments, then their radii
+    model_values: Array  # (2 s,), the model's values [m]
+    log_ratio: Array  # (2 s,), logarithm of the value that fits over the model's
+    covariance: Array  # (2 s, 2 s), of `log_ratio`
+    is_estimated: tuple[bool, ...]  # which of them the fit uses in place of the model's
+    n_frames: int  # that were asked; 0 where nothing could be said
 
     @property
     def log_ratio_std(self) -> Array:
@@ -485,18 +448,8 @@ def _changed(system: System, given: Mapping[str, float] | None, change: Array) -
 
 @dataclass(frozen=True, eq=False)
 class SequenceCalibration:
-    """Camera calibration, object dimensions and background of a sequence.
+    """Camera calibration, object dimensions and background of a sequence."""
 
-    Attributes
-    ----------
-    camera_calibration : Calibration
-        Where the camera stands, how it scales depth, and its clock.
-    dimensions : Sizes
-        What the frames say of the object's lengths and radii.
-    background : Background
-        What stands there in all frames.
-    """
-
-    camera_calibration: CameraCalibration
-    dimensions: DimensionCheck
-    background: BackgroundPoints
+    camera_calibration: CameraCalibration  # where the camera stands, how it scales depth, and its clock
+    dimensions: DimensionCheck  # what the frames say of the object's lengths and radii
+    background: BackgroundPoints  # what stands there in all frames

@@ -42,23 +42,12 @@ _AHEAD = 0.5  # of its length, by which a tube may be too short and its end stil
 
 @dataclass(frozen=True, eq=False)
 class TubeLinks:
-    """Links of a shape as cylinders in the world.
+    """Links of a shape as cylinders in the world."""
 
-    Attributes
-    ----------
-    link_ends : ndarray, shape (K, 2, 3)
-        Start and end of every link's centre line [m].
-    radius : ndarray, shape (K,) [m]
-    free_end_links : tuple of int
-        Links whose end nothing holds and nothing grows on.
-    tube_lengths : ndarray, shape (K,)
-        Length of the whole tube that a link belongs to [m].
-    """
-
-    link_ends: Array
-    radius: Array
-    free_end_links: tuple[int, ...]
-    tube_lengths: Array
+    link_ends: Array  # (K, 2, 3), start and end of every link's centre line [m]
+    radius: Array  # (K,) [m]
+    free_end_links: tuple[int, ...]  # links whose end nothing holds and nothing grows on
+    tube_lengths: Array  # (K,), length of the whole tube that a link belongs to [m]
 
     @property
     def link_lengths(self) -> Array:
@@ -111,53 +100,32 @@ def _faces_away_from_camera(normal: Array, sight: Array) -> Mask:
 
 @dataclass(frozen=True, eq=False)
 class ForeignCluster:
-    """Cluster of points that belong to no tube.
+    """Cluster of points that belong to no tube."""
 
-    Attributes
-    ----------
-    centre : ndarray, shape (3,)
-        Median of its points in the world [m].
-    extent : ndarray, shape (3,)
-        Extents along the world's axes [m].
-    """
-
-    centre: Array
-    extent: Array
+    centre: Array  # (3,), median of its points in the world [m]
+    extent: Array  # (3,), extents along the world's axes [m]
     n_points: int
 
 
 @dataclass(frozen=True, eq=False)
 class ShapeEvidence:
-    """Classification of a frame's points by a shape, and how much of the shape they cover.
+    """Classification of a frame's points by a shape, and how much of the shape they cover."""
 
-    Attributes
-    ----------
-    is_own, is_contested, is_foreign : ndarray of bool, shape (N,)
-        Points on the shape that are surely its own; points there that may be a thing's; points of things.
-    noise_std : float
-        Standard deviation of their distances from the surface [m].
-    mean_distance : float
-        Mean distance from the surface of points near it that are no thing's [m].
-    covered_fraction, visibly_empty_fraction : ndarray, shape (K,)
-        Share of each link's length on which there are own points, and on which the camera sees that there are none.
-    end_offsets : ndarray, shape (E,)
-        By how much each free tube's end lies further along than the shape has it, NaN where that cannot be seen [m].
-    excess_variance : ndarray, shape (K,)
-        Variance across each link beyond that of its tube [m^2].
-    foreign_clusters : tuple of Thing
-        The largest first.
-    """
-
+    # (N,), points on the shape that are surely its own; points there that may be a thing's; points of things
     is_own: Mask
     is_contested: Mask
     is_foreign: Mask
-    noise_std: float
-    mean_distance: float
+    noise_std: float  # standard deviation of their distances from the surface [m]
+    mean_distance: float  # mean distance from the surface of points near it that are no thing's [m]
+    # (K,), share of each link's length on which there are own points, and on which the camera sees that there are
+    # none
     covered_fraction: Array
     visibly_empty_fraction: Array
+    # (E,), by how much each free tube's end lies further along than the shape has it, NaN where that cannot be seen
+    # [m]
     end_offsets: Array
-    excess_variance: Array
-    foreign_clusters: tuple[ForeignCluster, ...]
+    excess_variance: Array  # (K,), variance across each link beyond that of its tube [m^2]
+    foreign_clusters: tuple[ForeignCluster, ...]  # the largest first
 
     @property
     def visible_coverage(self) -> Array:
@@ -169,31 +137,15 @@ class ShapeEvidence:
 
 @dataclass(frozen=True, eq=False)
 class CloudObservation:
-    """Processed points of one frame with the camera and occlusion that they were seen with.
+    """Processed points of one frame with the camera and occlusion that they were seen with."""
 
-    Attributes
-    ----------
-    points : ndarray, shape (N, 3)
-        Surface points in the world [m].
-    point_weights : ndarray, shape (N,)
-    skeleton_nodes : ndarray, shape (K, 3)
-        Of their skeleton [m].
-    camera_position : ndarray, shape (3,) [m]
-    occlusion_map : View, optional
-        Everything that the camera saw; without it no place counts as hidden.
-    is_filtered_out : callable, optional
-        Which places, shape (S, 3), lie where filters leave no points.
-    end_anchors : sequence of Anchor
-        Ends of the object that were seen.
-    """
-
-    points: Array
-    point_weights: Array
-    skeleton_nodes: Array
-    camera_position: Array
-    occlusion_map: OcclusionMap | None = None
-    is_filtered_out: _FilteredOutTest | None = None
-    end_anchors: Sequence[EndAnchor] = ()
+    points: Array  # (N, 3), surface points in the world [m]
+    point_weights: Array  # (N,)
+    skeleton_nodes: Array  # (K, 3), of their skeleton [m]
+    camera_position: Array  # (3,) [m]
+    occlusion_map: OcclusionMap | None = None  # everything that the camera saw; without it no place counts as hidden
+    is_filtered_out: _FilteredOutTest | None = None  # which places, shape (S, 3), lie where filters leave no points
+    end_anchors: Sequence[EndAnchor] = ()  # ends of the object that were seen
 
     @cached_property
     def point_tree(self) -> cKDTree:
@@ -499,69 +451,36 @@ class DimensionEquations:
 
     The sizes are the logarithms of all lengths and then of all radii, segment by segment, relative to the values of the
     fit. About these the least cost is  g'x + x'Sx/2.
-
-    Attributes
-    ----------
-    gradient : ndarray, shape (2 s,)
-    hessian : ndarray, shape (2 s, 2 s)
-    point_jacobian : ndarray, shape (np, 3, 2 s)
-        How the system's points move with them [m].
     """
 
-    gradient: Array
-    hessian: Array
-    point_jacobian: Array
+    gradient: Array  # (2 s,)
+    hessian: Array  # (2 s, 2 s)
+    point_jacobian: Array  # (np, 3, 2 s), how the system's points move with them [m]
 
 
 @dataclass(frozen=True, eq=False)
 class FrameShapeFit:
-    """Fitted shape of one frame with its uncertainty and quality.
+    """Fitted shape of one frame with its uncertainty and quality."""
 
-    Attributes
-    ----------
-    q : ndarray, shape (n,)
-        Configuration, twists at rest.
-    point_positions : ndarray, shape (np, 3)
-        The system's points there [m].
-    point_std : ndarray, shape (np, 3)
-        Standard deviation of each coordinate by the curvature of the cost [m].
-    mean_distance : float
-        Mean of |e_i| over the points near the shape that belong to no other thing [m].
-    noise_std : float
-        Standard deviation of e_i of the points on the shape [m].
-    covered_fraction, visibly_empty_fraction : ndarray, shape (K,)
-        Share of each link's length on which there are points, and on which the camera sees that there are none.
-    is_point_seen : ndarray of bool, shape (np,)
-        Whether there are points enough about each of the system's points, or a gripper that holds it.
-    grasp_gaps : ndarray, shape (grasps, 3)
-        From what each gripper holds to the gripper [m].
-    end_offsets : ndarray, shape (E,)
-        By how much each free tube's end lies further along than the shape has it, NaN where that is not seen [m].
-    contested_fraction : float
-        Share of the points on the shape that may belong to a thing which touches it; they are left out.
-    foreign_clusters : tuple of Thing
-        What else there is.
-    dimension_equations : SizeRows
-        What the frame says of lengths and radii.
-    link_ends : ndarray, shape (K, 2, 3)
-        Start and end of every link [m].
-    """
-
-    q: Array
-    point_positions: Array
-    point_std: Array
-    mean_distance: float
-    noise_std: float
+    q: Array  # (n,), configuration, twists at rest
+    point_positions: Array  # (np, 3), the system's points there [m]
+    point_std: Array  # (np, 3), standard deviation of each coordinate by the curvature of the cost [m]
+    mean_distance: float  # mean of |e_i| over the points near the shape that belong to no other thing [m]
+    noise_std: float  # standard deviation of e_i of the points on the shape [m]
+    # (K,), share of each link's length on which there are points, and on which the camera sees that there are none
     covered_fraction: Array
     visibly_empty_fraction: Array
+    # (np,), whether there are points enough about each of the system's points, or a gripper that holds it
     is_point_seen: NDArray[np.bool_]
-    grasp_gaps: Array
+    grasp_gaps: Array  # (grasps, 3), from what each gripper holds to the gripper [m]
+    # (E,), by how much each free tube's end lies further along than the shape has it, NaN where that is not seen [m]
     end_offsets: Array
+    # share of the points on the shape that may belong to a thing which touches it; they are left out
     contested_fraction: float
-    foreign_clusters: tuple[ForeignCluster, ...]
-    dimension_equations: DimensionEquations
+    foreign_clusters: tuple[ForeignCluster, ...]  # what else there is
+    dimension_equations: DimensionEquations  # what the frame says of lengths and radii
     n_iterations: int
-    link_ends: Array
+    link_ends: Array  # (K, 2, 3), start and end of every link [m]
 
     @property
     def visible_coverage(self) -> float:

@@ -7,7 +7,7 @@ moves.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -30,6 +30,7 @@ from yid_ocp.vision.frames import CameraIntrinsics, import_open3d
 Array = NDArray[np.float64]
 MeshKind = Literal["visual", "collision"]
 _PositiveLength = Annotated[float, Gt(0)]
+_Triple = tuple[float, float, float]
 
 _FACETS = 48  # of a tube: the surface is then within 0.2 % of the radius
 _TOUCHING = 5e-4  # [m]
@@ -53,8 +54,8 @@ class ExtraMesh:
         tuple[_PositiveLength, _PositiveLength] | None, OptionInfo("the same: radius and length along z", "m")
     ] = None
     sphere: Annotated[float | None, Gt(0), OptionInfo("the same: radius", "m")] = None
-    xyz: Annotated[tuple[float, float, float], OptionInfo("of its middle in the link", "m")] = (0.0, 0.0, 0.0)
-    rpy: Annotated[tuple[float, float, float], OptionInfo("roll, pitch and yaw in the link", "rad")] = (0.0, 0.0, 0.0)
+    xyz: Annotated[_Triple, OptionInfo("of its middle in the link", "m")] = (0.0, 0.0, 0.0)
+    rpy: Annotated[_Triple, OptionInfo("roll, pitch and yaw in the link", "rad")] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -198,15 +199,10 @@ class ArticulatedSurfaces:
             self._cells.append(_Cells(scene, self._low[-1]))
         q = ca.SX.sym("q", len(mechanism.joints))
         kinematics = forward_kinematics(mechanism, q)
-        poses = [
-            ca.SX.eye(4)
-            if joint < 0
-            else ca.vertcat(
-                ca.horzcat(kinematics.joint_rotations[joint], kinematics.joint_origins[joint]),
-                ca.SX(ca.DM([[0.0, 0.0, 0.0, 1.0]])),
-            )
-            for joint in self.part_joints
-        ]
+        poses, last = [], ca.SX(ca.DM([[0.0, 0.0, 0.0, 1.0]]))
+        for joint in self.part_joints:
+            turned = None if joint < 0 else (kinematics.joint_rotations[joint], kinematics.joint_origins[joint])
+            poses.append(ca.SX.eye(4) if turned is None else ca.vertcat(ca.horzcat(*turned), last))
         self._poses = ca.Function("poses", [q], [ca.densify(ca.horzcat(*poses))])
 
     def part_poses_at(self, q: ArrayLike) -> Array:
@@ -233,19 +229,22 @@ class ArticulatedSurfaces:
         ndarray, shape (N,)
             Unsigned [m]; infinite beyond `is_within_distance`.
         """
-        o3d = import_open3d()
         result = np.full(len(points), np.inf)
+        for part, _, near, local in self._near_parts(points, q, within, moving_only):
+            result[near] = np.minimum(result[near], self._cells[part].distance(local))
+        return np.where(result <= within, result, np.inf)
+
+    def _near_parts(
+        self, points: Array, q: ArrayLike, within: float, moving_only: bool
+    ) -> Iterator[tuple[int, Array, NDArray[np.int64], Array]]:
+        """Parts with points near their boxes: part, pose, indices of these points, and they in the part's frame."""
         for part, pose in enumerate(self.part_poses_at(q)):
             if moving_only and self.part_joints[part] < 0:
                 continue
             local = (points - pose[:3, 3]) @ pose[:3, :3]
             near = np.flatnonzero(self._inside(local, part, within))
-            if not len(near):
-                continue
-            query = o3d.core.Tensor(np.ascontiguousarray(local[near], dtype=np.float32))
-            found = self._scenes[part].compute_distance(query, nthreads=1).numpy().astype(np.float64)
-            result[near] = np.minimum(result[near], found)
-        return np.where(result <= within, result, np.inf)
+            if len(near):
+                yield part, pose, near, local[near]
 
     def _inside(self, local: Array, part: int, margin: float) -> NDArray[np.bool_]:
         """Which points of a part's frame lie in its box, widened by a margin [m], shape (N,)."""
@@ -301,14 +300,8 @@ class ArticulatedSurfaces:
         o3d = import_open3d()
         distance, normal = np.full(len(points), np.inf), np.zeros((len(points), 3))
         owner = np.full(len(points), -1)
-        for part, pose in enumerate(self.part_poses_at(q)):
-            if self.part_joints[part] < 0:
-                continue
-            local = (points - pose[:3, 3]) @ pose[:3, :3]
-            near = np.flatnonzero(self._inside(local, part, within))
-            if not len(near):
-                continue
-            query = np.ascontiguousarray(local[near], dtype=np.float32)
+        for part, pose, near, local in self._near_parts(points, q, within, True):
+            query = np.ascontiguousarray(local, dtype=np.float32)
             answer = self._scenes[part].compute_closest_points(o3d.core.Tensor(query), nthreads=1)
             away = query - answer["points"].numpy()
             length = np.linalg.norm(away, axis=1).astype(np.float64)
@@ -342,12 +335,9 @@ class ArticulatedSurfaces:
         part : ndarray of int, shape (height, width)
             Index into `part_joints`, -1 where there is nothing.
         """
-        o3d = import_open3d()
-        rays = pinhole.pixel_rays
-        camera = np.asarray(pose, float)
-        depth = np.full(rays.shape[:2], np.inf)
-        cosine = np.zeros(rays.shape[:2])
-        owner = np.full(rays.shape[:2], -1)
+        rays, camera = pinhole.pixel_rays, np.asarray(pose, float)
+        size = rays.shape[:2]
+        depth, cosine, owner = np.full(size, np.inf), np.zeros(size), np.full(size, -1)
         for part, placed in enumerate(self.part_poses_at(q)):
             rotation = placed[:3, :3].T @ camera[:3, :3]
             origin = placed[:3, :3].T @ (camera[:3, 3] - placed[:3, 3])
@@ -356,12 +346,7 @@ class ArticulatedSurfaces:
                 continue
             rows, columns = window
             directions = rays[rows, columns] @ rotation.T
-            packed = np.concatenate([np.broadcast_to(origin, directions.shape), directions], axis=-1)
-            answer = self._scenes[part].cast_rays(
-                o3d.core.Tensor(np.ascontiguousarray(packed, dtype=np.float32)), nthreads=1
-            )
-            hit = answer["t_hit"].numpy().astype(np.float64)
-            normals = answer["primitive_normals"].numpy()
+            hit, normals = self._cast(part, origin, directions)
             square = np.abs((normals * directions).sum(-1)) / np.linalg.norm(directions, axis=-1)
             nearer = hit < depth[rows, columns]
             depth[rows, columns] = np.where(nearer, hit, depth[rows, columns])
@@ -388,20 +373,23 @@ class ArticulatedSurfaces:
         part : ndarray of int, shape (N,)
             Index into `part_joints`, -1 for nothing.
         """
-        o3d = import_open3d()
         distance, normal = np.full(len(directions), np.inf), np.zeros((len(directions), 3))
         owner = np.full(len(directions), -1)
         for part, pose in enumerate(self.part_poses_at(q)):
             local = directions @ pose[:3, :3]
-            start = np.broadcast_to((origin - pose[:3, 3]) @ pose[:3, :3], local.shape)
-            rays = np.ascontiguousarray(np.concatenate([start, local], axis=1), dtype=np.float32)
-            answer = self._scenes[part].cast_rays(o3d.core.Tensor(rays), nthreads=1)
-            hit = answer["t_hit"].numpy().astype(np.float64)
+            hit, normals = self._cast(part, (origin - pose[:3, 3]) @ pose[:3, :3], local)
             nearer = hit < distance
             distance[nearer], owner[nearer] = hit[nearer], part
-            normal[nearer] = answer["primitive_normals"].numpy()[nearer] @ pose[:3, :3].T
+            normal[nearer] = normals[nearer] @ pose[:3, :3].T
         away = np.einsum("ij,ij->i", normal, directions) > 0
         return distance, np.where(away[:, None], -normal, normal), owner
+
+    def _cast(self, part: int, origin: Array, directions: Array) -> tuple[Array, Array]:
+        """Distances in lengths of the directions, and normals, where rays of a part's frame meet it."""
+        packed = np.concatenate([np.broadcast_to(origin, directions.shape), directions], axis=-1)
+        rays = import_open3d().core.Tensor(np.ascontiguousarray(packed, dtype=np.float32))
+        answer = self._scenes[part].cast_rays(rays, nthreads=1)
+        return answer["t_hit"].numpy().astype(np.float64), answer["primitive_normals"].numpy()
 
     def _window(
         self, pinhole: CameraIntrinsics, rotation: Array, origin: Array, part: int

@@ -137,10 +137,6 @@ class _Work:
     filtered: WeightedCloud | None = None
     skeleton: CloudSkeleton | None = None
 
-    def dropped(self, reason: str) -> _Work:
-        self.report = replace(self.report, drop_reason=reason)
-        return self
-
 
 @dataclass(frozen=True, eq=False)
 class _Look:
@@ -181,25 +177,18 @@ class FrameTracker:
         if anywhere:
             if scene.robot_urdf is not None:
                 hint = "set track.options.root_placement to model, or model.robot to null"
-                raise ConfigError(
-                    "a robot holds the object: its root is where the model has it", where="root", hint=hint
-                )
+                what = "a robot holds the object: its root is where the model has it"
+                raise ConfigError(what, where="root", hint=hint)
             system, self._loose = with_free_root(system, values)
-        self.system, self.parameter_values, self.sequence, self.options, self.empty_scene = (
-            system,
-            values,
-            sequence,
-            options,
-            empty,
-        )
+        self.system, self.parameter_values = system, values
+        self.sequence, self.options, self.empty_scene = sequence, options, empty
         self.shape_fitter = self._shape_of(values)
         self.initial_shape_finder = self.shape_fitter.initial_shape_finder() if anywhere else None
         self.point_names = _chosen_points(system, options.tracked_points)
         self.object_region = ObjectRegion(system, options.filters, values, anywhere=anywhere)
         # of a root that is sought nothing that was recorded is needed
-        self.joint_time_span, self.joint_angles_at = _joint_angles(
-            system, recording, () if anywhere else self.shape_fitter.recorded_joint_names
-        )
+        known = () if anywhere else self.shape_fitter.recorded_joint_names
+        self.joint_time_span, self.joint_angles_at = _joint_angles(system, recording, known)
         tree = numeric_mechanism(system, values)
         meshes: dict[int, TriangleMesh] = {}
         if scene.robot_urdf is not None:
@@ -211,12 +200,8 @@ class FrameTracker:
         self.robot_surfaces = ArticulatedSurfaces(tree, meshes) if meshes else None
         self.arm_surface: ArmSurface | None = None
         if self.robot_surfaces is not None and self.joint_time_span is not None and scene.robot_urdf is not None:
-            self.arm_surface = ArmSurface(
-                self.robot_surfaces,
-                self.configuration_at_rest,
-                self.shape_fitter.gripper_positions_at,
-                float(self.shape_fitter.link_radii.max()) + _GRIP,
-            )
+            grip, held_at = float(self.shape_fitter.link_radii.max()) + _GRIP, self.shape_fitter.gripper_positions_at
+            self.arm_surface = ArmSurface(self.robot_surfaces, self.configuration_at_rest, held_at, grip)
         self.frame_order, self._reasons = _by_stamp(sequence.stamps)
         usable = [i for i in self.frame_order if i not in self._reasons]
         self._check_clock(usable)
@@ -231,9 +216,8 @@ class FrameTracker:
         """Configuration at a time on the joints' clock with the object at rest; constant beyond the recording."""
         q = self.shape_fitter.rest_configuration.copy()
         if self.joint_angles_at is not None:
-            q[[self.system.mechanism.joint_index(name) for name in self.shape_fitter.recorded_joint_names]] = (
-                self.joint_angles_at(t)
-            )
+            index = [self.system.mechanism.joint_index(name) for name in self.shape_fitter.recorded_joint_names]
+            q[index] = self.joint_angles_at(t)
         return q
 
     def calibrate_sequence(self, progress: Callable[[int, str], None] = lambda done, text: None) -> SequenceCalibration:
@@ -243,12 +227,10 @@ class FrameTracker:
         background = BackgroundPoints()
         filters, noise = self.options.filters, self.options.shape_fit.surface_noise_std
         if self.empty_scene is not None:
-            clouds = [
-                calibration.camera_state.to_world(self._finite(self.empty_scene, i)[0])
-                for i in range(len(self.empty_scene))
-            ]
+            seen = (self._finite(self.empty_scene, i)[0] for i in range(len(self.empty_scene)))
+            clouds = [calibration.camera_state.to_world(points) for points in seen]
             background = BackgroundPoints.from_empty_scene(clouds, filters.voxel_size, noise)
-        looks = [look for i in self._asked if (look := self._look(i, calibration, background)) is not None]
+        looks = [look for i in self._asked if (look := self._look(i, calibration, background)[1]) is not None]
         last: list[tuple[ShapeFitter, FrameShapeFit]] = []
 
         def fitted(values: Mapping[str, float], starts: Sequence[Array]) -> list[FrameShapeFit]:
@@ -263,11 +245,9 @@ class FrameTracker:
         shared = 0.0
         if looks:
             places = self.shape_fitter.points_at(looks[0].q)
-            still = np.zeros(places.shape)
-            shared = float(calibration.shared_point_std(places, still, np.zeros(len(places))).max())
-        sizes = check_dimensions(
-            self.system, self.parameter_values, self.options.estimated_dimensions, (noise, shared), fitted
-        )
+            shared = float(calibration.shared_point_std(places, 0 * places, np.zeros(len(places))).max())
+        asked = self.options.estimated_dimensions
+        sizes = check_dimensions(self.system, self.parameter_values, asked, (noise, shared), fitted)
         if self.options.background_estimation == "frames":
             shapes = [shape.tubes_at(fit.q) for shape, fit in last if not rejection_reason(fit, shape, self.options)]
             clouds = [look.sights[0].points for look in looks]
@@ -286,14 +266,11 @@ class FrameTracker:
         for done, i in enumerate(self.calibration_frames):
             progress(done, f"reading {self.sequence.frame_names[i]}")
             try:
-                points = self._points(i)
+                points, _ = self._finite(self.sequence, i)
             except DataError:
                 continue  # the second pass says why
-            glimpses.append(
-                CalibrationFrame(
-                    float(self.sequence.stamps[i]), voxel_averages(points, options.filters.voxel_size).points
-                )
-            )
+            thinned = voxel_averages(points, options.filters.voxel_size).points
+            glimpses.append(CalibrationFrame(float(self.sequence.stamps[i]), thinned))
         progress(len(self.calibration_frames), "calibrating the camera by the arm")
         rng = np.random.default_rng(options.seed)
         pose, source = self.sequence.camera_pose, self.sequence.source
@@ -302,19 +279,14 @@ class FrameTracker:
     def _check_clock(self, usable: Sequence[int]) -> None:
         if self.joint_time_span is None or not usable:
             return
-        options, stamps = self.options.clock, self.sequence.stamps[list(usable)]
-        first, last = float(stamps.min()) - options.initial_offset, float(stamps.max()) - options.initial_offset
-        if (
-            first > self.joint_time_span[1] + options.search_half_width
-            or last < self.joint_time_span[0] - options.search_half_width
-        ):
-            raise DataError(
-                f"the frames run from {first:.3f} s to {last:.3f} s, the joints from {self.joint_time_span[0]:.3f} s to"
-                f" {self.joint_time_span[1]:.3f} s: their clocks are not the same",
-                where=self.sequence.source,
-                hint="give the clock offset (stamp minus joint time): "
-                f"{first + options.initial_offset - self.joint_time_span[0]:.3f} s if both started together",
-            )
+        stamps, offset = self.sequence.stamps[list(usable)], self.options.clock.initial_offset
+        first, last = float(stamps.min()) - offset, float(stamps.max()) - offset
+        (begin, end), reach = self.joint_time_span, self.options.clock.search_half_width
+        if first > end + reach or last < begin - reach:
+            spans = f"the frames run from {first:.3f} s to {last:.3f} s, the joints from {begin:.3f} s to {end:.3f} s"
+            hint = f"give the clock offset (stamp minus joint time): {first + offset - begin:.3f} s if both started"
+            where = self.sequence.source
+            raise DataError(f"{spans}: their clocks are not the same", where=where, hint=f"{hint} together")
 
     def _shape(self, sizes: DimensionCheck) -> ShapeFitter:
         """The object with the sizes that were estimated."""
@@ -344,10 +316,6 @@ class FrameTracker:
 
         return removed
 
-    def _points(self, index: int) -> Array:
-        """A frame's finite points in the camera's frame."""
-        return self._finite(self.sequence, index)[0]
-
     @staticmethod
     def _finite(sequence: FrameSequence, index: int) -> tuple[Array, Mask]:
         """A frame's finite points in the camera's frame, and which of all its points they are."""
@@ -376,7 +344,7 @@ class FrameTracker:
                 raise DataError("the cloud has no colours")
             inside[inside] = has_any_colour(colours[finite][inside], filters.object_colours, filters.max_colour_angle)
             if not inside.any():
-                raise DataError("no point has one of the object's colours: check filters.colours")
+                raise DataError("no point has one of the object's colours: check filters.object_colours")
         return voxel_averages(points[inside], filters.voxel_size), points
 
     def track_frame(self, index: int, common: SequenceCalibration) -> FrameReport:
@@ -389,17 +357,10 @@ class FrameTracker:
             cloud = common.camera_calibration.camera_state.to_world(self.sequence.load_cloud(frame.index))
         except DataError:
             return None
-        work = self._work(frame.index, common)
+        work, camera = self._work(frame.index, common), common.camera_calibration.camera_position
         filtered = None if work.filtered is None else work.filtered.points
-        return FrameStages(
-            frame.name,
-            frame.drop_reason,
-            common.camera_calibration.camera_position,
-            cloud,
-            filtered,
-            work.skeleton,
-            work.report.shape_fit,
-        )
+        fit = work.report.shape_fit
+        return FrameStages(frame.name, frame.drop_reason, camera, cloud, filtered, work.skeleton, fit)
 
     def unprocessed_report(self, index: int, calibration: CameraCalibration, reason: str) -> FrameReport:
         """Report of a frame before processing, with the reason if it is dropped."""
@@ -417,22 +378,14 @@ class FrameTracker:
         columns = [self.system.point_frames.index(name) for name in self.point_names]
         things = self.foreign_objects(frames)
         points = tracked_points(frames, columns, common, things, self.options, self.sequence.source)
-        return TrackResult(
-            self.point_names,
-            points.t,
-            points.q,
-            points.position,
-            points.std,
-            points.shared_std,
-            tuple(frames),
+        measured = points.t, points.q, points.position, points.std, points.shared_std
+        camera, dimensions, place = (
             common.camera_calibration,
             common.dimensions,
-            things,
-            note,
-            (),
-            self.system.point_frames,
             self._shape(common.dimensions).points_at,
         )
+        shown, names, seen = (), self.point_names, self.system.point_frames
+        return TrackResult(names, *measured, tuple(frames), camera, dimensions, things, note, shown, seen, place)
 
     def foreign_objects(self, frames: Sequence[FrameReport]) -> tuple[ForeignObject, ...]:
         """Foreign objects seen in the fitted frames."""
@@ -451,16 +404,11 @@ class FrameTracker:
         if self.robot_surfaces is None:
             return {}
         poses = self.robot_surfaces.part_poses_at(self.configuration_at_rest(t))
-        names = self.system.mechanism.joint_names
-        return {
-            _link_of(self.system, names[j]): pose
-            for j, pose in zip(self.robot_surfaces.part_joints, poses, strict=True)
-            if j >= 0
-        }
+        names, joints = self.system.mechanism.joint_names, self.robot_surfaces.part_joints
+        return {_link_of(self.system, names[j]): pose for j, pose in zip(joints, poses, strict=True) if j >= 0}
 
     def _work(self, index: int, common: SequenceCalibration) -> _Work:
-        work = _Work(self.unprocessed_report(index, common.camera_calibration, self._reasons.get(index, "")))
-        look = self._prepared(work, common.camera_calibration, common.background)
+        work, look = self._look(index, common.camera_calibration, common.background)
         if look is None:
             return work
         begun = time.process_time()
@@ -468,50 +416,42 @@ class FrameTracker:
         fits = [shape.fit_frame(sight, look.q, starts) for sight, starts in zip(look.sights, look.starts, strict=True)]
         fits.sort(key=lambda fit: fit.mean_distance)
         reason = rejection_reason(fits[0], shape, self.options)
-        if (
-            self.initial_shape_finder is not None
-            and not reason
-            and is_self_touching(fits[0].link_ends, shape.link_radii)
-        ):
+        anywhere = self.initial_shape_finder is not None
+        if anywhere and not reason and is_self_touching(fits[0].link_ends, shape.link_radii):
             reason = "the object crosses or touches itself"
         other = fits[1] if len(fits) > 1 and fits[1].mean_distance < _AS_GOOD * fits[0].mean_distance else None
         spent = work.report.cpu_seconds + time.process_time() - begun
-        work.report = replace(
-            work.report, shape_fit=fits[0], alternative_fit=other, drop_reason=reason, cpu_seconds=spent
-        )
+        work.report = replace(work.report, shape_fit=fits[0], alternative_fit=other, cpu_seconds=spent)
+        work.report = replace(work.report, drop_reason=reason)
         return work
 
-    def _look(self, index: int, calibration: CameraCalibration, background: BackgroundPoints) -> _Look | None:
-        """A frame that can be fitted; None for others."""
-        return self._prepared(
-            _Work(self.unprocessed_report(index, calibration, self._reasons.get(index, ""))), calibration, background
-        )
-
-    def _prepared(self, work: _Work, calibration: CameraCalibration, background: BackgroundPoints) -> _Look | None:
+    def _look(
+        self, index: int, calibration: CameraCalibration, background: BackgroundPoints
+    ) -> tuple[_Work, _Look | None]:
         """What a frame shows of the object, None with the reason in its report."""
-        options, index, stamp, t = self.options, work.report.index, work.report.stamp, work.report.joint_time
-        if work.report.drop_reason:
-            return None
+        work = _Work(self.unprocessed_report(index, calibration, self._reasons.get(index, "")))
         try:
-            cloud, raw = self._read(index, calibration)
+            return work, None if work.report.drop_reason else self._prepared(work, calibration, background)
         except DataError as error:
-            work.dropped(error.what)
-            return None
+            work.report = replace(work.report, drop_reason=error.what)
+            return work, None
+
+    def _prepared(self, work: _Work, calibration: CameraCalibration, background: BackgroundPoints) -> _Look:
+        """What a frame shows of the object; `DataError` with the reason why it is dropped."""
+        options, index, stamp, t = self.options, work.report.index, work.report.stamp, work.report.joint_time
+        cloud, raw = self._read(index, calibration)
         work.report = replace(work.report, n_raw_points=len(raw))
         if self.joint_time_span is not None and not self.joint_time_span[0] <= t <= self.joint_time_span[1]:
-            work.dropped("there are no joint angles at its time")
-            return None
+            raise DataError("there are no joint angles at its time")
         rng = np.random.default_rng([options.seed, index])
         usual = calibration.on_time_frames
         if self.arm_surface is not None and usual is not None:
-            own = estimate_stamp_delay(
-                self.arm_surface, calibration.camera_state, stamp, cloud.points, rng, usual.median_square_distance
-            )
+            state, typical = calibration.camera_state, usual.median_square_distance
+            own = estimate_stamp_delay(self.arm_surface, state, stamp, cloud.points, rng, typical)
             if own is not None and math.isfinite(own.std):
                 work.report = replace(work.report, stamp_delay=own.delay)
                 if is_stamped_late(own, options.clock):
-                    work.dropped(f"its stamp is late: by {1e3 * own.delay:.0f} ms")
-                    return None
+                    raise DataError(f"its stamp is late: by {1e3 * own.delay:.0f} ms")
         q = self.configuration_at_rest(t)
         filters, kept = options.filters, np.ones(len(cloud), bool)
         if self.robot_surfaces is not None:
@@ -520,24 +460,18 @@ class FrameTracker:
         # beside the robot's points: among all surfaces, wrong points are few
         cloud = cloud.select(is_not_outlier(cloud, filters.outlier_neighbours, filters.outlier_z_max, kept))
         work.filtered, work.report = cloud, replace(work.report, n_filtered_points=len(cloud))
-        if len(cloud) < options.filters.min_points:
-            work.dropped(f"too few points of the object: {len(cloud)} left")
-            return None
-        if len(cloud) > options.filters.max_points:
-            cloud = cloud.select(np.sort(rng.choice(len(cloud), options.filters.max_points, replace=False)))
+        if len(cloud) < filters.min_points:
+            raise DataError(f"too few points of the object: {len(cloud)} left")
+        if len(cloud) > filters.max_points:
+            cloud = cloud.select(np.sort(rng.choice(len(cloud), filters.max_points, replace=False)))
             work.report = replace(work.report, n_filtered_points=len(cloud))
         begun = time.process_time()
         view = OcclusionMap(raw, calibration.camera_state.pose, self.sequence.intrinsics, cloud.points)
         given = calibration.camera_position, view, self._removed(q, calibration, background)
-        try:
-            look = (
-                self._held(work, cloud, q, rng, given)
-                if self.initial_shape_finder is None
-                else self._anywhere(self.initial_shape_finder, work, cloud, rng, given)
-            )
-        except DataError as error:
-            work.dropped(error.what)
-            return None
+        if self.initial_shape_finder is None:
+            look = self._held(work, cloud, q, rng, given)
+        else:
+            look = self._anywhere(self.initial_shape_finder, work, cloud, rng, given)
         work.report = replace(work.report, cpu_seconds=time.process_time() - begun)
         return look
 
@@ -547,8 +481,7 @@ class FrameTracker:
         work.skeleton, work.report = found, replace(work.report, n_skeleton_nodes=len(found.nodes))
         if not len(found.nodes):
             raise DataError("no part of the cloud is dense enough for a skeleton")
-        rest = cloud.select(found.has_node)
-        work.filtered = rest
+        work.filtered = rest = cloud.select(found.has_node)
         return _Look((CloudObservation(rest.points, rest.point_weights, found.nodes, *given),), q, ((),))
 
     def _anywhere(
@@ -566,8 +499,7 @@ class FrameTracker:
             near = min(found, key=lambda start: float(np.linalg.norm(start.root_position - place))).root_position
             found = [start for start in found if np.array_equal(start.root_position, near)]
         own = cKDTree(course.nodes).query(cloud.points)[0] < 2.0 * diameter
-        rest = cloud.select(own)
-        work.filtered = rest
+        work.filtered = rest = cloud.select(own)
         sights = tuple(
             CloudObservation(rest.points, rest.point_weights, course.nodes, *given, end_anchors=start.end_anchors)
             for start in found
@@ -607,18 +539,14 @@ def _joint_angles(
         raise DataError(f"the recording has no joint angles, {need}", where=recording.name)
     for name in known:
         if name not in joints.names:
-            raise DataError(
-                f"joint '{name}' of the model is not recorded",
-                where=f"{recording.name}: joints",
-                hint=nearest_name_hint(name, joints.names),
-            )
-    columns = [joints.names.index(name) for name in known]
-    t, position = joints.t, joints.position[:, columns]
+            where, hint = f"{recording.name}: joints", nearest_name_hint(name, joints.names)
+            raise DataError(f"joint '{name}' of the model is not recorded", where=where, hint=hint)
+    t, position = joints.t, joints.position[:, [joints.names.index(name) for name in known]]
 
     def angles(at: float) -> Array:
-        after = int(np.clip(np.searchsorted(t, at), 1, len(t) - 1)) if len(t) > 1 else 0
         if len(t) == 1:
             return np.array(position[0])
+        after = int(np.clip(np.searchsorted(t, at), 1, len(t) - 1))
         share = float(np.clip((at - t[after - 1]) / (t[after] - t[after - 1]), 0.0, 1.0))
         return np.asarray((1 - share) * position[after - 1] + share * position[after])
 

@@ -84,25 +84,13 @@ def count_drop_reasons(frames: Iterable[FrameReport]) -> dict[str, int]:
 
 @dataclass(frozen=True, eq=False)
 class FrameStages:
-    """Processing stages of one frame, for figures; stages that a dropped frame did not reach are None.
-
-    Attributes
-    ----------
-    drop_reason : str
-        Why the frame was dropped; empty for a good one.
-    camera_position : ndarray, shape (3,) [m]
-    raw_points : ndarray, shape (N, 3)
-        In the world [m].
-    filtered_points : ndarray, shape (N, 3), optional
-        What the filters left [m].
-    shape_fit : Fit, optional
-    """
+    """Processing stages of one frame, for figures; stages that a dropped frame did not reach are None."""
 
     frame_name: str
-    drop_reason: str
-    camera_position: Array
-    raw_points: Array
-    filtered_points: Array | None = None
+    drop_reason: str  # why the frame was dropped; empty for a good one
+    camera_position: Array  # (3,) [m]
+    raw_points: Array  # (N, 3), in the world [m]
+    filtered_points: Array | None = None  # (N, 3), what the filters left [m]
     skeleton: CloudSkeleton | None = None
     shape_fit: FrameShapeFit | None = None
 

@@ -185,25 +185,13 @@ class FrameTiming:
 
 @dataclass(frozen=True, eq=False)
 class VirtualFrames:
-    """Frame sequence of a virtual camera with the true times and configurations.
-
-    Attributes
-    ----------
-    capture_times : ndarray, shape (M,)
-        Time of every picture on the simulator's clock [s].
-    true_configurations : ndarray, shape (M, n)
-        Configuration in every picture.
-    depth_images : sequence of ndarray
-        `depth[i]` is the measured depth image of frame i, made when asked for [m].
-    true_configuration_at : callable
-        From a time to the configuration then, shape (n,).
-    """
+    """Frame sequence of a virtual camera with the true times and configurations."""
 
     sequence: FrameSequence
-    capture_times: Array
-    true_configurations: Array
-    depth_images: Sequence[Array]
-    true_configuration_at: Callable[[float], Array]
+    capture_times: Array  # (M,), time of every picture on the simulator's clock [s]
+    true_configurations: Array  # (M, n), configuration in every picture
+    depth_images: Sequence[Array]  # `depth[i]` is the measured depth image of frame i, made when asked for [m]
+    true_configuration_at: Callable[[float], Array]  # from a time to the configuration then, shape (n,)
 
 
 @dataclass(frozen=True)
