@@ -99,7 +99,7 @@ def tracked(system, run, recording, shape):
         seen = made.sequence if frames is None else made.sequence.select_frames(frames)
         chosen = replace(options or TrackOptions(), tracked_points=system.point_frames)
         found = track_object(scene, recording, seen, chosen, stages=stages)
-        were = np.array([shape.place(made.true_configuration_at(t)) for t in found.t])
+        were = np.array([shape.points_at(made.true_configuration_at(t)) for t in found.t])
         errors = np.linalg.norm(found.position - were, axis=2)
         return SimpleNamespace(made=made, track=found, latency=when.latency, errors=errors)
 

@@ -329,7 +329,7 @@ def test_speed_and_time_enter_the_standard_deviation(robot):
 def test_refused_where_the_arm_does_not_tell(robot):
     with pytest.raises(DataError, match="moves too little") as caught:
         found_of(robot, 9, motion=still)
-    assert "search: 0" in caught.value.hint
+    assert "search_half_width: 0" in caught.value.hint
     found, true = found_of(
         robot, 9, motion=still, clock=CameraClockOptions(search_half_width=0.0), turn=2.0, shift=0.02
     )

@@ -109,7 +109,7 @@ def test_a_rope_on_a_table(rope):
     assert len(found.t) == 4
     assert apart.max() < 4 * MILLIMETRE
     assert (np.abs(off) < 3 * found.std).all()
-    assert "root_near" in found.root_note
+    assert "approximate_root_position" in found.root_note
     other = track_object(
         CameraScene(rope), None, film(lines[:1], TABLE), replace(OPTIONS, approximate_root_position=(0.5, 0.0, 0.0))
     )
@@ -217,4 +217,4 @@ def test_the_command_needs_no_recording(tmp_path, capsys):
     group = read_recording(tmp_path / "run" / "recording.h5").points[0]
     truth = np.array([places[[0, -1]] for places in lines])
     assert np.linalg.norm(group.position - truth, axis=2).max() < 4 * MILLIMETRE
-    assert "root_near" in json.loads((tmp_path / "run" / "result.json").read_text())["root"]
+    assert "approximate_root_position" in json.loads((tmp_path / "run" / "result.json").read_text())["root"]

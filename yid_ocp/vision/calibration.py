@@ -46,7 +46,7 @@ Array = NDArray[np.float64]
 
 _OFF_ARM_DISTANCE = 0.04  # at which a point stops to be the arm's [m]
 _THIN = 5000  # points of a frame among which starts are tried
-_POINTS, _FEW = 500, 150  # near the arm: for its offset, to see which start is best
+_POINTS, _FEW_POINTS = 500, 150  # near the arm: for its offset, to see which start is best
 _COARSE = 0.04  # between starts [s]
 _FURTHEST = 0.4  # of them [s]
 _NARROWING = (1.0, 0.7, 0.5, 0.5)  # of the reach, from iteration to iteration
@@ -127,7 +127,7 @@ def estimate_stamp_delay(
     if trial.mean_square_distance > _UNUSUAL * usual:
         steps = round(_FURTHEST / _COARSE)
         grid = _COARSE * np.arange(-steps, steps + 1)
-        few = chosen[:_FEW]
+        few = chosen[:_FEW_POINTS]
         start = float(grid[int(np.argmin([_misfit(arm, origin, t - delay, few) for delay in grid]))])
         if abs(start) > _LEAST_LATE:
             other = _nearby(arm, origin, t, chosen, start)

@@ -44,7 +44,7 @@ _MOST = 2500  # points
 
 @dataclass(frozen=True, eq=False)
 class _Centerline:
-    """_Centerline of an object in a cloud, as a tree of nodes."""
+    """Centerline of an object in a cloud, as a tree of nodes."""
 
     nodes: Array
     edges: Integers
