@@ -244,48 +244,26 @@ class CameraCalibrationOptions:
 
     def prior_precision(self, clock: CameraClockOptions) -> Array:
         """Inverse covariance of the prior, shape (10, 10)."""
-        std = [
-            *[self.rotation_prior_std] * 3,
-            *[self.translation_prior_std] * 3,
-            self.depth_scale_prior_std,
-            self.depth_offset_prior_std,
-        ]
+        pose = [*[self.rotation_prior_std] * 3, *[self.translation_prior_std] * 3]
         # a uniform distribution over what is searched; taken as it is where nothing is
-        return np.diag(
-            np.array([*std, max(clock.search_half_width / math.sqrt(3.0), 1e-6), clock.drift_prior_std]) ** -2
-        )
+        offset = max(clock.search_half_width / math.sqrt(3.0), 1e-6)
+        std = [*pose, self.depth_scale_prior_std, self.depth_offset_prior_std, offset, clock.drift_prior_std]
+        return np.diag(np.array(std) ** -2)
 
 
 @dataclass(frozen=True, eq=False)
 class CameraCalibration:
-    """Calibrated camera of a sequence.
+    """Calibrated camera of a sequence."""
 
-    Attributes
-    ----------
-    camera_state : CameraState
-        What is used: pose, depth, clock.
-    on_time_frames : Usual or None
-        Of frames by themselves; None where the clock was not compared.
-    state_covariance : ndarray, shape (10, 10)
-        Of `camera_state`, in the order of `CameraState.difference_from`; zero where nothing was estimated.
-    estimate_minus_used : ndarray, shape (10,)
-        What the arm says less what is used: of a pose that was to be kept.
-    arm_visibility : Presence or None
-        How much of the arm was seen where it is.
-    n_frames : int
-        From which it was estimated.
-    message : str
-        In words.
-    """
-
-    camera_state: CameraState
+    camera_state: CameraState  # what is used: pose, depth, clock
     prior_state: CameraState
-    on_time_frames: _OnTimeFrames | None
+    on_time_frames: _OnTimeFrames | None  # of frames by themselves; None where the clock was not compared
+    # (10, 10), of `camera_state`, in the order of `CameraState.difference_from`; zero where nothing was estimated
     state_covariance: Array
-    estimate_minus_used: Array
-    arm_visibility: SurfaceVisibility | None
-    n_frames: int
-    message: str
+    estimate_minus_used: Array  # (10,), what the arm says less what is used: of a pose that was to be kept
+    arm_visibility: SurfaceVisibility | None  # how much of the arm was seen where it is
+    n_frames: int  # from which it was estimated
+    message: str  # in words
 
     @property
     def camera_position(self) -> Array:
@@ -323,9 +301,8 @@ def calibration_as_given(pose: Array, options: CameraClockOptions, reason: str =
     """Camera calibration taken from the frames and settings without estimation, with the reason."""
     text = f"clock offset {1e3 * options.initial_offset:.0f} ms as given" + (f": {reason}" if reason else "")
     state = CameraState(pose, clock_offset=options.initial_offset)
-    return CameraCalibration(
-        state, state, None, np.zeros((STATE_SIZE, STATE_SIZE)), np.zeros(STATE_SIZE), None, 0, text
-    )
+    zero = np.zeros(STATE_SIZE)
+    return CameraCalibration(state, state, None, np.diag(zero), zero, None, 0, text)
 
 
 def calibrate_camera(
@@ -361,11 +338,8 @@ def calibrate_camera(
         if options.fix_pose and clock.search_half_width == 0:
             return calibration_as_given(pose, clock, str(reason))
         known = "track.options.calibration.fix_pose: true and track.options.clock.search_half_width: 0"
-        raise DataError(
-            f"the camera cannot be calibrated by the arm: {reason}",
-            where=source,
-            hint=f"{reason.hint}; with pose and clock known, set {known}",
-        ) from None
+        hint = f"{reason.hint}; with pose and clock known, set {known}"
+        raise DataError(f"the camera cannot be calibrated by the arm: {reason}", where=source, hint=hint) from None
 
 
 class _UntoldError(Exception):
@@ -473,29 +447,25 @@ class _Calibrator:
         chosen = []
         for glimpse in glimpses:
             points = state.to_world(glimpse.points)
-            near = np.flatnonzero(
-                self.arm.is_near_surface(points, float(state.to_joint_time(glimpse.stamp)), 1.5 * reach)
-            )
+            t = float(state.to_joint_time(glimpse.stamp))
+            near = np.flatnonzero(self.arm.is_near_surface(points, t, 1.5 * reach))
             if len(near) > most:
                 near = self.rng.choice(near, most, replace=False)
             if len(near) >= MIN_ARM_POINTS:
                 chosen.append(CalibrationFrame(glimpse.stamp, glimpse.points[near]))
         if len(chosen) < _LEAST_FRAMES:
-            raise _UntoldError(
-                "what the camera sees does not lie on it", "check the told pose and the unit of the clouds"
-            )
+            what = "what the camera sees does not lie on it"
+            raise _UntoldError(what, "check the told pose and the unit of the clouds")
+
+        def cost(state: CameraState) -> RobustCost:
+            rows = [self.arm.calibration_equations(state, g, reach, along) for g in chosen]
+            return evaluate_robust_cost(rows, reach)
+
         for _ in range(rounds):
-            found = evaluate_robust_cost(
-                [self.arm.calibration_equations(state, g, reach, along) for g in chosen], reach
-            )
-            state, step = gauss_newton_step(state, found, self.told, self.precision)
+            state, step = gauss_newton_step(state, cost(state), self.told, self.precision)
             if np.abs(step).max() < _SETTLED:
                 break
-        return (
-            state,
-            evaluate_robust_cost([self.arm.calibration_equations(state, g, reach, along) for g in chosen], reach),
-            chosen,
-        )
+        return state, cost(state), chosen
 
     def _check_presence(self, presence: SurfaceVisibility) -> None:
         free = presence.there + presence.through
@@ -531,10 +501,8 @@ def _message(
     points = arm.visible_points(state, middle.stamp)[0].mean(axis=0, keepdims=True)
     away = np.linalg.norm(state.to_world(told.to_measured(points)) - points)
     change = state.difference_from(told)
-    turn, shift = (
-        math.degrees(float(np.linalg.norm(change[ROTATION_SLICE]))),
-        float(np.linalg.norm(change[TRANSLATION_SLICE])),
-    )
+    turn = math.degrees(float(np.linalg.norm(change[ROTATION_SLICE])))
+    shift = float(np.linalg.norm(change[TRANSLATION_SLICE]))
     if used is not state:
         slopes = state.point_jacobian(points)[0]
         spread = slopes @ covariance[:CLOCK_OFFSET_INDEX, :CLOCK_OFFSET_INDEX] @ slopes.T

@@ -31,9 +31,8 @@ def rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: TrackOptio
     if not np.isfinite(fit.q).all():
         return "the fit failed"
     # a mean distance of normal noise is 0.8 of its standard deviation
-    limit = math.hypot(
-        options.max_distance_in_radii * float(shape.link_radii.mean()), _MEAN_ABS * shape.options.surface_noise_std
-    )
+    widest, noise = options.max_distance_in_radii * float(shape.link_radii.mean()), shape.options.surface_noise_std
+    limit = math.hypot(widest, _MEAN_ABS * noise)
     if not math.isfinite(fit.mean_distance):
         return f"{_NO_FIT}: no point of the cloud is near it"
     if fit.mean_distance > limit:
@@ -43,8 +42,7 @@ def rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: TrackOptio
     if bend > options.max_bend_angle:
         return f"the shape is folded: a joint is bent by {math.degrees(bend):.0f} degrees"
     if fit.visible_coverage < options.min_visible_coverage:
-        share = 100 * fit.visible_coverage
-        return f"{_NO_FIT}: only {share:.0f} % of its visible length has points of its own"
+        return f"{_NO_FIT}: only {100 * fit.visible_coverage:.0f} % of its visible length has points of its own"
     return ""
 
 
@@ -132,16 +130,10 @@ def tracked_points(
     if unseen.all():
         best = 1e3 * float(np.sqrt((std**2).mean(axis=2)).min())
         wrong_sizes = bool((np.linalg.norm(by_sizes, axis=2) > math.sqrt(3.0) * options.max_point_std).all())
-        raise DataError(
-            f"{_because(sizes, wrong_sizes)}no point is known well enough in any frame: the best within {best:.0f} mm,"
-            f" max_point_std is {1e3 * options.max_point_std:g} mm",
-            where=source,
-            hint=_hint(
-                sizes,
-                things,
-                f"check the camera's pose and clock ({calibration.message}), or look at the pictures of a frame",
-            ),
-        )
+        limit = f"the best within {best:.0f} mm, max_point_std is {1e3 * options.max_point_std:g} mm"
+        what = f"{_because(sizes, wrong_sizes)}no point is known well enough in any frame: {limit}"
+        check = f"check the camera's pose and clock ({calibration.message}), or look at the pictures of a frame"
+        raise DataError(what, where=source, hint=_hint(sizes, things, check))
     hidden = unseen[..., None]
     q = np.array([fit.q for fit in fits])
     return _TrackedPoints(t, q, *(np.where(hidden, np.nan, entry) for entry in (position, std, shared)))
@@ -191,25 +183,16 @@ def choose_root_ends(frames: Sequence[FrameReport], options: TrackOptions) -> tu
     """
     if options.root_placement == "model":
         return list(frames), ""
-    two = [
-        k
-        for k, frame in enumerate(frames)
-        if frame.is_good and frame.shape_fit is not None and frame.alternative_fit is not None
-    ]
+    fitted = [k for k, frame in enumerate(frames) if frame.is_good and frame.shape_fit is not None]
+    two = [k for k in fitted if frames[k].alternative_fit is not None]
     if not two:
-        said = (
-            "it is the one nearest to approximate_root_position"
-            if options.approximate_root_position is not None
-            else "lengths and branches tell it"
-        )
+        near, said = options.approximate_root_position, "lengths and branches tell it"
+        said = said if near is None else "it is the one nearest to approximate_root_position"
         return _fixed(frames, options), f"root: {said}"
     made, last = list(frames), None
-    for k in (k for k, frame in enumerate(frames) if frame.is_good and frame.shape_fit is not None):
-        if (
-            made[k].alternative_fit is not None
-            and last is not None
-            and _apart(made[k].alternative_fit, last) < _apart(made[k].shape_fit, last)
-        ):
+    for k in fitted:
+        other_fit = made[k].alternative_fit
+        if other_fit is not None and last is not None and _apart(other_fit, last) < _apart(made[k].shape_fit, last):
             made[k] = _exchanged(made[k])
         last = made[k].shape_fit
     roots, tips = _ends([frame.shape_fit for frame in (made[k] for k in two)])
@@ -231,11 +214,9 @@ def choose_root_ends(frames: Sequence[FrameReport], options: TrackOptions) -> tu
 
 
 def _exchanged(frame: FrameReport) -> FrameReport:
-    return (
-        frame
-        if frame.alternative_fit is None
-        else replace(frame, shape_fit=frame.alternative_fit, alternative_fit=frame.shape_fit)
-    )
+    if frame.alternative_fit is None:
+        return frame
+    return replace(frame, shape_fit=frame.alternative_fit, alternative_fit=frame.shape_fit)
 
 
 def _apart(one: FrameShapeFit | None, other: FrameShapeFit | None) -> float:

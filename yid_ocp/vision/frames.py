@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, lru_cache
 from types import ModuleType
@@ -27,12 +27,10 @@ from scipy.spatial import cKDTree
 from yid_ocp.errors import DataError, unknown_name_details
 
 Array = NDArray[np.float64]
+Colours = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
 
-_DISTORTION_COEFFICIENT_COUNTS: Mapping[str, tuple[int, ...]] = {
-    "plumb_bob": (4, 5),
-    "rational_polynomial": (8,),
-    "equidistant": (4,),
-}
+_DISTORTION_COEFFICIENT_COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
 """Models of distortion, and how many coefficients each may have: k1, k2, p1, p2, k3 (k4, k5, k6), or k1 to k4."""
 _STEPS = 30  # of the search for a pixel's direction
 _CLOSE = 1e-3  # [pixels]
@@ -71,18 +69,12 @@ class CameraIntrinsics:
         if not any(self.coefficients):
             return
         if self.model not in _DISTORTION_COEFFICIENT_COUNTS:
-            raise DataError(
-                f"the distortion is '{self.model}'",
-                where="intrinsics",
-                **unknown_name_details(self.model, _DISTORTION_COEFFICIENT_COUNTS),
-            )
+            known = unknown_name_details(self.model, _DISTORTION_COEFFICIENT_COUNTS)
+            raise DataError(f"the distortion is '{self.model}'", where="intrinsics", **known)
         count = _DISTORTION_COEFFICIENT_COUNTS[self.model]
         if len(self.coefficients) not in count or not np.isfinite(self.coefficients).all():
-            raise DataError(
-                f"the distortion '{self.model}' has the coefficients {self.coefficients}",
-                where="intrinsics",
-                allowed=f"{' or '.join(map(str, count))} numbers",
-            )
+            what = f"the distortion '{self.model}' has the coefficients {self.coefficients}"
+            raise DataError(what, where="intrinsics", allowed=f"{' or '.join(map(str, count))} numbers")
 
     @staticmethod
     def from_field_of_view(width: int, height: int, horizontal: float) -> CameraIntrinsics:
@@ -200,9 +192,6 @@ XTION_INTRINSICS = CameraIntrinsics.from_field_of_view(640, 480, math.radians(58
 """The depth camera of the Asus Xtion Pro Live: 640 x 480 pixels, 58 degrees wide."""
 
 
-Colours = NDArray[np.uint8]
-
-
 @cache
 def import_open3d() -> ModuleType:
     """The open3d package; `DataError` where it is not installed or cannot be loaded."""
@@ -223,28 +212,17 @@ def import_open3d() -> ModuleType:
 
 @dataclass(frozen=True, eq=False)
 class FrameSequence:
-    """Sequence of clouds of one camera, loaded one at a time.
+    """Sequence of clouds of one camera, loaded one at a time."""
 
-    Attributes
-    ----------
-    stamps : ndarray, shape (M,)
-        Time stamps as the camera gave them, in the order of the frames: neither sorted nor unique [s].
-    camera_pose : ndarray, shape (4, 4)
-        Camera (x right, y down, z ahead) in the world [m].
-    load_cloud : callable
-        From a frame's index to its cloud in the camera's frame, shape (N, 3) [m]; `DataError` where it cannot be read.
-    source : str
-        Where the frames come from, for messages.
-    load_colours : callable, optional
-        From a frame's index to the red, green and blue of each of its points, shape (N, 3), None where it has none.
-    """
-
+    # (M,), time stamps as the camera gave them, in the order of the frames: neither sorted nor unique [s]
     stamps: Array
     frame_names: tuple[str, ...]
-    camera_pose: Array
+    camera_pose: Array  # (4, 4), camera (x right, y down, z ahead) in the world [m]
+    # from a frame's index to its cloud in the camera's frame, shape (N, 3) [m]; `DataError` where it cannot be read
     load_cloud: Callable[[int], Array]
     intrinsics: CameraIntrinsics | None = None
-    source: str = "sequence"
+    source: str = "sequence"  # Where the frames come from, for messages
+    # from a frame's index to the red, green and blue of each of its points, shape (N, 3), None where it has none
     load_colours: Callable[[int], Colours | None] | None = None
 
     def __len__(self) -> int:
@@ -282,9 +260,8 @@ class FrameSequence:
         """
         arrays = [np.asarray(cloud, float).reshape(-1, 3) for cloud in clouds]
         names = tuple(f"frame {i}" for i in range(len(arrays)))
-        return FrameSequence(
-            np.asarray(t, float), names, validated_pose(pose, source), arrays.__getitem__, None, source
-        )
+        camera = validated_pose(pose, source)
+        return FrameSequence(np.asarray(t, float), names, camera, arrays.__getitem__, None, source)
 
 
 def look_at_pose(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
@@ -318,8 +295,6 @@ def validated_pose(pose: ArrayLike | None, where: str) -> Array:
         raise DataError("the pose of the camera is not a rigid transform", where=where, allowed="4x4", hint=hint)
     return matrix
 
-
-Mask = NDArray[np.bool_]
 
 _BASELINE = 0.1  # [m]; between the camera's two eyes, of which no usual depth camera has a wider one
 _PLENTY = 24  # points about the narrowest place; of more, some are left out
@@ -377,9 +352,8 @@ class OcclusionMap:
         for i in np.flatnonzero(~hidden):
             there = distance[tree.query_ball_point(asked[i], wide[i])]
             limit = depth[i] - radius[i] - margin
-            hidden[i] = (
-                np.mean(there < limit) > _HALF if len(there) else self._shadowed(tree, distance, asked[i], limit)
-            )
+            before = len(there) and np.mean(there < limit) > _HALF
+            hidden[i] = before if len(there) else self._shadowed(tree, distance, asked[i], limit)
         return hidden
 
     @cached_property

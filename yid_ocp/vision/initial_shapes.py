@@ -155,8 +155,7 @@ def _connected(points: Array, gap: float) -> tuple[Array, csr_matrix]:
     renamed[kept] = np.arange(len(kept))
     every = np.concatenate([edges, np.array(bridges, dtype=np.int64).reshape(-1, 2)])
     every = renamed[every]
-    every = every[(every >= 0).all(axis=1)]
-    both = np.unique(np.sort(every, axis=1), axis=0)
+    both = np.unique(np.sort(every[(every >= 0).all(axis=1)], axis=1), axis=0)
     return points[kept], _graph(points[kept], both)
 
 
@@ -218,8 +217,7 @@ def _pruned(trace: _Centerline, twig: float) -> _Centerline:
 
 def _branch(nodes: Array, edges: Integers, count: Integers, end: int) -> tuple[float, list[int]]:
     """Length of the branch from an end to where another one leaves [m], and its nodes with that one last."""
-    order, before = breadth_first_order(_graph(nodes, edges), end, directed=False)
-    del before
+    order, _ = breadth_first_order(_graph(nodes, edges), end, directed=False)
     way, length = [end], 0.0
     for node in order[1:]:
         length += float(np.linalg.norm(nodes[node] - nodes[way[-1]]))
@@ -381,10 +379,8 @@ class InitialShapeFinder:
 
     def _along(self, trace: _Centerline, ends: Sequence[int]) -> _InitialShape:
         """The start whose root and tips lie at some nodes of the course."""
-        courses = [
-            _Course(trace.path_between(ends[0], end), reach)
-            for end, reach in zip(ends[1:], self.root_to_tip_lengths, strict=True)
-        ]
+        reaches = zip(ends[1:], self.root_to_tip_lengths, strict=True)
+        courses = [_Course(trace.path_between(ends[0], end), reach) for end, reach in reaches]
         q = self._rest.copy()
         first = self.links[0]
         turned = self._rotations(q)
@@ -429,10 +425,8 @@ class InitialShapeFinder:
                     rate = float(np.cross(other, ahead) @ axis)
                     q[bends[1]] = np.arcsin(np.clip(rate * float(local @ axis), -1.0, 1.0))
                     ahead = Rotation.from_rotvec(q[bends[1]] * other).apply(ahead)
-                across = np.cross(axis, ahead)
-                q[j] = np.arctan2(
-                    float(local @ across), float(local @ ahead) - float(local @ axis) * float(ahead @ axis)
-                )
+                level = float(local @ ahead) - float(local @ axis) * float(ahead @ axis)
+                q[j] = np.arctan2(float(local @ np.cross(axis, ahead)), level)
             base = base @ self._own(j, q[j])
             turned[j] = base
 

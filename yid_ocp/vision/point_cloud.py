@@ -23,6 +23,7 @@ from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, numeric_mechanism
 Array = NDArray[np.float64]
 Coordinates = tuple[float, float, float]
 Mask = NDArray[np.bool_]
+Integers = NDArray[np.int64]
 _ColourComponent = Annotated[float, Ge(0), Le(255)]
 _RgbColour = tuple[_ColourComponent, _ColourComponent, _ColourComponent]
 
@@ -164,16 +165,16 @@ class ObjectRegion:
     ) -> None:
         tree = numeric_mechanism(system, values)
         symbols, theta = system.parameters.symbols, system.parameters.vector(values)
-        lengths = {
-            s.name: float(sum(float(ca.Function("l", [symbols], [length])(theta)) for length in s.link_lengths))
-            for s in system.segment_layouts
-        }
-        radius = max(float(ca.Function("r", [symbols], [s.radius])(theta)) for s in system.segment_layouts)
+
+        def number(expression: ca.SX) -> float:
+            return float(ca.Function("number", [symbols], [expression])(theta))
+
+        lengths = {s.name: float(sum(number(length) for length in s.link_lengths)) for s in system.segment_layouts}
+        radius = max(number(s.radius) for s in system.segment_layouts)
         reach: dict[str, float] = {}
         for segment in system.segment_layouts:
-            reach[segment.name] = lengths[segment.name] + (
-                reach[segment.parent_segment] if segment.parent_segment else 0.0
-            )
+            before = reach[segment.parent_segment] if segment.parent_segment else 0.0
+            reach[segment.name] = lengths[segment.name] + before
         first = next(s for s in system.segment_layouts if s.parent_segment is None)
         self._radius = np.inf if anywhere else max(reach.values()) + radius + options.reach_margin
         base = tree.joint_index(first.link_joints[0][0])
@@ -188,9 +189,8 @@ class ObjectRegion:
             heights = np.array(ca.Function("tips", [q], [ca.horzcat(*tips)])(rest))[2]
             if heights.min() > root:
                 low = root + options.floor_margin
-        self._lower = np.full(3, -np.inf) if options.box_lower is None else np.asarray(options.box_lower, float)
-        self._upper = np.full(3, np.inf) if options.box_upper is None else np.asarray(options.box_upper, float)
-        self._lower = self._lower.copy()
+        self._lower = np.full(3, -np.inf) if options.box_lower is None else np.array(options.box_lower, float)
+        self._upper = np.full(3, np.inf) if options.box_upper is None else np.array(options.box_upper, float)
         self._lower[2] = max(self._lower[2], low)
         self._behind = options.max_depth_behind_base
         elastic = {entry.joint_name for entry in system.elastic_joints}
@@ -307,9 +307,6 @@ def weighted_median(values: Array, weight: Array) -> float:
     order = np.argsort(values)
     total = np.cumsum(weight[order])
     return float(values[order[np.searchsorted(total, 0.5 * total[-1])]])
-
-
-Integers = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -60,22 +60,14 @@ class ExtraMesh:
 
 @dataclass(frozen=True)
 class CameraScene:
-    """Robot and object that a camera looks at.
-
-    Attributes
-    ----------
-    robot_urdf : str or Path, optional
-        File of the robot, for its meshes (`package:baxter`); None for the object alone.
-    parameter_values : mapping of str to float, optional
-        Parameter values (lengths, radii, relative stiffnesses); nominal where absent.
-    extra_meshes : sequence of ExtraMesh
-        What stands about that is neither.
-    """
+    """Robot and object that a camera looks at."""
 
     system: System
+    # file of the robot, for its meshes (`package:baxter`); None for the object alone
     robot_urdf: str | Path | None = None
+    # parameter values (lengths, radii, relative stiffnesses); nominal where absent
     parameter_values: Mapping[str, float] | None = None
-    extra_meshes: Sequence[ExtraMesh] = ()
+    extra_meshes: Sequence[ExtraMesh] = ()  # what stands about that is neither
 
 
 @dataclass(frozen=True, eq=False)

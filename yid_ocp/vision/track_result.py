@@ -35,40 +35,21 @@ _CAMERA_POINT_GROUP = "points_camera"
 
 @dataclass(frozen=True, eq=False)
 class FrameReport:
-    """Report of one frame: why it was dropped, or its fitted shape.
+    """Report of one frame: why it was dropped, or its fitted shape."""
 
-    Attributes
-    ----------
-    index : int
-        Of the sequence.
-    stamp : float
-        As the camera gave it [s].
-    joint_time : float
-        On the joints' clock [s].
-    drop_reason : str
-        Why it was dropped; empty for a good one.
-    n_raw_points, n_filtered_points, n_skeleton_nodes : int
-        Points of the cloud, points left by the filters, nodes of the skeleton.
-    stamp_delay : float
-        Of its stamp beyond the common offset, NaN where it cannot be told [s].
-    cpu_seconds : float
-        Processor time from the filtered cloud to the fitted points [s].
-    shape_fit : Fit or None
-    alternative_fit : Fit or None
-        The shape with another end as its root that fits as well, where the root is sought.
-    """
-
-    index: int
+    index: int  # of the sequence
     name: str
-    stamp: float
-    joint_time: float
-    drop_reason: str
+    stamp: float  # as the camera gave it [s]
+    joint_time: float  # on the joints' clock [s]
+    drop_reason: str  # why it was dropped; empty for a good one
+    # points of the cloud, points left by the filters, nodes of the skeleton
     n_raw_points: int
     n_filtered_points: int
     n_skeleton_nodes: int
-    stamp_delay: float
-    cpu_seconds: float
+    stamp_delay: float  # of its stamp beyond the common offset, NaN where it cannot be told [s]
+    cpu_seconds: float  # processor time from the filtered cloud to the fitted points [s]
     shape_fit: FrameShapeFit | None
+    # the shape with another end as its root that fits as well, where the root is sought
     alternative_fit: FrameShapeFit | None = None
 
     @property
@@ -97,43 +78,22 @@ class FrameStages:
 
 @dataclass(frozen=True, eq=False)
 class TrackResult:
-    """Result of tracking: shapes and points of the good frames.
+    """Result of tracking: shapes and points of the good frames."""
 
-    Attributes
-    ----------
-    point_names : tuple of str
-        Points written down.
-    t : ndarray, shape (M,)
-        Times of the good frames on the joints' clock [s].
-    configurations : ndarray, shape (M, n)
-        Configurations, twists at rest.
-    position, std, shared_std : ndarray, shape (M, np, 3)
-        [m]; NaN where a point was not seen well enough. `shared_std`: the part of `std` that all frames have in common,
-        from the camera's pose, depth and clock.
-    frame_reports : tuple of FrameReport
-        All of them, by time stamp.
-    dimensions : Sizes
-        What the frames say of the object's lengths and radii.
-    foreign_objects : tuple of Foreign
-        What stood about the object.
-    root_note : str
-        How the root was told from other ends; empty where the model says where it is.
-    frame_stages : tuple of Stages
-        Of the frames that were asked for and turned out well.
-    """
-
-    point_names: tuple[str, ...]
-    t: Array
-    configurations: Array
+    point_names: tuple[str, ...]  # points written down
+    t: Array  # (M,), times of the good frames on the joints' clock [s]
+    configurations: Array  # (M, n), configurations, twists at rest
+    # (M, np, 3), [m]; NaN where a point was not seen well enough. `shared_std`: the part of `std` that all frames
+    # have in common, from the camera's pose, depth and clock
     position: Array
     std: Array
     shared_std: Array
-    frame_reports: tuple[FrameReport, ...]
+    frame_reports: tuple[FrameReport, ...]  # all of them, by time stamp
     camera_calibration: CameraCalibration
-    dimensions: DimensionCheck
-    foreign_objects: tuple[ForeignObject, ...]
-    root_note: str
-    frame_stages: tuple[FrameStages, ...]
+    dimensions: DimensionCheck  # what the frames say of the object's lengths and radii
+    foreign_objects: tuple[ForeignObject, ...]  # what stood about the object
+    root_note: str  # how the root was told from other ends; empty where the model says where it is
+    frame_stages: tuple[FrameStages, ...]  # of the frames that were asked for and turned out well
     _system_points: tuple[str, ...]
     _place: Callable[[Array], Array]
 
@@ -143,11 +103,9 @@ class TrackResult:
         Beyond the first and the last frame it stays as it was there.
         """
         at = float(np.clip(t, self.t[0], self.t[-1]))
-        return (
-            self.configurations[0].copy()
-            if len(self.t) < 2
-            else np.asarray(CubicSpline(self.t, self.configurations, axis=0)(at))
-        )
+        if len(self.t) < 2:
+            return self.configurations[0].copy()
+        return np.asarray(CubicSpline(self.t, self.configurations, axis=0)(at))
 
     def points_at(self, t: float) -> Array:
         """Positions of the tracked points at any time, by the kinematics of `configuration_at`, shape (np, 3) [m]."""
@@ -259,9 +217,8 @@ def _drawings(stages: FrameStages) -> list[tuple[str, Callable[[Any], None]]]:
             axes.plot(*skeleton.nodes[[a, b]].T, color=_BLUE, linewidth=1.2)
 
     made.append((f"{len(skeleton.nodes)} nodes of the walk", nodes))
-    made.append(
-        (f"{len(skeleton.edges)} edges, {len(set(skeleton.component_of_node.tolist()))} connected parts", graph)
-    )
+    parts = len(set(skeleton.component_of_node.tolist()))
+    made.append((f"{len(skeleton.edges)} edges, {parts} connected parts", graph))
     if fit is None:
         return made
 
@@ -291,20 +248,17 @@ def draw_track(track: TrackResult, file: str | os.PathLike[str]) -> None:
     lost = [frame.joint_time for frame in track.frame_reports if not frame.is_good and np.isfinite(frame.joint_time)]
     for row, (panel, name) in enumerate(zip(axes, track.point_names, strict=True)):
         for axis, colour in enumerate((_BLUE, _ORANGE, _GREEN)):
-            centre = (
-                np.nanmean(track.position[:, row, axis]) if np.isfinite(track.position[:, row, axis]).any() else 0.0
-            )
+            place = track.position[:, row, axis]
+            centre = np.nanmean(place) if np.isfinite(place).any() else 0.0
             panel.plot(fine, 1e3 * (course[:, row, axis] - centre), color=colour, linewidth=1)
-            seen = 1e3 * (track.position[:, row, axis] - centre)
+            seen = 1e3 * (place - centre)
             panel.errorbar(track.t, seen, 2e3 * track.std[:, row, axis], fmt=".", color=colour, label="xyz"[axis])
         for t in lost:
             panel.axvline(t, color=_GREY, linewidth=0.6, linestyle=":")
         panel.set_ylabel(f"{name} [mm]")
     axes[0].legend(loc="upper right", ncols=3, frameon=False)
-    axes[0].set_title(
-        f"about the mean, two standard deviations; dotted: dropped frames\n{track.camera_calibration.message}",
-        fontsize=9,
-    )
+    said = "about the mean, two standard deviations; dotted: dropped frames"
+    axes[0].set_title(f"{said}\n{track.camera_calibration.message}", fontsize=9)
     axes[-1].set_xlabel("t [s]")
     with atomic_write(Path(file)) as temporary:
         figure.savefig(temporary, format="png", dpi=110)
@@ -325,16 +279,12 @@ def _write(path: Path, title: str, frame: Array, camera: Array, draw: Callable[[
     draw(axes)
     low, high = np.percentile(frame, 0.5, axis=0) - 0.02, np.percentile(frame, 99.5, axis=0) + 0.02
     middle, half = 0.5 * (low + high), 0.5 * float((high - low).max())
-    axes.set_xlim(middle[0] - half, middle[0] + half)
-    axes.set_ylim(middle[1] - half, middle[1] + half)
-    axes.set_zlim(middle[2] - half, middle[2] + half)
+    limits = np.column_stack([middle - half, middle + half])
+    axes.set(xlim=limits[0], ylim=limits[1], zlim=limits[2], xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
     axes.set_box_aspect((1, 1, 1))
     away = camera - middle
     # beside the camera's own view, where depth shows
     axes.view_init(elev=18, azim=float(np.degrees(np.arctan2(away[1], away[0]))) + 35)
-    axes.set_xlabel("x [m]")
-    axes.set_ylabel("y [m]")
-    axes.set_zlabel("z [m]")
     axes.set_title(title, fontsize=10)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, format="png", dpi=110)

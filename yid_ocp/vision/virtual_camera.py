@@ -36,48 +36,27 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class DepthCamera:
-    """Geometry and errors of a structured-light depth camera; the defaults are an Asus Xtion Pro Live.
-
-    Attributes
-    ----------
-    baseline : float
-        Between projector and camera, along x [m].
-    min_depth, max_depth : float
-        Range of depths that it measures [m].
-    disparity_std : float
-        Standard deviation of the disparity [pixels]; 1/16 gives 6 mm at 2 m.
-    disparity_step : float
-        Step of the disparity [pixels]; 1/8 gives 12 mm at 2 m.
-    noise_correlation_length : float
-        Over how many pixels neighbouring errors are alike [pixels].
-    min_incidence_cosine : float
-        Cosine of ray and normal below which nothing comes back; up to twice as much it comes back sometimes.
-    min_relative_edge_depth : float
-        Difference in depth of neighbouring pixels that makes an edge, relative to depth.
-    edge_loss_probability, edge_mixing_probability : float
-        Probability that a pixel at an edge is lost, or lies anywhere between front and back.
-    loss_probability : float
-        Probability that any pixel is lost.
-    outlier_probability : float
-        Probability that a pixel's pattern is matched wrongly: its depth is then anywhere within `outlier_depth_range`.
-    outlier_depth_range : float
-        [m], to either side of the true depth.
-    """
+    """Geometry and errors of a structured-light depth camera; the defaults are an Asus Xtion Pro Live."""
 
     intrinsics: CameraIntrinsics = XTION_INTRINSICS
-    baseline: float = 0.075
+    baseline: float = 0.075  # between projector and camera, along x [m]
+    # range of depths that it measures [m]
     min_depth: float = 0.8
     max_depth: float = 3.5
-    disparity_std: float = 1 / 16
-    disparity_step: float = 1 / 8
-    noise_correlation_length: float = 0.7
+    disparity_std: float = 1 / 16  # standard deviation of the disparity [pixels]; 1/16 gives 6 mm at 2 m
+    disparity_step: float = 1 / 8  # step of the disparity [pixels]; 1/8 gives 12 mm at 2 m
+    noise_correlation_length: float = 0.7  # over how many pixels neighbouring errors are alike [pixels]
+    # cosine of ray and normal below which nothing comes back; up to twice as much it comes back sometimes
     min_incidence_cosine: float = 0.12
+    # difference in depth of neighbouring pixels that makes an edge, relative to depth
     min_relative_edge_depth: float = 0.02
+    # probability that a pixel at an edge is lost, or lies anywhere between front and back
     edge_loss_probability: float = 0.6
     edge_mixing_probability: float = 0.05
-    loss_probability: float = 0.01
+    loss_probability: float = 0.01  # probability that any pixel is lost
+    # probability that a pixel's pattern is matched wrongly: its depth is then anywhere within `outlier_depth_range`
     outlier_probability: float = 0.0
-    outlier_depth_range: float = 0.4
+    outlier_depth_range: float = 0.4  # [m], to either side of the true depth
 
     def depth_std(self, depth: ArrayLike) -> Array:
         """Standard deviation of a measured depth, noise and steps together [m]:  z^2/(f b) sqrt(std^2 + step^2/12)."""
@@ -142,30 +121,15 @@ class DepthCamera:
 
 @dataclass(frozen=True)
 class FrameTiming:
-    """Timing model of a camera: frame rate, dropped frames and errors of time stamps.
+    """Timing model of a camera: frame rate, dropped frames and errors of time stamps."""
 
-    Attributes
-    ----------
-    mean_rate : float
-        Mean rate [Hz].
-    period_jitter : float
-        Periods vary by this share either way.
-    dropped_fraction : float
-        Share of frames that never arrive.
-    latency : float
-        By how much every stamp is later than the picture, and the camera's clock ahead, taken together [s].
-    latency_std : float
-        Standard deviation of the latency from frame to frame [s].
-    late_fraction : float
-        Share of frames that are stamped `late_stamp_delay` [s] too late.
-    """
-
-    mean_rate: float = 3.0
-    period_jitter: float = 0.25
-    dropped_fraction: float = 0.0
+    mean_rate: float = 3.0  # mean rate [Hz]
+    period_jitter: float = 0.25  # periods vary by this share either way
+    dropped_fraction: float = 0.0  # share of frames that never arrive
+    # by how much every stamp is later than the picture, and the camera's clock ahead, taken together [s]
     latency: float = 0.0
-    latency_std: float = 0.0
-    late_fraction: float = 0.0
+    latency_std: float = 0.0  # standard deviation of the latency from frame to frame [s]
+    late_fraction: float = 0.0  # share of frames that are stamped `late_stamp_delay` [s] too late
     late_stamp_delay: float = 0.15
 
     def sample_times_and_stamps(self, start: float, stop: float, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -241,25 +205,14 @@ class _Images(Sequence[Array]):
 
 @dataclass(frozen=True, eq=False)
 class VirtualCamera:
-    """Virtual depth camera: sensor model, pose and frame timing.
+    """Virtual depth camera: sensor model, pose and frame timing."""
 
-    Attributes
-    ----------
-    pose : array_like, shape (4, 4)
-        Camera in the world (x right, y down, z ahead) [m].
-    depth_camera : DepthCamera
-        An Asus Xtion Pro Live where absent.
-    background : Background, optional
-        A floor under the paper's Y and a wall behind Baxter where absent; nothing where there is no robot either.
-    seed : int
-        Of all that is drawn at random.
-    """
-
-    pose: ArrayLike | None
-    depth_camera: DepthCamera = field(default_factory=DepthCamera)
+    pose: ArrayLike | None  # (4, 4), camera in the world (x right, y down, z ahead) [m]
+    depth_camera: DepthCamera = field(default_factory=DepthCamera)  # an Asus Xtion Pro Live where absent
     timing: FrameTiming = field(default_factory=FrameTiming)
+    # A floor under the paper's Y and a wall behind Baxter where absent; nothing where there is no robot either
     background: FloorAndWall | None = None
-    seed: int = 0
+    seed: int = 0  # of all that is drawn at random
 
 
 def render_virtual_frames(scene: CameraScene, t: ArrayLike, q: ArrayLike, camera: VirtualCamera) -> VirtualFrames:
