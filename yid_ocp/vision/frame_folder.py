@@ -131,11 +131,8 @@ def _read_depth_image(path: Path) -> Array:
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         image = np.asarray(o3d.io.read_image(str(path)))
     if image.ndim != 2 or image.dtype != np.uint16:
-        raise DataError(
-            "the depth image is empty, damaged or not one channel of 16 bits",
-            where=str(path),
-            allowed="16-bit grey PNG",
-        )
+        what = "the depth image is empty, damaged or not one channel of 16 bits"
+        raise DataError(what, where=str(path), allowed="16-bit grey PNG")
     return image.astype(np.float64)
 
 
@@ -198,7 +195,7 @@ def _columns(path: Path, wanted: Sequence[str]) -> Array:
 
 
 def _damaged(path: Path, why: str) -> DataError:
-    return DataError(f"the cloud is empty or cannot be read: {why}", where=str(path), hint="copy or record it again")
+    return DataError(f"the cloud is empty or cannot be read: {why}", where=str(path), hint=_AGAIN)
 
 
 def _head(path: Path, text: str) -> tuple[str, list[_Element]]:
@@ -240,11 +237,8 @@ def _vertices(path: Path, element: _Element, order: str, body: bytes, wanted: Se
         raise _damaged(path, "its vertices have no x, y and z, or lists")
     size = sum(np.dtype(kind).itemsize for kind in kinds) if order else 2 * len(names)
     if element.count * size > len(body) + (not order):  # the last line of a text may end without a newline
-        raise DataError(
-            f"the cloud is damaged: it declares {element.count:.3g} points in {len(body)} bytes",
-            where=str(path),
-            hint="copy or record it again",
-        )
+        what = f"the cloud is damaged: it declares {element.count:.3g} points in {len(body)} bytes"
+        raise DataError(what, where=str(path), hint=_AGAIN)
     if not element.count:
         raise _damaged(path, "it has no vertices")
     if not set(wanted) <= set(names):
@@ -356,15 +350,10 @@ def write_frame_folder(
             _write_cloud(path / name, sequence.load_cloud(i))
         else:
             _write_depth_image(path / name, np.asarray(depth[i], float))
-    head: dict[str, Any] = {
-        "format": _FRAMES_FORMAT,
-        "pose": sequence.camera_pose.tolist(),
-        "frame": "camera",
-        "unit": "m",
-    }
+    pose = sequence.camera_pose.tolist()
+    head: dict[str, Any] = {"format": _FRAMES_FORMAT, "pose": pose, "frame": "camera", "unit": "m"}
     if sequence.intrinsics is not None:
-        head["intrinsics"] = asdict(sequence.intrinsics)
-        head["depth_unit"] = 1e-3
+        head |= {"intrinsics": asdict(sequence.intrinsics), "depth_unit": 1e-3}
     with atomic_write(path / _CAMERA_FILE) as temporary:
         temporary.write_text(json.dumps(head, indent=1) + "\n", encoding="utf-8")
     with atomic_write(path / STAMP_FILE) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
@@ -394,17 +383,12 @@ def _check_kinds(names: Sequence[str], folder: Path, intrinsics: CameraIntrinsic
     for name in names:
         kind = Path(name).suffix.lower()
         if kind not in (*_CLOUD_SUFFIXES, _DEPTH_IMAGE_SUFFIX):
-            what, allowed = (
-                f"'{name}' is neither a cloud nor a depth image",
-                ", ".join((*_CLOUD_SUFFIXES, _DEPTH_IMAGE_SUFFIX)),
-            )
-            raise DataError(what, where=str(folder / STAMP_FILE), allowed=allowed)
+            what, allowed = f"'{name}' is neither a cloud nor a depth image", (*_CLOUD_SUFFIXES, _DEPTH_IMAGE_SUFFIX)
+            raise DataError(what, where=str(folder / STAMP_FILE), allowed=", ".join(allowed))
         if kind == _DEPTH_IMAGE_SUFFIX and intrinsics is None:
-            raise DataError(
-                "there are depth images but the camera's intrinsics are missing",
-                where=str(folder / _CAMERA_FILE),
-                hint="add `intrinsics` with width, height, fx, fy, cx, cy [pixels]",
-            )
+            what, hint = "there are depth images but the camera's intrinsics are missing", "add `intrinsics` with"
+            hint += " width, height, fx, fy, cx, cy [pixels]"
+            raise DataError(what, where=str(folder / _CAMERA_FILE), hint=hint)
 
 
 def _intrinsics(entry: object, where: str) -> CameraIntrinsics | None:
@@ -415,20 +399,12 @@ def _intrinsics(entry: object, where: str) -> CameraIntrinsics | None:
     if not isinstance(entry, dict) or set(entry) - set(bent) != set(needed):
         allowed = f"{', '.join(needed)}; for a lens with distortion {', '.join(bent)} as well"
         raise DataError("the intrinsics are not complete", where=where, allowed=allowed)
-    values = {name: _number(entry[name], f"intrinsics.{name}", where) for name in needed}
+    width, height, fx, fy, cx, cy = (_number(entry[name], f"intrinsics.{name}", where) for name in needed)
     coefficients = entry.get("coefficients", ())
     if not isinstance(coefficients, (list, tuple)) or not all(type(k) in (int, float) for k in coefficients):
         raise DataError(f"the coefficients are {coefficients!r}", where=f"{where}: intrinsics", allowed="numbers")
-    return CameraIntrinsics(
-        int(values["width"]),
-        int(values["height"]),
-        values["fx"],
-        values["fy"],
-        values["cx"],
-        values["cy"],
-        model=str(entry.get("model", "plumb_bob")),
-        coefficients=tuple(float(k) for k in coefficients),
-    )
+    model = str(entry.get("model", "plumb_bob"))
+    return CameraIntrinsics(int(width), int(height), fx, fy, cx, cy, model, tuple(float(k) for k in coefficients))
 
 
 def _number(value: object, name: str, where: str) -> float:
@@ -455,8 +431,7 @@ def _read_stamps(path: Path) -> tuple[tuple[str, ...], Array]:
         try:
             times.append(float(row["t"]))
         except (TypeError, ValueError) as error:
-            raise DataError(
-                f"the time is {row['t']!r}", where=f"{path}, line {number}", allowed="seconds, as a number"
-            ) from error
+            where = f"{path}, line {number}"
+            raise DataError(f"the time is {row['t']!r}", where=where, allowed="seconds, as a number") from error
         names.append(str(row["file"]))
     return tuple(names), np.array(times)

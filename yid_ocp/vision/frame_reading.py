@@ -9,6 +9,7 @@ import os
 import struct
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,8 @@ from yid_ocp.vision.frames import CameraIntrinsics, Colours, FrameSequence, impo
 
 Array = NDArray[np.float64]
 
-_CLOUD_MESSAGE, _IMAGE_MESSAGE, _CAMERA_INFO_MESSAGE = (
-    "sensor_msgs/msg/PointCloud2",
-    "sensor_msgs/msg/Image",
-    "sensor_msgs/msg/CameraInfo",
-)
+_CLOUD_MESSAGE, _IMAGE_MESSAGE = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Image"
+_CAMERA_INFO_MESSAGE = "sensor_msgs/msg/CameraInfo"
 _JOINT_STATE_MESSAGE = "sensor_msgs/msg/JointState"
 _DEPTH_ENCODINGS = {"16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3), "32FC1": ("f4", 1.0)}
 """Encodings of depth images: type of a pixel and its unit [m]; REP 118. RealSense's files say `mono16`."""
@@ -93,12 +91,10 @@ class _Bag:
         self.kinds: dict[str, str] = {c.topic: c.msgtype for c in self.reader.connections}
 
     def _damaged(self, error: Exception) -> DataError:
-        return DataError(
-            f"the bag cannot be read ({type(error).__name__}: {error})",
-            where=str(self.path),
-            allowed="a ROS 1 .bag, a ROS 2 folder with metadata.yaml, or an .mcap or .db3 file of ROS 2",
-            hint="check with `ros2 bag info` or `rosbag info`; a bag cut off by a crash needs `ros2 bag reindex`",
-        )
+        what, where = f"the bag cannot be read ({type(error).__name__}: {error})", str(self.path)
+        allowed = "a ROS 1 .bag, a ROS 2 folder with metadata.yaml, or an .mcap or .db3 file of ROS 2"
+        hint = "check with `ros2 bag info` or `rosbag info`; a bag cut off by a crash needs `ros2 bag reindex`"
+        return DataError(what, where=where, allowed=allowed, hint=hint)
 
     def _of(self, topic: str) -> list[Any]:
         return [c for c in self.reader.connections if c.topic == topic]
@@ -181,13 +177,9 @@ def _topic(bag: _Bag, wanted: str | None) -> str:
         what = f"the bag has {len(deep)} topics of clouds or depth images"
         raise DataError(what, where=str(bag.path), allowed=", ".join(deep), hint=hint)
     held = ", ".join(f"{name} ({kind})" for name, kind in sorted(bag.kinds.items())) or "no topics at all"
-    raise DataError(
-        "the bag has no clouds and no depth images",
-        where=str(bag.path),
-        allowed=f"{_CLOUD_MESSAGE}, or {_IMAGE_MESSAGE} with the encoding {' or '.join(_DEPTH_ENCODINGS)}, "
-        "not compressed",
-        hint=f"it holds {held}",
-    )
+    encoded = f"with the encoding {' or '.join(_DEPTH_ENCODINGS)}, not compressed"
+    allowed, hint = f"{_CLOUD_MESSAGE}, or {_IMAGE_MESSAGE} {encoded}", f"it holds {held}"
+    raise DataError("the bag has no clouds and no depth images", where=str(bag.path), allowed=allowed, hint=hint)
 
 
 def _is_depth(bag: _Bag, topic: str) -> bool:
@@ -210,18 +202,15 @@ def _lens(bag: _Bag, topic: str) -> CameraIntrinsics:
     info = bag.first(nearest[0])
     matrix, projection, bent = (_field(info, name) for name in ("k", "p", "d"))
     if "rect" in topic and projection[0] > 0:
-        return CameraIntrinsics(
-            int(info.width), int(info.height), projection[0], projection[5], projection[2], projection[6]
-        )
+        fx, _, cx, _, _, fy, cy = projection[:7]
+        return CameraIntrinsics(int(info.width), int(info.height), fx, fy, cx, cy)
     if not (matrix[0] > 0 and matrix[4] > 0):
         hint = "calibrate the camera, or write a folder of frames with camera.json"
         raise DataError("the camera is not calibrated: its focal length is 0", where=nearest[0], hint=hint)
     model = str(info.distortion_model) or "plumb_bob"
-    if model == "fisheye":
-        model = "equidistant"
-    return CameraIntrinsics(
-        int(info.width), int(info.height), matrix[0], matrix[4], matrix[2], matrix[5], model, tuple(bent)
-    )
+    model = "equidistant" if model == "fisheye" else model
+    fx, _, cx, _, fy, cy = matrix[:6]
+    return CameraIntrinsics(int(info.width), int(info.height), fx, fy, cx, cy, model, tuple(bent))
 
 
 def _field(info: Any, name: str) -> list[float]:
@@ -230,12 +219,7 @@ def _field(info: Any, name: str) -> list[float]:
 
 
 def _shared(one: Sequence[str], other: Sequence[str]) -> int:
-    count = 0
-    for a, b in zip(one, other, strict=False):
-        if a != b:
-            break
-        count += 1
-    return count
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(one, other, strict=False)))
 
 
 def _depth(content: Any, per_metre: float, where: str) -> Array:
@@ -300,7 +284,7 @@ def read_frames(
     Parameters
     ----------
     path : path-like
-        A folder (`read_frame_folder`); a bag of ROS 1 or ROS 2, an MCAP file or a RealSense file (`_read_bag_frames`);
+        A folder (`read_frame_folder`); a bag of ROS 1 or ROS 2, an MCAP file or a RealSense file;
         or an Azure Kinect's `.mkv`, where the build of Open3D reads it.
     pose : array_like, shape (4, 4), optional
         Camera in the world, instead of the folder's; others do not say it.
@@ -317,15 +301,10 @@ def read_frames(
     place = Path(path)
     ending = place.suffix.lower()
     if place.is_dir():
-        bag = not (place / STAMP_FILE).exists() and any(
-            file.name == "metadata.yaml" or file.suffix in _BAG_SUFFIXES for file in place.iterdir()
-        )
-        return (
-            _read_bag_frames(place, pose=pose, unit=unit, topic=topic)
-            if bag
-            else read_frame_folder(place, pose=pose, unit=unit)
-        )
-    if place.is_file() and ending in _BAG_SUFFIXES:
+        files = () if (place / STAMP_FILE).exists() else place.iterdir()
+        if not any(file.name == "metadata.yaml" or file.suffix in _BAG_SUFFIXES for file in files):
+            return read_frame_folder(place, pose=pose, unit=unit)
+    if place.is_dir() or (place.is_file() and ending in _BAG_SUFFIXES):
         return _read_bag_frames(place, pose=pose, unit=unit, topic=topic)
     if place.is_file() and ending == _AZURE_KINECT_SUFFIX:
         return _read_film(place, pose)

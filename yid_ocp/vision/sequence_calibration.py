@@ -31,8 +31,7 @@ from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.system import System
 from yid_ocp.vision.calibration import CameraCalibration
-from yid_ocp.vision.shape_evidence import ForeignCluster, FrameShapeFit, TubeLinks
-from yid_ocp.vision.shape_evidence import nearest_on_tubes as nearest_place
+from yid_ocp.vision.shape_evidence import ForeignCluster, FrameShapeFit, TubeLinks, nearest_on_tubes
 from yid_ocp.vision.surface_meshes import ExtraMesh, TriangleMesh, load_mesh_file
 
 Array = NDArray[np.float64]
@@ -99,7 +98,7 @@ class BackgroundPoints:
         points: Array = np.asarray((place[count >= max(2.0, _MOST * len(clouds))] + 0.5) * voxel)
         for tubes in shapes:
             if len(points):
-                link, _, _, distance = nearest_place(tubes.link_ends, tubes.radius, points)
+                link, _, _, distance = nearest_on_tubes(tubes.link_ends, tubes.radius, points)
                 points = points[distance > tubes.radius[link] + near]
         return BackgroundPoints(points, _NOISE_STDS * noise + 0.5 * math.sqrt(3.0) * voxel)
 
@@ -144,9 +143,8 @@ def _shape(entry: ExtraMesh, where: str) -> TriangleMesh:
         return TriangleMesh.sphere(entry.sphere)
     path = Path(str(entry.mesh))
     if not is_file(path):
-        raise ModelError(
-            f"there is no mesh '{path}'", where=where, hint="give a file that trimesh reads: STL, OBJ, DAE"
-        )
+        hint = "give a file that trimesh reads: STL, OBJ, DAE"
+        raise ModelError(f"there is no mesh '{path}'", where=where, hint=hint)
     return load_mesh_file(path)
 
 
@@ -213,6 +211,16 @@ def _wandering(places: Array) -> float:
     return _TO_SIGMA * float(np.median(np.linalg.norm(places - np.median(places, axis=0), axis=1)))
 
 
+def _carrying_link(places: Array, poses: Sequence[Mapping[str, Array]]) -> str:
+    """Link within which places wander much less than in the world; empty for none."""
+    inside = {}
+    for name in poses[0]:
+        own = [(p - at[name][:3, 3]) @ at[name][:3, :3] for p, at in zip(places, poses, strict=True)]
+        inside[name] = _wandering(np.array(own))
+    best = min(inside, key=lambda name: inside[name], default="")
+    return best if best and inside[best] < _FOLLOWS * _wandering(places) else ""
+
+
 def _named(
     group: Sequence[tuple[float, ForeignCluster]],
     total: int,
@@ -222,27 +230,12 @@ def _named(
     coloured: bool,
     background: bool,
 ) -> ForeignObject:
-    places = np.array([thing.centre for _, thing in group])
-    centre = np.median(places, axis=0)
-    size = np.median([thing.extent for _, thing in group], axis=0)
-    far = _wandering(places)
+    places, extents = np.array([thing.centre for _, thing in group]), [thing.extent for _, thing in group]
+    centre, size = np.median(places, axis=0), np.median(extents, axis=0)
     # as arm and object hide parts of a still thing, the middle of the rest wanders within it
-    span = np.ptp(places, axis=0)
-    moving = bool(
-        (span > np.maximum(2 * _NOISE_STDS * noise, _STILL * np.max([x.extent for _, x in group], axis=0))).any()
-    )
-    link = ""
-    if moving:
-        poses = [links(t) for t, _ in group]
-        inside = {
-            name: _wandering(
-                np.array([(p - at[name][:3, 3]) @ at[name][:3, :3] for p, at in zip(places, poses, strict=True)])
-            )
-            for name in poses[0]
-        }
-        if inside:
-            best = min(inside, key=lambda name: inside[name])
-            link = best if inside[best] < _FOLLOWS * far else ""
+    still = np.maximum(2 * _NOISE_STDS * noise, _STILL * np.max(extents, axis=0))
+    moving = bool((np.ptp(places, axis=0) > still).any())
+    link = _carrying_link(places, [links(t) for t, _ in group]) if moving else ""
     low, high = places.min(axis=0) - 0.5 * size, places.max(axis=0) + 0.5 * size
     beside = bool(((low > box[1]) | (high < box[0])).any())
     where = ", ".join(f"{value:.2f}" for value in centre)
@@ -252,9 +245,8 @@ def _named(
     if link:
         text += f"give its shape under model.extra_meshes with parent_frame: {link}"
     elif moving:
-        text += (
-            "take it out of view" if not beside else "leave it out with track.options.filters.box_lower and box_upper"
-        )
+        boxed = "leave it out with track.options.filters.box_lower and box_upper"
+        text += boxed if beside else "take it out of view"
         text += ", or give the object's colour under track.options.filters.object_colours" if coloured else ""
     else:
         text += "" if background else "set track.options.background_estimation: frames, or "
@@ -320,14 +312,12 @@ class DimensionCheck:
             value = self.model_values[i] * math.exp(self.log_ratio[i])
             two = 2 * value * self.log_ratio_std[i]
             found = f"{1e3 * value:.4g} mm ± {1e3 * two:.2g} mm (two standard deviations) fits {self.n_frames} frames"
+            said = f"the model says {1e3 * self.model_values[i]:.4g} mm"
             if self.is_estimated[i]:
-                lines.append(f"{name} is estimated: {found}; the model says {1e3 * self.model_values[i]:.4g} mm")
+                lines.append(f"{name} is estimated: {found}; {said}")
             elif self.is_contradicted[i]:
-                kind = name.rpartition(".")[2]
-                lines.append(
-                    f"{name} seems to be wrong: {found}, the model says {1e3 * self.model_values[i]:.4g} mm. "
-                    f"Measure it again, or estimate it: track.options.estimated_dimensions: [{kind}]"
-                )
+                remedy = f"estimate it: track.options.estimated_dimensions: [{name.rpartition('.')[2]}]"
+                lines.append(f"{name} seems to be wrong: {found}, {said}. Measure it again, or {remedy}")
         return tuple(lines)
 
     def point_std(self, points: Array) -> Array:
@@ -432,9 +422,8 @@ def _symbols(system: System) -> list[list[str]]:
 
 def _told(system: System, given: Mapping[str, float] | None) -> Array:
     symbols, theta = system.parameters.symbols, system.parameters.vector(given)
-    sums = [ca.sum1(ca.vertcat(*s.link_lengths)) for s in system.segment_layouts] + [
-        s.radius for s in system.segment_layouts
-    ]
+    sums = [ca.sum1(ca.vertcat(*s.link_lengths)) for s in system.segment_layouts]
+    sums += [s.radius for s in system.segment_layouts]
     return np.array(ca.Function("told", [symbols], [ca.densify(ca.vertcat(*sums))])(theta)).ravel()
 
 

@@ -130,9 +130,8 @@ class ShapeEvidence:
     @property
     def visible_coverage(self) -> Array:
         """Share of each link's visible length that has own points, shape (K,); 0 where nothing of it is visible."""
-        return np.asarray(
-            self.covered_fraction / np.maximum(self.covered_fraction + self.visibly_empty_fraction, 1e-12)
-        )
+        visible = self.covered_fraction + self.visibly_empty_fraction
+        return np.asarray(self.covered_fraction / np.maximum(visible, 1e-12))
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,30 +201,18 @@ def assess_shape(tubes: TubeLinks, seen: CloudObservation, near: float) -> Shape
     widest = 2 * (tubes.radius[link] + gate)
     contested = np.zeros(len(on_shape), bool)
     if contact.any():
-        apart, _ = cKDTree(seen.points[contact]).query(seen.points)
-        contested = (on_shape | beyond) & (apart < widest)
+        touching = cKDTree(seen.points[contact])
+        contested = (on_shape | beyond) & (touching.query(seen.points)[0] < widest)
         for i, cut in enumerate(slices):
             # whose the points at the end are is not known, so neither is where it is
-            if np.isfinite(ends[i]) and cKDTree(seen.points[contact]).query(cut.place(ends[i]))[0] < 2 * (
-                cut.radius + gate
-            ):
+            if np.isfinite(ends[i]) and touching.query(cut.place(ends[i]))[0] < 2 * (cut.radius + gate):
                 ends[i] = np.nan
     own = on_shape & ~contested
     filled, empty = _coverage(tubes, seen, own, link, along, gate)
     counted = close & ~foreign
     mean = float(np.average(size[counted], weights=seen.point_weights[counted])) if counted.any() else math.inf
-    return ShapeEvidence(
-        own,
-        contested,
-        foreign,
-        noise,
-        mean,
-        filled,
-        empty,
-        ends,
-        _swath(tubes, seen, counted & ~contested, link, normal * distance[:, None]),
-        _things(part, seen),
-    )
+    swath, things = _swath(tubes, seen, counted & ~contested, link, normal * distance[:, None]), _things(part, seen)
+    return ShapeEvidence(own, contested, foreign, noise, mean, filled, empty, ends, swath, things)
 
 
 def tube_like_nodes_and_points(sight: CloudObservation, radius: float) -> tuple[Mask, Mask]:

@@ -21,6 +21,7 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
 from yid_ocp.errors import ConfigError
+from yid_ocp.model.rotations import homogeneous_transform
 from yid_ocp.vision.frames import XTION_INTRINSICS, CameraIntrinsics, FrameSequence, validated_pose
 from yid_ocp.vision.surface_meshes import (
     ArticulatedSurfaces,
@@ -95,9 +96,7 @@ class DepthCamera:
         if self.disparity_step > 0:
             disparity = np.rint(disparity / self.disparity_step) * self.disparity_step
         measured = scale / np.maximum(disparity, 1e-6)
-        lost = (
-            (far < self.min_depth) | (far > self.max_depth) | (measured < self.min_depth) | (measured > self.max_depth)
-        )
+        lost = (np.minimum(far, measured) < self.min_depth) | (np.maximum(far, measured) > self.max_depth)
         lost |= cosine < self.min_incidence_cosine * (1.0 + chance[2])
         lost |= edge & ~mixed & (chance[0] > 1.0 - self.edge_loss_probability)
         lost |= chance[3] < self.loss_probability
@@ -167,15 +166,12 @@ class FloorAndWall:
 
     def to_mesh(self) -> TriangleMesh | None:
         """Mesh of floor and wall as thin boxes; None if there is neither."""
-        parts = []
+        boxes = []
         if self.floor_height is not None:
-            at = np.eye(4)
-            at[:3, 3] = [1.0, 0.0, self.floor_height - 0.01]
-            parts.append(TriangleMesh.box([8.0, 8.0, 0.02]).transformed(at))
+            boxes.append(([8.0, 8.0, 0.02], [1.0, 0.0, self.floor_height - 0.01]))
         if self.wall_position is not None:
-            at = np.eye(4)
-            at[:3, 3] = [self.wall_position - 0.01, 0.0, 0.5]
-            parts.append(TriangleMesh.box([0.02, 8.0, 3.0]).transformed(at))
+            boxes.append(([0.02, 8.0, 3.0], [self.wall_position - 0.01, 0.0, 0.5]))
+        parts = [TriangleMesh.box(size).transformed(homogeneous_transform(np.eye(3), at)) for size, at in boxes]
         return TriangleMesh.concatenate(parts) if parts else None
 
 
@@ -236,24 +232,15 @@ def render_virtual_frames(scene: CameraScene, t: ArrayLike, q: ArrayLike, camera
     DataError, ModelError
         No Open3D, no object, a mesh that cannot be read, or a pose that is none.
     """
-    sensor = camera.depth_camera
-    pose = validated_pose(camera.pose, "sequence")
-    times, path = np.asarray(t, float), np.asarray(q, float)
-    taken, stamps = camera.timing.sample_times_and_stamps(
-        float(times[0]), float(times[-1]), np.random.default_rng(camera.seed)
-    )
+    lens, pose = camera.depth_camera.intrinsics, validated_pose(camera.pose, "sequence")
+    times, path, rng = np.asarray(t, float), np.asarray(q, float), np.random.default_rng(camera.seed)
+    taken, stamps = camera.timing.sample_times_and_stamps(float(times[0]), float(times[-1]), rng)
     course = CubicSpline(times, path, axis=0)
     configuration = np.asarray(course(taken))
-    images = _Images(_surfaces(scene, camera.background), sensor, pose, configuration, camera.seed)
+    surfaces = _surfaces(scene, camera.background)
+    images = _Images(surfaces, camera.depth_camera, pose, configuration, camera.seed)
     names = tuple(f"frame {i}" for i in range(len(taken)))
-    made = FrameSequence(
-        stamps,
-        names,
-        pose,
-        lambda i: sensor.intrinsics.points_from_depth(images[i]),
-        sensor.intrinsics,
-        "virtual camera",
-    )
+    made = FrameSequence(stamps, names, pose, lambda i: lens.points_from_depth(images[i]), lens, "virtual camera")
     return VirtualFrames(made, taken, configuration, images, lambda at: np.asarray(course(at)))
 
 
