@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.table import Table
 
 import yid_ocp as yid
-from yid_ocp.data.edge_lengths import median_edge_lengths
+from yid_ocp.data.channel_checks import median_edge_lengths
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.model.cable import (

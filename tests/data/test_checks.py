@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from yid_ocp.data.channel_checks import quantization_step
-from yid_ocp.data.checks import _shared_sample_count, check_recording, duplicate_data_issue
+from yid_ocp.data.checks import _shared_sample_count, check_recording, duplicate_data_issue, split_at_gaps
 from yid_ocp.data.issues import ISSUE_CAUSES, Issue
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
-from yid_ocp.data.recording_gaps import split_at_gaps
 from yid_ocp.problem.options import SensorOptions
 
 NAMES = ("a", "b", "c")
@@ -117,10 +116,7 @@ FAULTS = {
         changed(RECORDING, position=column(POSITION, 2, lambda x: np.where(np.arange(len(x)) > 300, x[300], x))),
         {"stuck"},
     ),
-    "all repeat one sample": (
-        changed(RECORDING, position=0 * POSITION + 0.1, velocity=None, effort=None),
-        {"stuck"},
-    ),
+    "all repeat one sample": (changed(RECORDING, position=0 * POSITION + 0.1, velocity=None, effort=None), {"stuck"}),
     "coarse angles": (changed(RECORDING, position=0.01 * np.rint(POSITION / 0.01)), {"quantised"}),
     "coarse efforts": (changed(RECORDING, effort=np.rint(EFFORT)), {"quantised"}),
     "noisy efforts": (

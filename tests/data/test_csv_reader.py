@@ -52,14 +52,7 @@ def test_csv_units_are_converted(tmp_path: Path) -> None:
 
 def test_csv_columns_given(tmp_path: Path) -> None:
     path = table(tmp_path, "stamp;angle;label;X;Y;Z\n0;0.1;start;1;2;3\n1;0.2;;4;5;6\n")
-    columns = {
-        "stamp": "t",
-        "angle": "position:elbow",
-        "label": "skip",
-        "X": "x:tip",
-        "Y": "y:tip",
-        "Z": "z:tip",
-    }
+    columns = {"stamp": "t", "angle": "position:elbow", "label": "skip", "X": "x:tip", "Y": "y:tip", "Z": "z:tip"}
     recording = read_csv(path, columns=columns, delimiter=";")
     assert recording.joint_names == ("elbow",)
     assert np.array_equal(recording.points[0].position[:, 0], [[1, 2, 3], [4, 5, 6]])

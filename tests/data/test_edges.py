@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from yid_ocp.data.edge_lengths import _measured_positions, median_edge_lengths
+from yid_ocp.data.channel_checks import _measured_positions, median_edge_lengths
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.errors import DataError
 

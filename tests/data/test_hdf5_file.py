@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 import pytest
 
-from yid_ocp.data import hdf5_io, readability_check
+from yid_ocp.data import hdf5_io
 from yid_ocp.data.hdf5_io import create_hdf5_atomically, open_checked_hdf5
 from yid_ocp.errors import DataError, OutputError
 
@@ -92,7 +92,7 @@ def test_a_file_that_ends_the_library_does_not_end_us(file, monkeypatch):
 
 @needs_fork
 def test_a_file_that_never_ends_is_given_up(file, monkeypatch):
-    monkeypatch.setattr(readability_check, "_READ_TIMEOUT", 0.3)
+    monkeypatch.setattr(hdf5_io, "_READ_TIMEOUT", 0.3)
     monkeypatch.setattr(hdf5_io, "_foreign", lambda group: signal.pause())
     with pytest.raises(DataError, match=r"within 0\.3 s"), open_checked_hdf5(file):
         pass

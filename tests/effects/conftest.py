@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from yid_ocp.data.edge_lengths import median_edge_lengths
+from yid_ocp.data.channel_checks import median_edge_lengths
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.effects import SENSOR_KINDS, EffectBase, candidate_effects, make_effect
 from yid_ocp.integrator.rollout import simulate

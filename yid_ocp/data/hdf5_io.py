@@ -1,21 +1,80 @@
 """Safe HDF5 access: atomic writes, and reads only after another process has read the file without a crash.
 
 The HDF5 library ends the process that meets a full disk while it writes, or certain damage while it reads, and takes
-links into other files for its own. None of this can be caught, so it is kept away from the process that does the work.
+links into other files for its own. None of this can be caught, so it is kept away from the process that does the
+work.
 """
 
 from __future__ import annotations
 
 import contextlib
+import faulthandler
 import os
-from collections.abc import Iterator
+import select
+import signal
+import warnings
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import h5py
 
-from yid_ocp.data.readability_check import check_readable_in_fork
 from yid_ocp.errors import DataError
 from yid_ocp.files import atomic_write, os_error_reason
+
+_READ_TIMEOUT = 10.0
+"""Time limit for reading a whole file [s]."""
+
+
+def check_readable_in_fork(path: Path, complaint: Callable[[Path], str], noun: str) -> None:
+    """Check in a forked process that a file can be read.
+
+    A fork, as a new process would take a second and a process of a pool may have no children.
+
+    Parameters
+    ----------
+    complaint : callable
+        Reads the file and says what stands against it; nothing where all of it can be read.
+    noun : str
+        The format, for messages.
+
+    Raises
+    ------
+    DataError
+        What the trial said, or how it ended.
+    """
+    if not hasattr(os, "fork"):
+        return
+    here, there = os.pipe()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of threads, none of which the fork needs
+        child = os.fork()
+    if child == 0:
+        try:
+            faulthandler.disable()
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # allocators print before they abort
+            os.write(there, f".{complaint(path)}".encode(errors="replace")[:2000])
+        finally:
+            os._exit(0)
+    os.close(there)
+    try:
+        ready, _, _ = select.select([here], [], [], _READ_TIMEOUT)
+        said = os.read(here, 4000).decode(errors="replace") if ready else None
+    finally:
+        os.close(here)
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(child, signal.SIGKILL)
+        _, status = os.waitpid(child, 0)
+    if said is None:
+        what = f"the {noun} file cannot be read within {_READ_TIMEOUT:g} s: it is damaged, or far too large"
+    elif not said:
+        number = os.WTERMSIG(status) if os.WIFSIGNALED(status) else 0
+        how = signal.Signals(number).name if number else "an exit"
+        what = f"the {noun} file is damaged (it ends the {noun} library with {how})"
+    else:
+        what = said[1:]
+    if what:
+        raise DataError(what, where=str(path), hint="copy or record it again, as one file of its own")
+
 
 _MAX_GROUP_DEPTH = 10
 """Largest nesting depth of groups."""
@@ -53,10 +112,6 @@ def create_hdf5_atomically(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
 @contextlib.contextmanager
 def open_checked_hdf5(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
     """Open an HDF5 file after checking in another process that it can be read.
-
-    Parameters
-    ----------
-    path : path-like
 
     Yields
     ------

@@ -28,36 +28,8 @@ MIN_NOISE_DIFFERENCES = 30
 
 
 @dataclass(frozen=True)
-class QualityLimits:
-    """Limits beyond which a check of a recording reports an issue.
-
-    Attributes
-    ----------
-    max_joint_period, max_point_period : float
-        Longest period of a robot's joints and of frames [s].
-    max_missing_fraction : float
-        Part of a clock's samples that may be missing.
-    max_clock_mismatch_fraction : float
-        Part of the joints' time by which points may start late and end late.
-    max_rate_ratio : float
-        Factor by which angles may turn faster or more slowly than the recorded velocity says.
-    max_noise_ratio : float
-        Factor by which noise may exceed what is stated.
-    max_overstatement_ratio : float
-        Factor by which it may stay below.
-    min_stuck_time : float
-        How long a channel that is noisy elsewhere may repeat one value [s].
-    min_stuck_samples : int
-        How often it may.
-    max_unseen_rotation : float
-        By how much the recorded velocity may turn a joint whose angle stays the same [rad].
-    min_clipped_samples : int
-        How often a noisy effort may hit its extreme exactly.
-    min_joint_motion, min_point_travel : float
-        Less is no motion, of any joint [rad], of any point [m].
-    min_shared_samples : int
-        Samples that two recordings may share.
-    """
+class _QualityLimits:
+    """Limits beyond which a check of a recording reports an issue."""
 
     max_joint_period: float = 0.5
     max_point_period: float = 30.0
@@ -75,44 +47,27 @@ class QualityLimits:
     min_shared_samples: int = 50
 
 
-QUALITY_LIMITS = QualityLimits()
+QUALITY_LIMITS = _QualityLimits()
 
 
 @dataclass(frozen=True)
 class Issue:
-    """One data quality issue of a recording.
+    """One data quality issue of a recording."""
 
-    Attributes
-    ----------
-    cause : str
-        What is wrong, in one word of `ISSUE_CAUSES`.
-    what : str
-        The same in one sentence, with numbers.
-    weight : {'warning', 'not_trusted', 'refused'}
-        Whether a run goes on as it would (and says so), goes on but says of no number that it is found, or stops.
-    evidence : float
-        How many times what was seen exceeds the limit from which on it counts, 1 to `MAX_LIMIT_RATIO`.
-    advice : str
-        What to do.
-    recording, group, channel : str
-        Where; empty for all of them.
-    begin, end : float, optional
-        Stretch of time on the group's clock [s]; all of it when absent.
-    setting : str
-        Line of configuration that repairs or describes it, where there is one.
-    """
-
-    cause: str
-    what: str
+    cause: str  # what is wrong, in one word of `ISSUE_CAUSES`
+    what: str  # the same in one sentence, with numbers
+    # whether a run goes on as it would (and says so), goes on but says of no number that it is found, or stops
     weight: Severity
-    evidence: float
-    advice: str
+    evidence: float  # how many times what was seen exceeds the limit from which on it counts, 1 to `MAX_LIMIT_RATIO`
+    advice: str  # what to do
+    # Where; empty for all of them
     recording: str
     group: str = ""
     channel: str = ""
+    # stretch of time on the group's clock [s]; all of it when absent
     begin: float | None = None
     end: float | None = None
-    setting: str = ""
+    setting: str = ""  # Line of configuration that repairs or describes it, where there is one
 
     def __post_init__(self) -> None:
         if self.cause not in ISSUE_CAUSES:

@@ -20,7 +20,7 @@ from yid_ocp.config.settings import (
     RunSettings,
     SegmentedObjectSettings,
 )
-from yid_ocp.data.edge_lengths import median_edge_lengths
+from yid_ocp.data.channel_checks import median_edge_lengths
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ModelError, YidError, nearest_name_hint
 from yid_ocp.integrator.step import Step, compile_step

@@ -12,7 +12,7 @@ from yid_ocp.config.settings import (
     CableSettings,
     RunSettings,
 )
-from yid_ocp.data.edge_lengths import median_edge_lengths
+from yid_ocp.data.channel_checks import median_edge_lengths
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
 from yid_ocp.integrator.step import Step

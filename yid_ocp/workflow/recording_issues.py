@@ -25,10 +25,9 @@ from yid_ocp.analysis.data_quality import (
     check_point_distances,
 )
 from yid_ocp.config.settings import RunSettings
-from yid_ocp.data.checks import check_recording, duplicate_data_issue
+from yid_ocp.data.checks import check_recording, duplicate_data_issue, split_at_gaps
 from yid_ocp.data.issues import ISSUE_CAUSES, Issue
 from yid_ocp.data.recording import Recording
-from yid_ocp.data.recording_gaps import split_at_gaps
 from yid_ocp.errors import DataError
 from yid_ocp.model.cable import CableTopology
 from yid_ocp.model.system import System

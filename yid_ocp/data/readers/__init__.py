@@ -68,11 +68,6 @@ def preview_file(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
     ----------
     path : path-like
         As `read_any`.
-    progress : Progress, optional
-
-    Returns
-    -------
-    Contents
 
     Raises
     ------
@@ -106,9 +101,5 @@ def _format_of(path: Path) -> str:
     if path.is_dir():
         key = "LeRobot dataset" if (path / "meta" / "info.json").is_file() else "folder"
     if key not in READERS:
-        raise DataError(
-            f"there is no reader for '{key}' files",
-            where=str(path),
-            **unknown_name_details(key, READERS),
-        )
+        raise DataError(f"there is no reader for '{key}' files", where=str(path), **unknown_name_details(key, READERS))
     return key

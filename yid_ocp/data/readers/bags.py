@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.data.clock_merging import merge_on_fastest_clock, zero_order_hold
 from yid_ocp.data.readers.base import (
     PREVIEWS,
     READERS,
@@ -20,7 +19,9 @@ from yid_ocp.data.readers.base import (
     check_point_names,
     convert_to_si_and_validate,
     guess_units,
+    merge_on_fastest_clock,
     parse_renamings,
+    zero_order_hold,
 )
 from yid_ocp.data.recording import Array, JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
@@ -173,14 +174,8 @@ def read_bag(
 @PREVIEWS.register(".mcap")
 @PREVIEWS.register(".db3")
 @PREVIEWS.register("folder")
-def preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRESS) -> FileContents:
-    """What a bag holds: its topics, what they would become, and units that their values look like.
-
-    Raises
-    ------
-    DataError
-        If `rosbags` is not installed or the bag cannot be read.
-    """
+def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRESS) -> FileContents:
+    """What a bag holds: its topics, what they would become, and units that their values look like."""
     path = Path(path)
     file_sha256(path)
     bag = _bag(path, None, progress)

@@ -1,4 +1,4 @@
-"""Registries of readers and previews, and their shared steps: selection, renaming, units, torques from currents."""
+"""Registries of readers and previews, and their shared steps: selection, renaming, units, torques, one clock."""
 
 from __future__ import annotations
 
@@ -9,38 +9,26 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, Array, JointGroup, PointGroup, Recording, validate_recording
 from yid_ocp.errors import DataError, unknown_name_details
 from yid_ocp.registry import Registry
 
-RecordingReader = Callable[..., Recording]
+_RecordingReader = Callable[..., Recording]
 
 
 @dataclass(frozen=True)
 class FileSource:
-    """One data source in a file of another tool: a topic, a column or a marker.
+    """One data source in a file of another tool: a topic, a column or a marker."""
 
-    Attributes
-    ----------
-    name, kind : str
-        What the file calls it, and its type.
-    n_samples : int
-        Messages or values.
-    mean_rate : float
-        Mean rate [Hz]; NaN where it has none.
-    imported_as : str
-        What an import makes of it, empty where it is left out.
-    note : str
-        Why it is left out, or what should be looked at.
-    """
-
+    # what the file calls it, and its type
     name: str
     kind: str
-    n_samples: int
-    mean_rate: float
-    imported_as: str = ""
-    note: str = ""
+    n_samples: int  # messages or values
+    mean_rate: float  # mean rate [Hz]; NaN where it has none
+    imported_as: str = ""  # What an import makes of it, empty where it is left out
+    note: str = ""  # Why it is left out, or what should be looked at
 
 
 @dataclass(frozen=True)
@@ -49,7 +37,6 @@ class FileContents:
 
     Attributes
     ----------
-    sources : tuple of Source
     reader_options : mapping of str to object
         Named options of the reader.
     notes : tuple of str
@@ -61,7 +48,7 @@ class FileContents:
     notes: tuple[str, ...] = ()
 
 
-READERS: Registry[RecordingReader] = Registry("recording format")
+READERS: Registry[_RecordingReader] = Registry("recording format")
 """Readers by file suffix, and by word for what is stored as a folder; each takes a path, then named options."""
 
 PREVIEWS: Registry[Callable[..., FileContents]] = Registry("recording format with a preview")
@@ -90,10 +77,6 @@ def parse_units(words: Iterable[str]) -> dict[str, str]:
     ----------
     words : iterable of str
         `deg`, `mm`, `velocity=rpm`.
-
-    Returns
-    -------
-    dict of quantity to unit
 
     Raises
     ------
@@ -217,11 +200,7 @@ def convert_to_si_and_validate(
 def _chosen_joints(group: JointGroup, chosen: Mapping[str, str], where: str) -> JointGroup:
     for name in chosen:
         if name not in group.names:
-            raise DataError(
-                f"there is no joint '{name}'",
-                where=where,
-                **unknown_name_details(name, group.names),
-            )
+            raise DataError(f"there is no joint '{name}'", where=where, **unknown_name_details(name, group.names))
     at = [group.names.index(name) for name in chosen]
     channels: dict[str, Any] = {name: values[:, at] for name, values in group.channels.items()}
     return replace(group, names=tuple(chosen.values()), **channels)
@@ -319,3 +298,95 @@ def guess_units(recording: Recording) -> tuple[dict[str, str], tuple[str, ...]]:
             units["t"] = unit
             notes.append(f"samples come every {period:.3g}: the times look like {unit}")
     return units, tuple(notes)
+
+
+_MAX_INTERPOLATED_PERIODS = 5.0
+"""Longest gap of a source that is interpolated, in its sample periods."""
+
+
+def merge_on_fastest_clock(groups: Sequence[tuple[str, JointGroup]], where: str) -> tuple[JointGroup, tuple[str, ...]]:
+    """Merge the joints of several sources onto the clock of the fastest one.
+
+    Values of the others are interpolated linearly between their samples. A time at which one of them has no sample
+    within `_MAX_INTERPOLATED_PERIODS` of its periods on both sides is left out, so that a gap stays a gap.
+
+    Parameters
+    ----------
+    groups : sequence of (str, JointGroup)
+        Name of every source, and its joints with strictly increasing times on the same clock.
+    where : str
+        What errors call the file.
+
+    Returns
+    -------
+    JointGroup
+        All joints, with the channels that every source has.
+    tuple of str
+        What was done, in words.
+
+    Raises
+    ------
+    DataError
+        Two sources have a joint in common, one lacks a channel that another has, or they share no time.
+    """
+    if len(groups) == 1:
+        return groups[0][1], ()
+    _check_separate(groups, where)
+    fastest = max(range(len(groups)), key=lambda i: len(groups[i][1].t) / max(np.ptp(groups[i][1].t), 1e-12))
+    name, clock = groups[fastest]
+    kept = np.ones(len(clock.t), bool)
+    for _, group in groups:
+        kept &= _can_interpolate(group.t, clock.t)
+    if not kept.any():
+        listed = "; ".join(f"{name}: {group.t[0]:.6g} to {group.t[-1]:.6g} s" for name, group in groups)
+        raise DataError("the joint states share no time", where=where, allowed=listed, hint="choose one of the topics")
+    t = clock.t[kept]
+    channels: dict[str, Any] = {
+        channel: np.hstack([_at(group.t, values, t) for _, group in groups for values in [group.channels[channel]]])
+        for channel in clock.channels
+    }
+    notes = []
+    others = [entry for i, entry in enumerate(groups) if i != fastest]
+    moved = [source for source, group in others if not np.isin(t, group.t).all()]
+    if moved:
+        notes.append(f"joint states of {', '.join(moved)} were interpolated to the times of {name}")
+    if len(t) < len(clock.t):
+        notes.append(f"{len(clock.t) - len(t)} of {len(clock.t)} samples of {name} have none of another topic near")
+    names = tuple(joint for _, group in groups for joint in group.names)
+    return replace(clock, names=names, t=t, **channels), tuple(notes)
+
+
+def zero_order_hold(group: JointGroup, t: Array) -> Array:
+    """Positions of a group at other times by zero-order hold, shape (N, nj); before its first sample, that one."""
+    return group.position[np.maximum(np.searchsorted(group.t, t + 1e-9, side="right") - 1, 0)]
+
+
+def _can_interpolate(known: Array, t: Array) -> NDArray[np.bool_]:
+    """Whether each time is a sample or lies between two samples close enough to interpolate."""
+    after = np.searchsorted(known, t)
+    before = np.searchsorted(known, t, side="right") - 1
+    inside = (after < len(known)) & (before >= 0)
+    period = float(np.median(np.diff(known))) if len(known) > 1 else 0.0
+    gap = known[np.minimum(after, len(known) - 1)] - known[np.maximum(before, 0)]
+    return np.asarray(inside & (gap <= _MAX_INTERPOLATED_PERIODS * period + 1e-12))
+
+
+def _at(known: Array, values: Array, t: Array) -> Array:
+    return np.stack([np.interp(t, known, column) for column in values.T], axis=1)
+
+
+def _check_separate(groups: Sequence[tuple[str, JointGroup]], where: str) -> None:
+    choose = "choose topics: --joint-topic TOPIC, once for each"
+    owner: dict[str, str] = {}
+    for source, group in groups:
+        for joint in group.names:
+            if joint in owner:
+                what = f"the joint '{joint}' is on {owner[joint]} and on {source}"
+                raise DataError(what, where=where, allowed="every joint on one topic", hint=choose)
+            owner[joint] = source
+    every = {channel for _, group in groups for channel in group.channels}
+    for source, group in groups:
+        lacking = sorted(every - set(group.channels))
+        if lacking:
+            what = f"{source} has no {lacking[0]}, which another topic of joint states has"
+            raise DataError(what, where=where, allowed="the same channels on every topic", hint=choose)

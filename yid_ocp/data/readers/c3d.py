@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.data.readability_check import check_readable_in_fork
+from yid_ocp.data.hdf5_io import check_readable_in_fork
 from yid_ocp.data.readers.base import PREVIEWS, READERS, FileContents, FileSource, convert_to_si_and_validate
 from yid_ocp.data.recording import Array, PointGroup, Recording
 from yid_ocp.errors import DataError
@@ -85,7 +85,7 @@ def read_c3d(
 
 
 @PREVIEWS.register(".c3d")
-def preview_c3d(path: str | os.PathLike[str]) -> FileContents:
+def _preview_c3d(path: str | os.PathLike[str]) -> FileContents:
     """What a C3D file holds; errors as `read_c3d`."""
     path = Path(path)
     file_sha256(path)

@@ -100,13 +100,7 @@ def read_csv(
     raw = _raw(meanings, table, str(path), clock, sensor, frame)
     made = Recording(raw.joints, raw.points, description, path.name, path.stem, digest, notes=notes)
     return convert_to_si_and_validate(
-        made,
-        str(path),
-        joints=joints,
-        points=points,
-        units=units,
-        torque_constants=torque_constants,
-        gears=gears,
+        made, str(path), joints=joints, points=points, units=units, torque_constants=torque_constants, gears=gears
     )
 
 
@@ -137,14 +131,8 @@ def _raw(
 
 
 @PREVIEWS.register(".csv")
-def preview_csv(path: str | os.PathLike[str]) -> FileContents:
-    """What a table holds: columns, what their names say, and units that its values look like.
-
-    Raises
-    ------
-    DataError
-        If it is no table of text.
-    """
+def _preview_csv(path: str | os.PathLike[str]) -> FileContents:
+    """What a table holds: columns, what their names say, and units that its values look like."""
     path = Path(path)
     file_sha256(path)
     options: dict[str, Any] = {}

@@ -107,7 +107,7 @@ def read_lerobot(
 
 
 @PREVIEWS.register("LeRobot dataset")
-def preview_lerobot(path: str | os.PathLike[str]) -> FileContents:
+def _preview_lerobot(path: str | os.PathLike[str]) -> FileContents:
     """What a LeRobot dataset holds, by its first episode; errors as `read_lerobot`."""
     dataset = _dataset(Path(path))
     table, _ = _episode(dataset, 0)
