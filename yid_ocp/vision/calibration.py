@@ -7,7 +7,8 @@ deviation of every point.
 
 The common offset of the two clocks and its drift are part of the calibration. Here a frame is taken by itself: its own
 offset is where the robot's surface lies best on its points, and a frame whose own offset is another than the common one
-was stamped late. Clock offset and latency cannot be told apart and come as one number, stamp minus joint time."""
+was stamped late. Clock offset and latency cannot be told apart and come as one number, stamp minus joint time.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """A folder of clouds or depth images with time stamps and the camera (`yid-frames/1`), and the files in it.
 
-PLY files are read without a library in C: damage must not end the process. Turk (1994), The PLY polygon file format."""
+PLY files are read without a library in C: damage must not end the process. Turk (1994), The PLY polygon file format.
+"""
 
 from __future__ import annotations
 

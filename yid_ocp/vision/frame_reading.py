@@ -1,7 +1,8 @@
 """Frame sequences from a folder, a bag of ROS 1 or ROS 2, an MCAP file, a RealSense or an Azure Kinect recording.
 
 Of a bag, `sensor_msgs/PointCloud2`, or `sensor_msgs/Image` with depth and its `sensor_msgs/CameraInfo`: a sequence
-keeps where its messages stand; they are read when they are needed."""
+keeps where its messages stand; they are read when they are needed.
+"""
 
 from __future__ import annotations
 

@@ -7,7 +7,8 @@ to the root and the tips of the object in every way in which their distances agr
 
 References
 ----------
-Verroust & Lazarus (2000), Extracting skeletal curves from 3D scattered data, doi:10.1007/PL00007210."""
+Verroust & Lazarus (2000), Extracting skeletal curves from 3D scattered data, doi:10.1007/PL00007210.
+"""
 
 from __future__ import annotations
 

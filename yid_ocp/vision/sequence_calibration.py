@@ -9,7 +9,8 @@ following: g_f'x + x'S_f x/2 (`DimensionEquations`). Together, with a wide prior
 found by Gauss and Newton's method, the frames fitted anew at every x. The second term is the scatter between frames,
 however alike the errors within one are. b is what all frames share: an end is seen no better than a point is and stands
 where the camera's pose has it; noise along the sight makes a tube thinner or thicker by as much as its square over the
-radius."""
+radius.
+"""
 
 from __future__ import annotations
 

@@ -3,7 +3,8 @@
 Points within three standard deviations of the tubes' surface lie on the shape. Of the others, those that hang together
 and are as many as a piece of tube as long as it is wide would have are a thing. Where a thing's surface goes on from
 the shape's, nobody can tell whose the points are: within two tubes' reach of there they are contested and say nothing.
-A station of a tube that no own point lies on is hidden, or it is empty although the camera sees it."""
+A station of a tube that no own point lies on is hidden, or it is empty although the camera sees it.
+"""
 
 from __future__ import annotations
 
