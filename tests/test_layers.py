@@ -16,7 +16,7 @@ PACKAGE = Path(__file__).parents[1] / NAME
 LAYERS = (
     ("errors", "version"),
     ("registry",),  # it raises errors, so the two cannot share a layer
-    ("options", "files", "least_squares", "interruption", "progress", "display"),
+    ("options", "files", "least_squares", "interruption", "progress", "display", "serialization"),
     ("parallel",),
     ("model",),
     ("effects", "sensors"),

@@ -26,6 +26,7 @@ from yid_ocp.parallel import InlineExecutor, Task, WorkerConfig, require_task_va
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.animation import ModelTrajectory, make_animation
 from yid_ocp.report.summaries import track_summary
+from yid_ocp.serialization import from_plain_data, to_plain_data
 from yid_ocp.vision.calibration import CameraCalibration
 from yid_ocp.vision.camera_registration import (
     CLOCK_DRIFT_INDEX,
@@ -42,15 +43,7 @@ from yid_ocp.vision.frames import FrameSequence, look_at_pose
 from yid_ocp.vision.sequence_calibration import DimensionCheck, ForeignObject, SequenceCalibration
 from yid_ocp.vision.surface_meshes import CameraScene
 from yid_ocp.vision.track import FrameTracker
-from yid_ocp.vision.track_result import (
-    FrameReport,
-    TrackResult,
-    count_drop_reasons,
-    draw_frame_stages,
-    draw_track,
-    from_plain_data,
-    to_plain_data,
-)
+from yid_ocp.vision.track_result import FrameReport, TrackResult, count_drop_reasons, draw_frame_stages, draw_track
 from yid_ocp.vision.virtual_camera import DepthCamera, FrameTiming, VirtualCamera, VirtualFrames, render_virtual_frames
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.command_runner import CommandResult, run_and_print, workers_from_arguments
