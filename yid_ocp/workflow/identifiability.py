@@ -41,8 +41,8 @@ from yid_ocp.parallel import Task, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.summaries import identifiability_summary
-from yid_ocp.solvers import Iterate, Solution, Status, solve
 from yid_ocp.serialization import from_plain_data, to_plain_data
+from yid_ocp.solvers import Iterate, Solution, Status, solve
 from yid_ocp.workflow.build import build_step, build_system, system_with_second_arm
 from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.command_runner import CommandResult, run_and_print, workers_from_arguments
