@@ -22,6 +22,8 @@ import annotated_types
 from yid_ocp.errors import ConfigError
 from yid_ocp.registry import Registry
 
+PositiveFloat = Annotated[float, annotated_types.Gt(0)]
+Fraction = Annotated[float, annotated_types.Ge(0), annotated_types.Le(1)]
 _BOUND_MARKERS = (
     (annotated_types.Gt, "gt", operator.gt, "above"),
     (annotated_types.Ge, "ge", operator.ge, "from"),

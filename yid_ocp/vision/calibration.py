@@ -22,7 +22,7 @@ from annotated_types import Ge, Gt, Le
 from numpy.typing import NDArray
 
 from yid_ocp.errors import DataError
-from yid_ocp.options import OptionInfo, check_option_bounds
+from yid_ocp.options import OptionInfo, PositiveFloat, check_option_bounds
 from yid_ocp.vision.camera_registration import (
     CLOCK_DRIFT_INDEX,
     CLOCK_OFFSET_INDEX,
@@ -71,14 +71,13 @@ class CameraClockOptions:
         float, Ge(0), OptionInfo("how far from there the offset is looked for; 0 to take it as it is", "s")
     ] = 0.5
     drift_prior_std: Annotated[
-        float, Gt(0), OptionInfo("standard deviation of the drift of the camera's clock, in seconds per second")
+        PositiveFloat, OptionInfo("standard deviation of the drift of the camera's clock, in seconds per second")
     ] = 1e-3
-    max_offset_std: Annotated[float, Gt(0), OptionInfo("an offset of larger standard deviation is not used", "s")] = (
+    max_offset_std: Annotated[PositiveFloat, OptionInfo("an offset of larger standard deviation is not used", "s")] = (
         0.02
     )
     max_stamp_delay: Annotated[
-        float,
-        Gt(0),
+        PositiveFloat,
         OptionInfo(
             "a frame whose own offset differs from the common one by more, and by more than four standard deviations, "
             "is dropped",
@@ -221,15 +220,15 @@ class CameraCalibrationOptions:
         int, Ge(_LEAST_FRAMES), OptionInfo("so many, spread over the sequence, are compared with the arm")
     ] = 24
     rotation_prior_std: Annotated[
-        float, Gt(0), OptionInfo("standard deviation of the told directions, about each axis", "rad")
+        PositiveFloat, OptionInfo("standard deviation of the told directions, about each axis", "rad")
     ] = 0.06
     translation_prior_std: Annotated[
-        float, Gt(0), OptionInfo("standard deviation of the told place, along each axis", "m")
+        PositiveFloat, OptionInfo("standard deviation of the told place, along each axis", "m")
     ] = 0.04
-    depth_scale_prior_std: Annotated[float, Gt(0), OptionInfo("standard deviation of the scale of its depth")] = 0.03
-    depth_offset_prior_std: Annotated[float, Gt(0), OptionInfo("standard deviation of an offset of its depth", "m")] = (
-        0.01
-    )
+    depth_scale_prior_std: Annotated[PositiveFloat, OptionInfo("standard deviation of the scale of its depth")] = 0.03
+    depth_offset_prior_std: Annotated[
+        PositiveFloat, OptionInfo("standard deviation of an offset of its depth", "m")
+    ] = 0.01
     min_visible_fraction: Annotated[
         float,
         Gt(0),

@@ -20,7 +20,7 @@ from typing import Annotated
 
 import casadi as ca
 import numpy as np
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import ConfigError, DataError
@@ -28,7 +28,7 @@ from yid_ocp.least_squares import LocalQuadraticModel, minimize_by_damped_newton
 from yid_ocp.model.kinematics import Kinematics, forward_kinematics
 from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System
-from yid_ocp.options import OptionInfo, check_option_bounds
+from yid_ocp.options import Fraction, OptionInfo, PositiveFloat, check_option_bounds
 from yid_ocp.vision.initial_shapes import EndAnchor, InitialShapeFinder
 from yid_ocp.vision.shape_evidence import (
     CloudObservation,
@@ -63,48 +63,42 @@ class ShapeFitOptions:
     """Settings of the shape fit."""
 
     node_loss_scales: Annotated[
-        tuple[Annotated[float, Gt(0)], ...],
+        tuple[PositiveFloat, ...],
         OptionInfo(
             "scale of the robust loss on the nodes, pass after pass: wide first, to catch a start some decimetres off",
             "m",
         ),
     ] = (0.15, 0.05)
     surface_loss_scales: Annotated[
-        tuple[Annotated[float, Gt(0)], ...],
+        tuple[PositiveFloat, ...],
         OptionInfo(
             "the same on the points of the cloud; empty for a fit to the nodes alone, as in the source paper", "m"
         ),
     ] = (0.03, 0.015)
     surface_noise_std: Annotated[
-        float, Gt(0), OptionInfo("standard deviation of one averaged point's distance from the surface", "m")
+        PositiveFloat, OptionInfo("standard deviation of one averaged point's distance from the surface", "m")
     ] = 0.006
     correlated_points: Annotated[
-        float, Gt(0), OptionInfo("of how many points the errors are alike; divides the weight of all points together")
+        PositiveFloat, OptionInfo("of how many points the errors are alike; divides the weight of all points together")
     ] = 8.0
     grasp_position_std: Annotated[
-        float, Gt(0), OptionInfo("standard deviation between a gripper, by its joint angles, and what it holds", "m")
+        PositiveFloat, OptionInfo("standard deviation between a gripper, by its joint angles, and what it holds", "m")
     ] = 0.004
     grasp_direction_std: Annotated[
-        float, Gt(0), OptionInfo("the same of the axes that grasps of kind axis and weld make coincide", "rad")
+        PositiveFloat, OptionInfo("the same of the axes that grasps of kind axis and weld make coincide", "rad")
     ] = 0.05
     bend_prior_std: Annotated[
-        float,
-        Gt(0),
+        PositiveFloat,
         OptionInfo("bend of a joint of mean stiffness that costs as much as one standard deviation", "rad"),
     ] = 0.3
     max_iterations: Annotated[int, Ge(1), OptionInfo("at most so many in a pass")] = 25
-    max_point_weight: Annotated[float, Gt(0), OptionInfo("a point counts at most for so many of the camera's")] = 6.0
+    max_point_weight: Annotated[PositiveFloat, OptionInfo("a point counts at most for so many of the camera's")] = 6.0
     min_link_coverage: Annotated[
-        float,
-        Ge(0),
-        Le(1),
+        Fraction,
         OptionInfo("a link with points along a smaller fraction of its length is hidden, or not where the fit has it"),
     ] = 0.5
     min_tube_coverage: Annotated[
-        float,
-        Ge(0),
-        Le(1),
-        OptionInfo("a tube with points on a smaller share of its visible length is not where the fit has it"),
+        Fraction, OptionInfo("a tube with points on a smaller share of its visible length is not where the fit has it")
     ] = 0.75
 
     def __post_init__(self) -> None:

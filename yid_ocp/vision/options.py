@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge
 
-from yid_ocp.options import OptionInfo, check_option_bounds
+from yid_ocp.options import Fraction, OptionInfo, PositiveFloat, check_option_bounds
 from yid_ocp.vision.calibration import CameraCalibrationOptions, CameraClockOptions
 from yid_ocp.vision.fit import ShapeFitOptions
 from yid_ocp.vision.point_cloud import CloudFilterOptions, Coordinates, SkeletonOptions
@@ -47,22 +47,20 @@ class TrackOptions:
         ),
     ] = ()
     max_distance_in_radii: Annotated[
-        float,
-        Gt(0),
+        PositiveFloat,
         OptionInfo(
             "a frame whose points are further from the fitted shape on average, beyond their noise, is dropped; in "
             "radii of the tubes"
         ),
     ] = 0.5
     max_bend_angle: Annotated[
-        float, Gt(0), OptionInfo("a frame whose shape has a joint that is bent further is dropped", "rad")
+        PositiveFloat, OptionInfo("a frame whose shape has a joint that is bent further is dropped", "rad")
     ] = 1.2
     max_distance_ratio: Annotated[
-        float, Gt(0), OptionInfo("a frame whose distance is so many times the median of all good frames is dropped")
+        PositiveFloat, OptionInfo("a frame whose distance is so many times the median of all good frames is dropped")
     ] = 1.7
     max_grasp_gap_change: Annotated[
-        float,
-        Gt(0),
+        PositiveFloat,
         OptionInfo(
             "a frame in which an end is further from the gripper that holds it than usual by more is dropped: its time "
             "is not what its stamp says",
@@ -70,17 +68,13 @@ class TrackOptions:
         ),
     ] = 0.008
     min_visible_coverage: Annotated[
-        float,
-        Ge(0),
-        Le(1),
-        OptionInfo("a frame with points on a smaller share of the object's visible length is dropped"),
+        Fraction, OptionInfo("a frame with points on a smaller share of the object's visible length is dropped")
     ] = 0.6
     max_point_std: Annotated[
-        float, Gt(0), OptionInfo("a point that is known less well in a frame counts as not seen there", "m")
+        PositiveFloat, OptionInfo("a point that is known less well in a frame counts as not seen there", "m")
     ] = 0.02
     min_point_std: Annotated[
-        float,
-        Gt(0),
+        PositiveFloat,
         OptionInfo("standard deviation that no fit is better than, of straight links in place of a curve", "m"),
     ] = 0.002
     stamp_std: Annotated[

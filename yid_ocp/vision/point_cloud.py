@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
-from yid_ocp.options import OptionInfo, check_option_bounds
+from yid_ocp.options import Fraction, OptionInfo, PositiveFloat, check_option_bounds
 from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, numeric_mechanism
 
 Array = NDArray[np.float64]
@@ -50,10 +50,9 @@ class WeightedCloud:
 class CloudFilterOptions:
     """Settings of the filters that select the object's points."""
 
-    voxel_size: Annotated[float, Gt(0), OptionInfo("edge of the cubes in which points are averaged", "m")] = 0.008
+    voxel_size: Annotated[PositiveFloat, OptionInfo("edge of the cubes in which points are averaged", "m")] = 0.008
     robot_padding: Annotated[
-        float,
-        Gt(0),
+        PositiveFloat,
         OptionInfo(
             "points this near to the robot's surface belong to it; about five standard deviations of the depth", "m"
         ),
@@ -72,8 +71,7 @@ class CloudFilterOptions:
     ] = None
     floor_margin: Annotated[float, OptionInfo("height above the foot of an object", "m")] = 0.05
     reach_margin: Annotated[
-        float,
-        Gt(0),
+        PositiveFloat,
         OptionInfo(
             "points further from the object's root than its longest branch reaches, plus this, are left out", "m"
         ),
@@ -105,8 +103,7 @@ class CloudFilterOptions:
         int, Ge(1), OptionInfo("of every point, whose mean distance tells whether it is alone")
     ] = 12
     outlier_z_max: Annotated[
-        float,
-        Gt(0),
+        PositiveFloat,
         OptionInfo(
             "a point is an outlier where that distance exceeds the median by so many (robust) standard deviations"
         ),
@@ -315,17 +312,14 @@ class SkeletonOptions:
 
     segment_neighbours: Annotated[int, Ge(2), OptionInfo("points of a segment, k1 in the source paper")] = 50
     neighbour_radius: Annotated[
-        float,
-        Gt(0),
+        PositiveFloat,
         OptionInfo("points further away are no neighbours; somewhat more than the thickest tube's diameter", "m"),
     ] = 0.07
     min_segment_points: Annotated[int, Ge(1), OptionInfo("a segment of fewer points gives no node")] = 15
     node_neighbours: Annotated[int, Ge(1), OptionInfo("neighbours of a node in the graph")] = 4
-    max_edge_length: Annotated[float, Gt(0), OptionInfo("nodes further apart are not joined", "m")] = 0.15
+    max_edge_length: Annotated[PositiveFloat, OptionInfo("nodes further apart are not joined", "m")] = 0.15
     min_component_fraction: Annotated[
-        float,
-        Ge(0),
-        Le(1),
+        Fraction,
         OptionInfo("a connected part of the graph that holds a smaller fraction of the points is not the object"),
     ] = 0.04
 

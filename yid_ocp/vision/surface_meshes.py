@@ -24,12 +24,11 @@ from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import resolve_urdf_path
-from yid_ocp.options import OptionInfo
+from yid_ocp.options import OptionInfo, PositiveFloat
 from yid_ocp.vision.frames import CameraIntrinsics, import_open3d
 
 Array = NDArray[np.float64]
 MeshKind = Literal["visual", "collision"]
-_PositiveLength = Annotated[float, Gt(0)]
 _Triple = tuple[float, float, float]
 
 _FACETS = 48  # of a tube: the surface is then within 0.2 % of the radius
@@ -47,11 +46,11 @@ class ExtraMesh:
     parent_frame: Annotated[str | None, OptionInfo("link of the robot that carries it; null for the world")] = None
     mesh: Annotated[str | None, OptionInfo("file that trimesh reads, in metres: STL, OBJ, DAE", is_path=True)] = None
     box: Annotated[
-        tuple[_PositiveLength, _PositiveLength, _PositiveLength] | None,
+        tuple[PositiveFloat, PositiveFloat, PositiveFloat] | None,
         OptionInfo("in place of a file: edges along x, y, z", "m"),
     ] = None
     cylinder: Annotated[
-        tuple[_PositiveLength, _PositiveLength] | None, OptionInfo("the same: radius and length along z", "m")
+        tuple[PositiveFloat, PositiveFloat] | None, OptionInfo("the same: radius and length along z", "m")
     ] = None
     sphere: Annotated[float | None, Gt(0), OptionInfo("the same: radius", "m")] = None
     xyz: Annotated[_Triple, OptionInfo("of its middle in the link", "m")] = (0.0, 0.0, 0.0)
