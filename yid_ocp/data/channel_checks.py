@@ -314,10 +314,8 @@ def median_edge_lengths(
     for edge in edges:
         seen = []
         for recording in recordings:
-            difference = (
-                _measured_positions(recording, edge[1])[:frames] - _measured_positions(recording, edge[0])[:frames]
-            )
-            length = np.linalg.norm(difference, axis=1)
+            begin, end = (_measured_positions(recording, point)[:frames] for point in edge)
+            length = np.linalg.norm(end - begin, axis=1)
             if np.any(np.isfinite(length)):
                 seen.append(float(np.nanmean(length)))
         if not seen:
@@ -331,6 +329,5 @@ def _measured_positions(recording: Recording, point: str) -> Array:
     for group in recording.points:
         if point in group.names:
             return group.position[:, group.names.index(point)]
-    raise DataError(
-        f"point '{point}' is not recorded", where=recording.name, hint=nearest_name_hint(point, recording.point_names)
-    )
+    hint = nearest_name_hint(point, recording.point_names)
+    raise DataError(f"point '{point}' is not recorded", where=recording.name, hint=hint)

@@ -60,14 +60,14 @@ class Issue:
     weight: Severity
     evidence: float  # how many times what was seen exceeds the limit from which on it counts, 1 to `MAX_LIMIT_RATIO`
     advice: str  # what to do
-    # Where; empty for all of them
+    # where; empty for all of them
     recording: str
     group: str = ""
     channel: str = ""
     # stretch of time on the group's clock [s]; all of it when absent
     begin: float | None = None
     end: float | None = None
-    setting: str = ""  # Line of configuration that repairs or describes it, where there is one
+    setting: str = ""  # line of configuration that repairs or describes it, where there is one
 
     def __post_init__(self) -> None:
         if self.cause not in ISSUE_CAUSES:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from yid_ocp.data.readers.bags import damaged_bag_error
 from yid_ocp.errors import DataError, unknown_name_details
 from yid_ocp.vision.frame_folder import METRES_PER_UNIT, STAMP_FILE, read_frame_folder
 from yid_ocp.vision.frames import CameraIntrinsics, Colours, FrameSequence, import_open3d, validated_pose
@@ -88,14 +89,8 @@ class _Bag:
             self.reader: Any = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             self.reader.open()
         except Exception as error:  # rosbags lets through whatever a damaged file makes struct, sqlite3 or zstd raise
-            raise self._damaged(error) from error
+            raise damaged_bag_error(path, error) from error
         self.kinds: dict[str, str] = {c.topic: c.msgtype for c in self.reader.connections}
-
-    def _damaged(self, error: Exception) -> DataError:
-        what, where = f"the bag cannot be read ({type(error).__name__}: {error})", str(self.path)
-        allowed = "a ROS 1 .bag, a ROS 2 folder with metadata.yaml, or an .mcap or .db3 file of ROS 2"
-        hint = "check with `ros2 bag info` or `rosbag info`; a bag cut off by a crash needs `ros2 bag reindex`"
-        return DataError(what, where=where, allowed=allowed, hint=hint)
 
     def _of(self, topic: str) -> list[Any]:
         return [c for c in self.reader.connections if c.topic == topic]
@@ -112,7 +107,7 @@ class _Bag:
                 logs.append(logged)
             first = [_first(self.reader, c) for c in self.reader.connections if c.msgtype == _JOINT_STATE_MESSAGE]
         except Exception as error:
-            raise self._damaged(error) from error
+            raise damaged_bag_error(self.path, error) from error
         joints = [entry for entry in first if entry is not None]
         # one message without a stamp makes the two clocks incomparable, so then no stamp is used
         stamped = all(stamp > 0 for stamp in [*stamps, *(stamp for _, stamp in joints)])
@@ -129,7 +124,7 @@ class _Bag:
                 if number == place.before:
                     return self.reader.deserialize(data, connection.msgtype)
         except Exception as error:
-            raise self._damaged(error) from error
+            raise damaged_bag_error(self.path, error) from error
         raise DataError("the bag has changed since it was opened", where=str(self.path))
 
     def first(self, topic: str) -> Any:
@@ -138,7 +133,7 @@ class _Bag:
             for connection, _, data in self.reader.messages(self._of(topic)):
                 return self.reader.deserialize(data, connection.msgtype)
         except Exception as error:
-            raise self._damaged(error) from error
+            raise damaged_bag_error(self.path, error) from error
         raise DataError(f"there is no message on the topic '{topic}'", where=str(self.path))
 
     def depth_unit(self, topic: str) -> float:

@@ -145,13 +145,10 @@ def read_bag(
     groups, notes, used = _joints(bag, joint_topics, command_topic, joints, str(path))
     seen = _named_places(bag, points, str(path))
     if not groups and not seen:
-        raise DataError(
-            "the bag has no joint states and no points",
-            where=str(path),
-            allowed=f"topics of the types {', '.join((*_KNOWN, _TREES[0]))}",
-            hint="it holds "
-            + (", ".join(f"{topic.name} ({topic.kind})" for topic in bag.topics) or "no topics at all"),
-        )
+        allowed = f"topics of the types {', '.join((*_KNOWN, _TREES[0]))}"
+        held = ", ".join(f"{topic.name} ({topic.kind})" for topic in bag.topics) or "no topics at all"
+        what = "the bag has no joint states and no points"
+        raise DataError(what, where=str(path), allowed=allowed, hint=f"it holds {held}")
     messages = [*(m for entry in groups for m in entry.messages), *(m for entries in seen.values() for _, m in entries)]
     seconds = _clock(messages)
     joint_group, more = _on_one_clock(groups, seconds, str(path))
@@ -215,9 +212,8 @@ def _bag(path: Path, trees: Sequence[str] | None, progress: Progress) -> _Bag:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
-        raise DataError(
-            "reading bags needs the package rosbags", where=str(path), hint="pip install 'yid-ocp[bags]'"
-        ) from error
+        hint = "pip install 'yid-ocp[bags]'"
+        raise DataError("reading bags needs the package rosbags", where=str(path), hint=hint) from error
     states: list[_Message] = []
     places: list[_Message] = []
     wanted_kinds = _KNOWN if trees is not None and not trees else (*_KNOWN, *_TREES)
@@ -243,14 +239,17 @@ def _bag(path: Path, trees: Sequence[str] | None, progress: Progress) -> _Bag:
                 message = _Message(connection.topic, int(logged), _stamp(content), _plain(content, connection.msgtype))
                 (states if connection.msgtype == _JOINT_STATE else places).append(message)
     except Exception as error:  # rosbags lets through whatever a damaged file makes struct, sqlite3 or zstd raise
-        raise DataError(
-            f"the bag cannot be read ({type(error).__name__}: {error})",
-            where=str(path),
-            allowed="a ROS 1 .bag, a ROS 2 folder with metadata.yaml, or an .mcap or .db3 file of ROS 2",
-            hint="check with `ros2 bag info` or `rosbag info`; a bag cut off by a crash needs `ros2 bag reindex`",
-        ) from error
+        raise damaged_bag_error(path, error) from error
     topics = tuple(_Topic(topic, kind, count) for (topic, kind), count in sorted(counted.items()))
     return _Bag(topics, tuple(states), tuple(places))
+
+
+def damaged_bag_error(path: Path, error: Exception) -> DataError:
+    """Error that says that a bag cannot be read and what to do."""
+    what, where = f"the bag cannot be read ({type(error).__name__}: {error})", str(path)
+    allowed = "a ROS 1 .bag, a ROS 2 folder with metadata.yaml, or an .mcap or .db3 file of ROS 2"
+    hint = "check with `ros2 bag info` or `rosbag info`; a bag cut off by a crash needs `ros2 bag reindex`"
+    return DataError(what, where=where, allowed=allowed, hint=hint)
 
 
 def _stamp(content: Any) -> int:
