@@ -28,10 +28,10 @@ import yid_ocp as yid
 from yid_ocp.data.channel_checks import median_edge_lengths
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
-from yid_ocp.model.cable import (
+from yid_ocp.model.objects.base import CableTopology
+from yid_ocp.model.objects.cable import (
     CableBranchOptions,
     CableOptions,
-    CableTopology,
     cable_system,
     edge_length_parameters,
     estimable_parameters,

@@ -17,9 +17,9 @@ from make_recordings import TRAVEL, TRUTH, compress
 import yid_ocp
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.model import Grasp, System, flexible_object
+from yid_ocp.model.objects.foam_y import y_segments
 from yid_ocp.model.rotations import transform_from_xyz_rpy
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.model.y_object import y_segments
 from yid_ocp.virtual.experiment import VirtualExperiment, run_virtual_experiment
 from yid_ocp.virtual.joint_motion import BAXTER_ARM_JOINTS, MultisineOptions, grasping_joint_angles, random_multisine
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions

@@ -33,9 +33,9 @@ from scipy.spatial.transform import Rotation
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import YidError
+from yid_ocp.model.objects.foam_y import y_object
 from yid_ocp.model.system import Grasp, System
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.model.y_object import y_object
 from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.virtual.joint_motion import BAXTER_ARM_JOINTS, MultisineOptions, grasping_joint_angles, random_multisine
 from yid_ocp.virtual.mjcf import compile_mjcf, mujoco_xml

@@ -20,8 +20,8 @@ from pendulum_run import pendulum_data as pendulum_data
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.integrator.step_model import RolloutInputs
 from yid_ocp.model import Grasp, System
+from yid_ocp.model.objects.foam_y import y_object
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.model.y_object import y_object
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 SIDES = {"single": ("left",), "dual": ("left", "right")}

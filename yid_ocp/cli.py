@@ -198,13 +198,15 @@ def _init(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("files", metavar="FILE", nargs="+", help=text)
     parser.add_argument("--out", metavar="CONFIG.yaml", required=True, help="configuration to write")
     parser.add_argument("--replace", action="store_true", help="write over files that are there")
-    kinds = ("cable", "beam", "tree", "foam_y")
-    parser.add_argument("--object", choices=kinds, required=True, help="what is held; y is the foam Y of the paper")
+    text = "what is held, such as cable, beam, tree or foam_y, the paper's; an unknown word lists all"
+    parser.add_argument("--object", metavar="KIND", required=True, help=text)
     for name, text in (("length", "[m]"), ("mass", "[kg]"), ("radius", "[m]")):
         parser.add_argument(
             f"--{name}", type=float, metavar="NUMBER", help=f"of the object, of each equal branch {text}"
         )
     parser.add_argument("--section", metavar="X,Y", help="extents of a rectangular cross section [m], not a radius")
+    text = "further number of some kinds of objects; an unknown name lists them; may be repeated"
+    parser.add_argument("--number", metavar="NAME=VALUE", action="append", default=[], help=text)
     parser.add_argument("--links", type=int, metavar="NUMBER", help="rigid links of each segment")
     parser.add_argument("--branches", type=int, metavar="NUMBER", help="of a tree: equal ones, in a star")
     text = "of a tree: NAME=LENGTH,MASS,RADIUS[,ROLL,PITCH,YAW]; NAME@PARENT grows on PARENT's end; may be repeated"

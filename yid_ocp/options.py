@@ -48,10 +48,14 @@ class OptionInfo:
 
 @dataclass(frozen=True)
 class RegistryChoice:
-    """Annotation of a type: the user chooses a class of a registry by the key `name`, or by a mapping's key."""
+    """Annotation of a type: the user chooses a class of a registry by `selector_key`, or by a mapping's key.
+
+    Another key than `name` is a field of every class as well.
+    """
 
     registry: Registry[Any]
     default_name: str = ""
+    selector_key: str = "name"
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from yid_ocp.analysis.data_quality import (
 from yid_ocp.analysis.data_quality.clock_synchronization import clock_sensitivities, estimate_clock_error
 from yid_ocp.data import read_recording
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
-from yid_ocp.model.cable import CableTopology
+from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import example_robot_urdf, read_urdf
 from yid_ocp.problem.options import SensorOptions

@@ -28,9 +28,9 @@ from yid_ocp.errors import DataError, SolverError
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Grasp, System
 from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.objects.foam_y import y_object
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.model.y_object import y_object
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 
 

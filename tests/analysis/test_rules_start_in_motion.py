@@ -9,7 +9,7 @@ import pytest
 
 from yid_ocp.analysis import cable_memory_check as module
 from yid_ocp.analysis.cable_memory_check import decide_cable_memory
-from yid_ocp.model.cable import START_SPEED_PARAMETER
+from yid_ocp.model.objects.cable import START_SPEED_PARAMETER
 
 
 class Means:

@@ -8,9 +8,9 @@ import pytest
 from ruamel.yaml import YAML
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import CableSettings, DiagnosisSettings, ProblemSettings, dump_config
+from yid_ocp.config.settings import DiagnosisSettings, ProblemSettings, dump_config
 from yid_ocp.diagnosis import Thresholds
-from yid_ocp.model.cable import CableOptions
+from yid_ocp.model.objects.cable import Cable, CableOptions
 from yid_ocp.problem import ProblemOptions, SensorOptions
 from yid_ocp.solvers import GaussNewton
 
@@ -54,7 +54,7 @@ def test_no_section_repeats_the_options_of_another_package():
     for section, options in (
         (ProblemSettings, ProblemOptions),
         (DiagnosisSettings, Thresholds),
-        (CableSettings, CableOptions),
+        (Cable, CableOptions),
     ):
         own = section.__annotations__
         assert not set(own) & {field.name for field in dataclasses.fields(options)}

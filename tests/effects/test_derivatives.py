@@ -20,7 +20,7 @@ STEPS = 4
 def somewhere(effect) -> dict[str, float]:
     """Values well inside the expected ranges, away from neutral."""
     values = {}
-    for i, (name, (low, high)) in enumerate(effect.prior_range.items()):
+    for i, (name, (low, high)) in enumerate(effect.prior_ranges.items()):
         share = (0.3, 0.65, 0.8)[i % 3]
         values[name] = low + share * (high - low)
     return values
@@ -34,8 +34,8 @@ def at(bench, effects, where: str) -> SimpleNamespace:
         values |= somewhere(effect)
     start = bench.start(step)
     run = bench.run(step, values, names, start, STEPS)
-    assert run.rollout.status.ok, run.rollout.status.message
-    widths = {name: high - low for effect in effects for name, (low, high) in effect.prior_range.items()}
+    assert run.rollout.status.is_converged, run.rollout.status.message
+    widths = {name: high - low for effect in effects for name, (low, high) in effect.prior_ranges.items()}
     return SimpleNamespace(bench=bench, step=step, names=names, values=values, start=start, run=run, widths=widths)
 
 

@@ -360,14 +360,14 @@ def read(system: System, effects, sensor, q=None, effort=None) -> np.ndarray:
 class Encoder:
     """Measured angle of the hinge, which the library's effects change as well."""
 
-    group: str = "joints.position"
-    channels: tuple[str, ...] = ("joints.position.left_a",)
+    group_name: str = "joints.position"
+    channel_names: tuple[str, ...] = ("joints.position.left_a",)
     unit: str = "rad"
-    width: int = 1
-    frames: tuple[str, ...] = ()
-    camera: Placement | None = None
+    outputs_per_channel: int = 1
+    frame_names: tuple[str, ...] = ()
+    camera_pose: Placement | None = None
 
-    def output(self, state: NodeState) -> ca.SX:
+    def ideal_reading(self, state: NodeState) -> ca.SX:
         return state.q
 
 

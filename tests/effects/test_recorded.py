@@ -40,7 +40,7 @@ def recording(bench, effort: bool = True, camera: bool = True) -> Recording:
     t = H * np.arange(STEPS + 1)
     ramp = np.minimum(t / 0.1, 1.0)[:, None] ** 2
     position = bench.posture + 0.02 * ramp * np.sin(14 * t[:, None] + np.arange(3))
-    load = np.array([0.5, -3.0, 1.0]) if not len(bench.rest.torque) else bench.rest.torque
+    load = np.array([0.5, -3.0, 1.0]) if not len(bench.rest.holding_torque) else bench.rest.holding_torque
     torque = load + 0.4 * ramp * np.sin(11 * t[:, None] + 2 * np.arange(3))
     joints = JointGroup(
         NAMES, t, position, effort=torque if effort else None, position_std=1e-4, effort_std=0.05, effort_kind="command"
@@ -173,7 +173,7 @@ def test_a_late_camera_sees_the_past(driven, sensors) -> None:
     moved = episode.measurements[at]
     assert late.predicted_outputs[1 - at] == pytest.approx(now.predicted_outputs[1 - at], abs=1e-9)
     position = np.maximum(moved.node + moved.fraction - 3.0, 0.0)
-    n = driven.system.size
+    n = driven.system.n_coordinates
     function = sensor_function(task.system, sensors.camera, ())
     nodes = np.array([np.array(function(s[:n], [], np.zeros(n), task.theta)[0]).ravel() for s in now.rollout.state])
     for k in range(6):

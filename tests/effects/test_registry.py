@@ -49,7 +49,7 @@ def test_the_vocabulary_is_the_shared_one(shared) -> None:
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line.startswith("|")]
     table = {row[0]: row for row in rows[2:]}
     described = {kind.strip() for name in table for kind in name.split(",")}
-    assert set(EFFECTS) == described
+    assert set(EFFECTS) <= described  # the vocabulary is ahead: kinds of later work stand there as well
     servos, system = with_servos(), baxter_foam_y_system(1)
     places = {kind: (servos, place) for kind, place in candidate_effects(servos, SENSOR_KINDS)}
     places |= {kind: (system, place) for kind, place in candidate_effects(system, SENSOR_KINDS)}

@@ -14,8 +14,8 @@ from placed_frames import numbers, positions
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model import Segment, flexible_object
 from yid_ocp.model.flexible import polyline_rotations
+from yid_ocp.model.objects.foam_y import y_object
 from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
-from yid_ocp.model.y_object import y_object
 
 
 def stiffness(item, values=None):
@@ -49,7 +49,7 @@ def test_unequal_links():
 
 def test_rigidity_becomes_stiffness_by_the_lengths_about_a_joint():
     lengths = [0.1, 0.3, 0.2]
-    shared = {"bend": 2.0, "twist": 1.5, "damping": 0.1, "rigidity": True, "link_lengths": lengths}
+    shared = {"bend": 2.0, "twist": 1.5, "damping": 0.1, "stiffness_per_curvature": True, "link_lengths": lengths}
     trunk = Segment("A", 0.0, 0.6, 0.01, clamped_at_base=True, **shared)
     branch = Segment("B", 0.0, 0.6, 0.01, parent="A", parent_link_index=1, twist_damping=0.3, **shared)
     held = Segment("D", 0.0, 0.6, 0.01, parent="A", clamped_at_base=True, **shared)
@@ -170,13 +170,13 @@ WRONG = {
     "no_links": ({"links": 0}, ["links = 0"]),
     "empty_link": ({"link_lengths": [0.1, 0.0]}, ["a link has no length"]),
     "no_link_lengths": ({"link_lengths": []}, ["a link has no length"]),
-    "rotations": ({"links": 3, "link_rotations": [np.eye(3)]}, ["1 link rotations for 3 links", "2"]),
-    "at_link": ({"parent": "T1", "at_link": 4}, ["at_link = 4", "0 to 3"]),
-    "joint_order": ({"joint_order": "xxz"}, ["joint_order = 'xxz'", "x, y, z, each at most once"]),
-    "no_axis": ({"joint_order": ""}, ["joint_order = ''"]),
-    "two_sections": ({"section": (0.1, 0.2)}, ["a radius or a section"]),
+    "rotations": ({"links": 3, "link_rest_rotations": [np.eye(3)]}, ["1 link rotations for 3 links", "2"]),
+    "parent_link": ({"parent": "T1", "parent_link_index": 4}, ["parent_link_index = 4", "0 to 3"]),
+    "joint_axes": ({"joint_axes": "xxz"}, ["joint_axes = 'xxz'", "x, y, z, each at most once"]),
+    "no_axis": ({"joint_axes": ""}, ["joint_axes = ''"]),
+    "two_sections": ({"cross_section": (0.1, 0.2)}, ["a radius or a section"]),
     "no_section": ({"radius": None}, ["a radius or a section"]),
-    "flat_section": ({"radius": None, "section": (0.0, 0.2)}, ["section[0] = 0.0", "positive"]),
+    "flat_section": ({"radius": None, "cross_section": (0.0, 0.2)}, ["cross_section[0] = 0.0", "positive"]),
     "same_name": ({"name": "T1"}, ["two segments are called 'T1'"]),
 }
 

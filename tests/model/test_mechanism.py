@@ -8,9 +8,9 @@ import pytest
 
 from yid_ocp.errors import ModelError
 from yid_ocp.model.mechanism import Inertia, merge_bodies
+from yid_ocp.model.objects.foam_y import y_object
 from yid_ocp.model.rotations import homogeneous_transform, transform_from_xyz_rpy
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.model.y_object import y_object
 
 
 def numbers(expression) -> np.ndarray:

@@ -10,7 +10,8 @@ import pytest
 
 from yid_ocp.errors import ModelError
 from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object, forward_kinematics
-from yid_ocp.model.cable import CableTopology, cable_system
+from yid_ocp.model.objects.base import CableTopology
+from yid_ocp.model.objects.cable import cable_system
 from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 
 

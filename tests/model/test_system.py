@@ -21,10 +21,10 @@ from yid_ocp.model import (
     forward_kinematics,
 )
 from yid_ocp.model.mechanism import merge_bodies
+from yid_ocp.model.objects.foam_y import y_object
 from yid_ocp.model.rotations import rotation_from_rpy
 from yid_ocp.model.system import floating_clamp
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.model.y_object import y_object
 
 
 def numbers(expression) -> np.ndarray:
@@ -125,15 +125,15 @@ class Heavier:
 
     def __init__(self):
         self.parameters = Parameters([Parameter("heavier@world.fraction", 0.0, "1")])
-        self.internal = {}
+        self.internal_coordinates = {}
 
-    def modify(self, system):
+    def apply_to_system(self, system):
         return replace(system, gravity=system.gravity * (1 + self.parameters.symbols[0]))
 
-    def terms(self, state):
+    def step_terms(self, state):
         return StepTerms()
 
-    def measure(self, channel, output, state):
+    def distorted_reading(self, channel, output, state):
         return output
 
 

@@ -15,10 +15,10 @@ from yid_ocp.errors import ModelError
 from yid_ocp.model import Mechanism
 from yid_ocp.model import urdf as urdf_files
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, merge_bodies
+from yid_ocp.model.objects.foam_y import y_object
 from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.system import floating_clamp
 from yid_ocp.model.urdf import mechanism_to_urdf, read_urdf, resolve_urdf_path
-from yid_ocp.model.y_object import y_object
 
 LINK = '<link name="{name}"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
 

@@ -10,8 +10,8 @@ from placed_frames import numbers, positions
 
 from yid_ocp.errors import OutputError
 from yid_ocp.model import flexible_object
+from yid_ocp.model.objects.foam_y import write_y_urdf, y_object, y_segments
 from yid_ocp.model.rotations import homogeneous_transform
-from yid_ocp.model.y_object import write_y_urdf, y_object, y_segments
 
 
 def test_the_paper_y():

@@ -12,10 +12,10 @@ from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import forward_kinematics
-from yid_ocp.model.cable import (
+from yid_ocp.model.objects.base import CableTopology
+from yid_ocp.model.objects.cable import (
     CableBranchOptions,
     CableOptions,
-    CableTopology,
     cable_system,
     edge_length_parameters,
     estimable_parameters,

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from small_problems import joints, recording, seen
 
 from yid_ocp.errors import DataError
-from yid_ocp.model.cable import ClampPath
+from yid_ocp.model.objects.base import ClampPath
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.recorded_inputs import (
     _smoothed_point_path,

@@ -15,8 +15,8 @@ from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Mechanism, Segment, System, flexible_object
 from yid_ocp.model.kinematics import mass_matrix
 from yid_ocp.model.mechanism import Joint, Placement
+from yid_ocp.model.objects.foam_y import y_object
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.model.y_object import y_object
 
 SEEDS = st.integers(0, 2**32 - 1)
 

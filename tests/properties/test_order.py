@@ -10,8 +10,8 @@ import pytest
 
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
+from yid_ocp.model.objects.foam_y import y_object
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.model.y_object import y_object
 
 # The foam's thin tubes twist too fast (70 000 1/s) for a time step in the range where the order shows: thicker, softer.
 SLOW_OBJECT = {

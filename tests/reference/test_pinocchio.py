@@ -10,8 +10,8 @@ import pytest
 
 from yid_ocp.model import Mechanism, forward_kinematics, rotations
 from yid_ocp.model.kinematics import lagrangian_second_derivatives, mass_matrix, rigid_body_derivatives
+from yid_ocp.model.objects.foam_y import y_object
 from yid_ocp.model.urdf import example_robot_urdf, read_urdf
-from yid_ocp.model.y_object import y_object
 
 pin = pytest.importorskip("pinocchio", reason="the reference needs Pinocchio: pip install pin")
 

@@ -12,10 +12,10 @@ SENSOR = EffortSensor(("left_b", "left_a"))
 
 def test_it_says_what_it_measures() -> None:
     assert isinstance(SENSOR, Sensor)
-    assert SENSOR.group == "joints.effort"
-    assert SENSOR.channels == ("joints.effort.left_b", "joints.effort.left_a")
-    assert (SENSOR.unit, SENSOR.width) == ("N m", 1)
-    assert (SENSOR.frames, SENSOR.camera) == ((), None)
+    assert SENSOR.group_name == "joints.effort"
+    assert SENSOR.channel_names == ("joints.effort.left_b", "joints.effort.left_a")
+    assert (SENSOR.unit, SENSOR.outputs_per_channel) == ("N m", 1)
+    assert (SENSOR.frame_names, SENSOR.camera_pose) == ((), None)
 
 
 def test_it_reads_the_efforts_of_its_joints_in_its_own_order(system, read) -> None:

@@ -22,16 +22,18 @@ class Drift:
     kind: str = "drift"
     location: str = "left"
     parameters: Parameters = field(default_factory=lambda: Parameters([Parameter(f"{LABEL}.gain", 0.2, "1")]))
-    internal: Mapping[str, ca.SX] = field(default_factory=lambda: {f"{LABEL}.memory": ca.SX.sym(f"{LABEL}.memory")})
+    internal_coordinates: Mapping[str, ca.SX] = field(
+        default_factory=lambda: {f"{LABEL}.memory": ca.SX.sym(f"{LABEL}.memory")}
+    )
 
-    def modify(self, system: System) -> System:
+    def apply_to_system(self, system: System) -> System:
         return system
 
-    def terms(self, state: MidpointState) -> StepTerms:
+    def step_terms(self, state: MidpointState) -> StepTerms:
         return StepTerms()
 
-    def measure(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
-        memory = self.internal[f"{LABEL}.memory"]
+    def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
+        memory = self.internal_coordinates[f"{LABEL}.memory"]
         return output + self.parameters[f"{LABEL}.gain"].symbol * (memory**2 + ca.sin(state.effort[0]))
 
 

@@ -7,8 +7,8 @@ import pytest
 from smooth_rods import EYE, TARGET, SmoothY, box, filmed, floor_and_wall, pole, seen
 
 from yid_ocp.errors import ConfigError, DataError, ModelError
+from yid_ocp.model.objects.foam_y import y_object
 from yid_ocp.model.system import System
-from yid_ocp.model.y_object import y_object
 from yid_ocp.vision import (
     CameraScene,
     CloudFilterOptions,

@@ -7,8 +7,8 @@ import pytest
 from smooth_rods import Y_LENGTHS, Y_RADII, SmoothY, filmed
 
 from yid_ocp.errors import DataError
+from yid_ocp.model.objects.foam_y import y_object
 from yid_ocp.model.system import System
-from yid_ocp.model.y_object import y_object
 from yid_ocp.vision import CameraScene, CloudFilterOptions, TrackOptions, track_object
 from yid_ocp.vision.sequence_calibration import DimensionCheck
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from yid_ocp.errors import ConfigError, DataError
+from yid_ocp.model.objects.foam_y import y_object
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.model.y_object import y_object
 from yid_ocp.vision import ShapeFitOptions, ShapeFitter
 from yid_ocp.vision.fit import _NODE_RADIUS_FRACTION, _Task
 from yid_ocp.vision.initial_shapes import EndAnchor

@@ -8,9 +8,11 @@ import pytest
 
 import yid_ocp as yid
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import FoamYSettings, SegmentedObjectSettings, dump_config
+from yid_ocp.config.settings import dump_config
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model import forward_kinematics
+from yid_ocp.model.objects.foam_y import FoamY
+from yid_ocp.model.objects.segmented import SegmentedObject
 from yid_ocp.workflow.build import arms_are_estimated_states, build_system, load_system
 from yid_ocp.workflow.build_problem import build_problem, load_problem, problem_options
 from yid_ocp.workflow.run_inputs import read_recordings
@@ -63,7 +65,7 @@ def test_an_object_of_segments_on_a_robots_hand(written):
             "parameters: {beam.bend: {initial: 1.3}, tip.damping: {initial: 0.001}}\n"
         )
     )
-    assert isinstance(run.model.object, SegmentedObjectSettings)
+    assert isinstance(run.model.object, SegmentedObject)
     system = build_system(run)
     assert system.n_coordinates == 7 + 15 + 6
     assert len(system.prescribed) == 7
@@ -98,7 +100,7 @@ def test_a_branch_stays_at_its_place_of_a_finer_parent(written):
 
 def test_more_links_keep_the_stiffness_of_a_tube(written):
     run = load_config(written("model: {object: {kind: foam_y, mount: {xyz: [0, 0, 1]}}, damping: 0.02}\n"))
-    assert isinstance(run.model.object, FoamYSettings)
+    assert isinstance(run.model.object, FoamY)
     finer = build_system(run, link_division=2)
     assert finer.parameters["T1.bend"].value == 6.0
     assert finer.parameters["T1.damping"].value == 0.04

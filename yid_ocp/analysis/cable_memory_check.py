@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from yid_ocp.inference.linearized_residual import bounded_least_squares_step
 from yid_ocp.inference.null_test import DEFAULT_GAP_CRITERIA, GapCriteria
-from yid_ocp.model.cable import START_SPEED_PARAMETER, START_SPEED_SCALE_PARAMETER
+from yid_ocp.model.objects.cable import START_SPEED_PARAMETER, START_SPEED_SCALE_PARAMETER
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import Solution, solve
 from yid_ocp.solvers.base import Solver

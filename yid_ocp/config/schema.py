@@ -13,6 +13,7 @@ from pydantic import TypeAdapter
 
 from yid_ocp.config.setting_keys import SectionVariants, section_variants
 from yid_ocp.config.settings import RunSettings
+from yid_ocp.model.objects import OBJECTS
 from yid_ocp.options import (
     Option,
     OptionInfo,
@@ -139,6 +140,7 @@ def _default(value: Any) -> str:
 
 
 SETTINGS_EXAMPLES: Mapping[str, str] = {
+    **{section: text for kind in OBJECTS for section, text in OBJECTS[kind].settings_examples.items()},
     "The file": """\
 description: A cable of 1 m, swung by a UR5
 model: {robot: package:ur5, object: {kind: segments, segments: {cable: {length: 1.0, mass: 0.1, radius: 0.005}}}}
@@ -186,51 +188,6 @@ model:
 model:
   frames:
     tool: {parent_frame: panda_link8, xyz: [0.0, 0.0, 0.12]}    # [m]
-""",
-    "model.object, kind: foam_y": """\
-model:
-  object: {kind: foam_y, links: 8}
-""",
-    "model.object.mount": """\
-model:
-  object:
-    kind: foam_y
-    mount: {parent_frame: base, xyz: [0.85, 0.0, -0.93], rpy: [0.0, 0.0, 1.5708]}    # [m], [rad]
-""",
-    "model.object, kind: segments": """\
-model:
-  object:
-    kind: segments
-    mount: {parent_frame: tool0}
-    segments:
-      trunk: {length: 0.5, mass: 0.05, radius: 0.01}                           # [m], [kg], [m]
-      twig: {parent: trunk, length: 0.3, mass: 0.02, radius: 0.006, rpy: [0.5, 0.0, 0.0]}
-""",
-    "model.object.segments.NAME": """\
-model:
-  object:
-    kind: segments
-    segments:
-      beam: {length: 0.52, mass: 0.33, cross_section: [0.001, 0.08], links: 8, joint_axes: y, clamped_at_base: true}
-""",
-    "model.object, kind: cable": """\
-model:
-  object:
-    kind: cable
-    parent_vertices: [p0, p1, p2, p3, p4, p5]
-    child_vertices: {side: [p2, s1, s2]}
-    undeformed_shape_file: undeformed.csv
-    end_clamp: axis
-""",
-    "model.object.branches.NAME": """\
-model:
-  object:
-    kind: cable
-    parent_vertices: [p0, p1, p2, p3, p4, p5]
-    undeformed_shape_file: undeformed.csv
-    child_vertices: {side: [p2, s1, s2]}
-    branches:
-      side: {linear_density: 0.03, separate_twist_damping: true}    # [kg/m]
 """,
     "model.grasp.NAME": """\
 model:

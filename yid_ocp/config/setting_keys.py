@@ -85,15 +85,12 @@ def section_variants(hint: Any) -> SectionVariants | None:
     among = next((marker for marker in markers if isinstance(marker, RegistryChoice)), None)
     if among is not None:
         classes = {name: among.registry[name] for name in among.registry}
-        return SectionVariants(classes, "name", among.default_name, among.registry.entry_noun, nullable)
+        noun = among.registry.entry_noun
+        return SectionVariants(classes, among.selector_key, among.default_name, noun, nullable)
     kinds = [split_annotated(member)[0] for member in union_members(bare)]
     if not kinds or not all(map(dataclasses.is_dataclass, kinds)):
         return None
-    if len(kinds) == 1:
-        return SectionVariants({"": kinds[0]}, is_nullable=nullable)
-    return SectionVariants(
-        {dataclass_options(kind)["kind"].default_value: kind for kind in kinds}, "kind", "", "kind", nullable
-    )
+    return SectionVariants({"": kinds[0]}, is_nullable=nullable) if len(kinds) == 1 else None
 
 
 def unknown_key_error(root: type, name: str, known: Iterable[str], where: str, within: str = "") -> ConfigError:

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
-from annotated_types import Ge, Gt, Le, Len, Lt
+from annotated_types import Ge, Gt, Le, Lt
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedSeq
 
@@ -21,7 +21,8 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import ConfigError
 from yid_ocp.inference.null_test import GapCriteria
 from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
-from yid_ocp.model.cable import CableOptions
+from yid_ocp.model.objects import OBJECTS, ObjectKind
+from yid_ocp.model.objects.base import MountSettings
 from yid_ocp.model.servos_and_springs import CommandInterpolation
 from yid_ocp.options import OptionInfo, RegistryChoice, dataclass_options, split_annotated
 from yid_ocp.planning.options import PlanOptions
@@ -40,15 +41,6 @@ _RecordingPath = Annotated[
 ]
 _ArmMode = Literal["driven", "prescribed", "servo", "passive"]
 _GraspKind = Literal["point", "axis", "weld"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class MountSettings:
-    """Pose of an object's root in a parent frame."""
-
-    parent_frame: Annotated[str | None, OptionInfo("frame or clamp that carries it; the world when absent")] = None
-    xyz: Annotated[_Vector3, OptionInfo("position in that frame", "m")] = (0.0, 0.0, 0.0)
-    rpy: Annotated[_Vector3, OptionInfo("roll, pitch, yaw in that frame", "rad")] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,78 +66,6 @@ class ClampSettings:
         Literal["level", "transported"],
         OptionInfo("what two points do not tell: x axis across the world's y, or no turn about z from the start on"),
     ] = "level"
-
-
-@dataclass(frozen=True, kw_only=True)
-class FoamYSettings:
-    """The paper's foam letter Y."""
-
-    kind: Annotated[Literal["foam_y"], OptionInfo("what the object is")] = "foam_y"
-    links: Annotated[int, Ge(1), Le(64), OptionInfo("rigid links of every tube")] = 4
-    gravity_fraction: Annotated[
-        float, Ge(0), Le(1), OptionInfo("part of its weight that it has; its inertia is whole")
-    ] = 1.0
-    mount: Annotated[MountSettings | None, OptionInfo("the trunk's foot; the paper's when absent")] = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class SegmentSettings:
-    """One segment (tube, branch or beam) as a chain of rigid links; its stiffness and damping are in `parameters`."""
-
-    length: Annotated[float | None, Gt(0), Le(50), OptionInfo("length; not needed beside link_lengths", "m")] = None
-    mass: Annotated[float, Gt(0), OptionInfo("mass of the whole segment", "kg")]
-    radius: Annotated[
-        float | None, Gt(0), Le(5), OptionInfo("radius of the solid cylinder; or give a section", "m")
-    ] = None
-    cross_section: Annotated[
-        tuple[Annotated[float, Gt(0)], Annotated[float, Gt(0)]] | None,
-        OptionInfo("extents of a rectangular cross section along the links' x and y axes", "m"),
-    ] = None
-    links: Annotated[int, Ge(1), Le(64), OptionInfo("number of equal links")] = 4
-    link_lengths: Annotated[
-        tuple[Annotated[float, Gt(0)], ...] | None, OptionInfo("unequal links, base to tip", "m")
-    ] = None
-    parent: Annotated[str | None, OptionInfo("segment on which it grows; the mount when absent")] = None
-    parent_link_index: Annotated[
-        int | None, Ge(0), OptionInfo("it leaves at the tip of this link of the parent; the last")
-    ] = None
-    rpy: Annotated[_Vector3, OptionInfo("turn of its first link at rest against what carries it", "rad")] = (
-        0.0,
-        0.0,
-        0.0,
-    )
-    separate_twist_damping: Annotated[bool, OptionInfo("whether twists have a damping parameter of their own")] = False
-    stiffness_per_curvature: Annotated[bool, OptionInfo("whether stiffness and damping are per curvature")] = False
-    clamped_at_base: Annotated[bool, OptionInfo("whether it starts at a rigid wall or gripper")] = False
-    joint_axes: Annotated[str, OptionInfo("axes of the turns at a joint, base to tip; rigid about the others")] = "xyz"
-    link_length_parameters: Annotated[bool, OptionInfo("whether every link has a length parameter of its own")] = False
-
-
-@dataclass(frozen=True, kw_only=True)
-class SegmentedObjectSettings:
-    """A flexible object built from segments, such as a beam or a tube with branches."""
-
-    kind: Annotated[Literal["segments"], OptionInfo("what the object is")] = "segments"
-    segments: Annotated[Mapping[str, SegmentSettings], OptionInfo("by name, parents first")] = field(
-        default_factory=dict
-    )
-    gravity_fraction: Annotated[
-        float, Ge(0), Le(1), OptionInfo("part of its weight that it has; its inertia is whole")
-    ] = 1.0
-    mount: Annotated[MountSettings, OptionInfo("where its root sits")] = field(default_factory=MountSettings)
-
-
-@dataclass(frozen=True, kw_only=True)
-class CableSettings(CableOptions):
-    """A branched cable held at both ends by clamps that follow measured points; lengths come from recordings."""
-
-    kind: Annotated[Literal["cable"], OptionInfo("what the object is")] = "cable"
-    parent_vertices: Annotated[tuple[str, ...], Len(5), OptionInfo("points from clamp to clamp, two held at each end")]
-    child_vertices: Annotated[
-        Mapping[str, tuple[str, ...]],
-        OptionInfo("points of every branch, the first one the parent's at which it leaves"),
-    ] = field(default_factory=dict)
-    undeformed_shape_file: Annotated[_FilePath, OptionInfo("CSV table with the columns point, x, y, z [m]")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,7 +160,7 @@ class ModelSettings:
         ),
     ] = field(default_factory=dict)
     object: Annotated[
-        FoamYSettings | SegmentedObjectSettings | CableSettings | None, OptionInfo("the flexible object")
+        ObjectKind | None, RegistryChoice(OBJECTS, selector_key="kind"), OptionInfo("the flexible object")
     ] = None
     grasp: Annotated[Mapping[str, GraspSettings], OptionInfo("by name: left, right, gripper")] = field(
         default_factory=dict
@@ -577,7 +497,8 @@ def _plain(value: Any) -> Any:
         for name, option in dataclass_options(type(value)).items():
             item = getattr(value, option.field_name)
             if item is not None or option.default_value is not None:
-                chosen = any(isinstance(marker, RegistryChoice) for marker in split_annotated(option.type_hint)[1])
+                markers = split_annotated(option.type_hint)[1]
+                chosen = any(isinstance(m, RegistryChoice) and m.selector_key == "name" for m in markers)
                 result[name] = {"name": item.name, **_plain(item)} if chosen else _plain(item)
         return result
     if isinstance(value, Mapping):

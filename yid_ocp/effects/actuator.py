@@ -1,8 +1,8 @@
 """Effects between a motor and its recorded signals: elastic gears, backlash, effort sensing errors, late torque.
 
 Recorded torques drive the model and recorded angles prescribe or guide it, so that these effects reach a driven joint,
-or the angle of a prescribed one, through `corrected_reading`; the effort that a prescribed joint needs is compared with the
-recorded one through `measure`.
+or the angle of a prescribed one, through `corrected_reading`; the effort that a prescribed joint needs is compared with
+the recorded one through `measure`.
 """
 
 from __future__ import annotations

@@ -71,7 +71,7 @@ class JointCoulomb(EffectBase):
 
 @EFFECTS.register("joint_stribeck")
 class JointStribeck(EffectBase):
-    """Stribeck friction F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s), v_s = `SIGN_SMOOTHING_SPEED`, beside Coulomb friction."""
+    """Stribeck friction F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s) beside Coulomb friction, v_s as there."""
 
     equation = "F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s)"
     required_excitation = "how fast it moves"
@@ -117,10 +117,10 @@ class JointPresliding(EffectBase):
 
     at x = |d|/yield_angle is its solution and its mean for a motion that does not turn round within the step. It stays
     within -1 and 1 and takes energy out whatever the step is, where a midpoint rule would ring at steps longer than the
-    yield angle. The |d| beside s_k is rounded off below `_ABS_SMOOTHING_ANGLE`. A loaded joint whose arm rings on the friction's own
-    stiffness, tau_c/yield_angle, faster than the steps follow creeps a little instead of resting, as Dahl's law has it
-    of anything that is shaken: shorter steps hold it. What s was before a recording begins is not known: it
-    is estimated with every recording.
+    yield angle. The |d| beside s_k is rounded off below `_ABS_SMOOTHING_ANGLE`. A loaded joint whose arm rings on the
+    friction's own stiffness, tau_c/yield_angle, faster than the steps follow creeps a little instead of resting, as
+    Dahl's law has it of anything that is shaken: shorter steps hold it. What s was before a recording begins is not
+    known: it is estimated with every recording.
 
     References
     ----------

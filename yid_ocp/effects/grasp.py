@@ -80,8 +80,8 @@ class GraspCompliance(EffectBase):
 class GraspSlip(EffectBase):
     """The grasped point creeps along the tube in the direction in which the gripper pulls.
 
-    d(offset)/dt = slip_per_load x axial load, both along the object's z axis; `Grasp.axial_slip` counts the other way. At the
-    start of a recording nothing has slipped.
+    d(offset)/dt = slip_per_load x axial load, both along the object's z axis; `Grasp.axial_slip` counts the other way.
+    At the start of a recording nothing has slipped.
     """
 
     equation = "d(offset)/dt = slip_per_load x axial load"

@@ -133,17 +133,19 @@ class PointMass(EffectBase):
 class Payload(EffectBase):
     """A mass at (mx, my, mz)/mass in a frame, moving with it; a negative mass removes excess mass of the model.
 
-    The place is within `_MAX_PAYLOAD_DISTANCE` of the frame: moments beyond L = sqrt((`_MAX_PAYLOAD_DISTANCE` mass)^2 + (`_MAX_COM_SHIFT` M)^2) do not grow any
-    more, s = (mx, my, mz) (1 + (|(mx, my, mz)|/L)^8)^(-1/8), and s is what is reported. M, C and Sigma are mass, centre
-    and integral of r r' dm about the centre of what the joint carries (M at least 1 kg in L). With
-    e = s + mass (frame - C) the link gets `mass`, the first moment e about C, and the second moment
+    The place is within `_MAX_PAYLOAD_DISTANCE` of the frame: moments beyond L = sqrt((`_MAX_PAYLOAD_DISTANCE` mass)^2 +
+    (`_MAX_COM_SHIFT` M)^2) do not grow any more, s = (mx, my, mz) (1 + (|(mx, my, mz)|/L)^8)^(-1/8), and s is what is
+    reported. M, C and Sigma are mass, centre and integral of r r' dm about the centre of what the joint carries (M at
+    least 1 kg in L). With e = s + mass (frame - C) the link gets `mass`, the first moment e about C, and the second
+    moment
 
-        K = e e' (1/(M + mass) + c h),  c = w(mass) M/(M + mass),  w(mass) = mass^3/(mass^4 + (|e|/`_POINT_INERTIA_DISTANCE`)^4 + `_POINT_INERTIA_MIN_MASS`^4)
+        K = e e' (1/(M + mass) + c h),  c = w(mass) M/(M + mass),
+        w(mass) = mass^3/(mass^4 + (|e|/`_POINT_INERTIA_DISTANCE`)^4 + `_POINT_INERTIA_MIN_MASS`^4)
 
-    about C. w is 1/mass, and K = e e'/mass that of a point, but for a place further off than `_POINT_INERTIA_DISTANCE` and next to neutral,
-    where all goes smoothly to nothing. About its own centre the link then has Sigma + c h e e', where h is 1 for a mass
-    that is added and (1 + a^4)^(-1/4), a = c e' Sigma^-1 e, for one that is taken away: almost 1 while what is taken
-    away was there, and never so large that the link would be left without inertia.
+    about C. w is 1/mass, and K = e e'/mass that of a point, but for a place further off than `_POINT_INERTIA_DISTANCE`
+    and next to neutral, where all goes smoothly to nothing. About its own centre the link then has Sigma + c h e e',
+    where h is 1 for a mass that is added and (1 + a^4)^(-1/4), a = c e' Sigma^-1 e, for one that is taken away: almost
+    1 while what is taken away was there, and never so large that the link would be left without inertia.
     """
 
     equation = "a mass at (mx, my, mz)/mass, moving with the frame"
@@ -162,7 +164,7 @@ class Payload(EffectBase):
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definitions of mass [kg], from -`_MAX_REMOVED_MASS_FRACTION` times the link's, and of first moments mx, my, mz [kg m]."""
+        """Definitions of mass [kg], above -`_MAX_REMOVED_MASS_FRACTION` of the link's, first moments mx, my, mz [kg m]."""
         upper, expected = _bearable(system, location)
         lower = -_MAX_REMOVED_MASS_FRACTION * carried_body(system, system.mechanism.frame(location).joint_index).mass
         moments = (

@@ -92,8 +92,8 @@ class StandardLinearSolid(EffectBase):
 class Hysteresis(EffectBase):
     """A Dahl friction element parallel to every spring of a segment (bend and twist).
 
-    F = -stiffness z, dz/dt = v - |v| z / yield_angle, with |v| rounded off below `_ABS_SMOOTHING_SPEED`. At the start of a recording
-    z = 0: what came before is not known.
+    F = -stiffness z, dz/dt = v - |v| z / yield_angle, with |v| rounded off below `_ABS_SMOOTHING_SPEED`. At the start
+    of a recording z = 0: what came before is not known.
 
     References
     ----------

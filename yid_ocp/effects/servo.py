@@ -90,7 +90,7 @@ class ServoSaturation(EffectBase):
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definition of tightness = limit^-16, reported as limit, at least `_MIN_LIMIT_FRACTION` times the effort limit."""
+        """Definition of tightness = limit^-16, reported as limit, from `_MIN_LIMIT_FRACTION` of the effort limit."""
         joint = system.mechanism.joints[system.mechanism.joint_index(location)]
         known = joint.effort_limit if 0 < joint.effort_limit < UNLIMITED_EFFORT else _DEFAULT_EFFORT_LIMIT
         torque = "N m" if joint.coordinate_unit == "rad" else "N"

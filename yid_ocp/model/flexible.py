@@ -55,8 +55,8 @@ class Segment:
         Whether bend, twist and damping are per curvature: a joint between links of length a and b then has
         2/(a + b) times the value, and the first joint of a clamped segment 2/a.
     clamped_at_base : bool
-        Whether the first joint turns about the tip of a rigid wall or clamp (only matters with `stiffness_per_curvature`); otherwise
-        it sits between the parent's link and the first one.
+        Whether the first joint turns about the tip of a rigid wall or clamp (only matters with
+        `stiffness_per_curvature`); otherwise it sits between the parent's link and the first one.
     joint_axes : str
         Axes of the turns at each joint, base to tip; about those left out the segment is rigid.
     cross_section : (float, float), optional
@@ -65,8 +65,8 @@ class Segment:
         Whether every link has a length parameter of its own (`SEGMENT.length_0`, ...) in place of `SEGMENT.length`,
         for markers that sit elsewhere in every recording; masses do not follow them.
     clamped_edge_length : float, optional
-        Length of a flexible edge that a clamp keeps straight before a root segment; with `stiffness_per_curvature` its first joint
-        then counts half of it [m].
+        Length of a flexible edge that a clamp keeps straight before a root segment; with `stiffness_per_curvature` its
+        first joint then counts half of it [m].
     """
 
     name: str
@@ -398,13 +398,13 @@ def _check(segment: Segment, known: dict[str, SegmentLayout]) -> None:
             "a segment needs a radius or a section",
             where=where,
             allowed="one of the two",
-            hint="section: [0.001, 0.08]",
+            hint="cross_section: [0.001, 0.08]",
         )
     sizes = {"mass": segment.mass}
     if segment.link_lengths is None:
         sizes["length"] = segment.length
     sizes |= {"radius": segment.radius} if segment.radius is not None else {}
-    sizes |= {f"section[{i}]": size for i, size in enumerate(segment.cross_section or ())}
+    sizes |= {f"cross_section[{i}]": size for i, size in enumerate(segment.cross_section or ())}
     for quantity, value in sizes.items():
         if not (math.isfinite(value) and value > 0):
             raise ModelError(f"{quantity} = {value}", where=where, allowed="a positive number in SI units")
@@ -420,7 +420,9 @@ def _check(segment: Segment, known: dict[str, SegmentLayout]) -> None:
     if segment.parent_link_index is not None and segment.parent is not None:
         links = len(known[segment.parent].link_joints)
         if not 0 <= segment.parent_link_index < links:
-            raise ModelError(f"at_link = {segment.parent_link_index}", where=where, allowed=f"0 to {links - 1}")
+            raise ModelError(
+                f"parent_link_index = {segment.parent_link_index}", where=where, allowed=f"0 to {links - 1}"
+            )
     axes = segment.joint_axes
     if not axes or len(set(axes)) < len(axes) or not set(axes) <= set(UNIT_AXES):
-        raise ModelError(f"joint_order = '{axes}'", where=where, allowed="letters of x, y, z, each at most once")
+        raise ModelError(f"joint_axes = '{axes}'", where=where, allowed="letters of x, y, z, each at most once")

@@ -253,7 +253,7 @@ def mass_matrix(rigid: RigidBodyDerivatives, mechanism: Mechanism) -> ca.SX:
 
 
 def lagrangian_second_derivatives(rigid: RigidBodyDerivatives, mechanism: Mechanism) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """(L_qq, L_qv, L_vv) of the bodies, each (n, n), from the closed form of `RigidBodyDerivatives`; L_qv[row q, column v]."""
+    """(L_qq, L_qv, L_vv) of the bodies, each (n, n), from `RigidBodyDerivatives`; L_qv[row q, column v]."""
 
     def by_qq(i: int, j: int) -> tuple[ca.SX, ca.SX]:
         entry = _dot(rigid.D, i, rigid.B, j) + ca.dot(rigid.S[:3, i], rigid.G[:, j])

@@ -108,7 +108,7 @@ class Grasp:
     def axis_misalignment(self, kinematics: Kinematics) -> ca.SX:
         """Differences between the axes that the grasp aligns, shape (0, 3 or 9; 1).
 
-        Redundant beside `constraint_residual`, but not zero where axes point in opposite ways: for a search that starts far off.
+        Beside `constraint_residual` redundant, but not zero where axes are opposite: for a search that starts far off.
         """
         if self.kind == "point":
             return ca.SX(0, 1)
@@ -237,8 +237,8 @@ class StepTerms:
 class Effect(Protocol):
     """Interface of an unmodelled effect or another addition to the nominal model.
 
-    `apply_to_system` changes the description (masses, lengths, grasps, gravity, added joints); `step_terms` adds energy, force and
-    equations of internal coordinates. At neutral parameters both must leave the nominal model unchanged.
+    `apply_to_system` changes the description (masses, lengths, grasps, gravity, added joints); `step_terms` adds
+    energy, force, equations of internal coordinates. At neutral parameters both must leave the nominal model unchanged.
     """
 
     @property

@@ -122,7 +122,7 @@ def read_urdf(
     Parameters
     ----------
     path : str or Path
-        As `resolve_urdf_path`: a URDF file, `package:baxter` (or any robot folder of example-robot-data), `default:NAME.urdf`.
+        As `resolve_urdf_path`: a URDF file, `package:baxter` (any folder of example-robot-data), `default:NAME.urdf`.
     joints : sequence of str, optional
         Names of the joints to keep as degrees of freedom, which are then ordered as given as far as parents come
         first; all movable ones when absent.

@@ -16,7 +16,7 @@ from yid_ocp.integrator.statics import relaxed_internal_coordinates
 from yid_ocp.integrator.step import Step
 from yid_ocp.least_squares import levenberg_marquardt
 from yid_ocp.model import forward_kinematics
-from yid_ocp.model.cable import START_SHAPE_SUFFIXES, START_SPEED_PARAMETER
+from yid_ocp.model.objects.cable import START_SHAPE_SUFFIXES, START_SPEED_PARAMETER
 from yid_ocp.parallel import LockedCache
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.sensors import Sensor, sensor_function

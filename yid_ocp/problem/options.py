@@ -11,7 +11,7 @@ from annotated_types import Ge, Gt, Len
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.data.issues import Issue
-from yid_ocp.model.cable import ClampPath
+from yid_ocp.model.objects.base import ClampPath
 from yid_ocp.options import OptionInfo
 from yid_ocp.problem.measurements import ResidualWeighting
 from yid_ocp.sensors.base import EffortKind

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.errors import DataError, nearest_name_hint
-from yid_ocp.model.cable import ClampPath
+from yid_ocp.model.objects.base import ClampPath
 from yid_ocp.model.servos_and_springs import PositionServo
 from yid_ocp.model.system import System
 from yid_ocp.problem.measurements import TimeGrid

@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate_recording
 from yid_ocp.effects.base import joints_by_arm
 from yid_ocp.errors import ConfigError, ModelError
+from yid_ocp.model.objects.foam_y import y_object
 from yid_ocp.model.system import Grasp, System
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.model.y_object import y_object
 from yid_ocp.virtual.joint_motion import (
     BAXTER_ARM_JOINTS,
     MultisineMotion,

@@ -12,25 +12,21 @@ import numpy as np
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import (
-    CableSettings,
-    FoamYSettings,
     GraspSettings,
-    MountSettings,
     ParameterSettings,
     RunSettings,
-    SegmentedObjectSettings,
 )
 from yid_ocp.data.channel_checks import median_edge_lengths
 from yid_ocp.effects import make_effect
-from yid_ocp.errors import ModelError, YidError, nearest_name_hint
+from yid_ocp.errors import YidError, nearest_name_hint
 from yid_ocp.integrator.step import Step, compile_step
-from yid_ocp.model import FlexibleObject, Grasp, Mechanism, Segment, System, flexible_object
-from yid_ocp.model.cable import CableTopology, cable_system, read_vertex_positions
+from yid_ocp.model import FlexibleObject, Grasp, Mechanism, System
+from yid_ocp.model.objects import ObjectKind
+from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.parameters import Parameters
-from yid_ocp.model.rotations import rotation_from_rpy, transform_from_xyz_rpy
+from yid_ocp.model.rotations import rotation_from_rpy
 from yid_ocp.model.servos_and_springs import PositionServoOptions, RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.model.y_object import Y_FOOT_POSITION, y_segments
 from yid_ocp.workflow.clamps import clamp_mechanism, marker_parameter_values, with_extra_frames
 from yid_ocp.workflow.run_inputs import (
     input_files,
@@ -40,7 +36,6 @@ from yid_ocp.workflow.run_inputs import (
 )
 
 _OBJECT_DAMPING_KEY = "object"  # key of the object's damping beside those of the joints
-_PER_JOINT_QUANTITIES = ("bend", "twist", "damping", "twist_damping")
 _DEFAULT_JOINT_DAMPING = 0.05  # of joints that a damping by name does not mention [N m s/rad]
 _PlacedObject = tuple[FlexibleObject, str | None, np.ndarray | None]
 
@@ -62,8 +57,9 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
     model = run.model
     input_files(run)
     load_plugins(run)
-    if isinstance(model.object, CableSettings):
-        return _cable_model(run)
+    cable = build_cable(run)
+    if model.object is not None and cable is not None:
+        return _clamped_system(run, model.object, cable)
     robot = _robot(run)
     joints = () if robot is None else robot.joint_names
     held = clamp_mechanism(run)
@@ -150,38 +146,25 @@ def _completed(run: RunSettings, system: System, finer: int = 1) -> System:
     return replace(system, parameters=_set_parameters(run, system.parameters, finer))
 
 
-def _cable_model(run: RunSettings) -> System:
-    cable, item = build_cable(run), run.model.object
-    assert cable is not None
-    assert isinstance(item, CableSettings)
+def _clamped_system(run: RunSettings, item: ObjectKind, cable: CableTopology) -> System:
+    """The system of an object that brings its clamps."""
     for key in ("robot", "grasp", "springs", "clamps", "frames"):
         if getattr(run.model, key):
-            raise run.config_error(f"a cable takes no {key}: its clamps hold it", "model", key, hint=f"remove {key}")
-    for name in item.branches:
-        if name not in cable.branch_vertices:
-            hint = nearest_name_hint(name, cable.branch_vertices)
-            raise run.config_error(f"there is no branch '{name}'", "model", "object", "branches", name, hint=hint)
+            what = f"a {item.kind} takes no {key}: its clamps hold it"
+            raise run.config_error(what, "model", key, hint=f"remove {key}")
     recordings = read_recordings(run, "estimate")
     if not recordings:
-        raise run.config_error(
-            "a cable's lengths come from recordings", "recordings", "estimate", hint="list at least one"
-        )
+        what = f"a {item.kind}'s lengths come from recordings"
+        raise run.config_error(what, "recordings", "estimate", hint="list at least one")
     with locate_errors(run, "model", "object"):
-        system = cable_system(
-            median_edge_lengths(cable.edges, recordings), cable, replace(item, gravity=run.model.gravity)
-        )
+        system = item.clamped_system(median_edge_lengths(cable.edges, recordings), run.model.gravity)
     return _completed(run, system)
 
 
 def build_cable(run: RunSettings) -> CableTopology | None:
-    """The cable that a run's object describes, None for another object."""
-    item = run.model.object
-    if not isinstance(item, CableSettings):
-        return None
-    with locate_errors(run, "model", "object", "undeformed_shape_file"):
-        undeformed = read_vertex_positions(item.undeformed_shape_file)
+    """Measured vertices and clamps of a run's object that brings its clamps, None for another object."""
     with locate_errors(run, "model", "object"):
-        return CableTopology(item.parent_vertices, dict(item.child_vertices), undeformed)
+        return None if run.model.object is None else run.model.object.topology()
 
 
 def _robot(run: RunSettings) -> Mechanism | None:
@@ -193,68 +176,9 @@ def _robot(run: RunSettings) -> Mechanism | None:
         return read_urdf(model.robot, joints=arms.joints, locked=arms.locked_joints, exclude_links=arms.exclude_links)
 
 
-def _objects(run: RunSettings, damping: float, finer: int) -> list[_PlacedObject]:
+def _objects(run: RunSettings, damping: float, link_division: int) -> list[_PlacedObject]:
     item = run.model.object
-    if item is None or isinstance(item, CableSettings):
-        return []
-    if isinstance(item, FoamYSettings):
-        segments = [
-            replace(
-                segment,
-                links=item.links * finer,
-                bend=segment.bend * finer,
-                twist=segment.twist * finer,
-                damping=damping * finer,
-            )
-            for segment in y_segments()
-        ]
-        if item.mount is None:
-            made = flexible_object(segments, transform_from_xyz_rpy(Y_FOOT_POSITION), "y_object", item.gravity_fraction)
-            return [(made, None, None)]
-        made = flexible_object(segments, None, "y_object", item.gravity_fraction)
-        return [(made, item.mount.parent_frame, _placement(item.mount))]
-    made = flexible_object(_segments(item, damping, finer), name="object", gravity_fraction=item.gravity_fraction)
-    return [(made, item.mount.parent_frame, _placement(item.mount))]
-
-
-def _placement(mount: MountSettings) -> np.ndarray:
-    return transform_from_xyz_rpy(mount.xyz, mount.rpy)
-
-
-def _segments(item: SegmentedObjectSettings, damping: float, finer: int) -> list[Segment]:
-    result = []
-    for name, s in item.segments.items():
-        if s.length is None and s.link_lengths is None:
-            raise ModelError(
-                f"segment '{name}' has no length", where=f"segments.{name}", hint="set length or link_lengths"
-            )
-        # a rigidity does not depend on the number of links, a stiffness per joint does
-        factor = 1 if s.stiffness_per_curvature else finer
-        lengths = s.link_lengths
-        result.append(
-            Segment(
-                name,
-                s.length if s.length is not None else float(sum(lengths or ())),
-                s.mass,
-                s.radius,
-                s.links * finer,
-                None if lengths is None else [length / finer for length in lengths for _ in range(finer)],
-                s.parent,
-                # a child stays at the same place of its parent
-                None if s.parent_link_index is None else (s.parent_link_index + 1) * finer - 1,
-                rotation_from_rpy(*s.rpy),
-                bend=Segment.bend * factor,
-                twist=Segment.twist * factor,
-                damping=damping * factor,
-                twist_damping=damping * factor if s.separate_twist_damping else None,
-                stiffness_per_curvature=s.stiffness_per_curvature,
-                clamped_at_base=s.clamped_at_base,
-                joint_axes=s.joint_axes,
-                cross_section=s.cross_section,
-                link_length_parameters=s.link_length_parameters,
-            )
-        )
-    return result
+    return [] if item is None else [(item.build(damping, link_division), *item.placement)]
 
 
 # -- parameters -------------------------------------------------------------------------------------------------------
@@ -301,13 +225,8 @@ def _set_parameters(run: RunSettings, parameters: Parameters, finer: int) -> Par
 
 def link_division_factor(run: RunSettings, name: str, link_division: int) -> int:
     """Factor on a per-joint parameter that keeps the tube's stiffness when each link is divided."""
-    item, (owner, _, quantity) = run.model.object, name.rpartition(".")
-    if quantity not in _PER_JOINT_QUANTITIES or isinstance(item, CableSettings):
-        return 1
-    if isinstance(item, FoamYSettings):
-        return link_division if owner in [segment.name for segment in y_segments()] else 1
-    owned = None if item is None else item.segments.get(owner)
-    return 1 if owned is None or owned.stiffness_per_curvature else link_division
+    item = run.model.object
+    return 1 if item is None else item.link_division_factor(name, link_division)
 
 
 def _key_of(run: RunSettings, name: str) -> str:

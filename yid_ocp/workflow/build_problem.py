@@ -9,7 +9,6 @@ from pathlib import Path
 from yid_ocp.analysis.convergence import min_grasp_gaps
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import (
-    CableSettings,
     RunSettings,
 )
 from yid_ocp.data.channel_checks import median_edge_lengths
@@ -17,7 +16,6 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
 from yid_ocp.integrator.step import Step
 from yid_ocp.model import System
-from yid_ocp.model.cable import edge_length_parameters
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.sensors.joints import EFFORT_GROUP, POSITION_GROUP, is_measured_by_arm
@@ -61,17 +59,14 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
             sensors[group] = replace(sensors.get(group, SensorOptions()), use=False)
     cable = build_cable(run)
     own = marker_parameter_values(run, system, recordings)
-    if cable is not None and isinstance(run.model.object, CableSettings):
+    if cable is not None and run.model.object is not None:
         for group in {group.name for recording in recordings for group in recording.points}:
             said = sensors.get(group, SensorOptions())
             sensors[group] = said if said.points is not None else replace(said, points=cable.free_vertices)
-        if run.model.object.lengths_per_recording:
-            own = {
-                recording.name: edge_length_parameters(
-                    cable, median_edge_lengths(cable.edges, [recording], _START_FRAMES)
-                )
-                for recording in recordings
-            }
+        for recording in recordings:
+            lengths = median_edge_lengths(cable.edges, [recording], _START_FRAMES)
+            if values := run.model.object.recording_parameters(lengths):
+                own[recording.name] = values
     return replace(
         run.problem,
         sensors=sensors,

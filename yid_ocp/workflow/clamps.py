@@ -8,12 +8,12 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
-from yid_ocp.config.settings import CableSettings, RunSettings
+from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError, nearest_name_hint
 from yid_ocp.model import FlexibleObject, Mechanism, Parameter, System, forward_kinematics
-from yid_ocp.model.cable import CableTopology, ClampPath
 from yid_ocp.model.mechanism import Frame, Placement
+from yid_ocp.model.objects.base import CableTopology, ClampPath
 from yid_ocp.model.rotations import transform_from_xyz_rpy
 from yid_ocp.model.system import floating_clamp
 
@@ -170,7 +170,7 @@ def marker_parameter_values(
 
 def _check_standing(run: RunSettings, name: str) -> None:
     item = run.model.object
-    if isinstance(item, CableSettings) or (item is not None and item.mount is not None and item.mount.parent_frame):
+    if item is not None and not item.stands_in_world:
         what = "the object moves with what carries it, so `marker_reference_pose` does not say where it was"
         allowed = "an object whose mount stands in the world"
         hint = f"give model.frames.{name}.xyz instead"

@@ -5,32 +5,23 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
+from yid_ocp.model.objects.base import InitObject
+from yid_ocp.options import OptionInfo, dataclass_options, split_annotated
 from yid_ocp.version import package_version
-from yid_ocp.workflow.config_proposal import STANDARD_GRAVITY, BranchDescription, ConfigProposal
+from yid_ocp.workflow.config_proposal import ConfigProposal
 
 _PLAIN_TEXT = re.compile(r"[A-Za-z_/][\w./@-]*")  # text that YAML reads as it stands
 _YAML_KEYWORDS = ("true", "false", "null", "yes", "no", "on", "off")
-_RIGIDITY_RATIO = {"cable": 0.01, "beam": 1.0, "tree": 0.1}
-"""Where the search for a bending rigidity starts, over weight times length squared."""
-_DAMPING_TIME = 0.02  # damping over rigidity, where the search for it starts [s]
 _COMMENT_COLUMN = 44
-
-
-@dataclass(frozen=True)
-class ObjectDescription:
-    """User's description of the object: kind (cable, beam, tree or y), branches, and links per branch."""
-
-    kind: str
-    branches: tuple[BranchDescription, ...]
-    links_per_branch: int
+_ALWAYS_WRITTEN_SETTINGS = ("kind", "links")
 
 
 def commented_config_text(
     robot: str,
-    item: ObjectDescription,
+    noun: str,
+    item: InitObject,
     proposal: ConfigProposal,
     recordings: Sequence[str],
     imports: Mapping[str, Any],
@@ -42,6 +33,9 @@ def commented_config_text(
     ----------
     robot : str
         As the file is to name it.
+    noun : str
+        What the object is.
+    item : InitObject
     recordings : sequence of str
         Files, as the configuration is to name them.
     imports : mapping
@@ -53,7 +47,7 @@ def commented_config_text(
         f"# yaml-language-server: $schema={schema}",
         f"# Written by `yid-ocp init` {package_version()}. Everything may be changed; docs/settings.md has all keys.",
         "# What the recordings say stands beside each line. Next: `yid-ocp check` on this file, then `yid-ocp solve`.",
-        _line("", "description", _text(f"A {item.kind} moved by {robot}."), "one sentence for the report"),
+        _line("", "description", _text(f"A {noun} moved by {robot}."), "one sentence for the report"),
         "",
         "model:",
         _line("  ", "robot", _text(robot), "URDF file, or package:NAME of example-robot-data"),
@@ -153,68 +147,44 @@ def _servos(proposal: ConfigProposal) -> list[str]:
             "      ",
             "command_interpolation",
             "held",
-            "until the next one; interpolated where the controller goes in between",
+            "until the next; interpolated: straight lines in between",
         ),
         _line("      ", "has_gravity_compensation", "false", "true where the controller carries the arm's own weight"),
     ]
 
 
-def _object(item: ObjectDescription, proposal: ConfigProposal) -> list[str]:
-    if item.kind == "foam_y":
-        return [
-            "  # the foam Y of the source paper; `mount` moves its foot, which stands at (0.85, 0, -0.93) m",
-            f"  object: {{kind: foam_y, links: {item.links_per_branch}}}",
+def _object(item: InitObject, proposal: ConfigProposal) -> list[str]:
+    said = item.settings
+    lines = ["  object:"]
+    if item.stands_in_world:
+        lines.append("    # `mount: {parent_frame: FRAME, xyz: [x, y, z], rpy: [r, p, y]}` says where it stands")
+    else:
+        frames = [name for arm in proposal.arms[:1] for name in arm.tool_frames if name != proposal.holder_frame]
+        lines += [
+            "    # its root sits in this frame and leaves it along z, unless xyz [m] and rpy [rad] say else",
+            f"    # other frames there: {', '.join(frames[:8]) or 'none'}",
+            f"    mount: {{parent_frame: {_text(proposal.holder_frame)}, xyz: [0.0, 0.0, 0.0], rpy: [0.0, 0.0, 0.0]}}",
         ]
-    frames = [name for arm in proposal.arms[:1] for name in arm.tool_frames if name != proposal.holder_frame]
-    lines = [
-        "  object:",
-        _line("    ", "kind", "segments", "chains of rigid links with elastic joints"),
-        "    # its root sits in this frame of the robot and leaves it along z, unless xyz [m] and rpy [rad] say else",
-        f"    # other frames there: {', '.join(frames[:8]) or 'none'}",
-        f"    mount: {{parent_frame: {_text(proposal.holder_frame)}, xyz: [0.0, 0.0, 0.0], rpy: [0.0, 0.0, 0.0]}}",
-        "    segments:",
-    ]
-    for branch in item.branches:
-        lines += [f"      {_text(branch.name)}:", *_segment(branch, item.links_per_branch)]
+    return [*lines, *_settings_lines("    ", said)]
+
+
+def _settings_lines(indent: str, settings: Any) -> list[str]:
+    """Settings that differ from their defaults, and those that every reader asks for, with their descriptions."""
+    lines, kind = [], cast(Any, type(settings))
+    for key, option in dataclass_options(kind).items():
+        value = getattr(settings, option.field_name)
+        if key == "mount" or (value == option.default_value and key not in _ALWAYS_WRITTEN_SETTINGS):
+            continue
+        if isinstance(value, Mapping):
+            lines.append(f"{indent}{key}:")
+            for name, entry in value.items():
+                lines += [f"{indent}  {_text(name)}:", *_settings_lines(f"{indent}    ", entry)]
+            continue
+        about = next(m for m in reversed(split_annotated(option.type_hint)[1]) if isinstance(m, OptionInfo))
+        comment = about.description + (f" [{about.unit}]" if about.unit else "")
+        numbers = [float(f"{x:.8g}") for x in value] if isinstance(value, tuple) else value
+        lines.append(_line(indent, key, f"{value:g}" if isinstance(value, float) else _value(numbers), comment))
     return lines
-
-
-def _segment(branch: BranchDescription, links: int) -> list[str]:
-    at = "        "
-    lines = [
-        _line(at, "length", f"{branch.length:g}", "[m], from the grip to the end"),
-        _line(at, "mass", f"{branch.mass:g}", "[kg], spread along it"),
-    ]
-    if branch.cross_section is not None:
-        lines.append(
-            _line(
-                at, "cross_section", f"[{branch.cross_section[0]:g}, {branch.cross_section[1]:g}]", "along x and y [m]"
-            )
-        )
-    if branch.radius is not None:
-        lines.append(_line(at, "radius", f"{branch.radius:g}", "[m]"))
-    if branch.parent is not None:
-        lines.append(_line(at, "parent", _text(branch.parent), "on whose end it grows"))
-    if any(branch.rpy):
-        lines.append(
-            _line(at, "rpy", str([float(f"{turn:.8g}") for turn in branch.rpy]), "turn against what holds it [rad]")
-        )
-    order, why = "xy", "bends both ways; xyz where it twists as well"
-    if branch.cross_section is not None:
-        # a turn about y bends it along x
-        order, why = (
-            "y" if branch.cross_section[0] <= branch.cross_section[1] else "x",
-            "it bends across its thinner side alone",
-        )
-    return [
-        *lines,
-        _line(at, "links", str(links), "rigid links; `check` says how far estimates move with more"),
-        _line(at, "joint_axes", order, why),
-        _line(at, "stiffness_per_curvature", "true", "parameters per curvature, whatever the number of links"),
-        _line(
-            at, "clamped_at_base", "true" if branch.parent is None else "false", "whether the grip holds its direction"
-        ),
-    ]
 
 
 def _grasps(proposal: ConfigProposal) -> list[str]:
@@ -226,15 +196,16 @@ def _grasps(proposal: ConfigProposal) -> list[str]:
     return lines
 
 
-def _damping(item: ObjectDescription) -> list[str]:
-    if item.kind == "foam_y":
+def _damping(item: InitObject) -> list[str]:
+    dampings = [value for name, (value, _) in item.start_values.items() if name.endswith(".damping")]
+    if not dampings:
         return [_line("  ", "damping", "0.05", "viscous, of every coordinate [N m s/rad]")]
-    start = max(_DAMPING_TIME * _rigidity(branch, item.kind) for branch in item.branches)
-    return [_line("  ", "damping", f"{{object: {start:.2g}}}", "where the search for it starts [N m^2 s]")]
+    said = f"{{object: {max(dampings):.2g}}}"
+    return [_line("  ", "damping", said, "where the search for it starts [N m^2 s]")]
 
 
-def _points(item: ObjectDescription, proposal: ConfigProposal) -> list[str]:
-    tips = ["w_T1", "w_T2", "w_T3"] if item.kind == "foam_y" else [f"w_{branch.name}" for branch in item.branches]
+def _points(item: InitObject, proposal: ConfigProposal) -> list[str]:
+    tips = [f"w_{segment.name}" for segment in item.settings.model_segments()]
     wanted = list(dict.fromkeys([*proposal.marked_frames, *proposal.grasps.values()]))
     if set(wanted) <= set(tips):
         return []
@@ -337,22 +308,10 @@ def _number(value: float) -> str:
 # -- parameters -------------------------------------------------------------------------------------------------------
 
 
-def _rigidity(branch: BranchDescription, kind: str) -> float:
-    return _RIGIDITY_RATIO[kind] * branch.mass * STANDARD_GRAVITY * branch.length**2
-
-
-def _parameters(item: ObjectDescription, proposal: ConfigProposal) -> list[str]:
-    lines = ["parameters:                                 # `yid-ocp inspect` lists all that there are"]
-    if item.kind == "foam_y":
-        names = [f"{tube}.{quantity}" for tube in ("T1", "T2", "T3") for quantity in ("bend", "twist")]
-        lines[0] = "parameters:                                 # stiffness of every joint of a tube [N m/rad]"
-        return [*lines, *(f"  {name}: {{free: true, initial: 3.0}}" for name in names)]
-    for branch in item.branches:
-        bend = _rigidity(branch, item.kind)
-        said = f"{{free: true, initial: {_number(bend)}}}"
-        lines.append(_line("  ", f"{branch.name}.bend", said, "bending rigidity [N m^2], where the search starts"))
-        said = f"{{free: true, initial: {_number(_DAMPING_TIME * bend)}}}"
-        lines.append(_line("  ", f"{branch.name}.damping", said, "[N m^2 s]"))
+def _parameters(item: InitObject, proposal: ConfigProposal) -> list[str]:
+    lines = [f"parameters:                                 # {item.parameters_comment}"]
+    for name, (value, comment) in item.start_values.items():
+        lines.append(_line("  ", name, f"{{free: true, initial: {_number(value)}}}", comment))
     if proposal.arm_mode == "servo":
         said = "{free: true}"
         lines.append(_line("  ", '"*.servo_gain"', said, "begins at a twentieth of a radian for the effort limit"))

@@ -16,9 +16,8 @@ from yid_ocp.data.channel_checks import quantization_step, white_noise_std
 from yid_ocp.data.readers import mean_sample_rate
 from yid_ocp.data.recording import Array, JointGroup, PointGroup, Recording
 from yid_ocp.errors import ConfigError, nearest_name_hint
-from yid_ocp.model import Mechanism
+from yid_ocp.model import Mechanism, Segment
 from yid_ocp.model.kinematics import forward_kinematics
-from yid_ocp.model.rotations import rotation_from_rpy
 from yid_ocp.model.urdf import read_urdf
 
 _TOOL_FRAME_NAMES = ("tool0", "tcp", "gripper", "tool", "end_effector", "ee_link", "flange", "hand", "link8")
@@ -32,22 +31,7 @@ _REST_WINDOW = 0.1  # over which speeds are taken [s]; up to twice that of slow 
 _MIN_FRICTION_TRAVEL = 0.02  # A joint that turns less than this says nothing of its own friction [rad]
 _COPIED_COMMAND_RATIO = 1e-6  # commands nearer to the measured angles than this part of the motion are a copy of them
 _MIN_ARM_TRAVEL = 0.1  # joints that turn less than this together do not move [rad]
-STANDARD_GRAVITY = 9.81
-_Y_TUBES = ("T1", "T2", "T3")
 _POSITION_STEP_PERCENT = 5  # places along a segment are told apart in so many percent
-
-
-@dataclass(frozen=True)
-class BranchDescription:
-    """User's description of one segment of an object, in m, kg and rad."""
-
-    name: str
-    length: float
-    mass: float
-    radius: float | None
-    cross_section: tuple[float, float] | None = None
-    rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    parent: str | None = None
 
 
 @dataclass(frozen=True)
@@ -155,7 +139,7 @@ class ConfigProposal:
 def propose_config(
     robot: str,
     recordings: Sequence[Recording],
-    branches: Sequence[BranchDescription],
+    branches: Sequence[Segment],
     *,
     holder: str | None = None,
     grasps: Mapping[str, str] | None = None,
@@ -169,7 +153,7 @@ def propose_config(
         URDF file, or `package:NAME`.
     recordings : sequence of Recording
         At least one, with joints.
-    branches : sequence of BranchDescription
+    branches : sequence of Segment
         Segments of the object, parents first.
     holder : str, optional
         Frame that carries the object's root; the tool of the arm that moves most when absent.
@@ -275,9 +259,7 @@ def _holder(tree: Mechanism, arms: Sequence[_ArmChain], frame: str | None, stand
     return frame, own
 
 
-def _held(
-    arms: Sequence[_ArmChain], own: _ArmChain, branches: Sequence[BranchDescription], standing: bool
-) -> dict[str, str]:
+def _held(arms: Sequence[_ArmChain], own: _ArmChain, branches: Sequence[Segment], standing: bool) -> dict[str, str]:
     if standing:
         return {arm.tool_frames[0]: end for arm, end in zip(arms, ("w_T2", "w_T3"), strict=False)}
     others = [arm for arm in arms if arm is not own]
@@ -374,9 +356,9 @@ def rest_split_time(recording: Recording, joints: Sequence[str]) -> float | None
 
 
 def _places(
-    tree: Mechanism, recording: Recording, branches: Sequence[BranchDescription], holder: str, standing: bool
+    tree: Mechanism, recording: Recording, branches: Sequence[Segment], holder: str, standing: bool
 ) -> dict[str, tuple[_PointPlacement, ...]]:
-    frames = [f"w_{name}" for name in (_Y_TUBES if standing else [branch.name for branch in branches])]
+    frames = [f"w_{branch.name}" for branch in branches]
     return {
         group.name: tuple(
             _named(point, frames, branches, tree)
@@ -391,9 +373,7 @@ def _places(
     }
 
 
-def _named(
-    point: str, frames: Sequence[str], branches: Sequence[BranchDescription], tree: Mechanism
-) -> _PointPlacement | None:
+def _named(point: str, frames: Sequence[str], branches: Sequence[Segment], tree: Mechanism) -> _PointPlacement | None:
     owner, colon, part = point.partition(":")
     names = [branch.name for branch in branches]
     if point in frames or point in tree.frames or (colon and owner in names and part.endswith("%")):
@@ -408,7 +388,7 @@ def _near(
     recording: Recording,
     group: PointGroup,
     column: int,
-    branches: Sequence[BranchDescription],
+    branches: Sequence[Segment],
     holder: str,
 ) -> _PointPlacement:
     """The place at which a point probably sits, by where it was seen from what holds the object."""
@@ -448,12 +428,12 @@ def _along(name: str, percent: int) -> str:
     return f"w_{name}" if percent == 100 else f"{name}:{percent}%"
 
 
-def _straight(branches: Sequence[BranchDescription]) -> dict[str, Array]:
+def _straight(branches: Sequence[Segment]) -> dict[str, Array]:
     spots: dict[str, Array] = {}
     ends: dict[str | None, tuple[Array, Array]] = {None: (np.eye(3), np.zeros(3))}
     for branch in branches:
         turn, base = ends[branch.parent]
-        turn = turn @ np.array(rotation_from_rpy(*branch.rpy))
+        turn = turn if branch.rest_rotation is None else turn @ np.asarray(branch.rest_rotation)
         along = branch.length * turn[:, 2]
         ends[branch.name] = (turn, base + along)
         for percent in range(_POSITION_STEP_PERCENT, 101, _POSITION_STEP_PERCENT):

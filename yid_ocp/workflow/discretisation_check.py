@@ -18,7 +18,7 @@ from yid_ocp.analysis.discretisation_shift import (
     joint_subdivision,
 )
 from yid_ocp.analysis.time_step_stability import StepErrorGrowth, largest_error_growth
-from yid_ocp.config.settings import FoamYSettings, RunSettings, SegmentedObjectSettings
+from yid_ocp.config.settings import RunSettings
 from yid_ocp.errors import YidError
 from yid_ocp.inference.uncertainty import typical_parameter_sizes
 from yid_ocp.integrator.step import with_time_step
@@ -66,12 +66,13 @@ class DiscretisationShifts:
 def requested_refinements(run: RunSettings) -> tuple[_Refinement, ...]:
     """Refinements that a run's settings request after a solve.
 
-    Where they do not say: the time step, and the links too where they stand for something that bends everywhere; the
-    links of the paper's Y are its definition.
+    Where they do not say: the time step, and the links too where they stand for something that bends everywhere
+    (`ObjectKind.default_link_refinement`).
     """
     said = run.output.discretisation_check
     if said is None:
-        said = "both" if isinstance(run.model.object, SegmentedObjectSettings) else "time_step"
+        item = run.model.object
+        said = "both" if item is not None and item.default_link_refinement else "time_step"
     return {"none": (), "time_step": ("time_step",), "both": ("links", "time_step")}[said]  # type: ignore[return-value]
 
 
@@ -228,14 +229,7 @@ def frequency_convergence(run: RunSettings, problem: EstimationProblem | None, w
 
 
 def _object_link_count(run: RunSettings) -> int | None:
-    """Number of links per tube of the object, in total where tubes differ; None without divisible links."""
-    item = run.model.object
-    if isinstance(item, FoamYSettings):
-        return item.links
-    if not isinstance(item, SegmentedObjectSettings):
-        return None
-    counts = [s.links if s.link_lengths is None else len(s.link_lengths) for s in item.segments.values()]
-    return counts[0] if len(set(counts)) == 1 else sum(counts)
+    return None if run.model.object is None else run.model.object.link_count
 
 
 def _posture(system: Any, problem: EstimationProblem | None) -> dict[str, float] | None:

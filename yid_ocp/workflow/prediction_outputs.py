@@ -21,7 +21,7 @@ from yid_ocp.inference.whitening import (
     estimate_torque_biases,
     held_out_whitened_at,
 )
-from yid_ocp.model.cable import CableTopology
+from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.measurements import Measurements

@@ -29,7 +29,7 @@ from yid_ocp.data.checks import check_recording, duplicate_data_issue, split_at_
 from yid_ocp.data.issues import ISSUE_CAUSES, Issue
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError
-from yid_ocp.model.cable import CableTopology
+from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.problem.episodes import EpisodePrediction

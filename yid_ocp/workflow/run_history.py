@@ -14,11 +14,12 @@ import numpy as np
 
 from yid_ocp.analysis.estimate_history import EstimateHistory, RunEstimates, assess_drift, pool_estimates
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import CableSettings, EffectSettings, ParameterSettings, RunSettings
+from yid_ocp.config.settings import EffectSettings, ParameterSettings, RunSettings
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.errors import ConfigError, DataError, YidError
 from yid_ocp.files import file_sha256, is_file
+from yid_ocp.model.objects import ObjectKind
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.html import write_report
@@ -189,10 +190,8 @@ def _different(run: RunSettings, there: RunSettings) -> str:
         here, other = getattr(run.model, key), getattr(there.model, key)
         if key == "robot" and here is not None and other is not None:
             here, other = Path(here).name, Path(other).name  # a folder may have moved
-        if isinstance(here, CableSettings) and isinstance(other, CableSettings):
-            here, other = (
-                replace(item, undeformed_shape_file=Path(item.undeformed_shape_file).name) for item in (here, other)
-            )
+        if isinstance(here, ObjectKind) and isinstance(other, ObjectKind):
+            here, other = here.without_folders(), other.without_folders()
         if here != other:
             return key
     return ""

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from yid_ocp.config.settings import (
-    CableSettings,
     RunSettings,
 )
 from yid_ocp.data.recording import Recording
@@ -156,9 +155,8 @@ def input_files(run: RunSettings) -> dict[str, Path]:
         with locate_errors(run, "model", "robot"):
             file = resolve_urdf_path(robot)
         files[robot] = _existing(run, file, "URDF file", "model", "robot")
-    if isinstance(run.model.object, CableSettings):
-        file = Path(run.model.object.undeformed_shape_file)
-        files[str(file)] = _existing(run, file, "table of points", "model", "object", "undeformed_shape_file")
+    for key, name in {} if run.model.object is None else run.model.object.input_files().items():
+        files[name] = _existing(run, Path(name), "file", "model", "object", key)
     for which in ("estimate", "held_out"):
         for i, path in enumerate(getattr(run.recordings, which)):
             files[path] = _existing(run, recording_path(path), "recording", "recordings", which, i)

@@ -17,7 +17,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.issues import Issue
 from yid_ocp.inference.uncertainty import covariance_to_dict, mark_not_trusted
-from yid_ocp.model.cable import CableTopology
+from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.prediction_errors import rmse_by_channel

@@ -21,7 +21,7 @@ from yid_ocp.analysis.data_quality.clock_synchronization import (
 from yid_ocp.analysis.data_quality.recorded_joints import RecordedJointsModel, effect_setting_line
 from yid_ocp.data.issues import Issue, Severity, median_sample_period
 from yid_ocp.data.recording import PointGroup, Recording
-from yid_ocp.model.cable import CableTopology
+from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.system import System
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.sensors.base import SensorUsage

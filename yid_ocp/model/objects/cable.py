@@ -20,24 +20,26 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import casadi as ca
 import numpy as np
-from annotated_types import Ge, Gt, Le
-from numpy.typing import ArrayLike, NDArray
+from annotated_types import Ge, Gt, Le, Len
+from numpy.typing import NDArray
 
 from yid_ocp.errors import DataError, ModelError, nearest_name_hint
-from yid_ocp.model import Grasp, Mechanism, System, flexible_object
-from yid_ocp.model.flexible import UNIT_AXES, FlexibleObject, Segment, polyline_rotations
-from yid_ocp.model.mechanism import Frame, LinkChain, Placement
+from yid_ocp.model.flexible import UNIT_AXES, FlexibleObject, Segment, flexible_object, polyline_rotations
+from yid_ocp.model.mechanism import Frame, LinkChain, Mechanism, Placement
+from yid_ocp.model.objects.base import END_CLAMP as _END_CLAMP
+from yid_ocp.model.objects.base import OBJECTS, CableTopology, ObjectKind
+from yid_ocp.model.objects.base import START_CLAMP as _START_CLAMP
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.rotations import symbolic_axis_rotation
-from yid_ocp.model.system import floating_clamp
+from yid_ocp.model.system import Grasp, System, floating_clamp
 from yid_ocp.options import OptionInfo
 
 Array = NDArray[np.float64]
-_START_CLAMP, _END_CLAMP = "clamp_start", "clamp_end"
+_Vector3 = tuple[float, float, float]
 _START_ROLL_PARAMETER, _END_ROLL_PARAMETER = f"{_START_CLAMP}.roll", f"{_END_CLAMP}.roll"
 _REST_ANGLE_SUFFIX = ".rest"
 START_SPEED_SCALE_PARAMETER = "start.speed_scale"
@@ -50,107 +52,6 @@ _START_EDGE_FRAME, _LAST_EDGE_FRAME = f"{_START_CLAMP}_edge", "last_edge"
 START_SHAPE_SUFFIXES = ("start", "load")
 # Parameter that is told the root mean square speed of the measured points at the start [m/s].
 START_SPEED_PARAMETER = "start.speed"
-
-
-@dataclass(frozen=True)
-class ClampPath:
-    """How a prescribed clamp (`floating_clamp`) follows two measured points.
-
-    Attributes
-    ----------
-    clamp_name : str
-        Name of the clamp.
-    origin_point : str
-        Point at which its origin sits.
-    z_axis_point : str
-        Point to which its z axis looks.
-    roll_convention : "level" or "transported"
-        What the points do not tell, the turn about z: with `level` the third angle stays zero (x axis across world y);
-        with `transported` the clamp never turns about its own z axis, from `level` at the first node on.
-    """
-
-    clamp_name: str
-    origin_point: str
-    z_axis_point: str
-    roll_convention: Literal["level", "transported"] = "level"
-
-
-@dataclass(frozen=True)
-class CableTopology:
-    """Vertices and branches of a cable with their undeformed positions.
-
-    Attributes
-    ----------
-    parent_vertices : tuple of str
-        Vertices of the parent from one clamp to the other; the first two and the last two are held.
-    child_vertices : mapping of str to tuple of str
-        Name of each child to its vertices, the first one that of the parent at which it leaves.
-    undeformed_positions : mapping of str to array_like, shape (3,)
-        Every vertex of the cable at rest without load [m], in any frame.
-    parent_segment : str
-        Segment name of the parent.
-    """
-
-    parent_vertices: tuple[str, ...]
-    child_vertices: Mapping[str, tuple[str, ...]]
-    undeformed_positions: Mapping[str, ArrayLike]
-    parent_segment: str = "parent"
-
-    def __post_init__(self) -> None:
-        if len(self.parent_vertices) < 5:
-            raise ModelError(
-                f"the parent has {len(self.parent_vertices)} vertices",
-                where="cable",
-                allowed="5 or more: two held at each end",
-            )
-        for name, vertices in self.child_vertices.items():
-            if len(vertices) < 2 or vertices[0] not in self.parent_vertices[2:-2]:
-                raise ModelError(
-                    f"child '{name}' does not leave the parent at one of its free vertices",
-                    where="cable",
-                    allowed=", ".join(self.parent_vertices[2:-2]),
-                )
-        for vertex in self.vertices:
-            if vertex not in self.undeformed_positions:
-                hint = nearest_name_hint(vertex, self.undeformed_positions)
-                raise ModelError(f"vertex '{vertex}' has no undeformed position", where="cable", hint=hint)
-        if len(set(self.vertices)) != len(self.vertices):
-            raise ModelError("a vertex belongs to two branches", where="cable")
-
-    @property
-    def vertices(self) -> tuple[str, ...]:
-        """Names of all vertices, the parent's first."""
-        return (*self.parent_vertices, *(vertex for chain in self.child_vertices.values() for vertex in chain[1:]))
-
-    @property
-    def clamped_vertices(self) -> tuple[str, ...]:
-        """Names of the four vertices held by the clamps."""
-        return (*self.parent_vertices[:2], *self.parent_vertices[-2:])
-
-    @property
-    def free_vertices(self) -> tuple[str, ...]:
-        """Names of the vertices that no clamp holds, on which predictions are evaluated."""
-        return tuple(vertex for vertex in self.vertices if vertex not in self.clamped_vertices)
-
-    @property
-    def branch_vertices(self) -> dict[str, tuple[str, ...]]:
-        """Names of the vertices of every branch, by segment, the parent first."""
-        return {self.parent_segment: self.parent_vertices, **self.child_vertices}
-
-    @property
-    def edges(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of neighbouring vertices, branch by branch."""
-        return tuple(pair for chain in self.branch_vertices.values() for pair in pairwise(chain))
-
-    @property
-    def clamp_paths(self) -> tuple[ClampPath, ClampPath]:
-        """Paths of the two clamps, start and end."""
-        p = self.parent_vertices
-        return ClampPath(_START_CLAMP, p[0], p[1], "transported"), ClampPath(_END_CLAMP, p[-2], p[-1], "transported")
-
-    def undeformed_polyline(self, chain: Sequence[str]) -> Array:
-        """Undeformed positions of some vertices, shape (len(chain), 3) [m]."""
-        return np.array([np.asarray(self.undeformed_positions[vertex], float) for vertex in chain])
 
 
 @dataclass(frozen=True)
@@ -176,8 +77,8 @@ class CableBranchOptions:
 class CableOptions:
     """Options of a cable's model.
 
-    With a `shape_memory` each joint rests at (1 - memory) x undeformed + memory x (start angle - load/stiffness), the load
-    being what the joint bears at the recording's start if the cable is at rest there. It becomes the parameter
+    With a `shape_memory` each joint rests at (1 - memory) x undeformed + memory x (start angle - load/stiffness), the
+    load being what the joint bears at the recording's start if the cable is at rest there. It becomes the parameter
     `SEGMENT.memory` and counts less for a recording that starts in motion, by the factor
     1/(1 + (start speed/`start.speed_scale`)^2).
 
@@ -453,3 +354,63 @@ def _segments(cable: CableTopology, lengths: Mapping[tuple[str, str], float], op
             )
         )
     return segments
+
+
+@OBJECTS.register("cable")
+@dataclass(frozen=True, kw_only=True)
+class Cable(CableOptions, ObjectKind):
+    """A branched cable held at both ends by clamps that follow measured points; lengths come from recordings."""
+
+    brings_clamps = True
+    settings_examples: ClassVar[Mapping[str, str]] = {
+        "model.object, kind: cable": """\
+model:
+  object:
+    kind: cable
+    parent_vertices: [p0, p1, p2, p3, p4, p5]
+    child_vertices: {side: [p2, s1, s2]}
+    undeformed_shape_file: undeformed.csv
+    end_clamp: axis
+""",
+        "model.object.branches.NAME": """\
+model:
+  object:
+    kind: cable
+    parent_vertices: [p0, p1, p2, p3, p4, p5]
+    undeformed_shape_file: undeformed.csv
+    child_vertices: {side: [p2, s1, s2]}
+    branches:
+      side: {linear_density: 0.03, separate_twist_damping: true}    # [kg/m]
+""",
+    }
+
+    kind: Annotated[Literal["cable"], OptionInfo("what the object is")] = "cable"
+    parent_vertices: Annotated[tuple[str, ...], Len(5), OptionInfo("points from clamp to clamp, two held at each end")]
+    child_vertices: Annotated[
+        Mapping[str, tuple[str, ...]],
+        OptionInfo("points of every branch, the first one the parent's at which it leaves"),
+    ] = field(default_factory=dict)
+    undeformed_shape_file: Annotated[
+        str,
+        OptionInfo("a file, relative to the configuration", is_path=True),
+        OptionInfo("CSV table with the columns point, x, y, z [m]"),
+    ]
+
+    def topology(self) -> CableTopology:
+        """Measured vertices and clamps; `DataError` or `ModelError` where they do not fit together."""
+        found = CableTopology(
+            self.parent_vertices, dict(self.child_vertices), read_vertex_positions(self.undeformed_shape_file)
+        )
+        for name in self.branches:
+            if name not in found.branch_vertices:
+                hint = nearest_name_hint(name, found.branch_vertices)
+                raise ModelError(f"there is no branch '{name}'", where=f"branches.{name}", hint=hint)
+        return found
+
+    def clamped_system(self, edge_lengths: Mapping[tuple[str, str], float], gravity: _Vector3) -> System:
+        """The whole system, from the measured edge lengths [m]."""
+        return cable_system(edge_lengths, self.topology(), replace(self, gravity=gravity))
+
+    def recording_parameters(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
+        """Edge length parameters of one recording, where not all recordings share them."""
+        return edge_length_parameters(self.topology(), edge_lengths) if self.lengths_per_recording else {}

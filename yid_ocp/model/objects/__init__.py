@@ -1,0 +1,11 @@
+"""The kinds of flexible objects, one file each: settings, geometry, refinement, clamps, and what `init` writes."""
+
+from importlib import import_module
+from pkgutil import iter_modules
+
+from yid_ocp.model.objects.base import OBJECTS as OBJECTS
+from yid_ocp.model.objects.base import ObjectKind as ObjectKind
+
+# every file of this folder registers its kinds when it is imported
+for _file in iter_modules(__path__):
+    import_module(f"{__name__}.{_file.name}")

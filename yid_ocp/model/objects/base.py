@@ -1,0 +1,349 @@
+"""What a kind of flexible object says about itself: settings, geometry, refinement, clamps and `init` templates."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+import numpy as np
+from annotated_types import Ge, Le
+from numpy.typing import ArrayLike, NDArray
+
+from yid_ocp.errors import ConfigError, ModelError, nearest_name_hint
+from yid_ocp.model.flexible import FlexibleObject, Segment, flexible_object
+from yid_ocp.model.rotations import transform_from_xyz_rpy
+from yid_ocp.model.system import System
+from yid_ocp.options import OptionInfo, dataclass_options, split_annotated
+from yid_ocp.registry import Registry
+
+Array = NDArray[np.float64]
+START_CLAMP, END_CLAMP = "clamp_start", "clamp_end"
+_Vector3 = tuple[float, float, float]
+_STANDARD_GRAVITY = 9.81
+_DAMPING_TIME = 0.02  # damping over rigidity, where the search for it starts [s]
+SIZE_MEANINGS = {"length": "its length [m]", "mass": "its mass [kg]", "radius": "its radius [m]"}
+_PER_JOINT_QUANTITIES = ("bend", "twist", "damping", "twist_damping")
+
+
+# -- what holds an object ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class MountSettings:
+    """Pose of an object's root in a parent frame."""
+
+    parent_frame: Annotated[str | None, OptionInfo("frame or clamp that carries it; the world when absent")] = None
+    xyz: Annotated[_Vector3, OptionInfo("position in that frame", "m")] = (0.0, 0.0, 0.0)
+    rpy: Annotated[_Vector3, OptionInfo("roll, pitch, yaw in that frame", "rad")] = (0.0, 0.0, 0.0)
+
+    @property
+    def pose(self) -> Array:
+        """Homogeneous transform of the root in the parent frame, shape (4, 4)."""
+        return transform_from_xyz_rpy(self.xyz, self.rpy)
+
+
+@dataclass(frozen=True)
+class ClampPath:
+    """How a prescribed clamp (`floating_clamp`) follows two measured points.
+
+    Attributes
+    ----------
+    clamp_name : str
+        Name of the clamp.
+    origin_point : str
+        Point at which its origin sits.
+    z_axis_point : str
+        Point to which its z axis looks.
+    roll_convention : "level" or "transported"
+        What the points do not tell, the turn about z: with `level` the third angle stays zero (x axis across world y);
+        with `transported` the clamp never turns about its own z axis, from `level` at the first node on.
+    """
+
+    clamp_name: str
+    origin_point: str
+    z_axis_point: str
+    roll_convention: Literal["level", "transported"] = "level"
+
+
+@dataclass(frozen=True)
+class CableTopology:
+    """Vertices and branches of a cable with their undeformed positions.
+
+    Attributes
+    ----------
+    parent_vertices : tuple of str
+        Vertices of the parent from one clamp to the other; the first two and the last two are held.
+    child_vertices : mapping of str to tuple of str
+        Name of each child to its vertices, the first one that of the parent at which it leaves.
+    undeformed_positions : mapping of str to array_like, shape (3,)
+        Every vertex of the cable at rest without load [m], in any frame.
+    parent_segment : str
+        Segment name of the parent.
+    """
+
+    parent_vertices: tuple[str, ...]
+    child_vertices: Mapping[str, tuple[str, ...]]
+    undeformed_positions: Mapping[str, ArrayLike]
+    parent_segment: str = "parent"
+
+    def __post_init__(self) -> None:
+        if len(self.parent_vertices) < 5:
+            raise ModelError(
+                f"the parent has {len(self.parent_vertices)} vertices",
+                where="cable",
+                allowed="5 or more: two held at each end",
+            )
+        for name, vertices in self.child_vertices.items():
+            if len(vertices) < 2 or vertices[0] not in self.parent_vertices[2:-2]:
+                raise ModelError(
+                    f"child '{name}' does not leave the parent at one of its free vertices",
+                    where="cable",
+                    allowed=", ".join(self.parent_vertices[2:-2]),
+                )
+        for vertex in self.vertices:
+            if vertex not in self.undeformed_positions:
+                hint = nearest_name_hint(vertex, self.undeformed_positions)
+                raise ModelError(f"vertex '{vertex}' has no undeformed position", where="cable", hint=hint)
+        if len(set(self.vertices)) != len(self.vertices):
+            raise ModelError("a vertex belongs to two branches", where="cable")
+
+    @property
+    def vertices(self) -> tuple[str, ...]:
+        """Names of all vertices, the parent's first."""
+        return (*self.parent_vertices, *(vertex for chain in self.child_vertices.values() for vertex in chain[1:]))
+
+    @property
+    def clamped_vertices(self) -> tuple[str, ...]:
+        """Names of the four vertices held by the clamps."""
+        return (*self.parent_vertices[:2], *self.parent_vertices[-2:])
+
+    @property
+    def free_vertices(self) -> tuple[str, ...]:
+        """Names of the vertices that no clamp holds, on which predictions are evaluated."""
+        return tuple(vertex for vertex in self.vertices if vertex not in self.clamped_vertices)
+
+    @property
+    def branch_vertices(self) -> dict[str, tuple[str, ...]]:
+        """Names of the vertices of every branch, by segment, the parent first."""
+        return {self.parent_segment: self.parent_vertices, **self.child_vertices}
+
+    @property
+    def edges(self) -> tuple[tuple[str, str], ...]:
+        """Pairs of neighbouring vertices, branch by branch."""
+        return tuple(pair for chain in self.branch_vertices.values() for pair in pairwise(chain))
+
+    @property
+    def clamp_paths(self) -> tuple[ClampPath, ClampPath]:
+        """Paths of the two clamps, start and end."""
+        p = self.parent_vertices
+        return ClampPath(START_CLAMP, p[0], p[1], "transported"), ClampPath(END_CLAMP, p[-2], p[-1], "transported")
+
+    def undeformed_polyline(self, chain: Sequence[str]) -> Array:
+        """Undeformed positions of some vertices, shape (len(chain), 3) [m]."""
+        return np.array([np.asarray(self.undeformed_positions[vertex], float) for vertex in chain])
+
+
+# -- what `init` asks for and writes ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class InitObject:
+    """An object described on the command line of `init`.
+
+    Attributes
+    ----------
+    settings : ObjectKind
+        Without its mount.
+    start_values : mapping of parameter to (float, str)
+        Where the search for each free parameter starts, with a comment.
+    parameters_comment : str
+    stands_in_world : bool
+        Whether it stands where the settings say, and arms hold its ends; or else a frame of the robot carries its root.
+    """
+
+    settings: ObjectKind
+    start_values: Mapping[str, tuple[float, str]]
+    parameters_comment: str = "`yid-ocp inspect` lists all that there are"
+    stands_in_world: bool = False
+
+
+@dataclass(frozen=True)
+class InitTemplate:
+    """A word of `init --object`.
+
+    Attributes
+    ----------
+    default_links : int
+        Per segment.
+    build : callable
+        The object from what was given by name (flags of `init`, and `--number`) and the number of links per segment;
+        `ConfigError` where something is missing.
+    further_numbers : mapping of str to str
+        Names beside length, mass and radius that `--number NAME=VALUE` takes, with their meanings.
+    has_branches : bool
+    """
+
+    default_links: int
+    build: Callable[[Mapping[str, Any], int], InitObject]
+    further_numbers: Mapping[str, str] = field(default_factory=dict)
+    has_branches: bool = False
+
+
+def required_numbers(noun: str, numbers: Mapping[str, Any], meanings: Mapping[str, str]) -> list[float]:
+    """Numbers of an object in the order of their meanings; `ConfigError` where one is missing."""
+    for name, meaning in meanings.items():
+        if name not in numbers:
+            flag, value = (f"--{name}", " NUMBER") if name in SIZE_MEANINGS else ("--number", f" {name}=NUMBER")
+            raise ConfigError(f"{noun} needs a {name}", where=flag, allowed=meaning, hint=f"add {flag}{value}")
+    return [float(numbers[name]) for name in meanings]
+
+
+def comma_separated_numbers(text: str, count: int, flag: str) -> list[float]:
+    """Finite numbers in the value of a flag; `ConfigError` where they are not `count`."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count or not all(map(math.isfinite, values)):
+        noun = f"{count} numbers" if count > 1 else "a number"
+        raise ConfigError(f"'{text}' is not {noun}", where=flag, allowed=f"{noun} with commas" if count > 1 else noun)
+    return values
+
+
+def bending_start_values(segments: Sequence[Segment], rigidity_ratio: float) -> dict[str, tuple[float, str]]:
+    """Start values of bending rigidity and damping, as fractions of weight times length squared, with comments."""
+    found: dict[str, tuple[float, str]] = {}
+    for s in segments:
+        bend = rigidity_ratio * s.mass * _STANDARD_GRAVITY * s.length**2
+        found[f"{s.name}.bend"] = bend, "bending rigidity [N m^2], where the search starts"
+        found[f"{s.name}.damping"] = _DAMPING_TIME * bend, "[N m^2 s]"
+    return found
+
+
+# -- kinds ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectKind:
+    """A kind of flexible object, whose fields are its settings; one class in one file, registered in `OBJECTS`.
+
+    A class overrides `kind`, and `model_segments`, `build` or `clamped_system`, and what else differs.
+
+    Attributes
+    ----------
+    default_link_refinement : bool
+        Whether `solve` looks at twice the links where nothing is said: not where the links are the object's definition.
+    brings_clamps : bool
+        Whether it is a system of its own (`clamped_system`), held by clamps that follow measured points.
+    init_templates : mapping of str to InitTemplate
+        Words of `init --object`.
+    settings_examples : mapping of section to str
+        YAML for the page of settings.
+    """
+
+    default_link_refinement: ClassVar[bool] = False
+    brings_clamps: ClassVar[bool] = False
+    init_templates: ClassVar[Mapping[str, InitTemplate]] = {}
+    settings_examples: ClassVar[Mapping[str, str]] = {}
+
+    kind: Annotated[str, OptionInfo("what the object is")]
+
+    def model_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
+        """Segments, parents first, with the damping of every joint and each link divided, their stiffness kept."""
+        return []
+
+    def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
+        """The object, to be placed by `placement`.
+
+        Parameters
+        ----------
+        damping : float
+            Of every coordinate [N m s/rad], or per curvature rate [N m^2 s] where the segments say so.
+        link_division : int
+            Into how many links each one is divided.
+        """
+        return flexible_object(self.model_segments(damping, link_division))
+
+    @property
+    def placement(self) -> tuple[str | None, Array | None]:
+        """Frame that carries the object's root (the world when None), and the root's pose in it, shape (4, 4)."""
+        return None, None
+
+    @property
+    def stands_in_world(self) -> bool:
+        """Whether nothing moves the object's root."""
+        return False
+
+    @property
+    def link_count(self) -> int | None:
+        """Number of links per segment, in total where segments differ; None without divisible links."""
+        counts = [s.links if s.link_lengths is None else len(s.link_lengths) for s in self.model_segments()]
+        return None if not counts else counts[0] if len(set(counts)) == 1 else sum(counts)
+
+    def link_division_factor(self, parameter: str, link_division: int) -> int:
+        """Factor on a per-joint parameter that keeps a segment's stiffness when each link is divided."""
+        owner, _, quantity = parameter.rpartition(".")
+        per_joint = {segment.name for segment in self.model_segments() if not segment.stiffness_per_curvature}
+        return link_division if quantity in _PER_JOINT_QUANTITIES and owner in per_joint else 1
+
+    def input_files(self) -> dict[str, str]:
+        """Files that the settings name, by key."""
+        own: Any = type(self)
+        return {
+            key: getattr(self, option.field_name)
+            for key, option in dataclass_options(own).items()
+            if any(isinstance(m, OptionInfo) and m.is_path for m in split_annotated(option.type_hint)[1])
+        }
+
+    def without_folders(self) -> Self:
+        """The same object with file names in place of paths, to be compared with that of another run."""
+        names = {key: Path(file).name for key, file in self.input_files().items()}
+        return replace(self, **names)
+
+    def topology(self) -> CableTopology | None:
+        """Measured vertices and clamps of an object that brings its clamps, None for another."""
+        return None
+
+    def clamped_system(self, edge_lengths: Mapping[tuple[str, str], float], gravity: _Vector3) -> System:
+        """The whole system of an object that brings its clamps, from its measured edge lengths [m]."""
+        raise NotImplementedError
+
+    def recording_parameters(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
+        """Parameter values that one recording's edge lengths [m] give, where not all recordings share them."""
+        return {}
+
+
+@dataclass(frozen=True, kw_only=True)
+class MountedObject(ObjectKind):
+    """An object whose root a frame carries."""
+
+    gravity_fraction: Annotated[
+        float, Ge(0), Le(1), OptionInfo("part of its weight that it has; its inertia is whole")
+    ] = 1.0
+    mount: Annotated[MountSettings | None, OptionInfo("where its root sits; the world's origin when absent")] = None
+
+    def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
+        """The object, to be placed by `placement`; parameters as in `ObjectKind.build`."""
+        return flexible_object(self.model_segments(damping, link_division), gravity_fraction=self.gravity_fraction)
+
+    @property
+    def placement(self) -> tuple[str | None, Array | None]:
+        """Frame that carries the object's root (the world when None), and the root's pose in it, shape (4, 4)."""
+        return (None, None) if self.mount is None else (self.mount.parent_frame, self.mount.pose)
+
+    @property
+    def stands_in_world(self) -> bool:
+        """Whether nothing moves the object's root."""
+        return self.mount is None or not self.mount.parent_frame
+
+
+OBJECTS: Registry[type[ObjectKind]] = Registry("kind")
+
+
+def init_templates() -> dict[str, InitTemplate]:
+    """Words of `init --object`, of all kinds."""
+    return {word: template for kind in OBJECTS for word, template in OBJECTS[kind].init_templates.items()}

@@ -1,0 +1,97 @@
+"""The source paper's foam letter Y: three tubes of four links each, standing on the ground."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from annotated_types import Ge, Le
+
+from yid_ocp.errors import OutputError
+from yid_ocp.model.flexible import FlexibleObject, Segment, flexible_object
+from yid_ocp.model.objects.base import OBJECTS, InitObject, InitTemplate, MountedObject
+from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
+from yid_ocp.model.urdf import mechanism_to_urdf
+from yid_ocp.options import OptionInfo
+
+Y_FOOT_POSITION = (0.85, 0.0, -0.93)
+"""Position of the trunk's foot in the world, Baxter's `base` [m]."""
+
+
+def y_segments() -> tuple[Segment, ...]:
+    """Segments of the paper's foam Y: trunk T1, branches T2 (45 degrees towards +y) and T3 (towards -y)."""
+    lean = math.radians(45.0)
+    return (
+        Segment("T1", 0.813, 0.064, 0.032),
+        Segment("T2", 0.610, 0.015, 0.025, parent="T1", rest_rotation=rotation_from_rpy(-lean, 0.0, 0.0)),
+        Segment("T3", 0.737, 0.016, 0.019, parent="T1", rest_rotation=rotation_from_rpy(lean, 0.0, 0.0)),
+    )
+
+
+def y_object(links: int = 4, gravity_fraction: float = 1.0) -> FlexibleObject:
+    """The paper's foam Y as a flexible object, its trunk's foot at (0.85, 0, -0.93) m.
+
+    Parameters
+    ----------
+    links : int
+        Rigid links of every tube; the nominal stiffness per joint is that of four links.
+    gravity_fraction : float
+        See `flexible_object`.
+    """
+    segments = [replace(segment, links=links) for segment in y_segments()]
+    return flexible_object(segments, homogeneous_transform(np.eye(3), Y_FOOT_POSITION), "y_object", gravity_fraction)
+
+
+def write_y_urdf(path: str | Path) -> None:
+    """Write the paper's Y object as a URDF file; `OutputError` where that fails."""
+    try:
+        Path(path).write_text(mechanism_to_urdf(y_object().mechanism), encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"the URDF cannot be written: {error.strerror}", where=str(path)) from error
+
+
+def _init_object(numbers: Mapping[str, Any], links: int) -> InitObject:
+    names = [f"{segment.name}.{quantity}" for segment in y_segments() for quantity in ("bend", "twist")]
+    return InitObject(
+        FoamY(links=links), dict.fromkeys(names, (3.0, "")), "stiffness of every joint of a tube [N m/rad]", True
+    )
+
+
+@OBJECTS.register("foam_y")
+@dataclass(frozen=True, kw_only=True)
+class FoamY(MountedObject):
+    """The paper's foam letter Y; its foot stands where the paper's does when there is no mount."""
+
+    init_templates: ClassVar[Mapping[str, InitTemplate]] = {"foam_y": InitTemplate(4, _init_object)}
+    settings_examples: ClassVar[Mapping[str, str]] = {
+        "model.object, kind: foam_y": """\
+model:
+  object: {kind: foam_y, links: 8}
+""",
+        "model.object.mount": """\
+model:
+  object:
+    kind: foam_y
+    mount: {parent_frame: base, xyz: [0.85, 0.0, -0.93], rpy: [0.0, 0.0, 1.5708]}    # [m], [rad]
+""",
+    }
+
+    kind: Annotated[Literal["foam_y"], OptionInfo("what the object is")] = "foam_y"
+    links: Annotated[int, Ge(1), Le(64), OptionInfo("rigid links of every tube")] = 4
+
+    def model_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
+        """The three tubes; the nominal stiffness per joint is that of four links, whatever `links` says."""
+        n = link_division
+        return [
+            replace(s, links=self.links * n, bend=s.bend * n, twist=s.twist * n, damping=damping * n)
+            for s in y_segments()
+        ]
+
+    def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
+        """The object, its foot at (0.85, 0, -0.93) m without a mount; parameters as in `ObjectKind.build`."""
+        root = homogeneous_transform(np.eye(3), Y_FOOT_POSITION) if self.mount is None else None
+        return flexible_object(self.model_segments(damping, link_division), root, "y_object", self.gravity_fraction)

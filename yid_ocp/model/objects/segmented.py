@@ -1,0 +1,236 @@
+"""Objects of segments: a cable, beam or tree as chains of rigid links, each described in the configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Annotated, Any, ClassVar, Literal
+
+from annotated_types import Ge, Gt, Le
+
+from yid_ocp.errors import ConfigError, ModelError
+from yid_ocp.model.flexible import Segment
+from yid_ocp.model.objects.base import (
+    OBJECTS,
+    SIZE_MEANINGS,
+    InitObject,
+    InitTemplate,
+    MountedObject,
+    MountSettings,
+    bending_start_values,
+    comma_separated_numbers,
+    required_numbers,
+)
+from yid_ocp.model.rotations import rotation_from_rpy
+from yid_ocp.options import OptionInfo
+
+_Vector3 = tuple[float, float, float]
+_RIGIDITY_RATIO = {"cable": 0.01, "beam": 1.0, "tree": 0.1}
+_BRANCH_SHAPE = "NAME=LENGTH,MASS,RADIUS, or with ROLL,PITCH,YAW; NAME@PARENT grows on the end of PARENT"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SegmentSettings:
+    """One segment (tube, branch or beam) as a chain of rigid links; its stiffness and damping are in `parameters`."""
+
+    length: Annotated[float | None, Gt(0), Le(50), OptionInfo("length; not needed beside link_lengths", "m")] = None
+    mass: Annotated[float, Gt(0), OptionInfo("mass of the whole segment", "kg")]
+    radius: Annotated[
+        float | None, Gt(0), Le(5), OptionInfo("radius of the solid cylinder; or give a section", "m")
+    ] = None
+    cross_section: Annotated[
+        tuple[Annotated[float, Gt(0)], Annotated[float, Gt(0)]] | None,
+        OptionInfo("extents of a rectangular cross section along the links' x and y axes", "m"),
+    ] = None
+    links: Annotated[int, Ge(1), Le(64), OptionInfo("number of equal links")] = 4
+    link_lengths: Annotated[
+        tuple[Annotated[float, Gt(0)], ...] | None, OptionInfo("unequal links, base to tip", "m")
+    ] = None
+    parent: Annotated[str | None, OptionInfo("segment on which it grows; the mount when absent")] = None
+    parent_link_index: Annotated[
+        int | None, Ge(0), OptionInfo("it leaves at the tip of this link of the parent; the last")
+    ] = None
+    rpy: Annotated[_Vector3, OptionInfo("turn of its first link at rest against what carries it", "rad")] = (
+        0.0,
+        0.0,
+        0.0,
+    )
+    separate_twist_damping: Annotated[bool, OptionInfo("whether twists have a damping parameter of their own")] = False
+    stiffness_per_curvature: Annotated[bool, OptionInfo("whether stiffness and damping are per curvature")] = False
+    clamped_at_base: Annotated[bool, OptionInfo("whether it starts at a rigid wall or gripper")] = False
+    joint_axes: Annotated[str, OptionInfo("axes of the turns at a joint, base to tip; rigid about the others")] = "xyz"
+    link_length_parameters: Annotated[bool, OptionInfo("whether every link has a length parameter of its own")] = False
+
+    def segment(self, name: str, damping: float, link_division: int) -> Segment:
+        """The segment of a name, with the damping of every joint and each link divided, its stiffness kept."""
+        if self.length is None and self.link_lengths is None:
+            hint = "set length or link_lengths"
+            raise ModelError(f"segment '{name}' has no length", where=f"segments.{name}", hint=hint)
+        n = link_division
+        # a rigidity does not depend on the number of links, a stiffness per joint does
+        factor = 1 if self.stiffness_per_curvature else n
+        lengths, index = self.link_lengths, self.parent_link_index
+        return Segment(
+            name,
+            self.length if self.length is not None else float(sum(lengths or ())),
+            self.mass,
+            self.radius,
+            self.links * n,
+            None if lengths is None else [length / n for length in lengths for _ in range(n)],
+            self.parent,
+            None if index is None else (index + 1) * n - 1,  # a child stays at the same place of its parent
+            rotation_from_rpy(*self.rpy),
+            bend=Segment.bend * factor,
+            twist=Segment.twist * factor,
+            damping=damping * factor,
+            twist_damping=damping * factor if self.separate_twist_damping else None,
+            stiffness_per_curvature=self.stiffness_per_curvature,
+            clamped_at_base=self.clamped_at_base,
+            joint_axes=self.joint_axes,
+            cross_section=self.cross_section,
+            link_length_parameters=self.link_length_parameters,
+        )
+
+
+# -- the command line of `init` ---------------------------------------------------------------------------------------
+
+
+def _init_segment(links: int, length: float, mass: float, radius: float | None, **more: Any) -> SegmentSettings:
+    """A segment as `init` writes it; a flat one bends across its thinner side alone, about the other axis."""
+    section = more.get("cross_section")
+    axes = "xy" if section is None else "y" if section[0] <= section[1] else "x"
+    return SegmentSettings(
+        length=length,
+        mass=mass,
+        radius=radius,
+        links=links,
+        joint_axes=axes,
+        stiffness_per_curvature=True,
+        clamped_at_base=more.get("parent") is None,
+        **more,
+    )
+
+
+def _init_object(word: str, segments: Mapping[str, SegmentSettings]) -> InitObject:
+    item = SegmentedObject(segments=segments)
+    return InitObject(item, bending_start_values(item.model_segments(), _RIGIDITY_RATIO[word]))
+
+
+def _cable(numbers: Mapping[str, Any], links: int) -> InitObject:
+    length, mass, radius = required_numbers("a cable", numbers, SIZE_MEANINGS)
+    section = _section(numbers)
+    given = None if section else radius
+    return _init_object("cable", {"cable": _init_segment(links, length, mass, given, cross_section=section)})
+
+
+def _beam(numbers: Mapping[str, Any], links: int) -> InitObject:
+    length, mass = required_numbers("a beam", numbers, {name: SIZE_MEANINGS[name] for name in ("length", "mass")})
+    section = _section(numbers)
+    if section is None and "radius" not in numbers:
+        raise ConfigError(
+            "a beam needs a radius or a section",
+            where="--radius",
+            allowed=SIZE_MEANINGS["radius"],
+            hint="add --radius NUMBER, or --section WIDTH,HEIGHT",
+        )
+    radius = None if section else float(numbers["radius"])
+    return _init_object("beam", {"beam": _init_segment(links, length, mass, radius, cross_section=section)})
+
+
+def _tree(numbers: Mapping[str, Any], links: int) -> InitObject:
+    if numbers.get("branch"):
+        return _init_object("tree", _grown([_branch(text, links) for text in numbers["branch"]]))
+    if not numbers.get("branches"):
+        raise ConfigError(
+            "a tree needs branches",
+            where="--branch",
+            allowed="--branch NAME=LENGTH,MASS,RADIUS[,ROLL,PITCH,YAW] for each, or --branches NUMBER of equal ones",
+            hint="--branches 4 --length 0.4 --mass 0.03 --radius 0.008",
+        )
+    length, mass, radius = required_numbers("each branch of a tree", numbers, SIZE_MEANINGS)
+    count, quarter = numbers["branches"], 1.5707963
+    if not 1 <= count <= 16:
+        raise ConfigError(f"the tree has {count} branches", where="--branches", allowed="1 to 16")
+    # across the z axis of what holds them, the first one along its x axis
+    turns = [(0.0, quarter, round(4 * quarter * i / count, 7)) for i in range(count)]
+    return _init_object(
+        "tree", {f"b{i + 1}": _init_segment(links, length, mass, radius, rpy=turn) for i, turn in enumerate(turns)}
+    )
+
+
+def _section(numbers: Mapping[str, Any]) -> tuple[float, float] | None:
+    if not numbers.get("section"):
+        return None
+    x, y = comma_separated_numbers(numbers["section"], 2, "--section")
+    return x, y
+
+
+def _grown(branches: Sequence[tuple[str, SegmentSettings]]) -> dict[str, SegmentSettings]:
+    """The branches by name, each with a name of its own and on one that comes before it."""
+    made: dict[str, SegmentSettings] = {}
+    for name, branch in branches:
+        if name in made:
+            raise ConfigError(f"two branches are called '{name}'", where="--branch", allowed="a name for each")
+        if branch.parent is not None and branch.parent not in made:
+            what = f"branch '{name}' grows on '{branch.parent}', which does not come before it"
+            raise ConfigError(what, where="--branch", allowed=", ".join(made) or "the holder alone")
+        made[name] = branch
+    return made
+
+
+def _branch(text: str, links: int) -> tuple[str, SegmentSettings]:
+    said, equals, numbers = text.partition("=")
+    name, at, parent = said.partition("@")
+    count = len(numbers.split(","))
+    if not (name and equals) or (at and not parent) or count not in (3, 6):
+        raise ConfigError(f"'{text}' describes no branch", where="--branch", allowed=_BRANCH_SHAPE)
+    values = comma_separated_numbers(numbers, count, "--branch")
+    if min(values[:3]) <= 0:
+        raise ConfigError(f"'{text}' has a size that is not above 0", where="--branch", allowed=_BRANCH_SHAPE)
+    turn = (values[3], values[4], values[5]) if count == 6 else (0.0, 0.0, 0.0)
+    return name, _init_segment(links, values[0], values[1], values[2], rpy=turn, parent=parent or None)
+
+
+# -- the kind ---------------------------------------------------------------------------------------------------------
+
+
+@OBJECTS.register("segments")
+@dataclass(frozen=True, kw_only=True)
+class SegmentedObject(MountedObject):
+    """A flexible object built from segments, such as a beam or a tube with branches."""
+
+    default_link_refinement = True
+    init_templates: ClassVar[Mapping[str, InitTemplate]] = {
+        "cable": InitTemplate(8, _cable),
+        "beam": InitTemplate(6, _beam),
+        "tree": InitTemplate(4, _tree, has_branches=True),
+    }
+    settings_examples: ClassVar[Mapping[str, str]] = {
+        "model.object, kind: segments": """\
+model:
+  object:
+    kind: segments
+    mount: {parent_frame: tool0}
+    segments:
+      trunk: {length: 0.5, mass: 0.05, radius: 0.01}                           # [m], [kg], [m]
+      twig: {parent: trunk, length: 0.3, mass: 0.02, radius: 0.006, rpy: [0.5, 0.0, 0.0]}
+""",
+        "model.object.segments.NAME": """\
+model:
+  object:
+    kind: segments
+    segments:
+      beam: {length: 0.52, mass: 0.33, cross_section: [0.001, 0.08], links: 8, joint_axes: y, \
+stiffness_per_curvature: true, clamped_at_base: true}
+""",
+    }
+
+    kind: Annotated[Literal["segments"], OptionInfo("what the object is")] = "segments"
+    mount: Annotated[MountSettings, OptionInfo("where its root sits")] = field(default_factory=MountSettings)
+    segments: Annotated[Mapping[str, SegmentSettings], OptionInfo("by name, parents first")] = field(
+        default_factory=dict
+    )
+
+    def model_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
+        """Segments, parents first, with the damping of every joint and each link divided, their stiffness kept."""
+        return [s.segment(name, damping, link_division) for name, s in self.segments.items()]

@@ -1,0 +1,125 @@
+"""A round rod that becomes thinner from base to tip, or thicker, such as a fishing rod or a branch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar, Literal
+
+import casadi as ca
+from annotated_types import Ge, Gt, Le
+
+from yid_ocp.model.flexible import FlexibleObject, Segment
+from yid_ocp.model.mechanism import Inertia, Joint
+from yid_ocp.model.objects.base import (
+    OBJECTS,
+    SIZE_MEANINGS,
+    InitObject,
+    InitTemplate,
+    MountedObject,
+    bending_start_values,
+    required_numbers,
+)
+from yid_ocp.model.parameters import Parameter
+from yid_ocp.options import OptionInfo
+
+_SEGMENT = "rod"
+_FURTHER_NUMBERS = {"tip_radius": "the radius of its tip [m]"}
+
+
+def _init_object(numbers: Mapping[str, Any], links: int) -> InitObject:
+    length, mass, radius, tip = required_numbers("a tapered rod", numbers, SIZE_MEANINGS | _FURTHER_NUMBERS)
+    item = TaperedRod(length=length, mass=mass, base_radius=radius, tip_radius=tip, links=links, joint_axes="xy")
+    return InitObject(item, bending_start_values(item.model_segments(), 1.0))
+
+
+@OBJECTS.register("tapered_rod")
+@dataclass(frozen=True, kw_only=True)
+class TaperedRod(MountedObject):
+    """A solid round rod whose radius changes linearly from its clamped base to its tip; the segment is called `rod`.
+
+    `rod.bend`, `rod.twist` and `rod.damping` are per curvature at the base; a section of radius r has (r/base radius)^4
+    of them. `rod.taper` is the tip's radius over the base's.
+    """
+
+    default_link_refinement = True
+    init_templates: ClassVar[Mapping[str, InitTemplate]] = {
+        "tapered_rod": InitTemplate(8, _init_object, _FURTHER_NUMBERS)
+    }
+    settings_examples: ClassVar[Mapping[str, str]] = {
+        "model.object, kind: tapered_rod": """\
+model:
+  object: {kind: tapered_rod, length: 1.2, mass: 0.08, base_radius: 0.006, tip_radius: 0.002}    # [m], [kg]
+parameters:
+  rod.bend: {free: true, initial: 20.0}    # [N m^2]
+"""
+    }
+
+    kind: Annotated[Literal["tapered_rod"], OptionInfo("what the object is")] = "tapered_rod"
+    length: Annotated[float, Gt(0), Le(50), OptionInfo("from base to tip", "m")]
+    mass: Annotated[float, Gt(0), OptionInfo("of the whole rod", "kg")]
+    base_radius: Annotated[float, Gt(0), Le(5), OptionInfo("radius at the base", "m")]
+    tip_radius: Annotated[float, Gt(0), Le(5), OptionInfo("radius at the tip", "m")]
+    links: Annotated[int, Ge(1), Le(64), OptionInfo("number of equal links")] = 8
+    joint_axes: Annotated[str, OptionInfo("axes of the turns at a joint, base to tip; rigid about the others")] = "xyz"
+
+    def model_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
+        """The rod as a segment without taper."""
+        return [
+            Segment(
+                _SEGMENT,
+                self.length,
+                self.mass,
+                self.base_radius,
+                self.links * link_division,
+                damping=damping,
+                stiffness_per_curvature=True,
+                clamped_at_base=True,
+                joint_axes=self.joint_axes,
+            )
+        ]
+
+    def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
+        """The object, to be placed by `placement`; parameters as in `ObjectKind.build`."""
+        return _tapered(super().build(damping, link_division), self.tip_radius / self.base_radius)
+
+
+def _tapered(plain: FlexibleObject, ratio: float) -> FlexibleObject:
+    """The object with a parameter for its taper, on which masses, inertias, springs and dampers depend."""
+    tree, layout = plain.mechanism, plain.segment_layout(_SEGMENT)
+    text = "radius of the tip over that of the base"
+    taper = Parameter(f"{_SEGMENT}.taper", ratio, "1", 1e-3, math.inf, text)
+    n, links = len(layout.link_joints), layout.link_joints
+
+    def radius_at(fraction: float) -> ca.SX:
+        return 1 + (taper.symbol - 1) * fraction
+
+    def carried(joint: Joint) -> Joint:
+        i = next(i for i, names in enumerate(links) if joint.name in names)
+        ends, sizes = (radius_at(i / n), radius_at((i + 1) / n), taper.symbol), (layout.link_lengths[i], layout.radius)
+        return replace(joint, bodies=tuple(_frustum(body, *ends, *sizes) for body in joint.bodies))
+
+    # a joint stands for the half links on both sides of it, the first one for its own half link
+    factors = {name: radius_at(i / n if i else 0.25 / n) ** 4 for i, names in enumerate(links) for name in names}
+    springs = tuple(
+        replace(s, stiffness=s.stiffness * factors[s.joint_name], damping=s.damping * factors[s.joint_name])
+        for s in plain.elastic_joints
+    )
+    made = replace(tree, joints=tuple(map(carried, tree.joints)), parameters=tree.parameters.with_added([taper]))
+    return replace(plain, mechanism=made, elastic_joints=springs)
+
+
+def _frustum(body: Inertia, a: ca.SX, b: ca.SX, taper: ca.SX, length: ca.SX, radius: ca.SX) -> Inertia:
+    """The body of a link between sections of `a` and `b` times the base radius, in place of a cylinder's.
+
+    From exact integrals of powers of the radius, which changes linearly along the link.
+    """
+    area, whole = (a**2 + a * b + b**2) / 3, (1 + taper + taper**2) / 3
+    first = (a**2 + 2 * a * b + 3 * b**2) / 12 / area
+    second = (a**2 + 3 * a * b + 6 * b**2) / 30 / area
+    fourth = (a**4 + a**3 * b + a**2 * b**2 + a * b**3 + b**4) / 5 / area
+    mass = body.mass * area / whole
+    across = length**2 * (second - first**2) + radius**2 / 4 * fourth
+    moments = ca.vertcat(across, across, radius**2 / 2 * fourth)
+    return Inertia(mass, ca.vertcat(0, 0, first * length), ca.diag(moments) * mass, body.gravity_fraction)
