@@ -277,19 +277,17 @@ def build_effect(kind: str, location: str, system: System, values: Mapping[str, 
         if name != quantity.name:
             signed = quantity.lower < 0
             if not (value > 0 or (signed and value < 0)):
-                kind_of = "a number other than zero" if signed else "a positive number"
-                raise ConfigError(
-                    f"{name} = {value}", where=label, allowed=f"{kind_of} {quantity.reported_name_and_unit[1]}"
-                )
+                allowed = f"{'a number other than zero' if signed else 'a positive number'} "
+                allowed += quantity.reported_name_and_unit[1]
+                raise ConfigError(f"{name} = {value}", where=label, allowed=allowed)
             value = quantity.to_internal(value)
         given[quantity.name] = float(value)
     entries = (
         Parameter(f"{label}.{q.name}", given.get(q.name, q.neutral_value), q.unit, q.lower, q.upper, q.description)
         for q in quantities
     )
-    internal = {
-        f"{label}.{name}": ca.SX.sym(f"{label}.{name}") for name in cls.internal_coordinate_names(location, system)
-    }
+    inner = (f"{label}.{name}" for name in cls.internal_coordinate_names(location, system))
+    internal = {name: ca.SX.sym(name) for name in inner}
     return cls(kind, location, quantities, Parameters(entries), internal, cls.arm_joints_at_location(location, system))
 
 
@@ -437,11 +435,10 @@ def link_frames(system: System) -> tuple[str, ...]:
     found = []
     for name in robot_joints(system):
         index = tree.joint_index(name)
-        finger = (
-            tree.joints[index].kind == "prismatic" and index not in parents and tree.joints[index].parent_index >= 0
-        )
+        joint = tree.joints[index]
+        finger = joint.kind == "prismatic" and index not in parents and joint.parent_index >= 0
         frames = [frame for frame, entry in tree.frames.items() if entry.joint_index == index]
-        if not finger and frames and tree.joints[index].bodies:
+        if not finger and frames and joint.bodies:
             found.append(next((frame for frame in preferred if frame in frames), frames[0]))
     return tuple(found)
 
@@ -482,11 +479,8 @@ def branch_joints_by_junction(system: System) -> dict[str, tuple[str, ...]]:
             continue
         first = segment.link_joints[0][0]
         tip = tree.frame(f"w_{segment.parent_segment}").joint_index
-        place = (
-            f"w_{segment.parent_segment}"
-            if tip in tree.ancestor_joints(tree.joint_index(first))
-            else f"junction_{segment.name}"
-        )
+        at_tip = tip in tree.ancestor_joints(tree.joint_index(first))
+        place = f"w_{segment.parent_segment}" if at_tip else f"junction_{segment.name}"
         found[place] = (*found.get(place, ()), first)
     return found
 
@@ -510,9 +504,7 @@ def segment_springs(system: System, segment: str) -> tuple[ElasticJoint, ...]:
 
 def with_elastic_joints(system: System, changed: Mapping[str, ElasticJoint]) -> System:
     """The system with some elastic joints replaced, by joint name."""
-    return replace(
-        system, elastic_joints=tuple(changed.get(spring.joint_name, spring) for spring in system.elastic_joints)
-    )
+    return replace(system, elastic_joints=tuple(changed.get(s.joint_name, s) for s in system.elastic_joints))
 
 
 def mean_bending_stiffness(system: System, segment: str) -> float:

@@ -6,14 +6,7 @@ from dataclasses import replace
 
 import casadi as ca
 
-from yid_ocp.effects.base import (
-    EFFECTS,
-    EffectBase,
-    ParameterDefinition,
-    object_joints,
-    segment_names,
-    with_bodies,
-)
+from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, object_joints, segment_names, with_bodies
 from yid_ocp.model.kinematics import Kinematics, cross_product, motion_cross_force_product, motion_cross_motion_product
 from yid_ocp.model.rotations import symbolic_rotation_from_rpy
 from yid_ocp.model.system import ForceWithDerivatives, MidpointState, StepTerms, System

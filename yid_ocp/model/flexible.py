@@ -139,12 +139,15 @@ class FlexibleObject(ReprMixin):
 
     def segment_layout(self, name: str) -> SegmentLayout:
         """Layout of a segment by name; `ModelError` where there is none."""
-        for entry in self.segment_layouts:
-            if entry.name == name:
-                return entry
-        raise ModelError(
-            f"there is no segment '{name}'", hint=nearest_name_hint(name, [s.name for s in self.segment_layouts])
-        )
+        return find_segment_layout(self.segment_layouts, name)
+
+
+def find_segment_layout(layouts: Sequence[SegmentLayout], name: str) -> SegmentLayout:
+    """Layout of a segment by name; `ModelError` with the nearest name where there is none."""
+    found = {layout.name: layout for layout in layouts}
+    if name not in found:
+        raise ModelError(f"there is no segment '{name}'", hint=nearest_name_hint(name, found))
+    return found[name]
 
 
 def flexible_object(

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
-from yid_ocp.errors import ModelError, nearest_name_hint
-from yid_ocp.model.flexible import UNIT_AXES, ElasticJoint, FlexibleObject, SegmentLayout
+from yid_ocp.errors import ModelError
+from yid_ocp.model.flexible import UNIT_AXES, ElasticJoint, FlexibleObject, SegmentLayout, find_segment_layout
 from yid_ocp.model.kinematics import Kinematics
 from yid_ocp.model.mechanism import Frame, Joint, Mechanism, Placement
 from yid_ocp.model.parameters import Parameters
@@ -112,10 +112,8 @@ class Grasp:
         """
         if self.kind == "point":
             return ca.SX(0, 1)
-        difference = (
-            kinematics.frame_pose(self.holder_frame).rotation @ self.held_orientation
-            - kinematics.frame_pose(self.held_frame).rotation
-        )
+        holder, held = (kinematics.frame_pose(name).rotation for name in (self.holder_frame, self.held_frame))
+        difference = holder @ self.held_orientation - held
         return difference[:, 2] if self.kind == "axis" else ca.vec(difference)
 
 
@@ -244,34 +242,27 @@ class Effect(Protocol):
     @property
     def kind(self) -> str:
         """Name under which the effect's class is registered."""
-        ...
 
     @property
     def location(self) -> str:
         """Name of the place where the effect acts."""
-        ...
 
     @property
     def parameters(self) -> Parameters:
         """The effect's parameters, named `kind@location.quantity`."""
-        ...
 
     @property
     def internal_coordinates(self) -> Mapping[str, ca.SX]:
         """The effect's internal coordinates (without momentum): name to the symbol that `apply_to_system` uses."""
-        ...
 
     def apply_to_system(self, system: System) -> System:
         """The system with the effect's changes of masses, lengths, grasps, gravity or joints."""
-        ...
 
     def step_terms(self, state: MidpointState) -> StepTerms:
         """Energy, forces and internal equations that the effect adds to one step."""
-        ...
 
     def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
         """What a sensor reads instead of `output`; `channel` is `group.point` or `joints.quantity.JOINT`."""
-        ...
 
 
 @runtime_checkable
@@ -284,7 +275,6 @@ class RecordingErrorEffect(Effect, Protocol):
 
     def corrected_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
         """The true value for a recorded `joints.position.JOINT` or `joints.effort.JOINT`, at the true `effort`."""
-        ...
 
     def added_delay(self, channel: str, camera: bool) -> ca.SX:
         """How long before its recorded time a sample was true [s].
@@ -292,14 +282,12 @@ class RecordingErrorEffect(Effect, Protocol):
         `channel` is as in `measure`, or `torque.JOINT` for a recorded torque that drives the model: it then acts so
         much later than it was recorded.
         """
-        ...
 
     def lag_time_constant(self, channel: str) -> ca.SX:
         """Time constant with which a torque follows the recorded one, or a recorded effort the true one [s].
 
         `channel` is `torque.JOINT` or `joints.effort.JOINT`.
         """
-        ...
 
 
 @dataclass(frozen=True, repr=False)
@@ -422,11 +410,8 @@ class System(ReprMixin):
             tree = tree.with_mechanism(item.mechanism, frame, placement)
             elastic += item.elastic_joints
             segments += item.segment_layouts
-        seen = (
-            tuple(point_frames)
-            if point_frames is not None
-            else tuple(name for name in tree.frames if name.startswith("w_"))
-        )
+        tips = (name for name in tree.frames if name.startswith("w_"))
+        seen = tuple(tips if point_frames is None else point_frames)
         _check_names(tree, grasps, driven, prescribed, seen)
         system = System(
             tree,
@@ -495,12 +480,7 @@ class System(ReprMixin):
 
     def segment_layout(self, name: str) -> SegmentLayout:
         """Layout of a segment by name; `ModelError` with the nearest name where there is none."""
-        for entry in self.segment_layouts:
-            if entry.name == name:
-                return entry
-        raise ModelError(
-            f"there is no segment '{name}'", hint=nearest_name_hint(name, [s.name for s in self.segment_layouts])
-        )
+        return find_segment_layout(self.segment_layouts, name)
 
     def map_expressions(self, change: Callable[[ca.SX], ca.SX]) -> System:
         """The system with `change` applied to every expression of its description."""
@@ -509,9 +489,7 @@ class System(ReprMixin):
             for e in self.elastic_joints
         )
         segments = tuple(
-            replace(
-                s, link_lengths=tuple(change(x) for x in s.link_lengths), radius=change(s.radius), mass=change(s.mass)
-            )
+            replace(s, link_lengths=tuple(map(change, s.link_lengths)), radius=change(s.radius), mass=change(s.mass))
             for s in self.segment_layouts
         )
         return replace(
@@ -556,24 +534,15 @@ class System(ReprMixin):
 
     def constraint_residual(self, kinematics: Kinematics) -> ca.SX:
         """Constraint residual phi(q) of all grasps, shape (m, 1)."""
-        return (
-            ca.vertcat(*(grasp.constraint_residual(kinematics) for grasp in self.grasps))
-            if self.grasps
-            else ca.SX(0, 1)
-        )
+        rows = [grasp.constraint_residual(kinematics) for grasp in self.grasps]
+        return ca.vertcat(*rows) if rows else ca.SX(0, 1)
 
     def constraint_relaxation_times(self) -> ca.SX | None:
         """Relaxation times T in phi + T dphi/dt = C lam / h, shape (m, 1) [s]; None where no grasp has one."""
         if all(grasp.relaxation_time is None for grasp in self.grasps):
             return None
-        zero = ca.SX(0)
-        return ca.vertcat(
-            *(
-                zero if g.relaxation_time is None else g.relaxation_time
-                for g in self.grasps
-                for _ in range(g.n_equations)
-            )
-        )
+        times = ((ca.SX(0) if g.relaxation_time is None else g.relaxation_time, g) for g in self.grasps)
+        return ca.vertcat(*(time for time, grasp in times for _ in range(grasp.n_equations)))
 
     def constraint_compliance(self) -> ca.SX:
         """Diagonal of C in phi(q_{k+1}) = C lam_k / h, shape (m, 1)."""

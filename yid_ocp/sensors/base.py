@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol, runtime_checkable
+from typing import ClassVar, Literal, Protocol
 
 import casadi as ca
 import numpy as np
@@ -19,63 +20,50 @@ from yid_ocp.registry import Registry
 Array = NDArray[np.float64]
 
 
-@runtime_checkable
-class Sensor(Protocol):
-    """A group of measured channels with one clock; hashable.
+class Sensor(ABC):
+    """A group of measured channels with one clock; hashable, as subclasses are frozen dataclasses.
 
     Channels are named `group.point` (three outputs each) or `joints.quantity.JOINT` (one output each).
+
+    Attributes
+    ----------
+    group_name : str
+        The recording's group, such as `points_camera`.
+    unit : str
+        Of the readings.
+    outputs_per_channel : int
+        3 for a point, 1 for a joint.
+    naive_prediction : "zero" or "stays"
+        What a trivial prediction without a model is: zero, or the first measured value.
+    frame_names, point_names : tuple of str
+        The mechanism's frame that each channel marks and its recorded name; none for joints.
     """
 
-    @property
-    def group_name(self) -> str:
-        """Name of the recording's group, such as `points_camera`."""
-        ...
+    group_name: str
+    unit: ClassVar[str]
+    outputs_per_channel: ClassVar[int] = 1
+    naive_prediction: ClassVar[Literal["zero", "stays"]] = "stays"
+    frame_names: tuple[str, ...]
+    point_names: tuple[str, ...]
 
     @property
+    @abstractmethod
     def channel_names(self) -> tuple[str, ...]:
         """Names of the channels, in the order of the outputs."""
-        ...
-
-    @property
-    def unit(self) -> str:
-        """Unit of the readings."""
-        ...
-
-    @property
-    def outputs_per_channel(self) -> int:
-        """Number of outputs per channel: 3 for a point, 1 for a joint."""
-        ...
-
-    @property
-    def frame_names(self) -> tuple[str, ...]:
-        """Name of the mechanism's frame that each channel marks; none for joints."""
-        ...
-
-    @property
-    def point_names(self) -> tuple[str, ...]:
-        """Recorded name of the point that each channel marks; none for joints."""
-        ...
 
     @property
     def effort_joints(self) -> tuple[str, ...]:
         """Names of joints whose predicted effort it reads, filtered like the path; none for other sensors."""
-        ...
+        return ()
 
     @property
     def camera_pose(self) -> Placement | None:
         """Pose of the camera in the world; None for any other sensor."""
-        ...
+        return None
 
-    @property
-    def naive_prediction(self) -> Literal["zero", "stays"]:
-        """What a trivial prediction without a model is: zero, or the first measured value."""
-        ...
-
-    def __hash__(self) -> int: ...
-
+    @abstractmethod
     def ideal_reading(self, state: NodeState) -> ca.SX:
-        """What the sensor reads at a node without effects, shape (width * len(channels), 1)."""
-        ...
+        """What the sensor reads at a node without effects, shape (outputs_per_channel * len(channel_names), 1)."""
 
 
 def sensor_function(system: System, sensor: Sensor, names: tuple[str, ...]) -> ca.Function:

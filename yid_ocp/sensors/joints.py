@@ -5,20 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import casadi as ca
 import numpy as np
 import scipy.special
 
 from yid_ocp.errors import ConfigError, DataError, nearest_name_hint
-from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeState
 from yid_ocp.sensors.base import (
     SENSOR_READERS,
     Array,
     JointData,
     PointData,
+    Sensor,
     SensorContext,
     SensorData,
     SensorUsage,
@@ -32,8 +31,10 @@ NOISE_DIFFERENCE_ORDER = 6
 
 
 @dataclass(frozen=True)
-class _JointSensor:
+class _JointSensor(Sensor):
     """A sensor of named joints with one output per joint and no points."""
+
+    frame_names = point_names = ()
 
     joint_names: tuple[str, ...]
     group_name: str
@@ -43,47 +44,13 @@ class _JointSensor:
         """`joints.QUANTITY.JOINT` for every joint."""
         return tuple(f"{self.group_name}.{joint}" for joint in self.joint_names)
 
-    @property
-    def outputs_per_channel(self) -> int:
-        """One output per joint."""
-        return 1
-
-    @property
-    def frame_names(self) -> tuple[str, ...]:
-        """No points."""
-        return ()
-
-    @property
-    def point_names(self) -> tuple[str, ...]:
-        """No points."""
-        return ()
-
-    @property
-    def camera_pose(self) -> Placement | None:
-        """No camera."""
-        return None
-
 
 @dataclass(frozen=True)
 class PositionSensor(_JointSensor):
     """Encoders of named driven joints."""
 
+    unit = "rad"
     group_name: str = POSITION_GROUP
-
-    @property
-    def unit(self) -> str:
-        """Radians."""
-        return "rad"
-
-    @property
-    def effort_joints(self) -> tuple[str, ...]:
-        """No efforts."""
-        return ()
-
-    @property
-    def naive_prediction(self) -> Literal["zero", "stays"]:
-        """Every joint keeps its first angle."""
-        return "stays"
 
     def ideal_reading(self, state: NodeState) -> ca.SX:
         """Angles of the joints, shape (nj, 1) [rad]."""
@@ -94,22 +61,14 @@ class PositionSensor(_JointSensor):
 class EffortSensor(_JointSensor):
     """Efforts of named prescribed joints, predicted by the discrete inverse dynamics."""
 
+    unit = "N m"
+    naive_prediction = "zero"
     group_name: str = EFFORT_GROUP
-
-    @property
-    def unit(self) -> str:
-        """Newton metres."""
-        return "N m"
 
     @property
     def effort_joints(self) -> tuple[str, ...]:
         """All its joints."""
         return self.joint_names
-
-    @property
-    def naive_prediction(self) -> Literal["zero", "stays"]:
-        """Zero effort."""
-        return "zero"
 
     def ideal_reading(self, state: NodeState) -> ca.SX:
         """Efforts of the joints, shape (nj, 1) [N m]."""
@@ -204,9 +163,8 @@ def joint_angle_noise_std(joints: JointData, names: Sequence[str], choice: Senso
     """Noise standard deviation of driven joints' encoders, stated or estimated, shape (len(names),) [rad]."""
     given = choice.std if choice.std is not None else joints.position_std
     if given is None:
-        return _estimated_noise_std(
-            joints.position[:, recorded_joint_columns(joints, tuple(names), where)], where, POSITION_GROUP, "rad"
-        )
+        measured = joints.position[:, recorded_joint_columns(joints, tuple(names), where)]
+        return _estimated_noise_std(measured, where, POSITION_GROUP, "rad")
     return values_by_joint(given, joints.names, names, "sensors.joints.position.std")
 
 
@@ -215,9 +173,8 @@ def joint_torque_noise_std(joints: JointData, names: Sequence[str], choice: Sens
     given = choice.std if choice.std is not None else joints.effort_std
     if given is None:
         assert joints.effort is not None
-        return _estimated_noise_std(
-            joints.effort[:, recorded_joint_columns(joints, tuple(names), where)], where, EFFORT_GROUP, "N m"
-        )
+        measured = joints.effort[:, recorded_joint_columns(joints, tuple(names), where)]
+        return _estimated_noise_std(measured, where, EFFORT_GROUP, "N m")
     return values_by_joint(given, joints.names, names, "sensors.joints.effort.std")
 
 
@@ -228,18 +185,9 @@ def joint_torque_bias_std(joints: JointData, names: Sequence[str], choice: Senso
 
 
 def _estimated_noise_std(values: Array, where: str, group: str, unit: str) -> Array:
-    """White-noise standard deviation of evenly sampled channels, estimated from high-order differences.
+    """White-noise standard deviation of evenly sampled channels (N, k), estimated from high-order differences, (k,).
 
-    Parameters
-    ----------
-    values : ndarray, shape (N, k)
-    where, group, unit : str
-        Names of the recording and of the channels, and their unit.
-
-    Returns
-    -------
-    ndarray, shape (k,)
-        Whatever else is as fast as the sampling counts as noise, so that this is rather too much than too little.
+    Whatever else is as fast as the sampling counts as noise, so that this is rather too much than too little.
     """
     if len(values) <= NOISE_DIFFERENCE_ORDER:
         raise DataError(

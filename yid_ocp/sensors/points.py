@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 import casadi as ca
 import numpy as np
@@ -12,11 +11,11 @@ import numpy as np
 from yid_ocp.errors import ConfigError, DataError, nearest_name_hint
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeState
-from yid_ocp.sensors.base import SENSOR_READERS, PointData, SensorContext, SensorData, SensorUsage
+from yid_ocp.sensors.base import SENSOR_READERS, PointData, Sensor, SensorContext, SensorData, SensorUsage
 
 
 @dataclass(frozen=True)
-class PointSensor:
+class PointSensor(Sensor):
     """Measured positions of named frames in the world.
 
     Attributes
@@ -31,6 +30,9 @@ class PointSensor:
         4x4 pose of the camera in the world; None for a sensor that is no camera.
     """
 
+    unit = "m"
+    outputs_per_channel = 3
+
     group_name: str
     point_names: tuple[str, ...]
     frame_names: tuple[str, ...]
@@ -42,29 +44,9 @@ class PointSensor:
         return tuple(f"{self.group_name}.{point}" for point in self.point_names)
 
     @property
-    def unit(self) -> str:
-        """Metres."""
-        return "m"
-
-    @property
-    def outputs_per_channel(self) -> int:
-        """Three coordinates per point."""
-        return 3
-
-    @property
-    def effort_joints(self) -> tuple[str, ...]:
-        """No joints."""
-        return ()
-
-    @property
     def camera_pose(self) -> Placement | None:
         """Pose of the camera; None where no camera measures."""
         return None if self.camera_pose_matrix is None else Placement.from_matrix(self.camera_pose_matrix)
-
-    @property
-    def naive_prediction(self) -> Literal["zero", "stays"]:
-        """Every point stays where it was first seen."""
-        return "stays"
 
     def ideal_reading(self, state: NodeState) -> ca.SX:
         """Positions of all points, stacked, shape (3 np, 1) [m]."""
