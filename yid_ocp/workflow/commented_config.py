@@ -47,7 +47,7 @@ def commented_config_text(
         f"# yaml-language-server: $schema={schema}",
         f"# Written by `yid-ocp init` {package_version()}. Everything may be changed; docs/settings.md has all keys.",
         "# What the recordings say stands beside each line. Next: `yid-ocp check` on this file, then `yid-ocp solve`.",
-        _line("", "description", _text(f"A {noun} moved by {robot}."), "one sentence for the report"),
+        _line("", "description", _text(f"A {noun.replace('_', ' ')} moved by {robot}."), "one sentence for the report"),
         "",
         "model:",
         _line("  ", "robot", _text(robot), "URDF file, or package:NAME of example-robot-data"),
