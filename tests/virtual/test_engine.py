@@ -15,7 +15,6 @@ from yid_ocp.model.kinematics import forward_kinematics, rigid_body_derivatives
 from yid_ocp.model.objects.foam_y import y_object
 from yid_ocp.model.system import Grasp, System
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.model.objects.foam_y import y_object
 from yid_ocp.virtual.joint_motion import grasping_joint_angles, random_multisine
 from yid_ocp.virtual.mjcf import compile_mjcf, mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import (
