@@ -167,7 +167,7 @@ def violation():
     def evaluate(step, q, theta):
         e = step.equations
         old, zero = [e.z1, e.lam], [np.zeros(e.z1.shape), np.zeros(e.lam.shape)]
-        phi = ca.substitute([e.constraint], old, [ca.SX(ca.DM(x)) for x in zero])[0]
+        phi = ca.substitute([e.constraint_residual], old, [ca.SX(ca.DM(x)) for x in zero])[0]
         return np.array(ca.Function("phi", [e.q1, e.theta, e.time_step], [phi])(q, theta, step.time_step)).ravel()
 
     return evaluate
