@@ -25,7 +25,7 @@ FUNCTIONS = ("rows", "rows_by_theta", "rows_by_unknowns", "points", "mechanics")
 @pytest.fixture(scope="module")
 def step(urdf_folder):
     """Two motors that take the end of a rod with a relaxing branch; a point half way along it."""
-    system = held_rod(urdf_folder, ratio=0.4, driven=["shoulder", "elbow"], points=["w_T1", "T1:50%"])
+    system = held_rod(urdf_folder, ratio=0.4, driven=["shoulder", "elbow"], point_frames=["w_T1", "T1:50%"])
     return compile_step(system, 0.01, use_compiler=False)
 
 

@@ -108,9 +108,9 @@ def test_what_a_slow_recording_keeps_of_a_fast_controller() -> None:
     def run(**choices: Any) -> SimulationResult:
         return simulate_in_mujoco(SYSTEMS[1], TRUTH, motion, SimulationOptions(0.4, time_step=2.5e-4, **choices))
 
-    finely = run(rate=1000.0)
-    sample = run(rate=100.0, controller_rate=1000.0, effort_kind="sample")
-    mean = run(rate=100.0, controller_rate=1000.0, effort_kind="mean")
+    finely = run(sample_rate=1000.0)
+    sample = run(sample_rate=100.0, controller_rate=1000.0, effort_kind="sample")
+    mean = run(sample_rate=100.0, controller_rate=1000.0, effort_kind="mean")
     for coarse in (sample, mean):
         assert len(coarse.t) == 41
         np.testing.assert_array_equal(coarse.q, finely.q[::10])
@@ -199,11 +199,11 @@ def test_a_state_that_is_lost_is_told(later: bool, said: str, tmp_path: Path, mo
     class Thrown:
         begun = False
 
-        def prepare(self, model: Any) -> None: ...
-        def begin(self, data: Any) -> None:
+        def edit_model(self, model: Any) -> None: ...
+        def start_motion(self, data: Any) -> None:
             self.begun = True
 
-        def force(self, model: Any, data: Any) -> None:
+        def add_forces(self, model: Any, data: Any) -> None:
             if self.begun or not later:
                 data.qfrc_passive[:] += 1e14
 

@@ -65,12 +65,12 @@ class Pull:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parameters", Parameters([Parameter("pull@T1.force", 0.0, "N m")]))
-        object.__setattr__(self, "internal", {})
+        object.__setattr__(self, "internal_coordinates", {})
 
-    def modify(self, system: System) -> System:
+    def apply_to_system(self, system: System) -> System:
         return system
 
-    def terms(self, state: MidpointState) -> StepTerms:
+    def step_terms(self, state: MidpointState) -> StepTerms:
         return StepTerms(generalized_force=self.parameters["pull@T1.force"].symbol * state.v)  # type: ignore[attr-defined]
 
 
