@@ -21,14 +21,14 @@ from pathlib import Path
 
 from diagnosis_cases import CASES, record
 from make_recordings import ROUGH, TRUTH
+from planning import PlannedMovement
 
 from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG, load_config
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis import DiagnosisResult, Thresholds, diagnose
 from yid_ocp.effects import make_effect
 from yid_ocp.planning.information_plan import InformativeMotionPlan, plan_informative_motion
-from yid_ocp.planning.motion_plan import PlannedMovement
-from yid_ocp.planning.options import PlanLimits, PlanOptions
+from yid_ocp.planning.joint_paths import PlanLimits, PlanOptions
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.solvers import GaussNewton, Solution, solve

@@ -17,7 +17,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +32,8 @@ from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.effects import make_effect
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model.system import System
-from yid_ocp.planning.end_equilibria import solve_end_equilibrium, solve_start_equilibrium
-from yid_ocp.planning.frame_positions import FramePositions
-from yid_ocp.planning.motion_plan import MotionPlan, PlannedMovement, plan_motion
-from yid_ocp.planning.spline_path import SplinePath
+from yid_ocp.planning.joint_paths import FramePositions, SplinePath, solve_end_equilibrium, solve_start_equilibrium
+from yid_ocp.planning.motion_plan import MotionPlan, plan_motion
 from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, baxter_foam_y_system
 from yid_ocp.virtual.injected import InjectedEffect, run_injected_experiment
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine
@@ -80,6 +78,21 @@ def goals(step: Step, count: int = 10) -> list[tuple[float, float, float]]:
         ):
             found.append((float(x), float(y), float(z)))
     return found
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedMovement:
+    """A planned joint motion as reference for the virtual robot's controller."""
+
+    joints: tuple[str, ...]
+    path: SplinePath
+    spline_coefficients: Array
+
+    def offset_and_derivatives(self, t: float) -> tuple[Array, Array, Array]:
+        """Joint displacement from the start, velocity and acceleration at time t [s], three arrays of shape (nj,)."""
+        bases = (self.path.basis_values(np.array([t]), order)[0] for order in range(3))
+        offset, rate, bend = (basis @ self.spline_coefficients for basis in bases)
+        return offset, rate, bend
 
 
 def straight(step: Step, posture: Array, shift: Array, path: SplinePath) -> PlannedMovement:
@@ -164,7 +177,7 @@ def carried_out(
     simulation = SimulationOptions(duration + settle, time_step=5e-5, controller_rate=500.0, effort_kind="mean")
     # all coordinates, so that what hangs between two hands is in their hold when it settles
     posture = dict(
-        zip(system.mechanism.joint_names, map(float, by.state_trajectory[0, : system.n_coordinates]), strict=True)
+        zip(system.mechanism.joint_names, map(float, by.rollout.state[0, : system.n_coordinates]), strict=True)
     )
     terms = Servo(movement, planned)
     run = simulate_in_mujoco(system, values, movement, simulation, initial_joint_angles=posture, injected=terms)

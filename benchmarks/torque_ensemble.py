@@ -22,7 +22,7 @@ import numpy as np
 from coverage import CONFIGS, PACKAGE, print_progress, solve_twin, working
 from make_recordings import OFFSET, OFFSETS, ROUGH, TRUTH, WHITE
 
-from yid_ocp.analysis.paper_comparison import PAPER_ESTIMATES, is_within_ensemble
+from yid_ocp.analysis.compare import PAPER_ESTIMATES, is_within_ensemble
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.errors import ModelError
 from yid_ocp.files import json_sha256, write_json

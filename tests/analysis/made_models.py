@@ -43,82 +43,73 @@ class Formula:
         noise: float = 1.0,
         fails: Callable[[dict[str, float]], bool] | None = None,
     ) -> None:
-        self.names = tuple(start)
-        self.free = tuple(name for name in self.names if not name.startswith("start."))
-        self.start = np.array(list(start.values()))
-        x = ca.SX.sym("x", len(self.names))
-        residual = ca.vertcat(ca.SX(0, 1), *rows({name: x[i] for i, name in enumerate(self.names)}))
+        self.unknown_names = tuple(start)
+        self.free = tuple(name for name in self.unknown_names if not name.startswith("start."))
+        self.initial_unknowns = np.array(list(start.values()))
+        x = ca.SX.sym("x", len(self.unknown_names))
+        residual = ca.vertcat(ca.SX(0, 1), *rows({name: x[i] for i, name in enumerate(self.unknown_names)}))
         self._function = ca.Function("rows", [x], [residual, ca.jacobian(residual, x)])
-        limits = dict.fromkeys(self.names, (0.0, np.inf)) | dict(bounds or {})
-        self.bounds = tuple(np.array([limits[name][side] for name in self.names]) for side in (0, 1))
-        sizes = dict(zip(self.names, np.abs(self.start), strict=True)) | dict(scales or {})
-        self.scales = np.array([sizes[name] or 1.0 for name in self.names])
+        limits = dict.fromkeys(self.unknown_names, (0.0, np.inf)) | dict(bounds or {})
+        self.bounds = tuple(np.array([limits[name][side] for name in self.unknown_names]) for side in (0, 1))
+        sizes = dict(zip(self.unknown_names, np.abs(self.initial_unknowns), strict=True)) | dict(scales or {})
+        self.unknown_scales = np.array([sizes[name] or 1.0 for name in self.unknown_names])
         data = residual.numel() - stated - weak
-        self.rows = ResidualRows(
+        self.residual_rows = ResidualRows(
             ((slice(0, data),),), slice(0, data), slice(data, data + stated), slice(data + stated, data + stated + weak)
         )
-        self.noise, self._fails = noise, fails or (lambda values: False)
-        self.innovations, self.disturbed = (None,), False
+        self.data_noise_unit, self._fails = noise, fails or (lambda values: False)
+        self.whitening_filters, self.has_process_noise = (None,), False
         self.options = SimpleNamespace(
-            believed=True,
+            data_issues=(),
+            has_trusted_data=True,
             weighting="paper" if noise != 1 else "whitened",
             initial_state="equilibrium",
-            known_start={},
-            recording_values={},
-            priors={},
-            joint_prior=MultivariateGaussianPrior(),
+            known_initial_states={},
+            parameters_by_recording={},
+            prior_stds={},
+            multivariate_prior=MultivariateGaussianPrior(),
             path_cutoff=np.inf,
         )
         everything = samples(
-            ("points.tip",), np.full((data, 1), noise), seen=np.ones((data, 1), bool), value=np.zeros((data, 1)),
+            ("points.tip",), np.full((data, 1), noise), is_used=np.ones((data, 1), bool), value=np.zeros((data, 1)),
             node=np.arange(data), fraction=np.zeros(data), count=data,
         )  # fmt: skip
         grid = SimpleNamespace(steps=data, time_step=0.1)
-        self.episodes = (SimpleNamespace(name="run", grid=grid, samples=(everything,)),)
+        self.episodes = (SimpleNamespace(name="run", grid=grid, measurements=(everything,)),)
         self.step = SimpleNamespace(time_step=0.1)
-        self.shared = tuple(name for name in self.free if "[" not in name)
-        self.local = tuple(dict.fromkeys(name.split("[")[0] for name in self.free if "[" in name))
+        self.shared_parameters = tuple(name for name in self.free if "[" not in name)
+        self.local_parameters = tuple(dict.fromkeys(name.split("[")[0] for name in self.free if "[" in name))
         kinds = dict(units or {})
         self.system = SimpleNamespace(
             parameters=Parameters(
                 Parameter(name, 1.0, kinds.get(name, "N m/rad"))
-                for name in dict.fromkeys(name.split("[")[0] for name in self.names)
+                for name in dict.fromkeys(name.split("[")[0] for name in self.unknown_names)
             )
         )
         self.asked: list[tuple[float, ...]] = []
 
     def split(self, x: np.ndarray, episode: int) -> tuple[np.ndarray, np.ndarray]:
-        values = dict(zip((name.split("[")[0] for name in self.names), np.asarray(x, float), strict=True))
+        values = dict(zip((name.split("[")[0] for name in self.unknown_names), np.asarray(x, float), strict=True))
         return np.array([values[name] for name in self.system.parameters.names]), np.zeros(0)
 
     @property
     def theta(self) -> np.ndarray:
-        return self.split(self.start, 0)[0]
+        return self.split(self.initial_unknowns, 0)[0]
 
     @property
-    def positive(self) -> np.ndarray:
-        return (self.bounds[0] >= 0) & (self.start > 0)
+    def is_positive(self) -> np.ndarray:
+        return (self.bounds[0] >= 0) & (self.initial_unknowns > 0)
 
-    def weighted_at(self, x, warm=None, rounds=1):
-        """Itself: nothing drives its motion wrong."""
-        return self
-
-    def evaluate(self, x: np.ndarray, derivatives: bool = True, warm: object = None) -> Evaluation:
+    def evaluate(self, x: np.ndarray, derivatives: bool = True, equilibrium_guesses: object = None) -> Evaluation:
         x = np.asarray(x, float)
         self.asked.append(tuple(x))
-        if self._fails(dict(zip(self.names, x, strict=True))):
+        if self._fails(dict(zip(self.unknown_names, x, strict=True))):
             return Evaluation(np.inf, np.zeros(0), None, False, "it snaps", ())
         residual, jacobian = (np.array(ca.densify(part)) for part in self._function(x))
         residual = residual.ravel()
-        done = (SimpleNamespace(predicted=(residual[self.rows.data, None],), warm=None),)
+        done = (SimpleNamespace(predicted_outputs=(residual[self.residual_rows.data, None],), equilibrium_guess=None),)
         cost = 0.5 * float(residual @ residual)
         return Evaluation(cost, residual, jacobian if derivatives else None, True, "", done)
-
-    def informing(self, evaluation: Evaluation) -> tuple[np.ndarray, np.ndarray]:
-        rows = self.rows.without_weak_priors
-        unit = np.ones(rows.stop)
-        unit[self.rows.data] = self.noise
-        return evaluation.residual[rows] / unit, evaluation.jacobian[rows] / unit[:, None]
 
 
 GOOD = GoodnessOfFit(1.0, 0.5, True)

@@ -7,9 +7,7 @@ from types import SimpleNamespace
 import casadi as ca
 import numpy as np
 
-from yid_ocp.analysis.experiment_design import (
-    BaseExperiment,
-)
+from yid_ocp.analysis.experiment_design import BaseExperiment
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics

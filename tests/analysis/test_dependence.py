@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.analysis.parameter_dependence import (
+from yid_ocp.analysis.step_diagnostics import (
     _MIN_RELATIVE_RESPONSE,
     ParameterDependence,
     _Linear,
     _readings,
     _summarize_rows,
+    linearise_step_equations,
     parameter_dependences,
 )
-from yid_ocp.analysis.step_diagnostics import linearise_step_equations
 from yid_ocp.analysis.step_symbols import StepSymbols
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.integrator.statics import EquilibriumSolver
@@ -170,7 +170,7 @@ def rolled_out(problem, rest, theta, kick=None):
         std = np.nanmedian(samples.std, axis=0)
         effort = np.zeros((STEPS + 1, n))
         effort[:, list(system.prescribed_indices)] = rollout.effort
-        function = problem.model_functions.compiled_sensor(samples.compiled_sensor, ())
+        function = problem.model_functions.compiled_sensor(samples.sensor, ())
         state = rollout.state[:-1]
         found.append(function(state[:, :n], state[:, 2 * n :], effort, theta)[0][:, :, 0] / std)
     return found

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.analysis.data_quality import RecordedJointsModel, check_dynamic_excitation, check_joint_excitation
+from yid_ocp.analysis.joint_checks import RecordedJointsModel, check_dynamic_excitation, check_joint_excitation
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.analysis.data_quality import check_fit_residuals
+from yid_ocp.analysis.clock_checks import check_fit_residuals
 from yid_ocp.config.reader import load_config
 from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.solvers import solve

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from formula_reader import FUNCTIONS, read, read_latex
 
-from yid_ocp.analysis.formula_text import SymbolName, count_operations, format_expressions
+from yid_ocp.analysis.step_symbols import SymbolName, count_operations, format_expressions
 
 X = ca.SX.sym("x", 4)
 A, B, C, D = ca.vertsplit(X)

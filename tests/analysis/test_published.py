@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from made_models import estimate
 
-from yid_ocp.analysis.paper_comparison import (
+from yid_ocp.analysis.compare import (
     _PAPER_PARAMETERS,
     _TRUTH_EXPERIMENT,
     PAPER_ESTIMATES,

@@ -175,12 +175,7 @@ class Problem:
 
     def __init__(self, weighting="whitened", disturbed=False):
         self.options = ProblemOptions(weighting=weighting)
-        self.disturbed, self.asked = disturbed, []
-
-    def without_input_errors(self):
-        other = Problem(self.options.weighting)
-        other.asked = self.asked
-        return other
+        self.has_process_noise, self.asked = disturbed, []
 
     def with_options(self, options):
         other = Problem(options.weighting)
@@ -191,8 +186,14 @@ class Problem:
         self.asked.append((self.options.weighting, float(x[0]), derivatives))
         return SimpleNamespace(cost=float(x[0]))
 
-    def validate(self, x):
+    def predict_held_out(self, x):
         return [(self.options.weighting, float(x[0]))]
+
+
+def without_noise(problem):
+    other = Problem(problem.options.weighting)
+    other.asked = problem.asked
+    return other
 
 
 @pytest.mark.parametrize("weighting", ["whitened", "paper"])
@@ -206,6 +207,7 @@ def test_methods_run_one_by_one_and_the_lowest_cost_is_the_reference(monkeypatch
         return solution(solver.name, a=estimate(answers[solver.name]))
 
     monkeypatch.setattr(module, "solve", solve)
+    monkeypatch.setattr(module, "without_input_errors", without_noise)
     solvers = [SimpleNamespace(name=name) for name in answers]
     problem = Problem(weighting)
     found = compare_methods(problem, solvers, {"a": 2.0}, lambda name, entry: told.append((name, entry)))
@@ -244,7 +246,11 @@ def test_verdicts_count_the_noise_that_drives_the_motion(monkeypatch):
         return solution(solver.name, a=estimate(value, 0.1, verdict))
 
     monkeypatch.setattr(module, "solve", solve)
-    able, other = SimpleNamespace(name="able", carries_covariance=True), SimpleNamespace(name="single_shooting")
+    monkeypatch.setattr(module, "without_input_errors", without_noise)
+    able, other = (
+        SimpleNamespace(name="able", uses_process_noise_covariance=True),
+        SimpleNamespace(name="single_shooting"),
+    )
     found = compare_methods(Problem(disturbed=True), [other, able], {"a": 10.0}, lambda *entry: told.append(entry))
     # by the sensors' noise alone every fit is poor, from wherever it starts
     assert solved == [("single_shooting", False, False), ("able", False, False), ("able", True, True)]

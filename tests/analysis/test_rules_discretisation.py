@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from made_models import Formula, estimate
 
-from yid_ocp.analysis.discretisation_shift import (
+from yid_ocp.analysis.discretisation import (
     DiscretisationShift,
     RefinedProblem,
     _worse_verdict,
@@ -28,7 +28,7 @@ OPEN = {"a": (-math.inf, math.inf), "b": (-math.inf, math.inf)}
 
 def problem(rows, start, shared=None, **more):
     made = Formula(rows, start, **more)
-    made.shared = tuple(start) if shared is None else shared
+    made.shared_parameters = tuple(start) if shared is None else shared
     made.system = SimpleNamespace(mechanism=SimpleNamespace(joint_names=()))
     return made
 
@@ -41,12 +41,10 @@ def test_an_estimate_moves_to_where_a_linear_finer_model_fits_best(factor):
     """The finer model's own parameter is so many times the coarse one's; its best fit is at 3.3 coarse units."""
     coarse = problem(lambda x: [2 * (x["a"] - 3.0), x["a"] + x["b"] - 5.0], {"a": 3.0, "b": 2.0}, bounds=OPEN)
     finer = problem(
-        lambda x: [2 * (x["a"] / factor - 3.3), x["a"] / factor + x["b"] - 5.1],
-        {"a": 1.0, "b": 1.0},
-        bounds=OPEN,
+        lambda x: [2 * (x["a"] / factor - 3.3), x["a"] / factor + x["b"] - 5.1], {"a": 1.0, "b": 1.0}, bounds=OPEN
     )
-    at = coarse.evaluate(coarse.start)
-    found = discretisation_shifts(RefinedProblem(finer, {"a": factor}), coarse, coarse.start, at)
+    at = coarse.evaluate(coarse.initial_unknowns)
+    found = discretisation_shifts(RefinedProblem(finer, {"a": factor}), coarse, coarse.initial_unknowns, at)
     assert found == pytest.approx({"a": 0.3, "b": -0.2})
 
 
@@ -54,34 +52,41 @@ def test_a_point_that_is_no_estimate_counts_the_difference_of_the_models_alone()
     """At 2 the coarse model wants to go to 3 and the finer one to 3.3."""
     coarse = problem(lambda x: [2 * (x["a"] - 3.0)], {"a": 2.0}, bounds=OPEN)
     finer = problem(lambda x: [2 * (x["a"] - 3.3)], {"a": 2.0}, bounds=OPEN)
-    at = coarse.evaluate(coarse.start)
-    assert discretisation_shifts(RefinedProblem(finer), coarse, coarse.start, at) == pytest.approx({"a": 1.3})
+    at = coarse.evaluate(coarse.initial_unknowns)
+    assert discretisation_shifts(RefinedProblem(finer), coarse, coarse.initial_unknowns, at) == pytest.approx(
+        {"a": 1.3}
+    )
     assert discretisation_shifts(
-        RefinedProblem(finer), coarse, coarse.start, at, model_difference_only=True
+        RefinedProblem(finer), coarse, coarse.initial_unknowns, at, model_difference_only=True
     ) == pytest.approx({"a": 0.3})
 
 
 def test_a_move_ends_at_the_bound():
     coarse = problem(lambda x: [x["a"] - 1.0], {"a": 1.0})
     finer = problem(lambda x: [x["a"] + 5.0], {"a": 1.0})
-    at = coarse.evaluate(coarse.start)
-    assert discretisation_shifts(RefinedProblem(finer), coarse, coarse.start, at) == pytest.approx({"a": -1.0})
+    at = coarse.evaluate(coarse.initial_unknowns)
+    assert discretisation_shifts(RefinedProblem(finer), coarse, coarse.initial_unknowns, at) == pytest.approx(
+        {"a": -1.0}
+    )
 
 
 def test_a_finer_model_that_cannot_be_rolled_out_says_why():
     coarse = problem(lambda x: [x["a"] - 1.0], {"a": 1.0})
     finer = problem(lambda x: [x["a"]], {"a": 1.0}, fails=lambda values: True)
     assert (
-        discretisation_shifts(RefinedProblem(finer), coarse, coarse.start, coarse.evaluate(coarse.start)) == "it snaps"
+        discretisation_shifts(
+            RefinedProblem(finer), coarse, coarse.initial_unknowns, coarse.evaluate(coarse.initial_unknowns)
+        )
+        == "it snaps"
     )
 
 
 def test_models_that_are_compared_at_other_samples_have_no_difference():
     coarse = problem(lambda x: [x["a"] - 1.0], {"a": 1.0})
     finer = problem(lambda x: [x["a"], x["a"]], {"a": 1.0})
-    at = coarse.evaluate(coarse.start)
+    at = coarse.evaluate(coarse.initial_unknowns)
     assert "other samples" in discretisation_shifts(
-        RefinedProblem(finer), coarse, coarse.start, at, model_difference_only=True
+        RefinedProblem(finer), coarse, coarse.initial_unknowns, at, model_difference_only=True
     )
 
 
@@ -119,7 +124,7 @@ def test_a_start_is_carried_to_the_finer_chain():
     made = problem(lambda x: [x["a"]], start, bounds=dict.fromkeys(names, (-9.0, 9.0)))
     refined = RefinedProblem(made, {"a": 2.0, "c": 3.0}, {"T1_0_x": ("T1_0_x", "T1_1_x")})
     point = dict(
-        zip(made.names, refined.unknowns_from_coarse(coarse, np.array([1.5, 2.0, 0.4, 0.9, 5.0])), strict=True)
+        zip(made.unknown_names, refined.unknowns_from_coarse(coarse, np.array([1.5, 2.0, 0.4, 0.9, 5.0])), strict=True)
     )
     assert point == {"a": 3.0, "c[run]": 6.0, "b": 7.0, **dict(zip(names, (0.2, 0.2, 0.0, 0.0), strict=True))}
 

@@ -43,9 +43,9 @@ def holding(urdf_folder):
 
 
 def mechanics(*, grasps=(), second=None, driven=(), prescribed=(), measured=False, joints=True):
-    sensor = SimpleNamespace(efforts=measured)
+    sensor = SimpleNamespace(effort_joints=measured)
     recording = SimpleNamespace(joints=object() if joints else None)
-    episode = SimpleNamespace(samples=(SimpleNamespace(sensor=sensor),), recording=recording)
+    episode = SimpleNamespace(measurements=(SimpleNamespace(sensor=sensor),), recording=recording)
     system = SimpleNamespace(
         grasps=[SimpleNamespace(kind=kind) for kind in grasps], driven=driven, prescribed=prescribed, servos=()
     )
@@ -94,7 +94,7 @@ def test_noise_of_torques_is_what_is_stated_or_typical(joints, std):
 
 def test_a_layout_is_built_once_and_says_what_takes_time(monkeypatch):
     told, built = [], []
-    builder = CandidateExperimentBuilder(BaseExperiment(None, np.zeros(1)), SimpleNamespace(stage=told.append))
+    builder = CandidateExperimentBuilder(BaseExperiment(None, np.zeros(1)), SimpleNamespace(begin_stage=told.append))
 
     def build(mechanics):
         built.append(mechanics)
@@ -119,7 +119,7 @@ def test_a_layout_is_built_once_and_says_what_takes_time(monkeypatch):
 
 
 def travelled(system, angles):
-    episode = SimpleNamespace(measured_arm=np.array(angles, float))
+    episode = SimpleNamespace(measured_driven_angles=np.array(angles, float))
     return _travel(system, {}, episode)
 
 
@@ -182,12 +182,12 @@ def moving(holding, monkeypatch):
         joints[i] = replace(joints[i], lower_limit=lower, upper_limit=upper, effort_limit=effort)
     limited = replace(holding, mechanism=replace(holding.mechanism, joints=tuple(joints)))
 
-    def engine(system, values, motion, simulation, posture):
-        kept.simulated = (system, values, motion, simulation, posture)
+    def engine(system, values, motion, simulation, initial_joint_angles):
+        kept.simulated = (system, values, motion, simulation, initial_joint_angles)
         return SimpleNamespace(t=np.arange(3.0), q=kept.q, effort=kept.effort)
 
-    def draw(system, values, seed, posture, excitation):
-        kept.drawn = (system, values, seed, posture, excitation)
+    def draw(system, values, seed, initial_joint_angles, excitation):
+        kept.drawn = (system, values, seed, initial_joint_angles, excitation)
         return "motion"
 
     monkeypatch.setattr(module, "simulate_in_mujoco", engine)
@@ -198,7 +198,7 @@ def moving(holding, monkeypatch):
         kept.q = np.hstack([q, np.full((len(q), limited.n_coordinates - 2), 9.0)])
         kept.effort = np.array(effort, float)
         angles = np.array([[0.3, 0.1], [0.9, -0.4]])
-        episode = SimpleNamespace(measured_arm=angles, grid=GRID, name="run", errors=None)
+        episode = SimpleNamespace(measured_driven_angles=angles, grid=GRID, name="run", input_errors=None)
         problem = SimpleNamespace(
             system=limited, split=lambda x, i: (limited.parameters.vector({"T1.bend": x[0]}), None), episodes=(episode,)
         )
@@ -217,8 +217,8 @@ def test_another_motion_starts_where_the_recording_does_and_goes_as_far(moving, 
     system, values, seed, posture, excitation = kept.drawn
     assert values["T1.bend"] == 6.5
     assert (seed, posture) == (5, {"shoulder": 0.3, "elbow": 0.1})
-    assert excitation.travel == pytest.approx(factor * kept.travel)
-    assert excitation.speed == speed
+    assert excitation.gripper_travel == pytest.approx(factor * kept.travel)
+    assert excitation.max_joint_speed == speed
     assert excitation.duration == pytest.approx(2.0)
     assert kept.simulated[:3] == (system, values, "motion")
     assert kept.simulated[3].duration == pytest.approx(2.0)
@@ -256,8 +256,8 @@ def test_what_a_robot_could_not_do_is_noted(moving, q, effort, notes):
 def test_a_second_arm_finds_its_own_posture(moving, monkeypatch):
     asked = []
 
-    def settle(system, values, seed, offsets):
-        asked.append((system, seed, offsets))
+    def settle(system, values, start_angles, offsets):
+        asked.append((system, start_angles, offsets))
         return {"elbow": 0.7, "shoulder": 0.2}
 
     monkeypatch.setattr(module, "grasping_joint_angles", settle)
@@ -280,15 +280,13 @@ class Base:
     def __init__(self, held_out=1, duration=None):
         def episode(name):
             joints = JointGroup(("a",), 10.0 + np.arange(0, 3.001, 0.1), np.zeros((31, 1)))
-            return SimpleNamespace(name=name, recording=Recording(joints, (), name=name), grid=GRID, errors=None)
+            return SimpleNamespace(name=name, recording=Recording(joints, (), name=name), grid=GRID, input_errors=None)
 
         self.episodes = (episode("one"), episode("two"))
         self.held_out = tuple(episode(f"held_{i}") for i in range(held_out))
         self.system = SimpleNamespace(driven=("a",))
         self.options = ProblemOptions(duration=duration)
-
-    def weighted_at(self, x, rounds):
-        return self
+        self.has_process_noise = False
 
 
 @pytest.fixture
@@ -379,14 +377,17 @@ def test_a_second_arm_moves_and_its_grasps_are_welded_as_they_lie(engine):
 
 def dense(made, torque=False, seen=(), second=None, joints=None, base_grasps=("w_T2",)):
     chosen, episode = made
-    chosen.problem.system.grasps = [SimpleNamespace(held=name) for name in base_grasps]
+    chosen.problem.system.grasps = [SimpleNamespace(held_frame=name) for name in base_grasps]
     chosen.problem.step = SimpleNamespace(time_step=0.1)
     builder = CandidateExperimentBuilder(replace(chosen, two_arm_system=second))
     recording = replace(episode.recording, joints=joints) if joints is not None else episode.recording
     return builder._dense(recording, 3, seen, torque)
 
 
-SEEN = [SimpleNamespace(name="tip", arm=False), SimpleNamespace(name="marker", arm=True)]
+SEEN = [
+    SimpleNamespace(name="tip", is_arm_measurable=False, added_frame=None),
+    SimpleNamespace(name="marker", is_arm_measurable=True, added_frame=None),
+]
 
 
 def test_everything_is_in_view_at_every_node():
@@ -408,7 +409,9 @@ def test_everything_is_in_view_at_every_node():
 def test_sensors_that_were_not_there_are_added():
     t = np.arange(10.0, 12.05, 0.05)
     joints = JointGroup(("j",), t, np.zeros((len(t), 1)))
-    found = dense(setting(), seen=SEEN, joints=joints, second=SimpleNamespace(grasps=[SimpleNamespace(held="w_T3")]))
+    found = dense(
+        setting(), seen=SEEN, joints=joints, second=SimpleNamespace(grasps=[SimpleNamespace(held_frame="w_T3")])
+    )
     looking, feeling = found.points
     assert (looking.name, looking.names, looking.sensor) == (CAMERA_GROUP, ("tip", "marker"), "camera")
     np.testing.assert_array_equal(looking.pose, np.eye(4))
@@ -470,7 +473,7 @@ def informed(problem, mechanics=(), **settings):
         {"huber_threshold": 0.1},
         {"weighting": "paper"},
         {"weak_prior_factor": 0.01},
-        {"priors": {"elbow.stiffness": 1e-3}},
+        {"prior_stds": {"elbow.stiffness": 1e-3}},
         {"duration": 0.8},
     ],
     ids=["plain", "robust", "paper", "weak priors", "stated priors", "all of it"],
@@ -583,11 +586,13 @@ def test_welds_keep_the_orientation_at_the_start(held_tube):
 def test_welds_need_a_start(held_tube, monkeypatch, how):
     builder = CandidateExperimentBuilder(BaseExperiment(held_tube, held_tube.initial_unknowns, "known", None))
     if how == "layout":
-        monkeypatch.setattr(builder, "layout", lambda others: "it snaps")
+        monkeypatch.setattr(builder, "build_experiment", lambda others: "it snaps")
     else:
         builder.build_experiment(frozenset())
         monkeypatch.setattr(
-            EstimationProblem, "initial_state", lambda self, *rest: SimpleNamespace(message="it snaps", state=None)
+            EstimationProblem,
+            "initial_state",
+            lambda self, *rest: SimpleNamespace(failure_message="it snaps", state=None),
         )
     with pytest.raises(SolverError, match="it snaps"):
         builder._welded(held_tube.system, frozenset())

@@ -49,10 +49,10 @@ def test_a_parameter_is_as_sure_as_its_rows_say():
     assert (b.value, b.unit) == (50.0, "kg")
     assert (b.std, b.std_relative, b.verdict) == (pytest.approx(50 / 3), pytest.approx(1 / 3), "weak")
     assert a.verdict == "identifiable"
-    assert info.identifiable == ("a",)
-    np.testing.assert_allclose(info.information, np.diag([900.0, 9.0]))
+    assert info.identifiable_parameters == ("a",)
+    np.testing.assert_allclose(info.fisher_information, np.diag([900.0, 9.0]))
     np.testing.assert_allclose(info.correlations, np.eye(2), atol=1e-12)
-    assert (info.names, info.nuisance_names, info.profiles) == (("a", "b"), (), {})
+    assert (info.parameter_names, info.nuisance_names, info.profiles) == (("a", "b"), (), {})
 
 
 def test_parameters_that_are_seen_together_are_less_sure_than_each_alone():
@@ -85,25 +85,21 @@ def test_a_misfit_counts_at_a_fit_and_not_at_the_start():
     plain = 2 / (30 * math.sqrt(2.0))
     assert start.parameters["a"].std == pytest.approx(plain)
     assert fit.parameters["a"].std == pytest.approx(plain * math.sqrt(18.0))
-    np.testing.assert_allclose(start.information, [[1800.0]])
-    np.testing.assert_allclose(fit.information, [[100.0]])
+    np.testing.assert_allclose(start.fisher_information, [[1800.0]])
+    np.testing.assert_allclose(fit.fisher_information, [[100.0]])
     assert fit.parameters["a"].std_alone == pytest.approx(fit.parameters["a"].std_relative)
     good = Formula(lambda x: [30 * (x["a"] / 2 - 1)] * 5, {"a": 2.0})
     assert judged(good, [2.0]).parameters["a"].std == pytest.approx(2 / (30 * math.sqrt(5.0)))
 
 
-class Weighed(Formula):
-    """Far too large a residual until it is weighed by the noise that drives the motion."""
-
-    def weighted_at(self, x, warm=None, rounds=1):
-        return Formula(lambda x: [300 * (x["a"] / 2 - 1) + (-1) ** k for k in range(60)], {"a": 2.0})
-
-
 def test_a_fit_is_judged_by_the_noise_that_drives_the_motion_too(monkeypatch):
-    problem = Weighed(lambda x: [300 * (x["a"] / 2 - 1) + 20.0 * (-1) ** k for k in range(60)], {"a": 2.0})
+    """Far too large a residual until it is weighed by the noise that drives the motion."""
+    problem = Formula(lambda x: [300 * (x["a"] / 2 - 1) + 20.0 * (-1) ** k for k in range(60)], {"a": 2.0})
+    weighed = Formula(lambda x: [300 * (x["a"] / 2 - 1) + (-1) ** k for k in range(60)], {"a": 2.0})
+    monkeypatch.setattr(module, "whitened_at", lambda *given, rounds: weighed)
     assert judged(problem, [2.0]).parameters["a"].verdict == "identifiable"
     # of a problem with more unknowns the fit is still that of the problem as it was solved
-    monkeypatch.setattr(module, "with_nuisance_unknowns", lambda *given: Weighed.weighted_at(problem, None))
+    monkeypatch.setattr(module, "with_nuisance_unknowns", lambda *given: weighed)
     assert judged(problem, [2.0]).parameters["a"].verdict == "identifiable"
 
 
@@ -120,7 +116,7 @@ def test_what_was_known_beforehand_is_not_something_that_a_sensor_sees():
     info = judged(problem)
     assert info.parameters["a"].std_relative == pytest.approx(1 / math.hypot(3, 40))
     assert info.parameters["a"].std_alone == pytest.approx(1 / 3)
-    np.testing.assert_allclose(info.information, [[9.0]])
+    np.testing.assert_allclose(info.fisher_information, [[9.0]])
 
 
 # -- nuisances --------------------------------------------------------------------------------------------------------
@@ -136,12 +132,12 @@ def test_a_nuisance_takes_what_it_explains():
         return [30 * a + 5 * s, 40 * (x["b"] / 50 - 1), 0 * a + 2 * s]
 
     info = judged(with_start(rows, stated=1))
-    assert info.names == ("a", "b")
+    assert info.parameter_names == ("a", "b")
     assert info.nuisance_names == ("start.q.x[run]",)
     expected = np.linalg.inv(np.array([[900.0, 150.0], [150.0, 29.0]]))[0, 0]
     assert info.parameters["a"].std_relative == pytest.approx(math.sqrt(expected))
     assert info.parameters["a"].std_alone == pytest.approx(1 / 30)
-    np.testing.assert_allclose(info.information, np.diag([1 / expected, 1600.0]), atol=1e-9)
+    np.testing.assert_allclose(info.fisher_information, np.diag([1 / expected, 1600.0]), atol=1e-9)
 
 
 def test_what_only_a_nuisance_hides_is_said_to_be_hidden_by_it():
@@ -251,8 +247,8 @@ def test_what_is_hardly_seen_is_said_not_to_be_seen():
         assert directions[0].words == words
         assert directions[0].singular_value == pytest.approx(size)
     info = judged(Formula(two(30.0, 0.24), START))
-    assert [d.words for d in info.unseen] == ["b is not seen by any sensor"]
-    none = judged(Formula(lambda x: [30 * x["a"], 0 * x["b"]], START)).unseen[0]
+    assert [d.words for d in info.unidentifiable_directions] == ["b is not seen by any sensor"]
+    none = judged(Formula(lambda x: [30 * x["a"], 0 * x["b"]], START)).unidentifiable_directions[0]
     assert (none.singular_value, none.std_relative) == (0.0, math.inf)
 
 
@@ -261,7 +257,7 @@ def test_springs_in_series_are_named():
         return [300 * (1 / x["a"] + 1 / x["b"] - 0.7)]
 
     info = judged(Formula(rows, {"a": 2.0, "b": 5.0}))
-    [unseen] = info.unseen
+    [unseen] = info.unidentifiable_directions
     assert unseen.words == "a and b are seen only as 1/a + 1/b, as springs in series are"
     assert unseen.components["b"] / unseen.components["a"] == pytest.approx(-2.5)
     assert len(info.directions) == 2
@@ -272,7 +268,7 @@ def test_two_pairs_that_are_each_seen_together_are_told_apart():
         return [300 * (x["a"] + x["b"] - 7), 300 * (x["c"] * x["d"] - 12)]
 
     info = judged(Formula(rows, {"a": 2.0, "b": 5.0, "c": 3.0, "d": 4.0}))
-    assert {d.words for d in info.unseen} == {
+    assert {d.words for d in info.unidentifiable_directions} == {
         "a and b are seen only as a + b, as springs side by side are",
         "c and d are seen only as the product c x d",
     }
@@ -283,7 +279,7 @@ def test_a_combination_is_not_named_where_the_model_cannot_be_rolled_out():
         return [300 * (x["a"] + x["b"] - 7)]
 
     far = Formula(rows, {"a": 2.0, "b": 5.0}, fails=lambda values: values["a"] != 2.0)
-    assert "as springs" not in judged(far).unseen[0].words
+    assert "as springs" not in judged(far).unidentifiable_directions[0].words
 
 
 def test_fewer_rows_than_parameters_leave_directions_open():
@@ -296,7 +292,7 @@ def test_rows_in_metres_inform_in_units_of_their_noise():
     info = judged(Formula(lambda x: [0.3 * (x["a"] / 2 - 1)], {"a": 2.0}, noise=0.01))
     assert info.parameters["a"].std_relative == pytest.approx(1 / 30)
     series = Formula(lambda x: [3 * (x["a"] + x["b"] - 7)], {"a": 2.0, "b": 5.0}, noise=0.01)
-    assert "a + b" in judged(series).unseen[0].words
+    assert "a + b" in judged(series).unidentifiable_directions[0].words
 
 
 # -- intervals --------------------------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from yid_ocp.analysis.experiment_design import (
     FrameObservation,
     observable_frames,
     uniform_sample_times,
-    with_added_frames,
+    with_observable_frames,
 )
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.step import compile_step
@@ -38,13 +38,7 @@ def test_settings_ask_for_the_start_that_is_assumed_and_known_grasps_unless_told
         made.two_arm_system,
         made.torque_std,
         made.motion_seed,
-    ) == (
-        "assumed",
-        None,
-        None,
-        0.1,
-        11,
-    )
+    ) == ("assumed", None, None, 0.1, 11)
 
 
 @pytest.mark.parametrize(
@@ -289,9 +283,10 @@ def test_a_springy_joint_has_a_marker_across_its_axis(tmp_path, axis, beside):
 
 def test_more_frames_need_no_new_equations(urdf_folder):
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    step = compile_step(System.build(robot, point_frames=["tip"]), 0.01, use_compiler=False)
-    frame = step.system.mechanism.frame("tip")
-    more = with_added_frames(step, {"other": frame})
-    assert set(more.system.mechanism.frames) == {*step.system.mechanism.frames, "other"}
-    assert "other" not in step.system.mechanism.frames
+    springs = {"elbow": RobotJointSpring(3.0)}
+    system = System.build(robot, springs=springs, prescribed=["shoulder"], point_frames=["tip"])
+    step = compile_step(system, 0.01, use_compiler=False)
+    more, seen = with_observable_frames(step)
+    assert {sight.name for sight in seen} <= set(more.system.mechanism.frames)
+    assert set(more.system.mechanism.frames) - set(step.system.mechanism.frames) == {"elbow_marker"}
     assert more.kernel is step.kernel

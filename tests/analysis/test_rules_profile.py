@@ -19,17 +19,18 @@ from yid_ocp.analysis.profile import (
     profile_likelihood,
     with_profile_intervals,
 )
+from yid_ocp.inference.linearized_residual import residual_without_weak_priors
 
 OPEN = {"a": (-math.inf, math.inf), "b": (-math.inf, math.inf)}
 HALF = math.sqrt(CHI2_QUANTILE_95)
 
 
 def profiled(problem, name="a", std=None, at=None, **more):
-    x = problem.start if at is None else np.array(at)
+    x = problem.initial_unknowns if at is None else np.array(at)
     if std is None:
-        _, jacobian = problem.informing(problem.evaluate(x))
-        std = float(np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian))[problem.names.index(name)]))
-    return profile_likelihood(problem, x, problem.names.index(name), std, **more)
+        _, jacobian = residual_without_weak_priors(problem, problem.evaluate(x))
+        std = float(np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian))[problem.unknown_names.index(name)]))
+    return profile_likelihood(problem, x, problem.unknown_names.index(name), std, **more)
 
 
 def test_the_level_is_that_of_95_percent():
@@ -103,11 +104,11 @@ def test_rows_in_metres_count_in_units_of_their_noise():
 
 def steps(problem, std, unit, name="a", **more):
     """Values asked below and above the best fit, each in units of the interval's half-width or what is given."""
-    best = problem.evaluate(problem.start)
+    best = problem.evaluate(problem.initial_unknowns)
     problem.asked.clear()
     profiled(problem, name, std, evaluation=best, **more)
-    index = problem.names.index(name)
-    moved = [(x[index] - problem.start[index]) / unit for x in problem.asked]
+    index = problem.unknown_names.index(name)
+    moved = [(x[index] - problem.initial_unknowns[index]) / unit for x in problem.asked]
     return [-d for d in moved if d < 0], [d for d in moved if d > 0]
 
 
@@ -183,10 +184,10 @@ def test_edges_take_few_refits():
 
 def refits(problem, std):
     """What the other unknown is tried at, where the profiled one was first moved to above its best fit."""
-    best = problem.evaluate(problem.start)
+    best = problem.evaluate(problem.initial_unknowns)
     problem.asked.clear()
     profiled(problem, std=std, evaluation=best)
-    above = [x for x in problem.asked if x[0] > problem.start[0]]
+    above = [x for x in problem.asked if x[0] > problem.initial_unknowns[0]]
     return above[0][0], [b for a, b in above if a == above[0][0]]
 
 
@@ -397,16 +398,16 @@ def test_a_cliff_is_found_by_halving():
 
 def test_a_point_that_is_evaluated_already_is_not_evaluated_again():
     problem = Formula(lambda x: [2 * (x["a"] - 3.0)], {"a": 3.0}, bounds=OPEN)
-    best = problem.evaluate(problem.start)
+    best = problem.evaluate(problem.initial_unknowns)
     problem.asked.clear()
-    found = profile_likelihood(problem, problem.start, 0, 0.5, best)
+    found = profile_likelihood(problem, problem.initial_unknowns, 0, 0.5, best)
     assert (3.0,) not in problem.asked
     assert len(problem.asked) == len(found.values) - 1 <= 6
 
 
 def test_the_best_fit_is_the_optimum_nearby():
     problem = Formula(lambda x: [2 * (x["a"] - 3.0), x["a"] * x["b"] - 6.0], {"a": 2.0, "b": 1.0})
-    x, evaluation = nearby_optimum(problem, problem.start)
+    x, evaluation = nearby_optimum(problem, problem.initial_unknowns)
     np.testing.assert_allclose(x, [3.0, 2.0], rtol=1e-4)
     assert evaluation.cost == pytest.approx(0.0, abs=1e-6)
     assert evaluation.jacobian is not None
@@ -419,7 +420,10 @@ def test_the_best_fit_is_the_optimum_nearby():
 def test_intervals_are_worked_out_unasked_where_they_take_no_time(parameters, unknowns, expected):
     names = tuple(f"k{i}" for i in range(parameters))
     starts = tuple(f"start.q.joint[{i}]" for i in range(unknowns - parameters))
-    assert is_small_problem(SimpleNamespace(names=names + starts, shared=names, local=())) is expected
+    assert (
+        is_small_problem(SimpleNamespace(unknown_names=names + starts, shared_parameters=names, local_parameters=()))
+        is expected
+    )
 
 
 # -- verdicts ---------------------------------------------------------------------------------------------------------
@@ -432,9 +436,9 @@ def test_a_stiffness_that_comes_out_small_by_chance_is_not_called_found():
         return [100.0 * (x["a.bend"] - 20.0), 1.7 * (1.0 - 0.2 / x["b.bend"])]
 
     problem = Formula(rows, {"a.bend": 20.0, "b.bend": 0.2})
-    there = problem.evaluate(problem.start)
+    there = problem.evaluate(problem.initial_unknowns)
     fitted = solution(a_bend=estimate(20.0, 0.01), b_bend=estimate(0.2, 0.25))
-    judged = with_profile_intervals(problem, replace(fitted, x=problem.start, evaluation=there)).parameters
+    judged = with_profile_intervals(problem, replace(fitted, x=problem.initial_unknowns, evaluation=there)).parameters
     assert judged["a.bend"] == fitted.parameters["a.bend"]
     assert judged["b.bend"] == replace(fitted.parameters["b.bend"], verdict="not_identifiable", std=math.inf)
 
@@ -448,27 +452,34 @@ def test_a_small_stiffness_counts_where_its_typical_size_is_ruled_out(asymptote,
         lambda x: [100.0 * (x["a.bend"] - 20.0), asymptote * (1.0 - 0.2 / x["b.bend"]) / 0.99],
         {"a.bend": 20.0, "b.bend": 0.2},
     )
-    there = problem.evaluate(problem.start)
-    entry = check_small_estimate(problem, problem.start, 1, estimate(0.2, 0.01), 20.0, there)
+    there = problem.evaluate(problem.initial_unknowns)
+    entry = check_small_estimate(problem, problem.initial_unknowns, 1, estimate(0.2, 0.01), 20.0, there)
     assert entry.verdict == said
-    assert check_small_estimate(problem, problem.start, 1, estimate(7.0, 0.01), 20.0, there).verdict == "identifiable"
+    assert (
+        check_small_estimate(problem, problem.initial_unknowns, 1, estimate(7.0, 0.01), 20.0, there).verdict
+        == "identifiable"
+    )
 
 
 def test_an_interval_may_be_open_where_a_typical_size_is_not_asked():
     problem = Formula(
         lambda x: [100.0 * (x["a.bend"] - 20.0), 1.7 * (1.0 - 12.0 / x["b.bend"])], {"a.bend": 20.0, "b.bend": 12.0}
     )
-    there = problem.evaluate(problem.start)
+    there = problem.evaluate(problem.initial_unknowns)
     fitted = solution(a_bend=estimate(20.0, 0.01), b_bend=estimate(12.0, 7.0, "weak"))
-    found = with_profile_intervals(problem, replace(fitted, x=problem.start, evaluation=there)).parameters["b.bend"]
+    found = with_profile_intervals(problem, replace(fitted, x=problem.initial_unknowns, evaluation=there)).parameters[
+        "b.bend"
+    ]
     assert (found.verdict, found.std) == ("weak", math.inf)
     assert found.interval == (pytest.approx(12.0 / (1 + HALF / 1.7), rel=0.02), None)
 
 
 def test_a_stiffness_that_is_known_to_be_small_is_found():
     problem = Formula(lambda x: [x["a.bend"] - 20.0, 10.0 * (x["b.bend"] - 0.05)], {"a.bend": 20.0, "b.bend": 0.05})
-    there = problem.evaluate(problem.start)
+    there = problem.evaluate(problem.initial_unknowns)
     fitted = solution(a_bend=estimate(20.0, 1.0), b_bend=estimate(0.05, 0.1))
-    found = with_profile_intervals(problem, replace(fitted, x=problem.start, evaluation=there)).parameters["b.bend"]
+    found = with_profile_intervals(problem, replace(fitted, x=problem.initial_unknowns, evaluation=there)).parameters[
+        "b.bend"
+    ]
     assert (found.verdict, found.std) == ("identifiable", 0.1)
     assert found.interval == (None, pytest.approx(0.05 + HALF / 10, rel=0.01))

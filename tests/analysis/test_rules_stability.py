@@ -11,8 +11,8 @@ from made_models import estimate as estimated
 from made_models import solution
 from made_recordings import places
 
-from yid_ocp.analysis import time_step_stability as module
-from yid_ocp.analysis.time_step_stability import (
+from yid_ocp.analysis import discretisation as module
+from yid_ocp.analysis.discretisation import (
     _MAX_GROWTH_DECADES,
     _N_CHECKED_NODES,
     StepErrorGrowth,
@@ -38,7 +38,7 @@ def made(matrices, *, by_torque=None, fixed=(), finite=None):
     """A step whose A is given node by node, of two coordinates, and a rollout that stays where it is."""
     count = len(matrices)
     step = SimpleNamespace(
-        system=SimpleNamespace(size=2, prescribed_indices=fixed),
+        system=SimpleNamespace(n_coordinates=2, prescribed_indices=fixed),
         sizes={"nx": 4},
         time_step=H,
         jacobians=lambda q, p, u, theta, prescribed, z, names: (
@@ -228,9 +228,11 @@ def light_recording(light):
     fine = light(0.5, 0.001)
     t, path, rollout = moved(fine, 0.8)
     assert _error_growth_along(fine, fine.system.parameters.vector(), rollout).is_stable
-    seen = np.array([places(fine.system, fine.system.points, q) for q in rollout.state[::10, : fine.system.size]])
+    seen = np.array(
+        [places(fine.system, fine.system.point_frames, q) for q in rollout.state[::10, : fine.system.n_coordinates]]
+    )
     seen += 1e-3 * np.random.default_rng(0).standard_normal(seen.shape)
-    points = PointGroup("points", fine.system.points, t[::10], seen, 1e-3)
+    points = PointGroup("points", fine.system.point_frames, t[::10], seen, 1e-3)
     return Recording(JointGroup(["x", "z"], t[::5], path[::5], position_std=0.0), (points,), name="light")
 
 
@@ -270,11 +272,14 @@ def test_a_search_may_begin_but_not_end_where_the_step_is_not_stable(monkeypatch
     grown = {0.0: StepErrorGrowth("run", start, 1.3, 0.1, H), 1.0: StepErrorGrowth("run", estimate, 1.3, 0.1, H)}
     monkeypatch.setattr(discretisation_check, "largest_error_growth", lambda problem, x: grown[float(x[0])])
     found = replace(solution(status=before, a=estimated(1.0)), message="done")
-    judged, said = with_stability_check(SimpleNamespace(start=np.zeros(1)), found)
+    judged, said = with_stability_check(SimpleNamespace(initial_unknowns=np.zeros(1)), found)
     assert judged.status == after
     assert (said["start"]["decades"], said["estimate"]["decades"]) == (start, estimate)
     named = "at the estimate run" if estimate else "at the start run" if start and before == Status.FAILED else "done"
     assert judged.message.startswith(named)
     assert "done" in judged.message
     monkeypatch.setattr(discretisation_check, "largest_error_growth", lambda problem, x: None)
-    assert with_stability_check(SimpleNamespace(start=np.zeros(1)), found) == (found, {"start": None, "estimate": None})
+    assert with_stability_check(SimpleNamespace(initial_unknowns=np.zeros(1)), found) == (
+        found,
+        {"start": None, "estimate": None},
+    )

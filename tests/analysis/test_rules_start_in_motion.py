@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from yid_ocp.analysis import cable_memory_check as module
-from yid_ocp.analysis.cable_memory_check import decide_cable_memory
+from yid_ocp.analysis import compare as module
+from yid_ocp.analysis.compare import decide_cable_memory
 from yid_ocp.model.objects.cable import START_SPEED_PARAMETER
 
 
@@ -16,48 +16,52 @@ class Means:
     """One unknown measured once by every recording, and the memory of one branch, which nothing sees."""
 
     def __init__(self, values, speeds, names=("k", "a.memory")):
-        self.values, self.names = np.array(values, float), names
-        self.shared = self.free = names
+        self.values, self.unknown_names = np.array(values, float), names
+        self.shared_parameters = self.free = names
         self.episodes = [self._episode(value, speed) for value, speed in zip(values, speeds, strict=True)]
-        self.rows = SimpleNamespace(measurements=[(slice(i, i + 1),) for i in range(len(values))])
+        self.residual_rows = SimpleNamespace(measurements=[(slice(i, i + 1),) for i in range(len(values))])
         self.bounds = np.full(len(names), -np.inf), np.full(len(names), np.inf)
-        self.scales = np.full(len(names), 100.0)
-        self.predictor = SimpleNamespace(run=lambda episode, theta, offset, derivatives: self._predicted(theta))
+        self.unknown_scales = np.full(len(names), 100.0)
+        self.predictor = SimpleNamespace(
+            predict_episode=lambda episode, theta, offset, derivatives: self._predicted(theta)
+        )
         self.fixed = {}
 
     @staticmethod
     def _episode(value, speed):
-        samples = SimpleNamespace(whitened=lambda predicted: predicted - value, count=1)
-        start = None if speed is None else SimpleNamespace(values={START_SPEED_PARAMETER: speed})
-        return SimpleNamespace(samples=(samples,), start=start)
+        samples = SimpleNamespace(whitened_residual=lambda predicted: predicted - value, n_residuals=1)
+        start = None if speed is None else SimpleNamespace(fitted_parameters={START_SPEED_PARAMETER: speed})
+        return SimpleNamespace(measurements=(samples,), fixed_initial_state=start)
 
     @staticmethod
     def _predicted(theta):
-        return SimpleNamespace(predicted=(np.array([theta]),))
+        return SimpleNamespace(predicted_outputs=(np.array([theta]),))
 
     def split(self, x, i):
         return float(x[0]), None
 
-    def evaluate(self, x, warm=None):
-        jacobian = np.zeros((len(self.values), len(self.names)))
+    def evaluate(self, x, equilibrium_guesses=None):
+        jacobian = np.zeros((len(self.values), len(self.unknown_names)))
         jacobian[:, 0] = 1.0
-        return SimpleNamespace(residual=x[0] - self.values, jacobian=jacobian, warm=None)
+        return SimpleNamespace(residual=x[0] - self.values, jacobian=jacobian, equilibrium_guesses=None)
 
-    def freeing(self, names):
+    def with_free_subset(self, names):
         made = Means(self.values, [0.0] * len(self.values), tuple(names))
         made.episodes = self.episodes
         return made
 
-    def at(self, values):
+    def with_parameter_values(self, values):
         self.fixed = dict(values)
         return self
 
     def vector(self, values):
-        return np.array([values[name] for name in self.names])
+        return np.array([values[name] for name in self.unknown_names])
 
 
 def solution(x, names=("k", "a.memory")):
-    return SimpleNamespace(names=names, x=np.array(x, float), evaluation=SimpleNamespace(warm=None))
+    return SimpleNamespace(
+        unknown_names=names, x=np.array(x, float), evaluation=SimpleNamespace(equilibrium_guesses=None)
+    )
 
 
 @pytest.fixture
@@ -68,7 +72,7 @@ def asked(monkeypatch):
     def solve(problem, solver, start, limits):
         kept.problems.append(problem)
         kept.starts.append(start)
-        found = solution(start, problem.names)
+        found = solution(start, problem.unknown_names)
         return found if kept.ok else SimpleNamespace(evaluation=None)
 
     monkeypatch.setattr(module, "solve", solve)
@@ -90,7 +94,7 @@ def test_a_single_recording_in_motion_bears_nothing_out(asked):
     problem = Means((1.0, 2.0, 3.0), (0.5, 0.0, None))
     safe = decide_cable_memory(problem, None, solution((2.0, 0.5)))
     assert safe.problem is asked.problems[0]
-    assert (safe.problem.names, safe.problem.fixed, asked.starts) == (("k",), {"a.memory": 0.0}, [[2.0]])
+    assert (safe.problem.unknown_names, safe.problem.fixed, asked.starts) == (("k",), {"a.memory": 0.0}, [[2.0]])
     assert "too few recordings start in motion" in safe.message
 
 
@@ -123,14 +127,14 @@ def test_a_recording_is_predicted_from_the_others_alone():
     problem.bounds = np.array([2.0, 0.0]), np.array([np.inf, 1.0])
     bounded = np.sqrt(((4.0 - 1.0) ** 2 + (2.0 - 6.0) ** 2) / 2)
     assert module._left_out(problem, solution((2.5, 0.5)), [0, 2]) == pytest.approx(bounded, rel=1e-6)
-    problem.predictor = SimpleNamespace(run=lambda *_: "it snaps")
+    problem.predictor = SimpleNamespace(predict_episode=lambda *_: "it snaps")
     assert module._left_out(problem, solution((3.0, 0.5)), [0, 2]) == np.inf
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0], ids=["above", "below"])
 def test_where_one_unknown_meets_its_bound_the_other_takes_the_rest(side):
     near, far = np.array([10.0 + 0.5 * side, 10.0 + 9.0 * side]), np.array([10.0 - 9.0 * side, 10.0 - 9.0 * side])
-    problem = SimpleNamespace(bounds=(np.minimum(near, far), np.maximum(near, far)), scales=np.ones(2))
+    problem = SimpleNamespace(bounds=(np.minimum(near, far), np.maximum(near, far)), unknown_scales=np.ones(2))
     jacobian, residual = np.array([[1.0, 1.0], [0.0, 0.1]]), np.array([-2.0 * side, 0.0])
     found = module._stepped(problem, np.array([10.0, 10.0]), residual, jacobian)
     np.testing.assert_allclose(found, 10.0 + side * np.array([0.5, 1.5 / 1.01]), rtol=1e-6)

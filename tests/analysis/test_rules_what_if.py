@@ -183,7 +183,9 @@ def test_greedy_ends_where_nothing_more_goes_together():
 def layout(names, x, scales=None, free=None, notes=(), information=None, grasps=()):
     free = tuple(free or names)
     problem = SimpleNamespace(
-        names=tuple(names), scales=np.array(scales or np.ones(len(names))), system=SimpleNamespace(grasps=grasps)
+        unknown_names=tuple(names),
+        unknown_scales=np.array(scales or np.ones(len(names))),
+        system=SimpleNamespace(grasps=grasps),
     )
     told = []
 
@@ -191,7 +193,14 @@ def layout(names, x, scales=None, free=None, notes=(), information=None, grasps=
         told.append(views)
         return np.array(information, float)
 
-    return SimpleNamespace(problem=problem, x=np.array(x), names=free, notes=notes, information=inform, told=told)
+    return SimpleNamespace(
+        problem=problem,
+        x=np.array(x),
+        free_parameters=free,
+        feasibility_notes=notes,
+        fisher_information=inform,
+        told=told,
+    )
 
 
 def gained(*values):
@@ -250,19 +259,19 @@ class Recorded:
         self.t_camera, self.t_arm = np.array([0.0, 0.5, 1.0, 1.5]), np.array([0.0, 0.1, 0.2])
         self._camera = SimpleNamespace(name="points_camera_1", t=10.0 + self.t_camera) if camera else None
         self._arm = SimpleNamespace(name="points_arm_1", t=10.0 + self.t_arm) if arm else None
-        self.grasps = [SimpleNamespace(held=name) for name in grasps]
+        self.grasps = [SimpleNamespace(held_frame=name) for name in grasps]
         made = [SimpleNamespace(grid=GRID, number=i) for i in range(episodes)]
         self.problem = SimpleNamespace(episodes=made, system=SimpleNamespace(grasps=self.grasps))
 
-    def camera(self, episode):
+    def camera_sampling(self, episode):
         return (
             (self._camera, self.t_camera, 5e-3) if self._camera else (None, np.array([0.0, 1.0]), _DEFAULT_CAMERA_STD)
         )
 
-    def arm(self, episode):
+    def arm_sampling(self, episode):
         return (self._arm, self.t_arm, 2e-3) if self._arm else (None, np.array([0.0, 0.1]), _DEFAULT_ARM_POINT_STD)
 
-    def views(self, episode):
+    def recorded_observations(self, episode):
         found = []
         if self._camera:
             found += [
@@ -275,18 +284,20 @@ class Recorded:
 
 
 def views(setting, changes, grasps=None):
-    made = layout("a", [1.0], grasps=setting.grasps if grasps is None else [SimpleNamespace(held=g) for g in grasps])
+    made = layout(
+        "a", [1.0], grasps=setting.grasps if grasps is None else [SimpleNamespace(held_frame=g) for g in grasps]
+    )
     return _Outcomes(setting, None, 1.0)._views(setting.problem.episodes[0], changes, made)
 
 
 def said(view):
-    return view.group, view.frame, len(view.times), float(view.std[0, 0])
+    return view.point_group, view.frame, len(view.times), float(view.std[0, 0])
 
 
 def test_without_changes_everything_is_seen_as_it_was():
     setting = Recorded()
     found = views(setting, [])
-    assert [said(view) for view in found] == [said(view) for view in setting.views(None)]
+    assert [said(view) for view in found] == [said(view) for view in setting.recorded_observations(None)]
 
 
 @pytest.mark.parametrize(
@@ -295,11 +306,14 @@ def test_without_changes_everything_is_seen_as_it_was():
     ids=["a camera", "none so far"],
 )
 def test_a_camera_sees_more(has, group, times, std):
-    found = views(Recorded(camera=has), [change("x", camera=("w_T3", "w_T2")), change("y", camera=("w_T1",))])
+    found = views(
+        Recorded(camera=has),
+        [change("x", added_camera_frames=("w_T3", "w_T2")), change("y", added_camera_frames=("w_T1",))],
+    )
     new = [view for view in found if view.frame.startswith("w_")]
     assert [view.frame for view in new] == ["w_T3", "w_T2", "w_T1"]
     for view in new:
-        assert view.group == group
+        assert view.point_group == group
         np.testing.assert_array_equal(view.times, times)
         np.testing.assert_array_equal(view.std, np.full((len(times), 3), std))
 
@@ -310,19 +324,21 @@ def test_a_camera_sees_more(has, group, times, std):
     ids=["an arm", "none so far"],
 )
 def test_an_arm_feels_more(has, group, times, std):
-    found = views(Recorded(arm=has), [change("x", arm=("w_T3",))])
-    assert found[-1].group == group
+    found = views(Recorded(arm=has), [change("x", added_arm_frames=("w_T3",))])
+    assert found[-1].point_group == group
     assert found[-1].frame == "w_T3"
     np.testing.assert_array_equal(found[-1].times, times)
     np.testing.assert_array_equal(found[-1].std, np.full((len(times), 3), std))
 
 
 def test_another_rate_is_the_cameras_alone():
-    found = views(Recorded(), [change("rate:4"), change("x", camera=("w_T3",), arm=("w_T1",))])
+    found = views(
+        Recorded(), [change("rate:4"), change("x", added_camera_frames=("w_T3",), added_arm_frames=("w_T1",))]
+    )
     even = uniform_sample_times(GRID, 4.0)
     assert [view.frame for view in found] == ["tip", "elbow", "hand", "w_T3", "w_T1"]
     for view in found:
-        if view.group == "points_camera_1":
+        if view.point_group == "points_camera_1":
             np.testing.assert_array_equal(view.times, even)
             np.testing.assert_array_equal(view.std, np.full((len(even), 3), 5e-3))
         else:
@@ -331,7 +347,7 @@ def test_another_rate_is_the_cameras_alone():
 
 def test_what_a_second_arm_holds_is_that_arms_to_measure():
     found = views(Recorded(), [], grasps=("hand", "tip"))
-    assert [(view.group, view.frame) for view in found] == [
+    assert [(view.point_group, view.frame) for view in found] == [
         ("points_camera_1", "elbow"),
         ("points_arm_1", "hand"),
         ("points_arm_1", "tip"),
@@ -347,11 +363,11 @@ class Builder:
         self.layouts = layouts
         self.asked = []
 
-    def layout(self, mechanics):
+    def build_experiment(self, mechanics):
         self.asked.append(mechanics)
         return self.layouts["_".join(sorted(mechanics)) or "base"]
 
-    def possible(self):
+    def applicable_changes(self):
         return ["weld", "motion"]
 
 
@@ -398,7 +414,7 @@ def test_what_cannot_be_built_tells_nothing():
 
 
 def sight(name, arm=False):
-    return SimpleNamespace(name=name, words=f"the {name}", arm=arm)
+    return SimpleNamespace(name=name, description=f"the {name}", is_arm_measurable=arm)
 
 
 @pytest.fixture
@@ -414,10 +430,7 @@ def seen(monkeypatch):
         (Recorded(), "camera:middle camera:marker arm:marker rate:10 rate:30"),
         (Recorded(camera=False), "camera:tip camera:middle camera:marker arm:marker"),
         (Recorded(arm=False), "camera:middle camera:hand arm:hand camera:marker arm:marker rate:10 rate:30"),
-        (
-            Recorded(camera=False, arm=False),
-            "camera:tip camera:middle camera:hand arm:hand camera:marker arm:marker",
-        ),
+        (Recorded(camera=False, arm=False), "camera:tip camera:middle camera:hand arm:hand camera:marker arm:marker"),
     ],
     ids=["both", "no camera", "no arm", "neither"],
 )

@@ -45,7 +45,7 @@ def test_blocks_have_the_names_of_the_project(symbols):
     assert list(symbols.row_blocks[1].labels) == list(symbols.equations.system.internal_coordinates)
     assert symbols.column_blocks[3].full_names == ("u[shoulder]",)
     # parameters are called as everywhere, without a block
-    assert symbols.column_blocks[4].full_names == symbols.equations.system.parameters.full_names
+    assert symbols.column_blocks[4].full_names == symbols.equations.system.parameters.names
     assert len(set(symbols.row_names)) == len(symbols.row_names)
     assert len(set(symbols.column_names)) == len(symbols.column_names)
 

@@ -12,10 +12,9 @@ from small_problems import pendulum_step, taken
 from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.errors import ConfigError, YidError
 from yid_ocp.planning.information_plan import plan_informative_motion
-from yid_ocp.planning.informative_motion_search import InformativeMotionSearch
-from yid_ocp.planning.optimality_criteria import DOptimality, EffectDiscrimination
-from yid_ocp.planning.options import PlanLimits, PlanOptions
-from yid_ocp.planning.plan_constraints import ValueWithJacobian
+from yid_ocp.planning.informative_motion_search import DOptimality, EffectDiscrimination, InformativeMotionSearch
+from yid_ocp.planning.joint_paths import PlanLimits, PlanOptions
+from yid_ocp.planning.plan_shooting import ValueWithJacobian
 from yid_ocp.planning.planned_experiment import PlannedExperiment
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 
@@ -57,7 +56,7 @@ def values_of(problem):
 
 
 def some_motion(experiment, seed=0, size=0.1):
-    return size * np.random.default_rng(seed).normal(size=experiment.still.shape)
+    return size * np.random.default_rng(seed).normal(size=experiment.zero_coefficients.shape)
 
 
 # -- what would be recorded -------------------------------------------------------------------------------------------
@@ -68,8 +67,8 @@ def test_sensors_tell_as_much_in_a_second_as_in_the_recording(driven_problem):
     w = some_motion(experiment)
     planned, base = experiment.estimation_problem(w), driven_problem
     spent = base.episodes[0].grid.steps * base.step.time_step
-    for new, old in zip(planned.episodes[0].measurements, base.episodes[0].samples, strict=True):
-        assert new.sensor.channel_names == old.sensor.channels
+    for new, old in zip(planned.episodes[0].measurements, base.episodes[0].measurements, strict=True):
+        assert new.sensor.channel_names == old.sensor.channel_names
         length = len(new.node) * (new.node[1] - new.node[0]) * base.step.time_step
         np.testing.assert_allclose(
             np.sum(new.weight**2, axis=0) / length, np.sum(old.weight**2, axis=0) / spent, rtol=1e-9
@@ -99,12 +98,9 @@ def test_slopes_are_derivatives_of_the_sensitivities(kind, request):
 def test_prescribed_arms_tell_what_identifiability_says(moved_problem):
     experiment = PlannedExperiment.from_options(moved_problem, values_of(moved_problem), OPTIONS)
     w = some_motion(experiment, size=0.3)
-    searched, judged = (
-        experiment.search_sensitivities(w),
-        identifiability(experiment.estimation_problem(w)).fisher_information,
-    )
+    searched, judged = experiment.search_sensitivities(w), identifiability(experiment.estimation_problem(w))
     # the search sees fewer samples of points, each telling more
-    np.testing.assert_allclose(np.diag(searched.T @ searched), np.diag(judged), rtol=0.05)
+    np.testing.assert_allclose(np.diag(searched.T @ searched), np.diag(judged.fisher_information), rtol=0.05)
 
 
 def test_driven_arms_tell_about_what_the_innovations_say(driven_problem):
@@ -131,10 +127,8 @@ CRITERIA = {
 def test_criteria_know_their_derivatives(name):
     criterion, way, e = CRITERIA[name], np.random.default_rng(5).normal(size=ROWS.shape), 1e-6
     _, slope = criterion.value_and_gradient(ROWS)
-    central = (criterion.value_and_gradient(ROWS + e * way)[0] - criterion.value_and_gradient(ROWS - e * way)[0]) / (
-        2 * e
-    )
-    assert float(np.sum(slope * way)) == pytest.approx(central, rel=1e-6)
+    after, before = (criterion.value_and_gradient(ROWS + sign * e * way)[0] for sign in (1, -1))
+    assert float(np.sum(slope * way)) == pytest.approx((after - before) / (2 * e), rel=1e-6)
 
 
 def test_precision_is_that_of_the_marginal_standard_deviation():
@@ -168,12 +162,13 @@ def made_up(rows, limits, size, low, high):
     def slopes(w, here):
         return np.array([(rows(w + 1e-6 * e.reshape(w.shape)) - here) / 1e-6 for e in np.eye(size)])
 
-    mover = SimpleNamespace(path=SimpleNamespace(unknowns=size), roll=lambda w, slopes=False: w)
-    experiment = SimpleNamespace(mover=mover, rows=rows, slopes=slopes, still=np.zeros((size, 1)))
+    bounds = np.full((size, 1), low), np.full((size, 1), high)
+    simulator = SimpleNamespace(coefficient_bounds=lambda: bounds, simulate_path=lambda w, slopes=False: w)
+    experiment = SimpleNamespace(simulator=simulator, search_sensitivities=rows, sensitivity_derivatives=slopes)
     values, upper = limits
     bounded = [SimpleNamespace(unit=np.ones(len(upper)), lower=-np.inf * np.ones(len(upper)), upper=np.array(upper))]
-    kept = SimpleNamespace(bounded=bounded, limits=lambda rolled, w: ValueWithJacobian(*values(w.ravel())))
-    return InformativeMotionSearch(experiment, kept, DOptimality((0, 1), (0, 1)), np.array([low]), np.array([high]))
+    kept = SimpleNamespace(limit_rows=bounded, limit_values=lambda rolled, w: ValueWithJacobian(*values(w.ravel())))
+    return InformativeMotionSearch(experiment, kept, DOptimality((0, 1), (0, 1)))
 
 
 def straight(matrix):
@@ -187,26 +182,26 @@ def line(w):
 
 def test_a_straight_line_is_read_at_the_ends_of_its_range():
     search = made_up(line, (straight([[0.0, 0.0]]), [1.0]), 2, -1.0, 1.5)
-    found = search.improve(np.array([[0.1], [-0.05]]), 50)
-    assert found.finished
+    found = search.improve_motion(np.array([[0.1], [-0.05]]), 50)
+    assert found.is_converged
     np.testing.assert_allclose(np.sort(found.w.ravel()), [-1.0, 1.5], atol=1e-6)
-    assert found.value > found.first
+    assert found.final_criterion > found.initial_criterion
 
 
 def test_a_limit_is_kept_and_used_up():
     # the places are no more than 0.8 apart
     search = made_up(line, (straight([[1.0, -1.0], [-1.0, 1.0]]), [0.8, 0.8]), 2, -1.0, 1.5)
-    found = search.improve(np.array([[0.1], [-0.05]]), 50)
+    found = search.improve_motion(np.array([[0.1], [-0.05]]), 50)
     assert abs(float(np.diff(found.w.ravel())[0])) == pytest.approx(0.8, abs=5e-3)
-    assert search.passed(found.w) <= 0.0
+    assert search.max_limit_violation(found.w) <= 0.0
 
 
 def test_a_curved_limit_is_kept_on_the_way_and_in_the_end():
     # the places lie in a circle of radius 0.6
     search = made_up(line, (lambda w: (np.array([w @ w]), 2 * w[None, :]), [0.36]), 2, -1.0, 1.5)
     for rounds in (1, 2, 50):
-        found = search.improve(np.array([[0.1], [-0.05]]), rounds)
-        assert search.passed(found.w) <= 0.0
+        found = search.improve_motion(np.array([[0.1], [-0.05]]), rounds)
+        assert search.max_limit_violation(found.w) <= 0.0
     assert abs(float(np.diff(found.w.ravel())[0])) == pytest.approx(2 * 0.6 / 2**0.5, abs=5e-3)
 
 
@@ -214,33 +209,39 @@ def test_a_curved_limit_is_kept_on_the_way_and_in_the_end():
 
 
 def test_the_motion_tells_more_than_those_it_came_from(told, moved_problem):
-    assert told.reached, told.message
-    assert len(told.starts) == OPTIONS.n_random_starts
-    assert all(start.value > start.first + 0.3 for start in told.starts)
-    assert told.best == int(np.argmax([start.judged for start in told.starts]))
+    assert told.is_successful, told.message
+    assert len(told.start_results) == OPTIONS.n_random_starts
+    assert all(start.final_criterion > start.initial_criterion + 0.3 for start in told.start_results)
+    assert told.best_start_index == int(np.argmax([start.configured_criterion for start in told.start_results]))
     before = identifiability(moved_problem)
-    for name, known in told.parameters.items():
-        assert known.before == pytest.approx(before.parameters[name].std_relative)
-        assert known.together <= min(known.before, known.after)
-    assert told.parameters["elbow.stiffness"].after < told.parameters["elbow.stiffness"].before
+    for name, known in told.parameter_precisions.items():
+        assert known.std_recorded == pytest.approx(before.parameters[name].std_relative)
+        assert known.std_combined <= min(known.std_recorded, known.std_planned)
+    assert (
+        told.parameter_precisions["elbow.stiffness"].std_planned
+        < told.parameter_precisions["elbow.stiffness"].std_recorded
+    )
 
 
 def test_it_starts_and_ends_at_rest_within_limits(told):
-    for values in (told.velocity, told.acceleration):
+    for values in (told.joint_velocities, told.joint_accelerations):
         np.testing.assert_allclose(values[[0, -1]], 0.0, atol=1e-9)
-    assert np.abs(told.acceleration).max() <= 15.0 * (1 + 1e-6)
-    assert np.abs(told.effort).max() <= 0.9 * 40.0 * (1 + 1e-6)
-    assert np.all(np.abs(told.position) <= 1.2 + 1e-9)
+    assert np.abs(told.joint_accelerations).max() <= 15.0 * (1 + 1e-6)
+    assert np.abs(told.joint_efforts).max() <= 0.9 * 40.0 * (1 + 1e-6)
+    assert np.all(np.abs(told.joint_positions) <= 1.2 + 1e-9)
     elbow = told.simulator.step.system.mechanism.joint_index("elbow")
     assert np.abs(told.rollout.state[::2, elbow]).max() <= 1.0
     # what tells much goes to the limits
-    assert told.active
-    assert all(names in (("shoulder",), ("elbow",)) for names in told.active.values())
+    assert told.active_limits
+    assert all(names in (("shoulder",), ("elbow",)) for names in told.active_limits.values())
 
 
 def test_one_parameter_is_told_better_where_it_alone_counts(moved_problem, told):
     alone = plan_informative_motion(moved_problem, replace(OPTIONS, identify=("elbow.damping",)))
-    assert alone.parameter_precisions["elbow.damping"].std_planned <= 1.02 * told.parameters["elbow.damping"].after
+    assert (
+        alone.parameter_precisions["elbow.damping"].std_planned
+        <= 1.02 * told.parameter_precisions["elbow.damping"].std_planned
+    )
 
 
 def test_the_same_seed_gives_the_same_motion(moved_problem):
@@ -260,16 +261,12 @@ def test_two_effects_are_moved_apart(driven_problem):
 
 
 def test_effects_of_twice_the_size_lie_twice_as_far_apart(driven_problem):
-    pair, quick = (
-        ("joint_coulomb@shoulder", "joint_viscous@shoulder"),
-        replace(OPTIONS, n_random_starts=1, max_iterations=1),
-    )
+    pair = ("joint_coulomb@shoulder", "joint_viscous@shoulder")
+    quick = replace(OPTIONS, n_random_starts=1, max_iterations=1, discriminate=pair)
     told = []
     for factor in (1.0, 2.0):
         sizes = {pair[0]: {"tau_c": 0.2 * factor}, pair[1]: {"b": 0.05 * factor}}
-        told.append(
-            plan_informative_motion(driven_problem, replace(quick, discriminate=pair), None, sizes).effect_distances
-        )
+        told.append(plan_informative_motion(driven_problem, quick, None, sizes).effect_distances)
     for key in told[0]:
         assert told[1][key][0] == pytest.approx(2 * told[0][key][0], rel=1e-3)
 
@@ -292,20 +289,23 @@ def test_a_parameter_that_nothing_sees_is_named_and_the_others_are_told(limited_
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        ({"inform": ("elbow.stifness",)}, ("no parameter 'elbow.stifness'", "did you mean 'elbow.stiffness'?")),
-        ({"inform": ("lower.mass",)}, ("plan.identify",)),
-        ({"inform": ()}, ("no parameter is to be told", "elbow.stiffness")),
-        ({"inform": FREE, "separate": ("joint_viscous@elbow",)}, ("one of the two",)),
-        ({"separate": ("joint_viscous@elbow",)}, ("1 effect is to be separated", "two effects or more")),
-        ({"separate": ("joint_viscous", "joint_coulomb@elbow")}, ("nothing of where", "kind@location")),
-        ({"separate": ("joint_viscus@elbow", "joint_coulomb@elbow")}, ("no effect 'joint_viscus'", "joint_viscous")),
-        ({"separate": ("joint_viscous@elbw", "joint_coulomb@elbow")}, ("elbw", "elbow")),
-        ({"posture": {"shoulder": 1.5}}, ("0.3 beyond its limit",)),
+        ({"identify": ("elbow.stifness",)}, ("no parameter 'elbow.stifness'", "did you mean 'elbow.stiffness'?")),
+        ({"identify": ("lower.mass",)}, ("plan.identify",)),
+        ({"identify": ()}, ("no parameter is to be told", "elbow.stiffness")),
+        ({"identify": FREE, "discriminate": ("joint_viscous@elbow",)}, ("one of the two",)),
+        ({"discriminate": ("joint_viscous@elbow",)}, ("1 effect is to be separated", "two effects or more")),
+        ({"discriminate": ("joint_viscous", "joint_coulomb@elbow")}, ("nothing of where", "kind@location")),
+        (
+            {"discriminate": ("joint_viscus@elbow", "joint_coulomb@elbow")},
+            ("no effect 'joint_viscus'", "joint_viscous"),
+        ),
+        ({"discriminate": ("joint_viscous@elbw", "joint_coulomb@elbow")}, ("elbw", "elbow")),
+        ({"start_joint_positions": {"shoulder": 1.5}}, ("0.3 beyond its limit",)),
         (
             {"limits": PlanLimits(effort_fraction=1e-4)},
             ("pass their limits before they move", "shoulder", "where 0.004"),
         ),
-        ({"starts": 0}, ("starts = 0", "from 1")),
+        ({"n_random_starts": 0}, ("n_random_starts = 0", "from 1")),
     ],
 )
 def test_what_is_refused(moved_problem, more, words):

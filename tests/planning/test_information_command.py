@@ -20,17 +20,17 @@ CONFIG = """\
 model:
   robot: {urdf}
   springs:
-    elbow: {{stiffness: 3.0, rest: 0.1}}
-  arms: {{mode: prescribed, passive: [elbow]}}
+    elbow: {{stiffness: 3.0, rest_position: 0.1}}
+  arms: {{mode: prescribed, passive_joints: [elbow]}}
   damping: 0.2
   points: [tip, lower]
 recordings: {{estimate: [{recording}]}}
 parameters:
   elbow.stiffness: {{free: true}}
   elbow.damping: {{free: true}}
-problem: {{compiler: false, path_cutoff: 15.0, feedback: none}}
+problem: {{use_compiler: false, path_cutoff: 15.0, feedback: none}}
 plan:
-  {{goal: information, duration: 0.8, settle: 0.4, knots: 3, starts: 2, limits: {{acceleration: 15.0}}}}
+  {{goal: information, duration: 0.8, hold_duration: 0.4, n_spline_coefficients: 3, n_random_starts: 2, limits: {{max_acceleration: 15.0}}}}
 """
 PAIR = ("joint_coulomb@shoulder", "joint_viscous@shoulder")
 
@@ -87,7 +87,7 @@ def test_a_diagnosis_hands_over_its_parameters_and_effects(config, tmp_path):
     folder = diagnosed(tmp_path / "diagnosed", 4.0)
     alike = [[{"kind": label.partition("@")[0], "location": label.partition("@")[2]} for label in PAIR]]
     section = next_plan_settings(alike, folder)
-    assert section == {"goal": "information", "separate": list(PAIR), "run": str(folder)}
+    assert section == {"goal": "information", "discriminate": list(PAIR), "parameter_run": str(folder)}
     assert next_plan_settings([], folder) is None
     command = _planning_command(section)
     assert command.startswith(f"yid-ocp plan {folder / 'config.yaml'} --set plan.goal=information")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from yid_ocp.planning.spline_path import SplinePath
+from yid_ocp.planning.joint_paths import SplinePath
 
 
 @pytest.fixture(params=[2, 3, 7, 12])

@@ -11,29 +11,28 @@ from yid_ocp.errors import ConfigError, ModelError, YidError
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.planning.frame_positions import FramePositions
+from yid_ocp.planning.joint_paths import FramePositions, PathSimulator, PlanLimits, PlanOptions, SplinePath
 from yid_ocp.planning.motion_plan import ParameterCovariance, plan_motion
-from yid_ocp.planning.options import PlanLimits, PlanOptions
-from yid_ocp.planning.path_simulator import PathSimulator
-from yid_ocp.planning.plan_constraints import PlanResidualsAndLimits
-from yid_ocp.planning.plan_shooting import PlanShooting
-from yid_ocp.planning.spline_path import SplinePath
+from yid_ocp.planning.plan_shooting import PlanResidualsAndLimits, PlanShooting
 
 START, GOAL = 0.2, 0.7
 
 
-def tip_at(step, angle, theta=None):
-    """Where the tip rests with the shoulder at an angle."""
-    theta = step.system.parameters.vector() if theta is None else theta
-    rest = EquilibriumSolver(step).solve([angle], theta)
-    return FramePositions(step.system, ["tip"]).positions_and_jacobian(rest.state[None, : step.system.size], theta)[0][
-        0
-    ]
+def point_at(step, angle, name="tip"):
+    """Where a point rests with the shoulder at an angle."""
+    theta = step.system.parameters.vector()
+    state = EquilibriumSolver(step).solve([angle], theta).state[None]
+    return positions(step.system, name, state, theta)[0]
+
+
+def positions(system, name, state, theta):
+    """Positions of a frame along states."""
+    return FramePositions(system, [name]).positions_and_jacobian(state[:, : system.n_coordinates], theta)[0]
 
 
 @pytest.fixture(scope="module")
 def wanted(moved):
-    place = tuple(float(x) for x in tip_at(moved, GOAL))
+    place = tuple(float(x) for x in point_at(moved, GOAL))
     return PlanOptions(
         point="tip",
         target_position=place,
@@ -55,8 +54,8 @@ BOX = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.3))
 @pytest.mark.parametrize(
     "more",
     [
-        {"goal": "place", "effort": 0.5, "limits": PlanLimits(max_spring_angle=0.5)},
-        {"goal": "path", "via": ((0.0, 0.1, 0.0),)},
+        {"goal": "place", "effort_weight": 0.5, "limits": PlanLimits(max_spring_angle=0.5)},
+        {"goal": "path", "waypoint_offsets": ((0.0, 0.1, 0.0),)},
         {"goal": "box", "box": BOX},
     ],
     ids=["place", "path", "box"],
@@ -68,7 +67,12 @@ def test_slopes_are_derivatives(moved, wanted, more):
     inside = FramePositions(moved.system, ("tip", "lower")) if options.box else None
     simple = mover.path.straight_line_coefficients([0.4])
     rows = PlanResidualsAndLimits(
-        mover, options, FramePositions(moved.system, ("tip", "lower")), np.array(options.place), simple, inside
+        mover,
+        options,
+        FramePositions(moved.system, ("tip", "lower")),
+        np.array(options.target_position),
+        simple,
+        inside,
     )
     shooting = PlanShooting([rows], simple.shape)
     rng, x, e = np.random.default_rng(5), simple.ravel() + 0.1, 1e-5
@@ -81,43 +85,37 @@ def test_slopes_are_derivatives(moved, wanted, more):
 
 
 def test_the_point_arrives_and_stays_without_swinging(moved, wanted, found):
-    assert found.reached, found.message
-    assert found.error < 1e-4
-    assert found.swing < wanted.swing
-    n = moved.system.size
+    assert found.is_successful, found.message
+    assert found.max_position_error < 1e-4
+    assert found.max_residual_speed < wanted.rest_speed_tolerance
     step = found.simulator.step
-    again = simulate(step, found.simulator.theta, found.simulator.start.state, len(found.t) - 1, path=found.position)
-    tip = FramePositions(moved.system, ["tip"]).positions_and_jacobian(again.state[:, :n], found.simulator.theta)[0]
-    np.testing.assert_allclose(found.points["tip"], tip, atol=1e-12)
-    end = found.t >= wanted.duration - 1e-9
-    assert np.linalg.norm(tip[end] - wanted.place, axis=1).max() == pytest.approx(found.error)
-    speed = np.linalg.norm(np.diff(tip[end], axis=0), axis=1) / step.time_step
-    assert speed.max() <= found.swing + 1e-12
-    # moving the shoulder there smoothly, as if the elbow were stiff, leaves the tip swinging
-    simple = found.simulator.roll(found.simulator.path.straight([GOAL - START]))
-    left = (
-        FramePositions(moved.system, ["tip"]).positions_and_jacobian(simple.state[end, :n], found.simulator.theta)[0]
-        - wanted.place
+    again = simulate(
+        step,
+        found.simulator.theta,
+        found.simulator.start_equilibrium.state,
+        len(found.t) - 1,
+        path=found.joint_positions,
     )
-    assert np.linalg.norm(left, axis=1).max() > 20 * found.error
+    tip = positions(moved.system, "tip", again.state, found.simulator.theta)
+    np.testing.assert_allclose(found.point_trajectories["tip"], tip, atol=1e-12)
+    end = found.t >= wanted.duration - 1e-9
+    assert np.linalg.norm(tip[end] - wanted.target_position, axis=1).max() == pytest.approx(found.max_position_error)
+    speed = np.linalg.norm(np.diff(tip[end], axis=0), axis=1) / step.time_step
+    assert speed.max() <= found.max_residual_speed + 1e-12
+    # moving the shoulder there smoothly, as if the elbow were stiff, leaves the tip swinging
+    simple = found.simulator.simulate_path(found.simulator.path.straight_line_coefficients([GOAL - START]))
+    left = positions(moved.system, "tip", simple.state[end], found.simulator.theta) - wanted.target_position
+    assert np.linalg.norm(left, axis=1).max() > 20 * found.max_position_error
 
 
 def test_what_hangs_below_the_point_comes_to_rest_as_well(moved, wanted):
-    lower = FramePositions(moved.system, ["lower"])
-
-    def at(angle):
-        rest = EquilibriumSolver(moved).solve([angle], moved.system.parameters.vector())
-        return lower.positions_and_jacobian(rest.state[None, : moved.system.size], moved.system.parameters.vector())[0][
-            0
-        ]
-
     # the shoulder alone brings this one there, whatever the elbow does
-    done = plan_motion(moved, replace(wanted, point="lower", place=tuple(map(float, at(GOAL)))))
-    assert done.is_successful, done.message
-    tip = (
-        np.diff(done.point_trajectories["tip"][done.simulator.standstill_nodes], axis=0) / done.simulator.step.time_step
+    done = plan_motion(
+        moved, replace(wanted, point="lower", target_position=tuple(map(float, point_at(moved, GOAL, "lower"))))
     )
-    assert np.linalg.norm(tip, axis=1).max() < wanted.swing
+    assert done.is_successful, done.message
+    moves = np.diff(done.point_trajectories["tip"][done.simulator.standstill_nodes], axis=0)
+    assert np.linalg.norm(moves, axis=1).max() / done.simulator.step.time_step < wanted.rest_speed_tolerance
 
 
 def test_a_plan_holds_where_time_is_stepped_more_finely(moved, wanted):
@@ -127,27 +125,25 @@ def test_a_plan_holds_where_time_is_stepped_more_finely(moved, wanted):
     assert done.simulator.step.time_step < coarse.time_step
     start = EquilibriumSolver(fine).solve([START], done.simulator.theta)
     held = replace(done.simulator, step=fine, start_equilibrium=start)
-    tip = FramePositions(moved.system, ["tip"]).positions_and_jacobian(
-        held.simulate_path(done.spline_coefficients).state[:, : moved.system.size], held.theta
-    )[0]
+    tip = positions(moved.system, "tip", held.simulate_path(done.spline_coefficients).state, held.theta)
     end = held.node_times >= wanted.duration - 1e-9
-    assert np.linalg.norm(tip[end] - wanted.place, axis=1).max() < wanted.tolerance
-    assert np.linalg.norm(np.diff(tip[end], axis=0), axis=1).max() / fine.time_step < 2 * wanted.swing
+    assert np.linalg.norm(tip[end] - wanted.target_position, axis=1).max() < wanted.position_tolerance
+    assert np.linalg.norm(np.diff(tip[end], axis=0), axis=1).max() / fine.time_step < 2 * wanted.rest_speed_tolerance
 
 
 def test_a_plan_starts_and_ends_at_rest(found):
-    for values in (found.velocity, found.acceleration):
+    for values in (found.joint_velocities, found.joint_accelerations):
         np.testing.assert_allclose(values[[0, -1]], 0.0, atol=1e-9)
-    assert found.position[0] == pytest.approx([START])
+    assert found.joint_positions[0] == pytest.approx([START])
 
 
 def test_limits_are_kept_at_the_price_of_the_goal_or_of_calm(moved, wanted, found):
-    top = np.abs(found.acceleration).max()
+    top = np.abs(found.joint_accelerations).max()
     bound = 0.8 * top
     calm = plan_motion(moved, replace(wanted, duration=0.8, limits=PlanLimits(max_acceleration=bound)))
     assert calm.is_successful, calm.message
     assert np.abs(calm.joint_accelerations).max() <= bound * 1.001
-    strong = np.abs(found.effort).max()
+    strong = np.abs(found.joint_efforts).max()
     share = 0.97 * strong / 40.0
     gentle = plan_motion(moved, replace(wanted, duration=0.8, limits=PlanLimits(effort_fraction=share)))
     assert np.abs(gentle.joint_efforts).max() <= share * 40.0 * 1.005, gentle.message
@@ -161,16 +157,20 @@ def test_a_limit_that_cannot_be_kept_is_named(moved, wanted):
 
 
 def test_a_motion_that_leaves_the_point_elsewhere_has_not_arrived(moved, wanted):
-    few = plan_motion(moved, replace(wanted, knots=2, duration=0.4, limits=PlanLimits(max_acceleration=1e3)))
-    assert few.max_position_error > 2 * wanted.tolerance, "the motion must fail for this to be a test"
+    few = plan_motion(
+        moved, replace(wanted, n_spline_coefficients=2, duration=0.4, limits=PlanLimits(max_acceleration=1e3))
+    )
+    assert few.max_position_error > 2 * wanted.position_tolerance, "the motion must fail for this to be a test"
     assert not few.is_successful
     assert f"leaves the point {1e3 * few.max_position_error:.3g} mm from its place" in few.message
 
 
 def test_a_path_is_followed(moved, wanted):
-    begin = tip_at(moved, START)
-    via = tuple(tuple(float(x) for x in tip_at(moved, angle) - begin) for angle in (0.45, 0.8))
-    options = replace(wanted, goal="path", via=via, duration=1.5, knots=12, tolerance=5e-3)
+    begin = point_at(moved, START)
+    via = tuple(tuple(float(x) for x in point_at(moved, angle) - begin) for angle in (0.45, 0.8))
+    options = replace(
+        wanted, goal="path", waypoint_offsets=via, duration=1.5, n_spline_coefficients=12, position_tolerance=5e-3
+    )
     followed = plan_motion(moved, options)
     assert followed.is_successful, followed.message
     direct = plan_motion(moved, replace(options, goal="place")).point_trajectories["tip"]
@@ -183,21 +183,23 @@ def test_a_path_is_followed(moved, wanted):
 
 
 def test_points_stay_in_the_box(moved, wanted, found):
-    tip = found.points["tip"]
+    tip = found.point_trajectories["tip"]
     top = float(tip[:, 2].max())
     low, high = tip.min(0), tip.max(0)
-    assert top > wanted.place[2] + 2e-3, "the free motion must overshoot for this to be a test"
-    lid = 0.5 * (top + wanted.place[2])
+    assert top > wanted.target_position[2] + 2e-3, "the free motion must overshoot for this to be a test"
+    lid = 0.5 * (top + wanted.target_position[2])
     box = ((-1.0, float(low[1]) - 1.0, float(low[2]) - 1.0), (1.0, float(high[1]) + 1.0, lid))
-    kept = plan_motion(moved, replace(wanted, goal="box", box=box, inside=("tip",), duration=0.8, knots=8))
+    kept = plan_motion(
+        moved, replace(wanted, goal="box", box=box, frames_in_box=("tip",), duration=0.8, n_spline_coefficients=8)
+    )
     assert kept.is_successful, kept.message
     assert kept.point_trajectories["tip"][::2, 2].max() <= lid + 1e-4
 
 
 def test_the_shortest_duration_is_shorter_and_arrives(moved, wanted):
-    quick = plan_motion(moved, replace(wanted, duration=1.2, shortest=True))
+    quick = plan_motion(moved, replace(wanted, duration=1.2, minimize_duration=True))
     assert quick.is_successful
-    assert quick.max_residual_speed <= wanted.swing
+    assert quick.max_residual_speed <= wanted.rest_speed_tolerance
     assert quick.simulator.path.duration < 0.8
 
 
@@ -209,16 +211,16 @@ def test_spread_is_the_derivative_times_the_uncertainty(moved, wanted):
         theta = told.simulator.theta.copy()
         theta[moved.system.parameters.index("elbow.stiffness")] += sign * 1e-4
         mover = replace(told.simulator, theta=theta, start_equilibrium=EquilibriumSolver(moved).solve([START], theta))
-        state = mover.simulate_path(told.spline_coefficients).state[-1:, : moved.system.size]
-        places.append(FramePositions(moved.system, ["tip"]).positions_and_jacobian(state, theta)[0][0])
+        state = mover.simulate_path(told.spline_coefficients).state[-1:]
+        places.append(positions(moved.system, "tip", state, theta)[0])
     np.testing.assert_allclose(told.end_position_std, 0.3 * np.abs(places[1] - places[0]) / 2e-4, rtol=1e-4, atol=1e-9)
 
 
 def test_a_motion_planned_for_uncertainty_errs_less_where_the_stiffness_is_another(moved, wanted):
     known = ParameterCovariance(("elbow.stiffness",), np.array([[0.6**2]]))
-    options, worst = replace(wanted, knots=8, duration=1.0), []
+    options, worst = replace(wanted, n_spline_coefficients=8, duration=1.0), []
     for spread in (False, True):
-        done = plan_motion(moved, replace(options, spread=spread), known=known)
+        done = plan_motion(moved, replace(options, minimize_parameter_sensitivity=spread), known=known)
         assert done.is_successful, done.message
         errors = []
         for sign in (-1, 1):
@@ -228,9 +230,11 @@ def test_a_motion_planned_for_uncertainty_errs_less_where_the_stiffness_is_anoth
                 done.simulator, theta=theta, start_equilibrium=EquilibriumSolver(moved).solve([START], theta)
             )
             state = mover.simulate_path(done.spline_coefficients).state[
-                done.simulator.standstill_nodes, : moved.system.size
+                done.simulator.standstill_nodes, : moved.system.n_coordinates
             ]
-            off = FramePositions(moved.system, ["tip"]).positions_and_jacobian(state, theta)[0] - options.place
+            off = (
+                FramePositions(moved.system, ["tip"]).positions_and_jacobian(state, theta)[0] - options.target_position
+            )
             errors.append(np.sqrt(np.mean(np.sum(off**2, axis=1))))
         worst.append(max(errors))
     assert worst[1] < 0.8 * worst[0]
@@ -239,21 +243,24 @@ def test_a_motion_planned_for_uncertainty_errs_less_where_the_stiffness_is_anoth
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        ({"place": (0.0, 3.0, 0.0)}, ("out of reach", "mm off", "joint's limit", "nearer place")),
+        ({"target_position": (0.0, 3.0, 0.0)}, ("out of reach", "mm off", "joint's limit", "nearer place")),
         ({"point": "tipp"}, ("no frame 'tipp'",)),
         ({"point": None}, ("no point is named",)),
-        ({"shift": (0.0, 0.1, 0.0)}, ("said twice", "one of place and shift")),
-        ({"place": None}, ("nothing says where the point is to arrive",)),
-        ({"posture": {"shoulder": 1.5}}, ("shoulder starts at 1.5", "0.3 beyond its limit", "-1.2 to 1.2")),
-        ({"posture": {"sholder": 0.5}}, ("'sholder' is no joint that moves", "did you mean 'shoulder'?")),
-        ({"posture": {}}, ("says nothing of shoulder",)),
-        ({"posture": None}, ("nothing says where the motion begins",)),
+        ({"target_offset": (0.0, 0.1, 0.0)}, ("said twice", "one of place and shift")),
+        ({"target_position": None}, ("nothing says where the point is to arrive",)),
+        (
+            {"start_joint_positions": {"shoulder": 1.5}},
+            ("shoulder starts at 1.5", "0.3 beyond its limit", "-1.2 to 1.2"),
+        ),
+        ({"start_joint_positions": {"sholder": 0.5}}, ("'sholder' is no joint that moves", "did you mean 'shoulder'?")),
+        ({"start_joint_positions": {}}, ("says nothing of shoulder",)),
+        ({"start_joint_positions": None}, ("nothing says where the motion begins",)),
         ({"goal": "path"}, ("no places on the way",)),
         ({"goal": "box"}, ("there is no box",)),
         ({"goal": "box", "box": ((0, 0, 1), (1, 1, 0))}, ("empty along z", "from 1 up to 0 m")),
         ({"goal": "box", "box": ((-1, -1, -1), (1, 1, 0.3))}, ("mm outside the box along z", "plan.frames_in_box")),
-        ({"spread": True}, ("uncertainty is not known", "plan.parameter_run")),
-        ({"knots": 1}, ("knots = 1", "from 2")),
+        ({"minimize_parameter_sensitivity": True}, ("uncertainty is not known", "plan.parameter_run")),
+        ({"n_spline_coefficients": 1}, ("n_spline_coefficients = 1", "from 2")),
         ({"duration": -1.0}, ("duration = -1", "above 0")),
     ],
 )

@@ -11,7 +11,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording
 from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.rollout import simulate
-from yid_ocp.planning.frame_positions import FramePositions
+from yid_ocp.planning.joint_paths import FramePositions
 from yid_ocp.workflow.plan import run_plan
 from yid_ocp.workflow.run_inputs import recording_path
 
@@ -34,18 +34,18 @@ def test_every_plan_that_ships_is_tried(repository):
 @pytest.mark.parametrize("name", sorted(COARSE))
 def test_a_plan_that_ships_arrives_within_its_limits(repository, tmp_path, name):
     run, outcome = planned(repository, tmp_path, name, *COARSE[name])
-    assert outcome.ok, outcome.result["message"]
-    assert outcome.result["error"] < run.plan.tolerance
-    assert outcome.result["swing"] < run.plan.swing
+    assert outcome.is_successful, outcome.result["message"]
+    assert outcome.result["error"] < run.plan.position_tolerance
+    assert outcome.result["swing"] < run.plan.rest_speed_tolerance
     for joint, own in outcome.result["joints"].items():
-        assert own["velocity"] <= run.plan.limits.velocity + 1e-3, joint
-        assert own["effort"] <= run.plan.limits.effort + 1e-3, joint
+        assert own["velocity"] <= run.plan.limits.velocity_fraction + 1e-3, joint
+        assert own["effort"] <= run.plan.limits.effort_fraction + 1e-3, joint
     written = read_recording(outcome.folder / "recording.h5")
     assert set(written.joints.names) == set(run.model.arms.joints)
     # what is to arrive is among the points that were written, whether or not the system names it
     group = written.points[0]
     last = group.position[-1, group.names.index(run.plan.point)]
-    np.testing.assert_allclose(last, outcome.result["place"], atol=run.plan.tolerance)
+    np.testing.assert_allclose(last, outcome.result["place"], atol=run.plan.position_tolerance)
     message = json.loads((outcome.folder / "trajectory.json").read_text())
     assert message["joint_names"] == list(written.joints.names)
 
@@ -53,13 +53,13 @@ def test_a_plan_that_ships_arrives_within_its_limits(repository, tmp_path, name)
 def test_the_middle_of_a_cable_stays_below_a_lid(repository, tmp_path):
     quick = (*COARSE["plan_cable"], "plan.duration=0.6")
     _, free = planned(repository, tmp_path / "free", "plan_cable", *quick, "plan.goal=place")
-    height = free.plan.points["cable:50%"][:, 2]
-    lid = 0.5 * (height.max() + free.plan.place[2])
+    height = free.plan.point_trajectories["cable:50%"][:, 2]
+    lid = 0.5 * (height.max() + free.plan.target_position[2])
     assert height.max() > lid + 1e-3, "the free motion must pass the lid for this to be a test"
     box = f"plan.box=[[0.0, -1.0, -0.6], [1.5, 1.0, {lid}]]"
     _, kept = planned(repository, tmp_path / "kept", "plan_cable", *quick, box, "plan.frames_in_box=['cable:50%']")
-    assert kept.ok, kept.result["message"]
-    assert kept.plan.points["cable:50%"][:, 2].max() < lid + 2e-4
+    assert kept.is_successful, kept.result["message"]
+    assert kept.plan.point_trajectories["cable:50%"][:, 2].max() < lid + 2e-4
 
 
 def test_a_path_of_the_free_tip_is_followed_as_far_as_it_says(repository, tmp_path):
@@ -72,34 +72,36 @@ def test_a_path_of_the_free_tip_is_followed_as_far_as_it_says(repository, tmp_pa
     run, outcome = planned(
         repository, tmp_path, "plan_place", *COARSE["plan_place"], *path, "plan.position_tolerance=0.004"
     )
-    assert outcome.ok, outcome.result["message"]
-    tip, t = outcome.plan.points["w_T3"], outcome.plan.t
+    assert outcome.is_successful, outcome.result["message"]
+    tip, t = outcome.plan.point_trajectories["w_T3"], outcome.plan.t
     halfway = tip[int(np.argmin(np.abs(t - 0.8)))] - tip[0]
-    off = np.linalg.norm(halfway - run.plan.via[0])
+    off = np.linalg.norm(halfway - run.plan.waypoint_offsets[0])
     assert off <= outcome.result["off_path"] + 1e-9
     assert outcome.result["off_path"] < 0.01
-    direct = 0.5 * (outcome.plan.place - tip[0])
-    assert np.linalg.norm(np.array(run.plan.via[0]) - direct) > 0.01, "the way there must not lead there by itself"
+    direct = 0.5 * (outcome.plan.target_position - tip[0])
+    assert np.linalg.norm(np.array(run.plan.waypoint_offsets[0]) - direct) > 0.01, (
+        "the way there must not lead there by itself"
+    )
 
 
 def test_two_arms_bring_the_junction_to_a_place_and_keep_hold_of_it(repository, tmp_path):
     name = "dual_arm_vision"
     way = "plan={point: w_T1, target_offset: [0.03, 0.03, 0.0], duration: 0.8, hold_duration: 0.3}"
     run, outcome = planned(repository, tmp_path, name, "model.object.links=2", STIFF, way)
-    assert outcome.ok, outcome.result["message"]
-    assert outcome.result["swing"] < run.plan.swing
+    assert outcome.is_successful, outcome.result["message"]
+    assert outcome.result["swing"] < run.plan.rest_speed_tolerance
     found = outcome.plan
     # it begins where the recording does, and both arms take part
     recorded = read_recording(recording_path(run.recordings.estimate[0])).joints
-    first = recorded.position[0, [recorded.names.index(name) for name in found.joints]]
-    np.testing.assert_allclose(found.position[0], first, atol=5e-3)
-    travel = dict(zip(found.joints, np.ptp(found.position, axis=0), strict=True))
+    first = recorded.position[0, [recorded.names.index(name) for name in found.joint_names]]
+    np.testing.assert_allclose(found.joint_positions[0], first, atol=5e-3)
+    travel = dict(zip(found.joint_names, np.ptp(found.joint_positions, axis=0), strict=True))
     assert min(max(v for k, v in travel.items() if k.startswith(side)) for side in ("left", "right")) > 0.01
     system, theta = found.simulator.step.system, found.simulator.theta
-    names = [end for grasp in system.grasps for end in (grasp.holder_frame, grasp.held)]
+    names = [end for grasp in system.grasps for end in (grasp.holder_frame, grasp.held_frame)]
     at = (
         FramePositions(system, names)
-        .positions_and_jacobian(found.state[:, : system.size], theta)[0]
+        .positions_and_jacobian(found.rollout.state[:, : system.n_coordinates], theta)[0]
         .reshape(len(found.t), -1, 2, 3)
     )
     assert np.abs(at[:, :, 0] - at[:, :, 1]).max() < 1e-8
@@ -113,8 +115,11 @@ def test_an_arm_that_holds_nothing_cannot_move_the_object(repository, tmp_path):
 @pytest.mark.parametrize(
     ("limit", "words"),
     [
-        ("effort=0.4", ("left_s1 at rest where the motion begins", "beyond its limit", "plan.limits.effort_fraction")),
-        ("spring_angle=0.001", ("at rest", "rad", "plan.limits.max_spring_angle")),
+        (
+            "effort_fraction=0.4",
+            ("left_s1 at rest where the motion begins", "beyond its limit", "plan.limits.effort_fraction"),
+        ),
+        ("max_spring_angle=0.001", ("at rest", "rad", "plan.limits.max_spring_angle")),
     ],
 )
 def test_limits_that_rest_itself_passes_are_refused(repository, tmp_path, limit, words):
@@ -131,8 +136,10 @@ def test_a_real_cable_in_two_clamps_is_at_rest_before_it_is_moved(repository, tm
         pytest.skip("its recordings are not here")
     way = "plan={point: p6, target_offset: [0.02, 0.02, 0.0], duration: 1.0, n_spline_coefficients: 4}"
     run, outcome = planned(repository, tmp_path, "deft_bdlo1", way)
-    assert outcome.ok, outcome.result["message"]
-    first = outcome.plan.state[0]
+    assert outcome.is_successful, outcome.result["message"]
+    first = outcome.plan.rollout.state[0]
     held = simulate(outcome.plan.simulator.step, outcome.plan.simulator.theta, first, 20).state[-1]
     np.testing.assert_allclose(held, first, atol=1e-7)
-    np.testing.assert_allclose(outcome.plan.points["p6"][-1], outcome.result["place"], atol=run.plan.tolerance)
+    np.testing.assert_allclose(
+        outcome.plan.point_trajectories["p6"][-1], outcome.result["place"], atol=run.plan.position_tolerance
+    )

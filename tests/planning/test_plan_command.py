@@ -19,14 +19,15 @@ CONFIG = """\
 model:
   robot: {urdf}
   springs:
-    elbow: {{stiffness: 3.0, rest: 0.1}}
-  arms: {{mode: prescribed, passive: [elbow]}}
+    elbow: {{stiffness: 3.0, rest_position: 0.1}}
+  arms: {{mode: prescribed, passive_joints: [elbow]}}
   damping: 0.2
   points: [tip]
 parameters:
   elbow.stiffness: {{free: true}}
-problem: {{compiler: false, path_cutoff: .inf}}
-plan: {{point: tip, shift: [0.0, 0.15, 0.04], posture: {{shoulder: 0.2}}, duration: 0.7, settle: 0.3, tolerance: 0.02}}
+problem: {{use_compiler: false, path_cutoff: .inf}}
+plan: {{point: tip, target_offset: [0.0, 0.15, 0.04], start_joint_positions: {{shoulder: 0.2}}, duration: 0.7,
+  hold_duration: 0.3, position_tolerance: 0.02}}
 """
 
 

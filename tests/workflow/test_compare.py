@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from yid_ocp.analysis.paper_comparison import PAPER_ESTIMATES
+from yid_ocp.analysis.compare import PAPER_ESTIMATES
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import CompareSettings
 from yid_ocp.errors import ConfigError

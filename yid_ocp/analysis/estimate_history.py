@@ -12,7 +12,7 @@ Birge (1932), Physical Review 40:207, doi:10.1103/PhysRev.40.207.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.stats
@@ -31,12 +31,9 @@ class RunEstimates(ReprMixin):
 
     Attributes
     ----------
-    run_name : str
-        Name of the run.
     parameter_names : tuple of str, length n
     values : ndarray, shape (n,)
     covariance : ndarray, shape (n, n)
-    units : mapping of str to str
     is_fit_adequate : bool
         Whether the model explains the run's recordings; where not, the covariance includes the misfit.
     effects : mapping of label to mapping of quantity to value
@@ -55,9 +52,8 @@ class RunEstimates(ReprMixin):
         rows = [("parameter", "value", "unit")]
         known = zip(self.parameter_names, self.values, self.std, strict=True)
         rows += [(name, f"{value:.4g} ± {std:.2g}", self.units.get(name, "")) for name, value, std in known]
-        return ReprSummary(
-            f"{count_with_noun(len(self.parameter_names), 'parameter')} of the run '{self.run_name}'", rows
-        )
+        count = count_with_noun(len(self.parameter_names), "parameter")
+        return ReprSummary(f"{count} of the run '{self.run_name}'", rows)
 
     @property
     def std(self) -> Array:
@@ -69,21 +65,15 @@ class RunEstimates(ReprMixin):
         at = [self.parameter_names.index(name) for name in names if name in self.parameter_names]
         kept = tuple(self.parameter_names[i] for i in at)
         covariance = self.covariance[np.ix_(at, at)]
-        return RunEstimates(
-            self.run_name, kept, self.values[at], covariance, self.units, self.is_fit_adequate, self.effects
-        )
+        return replace(self, parameter_names=kept, values=self.values[at], covariance=covariance)
 
 
 @dataclass(frozen=True)
 class ParameterDrift:
-    """Test whether one parameter has the same value in all runs.
+    """Test whether one parameter has the same value in all runs that have it.
 
     Attributes
     ----------
-    name, unit : str
-    run_names : tuple of str
-        That have it.
-    values, std : tuple of float
     mean, mean_std : float
         Pooled over these runs.
     chi2, p_value : float
@@ -110,14 +100,8 @@ class RunConsistency:
 
     Attributes
     ----------
-    run_name : str
-    chi2 : float
-    degrees_of_freedom : int
-    p_value : float
     worst_parameter : str
         Parameter that differs most, in standard deviations.
-    is_fit_adequate : bool
-        Whether the model explained its recordings.
     is_outlier : bool
         Whether it alone disagrees with the others, which agree without it.
     """
@@ -133,18 +117,7 @@ class RunConsistency:
 
 @dataclass(frozen=True)
 class EstimateHistory:
-    """Drift of parameters and consistency of runs over several runs of one model.
-
-    Attributes
-    ----------
-    run_names : tuple of str
-    parameter_drifts : tuple of Drift
-    run_consistencies : tuple of Against
-    chi2, p_value : float
-        Of all differences together.
-    degrees_of_freedom : int
-    significance_level : float
-    """
+    """Drift of parameters and consistency of several runs of one model; chi2 is of all differences together."""
 
     run_names: tuple[str, ...]
     parameter_drifts: tuple[ParameterDrift, ...]
@@ -177,27 +150,14 @@ def nearest_positive_definite(covariance: Array) -> Array:
 def pool_estimates(runs: Sequence[RunEstimates]) -> tuple[RunEstimates, float, int]:
     """Pool the estimates of several runs; returns them with chi2 of the differences and its degrees of freedom.
 
-    Parameters
-    ----------
-    runs : sequence of Estimates
-        Each may lack some of the parameters.
-
-    Returns
-    -------
-    Estimates
-        Of all parameters of any run, widened by Birge's ratio where the runs differ by more than they state.
-    chi2 : float
-    degrees : int
+    Each run may lack some of the parameters. The pooled estimates are of all parameters of any run, widened by Birge's
+    ratio where the runs differ by more than they state.
     """
     names = tuple(dict.fromkeys(name for run in runs for name in run.parameter_names))
     information, sums = np.zeros((len(names), len(names))), np.zeros(len(names))
     # in units of the first standard deviations known, so that nothing is lost to rounding
-    unit = np.array(
-        [
-            next(run.std[run.parameter_names.index(name)] for run in runs if name in run.parameter_names)
-            for name in names
-        ]
-    )
+    first = [next(run for run in runs if name in run.parameter_names) for name in names]
+    unit = np.array([run.std[run.parameter_names.index(name)] for name, run in zip(names, first, strict=True)])
     parts = []
     for run in runs:
         at = [names.index(name) for name in run.parameter_names]
@@ -209,16 +169,12 @@ def pool_estimates(runs: Sequence[RunEstimates]) -> tuple[RunEstimates, float, i
     chi2 = float(sum((x - mean[at]) @ inverse @ (x - mean[at]) for at, inverse, x in parts))
     degrees = sum(len(run.parameter_names) for run in runs) - len(names)
     widened = max(1.0, chi2 / degrees) if degrees else 1.0
-    covariance = np.linalg.inv(information) * widened * np.outer(unit, unit)
+    covariance = np.asarray(np.linalg.inv(information) * widened * np.outer(unit, unit), float)
     units = {name: unit for run in runs for name, unit in run.units.items()}
     effects = {label: own for run in runs for label, own in run.effects.items()}
     label = runs[0].run_name if len(runs) == 1 else f"{len(runs)} runs"
     explains = all(run.is_fit_adequate for run in runs)
-    return (
-        RunEstimates(label, names, mean * unit, np.asarray(covariance, float), units, explains, effects),
-        chi2,
-        degrees,
-    )
+    return RunEstimates(label, names, mean * unit, covariance, units, explains, effects), chi2, degrees
 
 
 def assess_drift(runs: Sequence[RunEstimates], level: float = 0.01) -> EstimateHistory:
@@ -229,7 +185,7 @@ def assess_drift(runs: Sequence[RunEstimates], level: float = 0.01) -> EstimateH
 
     Parameters
     ----------
-    runs : sequence of Estimates
+    runs : sequence of RunEstimates
         Two or more, in the order of time.
     level : float
         Significance level; divided by the number of parameters, and by that of runs.
@@ -238,9 +194,8 @@ def assess_drift(runs: Sequence[RunEstimates], level: float = 0.01) -> EstimateH
     _, chi2, degrees = pool_estimates(runs)
     drifts = tuple(_drift(name, runs, level / max(len(names), 1)) for name in names)
     against = tuple(_against(i, runs, level / len(runs)) for i in range(len(runs)))
-    return EstimateHistory(
-        tuple(run.run_name for run in runs), drifts, against, chi2, degrees, chi2_p_value(chi2, degrees), level
-    )
+    run_names, p = tuple(run.run_name for run in runs), chi2_p_value(chi2, degrees)
+    return EstimateHistory(run_names, drifts, against, chi2, degrees, p, level)
 
 
 def _drift(name: str, runs: Sequence[RunEstimates], level: float) -> ParameterDrift:
@@ -248,24 +203,18 @@ def _drift(name: str, runs: Sequence[RunEstimates], level: float) -> ParameterDr
     mean, chi2, degrees = pool_estimates(own)
     p = chi2_p_value(chi2, degrees)
     values, std = tuple(float(run.values[0]) for run in own), tuple(float(run.std[0]) for run in own)
-    unit = mean.units.get(name, "")
-    places = tuple(run.run_name for run in own)
-    return ParameterDrift(
-        name, unit, places, values, std, float(mean.values[0]), float(mean.std[0]), chi2, p, p < level
-    )
+    pooled, places = (float(mean.values[0]), float(mean.std[0])), tuple(run.run_name for run in own)
+    return ParameterDrift(name, mean.units.get(name, ""), places, values, std, *pooled, chi2, p, p < level)
 
 
 def _against(i: int, runs: Sequence[RunEstimates], level: float) -> RunConsistency:
     """One run against the mean of all others; distrusted where they agree without it."""
     chi2, degrees, worst = _apart(runs[i], [run for k, run in enumerate(runs) if k != i])
     p = chi2_p_value(chi2, degrees)
-    without = []
-    for k in range(len(runs)):
-        _, rest, free = pool_estimates([run for j, run in enumerate(runs) if j != k])
-        without.append((rest, free))
+    without = [pool_estimates([*runs[:k], *runs[k + 1 :]])[1:] for k in range(len(runs))]
     rest, free = without[i]
-    alone = len(runs) > 2 and p < level and chi2_p_value(rest, free) >= level
-    alone = alone or (len(runs) > 2 and p < level and rest < 0.5 * min(r for k, (r, _) in enumerate(without) if k != i))
+    agree = chi2_p_value(rest, free) >= level or rest < 0.5 * min(r for k, (r, _) in enumerate(without) if k != i)
+    alone = len(runs) > 2 and p < level and agree
     return RunConsistency(runs[i].run_name, chi2, degrees, p, worst, runs[i].is_fit_adequate, alone)
 
 

@@ -26,7 +26,7 @@ from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.sensors import recorded_camera_pose
-from yid_ocp.sensors.joints import POSITION_GROUP, PositionSensor, is_measured_by_arm
+from yid_ocp.sensors.joints import EFFORT_GROUP, POSITION_GROUP, PositionSensor, is_measured_by_arm
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 
@@ -43,17 +43,7 @@ _INWARD_GRIPPER_OFFSET, _FORWARD_GRIPPER_OFFSET = 0.05, 0.08
 
 @dataclass(frozen=True)
 class FrameObservation:
-    """Times and noise at which a sensor measures the position of one frame.
-
-    Attributes
-    ----------
-    point_group, frame : str
-        Group of the recording and frame of the mechanism.
-    times : ndarray, shape (M,)
-        Since the start of the recording [s].
-    std : ndarray, shape (M, 3)
-        [m]
-    """
+    """Times (M,) since a recording's start [s] and standard deviations (M, 3) [m] of one frame measured by a group."""
 
     point_group: str
     frame: str
@@ -67,11 +57,8 @@ class BaseExperiment:
 
     Attributes
     ----------
-    problem : EstimationProblem
     x : ndarray, shape (nx,)
         Unknowns at which the information is evaluated.
-    initial_state_knowledge : "unknown" or "known"
-    grasp_offset_prior_std : float or None
     two_arm_system : System, optional
         The system with a second arm and its grasp.
     torque_std : float
@@ -98,8 +85,7 @@ class BaseExperiment:
         """The camera's point group, its frame times since the start [s] and its typical standard deviation [m]."""
         for group in _used_point_groups(self.problem, episode):
             if recorded_camera_pose(group) is not None:
-                std = self._std(group)
-                return group, group.t - episode.grid.start_time, float(np.nanmedian(std))
+                return group, group.t - episode.grid.start_time, float(np.nanmedian(self._std(group)))
         return None, uniform_sample_times(episode.grid, _DEFAULT_CAMERA_RATE), _DEFAULT_CAMERA_STD
 
     def arm_sampling(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
@@ -113,13 +99,11 @@ class BaseExperiment:
         """Observations of the recording's sensors, one entry for each point."""
         found = []
         for group in _used_point_groups(self.problem, episode):
-            std = self._std(group)
+            std, t = self._std(group), group.t - episode.grid.start_time
             for point, frame in self.point_frames(group).items():
                 at = group.names.index(point)
                 seen = np.all(np.isfinite(group.position[:, at]), axis=1)
-                found.append(
-                    FrameObservation(group.name, frame, group.t[seen] - episode.grid.start_time, std[seen, at])
-                )
+                found.append(FrameObservation(group.name, frame, t[seen], std[seen, at]))
         return found
 
     def point_frames(self, group: PointGroup) -> dict[str, str]:
@@ -164,32 +148,28 @@ class ObservableFrame:
 
 def observable_frames(system: System) -> list[ObservableFrame]:
     """Measurable frames: tips and middles of segments and markers beside them; without segments, links and markers."""
-    tree = system.mechanism
+    tree, off_axis = system.mechanism, f"a marker {100 * _MARKER_AXIS_DISTANCE:g} cm off the axis"
     held = {grasp.held_frame for grasp in system.grasps}
     found: list[ObservableFrame] = []
     for segment in system.segment_layouts:
-        count, tip = len(segment.link_joints), f"w_{segment.name}"
-        found.append(ObservableFrame(tip, f"the end of {segment.name}", False))
+        name, count, tip = segment.name, len(segment.link_joints), f"w_{segment.name}"
+        found.append(ObservableFrame(tip, f"the end of {name}", False))
         if count > 1:
-            found.append(
-                ObservableFrame(f"{segment.name}_{(count - 1) // 2}_tip", f"the middle of {segment.name}", False)
-            )
+            found.append(ObservableFrame(f"{name}_{(count - 1) // 2}_tip", f"the middle of {name}", False))
         beside = _displaced(tree.frame(tip), (_MARKER_AXIS_DISTANCE, 0.0, 0.0))
-        words = f"a marker {100 * _MARKER_AXIS_DISTANCE:g} cm off the axis at the end of {segment.name}"
-        found.append(ObservableFrame(f"{segment.name}_marker", words, tip in held, beside))
+        found.append(ObservableFrame(f"{name}_marker", f"{off_axis} at the end of {name}", tip in held, beside))
     if system.segment_layouts:
         return found
-    moving = [name for name, frame in tree.frames.items() if frame.joint_index >= 0]
-    found = [ObservableFrame(name, name, False) for name in moving]
+    found = [ObservableFrame(name, name, False) for name, frame in tree.frames.items() if frame.joint_index >= 0]
     for spring in system.elastic_joints:
-        joint = tree.joints[tree.joint_index(spring.joint_name)]
-        if joint.kind == "revolute":
-            across = np.eye(3)[int(np.argmin(np.abs(joint.axis)))]
-            across -= np.array(joint.axis) * float(across @ joint.axis)
+        index, name = tree.joint_index(spring.joint_name), spring.joint_name
+        if tree.joints[index].kind == "revolute":
+            axis = np.array(tree.joints[index].axis)
+            across = np.eye(3)[int(np.argmin(np.abs(axis)))]
+            across -= axis * float(across @ axis)
             across *= _MARKER_AXIS_DISTANCE / float(np.linalg.norm(across))
-            frame = _displaced(Frame(tree.joint_index(spring.joint_name), Placement.identity()), across)
-            words = f"a marker {100 * _MARKER_AXIS_DISTANCE:g} cm off the axis of {spring.joint_name}"
-            found.append(ObservableFrame(f"{spring.joint_name}_marker", words, False, frame))
+            frame = _displaced(Frame(index, Placement.identity()), across)
+            found.append(ObservableFrame(f"{name}_marker", f"{off_axis} of {name}", False, frame))
     return found
 
 
@@ -198,11 +178,12 @@ def _displaced(frame: Frame, offset: ArrayLike) -> Frame:
     return Frame(frame.joint_index, frame.placement @ shift)
 
 
-def with_added_frames(step: Step, frames: Mapping[str, Frame]) -> Step:
-    """The step with further frames in its mechanism; the equations of motion stay the same."""
-    mechanism = step.system.mechanism
-    system = replace(step.system, mechanism=replace(mechanism, frames={**mechanism.frames, **frames}))
-    return replace(step, model=replace(step.model, system=system))
+def with_observable_frames(step: Step) -> tuple[Step, list[ObservableFrame]]:
+    """The step with all measurable frames in its mechanism, and these; the equations of motion stay the same."""
+    mechanism, seen = step.system.mechanism, observable_frames(step.system)
+    added = {sight.name: sight.added_frame for sight in seen if sight.added_frame is not None}
+    system = replace(step.system, mechanism=replace(mechanism, frames={**mechanism.frames, **added}))
+    return replace(step, model=replace(step.model, system=system)), seen
 
 
 # -- layouts ----------------------------------------------------------------------------------------------------------
@@ -218,10 +199,10 @@ class CandidateExperiment:
         With nuisances, and with every measurable frame observed at every node.
     x : ndarray, shape (nx,)
     free_parameters : tuple of str
-        Free parameters, in the order of results.
+        In the order of results.
     position_sensitivities : mapping of (episode, group, frame) to ndarray, shape (N + 1, 3, nx + q)
         Sensitivity of a frame's position at every node by the unknowns, then by what stands for the errors of the
-        torques that drive this episode (`_low_rank_error_sensitivity`).
+        torques that drive this episode (`episode_sensitivities`).
     prior_information : ndarray, shape (nx, nx)
         Fisher information of the priors of nuisances.
     joint_information : mapping of episode to ndarray, shape (nx + q, nx + q)
@@ -276,13 +257,7 @@ MECHANICAL_CHANGES: Mapping[str, str] = {
 
 
 class CandidateExperimentBuilder:
-    """Builds and caches variants of an experiment by their mechanical changes.
-
-    Parameters
-    ----------
-    setting : Setting
-    progress : Progress, optional
-    """
+    """Builds and caches variants of an experiment by their mechanical changes."""
 
     def __init__(self, setting: BaseExperiment, progress: Progress = NULL_PROGRESS) -> None:
         self.setting = setting
@@ -293,9 +268,8 @@ class CandidateExperimentBuilder:
         """The experiment with a set of mechanical changes, or a message why it cannot be built."""
         if mechanics not in self._layouts:
             if mechanics:
-                self._progress.begin_stage(
-                    "working out " + " and ".join(MECHANICAL_CHANGES[name] for name in sorted(mechanics))
-                )
+                words = " and ".join(MECHANICAL_CHANGES[name] for name in sorted(mechanics))
+                self._progress.begin_stage(f"working out {words}")
             try:
                 self._layouts[mechanics] = self._build(mechanics)
             except YidError as error:
@@ -318,29 +292,17 @@ class CandidateExperimentBuilder:
         return found
 
     def _build(self, mechanics: frozenset[str]) -> CandidateExperiment:
-        setting = self.setting
-        base = setting.problem
+        setting, base = self.setting, self.setting.problem
         system, recordings, notes = self._experiment(mechanics)
         if "torque" in mechanics:
             system = replace(system, driven=(), servos={}, prescribed=(*system.prescribed, *system.driven))
-        if mechanics - {"motion", "travel"} or system is not base.system:
-            step = compile_step_like(base.step, system, use_compiler=False)
-        else:
-            step = base.step
-        seen = observable_frames(system)
-        step = with_added_frames(
-            step, {sight.name: sight.added_frame for sight in seen if sight.added_frame is not None}
-        )
+        other = mechanics - {"motion", "travel"} or system is not base.system
+        step = compile_step_like(base.step, system, use_compiler=False) if other else base.step
+        step, seen = with_observable_frames(step)
         wide = with_nuisance_unknowns(base, setting.x, setting.initial_state_knowledge, setting.grasp_offset_prior_std)
-        sensors = {k: replace(v, use=None) for k, v in base.options.sensors.items() if k.startswith("joints.")}
-        if "second_arm" in mechanics:
-            # made motions state their noise, that of joints which the settings do not know too
-            sensors = {name: replace(choice, std=None, bias_std=None) for name, choice in sensors.items()}
-        if "torque" in mechanics:
-            sensors["joints.effort"] = self._torque_options()
         options = replace(
             wide.options,
-            sensors=sensors,
+            sensors=self._joint_sensors(mechanics),
             huber_threshold=math.inf,
             weak_prior_factor=0.0,
             weighting="whitened",
@@ -367,15 +329,24 @@ class CandidateExperimentBuilder:
         stated[:, [problem.unknown_names.index(name) for name in names]] = 0.0
         return CandidateExperiment(problem, x, names, slopes, stated.T @ stated, by_joints, tuple(notes))
 
+    def _joint_sensors(self, mechanics: frozenset[str]) -> dict[str, SensorOptions]:
+        given = self.setting.problem.options.sensors
+        sensors = {name: replace(choice, use=None) for name, choice in given.items() if name.startswith("joints.")}
+        if "second_arm" in mechanics:
+            # made motions state their noise, that of joints which the settings do not know too
+            sensors = {name: replace(choice, std=None, bias_std=None) for name, choice in sensors.items()}
+        if "torque" in mechanics:
+            sensors[EFFORT_GROUP] = self._torque_options()
+        return sensors
+
     def _finest(self, episode: Episode) -> dict[str, float]:
         """Least standard deviation that each group's points can have in a recording [m]."""
-        setting, finest = self.setting, {}
-        for default, (group, _, std) in (
-            (CAMERA_GROUP, setting.camera_sampling(episode)),
-            (ARM_GROUP, setting.arm_sampling(episode)),
-        ):
+        finest = {}
+        samplings = (CAMERA_GROUP, self.setting.camera_sampling), (ARM_GROUP, self.setting.arm_sampling)
+        for default, sampling in samplings:
+            group, _, std = sampling(episode)
             finest[default if group is None else group.name] = std
-        for view in setting.recorded_observations(episode):
+        for view in self.setting.recorded_observations(episode):
             finest[view.point_group] = min(finest.get(view.point_group, math.inf), float(view.std.min()))
         return finest
 
@@ -428,14 +399,14 @@ class CandidateExperimentBuilder:
 
     def _cut(self, episode: Episode) -> Recording:
         """The part of a recording that the problem uses, its torques without the errors that are known."""
-        recording, errors = episode.recording, episode.input_errors
-        joints = recording.joints
+        recording, errors, joints = episode.recording, episode.input_errors, episode.recording.joints
         if errors is not None and joints is not None and joints.effort is not None:
             effort = joints.effort.copy()
-            columns = [joints.names.index(name) for name in self.setting.problem.system.driven]
-            effort[errors.sample_of_step[:, None], columns] = (
-                effort[errors.sample_of_step[:, None], columns] - errors.total_torque_error
+            at = (
+                errors.sample_of_step[:, None],
+                [joints.names.index(name) for name in self.setting.problem.system.driven],
             )
+            effort[at] = effort[at] - errors.total_torque_error
             recording = replace(recording, joints=replace(joints, effort=effort))
         if self.setting.problem.options.duration is None:
             return recording
@@ -446,89 +417,73 @@ class CandidateExperimentBuilder:
         layout = self.build_experiment(others)
         if isinstance(layout, str):
             raise SolverError(layout)
-        problem = layout.problem
-        episode = problem.episodes[0]
-        start = problem.initial_state(episode, *problem.split(layout.x, 0))
+        problem, n = layout.problem, system.n_coordinates
+        theta, offset = problem.split(layout.x, 0)
+        start = problem.initial_state(problem.episodes[0], theta, offset)
         if start.failure_message:
             raise SolverError(start.failure_message)
-        q, parameters = ca.SX.sym("q", system.n_coordinates), problem.system.parameters
+        q, parameters = ca.SX.sym("q", n), problem.system.parameters
         kinematics = forward_kinematics(problem.system.mechanism, q)
         turned = []
         for grasp in system.grasps:
-            pose = (
-                kinematics.frame_pose(grasp.holder_frame).rotation.T @ kinematics.frame_pose(grasp.held_frame).rotation
-            )
-            rotation = ca.Function("turn", [q, parameters.symbols], [pose])
-            theta, _ = problem.split(layout.x, 0)
-            turned.append(
-                replace(
-                    grasp, kind="weld", held_orientation=ca.SX(rotation(start.state[: system.n_coordinates], theta))
-                )
-            )
+            holder, held = (kinematics.frame_pose(name).rotation for name in (grasp.holder_frame, grasp.held_frame))
+            rotation = ca.Function("turn", [q, parameters.symbols], [holder.T @ held])
+            turned.append(replace(grasp, kind="weld", held_orientation=ca.SX(rotation(start.state[:n], theta))))
         return replace(system, grasps=tuple(turned))
 
     def _moved(self, system: System, episode: Episode, seed: int, twice: bool) -> tuple[Recording, list[str]]:
         """A motion of the driven joints in MuJoCo, from the recording's posture; what of it a robot could not do."""
-        setting = self.setting
-        base = setting.problem
-        values = {name: v for name, v in setting.parameter_values.items() if name in system.parameters}
-        measured = dict(zip(base.system.driven, map(float, episode.measured_driven_angles[0]), strict=True))
-        posture = measured
+        base, given = self.setting.problem, self.setting.parameter_values
+        values = {name: v for name, v in given.items() if name in system.parameters}
+        posture = dict(zip(base.system.driven, map(float, episode.measured_driven_angles[0]), strict=True))
         if system.driven != base.system.driven:
-            posture = grasping_joint_angles(
-                system, values, start_angles=measured, offsets=_pushed_together(system, values)
-            )
+            together = _pushed_together(system, values)
+            posture = grasping_joint_angles(system, values, start_angles=posture, offsets=together)
         duration = episode.grid.steps * episode.grid.time_step
-        travel = _travel(base.system, setting.parameter_values, episode) * (2.0 if twice else 1.0)
-        speed = 2.8 if twice else 1.4
+        travel, speed = (factor * (2.0 if twice else 1.0) for factor in (_travel(base.system, given, episode), 1.4))
         excitation = MultisineOptions(gripper_travel=travel, max_joint_speed=speed, duration=duration)
         motion = random_multisine(system, values, seed=seed, initial_joint_angles=posture, excitation=excitation)
         run = simulate_in_mujoco(system, values, motion, SimulationOptions(duration), initial_joint_angles=posture)
         driven, noise = list(system.driven_indices), _noise_as_recorded(base.system, system, episode)
+        q = run.q[:, driven]
         joints = JointGroup(
             system.driven,
             run.t,
-            run.q[:, driven],
+            q,
             effort=run.effort,
             effort_kind="command",
             position_std=noise[0],
             effort_std=noise[1],
             effort_bias_std=noise[2],
         )
-        beyond: dict[str, list[str]] = {"range": [], "torque": []}
-        for k, name in enumerate(system.driven):
-            joint = system.mechanism.joints[driven[k]]
-            q, effort = run.q[:, driven[k]], run.effort[:, k]
-            if q.min() < joint.lower_limit or q.max() > joint.upper_limit:
-                beyond["range"].append(name)
-            if np.abs(effort).max() > joint.effort_limit:
-                beyond["torque"].append(name)
-        notes = [f"beyond the {what} of {', '.join(names)}" for what, names in beyond.items() if names]
+        limits = [system.mechanism.joints[i] for i in driven]
+        low, high, most = (
+            np.array([getattr(joint, f"{name}_limit") for joint in limits]) for name in ("lower", "upper", "effort")
+        )
+        beyond = {"range": (q.min(0) < low) | (q.max(0) > high), "torque": np.abs(run.effort).max(0) > most}
+        names = {what: np.array(system.driven)[over] for what, over in beyond.items() if over.any()}
+        notes = [f"beyond the {what} of {', '.join(over)}" for what, over in names.items()]
         return Recording(joints, source="what if", name=episode.name), notes
 
     def _dense(self, recording: Recording, index: int, seen: Sequence[ObservableFrame], torque: bool) -> Recording:
         """The recording with every sight in view at every node, of unit standard deviation, and efforts to predict."""
-        setting = self.setting
-        base = setting.problem
-        episode = base.episodes[index % len(base.episodes)]
-        joints = recording.joints
-        t = joints.t if joints is not None else episode.recording.points[0].t
-        step = base.step.time_step
+        setting, base = self.setting, self.setting.problem
+        episode, joints = base.episodes[index % len(base.episodes)], recording.joints
+        t, step = joints.t if joints is not None else episode.recording.points[0].t, base.step.time_step
         times = t[0] + step * np.arange(math.floor(float(t[-1] - t[0]) / step + 1e-6) + 1)
-        wanted: dict[str, list[str]] = {}
         poses: dict[str, Array | None] = {CAMERA_GROUP: np.eye(4), ARM_GROUP: None}
         sensors = {CAMERA_GROUP: "camera", ARM_GROUP: "arm"}
-        for view in setting.recorded_observations(episode):
-            wanted.setdefault(view.point_group, []).append(view.frame)
         for group in _used_point_groups(base, episode):
             poses[group.name], sensors[group.name] = group.pose, group.sensor
+        wanted: dict[str, dict[str, None]] = {}
+        for view in setting.recorded_observations(episode):
+            wanted.setdefault(view.point_group, {})[view.frame] = None
         camera, arm = setting.camera_sampling(episode)[0], setting.arm_sampling(episode)[0]
-        look = wanted.setdefault(CAMERA_GROUP if camera is None else camera.name, [])
-        look += [sight.name for sight in seen if sight.name not in look]
-        feel = wanted.setdefault(ARM_GROUP if arm is None else arm.name, [])
-        feel += [sight.name for sight in seen if sight.is_arm_measurable and sight.name not in feel]
-        held = {grasp.held_frame for grasp in (setting.two_arm_system or base.system).grasps}
-        feel += [frame for frame in held if frame not in feel]
+        look = wanted.setdefault(CAMERA_GROUP if camera is None else camera.name, {})
+        look |= dict.fromkeys(sight.name for sight in seen)
+        feel = wanted.setdefault(ARM_GROUP if arm is None else arm.name, {})
+        feel |= dict.fromkeys(sight.name for sight in seen if sight.is_arm_measurable)
+        feel |= dict.fromkeys({grasp.held_frame for grasp in (setting.two_arm_system or base.system).grasps})
         groups = []
         for name, frames in wanted.items():
             shape = (len(times), len(frames), 3)
@@ -560,35 +515,28 @@ def _noise_as_recorded(base: System, system: System, episode: Episode) -> Sequen
 
 def _travel(system: System, values: Mapping[str, float], episode: Episode) -> float:
     """Largest distance of a gripper from where it starts [m]."""
-    q = ca.SX.sym("q", system.n_coordinates)
-    tree = replace(system.mechanism, parameters=system.parameters).with_numeric_values(values)
-    kinematics = forward_kinematics(tree, q)
     whole = np.zeros((len(episode.measured_driven_angles), system.n_coordinates))
     whole[:, list(system.driven_indices)] = episode.measured_driven_angles
-    farthest = 0.0
-    for grasp in system.grasps:
-        tip = ca.Function("tip", [q], [kinematics.frame_position(grasp.holder_frame)]).map(len(whole))
-        path = np.array(tip(whole.T)).T
-        farthest = max(farthest, float(np.max(np.linalg.norm(path - path[0], axis=1))))
-    return farthest if farthest > 0 else 0.11
+    paths = _frame_positions(system, values, [grasp.holder_frame for grasp in system.grasps], whole)
+    return float(np.linalg.norm(paths - paths[0], axis=2).max(initial=0.0)) or 0.11
+
+
+def _frame_positions(system: System, values: Mapping[str, float], frames: Sequence[str], q: Array) -> Array:
+    """Positions of frames at configurations (N, n), shape (N, len(frames), 3) [m]."""
+    symbol = ca.SX.sym("q", system.n_coordinates)
+    tree = replace(system.mechanism, parameters=system.parameters).with_numeric_values(values)
+    kinematics = forward_kinematics(tree, symbol)
+    at = ca.vertcat(ca.SX(0, 1), *(kinematics.frame_position(name) for name in frames))
+    return np.array(ca.Function("at", [symbol], [ca.densify(at)]).map(len(q))(q.T)).T.reshape(len(q), len(frames), 3)
 
 
 def _pushed_together(system: System, values: Mapping[str, float]) -> dict[str, Array]:
     """Offsets of grippers that take an object held by several out of its full stretch."""
-    q = ca.SX.sym("q", system.n_coordinates)
-    tree = replace(system.mechanism, parameters=system.parameters).with_numeric_values(values)
-    kinematics = forward_kinematics(tree, q)
-    place = ca.Function("place", [q], [ca.horzcat(*(kinematics.frame_position(name) for name in system.point_frames))])
-    points = np.array(place(np.zeros(system.n_coordinates))).T
-    middle, held = points.mean(0), {name: points[i] for i, name in enumerate(system.point_frames)}
+    points = _frame_positions(system, values, system.point_frames, np.zeros((1, system.n_coordinates)))[0]
+    middle, held = points.mean(0), dict(zip(system.point_frames, points, strict=True))
     away = np.array([middle[0], middle[1], 0.0])
-    away /= max(float(np.linalg.norm(away)), 1e-9)
-    offsets = {}
-    for grasp in system.grasps:
-        if grasp.held_frame in held:
-            inward = middle - held[grasp.held_frame]
-            offsets[grasp.name] = (
-                _INWARD_GRIPPER_OFFSET * inward / max(float(np.linalg.norm(inward)), 1e-9)
-                + _FORWARD_GRIPPER_OFFSET * away
-            )
-    return offsets
+    forward = _FORWARD_GRIPPER_OFFSET * away / max(float(np.linalg.norm(away)), 1e-9)
+    inward = {grasp.name: middle - held[grasp.held_frame] for grasp in system.grasps if grasp.held_frame in held}
+    return {
+        name: _INWARD_GRIPPER_OFFSET * x / max(float(np.linalg.norm(x)), 1e-9) + forward for name, x in inward.items()
+    }

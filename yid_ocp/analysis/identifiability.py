@@ -53,13 +53,10 @@ _RANK_RTOL = 1e-10
 
 @dataclass(frozen=True)
 class ParameterInformation:
-    """Uncertainty and verdict of one parameter.
+    """Uncertainty and verdict of one parameter, in `unit`.
 
     Attributes
     ----------
-    value : float
-        Value at which the information was evaluated, in `unit`.
-    unit : str
     std : float
         Standard deviation with all other unknowns free; infinite where nothing informs it.
     std_relative : float
@@ -67,8 +64,7 @@ class ParameterInformation:
     std_alone : float
         Relative standard deviation if all other unknowns were known.
     verdict : str
-        That of a solution at the same point (`inference.uncertainty.parameter_verdict`), made consistent with a requested interval
-        (`inference.uncertainty.with_profile_interval`).
+        That of a solution at the same point (`inference.uncertainty.parameter_verdict`), consistent with the interval.
     interval : (float or None, float or None), or None
         95 % interval by profile likelihood about the best fit of all unknowns, None for an open end; None as a whole
         where not requested.
@@ -85,20 +81,15 @@ class ParameterInformation:
 
 @dataclass(frozen=True)
 class ParameterDirection:
-    """A direction of relative parameter changes and its uncertainty.
+    """A direction of relative parameter changes and its uncertainty, with limits of the verdict as for a parameter.
 
     Attributes
     ----------
     singular_value : float
         Of the whitened sensitivity to relative changes, nuisances eliminated: standard deviations of the data per
-        unit change.
-    std_relative : float
-        Its reciprocal, the standard deviation along the direction.
+        unit change; `std_relative` is its reciprocal.
     components : mapping of parameter to float
         The direction, of unit length.
-    verdict : str
-        Limits as for a parameter.
-    words : str
     """
 
     singular_value: float
@@ -114,20 +105,18 @@ class IdentifiabilityResult(ReprMixin):
 
     Attributes
     ----------
-    parameters : mapping of str to ParameterInformation
     parameter_names : tuple of str, length p
         In the order of the matrices.
     correlations : ndarray, shape (p, p)
         NaN in rows of parameters that nothing informs.
     fisher_information : ndarray, shape (p, p)
-        Fisher information of relative changes, nuisances eliminated.
-    directions : tuple of Direction
+        Of relative changes, nuisances eliminated.
+    directions : tuple of ParameterDirection
         Least observable first.
     nuisance_names : tuple of str
-        Names of further unknowns, estimated together with the parameters.
+        Further unknowns, estimated together with the parameters.
     chi2_per_dof : float
         At the evaluated point; at a fit, standard deviations are scaled by its square root where it exceeds one.
-    profiles : mapping of str to Profile
     """
 
     parameters: Mapping[str, ParameterInformation]
@@ -141,23 +130,15 @@ class IdentifiabilityResult(ReprMixin):
 
     def _summary(self) -> ReprSummary:
         rows = [("parameter", "value", "unit", "")]
-        rows += [
-            (
-                name,
-                parameter_text(entry.value, finite_or_none(entry.std), None),
-                entry.unit,
-                VERDICT_WORDS[entry.verdict],
-            )
-            for name, entry in self.parameters.items()
-        ]
-        return ReprSummary(
-            f"{len(self.identifiable_parameters)} of {count_with_noun(len(self.parameter_names), 'parameter')} found",
-            rows,
-        )
+        for name, entry in self.parameters.items():
+            value = parameter_text(entry.value, finite_or_none(entry.std), None)
+            rows.append((name, value, entry.unit, VERDICT_WORDS[entry.verdict]))
+        count = count_with_noun(len(self.parameter_names), "parameter")
+        return ReprSummary(f"{len(self.identifiable_parameters)} of {count} found", rows)
 
     @property
     def identifiable_parameters(self) -> tuple[str, ...]:
-        """Names of parameters whose verdict is `identifiable_parameters`."""
+        """Names of parameters whose verdict is `identifiable`."""
         return tuple(name for name, entry in self.parameters.items() if entry.verdict == "identifiable")
 
     @property
@@ -183,7 +164,6 @@ def identifiability(
 
     Parameters
     ----------
-    problem : EstimationProblem
     solution : Solution or array_like, optional
         Point at which to judge (a solution of this problem, or its unknown vector); the initial values when absent.
     start : "assumed", "unknown" or "known"
@@ -194,14 +174,8 @@ def identifiability(
         `with_grasp_offset_effects`), which are estimated along [m]; None for grasps that are known.
     intervals : iterable of str, or "all"
         Parameters whose interval by profile likelihood is wanted.
-    limits : GapLimits, optional
+    limits : GapCriteria, optional
         What makes a residual at a solution more than noise.
-    progress : Progress, optional
-        Told which interval is next.
-
-    Returns
-    -------
-    Identifiability
 
     Raises
     ------
@@ -233,19 +207,16 @@ def _information(
     wanted = names if intervals == "all" else tuple(intervals)
     for name in wanted:
         if name not in names:
-            raise ConfigError(
-                f"'{name}' is not a free parameter", hint=nearest_name_hint(name, names), where="intervals"
-            )
+            hint = nearest_name_hint(name, names)
+            raise ConfigError(f"'{name}' is not a free parameter", hint=hint, where="intervals")
     given = unknowns_from_solution(problem, solution)
     wide = with_nuisance_unknowns(problem, given, start, grasp_std)
     x = transfer_unknowns(given, problem.unknown_names, wide)
     as_solved, wide = wide is problem, whitened_at(wide, x, rounds=2)
     evaluation = wide.evaluate(x)
     if not evaluation.ok or evaluation.jacobian is None:
-        raise SolverError(
-            f"the model cannot be rolled out where its information is asked for: {evaluation.message}",
-            hint="solve first, or choose other initial values",
-        )
+        message = f"the model cannot be rolled out where its information is asked for: {evaluation.message}"
+        raise SolverError(message, hint="solve first, or choose other initial values")
     covariance, chi2 = covariance_and_chi2(wide, evaluation)
     inflation = math.sqrt(max(1.0, chi2))
     fit = None
@@ -256,24 +227,19 @@ def _information(
         own = wide if as_solved else whitened_at(problem, given, rounds=2)
         fit = assess_goodness_of_fit(own, evaluation if as_solved else own.evaluate(given), limits)
         covariance = covariance_of_fit(wide, evaluation, fit)
-    chosen = np.array([wide.unknown_names.index(name) for name in names], int)
-    scale = np.where(x[chosen] != 0, np.abs(x[chosen]), wide.unknown_scales[chosen])
-    view = _Sensitivities(
-        wide, x, evaluation, names, chosen, _split_sensitivities(wide, evaluation, chosen), scale, inflation
-    )
+    view = _sensitivities(wide, x, evaluation, names, inflation)
     judged = parameter_estimates(wide, x, evaluation, covariance, fit)
     std = np.array([judged[name].std for name in names])
-    plain = np.sqrt(np.diag(covariance)[chosen])
-    informed = np.where(
-        plain < MIN_UNINFORMED_RELATIVE_STD * np.maximum(scale, wide.unknown_scales[chosen]), plain, np.inf
-    )
+    own_covariance = covariance[np.ix_(view.chosen, view.chosen)]
+    plain = np.sqrt(np.diag(own_covariance))
+    most = MIN_UNINFORMED_RELATIVE_STD * np.maximum(view.scale, wide.unknown_scales[view.chosen])
     profiles, judged = _profiles(view, std, wanted, judged, progress)
     return IdentifiabilityResult(
         _parameters(view, judged),
         names,
-        _correlations(covariance[np.ix_(chosen, chosen)], informed),
+        _correlations(own_covariance, np.where(plain < most, plain, np.inf)),
         view.relative.T @ view.relative,
-        _directions(view, std / scale),
+        _directions(view, std / view.scale),
         tuple(name for name in wide.unknown_names if name not in names),
         chi2,
         profiles,
@@ -296,9 +262,9 @@ def _profiles(
         found = profile_likelihood(problem, best, index, float(std[view.names.index(name)]), there)
         said = check_small_estimate(problem, best, index, judged[name], size, there)
         parts.count_done(name)
-        return found, with_profile_interval(judged[name], found.interval, size) if said.verdict == judged[
-            name
-        ].verdict else said
+        if said.verdict == judged[name].verdict:
+            said = with_profile_interval(judged[name], found.interval, size)
+        return found, said
 
     pairs = dict(zip(wanted, map_with_batched_calls(one, wanted), strict=True))
     profiles = {name: profile for name, (profile, _) in pairs.items()}
@@ -311,14 +277,9 @@ def _parameters(view: _Sensitivities, judged: Mapping[str, ParameterEstimate]) -
     for i, name in enumerate(view.names):
         entry = judged[name]
         scale, alone = float(view.scale[i]), float(view.alone[i])
+        value, relative = float(view.x[view.chosen[i]]), 1.0 / alone if alone > 0 else math.inf
         found[name] = ParameterInformation(
-            float(view.x[view.chosen[i]]),
-            view.unit(name),
-            entry.std,
-            entry.std / scale,
-            1.0 / alone if alone > 0 else math.inf,
-            entry.verdict,
-            entry.interval,
+            value, view.unit(name), entry.std, entry.std / scale, relative, entry.verdict, entry.interval
         )
     return found
 
@@ -356,9 +317,8 @@ def unknowns_from_solution(problem: EstimationProblem, solution: Solution | Arra
         return x
     x = np.array(solution, float)
     if x.shape != (len(problem.unknown_names),):
-        raise SolverError(
-            f"the point has shape {x.shape}", allowed=f"({len(problem.unknown_names)},), as problem.names"
-        )
+        shape = f"({len(problem.unknown_names)},), as problem.unknown_names"
+        raise SolverError(f"the point has shape {x.shape}", allowed=shape)
     if not np.all(np.isfinite(x)):
         raise SolverError(f"{problem.unknown_names[int(np.argmin(np.isfinite(x)))]} is not finite at the point")
     return x
@@ -371,10 +331,8 @@ def with_nuisance_unknowns(
 
     Parameters
     ----------
-    problem : EstimationProblem
     x : ndarray, shape (nx,)
         Point from which an estimated initial state is fixed.
-    start : "unknown" or "known"
     grasp_std : float, optional
         [m]
     """
@@ -426,36 +384,22 @@ def transfer_unknowns(x: Array, names: Sequence[str], other: EstimationProblem) 
 # -- sensitivities ----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _SensitivitySplit:
-    """Whitened sensitivities of the parameters of interest.
-
-    Attributes
-    ----------
-    alone : ndarray, shape (nr, p)
-        With all other unknowns known, without priors of the parameters.
-    sensitivity : ndarray, shape (nr, p)
-        The part of it orthogonal to the nuisances' sensitivities.
-    nuisance : ndarray, shape (nr, nn)
-        Sensitivities of the nuisances, their priors below those of the data.
-    """
-
-    alone: Array
-    sensitivity: Array
-    nuisance: Array
-
-
-def _split_sensitivities(
-    problem: EstimationProblem, evaluation: Evaluation, chosen: NDArray[np.int64]
-) -> _SensitivitySplit:
-    """Sensitivities of chosen unknowns with all others, and their priors, projected out."""
+def _sensitivities(
+    problem: EstimationProblem, x: Array, evaluation: Evaluation, names: tuple[str, ...], inflation: float
+) -> _Sensitivities:
+    """Sensitivities of named unknowns, all others and their priors projected out."""
     _, jacobian = residual_without_weak_priors(problem, evaluation)
     jacobian = jacobian.copy()
+    chosen = np.array([problem.unknown_names.index(name) for name in names], int)
     others = np.setdiff1d(np.arange(jacobian.shape[1]), chosen)
     # what is known beforehand of the parameters themselves is not something that a sensor sees
     jacobian[problem.residual_rows.stated_priors, chosen] = 0.0
-    alone, nuisance = jacobian[:, chosen], jacobian[:, others] * problem.unknown_scales[others]
-    return _SensitivitySplit(alone, _orthogonal_part(alone, nuisance), nuisance)
+    scale = np.where(x[chosen] != 0, np.abs(x[chosen]), problem.unknown_scales[chosen])
+    unit, nuisance = scale / inflation, jacobian[:, others] * problem.unknown_scales[others]
+    relative = _orthogonal_part(jacobian[:, chosen], nuisance) * unit
+    return _Sensitivities(
+        problem, x, evaluation, names, chosen, scale, inflation, jacobian[:, chosen] * unit, relative, nuisance
+    )
 
 
 def _orthogonal_part(columns: Array, explained: Array) -> Array:
@@ -467,29 +411,12 @@ def _orthogonal_part(columns: Array, explained: Array) -> Array:
     return np.asarray(columns - basis @ (basis.T @ columns))
 
 
-# -- directions with words --------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _Sensitivities:
     """What the sensors see of the parameters at one point.
 
-    Attributes
-    ----------
-    problem : EstimationProblem
-        With nuisances among its unknowns.
-    x : ndarray, shape (nx,)
-    evaluation : Evaluation
-        At `x`.
-    names : tuple of str, length p
-        Parameters of interest.
-    chosen : ndarray of int, shape (p,)
-        Their places among the unknowns.
-    split : SplitRows
-    scale : ndarray, shape (p,)
-        By which changes are relative.
-    inflation : float
-        Factor by which the noise is larger than stated.
+    `by_alone` is the whitened sensitivity (nr, p) to relative changes with everything else known, `relative` that with
+    nuisances eliminated, `nuisance` that of all other unknowns in their scales.
     """
 
     problem: EstimationProblem
@@ -497,19 +424,16 @@ class _Sensitivities:
     evaluation: Evaluation
     names: tuple[str, ...]
     chosen: NDArray[np.int64]
-    split: _SensitivitySplit
     scale: Array
     inflation: float
-
-    @property
-    def relative(self) -> Array:
-        """Sensitivity to relative changes, nuisances eliminated, shape (nr, p)."""
-        return self.split.sensitivity * self.scale / self.inflation
+    by_alone: Array
+    relative: Array
+    nuisance: Array
 
     @property
     def alone(self) -> Array:
         """Size of the sensitivity to relative changes with everything else known, shape (p,)."""
-        return np.linalg.norm(self.split.alone * self.scale / self.inflation, axis=0)
+        return np.linalg.norm(self.by_alone, axis=0)
 
     def unit(self, name: str) -> str:
         """Unit of a parameter, which may carry its recording's name."""
@@ -565,8 +489,7 @@ def _components(view: _Sensitivities, vector: Array) -> list[DirectionComponent]
 def _unseen_words(view: _Sensitivities, vector: Array) -> str:
     """Why a direction is not seen."""
     parts = _components(view, vector)
-    seen_alone = float(np.linalg.norm(view.split.alone @ (view.scale * vector)))
-    if seen_alone / view.inflation * MAX_WEAK_RELATIVE_STD >= 1.0:
+    if float(np.linalg.norm(view.by_alone @ vector)) * MAX_WEAK_RELATIVE_STD >= 1.0:
         what = parts[0].name if len(parts) == 1 else "this: " + describe_combination(parts, None)
         return f"{what} cannot be told apart from {_hiding_nuisances(view, vector)}"
     return describe_combination(parts, lambda changes: _moved(view, changes))
@@ -575,11 +498,11 @@ def _unseen_words(view: _Sensitivities, vector: Array) -> str:
 def _hiding_nuisances(view: _Sensitivities, vector: Array) -> str:
     """Which nuisances hide a direction."""
     others = [name for i, name in enumerate(view.problem.unknown_names) if i not in set(view.chosen)]
-    column = (view.split.alone @ (view.scale * vector))[:, None] / view.inflation
+    column = (view.by_alone @ vector)[:, None]
     groups = {"the unknown start": "start.", "where the grasp sits": _GRASP_OFFSET_PREFIX}
     for words, prefix in groups.items():
         at = [i for i, name in enumerate(others) if name.startswith(prefix)]
-        if at and np.linalg.norm(_orthogonal_part(column, view.split.nuisance[:, at])) * MAX_WEAK_RELATIVE_STD < 1.0:
+        if at and np.linalg.norm(_orthogonal_part(column, view.nuisance[:, at])) * MAX_WEAK_RELATIVE_STD < 1.0:
             return words
     return "the unknown start and where the grasp sits"
 
@@ -593,9 +516,9 @@ def _moved(view: _Sensitivities, changes: Mapping[str, float]) -> float:
     if not evaluation.ok:
         return math.inf
     rows = problem.residual_rows.data
-    change = np.zeros((len(view.split.alone), 1))
+    change = np.zeros((len(view.nuisance), 1))
     change[rows, 0] = (evaluation.residual[rows] - view.evaluation.residual[rows]) / problem.data_noise_unit
-    return float(np.linalg.norm(_orthogonal_part(change, view.split.nuisance))) / view.inflation
+    return float(np.linalg.norm(_orthogonal_part(change, view.nuisance))) / view.inflation
 
 
 def _seen_words(view: _Sensitivities, size: float, vector: Array, std: Array) -> str:

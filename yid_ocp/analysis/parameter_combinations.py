@@ -14,9 +14,7 @@ Array = NDArray[np.float64]
 _MAX_DIRECTION_MISMATCH = 0.05  # of a direction against that of a plain combination, both of unit length
 _FINITE_CHANGE_FACTOR = 1.3  # factor on the first parameter in the test of a combination at a finite change
 _MAX_LISTED_NAMES = 4  # in a sentence
-_MAX_RELATIVE_DATA_CHANGE = (
-    0.1  # a combination holds when the data then move by less than this share of what one change alone does
-)
+_MAX_RELATIVE_DATA_CHANGE = 0.1  # by which a combination may move the data, of what one change alone does
 
 
 @dataclass(frozen=True)
@@ -31,19 +29,7 @@ class DirectionComponent:
 
 @dataclass(frozen=True)
 class _CombinationForm:
-    """A function of two parameters that may be identifiable where neither of them is.
-
-    Attributes
-    ----------
-    words : str
-        With {a} and {b} for the names.
-    slope : callable
-        From the two values to the relative changes (a, b) that leave it as it is.
-    partner : callable
-        From (a, b, new a) to the b that leaves it as it is.
-    same_unit : bool
-        Whether it makes sense only for equal units.
-    """
+    """A function of two parameters that may be identifiable where neither of them is."""
 
     words: str
     slope: Callable[[float, float], tuple[float, float]]
@@ -51,13 +37,12 @@ class _CombinationForm:
     same_unit: bool
 
 
+def _series_partner(a: float, b: float, n: float) -> float:
+    return 1 / (1 / a + 1 / b - 1 / n)
+
+
 _COMBINATION_FORMS: tuple[_CombinationForm, ...] = (
-    _CombinationForm(
-        "1/{a} + 1/{b}, as springs in series are",
-        lambda a, b: (a, -b),
-        lambda a, b, n: 1 / (1 / a + 1 / b - 1 / n),
-        True,
-    ),
+    _CombinationForm("1/{a} + 1/{b}, as springs in series are", lambda a, b: (a, -b), _series_partner, True),
     _CombinationForm("{a} + {b}, as springs side by side are", lambda a, b: (b, -a), lambda a, b, n: a + b - n, True),
     _CombinationForm("the ratio {a} / {b}", lambda a, b: (1.0, 1.0), lambda a, b, n: b * n / a, False),
     _CombinationForm("the product {a} x {b}", lambda a, b: (1.0, -1.0), lambda a, b, n: b * a / n, False),
@@ -69,13 +54,8 @@ def describe_combination(
 ) -> str:
     """A sentence on which combination of the parameters in an unidentifiable direction the data determine.
 
-    Parameters
-    ----------
-    parts : sequence of Component
-        Of the unidentifiable direction.
-    moved : callable, optional
-        From new values of parameters to how far the data move [standard deviations]; tells combinations apart that look
-        alike for small changes. Without it the trade is described and not named.
+    `moved` tells how far the data move [standard deviations] where parameters take new values, and so combinations
+    apart that look alike for small changes. Without it the trade is described and not named.
     """
     if len(parts) == 1:
         return f"{parts[0].name} is not seen"
@@ -86,11 +66,9 @@ def describe_combination(
         if form is not None:
             return f"{listed} are seen only as {form.words.format(a=names[0], b=names[1])}"
     largest = max(abs(part.coefficient) for part in parts)
-    shown = (
-        parts
-        if len(parts) <= _MAX_LISTED_NAMES
-        else sorted(parts, key=lambda part: -abs(part.coefficient))[:_MAX_LISTED_NAMES]
-    )
+    shown = list(parts)
+    if len(parts) > _MAX_LISTED_NAMES:
+        shown = sorted(parts, key=lambda part: -abs(part.coefficient))[:_MAX_LISTED_NAMES]
     trade = " with ".join(f"{part.name} {10 * part.coefficient / largest:+.2g} %" for part in shown)
     rest = " and the others to match" if len(shown) < len(parts) else ""
     return f"{listed} are seen only together: {trade}{rest} changes nothing that is measured"
@@ -123,22 +101,14 @@ def _form(
     if not tried:
         return None
     least, best = min(tried, key=lambda entry: entry[0])
-    return (
-        best
-        if math.isfinite(least)
-        and least <= max(_MAX_RELATIVE_DATA_CHANGE * moved({first.name: a * _FINITE_CHANGE_FACTOR}), 1.0)
-        else None
-    )
+    allowed = max(_MAX_RELATIVE_DATA_CHANGE * moved({first.name: a * _FINITE_CHANGE_FACTOR}), 1.0)
+    return best if math.isfinite(least) and least <= allowed else None
 
 
 def sparse_basis(vectors: Array) -> list[Array]:
-    """Sparse basis, of unit vectors, of the space spanned by row vectors.
+    """Sparse basis, of unit vectors, of the space spanned by row vectors (d, p).
 
     Row echelon form with complete pivoting: as many components as there are vectors stand in one vector only.
-
-    Parameters
-    ----------
-    vectors : ndarray, shape (d, p)
     """
     rows = vectors.copy()
     taken: list[int] = []

@@ -37,12 +37,8 @@ _N_RANDOM_CONFIGURATIONS = 3  # at which both are compared, besides the one that
 class PinocchioComparison:
     """Relative differences between a model and Pinocchio's model of the same bodies.
 
-    Attributes
-    ----------
-    of : str
-        The compared model, in words.
-    mass, weight, motion : float
-        Largest difference of mass matrix, gravity forces and inverse dynamics, each divided by its largest entry.
+    `mass`, `weight` and `motion` are the largest difference of mass matrix, gravity forces and inverse dynamics, each
+    divided by its largest entry; `of` is the compared model, in words.
     """
 
     of: str
@@ -70,12 +66,7 @@ class PinocchioComparison:
 def compare_system_with_pinocchio(system: System, theta: Array, posture: Array) -> PinocchioComparison:
     """Compare the built system, its parameters at `theta`, with Pinocchio's model of the same joints and bodies.
 
-    Parameters
-    ----------
-    system : System
-    theta : ndarray, shape (ntheta,)
-    posture : ndarray, shape (n,)
-        Compared besides `_N_RANDOM_CONFIGURATIONS` drawn ones [rad or m].
+    The posture (n,) [rad or m] is compared besides `_N_RANDOM_CONFIGURATIONS` drawn ones.
     """
     built = with_numeric_parameters(system, theta)
     gravity = np.array(ca.DM(built.gravity)).ravel()
@@ -95,8 +86,6 @@ def compare_urdf_with_pinocchio(
 
     Parameters
     ----------
-    path : Path
-        URDF file.
     mechanism : Mechanism
         What `read_urdf` made of it with the same `joints`, `locked_joints` and `exclude_links`.
     gravity : ndarray, shape (3,)
@@ -121,9 +110,8 @@ def compare_urdf_with_pinocchio(
                 _place(at, model.joints[i], locked.get(name, _nearest_to_zero(model, model.joints[i])))
         model = pin.buildReducedModel(model, [i for i in range(1, model.njoints) if model.names[i] not in joints], at)
     model.gravity.linear = gravity
-    return _compared(
-        f"{path.name} as read", mechanism.with_numeric_values(), gravity, model, model, np.zeros(len(mechanism.joints))
-    )
+    posture = np.zeros(len(mechanism.joints))
+    return _compared(f"{path.name} as read", mechanism.with_numeric_values(), gravity, model, model, posture)
 
 
 def _without(path: Path, links: Sequence[str]) -> str:

@@ -29,39 +29,27 @@ from yid_ocp.solvers.gauss_newton import GaussNewton
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
-CHI2_QUANTILE_95 = 3.841458820694124
-"""Quantile 0.95 of chi2 with one degree of freedom."""
-
-_CHI2_QUANTILE_999 = 10.827566170662733
-"""Quantile 0.999."""
-_SMALL_VALUE_FRACTION = 0.3
-"""A value below this part of its typical size is small."""
-
-_MAX_LOG_DISTANCE = math.log(
-    1e3
-)  # how far a positive unknown is followed, up and down, before its interval counts as open
+# quantiles 0.95 and 0.999 of chi2 with one degree of freedom
+CHI2_QUANTILE_95, _CHI2_QUANTILE_999 = 3.841458820694124, 10.827566170662733
+_SMALL_VALUE_FRACTION = 0.3  # a value below this part of its typical size is small
+_MAX_LOG_DISTANCE = math.log(1e3)  # up to which a positive unknown is followed before its interval counts as open
 _LOG_PRIOR_STD = math.log(1e3)  # standard deviation that keeps other positive unknowns in place that nothing informs
 _REFIT_CHI2_ATOL = 1e-3  # chi2 that a refit may leave on the table
 _ROOT_RTOL = 0.01  # of the root of delta chi2 against its level's
 _MAX_REFIT_ITERATIONS, _MAX_PROFILE_POINTS = 30, 12
 _MAX_AUTOMATIC_INTERVALS, _MAX_UNKNOWNS = 12, 300  # beyond, profiles take long and are worked out only where asked for
 _OPTIMUM_ITERATIONS = 20  # iterations that bring all unknowns, nuisances among them, to their best fit
-_CLIFF_HEIGHT_RATIO, _CLIFF_WIDTH_RTOL = (
-    10.0,
-    1e-3,
-)  # height that is no parabola's, of the level's; distance of two sides, of that from the fit
+_CLIFF_HEIGHT_RATIO = 10.0  # height that is no parabola's, of the level's
+_CLIFF_WIDTH_RTOL = 1e-3  # distance of a cliff's two sides, of that from the fit
 _MAX_STEP_GROWTH, _STEP_OVERSHOOT = 3.0, 1.3
 
 
 @dataclass(frozen=True)
 class ParameterProfile:
-    """Profile likelihood of one unknown.
+    """Profile likelihood of one unknown, whose best fit is at `value`.
 
     Attributes
     ----------
-    name : str
-    value : float
-        At the best fit.
     lower, upper : float or None
         Ends of the 95 % interval; None where it is open.
     values, delta_chi2 : ndarray, shape (k,)
@@ -96,11 +84,11 @@ def profile_likelihood(
     """Profile-likelihood interval of one unknown: min over all others of chi2(x) - chi2(best) = level.
 
     Each value is reached from the last one, the others first moved along the tangent and then by Gauss-Newton.
-    Unknowns that are positive by nature move in their logarithm. The weak prior does not count.
+    Unknowns that are positive by nature move in their logarithm. The weak prior does not count. An end is open where
+    the level is not reached before the unknown's bound, or before it has changed by a factor of 1000.
 
     Parameters
     ----------
-    problem : EstimationProblem
     x : ndarray, shape (nx,)
         The best fit.
     index : int
@@ -111,12 +99,6 @@ def profile_likelihood(
         At `x`, with the Jacobian.
     level : float
         3.84 for 95 %.
-
-    Returns
-    -------
-    Profile
-        An end is open where the level is not reached before the unknown's bound, or before it has changed by a factor
-        of 1000.
 
     References
     ----------
@@ -143,25 +125,18 @@ def with_profile_intervals(
     """The solution with profile-likelihood intervals, and the verdicts they allow, for weakly determined parameters.
 
     There the cost is not a parabola; nor is it for stiffnesses that are small compared with their typical size
-    (`check_small_estimate`). The solution is unchanged where the problem is not `is_small_problem`, as profiles then take long.
-
-    Parameters
-    ----------
-    problem : EstimationProblem
-    solution : Solution
-        Of this problem.
-    progress : Progress, optional
+    (`check_small_estimate`). The solution is unchanged where the problem is too large, as profiles then take long.
     """
     usable = solution.evaluation is not None and problem.options.weighting != "paper"
     if not usable or not is_small_problem(problem):
         return solution
     sizes = typical_parameter_sizes(problem, solution.x)
-    asked = {
-        name: sizes[name.split("[")[0]]
-        for name, entry in solution.parameters.items()
-        if entry.verdict in ("identifiable", "weak")
-        and (not is_std_sufficient(entry) or entry.value < _SMALL_VALUE_FRACTION * sizes[name.split("[")[0]])
-    }
+    asked = {}
+    for name, entry in solution.parameters.items():
+        if entry.verdict in ("identifiable", "weak"):
+            size = sizes[name.split("[")[0]]
+            if not is_std_sufficient(entry) or entry.value < _SMALL_VALUE_FRACTION * size:
+                asked[name] = size
     if not asked:
         return solution
     progress.begin_stage(f"intervals of {', '.join(asked)} by profile likelihood")
@@ -172,9 +147,8 @@ def with_profile_intervals(
         index, size = problem.unknown_names.index(name), asked[name]
         entry = check_small_estimate(problem, best, index, solution.parameters[name], size, there)
         if entry.verdict != "not_identifiable" and not is_std_sufficient(entry):
-            entry = with_profile_interval(
-                entry, profile_likelihood(problem, best, index, entry.std, there).interval, size
-            )
+            profile = profile_likelihood(problem, best, index, entry.std, there)
+            entry = with_profile_interval(entry, profile.interval, size)
         parts.count_done(name)
         return entry
 
@@ -192,13 +166,10 @@ def check_small_estimate(
 
     Parameters
     ----------
-    problem : EstimationProblem
     x : ndarray, shape (nx,)
         The best fit.
     index : int
         Which unknown.
-    entry : Estimate
-        Of this unknown.
     size : float
         Its typical size, as in `inference.uncertainty.typical_parameter_sizes`.
     evaluation : Evaluation
@@ -209,17 +180,15 @@ def check_small_estimate(
     walk = _Walk(problem, x, index, evaluation, _CHI2_QUANTILE_999)
     rise = walk.rise(size)
     log.info("%s = %.3g: chi2 rises by %.3g up to %.3g", problem.unknown_names[index], entry.value, rise, size)
-    return (
-        entry if rise > _CHI2_QUANTILE_999 else replace(entry, verdict="not_identifiable", std=math.inf, interval=None)
-    )
+    if rise > _CHI2_QUANTILE_999:
+        return entry
+    return replace(entry, verdict="not_identifiable", std=math.inf, interval=None)
 
 
 def is_small_problem(problem: EstimationProblem) -> bool:
     """Whether a problem is small enough for its profile intervals to be computed by default."""
-    return (
-        len(parameter_unknown_names(problem)) <= _MAX_AUTOMATIC_INTERVALS
-        and len(problem.unknown_names) <= _MAX_UNKNOWNS
-    )
+    few = len(parameter_unknown_names(problem)) <= _MAX_AUTOMATIC_INTERVALS
+    return few and len(problem.unknown_names) <= _MAX_UNKNOWNS
 
 
 def nearby_optimum(problem: EstimationProblem, x: Array) -> tuple[Array, Evaluation]:
@@ -368,10 +337,8 @@ class _Walk:
 
     def _refit(self, near: _Point, s: float) -> _Point | None:
         """Best fit of the others at coordinate `s` of the profiled one, None where no rollout succeeds."""
-        now = near.x.copy()
-        change = s - now[self.index]
-        others = self.others
-        tangent = -near.jacobian[:, self.index] * change
+        now, others = near.x.copy(), self.others
+        tangent = -near.jacobian[:, self.index] * (s - now[self.index])
         if len(others):
             low, high = self.lower[others] - now[others], self.upper[others] - now[others]
             now[others] += bounded_least_squares_step(near.jacobian[:, others], -tangent, 0.0, low, high)
@@ -417,10 +384,8 @@ class _Walk:
 
     def _chi2(self, evaluation: Evaluation) -> float:
         """Twice the cost without the weak priors, in units of the noise."""
-        stated, weak = (
-            float(np.sum(evaluation.residual[rows] ** 2))
-            for rows in (self.problem.residual_rows.stated_priors, self.problem.residual_rows.weak_priors)
-        )
+        rows = self.problem.residual_rows
+        stated, weak = (float(np.sum(evaluation.residual[own] ** 2)) for own in (rows.stated_priors, rows.weak_priors))
         return (2.0 * evaluation.cost - weak - stated) / self.noise**2 + stated
 
     def _rows(self, evaluation: Evaluation, s: Array) -> tuple[Array, Array]:

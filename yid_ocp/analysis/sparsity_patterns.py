@@ -36,14 +36,10 @@ class SparsityPattern:
     name, title : str
         For files, and for people.
     nonzero_mask : ndarray of bool, shape (r, c)
-    row_blocks, column_blocks : tuple of Span
+    row_blocks, column_blocks : tuple of NamedRange
         Blocks, in order and without gaps.
-    row_labels, column_labels : tuple of str
-        One for every row and column.
     marked_mask : ndarray of bool, shape (r, c), or None
-        Entries that are highlighted.
-    mark_label : str
-        Meaning of the highlighted entries.
+        Entries that are highlighted; `mark_label` is their meaning.
     """
 
     name: str
@@ -58,10 +54,8 @@ class SparsityPattern:
 
     def with_marked_nonzeros(self, values: NDArray[np.float64], where: str) -> SparsityPattern:
         """The pattern with the numerically nonzero entries of one matrix highlighted."""
-        size = np.abs(values)
-        return replace(
-            self, marked_mask=size > _ZERO_RTOL * np.max(size, initial=0.0), mark_label=f"not zero at {where}"
-        )
+        marked = np.abs(values) > _ZERO_RTOL * np.max(np.abs(values), initial=0.0)
+        return replace(self, marked_mask=marked, mark_label=f"not zero at {where}")
 
     @property
     def n_nonzeros(self) -> int:
@@ -73,14 +67,9 @@ class SparsityPattern:
 class KktSize:
     """Size of the NLP with a node at every step.
 
-    Attributes
-    ----------
-    variables, constraints : int
-    jacobian_nonzeros : int
-        Of the constraints.
-    hessian_nonzeros : int
-        Both triangles of the exact Hessian of the steps' constraints times their multipliers; what measurements add to
-        it is not counted, and the start is linear in the parameters, as multiple shooting takes it.
+    `jacobian_nonzeros` counts those of the constraints, `hessian_nonzeros` both triangles of the exact Hessian of the
+    steps' constraints times their multipliers; what measurements add to it is not counted, and the start is linear in
+    the parameters, as multiple shooting takes it.
     """
 
     variables: int
@@ -95,15 +84,8 @@ class KktSize:
 def step_sparsity_patterns(symbols: StepSymbols) -> dict[str, SparsityPattern]:
     """Structural sparsity patterns of one step's matrices, by name.
 
-    Parameters
-    ----------
-    symbols : StepSymbols
-
-    Returns
-    -------
-    dict of str to Pattern
-        `dR_dy`, residual by unknowns; `A` = dx_{k+1}/dx_k, `B_u` and `B_theta` by the implicit function theorem;
-        `dR_dtheta`, all rows by the parameters.
+    `dR_dy`, residual by unknowns; `A` = dx_{k+1}/dx_k, `B_u` and `B_theta` by the implicit function theorem;
+    `dR_dtheta`, all rows by the parameters.
     """
     whole = _mask(symbols.jacobian_pattern)
     system = symbols.equations.system
@@ -196,12 +178,8 @@ class NlpStageSparsity:
         Of these constraints times their multipliers.
     gauss_newton_mask : ndarray of bool, shape (f + nx, f + nx)
         Gauss-Newton Hessian of the priors and of one reading of every sensor, by (theta_free, x_k).
-    constraint_blocks, state_blocks : tuple of Span
-        Blocks of a step's constraints and of a node's state.
-    constraint_labels, state_labels, multiplier_labels : tuple of str
-        Of their entries and of a step's multipliers.
-    n_free_parameters : int
-        Number of free parameters.
+    constraint_blocks, state_blocks : tuple of NamedRange
+        Blocks of a step's constraints and of a node's state, with the labels of their entries.
     fixed_start_rows, estimated_start_rows : tuple of int
         Rows of the first node's state that the start fixes, and that have a prior about it; the start depends on all
         free parameters.
@@ -236,7 +214,6 @@ def nlp_stage_sparsity(
 
     Parameters
     ----------
-    symbols : StepSymbols
     free : sequence of str
         Parameters that are unknowns.
     sensors : sequence of Sensor
@@ -338,15 +315,7 @@ def _spans(symbols: StepSymbols, wanted: Sequence[tuple[str, Sequence[int] | Non
 
 
 def kkt_pattern(stage: NlpStageSparsity, free: Sequence[str], steps: int) -> SparsityPattern:
-    """The KKT matrix [[H, J'], [J, 0]] of the first steps of a recording, as if every node were measured.
-
-    Parameters
-    ----------
-    stage : Stages
-    free : sequence of str
-        Parameters that are unknowns.
-    steps : int
-    """
+    """The KKT matrix [[H, J'], [J, 0]] of the first steps of a recording, as if every node were measured."""
     jacobian, hessian, measured = _nlp_sparsity_masks(stage, steps)
     blank = np.zeros((len(jacobian), len(jacobian)), bool)
     mask = np.vstack([np.hstack([hessian | measured, jacobian.T]), np.hstack([jacobian, blank])])

@@ -1,65 +1,34 @@
-"""Diagnostics of a compiled step: dimensions, operation counts, sparsity, and linearisation against differences."""
+"""Diagnostics of a compiled step: sizes, linearisation against differences, what each parameter enters and moves."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from yid_ocp.analysis.step_symbols import StepSymbols
 from yid_ocp.integrator.step import Step, float_array_of_shape
-from yid_ocp.integrator.step_model import StepLinearization
+from yid_ocp.integrator.step_model import StepLinearization, TrackingFeedback
 from yid_ocp.model.system import System
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.sensors import sensor_function
 
 Array = NDArray[np.float64]
 
-_DIFFERENCE_STEP = (
-    1e-5  # balances Newton's tolerance against the third derivative, for angles and stiffnesses of order one
-)
-
-
-@dataclass(frozen=True)
-class FunctionSize:
-    """Number of operations and of nonzero outputs of one generated function."""
-
-    name: str
-    n_operations: int
-    n_nonzeros: int
-
-
-@dataclass(frozen=True)
-class StepStructure:
-    """Dimensions, unknowns and function sizes of a step's equations.
-
-    Attributes
-    ----------
-    dimensions : dict of str to int
-        n, nz, m, nu, nc, nx, ntheta.
-    n_unknowns : int
-        Free coordinates, internal coordinates and multipliers that Newton's iteration solves for.
-    jacobian_nonzeros : int
-        Of the DEL residual by the unknowns.
-    function_sizes : tuple of Operations
-        Residual, its Jacobian's parts and the rest, as generated.
-    """
-
-    dimensions: dict[str, int]
-    n_unknowns: int
-    jacobian_nonzeros: int
-    function_sizes: tuple[FunctionSize, ...]
+# balances Newton's tolerance against the third derivative, for angles and stiffnesses of order one
+_DIFFERENCE_STEP = 1e-5
 
 
 @dataclass(frozen=True)
 class CheckedLinearisation:
-    """A_k, B_k at a state, with their deviation from finite differences.
+    """A_k (nx, nx), B_k at a state (q, p, z), with their deviation from finite differences.
 
     Attributes
     ----------
-    state : ndarray, shape (nx,)
-        (q, p, z)
-    a : ndarray, shape (nx, nx)
     b_input : ndarray, shape (nx, nu)
     b_theta : ndarray, shape (nx, ntheta)
     spectral_radius : float
@@ -76,21 +45,25 @@ class CheckedLinearisation:
     finite_difference_errors: dict[str, float]
 
 
-def step_structure(step: Step) -> StepStructure:
-    """Dimensions, nonzeros and operation counts of a step."""
-    e = step.equations
-    functions = tuple(
-        FunctionSize(f.name(), f.n_instructions(), sum(f.nnz_out(i) for i in range(f.n_out())))
-        for f in step.functions.all_functions
-    )
-    return StepStructure(step.sizes, e.unknowns.numel(), _jacobian_sparsity(step).nnz(), functions)
+def step_structure(step: Step) -> dict[str, Any]:
+    """Sizes of a step's vectors, number of unknowns, nonzeros of d(residual)/d(unknowns), operations of its functions.
 
-
-def _jacobian_sparsity(step: Step) -> ca.Sparsity:
-    """Pattern of d(DEL residual)/d(unknowns), shape (ny, ny)."""
-    e = step.equations
-    pattern: ca.Sparsity = ca.jacobian_sparsity(e.residual, e.unknowns)
-    return pattern
+    `unknowns` are the free coordinates, internal coordinates and multipliers that Newton's iteration solves for.
+    """
+    e, functions = step.equations, step.functions.all_functions
+    return {
+        "sizes": step.sizes,
+        "unknowns": e.unknowns.numel(),
+        "jacobian_nonzeros": ca.jacobian_sparsity(e.residual, e.unknowns).nnz(),
+        "functions": [
+            {
+                "name": f.name(),
+                "operations": f.n_instructions(),
+                "nonzeros": sum(f.nnz_out(i) for i in range(f.n_out())),
+            }
+            for f in functions
+        ],
+    }
 
 
 def linearise_and_check(
@@ -100,7 +73,6 @@ def linearise_and_check(
 
     Parameters
     ----------
-    step : Step
     state : array_like, shape (nx,)
         (q, p, z)
     torque : array_like, shape (nu,)
@@ -112,10 +84,8 @@ def linearise_and_check(
     sizes = step.sizes
     n, nx = sizes["n"], sizes["nx"]
     x = float_array_of_shape("state", state, (nx,))
-    u, values = (
-        float_array_of_shape("torque", torque, (sizes["nu"],)),
-        float_array_of_shape("theta", theta, (sizes["ntheta"],)),
-    )
+    u = float_array_of_shape("torque", torque, (sizes["nu"],))
+    values = float_array_of_shape("theta", theta, (sizes["ntheta"],))
     a, b_input, b_theta = step.jacobians(x[:n], x[n : 2 * n], u, values, prescribed, x[2 * n :])
 
     def after(x: Array, u: Array, values: Array) -> Array:
@@ -136,18 +106,9 @@ def linearise_and_check(
 
 
 def linearise_step_equations(step: Step, state: Array, torque: Array, theta: Array, path: Array) -> StepLinearization:
-    """Linearised equations of the step that starts at a state, with derivatives by all parameters.
+    """Linearised equations of the step that starts at a state (nx,), with derivatives by all parameters.
 
-    Parameters
-    ----------
-    step : Step
-    state : ndarray, shape (nx,)
-        (q, p, z)
-    torque : ndarray, shape (nu,)
-        [N m]
-    theta : ndarray, shape (ntheta,)
-    path : ndarray, shape (nc,)
-        Prescribed coordinates, before and after the step.
+    The torque (nu,) is in N m; `path` (nc,) are the prescribed coordinates, before and after the step.
     """
     n = step.sizes["n"]
     q1, p1, lam, status = step(state[:n], state[n : 2 * n], torque, theta, (path, path), state[2 * n :])
@@ -181,3 +142,201 @@ def _differences(function: Callable[[Array], Array], at: Array) -> Array:
 def _error(exact: Array, difference: Array) -> float:
     largest = float(np.max(np.abs(exact), initial=0.0))
     return float(np.max(np.abs(exact - difference), initial=0.0)) / largest if largest > 0 else 0.0
+
+
+# A row counts as seen where readings answer to it by more than this part of what they answer to the row seen best:
+# below is what a rest found to 1e-12 rad and a hundred steps of rounding leave.
+_MIN_RELATIVE_RESPONSE = 1e-7
+# Steps over which readings are looked at; what is not seen within them takes longer than most motions.
+_RESPONSE_STEPS = 100
+_NEGLIGIBLE_STDS = 1e-6  # standard deviations: beneath are the tolerance of a rest and what hundred steps make of it
+_MAX_LISTED_ROWS = 8  # rows that are named one by one
+
+
+@dataclass(frozen=True)
+class ParameterDependence:
+    """The equations of a step that one parameter enters, and how strongly sensors respond to it.
+
+    Attributes
+    ----------
+    rows : tuple of str
+        Equation rows that contain it, whatever the state.
+    seen : tuple of str or None
+        Those of them to which a sensor responds to first order; None without sensors.
+    best : str
+        Sensor that responds most; empty where none does.
+    read : tuple of str
+        Sensors whose reading depends on the parameter directly.
+    moved : float or None
+        Largest change of a reading per unit of the parameter, starting at the equilibrium, in standard deviations.
+    seconds : float
+        Time span over which readings were simulated [s].
+    along : float or None
+        Change of all readings of the recordings per unit of the parameter, in standard deviations (root of the sum of
+        squares); None where not requested.
+    """
+
+    parameter: str
+    unit: str
+    rows: tuple[str, ...]
+    seen: tuple[str, ...] | None
+    best: str
+    read: tuple[str, ...]
+    moved: float | None
+    seconds: float
+    along: float | None = None
+
+    @property
+    def words(self) -> str:
+        """Sentences on the equation rows, then on the change of readings from rest and along the recordings."""
+        said = f"{self.parameter} enters {self._rows}"
+        if self.read:
+            said += f"; the reading of {', '.join(self.read)} depends on it directly"
+        more = "1 more of it" if self.unit == "1" else f"one {self.unit} more of it"
+        within = f"within {self.seconds:.2g} s"
+        if self.moved is not None and self.moved > _NEGLIGIBLE_STDS:
+            said += f". From rest, {more} moves readings by at most {self.moved:.2g} standard deviations {within}"
+        elif self.moved is not None:
+            said += f". From rest, {more} moves no reading by a millionth of its standard deviation {within}"
+        if self.along is not None:
+            moves = f"moves all readings together by {self.along:.2g} standard deviations"
+            said += f". Along the recordings, {more} {moves}, to first order"
+        return said + "."
+
+    @property
+    def _rows(self) -> str:
+        if not self.rows:
+            return "no row of a step"
+        one, listed = len(self.rows) == 1, _summarize_rows(self.rows)
+        said = f"{len(self.rows)} row{'' if one else 's'} ({listed})"
+        if self.seen is None:
+            return said
+        best = f", {self.best} best" if self.best else ""
+        if not self.seen:
+            return f"{said}, {'which no sensor' if one else 'none of which a sensor'} sees to first order"
+        if len(self.seen) == len(self.rows):
+            return f"{said}, {'which' if one else 'all of which'} sensors see to first order{best}"
+        return f"{said}, {len(self.seen)} of which sensors see to first order ({_summarize_rows(self.seen)}){best}"
+
+
+@dataclass(frozen=True)
+class _Readings:
+    """One sensor at the rest, whitened: derivatives of its readings by state, effort and parameters."""
+
+    name: str
+    by_state: Array
+    by_effort: Array
+    by_theta: Array
+
+
+def parameter_dependences(
+    step: Step, symbols: StepSymbols, episode: Episode | None, state: Array, theta: Array, stages: StepLinearization
+) -> tuple[ParameterDependence, ...]:
+    """Dependence of the step equations and of a recording's sensors on every parameter, about a state (nx,).
+
+    A unit is added to one row of one step that starts at `state`; with A - B_u K the steps after it are linear, K the
+    tracking filter's first gain. The row is seen to first order where a reading answers within `_RESPONSE_STEPS` steps.
+    The episode provides the sensors and the tracking filter; without one only rows are listed.
+    """
+    names, parameters = symbols.row_names, step.system.parameters
+    span = symbols.block_slice("theta")
+    entered: dict[int, list[int]] = {i: [] for i in range(len(parameters))}
+    for row, column in zip(*symbols.jacobian_pattern.get_triplet(), strict=True):
+        if span.start <= column < span.stop:
+            entered[column - span.start].append(row)
+    if episode is None:
+        return tuple(
+            ParameterDependence(p.name, p.unit, tuple(names[r] for r in sorted(entered[i])), None, "", (), None, 0.0)
+            for i, p in enumerate(parameters)
+        )
+    linear = _Linear.of(step, stages, episode.tracking_feedback)
+    sensors = _readings(step, episode, state, theta)
+    steps = min(_RESPONSE_STEPS, episode.grid.steps)
+    by_row = linear.answers(np.eye(len(names)), sensors, steps, held=False)
+    by_theta = linear.answers(linear.by_theta, sensors, steps, held=True)
+    strength = np.max(by_row, axis=0, initial=0.0)
+    found = []
+    for i, p in enumerate(parameters):
+        rows = sorted(entered[i])
+        answered = [r for r in rows if strength[r] > _MIN_RELATIVE_RESPONSE * np.max(strength)]
+        best = sensors[int(np.argmax(np.max(by_row[:, answered], axis=1)))].name if answered else ""
+        read = tuple(s.name for s in sensors if np.any(s.by_theta[:, i]))
+        # what is rounding beside the parameter seen best is nothing
+        moved = float(np.max(by_theta[:, i], initial=0.0))
+        seen = tuple(names[r] for r in answered)
+        rows_named = tuple(names[r] for r in rows)
+        found.append(ParameterDependence(p.name, p.unit, rows_named, seen, best, read, moved, steps * step.time_step))
+    return tuple(found)
+
+
+def _summarize_rows(names: Sequence[str]) -> str:
+    """Row names joined to a text; more than eight are counted by kind."""
+    if len(names) <= _MAX_LISTED_ROWS:
+        return ", ".join(names)
+    kinds = [name.partition("[")[0] for name in names]
+    return ", ".join(f"{kinds.count(kind)} of {kind}" for kind in dict.fromkeys(kinds))
+
+
+def _readings(step: Step, episode: Episode, state: Array, theta: Array) -> list[_Readings]:
+    system, n = step.system, step.system.n_coordinates
+    effort = np.zeros(n)
+    found = []
+    for samples in episode.measurements:
+        used = np.any(samples.is_used, axis=0)
+        known = np.where(np.isfinite(samples.std) & samples.is_used, samples.std, np.nan)
+        if not np.any(used) or not np.any(np.isfinite(known)):
+            continue
+        std = np.array([np.nanmedian(known[:, k]) if u else np.inf for k, u in enumerate(used)])
+        function = sensor_function(system, samples.sensor, system.parameters.names)
+        _, by_q, by_z, by_effort, by_theta = (
+            np.array(x.full()) / std[:, None] for x in function.call([state[:n], state[2 * n :], effort, theta])
+        )
+        by_state = np.hstack([by_q, np.zeros_like(by_q), by_z])
+        found.append(_Readings(samples.sensor.group_name, by_state, by_effort, by_theta))
+    return found
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """The equations of a step about a rest, to first order."""
+
+    step: Step
+    stages: StepLinearization
+    gain: Array
+    by_theta: Array
+
+    @staticmethod
+    def of(step: Step, stages: StepLinearization, feedback: TrackingFeedback | None) -> _Linear:
+        sizes = step.sizes
+        gain = np.zeros((sizes["nu"], sizes["nx"]))
+        if feedback is not None:
+            gain[:, feedback.state_indices] = feedback.gain[0]
+        return _Linear(step, stages, gain, np.vstack([stages.residual_by_theta[0], stages.p1_by_theta[0]]))
+
+    def answers(self, push: Array, sensors: Sequence[_Readings], steps: int, held: bool) -> Array:
+        """Largest whitened answer of every sensor, shape (len(sensors), c)."""
+        sizes, stages, h = self.step.sizes, self.stages, self.step.time_step
+        n, nz, width = sizes["n"], sizes["nz"], push.shape[1]
+        nt = n + nz + sizes["m"]
+        known = list(self.step.system.prescribed_indices)
+        solved = np.setdiff1d(np.arange(nt), known)
+        new, p_new = stages.residual_by_new[0], stages.p1_by_new[0]
+        inverse = np.linalg.inv(new[np.ix_(solved, solved)])
+        identity = np.vstack([np.eye(n), np.zeros((nt - n, n))])
+        old = np.hstack([stages.residual_by_old[0][:, :n], identity, stages.residual_by_old[0][:, n:]])
+        p_old = np.hstack([stages.p1_by_old[0][:, :n], np.zeros((n, n)), stages.p1_by_old[0][:, n:]])
+        old, p_old = old - stages.residual_by_input[0] @ self.gain, p_old - stages.p1_by_input[0] @ self.gain
+        x = np.zeros((sizes["nx"], width))
+        largest = np.zeros((len(sensors), width))
+        for k in range(steps + 1):
+            added = push if held or k == 0 else np.zeros_like(push)
+            y = np.zeros((nt, width))
+            y[solved] = -inverse @ (old @ x + added[:nt])[solved]
+            effort = np.zeros((n, width))
+            effort[known] = -(new @ y + old @ x + added[:nt])[known] / h
+            for i, sensor in enumerate(sensors):
+                read = sensor.by_state @ x + sensor.by_effort @ effort + (sensor.by_theta if held else 0.0)
+                largest[i] = np.maximum(largest[i], np.max(np.abs(read), axis=0, initial=0.0))
+            momentum = p_new @ y + p_old @ x + added[nt:]
+            x = np.vstack([y[:n], momentum, y[n : n + nz]])
+        return largest

@@ -31,8 +31,7 @@ from yid_ocp.sensors.joints import PositionSensor
 
 Array = NDArray[np.float64]
 
-_NEGLIGIBLE_STD = 0.1
-"""Standard deviation that is left out, in units of a reading's noise."""
+_NEGLIGIBLE_STD = 0.1  # standard deviation that is left out, in units of a reading's noise
 _INITIAL_RANDOM_SAMPLES, _MAX_RANDOM_SAMPLES = 128, 512
 """Random samples of all errors at first, twice as many as long as they are too few, and at most."""
 
@@ -85,16 +84,14 @@ def episode_sensitivities(
         blur = np.zeros((len(result.rollout.state), len(units), 0))
     else:
         if encoders is not None:
-            angles = np.zeros(
-                (len(course.rollout.state), len(driving.input_errors.angle_std), course.rollout.state.shape[1])
-            )
+            nodes, nx = course.rollout.state.shape
+            angles = np.zeros((nodes, len(driving.input_errors.angle_std), nx))
             angles[:, np.arange(angles.shape[1]), list(problem.system.driven_indices)] = 1.0
             by_state.append(angles)
             units += list(driving.input_errors.angle_std)
         scale = np.array(units)[:, None]
-        blur = scale * _low_rank_error_sensitivity(
-            course, driving.input_errors, np.concatenate(by_state, axis=1) / scale
-        )
+        whole = np.concatenate(by_state, axis=1) / scale
+        blur = scale * _low_rank_error_sensitivity(course, driving.input_errors, whole)
     slopes: dict[tuple[str, str], Array] = {}
     at = 0
     for sensor, block in shown:
@@ -139,18 +136,6 @@ def _low_rank_error_sensitivity(course: NominalTrajectory, errors: InputErrors, 
 
     The tracking filter keeps the arms on what they followed. Where it follows encoders that are measurements, its share
     of their noise is taken as independent of theirs, which is small beside that of torques.
-
-    Parameters
-    ----------
-    course : Course
-    errors : InputErrors
-    slopes : ndarray, shape (N + 1, k, nx)
-        Of readings at every node by the state there, in units of their finest noise.
-
-    Returns
-    -------
-    ndarray, shape (N + 1, k, q)
-        In the same units.
     """
     motion = _Motion.of(course, errors)
     rng = np.random.default_rng(0)
@@ -174,18 +159,7 @@ def _low_rank_error_sensitivity(course: NominalTrajectory, errors: InputErrors, 
 
 @dataclass(frozen=True)
 class _Motion:
-    """How errors of unit standard deviation move the state: those of the start, of samples, of steps, the constant one.
-
-    Attributes
-    ----------
-    by_state : ndarray, shape (N, nx, nx)
-    by_torque, by_angles : ndarray, shape (N, nx, nu)
-        By the torque, and by the noise of the angles that the filter follows.
-    start_by_angles, start_by_torque : ndarray, shape (nx, nu)
-    torque_std, bias_std : ndarray, shape (nu,)
-    sample : ndarray of int, shape (N,)
-        Counted from 0 without a gap.
-    """
+    """How errors of unit standard deviation move the state: of the start, of samples, of steps, the constant one."""
 
     by_state: Array
     by_torque: Array
@@ -202,11 +176,8 @@ class _Motion:
         momentum = course.model_functions.momentum_shift.momentum_by_torque(course.theta)
         by_state, by_torque, by_angles = [], [], []
         for k, here in enumerate(linearized_steps(step, course.theta, course.rollout)):
-            state, angles, by_error = (
-                here.state_by_state.copy(),
-                np.zeros_like(here.state_by_torque),
-                here.state_by_torque.copy(),
-            )
+            state, by_error = here.state_by_state.copy(), here.state_by_torque.copy()
+            angles = np.zeros_like(by_error)
             if feedback is not None:
                 by_error = here.state_by_torque @ torque_error_feedthrough(feedback.gain[k], momentum)
                 pulled = here.state_by_torque @ feedback.gain[k]

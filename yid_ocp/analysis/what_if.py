@@ -35,9 +35,7 @@ from yid_ocp.solvers.base import Solution
 Array = NDArray[np.float64]
 
 _FASTER_CAMERA_RATES = (10.0, 30.0)  # rates of the camera to try [Hz]
-_MIN_INFORMATION_EIGENVALUE = (
-    1e-16  # of eigenvalues of the information on relative changes: standard deviations up to 1e8
-)
+_MIN_INFORMATION_EIGENVALUE = 1e-16  # of information on relative changes: standard deviations up to 1e8
 _MAX_CHANGE_SET_SIZE = 3
 
 
@@ -49,11 +47,8 @@ class ExperimentChange:
     ----------
     name : str
         `weld`, `second_arm`, `motion`, `travel`, `torque`, `camera:FRAME`, `arm:FRAME` or `rate:HERTZ`.
-    description : str
     mechanical_change : str
         Key of `MECHANICAL_CHANGES`, empty where only sensors change.
-    added_camera_frames, added_arm_frames : tuple of str
-        Additional frames that the camera, or the arm, measures.
     camera_rate : float or None
         Of the camera [Hz].
     """
@@ -68,16 +63,10 @@ class ExperimentChange:
 
 @dataclass(frozen=True)
 class ChangedExperimentResult:
-    """Predicted identifiability of an experiment with some changes.
+    """Predicted identifiability of an experiment with some changes; without verdicts where it could not be evaluated.
 
     Attributes
     ----------
-    changes : tuple of str
-        Names of the changes; empty for the unchanged experiment.
-    words : str
-    std_relative : mapping of parameter to float
-        Empty where the experiment could not be evaluated.
-    verdicts : mapping of parameter to str
     identifiable : int
         How many parameters.
     gain : float
@@ -107,17 +96,13 @@ class ExperimentRanking(ReprMixin):
 
     Attributes
     ----------
-    unchanged_experiment : Outcome
-        The experiment as it is.
-    single_changes : tuple of Outcome
-        Single changes, most identifiable parameters first, then by gain; those that could not be evaluated last.
-    smallest_sufficient_sets : tuple of Outcome
+    single_changes : tuple of ChangedExperimentResult
+        Most identifiable parameters first, then by gain; those that could not be evaluated last.
+    smallest_sufficient_sets : tuple of ChangedExperimentResult
         All sets of fewest changes with which every parameter is identifiable, largest gain first; empty where none of
         up to three changes does it.
-    greedy_sequence : tuple of Outcome
+    greedy_sequence : tuple of ChangedExperimentResult
         Best single change added one after the other.
-    n_evaluated_sets : int
-        Number of evaluated sets of changes.
     """
 
     unchanged_experiment: ChangedExperimentResult
@@ -127,14 +112,11 @@ class ExperimentRanking(ReprMixin):
     n_evaluated_sets: int
 
     def _summary(self) -> ReprSummary:
+        shown = (self.unchanged_experiment, *self.single_changes)
         rows = [("change", "parameters found", "gain [nat]")]
-        rows += [
-            (entry.words, str(entry.identifiable), f"{entry.gain:.3g}")
-            for entry in (self.unchanged_experiment, *self.single_changes)
-        ]
-        return ReprSummary(
-            f"{count_with_noun(len(self.single_changes), 'change')}, {self.n_evaluated_sets} sets of them judged", rows
-        )
+        rows += [(entry.words, str(entry.identifiable), f"{entry.gain:.3g}") for entry in shown]
+        count = count_with_noun(len(self.single_changes), "change")
+        return ReprSummary(f"{count}, {self.n_evaluated_sets} sets of them judged", rows)
 
 
 @dataclass(frozen=True)
@@ -147,8 +129,6 @@ class WhatIfOptions:
         Noise of joint torques as a measurement, where the recordings state none [N m].
     motion_seed : int
         Random seed of alternative motions.
-    max_set_size : int
-        Largest set of changes that is searched.
     considered_changes : tuple of str, optional
         Names of changes to consider, all when absent.
     """
@@ -182,21 +162,14 @@ def what_if(
 
     Parameters
     ----------
-    problem : EstimationProblem
     solution : Solution or array_like, optional
         Point at which to judge; the initial values when absent.
     start, grasp_std
         Nuisances, as in `identifiability`.
     two_arm_system : System, optional
         The system with one more arm and its grasp; without it that change is not tried.
-    options : WhatIfOptions, optional
-    progress : Progress, optional
     evaluate_changes : callable, optional
-        Evaluates sets of changes, in other processes for example, by `evaluate_change_sets`; in this process when absent.
-
-    Returns
-    -------
-    WhatIf
+        Evaluates sets of changes by `evaluate_change_sets`, in other processes for example; in this one when absent.
 
     Raises
     ------
@@ -214,10 +187,9 @@ def what_if(
     (base,) = outcomes.of_all([()])
     if not base.verdicts:
         raise SolverError(base.message)
+    wanted = options.considered_changes
     known = _possible_changes(setting, outcomes.builder)
-    changes = [
-        change for change in known if options.considered_changes is None or change.name in options.considered_changes
-    ]
+    changes = [change for change in known if wanted is None or change.name in wanted]
     singles = _rank_results(outcomes.of_all([(change,) for change in changes]))
     greedy = _greedy(outcomes, changes, base, options.max_set_size)
     smallest = _smallest(outcomes, changes, base, options.max_set_size)
@@ -229,13 +201,7 @@ def evaluate_change_sets(
 ) -> list[ChangedExperimentResult]:
     """Predicted results of an experiment with each of several sets of changes, given by name.
 
-    Parameters
-    ----------
-    setting : Setting
-    sets : sequence of sequence of str
-        Names of `_possible_changes`.
-    inflation : float
-        Factor by which variances are larger than stated.
+    `inflation` is the factor by which variances are larger than stated.
     """
     outcomes = _Outcomes(setting, CandidateExperimentBuilder(setting), inflation)
     known = {change.name: change for change in _possible_changes(setting, outcomes.builder)}
@@ -258,39 +224,25 @@ def _possible_changes(setting: BaseExperiment, builder: CandidateExperimentBuild
     """All single changes that apply to an experiment."""
     episode = setting.problem.episodes[0]
     camera, arm = setting.camera_sampling(episode)[0], setting.arm_sampling(episode)[0]
-    looked = {
-        view.frame
-        for view in setting.recorded_observations(episode)
-        if camera is not None and view.point_group == camera.name
-    }
-    felt = {
-        view.frame
-        for view in setting.recorded_observations(episode)
-        if arm is not None and view.point_group == arm.name
-    }
+    views = setting.recorded_observations(episode)
+    looked, felt = (
+        {view.frame for view in views if group is not None and view.point_group == group.name}
+        for group in (camera, arm)
+    )
     changes = [ExperimentChange(name, MECHANICAL_CHANGES[name], name) for name in builder.applicable_changes()]
-    system = setting.problem.system
-    for sight in observable_frames(system):
-        if sight.name not in looked | felt:
+    for sight in observable_frames(setting.problem.system):
+        name, words = sight.name, sight.description
+        if name not in looked | felt:
             changes.append(
-                ExperimentChange(
-                    f"camera:{sight.name}",
-                    f"{sight.description}, seen by the camera",
-                    added_camera_frames=(sight.name,),
-                )
+                ExperimentChange(f"camera:{name}", f"{words}, seen by the camera", added_camera_frames=(name,))
             )
-        if sight.is_arm_measurable and sight.name not in felt:
-            changes.append(
-                ExperimentChange(
-                    f"arm:{sight.name}", f"{sight.description}, seen by the arm", added_arm_frames=(sight.name,)
-                )
-            )
+        if sight.is_arm_measurable and name not in felt:
+            changes.append(ExperimentChange(f"arm:{name}", f"{words}, seen by the arm", added_arm_frames=(name,)))
     if camera is not None:
         now = 1.0 / float(np.median(np.diff(camera.t))) if len(camera.t) > 1 else 0.0
-        faster = [rate for rate in _FASTER_CAMERA_RATES if rate > now]
-        changes += [
-            ExperimentChange(f"rate:{r:g}", f"the camera at {r:g} Hz without gaps", camera_rate=r) for r in faster
-        ]
+        for rate in (rate for rate in _FASTER_CAMERA_RATES if rate > now):
+            words = f"the camera at {rate:g} Hz without gaps"
+            changes.append(ExperimentChange(f"rate:{rate:g}", words, camera_rate=rate))
     return changes
 
 
@@ -307,18 +259,7 @@ def _rank_results(outcomes: Iterable[ChangedExperimentResult]) -> list[ChangedEx
 
 
 class _Outcomes:
-    """What sets of changes would tell, each worked out once.
-
-    Attributes
-    ----------
-    setting : Setting
-    builder : LayoutBuilder
-    inflation : float
-        Factor by which variances are larger than stated.
-    judge : callable, optional
-        Who works them out instead.
-    progress : Progress, optional
-    """
+    """What sets of changes would tell, each worked out once."""
 
     def __init__(
         self,
@@ -349,18 +290,14 @@ class _Outcomes:
         self.progress.begin_stage(f"judging {len(sets)} experiments")
         found = []
         for done, changes in enumerate(sets):
-            self.progress.report_parts_done(
-                done, len(sets), "; ".join(change.description for change in changes) or "as it is"
-            )
+            self.progress.report_parts_done(done, len(sets), _words(changes))
             found.append(self._outcome(changes))
         return found
 
     def _outcome(self, changes: Sequence[ExperimentChange]) -> ChangedExperimentResult:
-        names = tuple(change.name for change in changes)
-        words = "; ".join(change.description for change in changes) if changes else "as it is"
-        layout = self.builder.build_experiment(
-            frozenset(change.mechanical_change for change in changes if change.mechanical_change)
-        )
+        names, words = tuple(change.name for change in changes), _words(changes)
+        mechanics = frozenset(change.mechanical_change for change in changes if change.mechanical_change)
+        layout = self.builder.build_experiment(mechanics)
         if isinstance(layout, str):
             return ChangedExperimentResult(names, words, {}, {}, 0, -math.inf, layout)
         views = [self._views(episode, changes, layout) for episode in self.setting.problem.episodes]
@@ -379,34 +316,29 @@ class _Outcomes:
         rate = next((change.camera_rate for change in changes if change.camera_rate is not None), None)
         if rate is not None:
             times = uniform_sample_times(episode.grid, rate)
-        held = {grasp.held_frame for grasp in layout.problem.system.grasps}
+
+        def look(frame: str) -> FrameObservation:
+            return FrameObservation(looking, frame, times, np.full((len(times), 3), std))
+
         # a point that a second arm now holds is that arm's to measure
-        taken = held - {grasp.held_frame for grasp in setting.problem.system.grasps}
-        views = []
-        for view in setting.recorded_observations(episode):
-            if view.point_group == looking and view.frame in taken:
-                continue
-            if view.point_group == looking and rate is not None:
-                view = FrameObservation(looking, view.frame, times, np.full((len(times), 3), std))
-            views.append(view)
-        views += [
-            FrameObservation(looking, frame, times, np.full((len(times), 3), std))
-            for change in changes
-            for frame in change.added_camera_frames
+        held, before = ({grasp.held_frame for grasp in p.system.grasps} for p in (layout.problem, setting.problem))
+        views = [
+            look(view.frame) if view.point_group == looking and rate is not None else view
+            for view in setting.recorded_observations(episode)
+            if view.point_group != looking or view.frame not in held - before
         ]
-        feels = [*sorted(taken), *(frame for change in changes for frame in change.added_arm_frames)]
+        views += [look(frame) for change in changes for frame in change.added_camera_frames]
+        feels = [*sorted(held - before), *(frame for change in changes for frame in change.added_arm_frames)]
         views += [FrameObservation(feeling, frame, arm_times, np.full((len(arm_times), 3), arm_std)) for frame in feels]
         return views
 
 
-def _relative_stds_and_gain(layout: CandidateExperiment, information: Array) -> tuple[dict[str, float], float]:
-    """Relative standard deviation of every free parameter, and the gain, from a Fisher information of all unknowns.
+def _words(changes: Sequence[ExperimentChange]) -> str:
+    return "; ".join(change.description for change in changes) or "as it is"
 
-    Parameters
-    ----------
-    layout : Layout
-    information : ndarray, shape (nx, nx)
-    """
+
+def _relative_stds_and_gain(layout: CandidateExperiment, information: Array) -> tuple[dict[str, float], float]:
+    """Relative standard deviation of every free parameter, and the gain, from a Fisher information of all unknowns."""
     problem, x = layout.problem, layout.x
     chosen = np.array([problem.unknown_names.index(name) for name in layout.free_parameters])
     others = np.setdiff1d(np.arange(len(x)), chosen)
@@ -431,9 +363,8 @@ def _greedy(
     steps: list[ChangedExperimentResult] = []
     best = base
     while len(chosen) < largest and not best.is_fully_identifiable:
-        trials = [
-            (*chosen, change) for change in changes if change not in chosen and _are_compatible((*chosen, change))
-        ]
+        trials = [(*chosen, change) for change in changes if change not in chosen]
+        trials = [trial for trial in trials if _are_compatible(trial)]
         if not trials:
             break
         found = outcomes.of_all(trials)

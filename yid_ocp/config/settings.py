@@ -25,7 +25,7 @@ from yid_ocp.model.objects import OBJECTS, ObjectKind
 from yid_ocp.model.objects.base import MountSettings
 from yid_ocp.model.servos_and_springs import CommandInterpolation
 from yid_ocp.options import OptionInfo, RegistryChoice, dataclass_options, split_annotated
-from yid_ocp.planning.options import PlanOptions
+from yid_ocp.planning.joint_paths import PlanOptions
 from yid_ocp.problem.options import ProblemOptions, SensorOptions
 from yid_ocp.solvers import SOLVERS, GaussNewton, MultipleShooting, SingleShooting, SteepestDescent
 from yid_ocp.solvers.base import Solver

@@ -12,9 +12,15 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.analysis.formula_text import FormulaText, count_operations, format_expressions
 from yid_ocp.analysis.step_diagnostics import with_numeric_parameters
-from yid_ocp.analysis.step_symbols import StepSymbols, SymbolBlock, escape_latex
+from yid_ocp.analysis.step_symbols import (
+    FormulaText,
+    StepSymbols,
+    SymbolBlock,
+    count_operations,
+    escape_latex,
+    format_expressions,
+)
 from yid_ocp.errors import OutputError
 from yid_ocp.files import atomic_write, write_text
 from yid_ocp.integrator.codegen import casadi_c_source, parameter_jacobian_function

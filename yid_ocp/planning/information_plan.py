@@ -2,47 +2,44 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.analysis.experiment_design import observable_frames, with_added_frames
+from yid_ocp.analysis.experiment_design import with_observable_frames
 from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.effects import EffectBase, make_effect
 from yid_ocp.errors import ConfigError, SolverError, nearest_name_hint
 from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD, MIN_UNINFORMED_RELATIVE_STD
 from yid_ocp.integrator.step import compile_step_like
-from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.options import check_option_bounds
-from yid_ocp.planning.end_equilibria import joint_position_limits
-from yid_ocp.planning.frame_positions import FramePositions
-from yid_ocp.planning.informative_motion_search import InformativeMotionSearch, MotionSearchResult
-from yid_ocp.planning.optimality_criteria import DOptimality, EffectDiscrimination, OptimalityCriterion
-from yid_ocp.planning.options import PlanOptions
-from yid_ocp.planning.path_simulator import PathSimulator
-from yid_ocp.planning.plan_constraints import PlanResidualsAndLimits
+from yid_ocp.planning.informative_motion_search import (
+    DOptimality,
+    EffectDiscrimination,
+    InformativeMotionSearch,
+    MotionSearchResult,
+    OptimalityCriterion,
+)
+from yid_ocp.planning.joint_paths import FramePositions, PlannedMotion, PlanOptions
+from yid_ocp.planning.plan_shooting import PlanResidualsAndLimits
 from yid_ocp.planning.planned_experiment import PlannedExperiment
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import NULL_PROGRESS, Progress
 
 Array = NDArray[np.float64]
 
-_UNOBSERVABLE_STDS = 1e-2
-"""Standard deviations by which no reading moves when a parameter changes by its whole value: nothing sees it."""
-_RANDOM_COEFFICIENT_STD = 0.3
-"""Size of the random motions from which a search begins, before limits make them smaller [rad or m]."""
-_MAX_RELATIVE_SENSITIVITY_CHANGE = 0.05
-"""Part of itself by which a sensitivity may change with a ten-thousandth of the motion, or the object snaps."""
-_ACTIVE_LIMIT_FRACTION = 0.98
-"""Part of a limit from which it counts as reached."""
-_PROBE_AMPLITUDE = 0.05
-"""Largest unknown of a motion in which it is asked what else could see a parameter [rad or m]."""
-_MIN_VISIBLE_MOTION = 1e-4
-"""Motion of a point that a camera may see, for a change of a parameter by its whole value [m]."""
+_UNOBSERVABLE_STDS = 1e-2  # stds by which no reading moves when a parameter changes by its whole value: nothing sees it
+_RANDOM_COEFFICIENT_STD = (
+    0.3  # of the random motions from which a search begins, before limits make them smaller [rad or m]
+)
+_MAX_RELATIVE_SENSITIVITY_CHANGE = 0.05  # of a sensitivity with a ten-thousandth of the motion, or the object snaps
+_ACTIVE_LIMIT_FRACTION = 0.98  # part of a limit from which it counts as reached
+_PROBE_AMPLITUDE = 0.05  # largest unknown of a motion that asks what else could see a parameter [rad or m]
+_MIN_VISIBLE_MOTION = 1e-4  # of a point that a camera may see, for a change of a parameter by its whole value [m]
 
 
 @dataclass(frozen=True)
@@ -55,9 +52,6 @@ class SearchStartResult:
         Search criterion of the initial and of the final motion [nat].
     configured_criterion : float
         Criterion of the final motion in the configured problem [nat]; minus infinity where it cannot be simulated.
-    is_converged : bool
-        Whether no round would gain more.
-    n_iterations : int
     """
 
     initial_criterion: float
@@ -69,18 +63,9 @@ class SearchStartResult:
 
 @dataclass(frozen=True)
 class ParameterPrecision:
-    """Relative standard deviations of a parameter before and after a planned recording; infinite without information.
+    """Relative standard deviations of a parameter, from the existing recordings, from the planned one and from both.
 
-    Attributes
-    ----------
-    std_recorded : float
-        From the existing recordings.
-    std_planned : float
-        From the planned recording alone.
-    std_combined : float
-        From both.
-    verdict : str
-        From the planned recording alone.
+    Infinite without information. The verdict is that from the planned recording alone.
     """
 
     std_recorded: float
@@ -90,26 +75,16 @@ class ParameterPrecision:
 
 
 @dataclass(frozen=True, eq=False)
-class InformativeMotionPlan:
+class InformativeMotionPlan(PlannedMotion):
     """The most informative motion that was found, with predicted parameter precisions.
 
     Attributes
     ----------
-    simulator : Mover
-    spline_coefficients : ndarray, shape (K, nc)
-    rollout : Rollout
-        By the mover.
-    is_successful : bool
-        Whether the search converged.
-    message : str
-    parameter_precisions : mapping of str to Knowledge
     effect_distances : mapping of (str, str) to (float, float)
         For each pair of effects, distance of the change by the first from what the second and all free unknowns can
         imitate, in standard deviations of the data: in the recordings and in the plan. Empty without effects.
-    start_results : tuple of Start
+    start_results : tuple of SearchStartResult
         Results of the random initial motions, in the order drawn.
-    best_start_index : int
-        Index of the best one.
     active_limits : mapping of str to tuple of str
         Names of the joints, springs or frames that reach a limit, by kind of limit.
     unobservable_parameters : mapping of str to str
@@ -118,11 +93,6 @@ class InformativeMotionPlan:
         Sentences on directions that the planned recording would leave unidentifiable.
     """
 
-    simulator: PathSimulator
-    spline_coefficients: Array
-    rollout: Rollout
-    is_successful: bool
-    message: str
     parameter_precisions: Mapping[str, ParameterPrecision]
     effect_distances: Mapping[tuple[str, str], tuple[float, float]]
     start_results: tuple[SearchStartResult, ...]
@@ -130,45 +100,6 @@ class InformativeMotionPlan:
     active_limits: Mapping[str, tuple[str, ...]]
     unobservable_parameters: Mapping[str, str]
     unidentifiable_directions: tuple[str, ...]
-
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        """Names of the moved joints."""
-        return self.simulator.step.system.prescribed
-
-    @property
-    def t(self) -> Array:
-        """Times of the nodes, shape (N + 1,) [s]."""
-        return self.simulator.node_times
-
-    @property
-    def joint_positions(self) -> Array:
-        """Joint positions, shape (N + 1, nc) [rad or m]."""
-        return self.simulator.joint_positions(self.spline_coefficients)
-
-    @property
-    def joint_velocities(self) -> Array:
-        """Joint velocities, shape (N + 1, nc) [rad/s or m/s]."""
-        return self.simulator.path.basis_values(self.t, 1) @ self.spline_coefficients
-
-    @property
-    def joint_accelerations(self) -> Array:
-        """Joint accelerations, shape (N + 1, nc) [rad/s^2 or m/s^2]."""
-        return self.simulator.path.basis_values(self.t, 2) @ self.spline_coefficients
-
-    @property
-    def joint_efforts(self) -> Array:
-        """Required joint efforts, the last row repeated, shape (N + 1, nc) [N m or N]."""
-        return np.vstack([self.rollout.effort, self.rollout.effort[-1:]])
-
-    @cached_property
-    def point_trajectories(self) -> dict[str, Array]:
-        """Trajectories of the system's points by name, each of shape (N + 1, 3) [m]."""
-        system = self.simulator.step.system
-        at = FramePositions(system, system.point_frames).positions_and_jacobian(
-            self.rollout.state[:, : system.n_coordinates], self.simulator.theta
-        )[0]
-        return {name: at[:, 3 * i : 3 * i + 3] for i, name in enumerate(system.point_frames)}
 
 
 def plan_informative_motion(
@@ -191,11 +122,6 @@ def plan_informative_motion(
         Parameters at which to judge; the problem's when absent.
     effects : mapping of label to mapping of quantity to value, optional
         Sizes of effects that are to be separated, where they are known; typical ones otherwise.
-    progress : Progress, optional
-
-    Returns
-    -------
-    InformationPlan
 
     Raises
     ------
@@ -210,16 +136,13 @@ def plan_informative_motion(
     chosen, rivals = _chosen(problem, options, effects or {})
     composed = problem if not rivals else _composed(problem, rivals, known)
     names = (*problem.free, *(name for effect in rivals for name in effect.amplitude_names))
-    shapes = {
-        entry.name: entry.value for effect in rivals for entry in effect.parameters if entry.name in effect.shape_names
-    }
+    shapes = {entry.name: entry.value for e in rivals for entry in e.parameters if entry.name in e.shape_names}
     experiment = PlannedExperiment.from_options(composed, known | shapes, options, names)
-    limits = _limits(experiment, options)
+    system, still = experiment.simulator.step.system, experiment.zero_coefficients
+    points = FramePositions(system, system.point_frames)
+    limits = PlanResidualsAndLimits(experiment.simulator, options, points, np.zeros(3), still)
     criterion = _criterion(experiment, chosen, rivals)
-    lower, upper = (
-        side - experiment.simulator.start_positions for side in joint_position_limits(experiment.simulator.step.system)
-    )
-    search = InformativeMotionSearch(experiment, limits, criterion, lower, upper)
+    search = InformativeMotionSearch(experiment, limits, criterion)
     _check_room(search, limits)
     begins = [
         _smooth(experiment, search.shrink_to_limits(_random(experiment, options.seed + i)))
@@ -335,13 +258,6 @@ def _size(effect: EffectBase) -> Array:
 # -- within which limits ----------------------------------------------------------------------------------------------
 
 
-def _limits(experiment: PlannedExperiment, options: PlanOptions) -> PlanResidualsAndLimits:
-    system, still = experiment.simulator.step.system, experiment.zero_coefficients
-    return PlanResidualsAndLimits(
-        experiment.simulator, options, FramePositions(system, system.point_frames), np.zeros(3), still
-    )
-
-
 def _check_room(search: InformativeMotionSearch, limits: PlanResidualsAndLimits) -> None:
     """Refuse limits that the arms pass where they begin."""
     mover, still = search.experiment.simulator, search.experiment.zero_coefficients
@@ -354,9 +270,8 @@ def _check_room(search: InformativeMotionSearch, limits: PlanResidualsAndLimits)
             )
     broken = limits.violated_limits(limits.limit_values(mover.simulate_path(still), still).value)
     if broken:
-        said = "; ".join(
-            f"{name}: {value:.4g} where {bound:.4g} is allowed, {what}" for what, (name, value, bound) in broken.items()
-        )
+        parts = ((what, *passed) for what, passed in broken.items())
+        said = "; ".join(f"{name}: {x:.4g} where {bound:.4g} is allowed, {what}" for what, name, x, bound in parts)
         raise ConfigError(
             f"the arms pass their limits before they move: {said}",
             where="plan.limits",
@@ -424,23 +339,20 @@ def _check_seen(
 
 def _would_see(experiment: PlannedExperiment, name: str, w: Array) -> str:
     """What would see a parameter, in words."""
-    mover = experiment.simulator
-    seen = observable_frames(mover.step.system)
-    wide = with_added_frames(
-        mover.step, {sight.name: sight.added_frame for sight in seen if sight.added_frame is not None}
-    ).system
+    mover, n = experiment.simulator, experiment.simulator.step.system.n_coordinates
+    wide, seen = with_observable_frames(mover.step)
     w = _PROBE_AMPLITUDE * w / max(float(np.abs(w).max()), _PROBE_AMPLITUDE)
-    rolled, n = mover.simulate_path(w, names=[name]), wide.n_coordinates
+    rolled = mover.simulate_path(w, names=[name])
     if rolled.state_sensitivity is None or not rolled.status.is_converged:
         return f"{name} needs another sensor"
-    _, by_q = FramePositions(wide, [sight.name for sight in seen]).positions_and_jacobian(
-        rolled.state[:, :n], mover.theta
-    )
-    size = abs(mover.theta[wide.parameters.index(name)]) or 1.0
+    frames = FramePositions(wide.system, [sight.name for sight in seen])
+    by_q = frames.positions_and_jacobian(rolled.state[:, :n], mover.theta)[1]
+    size = abs(mover.theta[wide.system.parameters.index(name)]) or 1.0
     moved = size * np.einsum("tiq,tq->ti", by_q, rolled.state_sensitivity[:, :n, 0]).reshape(len(by_q), -1, 3)
     farthest = np.linalg.norm(moved, axis=2).max(0)
     best = int(np.argmax(farthest))
-    moved_by = f"{1e3 * farthest[best]:.2g} mm in a random motion of {_PROBE_AMPLITUDE:g} rad, with {name} changed by its whole value"
+    motion = f"a random motion of {_PROBE_AMPLITUDE:g} rad, with {name} changed by its whole value"
+    moved_by = f"{1e3 * farthest[best]:.2g} mm in {motion}"
     if farthest[best] > _MIN_VISIBLE_MOTION:
         return f"let a camera see {seen[best].description}: it moves by {moved_by}"
     return (
@@ -485,8 +397,8 @@ def _plan(
         message = f"the search was stopped after {found[best].n_iterations} rounds; raise plan.max_iterations"
     lost = {name: _would_see(experiment, name, w) for name in unseen if name in experiment.configured_problem.free}
     return InformativeMotionPlan(
-        experiment.simulator, w, experiment.simulator.simulate_path(w), found[best].is_converged, message, parameters, distances,
-        starts, best, _active(search, limits, w), lost, open_words,
+        experiment.simulator, w, experiment.simulator.simulate_path(w), found[best].is_converged, message, parameters,
+        distances, starts, best, _active(search, limits, w), lost, open_words,
     )  # fmt: skip
 
 
@@ -524,12 +436,8 @@ def _distances(
         for rows in (experiment.recorded_sensitivities, experiment.configured_sensitivities(w))
     )
     labels = [effect.label for effect in rivals]
-    return {
-        (a, b): (float(before[i, j]), float(after[i, j]))
-        for i, a in enumerate(labels)
-        for j, b in enumerate(labels)
-        if i != j
-    }
+    pairs = itertools.permutations(range(len(labels)), 2)
+    return {(labels[i], labels[j]): (float(before[i, j]), float(after[i, j])) for i, j in pairs}
 
 
 def _active(search: InformativeMotionSearch, limits: PlanResidualsAndLimits, w: Array) -> dict[str, tuple[str, ...]]:

@@ -1,8 +1,9 @@
-"""Search for the most informative motion by sequential linearisation of the sensitivities, within limits.
+"""Search for the most informative motion within limits, and the optimality criteria that it maximises.
 
 Sensitivities J(w) of a motion w are nearly linear in it, since springs and small motions are; the criterion of J is
 not. In every round J and the limits are linearised and the criterion of the linear J is maximised within a trust
-region. All iterates keep the limits.
+region. All iterates keep the limits. Every parameter has a prior standard deviation of 400 % of its value
+(`MAX_WEAK_RELATIVE_STD`), so that a criterion stays finite where no measurement informs one.
 
 References
 ----------
@@ -12,20 +13,123 @@ Kraft (1988), DFVLR-FB 88-28 (the inner problem's SLSQP).
 
 from __future__ import annotations
 
-import logging
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from yid_ocp.planning.optimality_criteria import OptimalityCriterion
-from yid_ocp.planning.plan_constraints import PlanResidualsAndLimits
+from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD
+from yid_ocp.planning.plan_shooting import PlanResidualsAndLimits
 from yid_ocp.planning.planned_experiment import PlannedExperiment
 from yid_ocp.progress import NULL_PROGRESS, Progress
 
-log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
+
+
+class OptimalityCriterion(Protocol):
+    """A criterion to maximise [nat], with its gradient by the sensitivities (nr, columns)."""
+
+    def value_and_gradient(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
+        """Criterion and gradient at sensitivities (nr, columns) to relative changes; the gradient may be left empty."""
+        ...
+
+
+def _prior(columns: int, bounded: Sequence[int]) -> Array:
+    """Information beforehand: of parameters `MAX_WEAK_RELATIVE_STD`, of all else next to none (it is in the rows)."""
+    prior = np.full(columns, 1e-6)
+    prior[list(bounded)] = MAX_WEAK_RELATIVE_STD**-2
+    return prior
+
+
+@dataclass(frozen=True)
+class DOptimality:
+    """Minus half the log determinant of the covariance of chosen parameters, all others and nuisances eliminated.
+
+    With all parameters chosen that is D-optimality, with some of them D_s-optimality, with one its standard deviation.
+
+    References
+    ----------
+    Atkinson, Donev and Tobias (2007), Optimum Experimental Designs, with SAS, sections 10.2 and 10.3.
+    """
+
+    chosen_columns: tuple[int, ...]
+    parameter_columns: tuple[int, ...]
+
+    def column_covariance(self, rows: Array) -> Array:
+        """Covariance of all columns' unknowns with the prior, shape (columns, columns)."""
+        information = rows.T @ rows
+        information[np.diag_indices_from(information)] += _prior(len(information), self.parameter_columns)
+        return np.asarray(scipy.linalg.inv(information))
+
+    def value_and_gradient(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
+        """In nat, and by the rows."""
+        whole, chosen = self.column_covariance(rows), list(self.chosen_columns)
+        own = whole[np.ix_(chosen, chosen)]
+        found = -0.5 * float(np.linalg.slogdet(own)[1])
+        if not slope:
+            return found, np.zeros((0, 0))
+        # d C = -C d(J'J) C
+        wide = whole[:, chosen]
+        return found, rows @ (wide @ np.linalg.solve(own, wide.T))
+
+
+@dataclass(frozen=True)
+class EffectDiscrimination:
+    """Distance of each effect's change of the readings from what another effect and all free unknowns can imitate.
+
+    d_ij^2 = min_b |J_i a - J_j b|^2, over what j and the nuisances can do; the smaller distances count most:
+    -1/2 log sum_ij 1 / (1 + d_ij^2).
+
+    Attributes
+    ----------
+    amplitude_columns : tuple of tuple of int
+        Columns of every effect's amplitudes.
+    amplitude_cases : tuple of ndarray, shape (amplitudes, cases)
+        Of the amplitudes, in units of the columns: one case where they are known, else one for each.
+    parameter_columns : tuple of int
+        Columns with a prior: of the nominal parameters and of the effects.
+    """
+
+    amplitude_columns: tuple[tuple[int, ...], ...]
+    amplitude_cases: tuple[Array, ...]
+    parameter_columns: tuple[int, ...]
+
+    def effect_distances(self, rows: Array) -> Array:
+        """d_ij in standard deviations of the data, from i (row) to j; the diagonal is infinite."""
+        found = np.full((len(self.amplitude_columns),) * 2, np.inf)
+        for i, j in itertools.permutations(range(len(found)), 2):
+            found[i, j] = np.sqrt(self._apart(rows, i, j)[0])
+        return found
+
+    def value_and_gradient(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
+        """In nat, and by the rows."""
+        total, by_rows = 0.0, np.zeros_like(rows)
+        for i, j in itertools.permutations(range(len(self.amplitude_columns)), 2):
+            square, rest, others, used = self._apart(rows, i, j)
+            weight = 1.0 / (1.0 + square)
+            total += weight
+            if slope:
+                factor = 2.0 * weight**2 / len(self.amplitude_cases[i].T)
+                by_rows[:, list(self.amplitude_columns[i])] += factor * rest @ self.amplitude_cases[i].T
+                by_rows[:, others] -= factor * rest @ used.T
+        return -0.5 * float(np.log(total)), 0.5 * by_rows / total if slope else np.zeros((0, 0))
+
+    def _apart(self, rows: Array, i: int, j: int) -> tuple[float, Array, list[int], Array]:
+        """Squared distance, what is left of the change by i, the columns of what may explain it, and how they do."""
+        away = {column for k, effect in enumerate(self.amplitude_columns) if k != j for column in effect}
+        others = [column for column in range(rows.shape[1]) if column not in away]
+        change, basis = rows[:, list(self.amplitude_columns[i])] @ self.amplitude_cases[i], rows[:, others]
+        prior = _prior(rows.shape[1], self.parameter_columns)[others]
+        used = scipy.linalg.solve(basis.T @ basis + np.diag(prior), basis.T @ change, assume_a="pos")
+        rest = change - basis @ used
+        square = float(np.sum(rest**2) + np.sum(prior[:, None] * used**2)) / change.shape[1]
+        return square, rest, others, used
+
 
 _INITIAL_TRUST_RADIUS, _MAX_TRUST_RADIUS = 0.05, 0.4  # of the trust region, for every unknown of the motion [rad or m]
 _MIN_TRUST_RADIUS = 1e-3
@@ -38,17 +142,7 @@ _MAX_LIMIT_CORRECTIONS = 2  # of the linear limits where a step passes the true 
 
 @dataclass(frozen=True)
 class MotionSearchResult:
-    """Result of the search for an informative motion from one initial motion.
-
-    Attributes
-    ----------
-    w : ndarray, shape (K, nc)
-    initial_criterion, final_criterion : float
-        Criterion at the start and in the end [nat].
-    is_converged : bool
-        Whether no further iteration improves the criterion.
-    n_iterations : int
-    """
+    """Coefficients w (K, nc) that a search ended with, and the criterion at the start and in the end [nat]."""
 
     w: Array
     initial_criterion: float
@@ -58,29 +152,13 @@ class MotionSearchResult:
 
 
 class InformativeMotionSearch:
-    """Search for the motion of an experiment that maximises a criterion within limits.
-
-    Parameters
-    ----------
-    experiment : Experiment
-    limits : Rows
-        Its bounded rows are the limits.
-    criterion : Criterion
-    lower, upper : ndarray, shape (nc,)
-        Of every joint's unknowns, which bound the joint.
-    """
+    """Search for the motion of an experiment that maximises a criterion within limits."""
 
     def __init__(
-        self,
-        experiment: PlannedExperiment,
-        limits: PlanResidualsAndLimits,
-        criterion: OptimalityCriterion,
-        lower: Array,
-        upper: Array,
+        self, experiment: PlannedExperiment, limits: PlanResidualsAndLimits, criterion: OptimalityCriterion
     ) -> None:
         self.experiment, self.limits, self.criterion = experiment, limits, criterion
-        shape = (experiment.simulator.path.n_coefficients, 1)
-        self.lower, self.upper = np.tile(lower, shape).ravel(), np.tile(upper, shape).ravel()
+        self.lower, self.upper = (bound.ravel() for bound in experiment.simulator.coefficient_bounds())
         parts = [np.concatenate([getattr(b, k) for b in limits.limit_rows]) for k in ("unit", "lower", "upper")]
         self._unit, self._low, self._high = parts[0], parts[1] / parts[0], parts[2] / parts[0]
 

@@ -13,73 +13,48 @@ from numpy.typing import NDArray
 from yid_ocp.errors import ConfigError, nearest_name_hint
 from yid_ocp.integrator.statics import Equilibrium
 from yid_ocp.integrator.step import Step, compile_step
-from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.model.system import System
 from yid_ocp.options import check_option_bounds
-from yid_ocp.planning.end_equilibria import (
+from yid_ocp.planning.joint_paths import (
     REACHED_TOLERANCE_FACTOR,
     EndEquilibrium,
+    FramePositions,
+    PathSimulator,
+    PlannedMotion,
+    PlanOptions,
+    SplinePath,
     check_standstill_limits,
     check_target_reachable,
-    joint_position_limits,
     ordered_start_positions,
     solve_end_equilibrium,
     solve_start_equilibrium,
 )
-from yid_ocp.planning.frame_positions import FramePositions
-from yid_ocp.planning.options import PlanOptions
-from yid_ocp.planning.path_simulator import PathSimulator
-from yid_ocp.planning.plan_constraints import PlanResidualsAndLimits
-from yid_ocp.planning.plan_shooting import PlanShooting, PlanShootingResult, has_rollout_failed
-from yid_ocp.planning.spline_path import SplinePath
+from yid_ocp.planning.plan_shooting import PlanResidualsAndLimits, PlanShooting, PlanShootingResult
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.virtual.joint_motion import grasping_joint_angles
 
 Array = NDArray[np.float64]
 
 _MAX_STEP_HALVINGS = 3  # of the time step
-_CONVERGED_TOLERANCE_FRACTION = (
-    0.1  # change by halving it, in parts of what counts as reached and as rest, that counts as none
-)
+_CONVERGED_TOLERANCE_FRACTION = 0.1  # change by halving it, in parts of the tolerances, that counts as none
 
 
 @dataclass(frozen=True)
 class ParameterCovariance:
-    """Covariance of uncertain model parameters.
-
-    Attributes
-    ----------
-    parameter_names : tuple of str
-    covariance : ndarray, shape (len(names), len(names))
-    """
+    """Covariance of uncertain model parameters, shape (len(parameter_names), len(parameter_names))."""
 
     parameter_names: tuple[str, ...] = ()
     covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
 
 @dataclass(frozen=True, eq=False)
-class MotionPlan:
+class MotionPlan(PlannedMotion):
     """A planned motion that brings a point to a target, with its predicted errors.
 
     Attributes
     ----------
-    is_successful : bool
-        Whether the point reaches its target by a motion within the limits.
-    message : str
-    joint_names : tuple of str
-    t : ndarray, shape (N + 1,)
-        [s]
-    joint_positions, joint_velocities, joint_accelerations : ndarray, shape (N + 1, nc)
-        Of the joints [rad or m, per s, per s^2].
-    joint_efforts : ndarray, shape (N + 1, nc)
-        Required joint efforts, the last row repeated [N m or N].
-    state_trajectory : ndarray, shape (N + 1, nx)
-    point_trajectories : mapping of str to ndarray, shape (N + 1, 3)
-        Trajectories of the system's points and of the one with the target [m].
-    target_point : str
-        Frame that is moved to the target.
     target_position : ndarray, shape (3,)
-        Target position [m].
+        [m]
     max_position_error : float
         Largest distance of the point from its target while the arms stand still at the end [m].
     max_residual_speed : float
@@ -88,47 +63,21 @@ class MotionPlan:
         Largest distance of the point from its reference path at the same time [m]; None without a path.
     end_position_std : ndarray, shape (3,), or None
         Of the point's final position, from the parameters' covariance [m]; None without one.
-    spline_coefficients : ndarray, shape (K, nc)
-    n_evaluations : int
-    simulator : Mover
+    simulator : PathSimulator
         Its step may be a shorter one than that the plan began with.
     """
 
-    is_successful: bool
-    message: str
-    joint_names: tuple[str, ...]
-    t: Array
-    joint_positions: Array
-    joint_velocities: Array
-    joint_accelerations: Array
-    joint_efforts: Array
-    state_trajectory: Array
-    point_trajectories: dict[str, Array]
     target_point: str
     target_position: Array
     max_position_error: float
     max_residual_speed: float
     max_path_deviation: float | None
     end_position_std: Array | None
-    spline_coefficients: Array
     n_evaluations: int
-    simulator: PathSimulator
 
-
-@dataclass(frozen=True, eq=False)
-class PlannedMovement:
-    """A planned joint motion as reference for the virtual robot's controller (`virtual.motion.JointMotion`)."""
-
-    joints: tuple[str, ...]
-    path: SplinePath
-    spline_coefficients: Array
-
-    def offset_and_derivatives(self, t: float) -> tuple[Array, Array, Array]:
-        """Joint displacement from the start, velocity and acceleration at time t [s], three arrays of shape (nj,)."""
-        offset, rate, bend = (
-            self.path.basis_values(np.array([t]), order)[0] @ self.spline_coefficients for order in range(3)
-        )
-        return offset, rate, bend
+    @property
+    def _point_names(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys((*self.simulator.step.system.point_frames, self.target_point)))
 
 
 def plan_motion(
@@ -144,16 +93,14 @@ def plan_motion(
     ----------
     step : Step
         Arms prescribed, nothing driven.
-    options : PlanOptions
     theta : ndarray, optional, shape (ntheta,)
         Parameters of the model; the system's values when absent.
-    known : Known, optional
+    known : ParameterCovariance, optional
         Covariance of some of them.
-    progress : Progress, optional
 
     Returns
     -------
-    Plan
+    MotionPlan
         Also where no motion within the limits was found: `message` says which one is passed, and by how much.
 
     Raises
@@ -206,9 +153,8 @@ def _posture(system: System, options: PlanOptions, theta: Array) -> Array:
             hint="only where a gripper holds the object do the angles follow from that",
         )
     by_name = dict(zip(system.parameters.names, map(float, theta), strict=True))
-    return ordered_start_positions(
-        system, {k: v for k, v in grasping_joint_angles(system, by_name).items() if k in system.prescribed}
-    )
+    angles = grasping_joint_angles(system, by_name)
+    return ordered_start_positions(system, {name: angles[name] for name in angles if name in system.prescribed})
 
 
 def _points(step: Step, options: PlanOptions) -> tuple[FramePositions, FramePositions | None]:
@@ -221,32 +167,25 @@ def _points(step: Step, options: PlanOptions) -> tuple[FramePositions, FramePosi
             hint=nearest_name_hint("", system.point_frames),
         )
     calm = [name for name in system.point_frames if name != options.point]
-    inside = None
-    if options.goal == "box":
-        inside = FramePositions(system, options.frames_in_box or system.point_frames)
+    boxed = options.frames_in_box or system.point_frames
+    inside = FramePositions(system, boxed) if options.goal == "box" else None
     return FramePositions(system, [options.point, *calm]), inside
 
 
 def _place(options: PlanOptions, begin: Array) -> Array:
     if (options.target_position is None) == (options.target_offset is None):
-        twice = options.target_position is not None
-        raise ConfigError(
-            f"{'it is said twice' if twice else 'nothing says'} where the point is to arrive",
-            where="plan.target_position",
-            allowed="one of place and shift",
-            hint="set the other one to null"
-            if twice
-            else "set plan.target_position, or plan.target_offset from where it rests",
-        )
+        said, hint = "nothing says", "set plan.target_position, or plan.target_offset from where it rests"
+        if options.target_position is not None:
+            said, hint = "it is said twice", "set the other one to null"
+        allowed, where = "one of place and shift", "plan.target_position"
+        raise ConfigError(f"{said} where the point is to arrive", where=where, allowed=allowed, hint=hint)
     if options.goal == "path" and not options.waypoint_offsets:
         raise ConfigError(
             "the path has no places on the way", where="plan.waypoint_offsets", allowed="one or more shifts [m]"
         )
-    return (
-        np.array(options.target_position, float)
-        if options.target_position is not None
-        else begin + np.array(options.target_offset, float)
-    )
+    if options.target_position is not None:
+        return np.array(options.target_position, float)
+    return begin + np.array(options.target_offset, float)
 
 
 def _check_box(
@@ -299,10 +238,7 @@ def _attempt(
     path = SplinePath(options.duration, options.n_spline_coefficients)
     mover = PathSimulator(step, theta, start, path, options.hold_duration)
     guess = straight = path.straight_line_coefficients(end.joint_positions - mover.start_positions)
-    lower, upper = (
-        np.tile(side - mover.start_positions, (options.n_spline_coefficients, 1))
-        for side in joint_position_limits(step.system)
-    )
+    lower, upper = mover.coefficient_bounds()
     evaluations = 0
     for halved in range(_MAX_STEP_HALVINGS + 1):
         rows = PlanResidualsAndLimits(mover, options, points[0], place, straight, points[1])
@@ -321,32 +257,23 @@ def _attempt(
 def _finer(mover: PathSimulator) -> PathSimulator:
     """The same with half the time step."""
     step = mover.step
-    half = compile_step(
-        step.system, step.time_step / 2, step.force_split, step.constraint_force, use_compiler=step.is_compiled
-    )
-    return replace(
-        mover,
-        step=half,
-        start_equilibrium=solve_start_equilibrium(half, mover.theta, mover.start_positions, mover.start_configuration),
-    )
+    numerics = step.force_split, step.constraint_force
+    half = compile_step(step.system, step.time_step / 2, *numerics, use_compiler=step.is_compiled)
+    rest = solve_start_equilibrium(half, mover.theta, mover.start_positions, mover.start_configuration)
+    return replace(mover, step=half, start_equilibrium=rest)
 
 
 def _steady(rows: PlanResidualsAndLimits, finer: PathSimulator, w: Array) -> bool:
     """Whether half the time step moves the point neither from where it arrives nor from rest."""
-    options, n, h = rows.options, rows.simulator.step.system.n_coordinates, rows.simulator.step.time_step
     own, other = (
-        rows.point.positions_and_jacobian(mover.simulate_path(w).state[::every, :n], mover.theta)[0].reshape(
-            len(rows.simulator.node_times), -1, 3
-        )
+        mover.trajectories(rows.point, mover.simulate_path(w).state[::every])
         for mover, every in ((rows.simulator, 1), (finer, 2))
     )
     change = (other - own)[rows.simulator.standstill_nodes]
     place = np.linalg.norm(change[:, 0], axis=1).max()
-    speed = np.linalg.norm(np.diff(change, axis=0), axis=2).max() / h
-    return bool(
-        place <= _CONVERGED_TOLERANCE_FRACTION * options.position_tolerance
-        and speed <= _CONVERGED_TOLERANCE_FRACTION * options.rest_speed_tolerance
-    )
+    speed = np.linalg.norm(np.diff(change, axis=0), axis=2).max() / rows.simulator.step.time_step
+    reached, rest = rows.options.position_tolerance, rows.options.rest_speed_tolerance
+    return bool(np.all(np.array([place / reached, speed / rest]) <= _CONVERGED_TOLERANCE_FRACTION))
 
 
 def _scenarios(rows: PlanResidualsAndLimits, known: ParameterCovariance) -> list[PlanResidualsAndLimits]:
@@ -360,11 +287,7 @@ def _scenarios(rows: PlanResidualsAndLimits, known: ParameterCovariance) -> list
         )
     values, vectors = np.linalg.eigh(known.covariance)
     axes = vectors * np.sqrt(np.maximum(values, 0.0))
-    slope = _point_slopes(
-        rows,
-        mover.simulate_path(rows.quasi_static_coefficients, names=known.parameter_names),
-        len(known.parameter_names),
-    )
+    slope = _point_slopes(rows, rows.quasi_static_coefficients, known)
     moved = np.linalg.norm((slope @ axes).reshape(-1, axes.shape[1]), axis=0)
     found = []
     for k in np.argsort(-moved)[:2]:
@@ -376,52 +299,38 @@ def _scenarios(rows: PlanResidualsAndLimits, known: ParameterCovariance) -> list
                 floor = max(entry.lower, 0.2 * theta[i]) if theta[i] > 0 else entry.lower
                 theta[i] = np.clip(theta[i] + change, floor, entry.upper)
             rest = solve_start_equilibrium(mover.step, theta, mover.start_positions, mover.start_configuration)
-            found.append(
-                PlanResidualsAndLimits(
-                    replace(mover, theta=theta, start_equilibrium=rest),
-                    rows.options,
-                    rows.point,
-                    rows.target,
-                    rows.quasi_static_coefficients,
-                )
-            )
+            own = replace(mover, theta=theta, start_equilibrium=rest)
+            goal = rows.options, rows.point, rows.target, rows.quasi_static_coefficients
+            found.append(PlanResidualsAndLimits(own, *goal))
     return found
 
 
-def _point_slopes(rows: PlanResidualsAndLimits, rollout: Rollout, count: int) -> Array:
-    """Derivative of the point's place at every node of the end by parameters, shape (nodes, 3, count)."""
-    mover, n = rows.simulator, rows.simulator.step.system.n_coordinates
+def _point_slopes(rows: PlanResidualsAndLimits, w: Array, known: ParameterCovariance) -> Array:
+    """Derivative of the point's place at every node of the end by the uncertain parameters, shape (nodes, 3, count)."""
+    mover, n, end = rows.simulator, rows.simulator.step.system.n_coordinates, rows.simulator.standstill_nodes
+    rollout = mover.simulate_path(w, names=known.parameter_names)
     assert rollout.state_sensitivity is not None
-    end = mover.standstill_nodes
     _, by_q = rows.point.positions_and_jacobian(rollout.state[end, :n], mover.theta)
-    return np.einsum("tiq,tqd->tid", by_q[:, :3], rollout.state_sensitivity[end, :n, :count])
+    return np.einsum("tiq,tqd->tid", by_q[:, :3], rollout.state_sensitivity[end, :n, : len(known.parameter_names)])
 
 
 def _outcome(rows: PlanResidualsAndLimits, shot: PlanShootingResult, known: ParameterCovariance) -> MotionPlan:
-    mover, step, n = rows.simulator, rows.simulator.step, rows.simulator.step.system.n_coordinates
+    mover = rows.simulator
     rollout, std = mover.simulate_path(shot.w), None
     if len(known.parameter_names):
-        slope = _point_slopes(
-            rows, mover.simulate_path(shot.w, names=known.parameter_names), len(known.parameter_names)
-        )[-1]
+        slope = _point_slopes(rows, shot.w, known)[-1]
         std = np.sqrt(np.maximum(np.diag(slope @ known.covariance @ slope.T), 0.0))
-    names = tuple(dict.fromkeys((*step.system.point_frames, rows.point.names[0])))
-    at = (
-        FramePositions(step.system, names)
-        .positions_and_jacobian(rollout.state[:, :n], mover.theta)[0]
-        .reshape(len(mover.node_times), -1, 3)
-    )
-    own = rows.point.positions_and_jacobian(rollout.state[:, :n], mover.theta)[0].reshape(len(mover.node_times), -1, 3)
+    own = mover.trajectories(rows.point, rollout.state)
     end = mover.standstill_nodes
     error = float(np.max(np.linalg.norm(own[end, 0] - rows.target, axis=1)))
-    swing = float(np.max(np.linalg.norm(np.diff(own[end], axis=0), axis=2)) / step.time_step)
+    swing = float(np.max(np.linalg.norm(np.diff(own[end], axis=0), axis=2)) / mover.step.time_step)
     course = rows.reference_path
     off_path = None if course is None else float(np.max(np.linalg.norm(own[:, 0] - course, axis=1)))
     broken = rows.violated_limits(rows.limit_values(rollout, shot.w).value)
     message = shot.message
     for what, (name, value, bound) in broken.items():
         message += f"; {name} passes its limit of {what}: {value:.4g} where {bound:.4g} is allowed"
-    if has_rollout_failed(rollout):
+    if not np.all(np.isfinite(rollout.state)):
         message += "; the model could not be stepped to the end of the motion"
     if broken:
         message += "; take a longer plan.duration, a nearer place, or a higher plan.limits where the machine allows it"
@@ -434,13 +343,8 @@ def _outcome(rows: PlanResidualsAndLimits, shot: PlanShootingResult, known: Para
             "plan.duration or a nearer place"
         )
     reached = shot.is_converged and not broken and not far
-    return MotionPlan(
-        reached, message, step.system.prescribed, mover.node_times, mover.joint_positions(shot.w),
-        mover.path.basis_values(mover.node_times, 1) @ shot.w, mover.path.basis_values(mover.node_times, 2) @ shot.w,
-        np.vstack([rollout.effort, rollout.effort[-1:]]), rollout.state,
-        {name: at[:, i] for i, name in enumerate(names)}, rows.point.names[0], rows.target, error, swing, off_path, std,
-        shot.w, shot.n_evaluations, mover,
-    )  # fmt: skip
+    errors = error, swing, off_path, std, shot.n_evaluations
+    return MotionPlan(mover, shot.w, rollout, reached, message, rows.point.names[0], rows.target, *errors)
 
 
 def _shortest(

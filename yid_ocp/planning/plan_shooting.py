@@ -1,4 +1,4 @@
-"""Single shooting for a planned motion: least squares over spline coefficients, within limits.
+"""Goal and limits of a planned motion with Jacobians, and single shooting for it within limits.
 
 Bounds of the unknowns are kept by the trust region, all other limits by an augmented Lagrangian: a row g <= u adds
 rho/2 max(0, g - u + lam/rho)^2 to the cost, and lam is raised until no row is passed.
@@ -6,17 +6,208 @@ rho/2 max(0, g - u + lam/rho)^2 to the cost, and lam is raised until no row is p
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
 from yid_ocp.integrator.step_model import Rollout
-from yid_ocp.planning.plan_constraints import PlanResidualsAndLimits, ValueWithJacobian, stack_values
+from yid_ocp.planning.joint_paths import FramePositions, PathSimulator, PlanOptions
 
 Array = NDArray[np.float64]
+
+_LIMIT_NODE_STRIDE = 2  # nodes between those at which limits on what moves freely are asked for
+_QUASI_STATIC_DISTANCE = 1.0  # RMS distance of the joints from the quasi-static motion that counts as one [rad or m]
+_ACCELERATION_WEIGHT = 1e-3  # of their mean square, in parts of their limit: of equal motions the calmer one
+
+
+@dataclass(frozen=True)
+class ValueWithJacobian:
+    """A vector (nr,) and its Jacobian (nr, nw) by the spline coefficients."""
+
+    value: Array
+    jacobian: Array | None
+
+
+@dataclass(frozen=True, eq=False)
+class LimitRows:
+    """Bounds of limit rows of one kind; `description` is the limited quantity, with its unit.
+
+    Attributes
+    ----------
+    lower, upper : ndarray, shape (rows,)
+    unit : ndarray, shape (rows,)
+        Divisor that scales each row to order one.
+    row_names : tuple of str
+        Joint, spring or frame of each row.
+    """
+
+    description: str
+    lower: Array
+    upper: Array
+    unit: Array
+    row_names: tuple[str, ...]
+
+
+def stack_values(parts: list[ValueWithJacobian]) -> ValueWithJacobian:
+    """Vectors and Jacobians stacked one below the other."""
+    slopes = [part.jacobian for part in parts]
+    known = [slope for slope in slopes if slope is not None]
+    value = np.concatenate([part.value for part in parts]) if parts else np.zeros(0)
+    return ValueWithJacobian(value, np.vstack(known) if len(known) == len(slopes) and known else None)
+
+
+class PlanResidualsAndLimits:
+    """Residuals and limit rows of a planned motion, for one set of parameters.
+
+    Parameters
+    ----------
+    point : FramePositions
+        Of the frame that is to arrive, and of all frames that are to rest.
+    target : ndarray, shape (3,)
+        Where it is to arrive [m].
+    simple : ndarray, shape (K, nc)
+        Unknowns of the quasi-static motion; of motions that do equally well, the one nearest to it is wanted.
+    inside : FramePositions, optional
+        Frames that stay in the box.
+    """
+
+    def __init__(
+        self,
+        mover: PathSimulator,
+        options: PlanOptions,
+        point: FramePositions,
+        target: Array,
+        simple: Array,
+        inside: FramePositions | None = None,
+    ) -> None:
+        self.simulator, self.options, self.point, self.target, self.inside = mover, options, point, target, inside
+        self.quasi_static_coefficients = simple
+        self.joints = [mover.step.system.mechanism.joints[i] for i in mover.joint_indices]
+        self.effort_limit = options.limits.effort_fraction * np.array([joint.effort_limit for joint in self.joints])
+        self._springs = sorted(
+            {mover.step.system.mechanism.joint_index(spring.joint_name) for spring in mover.step.system.elastic_joints}
+        )
+        self.limit_rows = self._bounded()
+
+    # -- what is wanted -----------------------------------------------------------------------------------------------
+
+    @property
+    def reference_path(self) -> Array | None:
+        """Reference position of the point at every node, shape (N + 1, 3) [m]; None where only the end counts."""
+        if self.options.goal != "path":
+            return None
+        begin = self.simulator.start_configuration[None]
+        first = self.point.positions_and_jacobian(begin, self.simulator.theta)[0][0, :3]
+        places = np.vstack([first, *(first + np.asarray(via) for via in self.options.waypoint_offsets), self.target])
+        at = np.linspace(0.0, self.simulator.path.duration, len(places))
+        # the clock starts and stops gently as well, so that the way is one that can be followed
+        return np.array(CubicSpline(at, places, bc_type="clamped")(np.minimum(self.simulator.node_times, at[-1])))
+
+    def goal_residual(self, rollout: Rollout, w: Array) -> ValueWithJacobian:
+        """Goal residual: distances and speeds over their tolerances, and weak regularisation of the motion."""
+        mover, options, h = self.simulator, self.options, self.simulator.step.time_step
+        n, size = mover.step.system.n_coordinates, w.size
+        at, by_q = self.point.positions_and_jacobian(rollout.state[:, :n], mover.theta)
+        by_w = None
+        if rollout.state_sensitivity is not None:
+            by_w = np.einsum("tiq,tqd->tid", by_q, rollout.state_sensitivity[:, :n, -size:])
+        end, course = mover.standstill_nodes, self.reference_path
+        after, before, reached = end[1:], end[1:] - 1, options.position_tolerance
+        by_speed = None if by_w is None else (by_w[after] - by_w[before]) / h
+        parts = [_rows(at[end, :3] - self.target, None if by_w is None else by_w[end, :3], reached)]
+        parts.append(_rows((at[after] - at[before]) / h, by_speed, options.rest_speed_tolerance))
+        if course is not None:
+            parts.append(_rows(at[:, :3] - course, None if by_w is None else by_w[:, :3], reached))
+        bend = mover.path.control_point_matrix(2) / options.limits.max_acceleration
+        parts.append(_rows(bend @ w, _by_coefficients(bend, w), _ACCELERATION_WEIGHT**-0.5))
+        parts.append(_rows(w - self.quasi_static_coefficients, np.eye(size), _QUASI_STATIC_DISTANCE))
+        if options.effort_weight:
+            finite = np.isfinite(self.effort_limit)
+            unit = self.effort_limit[finite] / np.sqrt(options.effort_weight)
+            by_effort = None if rollout.effort_sensitivity is None else rollout.effort_sensitivity[:, finite, -size:]
+            if by_effort is not None:
+                by_effort = by_effort / unit[:, None]
+            parts.append(_rows(rollout.effort[:, finite] / unit, by_effort, 1.0))
+        return stack_values(parts)
+
+    # -- what is kept within ------------------------------------------------------------------------------------------
+
+    def limit_values(self, rollout: Rollout, w: Array) -> ValueWithJacobian:
+        """Values of the limit rows of `limit_rows` along a motion, in their own units."""
+        mover, size, every = self.simulator, w.size, slice(None, None, _LIMIT_NODE_STRIDE)
+        n, moved, pushed = mover.step.system.n_coordinates, rollout.state_sensitivity, rollout.effort_sensitivity
+        controls = [mover.path.control_point_matrix(order) for order in (1, 2)]
+        parts = [ValueWithJacobian((matrix @ w).ravel(), _by_coefficients(matrix, w)) for matrix in controls]
+        finite = np.isfinite(self.effort_limit)
+        by_effort = None if pushed is None else pushed[every, finite, -size:].reshape(-1, size)
+        parts.append(ValueWithJacobian(rollout.effort[every, finite].ravel(), by_effort))
+        if self.options.limits.max_spring_angle is not None:
+            slope = None if moved is None else moved[every, self._springs, -size:].reshape(-1, size)
+            parts.append(ValueWithJacobian(rollout.state[every, self._springs].ravel(), slope))
+        if self.inside is not None:
+            at, by_q = self.inside.positions_and_jacobian(rollout.state[every, :n], mover.theta)
+            slope = None if moved is None else np.einsum("tiq,tqd->tid", by_q, moved[every, :n, -size:])
+            parts.append(ValueWithJacobian(at.ravel(), None if slope is None else slope.reshape(-1, size)))
+        return stack_values(parts)
+
+    def _bounded(self) -> list[LimitRows]:
+        mover, limits = self.simulator, self.options.limits
+        names = tuple(joint.name for joint in self.joints)
+        speed = limits.velocity_fraction * np.array([joint.velocity_limit for joint in self.joints])
+        sharp = np.full(len(names), limits.max_acceleration)
+        count = len(mover.path.control_point_matrix())
+        found = [_even("velocity [rad/s or m/s]", names, speed, count - 1)]
+        found.append(_even("acceleration [rad/s^2 or m/s^2]", names, sharp, count - 2))
+        finite = np.isfinite(self.effort_limit)
+        steps = len(range(0, len(mover.node_times) - 1, _LIMIT_NODE_STRIDE))
+        able = tuple(name for name, one in zip(names, finite, strict=True) if one)
+        found.append(_even("effort [N m or N]", able, self.effort_limit[finite], steps))
+        nodes = len(range(0, len(mover.node_times), _LIMIT_NODE_STRIDE))
+        if limits.max_spring_angle is not None:
+            springs = tuple(mover.step.system.mechanism.joint_names[i] for i in self._springs)
+            found.append(_even("angle [rad]", springs, np.full(len(springs), limits.max_spring_angle), nodes))
+        if self.inside is not None and self.options.box is not None:
+            low, high = (np.tile(corner, len(self.inside.names) * nodes) for corner in self.options.box)
+            axes = tuple(f"{name}, {axis}" for name in self.inside.names for axis in "xyz")
+            found.append(LimitRows("place [m]", low, high, np.full(len(low), 0.1), axes * nodes))
+        return found
+
+    def violated_limits(self, value: Array) -> dict[str, tuple[str, float, float]]:
+        """The worst violated row of each kind of limit: its name, value and bound."""
+        found, at = {}, 0
+        for rows in self.limit_rows:
+            own = value[at : at + len(rows.row_names)]
+            at += len(rows.row_names)
+            if not len(own):
+                continue
+            over = np.maximum(own - rows.upper, rows.lower - own) / rows.unit
+            worst = int(np.argmax(over))
+            if over[worst] > 1e-4:
+                bound = rows.upper[worst] if own[worst] > rows.upper[worst] else rows.lower[worst]
+                found[rows.description] = (rows.row_names[worst], float(own[worst]), float(bound))
+        return found
+
+
+def _by_coefficients(matrix: Array, w: Array) -> Array:
+    """Derivative of `matrix @ w` by the coefficients, row by row."""
+    return np.einsum("tk,ji->tjki", matrix, np.eye(w.shape[1])).reshape(-1, w.size)
+
+
+def _rows(value: Array, slope: Array | None, unit: float) -> ValueWithJacobian:
+    """Rows of nodes (N, m), so that the sum of their squares is the mean over the nodes in squares of the unit."""
+    scale = 1.0 / (unit * np.sqrt(len(value)))
+    return ValueWithJacobian(scale * value.ravel(), None if slope is None else scale * slope.reshape(value.size, -1))
+
+
+def _even(what: str, names: tuple[str, ...], limit: Array, count: int) -> LimitRows:
+    upper = np.tile(limit, count)
+    return LimitRows(what, -upper, upper, np.where(np.isfinite(upper), upper, 1.0), names * count)
+
 
 _INITIAL_PENALTY, _PENALTY_GROWTH, _MAX_PENALTY = 1e3, 10.0, 1e8
 _LIMIT_TOLERANCE = 1e-4  # largest violation of a limit, in parts of it, that counts as none
@@ -26,17 +217,7 @@ _FAILED_ROLLOUT_RESIDUAL = 1e4  # residual of a motion that cannot be stepped: t
 
 @dataclass(frozen=True)
 class PlanShootingResult:
-    """Result of the search for a planned motion.
-
-    Attributes
-    ----------
-    w : ndarray, shape (K, nc)
-    cost : float
-    is_converged : bool
-        Whether the search converged within the limits.
-    message : str
-    n_evaluations : int
-    """
+    """Result of the search for a planned motion, of coefficients w (K, nc); converged is one within the limits."""
 
     w: Array
     cost: float
@@ -46,14 +227,7 @@ class PlanShootingResult:
 
 
 class PlanShooting:
-    """Shooting problem with the residuals of several parameter cases and the limits of the first case.
-
-    Parameters
-    ----------
-    cases : sequence of Rows
-    shape : (int, int)
-        Of the unknowns, (K, nc).
-    """
+    """Shooting problem with the residuals of several parameter cases and the limits of the first case."""
 
     def __init__(self, cases: Sequence[PlanResidualsAndLimits], shape: tuple[int, int]) -> None:
         self._cases, self._shape = list(cases), shape
@@ -75,10 +249,8 @@ class PlanShooting:
             assert whole.jacobian is not None
             assert limits.jacobian is not None
             residual = ValueWithJacobian(scale * whole.value, scale * whole.jacobian)
-            self._last = (
-                np.array(x),
-                (residual, ValueWithJacobian(limits.value / self._unit, limits.jacobian / self._unit[:, None])),
-            )
+            scaled = ValueWithJacobian(limits.value / self._unit, limits.jacobian / self._unit[:, None])
+            self._last = np.array(x), (residual, scaled)
         return self._last[1]
 
     def solve(self, start: Array, lower: Array, upper: Array, iterations: int) -> PlanShootingResult:
@@ -94,20 +266,12 @@ class PlanShooting:
         pull = np.zeros((2, len(self._unit)))
         penalty, before, ended = _INITIAL_PENALTY, np.inf, False
         for _ in range(_MAX_OUTER_ITERATIONS):
-            found = least_squares(
-                lambda x: self._penalised(x, pull, penalty)[0],  # noqa: B023
-                x,
-                jac=lambda x: self._penalised(x, pull, penalty)[1],  # noqa: B023
-                bounds=(low, high),
-                x_scale=1.0,
-                max_nfev=iterations,
-                ftol=1e-6,
-                xtol=1e-7,
-                gtol=1e-8,
-            )
+            value, slope = (functools.partial(self._penalised, pull, penalty, part) for part in (0, 1))
+            stop = {"max_nfev": iterations, "ftol": 1e-6, "xtol": 1e-7, "gtol": 1e-8}
+            found = least_squares(value, x, jac=slope, bounds=(low, high), x_scale=1.0, **stop)
             x, ended = found.x, found.status > 0
-            value = self.residual_and_limits(x)[1].value
-            over = np.vstack([value - self._upper, self._lower - value])
+            reached = self.residual_and_limits(x)[1].value
+            over = np.vstack([reached - self._upper, self._lower - reached])
             passed = float(np.max(over, initial=0.0))
             if passed <= _LIMIT_TOLERANCE or not np.isfinite(passed):
                 break
@@ -126,7 +290,8 @@ class PlanShooting:
         cost = 0.5 * float(residual @ residual)
         return PlanShootingResult(x.reshape(self._shape), cost, finished, message, self.evaluations)
 
-    def _penalised(self, x: Array, pull: Array, penalty: float) -> tuple[Array, Array]:
+    def _penalised(self, pull: Array, penalty: float, part: int, x: Array) -> Array:
+        """Residual with the penalties of the limits (part 0), or its Jacobian (part 1)."""
         residual, limits = self.residual_and_limits(x)
         assert residual.jacobian is not None
         assert limits.jacobian is not None
@@ -140,10 +305,5 @@ class PlanShooting:
             slopes.append(sign * root * np.where(shifted > 0, 1.0, 0.0)[:, None] * limits.jacobian)
         value, slope = np.concatenate(values), np.vstack(slopes)
         if np.all(np.isfinite(value)) and np.all(np.isfinite(slope)):
-            return value, slope
-        return np.full(len(value), _FAILED_ROLLOUT_RESIDUAL), np.zeros_like(slope)
-
-
-def has_rollout_failed(rollout: Rollout) -> bool:
-    """Whether a rollout failed before its end."""
-    return not bool(np.all(np.isfinite(rollout.state)))
+            return (value, slope)[part]
+        return (np.full(len(value), _FAILED_ROLLOUT_RESIDUAL), np.zeros_like(slope))[part]

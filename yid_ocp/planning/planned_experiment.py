@@ -28,11 +28,14 @@ from yid_ocp.inference.linearized_residual import residual_without_weak_priors
 from yid_ocp.inference.whitening import whitened_at
 from yid_ocp.integrator.step import Step, compile_step_like
 from yid_ocp.parallel import map_with_batched_calls
-from yid_ocp.planning.end_equilibria import ordered_start_positions, solve_start_equilibrium
-from yid_ocp.planning.frame_positions import FramePositions
-from yid_ocp.planning.options import PlanOptions
-from yid_ocp.planning.path_simulator import PathSimulator
-from yid_ocp.planning.spline_path import SplinePath
+from yid_ocp.planning.joint_paths import (
+    FramePositions,
+    PathSimulator,
+    PlanOptions,
+    SplinePath,
+    ordered_start_positions,
+    solve_start_equilibrium,
+)
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import Measurements
@@ -43,9 +46,7 @@ Array = NDArray[np.float64]
 
 _PLANNED_RECORDING_NAME = "planned"
 _MIN_POINT_RATE = 20.0  # at least so often a slow sensor's information is spread over the motion [Hz]
-_MAX_SEARCH_POINT_RATE = (
-    40.0  # samples of a point while a motion is searched: twice the band in which the motion may be wrong [Hz]
-)
+_MAX_SEARCH_POINT_RATE = 40.0  # of points while a motion is searched: thrice the band in which it may be wrong [Hz]
 _PATH_ERROR_BANDWIDTH = 12.0  # up to which the motion may be wrong: beyond it efforts are smoothed away [Hz]
 _PATH_DIFFERENCE_STEP = 1e-6  # of the arms' motion, by which its errors' effect is differenced [rad or m]
 _SPLINE_DIFFERENCE_STEP = 1e-5  # of an unknown of the motion [rad or m]
@@ -61,10 +62,10 @@ class PlannedExperiment:
         The problem of the settings; its first recording defines sensors, noise and rates.
     parameter_values : mapping of str to float
         Parameters at which the sensitivities are taken.
-    simulator : Mover
+    simulator : PathSimulator
         Of the same system with its arms prescribed.
     free_parameters : tuple of str
-        Free parameters: those of the problem, and amplitudes of effects that are to be discriminated.
+        Those of the problem, and amplitudes of effects that are to be discriminated.
     """
 
     configured_problem: EstimationProblem
@@ -80,7 +81,6 @@ class PlannedExperiment:
 
         Parameters
         ----------
-        problem : EstimationProblem
         values : mapping of str to float
             Of any parameters; the others as the problem has them.
         options : PlanOptions
@@ -97,14 +97,10 @@ class PlannedExperiment:
         """
         system, episode = problem.system, problem.episodes[0]
         if problem.options.clamp_paths or not (system.driven or system.prescribed):
-            raise ConfigError(
-                "no joint moves whose motion could be planned"
-                if not problem.options.clamp_paths
-                else "the ends of a cable follow measured points: there is no joint whose motion could be planned",
-                where="plan",
-                allowed="a robot whose arms move",
-                hint="set model.robot and model.arms",
-            )
+            said, allowed = "no joint moves whose motion could be planned", "a robot whose arms move"
+            if problem.options.clamp_paths:
+                said = "the ends of a cable follow measured points: there is no joint whose motion could be planned"
+            raise ConfigError(said, where="plan", allowed=allowed, hint="set model.robot and model.arms")
         if system.servos:
             raise ConfigError(
                 "motions are not planned for arms of servos, whose commands are not their motion",
@@ -116,11 +112,9 @@ class PlannedExperiment:
         step = problem.step if not system.driven else compile_step_like(problem.step, moved)
         known = dict(zip(system.parameters.names, map(float, problem.theta), strict=True)) | dict(values)
         theta = step.system.parameters.vector(known)
-        first = (
-            np.array(episode.initial_known_coordinates)
-            if options.start_joint_positions is None
-            else ordered_start_positions(step.system, options.start_joint_positions)
-        )
+        first = np.array(episode.initial_known_coordinates)
+        if options.start_joint_positions is not None:
+            first = ordered_start_positions(step.system, options.start_joint_positions)
         path = SplinePath(options.duration, options.n_spline_coefficients)
         mover = PathSimulator(step, theta, solve_start_equilibrium(step, theta, first), path, options.hold_duration)
         _check_long_enough(problem, float(mover.node_times[-1]))
@@ -129,14 +123,10 @@ class PlannedExperiment:
     # -- what the sensors would record --------------------------------------------------------------------------------
 
     def noise_free_recording(self, w: Array, fastest: float = np.inf) -> Recording:
-        """Noise-free predicted recording of a motion; it states the standard deviations of its sensors.
+        """Noise-free predicted recording of a motion (K, nc); it states the standard deviations of its sensors.
 
-        Parameters
-        ----------
-        w : ndarray, shape (K, nc)
-            Unknowns of the motion.
-        fastest : float
-            Highest sample rate of points; those of a faster sensor are thinned, their information per second kept [Hz].
+        `fastest` is the highest sample rate of points [Hz]; those of a faster sensor are thinned, their information per
+        second kept.
         """
         mover, base = self.simulator, self.configured_problem.episodes[0]
         rollout, system = mover.simulate_path(w), mover.step.system
@@ -146,14 +136,12 @@ class PlannedExperiment:
         assert joints is not None
         period = float(np.median(np.diff(joints.t)))
         t = np.asarray(period * np.arange(int(np.floor(duration / period + 1e-9)) + 1), float)
-        sums = (
-            np.vstack([np.zeros((1, len(mover.joint_indices))), np.cumsum(rollout.effort, axis=0)])
-            * mover.step.time_step
+        impulse = np.cumsum(np.vstack([np.zeros((1, len(mover.joint_indices))), rollout.effort]), axis=0)
+        impulse = impulse * mover.step.time_step
+        begin, end = (
+            np.stack([np.interp(at, mover.node_times, x) for x in impulse.T], axis=1) for at in (t, t + period)
         )
-        edges = [
-            np.stack([np.interp(at, mover.node_times, total) for total in sums.T], axis=1) for at in (t, t + period)
-        ]
-        effort = (edges[1] - edges[0]) / period
+        effort = (end - begin) / period
         # nothing is known of what comes after
         effort[t + period > duration + 1e-9] = rollout.effort[-1]
         columns = [joints.names.index(name) for name in system.prescribed]
@@ -189,15 +177,8 @@ class PlannedExperiment:
         places = np.where(np.isfinite(std), places, np.nan).reshape(len(at), -1, 3)
         std = np.broadcast_to(np.where(np.isfinite(std), std, 1.0).reshape(-1, 3), places.shape)
         group = next(g for g in base.recording.points if g.name == sensor.group_name)
-        return PointGroup(
-            sensor.group_name,
-            sensor.point_names,
-            mover.node_times[at],
-            places,
-            std.copy(),
-            group.sensor,
-            pose=group.pose,
-        )
+        points, times = (sensor.group_name, sensor.point_names), mover.node_times[at]
+        return PointGroup(*points, times, places, std.copy(), group.sensor, pose=group.pose)
 
     @cached_property
     def _frames(self) -> dict[tuple[str, ...], FramePositions]:
@@ -215,11 +196,8 @@ class PlannedExperiment:
         for samples in base.measurements:
             if samples.sensor.outputs_per_channel == 3 and samples.sensor.group_name in own:
                 own[samples.sensor.group_name] = replace(own[samples.sensor.group_name], std=None)
-        named = (
-            {_PLANNED_RECORDING_NAME: dict(options.parameters_by_recording[base.name])}
-            if base.name in options.parameters_by_recording
-            else {}
-        )
+        given = options.parameters_by_recording
+        named = {_PLANNED_RECORDING_NAME: dict(given[base.name])} if base.name in given else {}
         same = {"sensors": own, "duration": None, "known_initial_states": {}, "parameters_by_recording": named}
         return replace(options, **{**same, **changes})  # type: ignore[arg-type]
 
@@ -235,9 +213,8 @@ class PlannedExperiment:
     def _problem(self, step: Step, recording: Recording, options: ProblemOptions) -> EstimationProblem:
         free = [name for name in self.free_parameters if name in self.configured_problem.free]
         extra = [name for name in self.free_parameters if name not in free]
-        return EstimationProblem(step, [recording], free, options, self.parameter_values, (), extra).with_free_subset(
-            self.free_parameters
-        )
+        problem = EstimationProblem(step, [recording], free, options, self.parameter_values, (), extra)
+        return problem.with_free_subset(self.free_parameters)
 
     def configured_sensitivities(self, w: Array) -> Array:
         """Sensitivities of the planned recording in the configured problem, without columns of torque offsets.
@@ -252,9 +229,8 @@ class PlannedExperiment:
     @property
     def recorded_sensitivities(self) -> Array:
         """Sensitivities of the existing recordings in the configured problem."""
-        return self._weighted(
-            self.configured_problem.with_parameter_values(self.parameter_values).with_free_subset(self.free_parameters)
-        )
+        problem = self.configured_problem.with_parameter_values(self.parameter_values)
+        return self._weighted(problem.with_free_subset(self.free_parameters))
 
     def _weighted(self, problem: EstimationProblem) -> Array:
         problem = whitened_at(problem, problem.initial_unknowns)
@@ -270,9 +246,7 @@ class PlannedExperiment:
         """
         jacobian = residual_without_weak_priors(problem, evaluation)[1] * _sizes(problem)
         own = np.array([name.split("[")[0] in self.free_parameters for name in problem.unknown_names])
-        jacobian[problem.residual_rows.stated_priors] = np.where(
-            own, 0.0, jacobian[problem.residual_rows.stated_priors]
-        )
+        jacobian[problem.residual_rows.stated_priors] *= ~own
         return jacobian
 
     # -- sensitivities with a known motion ----------------------------------------------------------------------------
@@ -331,13 +305,7 @@ class PlannedExperiment:
 
         With rows for the priors of nuisances; None where the motion cannot be simulated.
         """
-        problem = self._known
-        episode = replace(problem.episodes[0], prescribed_path=np.asarray(self.simulator.joint_positions(w)))
-        moved = problem.with_episodes([episode], ())
-        evaluation = moved.evaluate(
-            moved.initial_unknowns,
-            equilibrium_guesses=(self.simulator.start_equilibrium.state[: self.simulator.step.system.n_coordinates],),
-        )
+        moved, evaluation = self._evaluated(np.asarray(self.simulator.joint_positions(w)))
         if not evaluation.ok:
             return None
         jacobian = self._relative(moved, evaluation)
@@ -349,6 +317,12 @@ class PlannedExperiment:
         data = len(vectors)
         whole[:data] -= vectors @ (taken[:, None] * (vectors.T @ whole[:data]))
         return whole
+
+    def _evaluated(self, path: Array, derivatives: bool = True) -> tuple[EstimationProblem, Evaluation]:
+        """The problem with the joints on a path (N + 1, nc), and its evaluation."""
+        problem = self._known
+        moved = problem.with_episodes([replace(problem.episodes[0], prescribed_path=path)], ())
+        return moved, moved.evaluate(moved.initial_unknowns, derivatives, (self.simulator.start_configuration,))
 
     @cached_property
     def _blur(self) -> tuple[Array, Array]:
@@ -365,35 +339,24 @@ class PlannedExperiment:
             moved = path.copy()
             if i >= 0:
                 moved[:, i % nc] += _PATH_DIFFERENCE_STEP * waves[:, i // nc]
-            found = problem.with_episodes([replace(problem.episodes[0], prescribed_path=moved)], ())
-            evaluation = found.evaluate(
-                found.initial_unknowns, False, (mover.start_equilibrium.state[: mover.step.system.n_coordinates],)
-            )
+            _, evaluation = self._evaluated(moved, False)
             if not evaluation.ok:
                 raise DataError(f"the motion cannot be carried out: {evaluation.message}", where="plan")
             return evaluation.residual[problem.residual_rows.data]
 
         still = residual(-1)
-        blur = np.stack(
-            [
-                (found - still) / _PATH_DIFFERENCE_STEP
-                for found in map_with_batched_calls(residual, range(nc * waves.shape[1]))
-            ],
-            axis=1,
-        )
+        columns = [found - still for found in map_with_batched_calls(residual, range(nc * waves.shape[1]))]
+        blur = np.stack(columns, axis=1) / _PATH_DIFFERENCE_STEP
         known = blur.T @ blur
         if errors is not None and errors.has_encoder_measurements:
-            told = (waves.T @ waves)[:, None, :, None] * np.diag(errors.angle_std**-2 * errors.encoder_noise_steps**-1)[
-                None, :, None, :
-            ]
-            known += told.reshape(known.shape)
+            known += np.kron(waves.T @ waves, np.diag(errors.angle_std**-2 * errors.encoder_noise_steps**-1))
         values, vectors = scipy.linalg.eigh(known)
         kept = values > 1e-10 * values[-1]
         u, s, _ = np.linalg.svd(blur @ (vectors[:, kept] / np.sqrt(values[kept])), full_matrices=False)
         return u, 1.0 - np.sqrt(np.clip(1.0 - s**2, 0.0, 1.0))
 
     def sensitivity_derivatives(self, w: Array, rows: Array) -> Array | None:
-        """Derivative of `search_sensitivities` by the spline coefficients, by forward differences, (w.size, nr, columns)."""
+        """Forward differences of `search_sensitivities` by the spline coefficients, (w.size, nr, columns)."""
 
         def one(i: int) -> Array | None:
             moved = w.ravel().copy()
@@ -408,9 +371,8 @@ class PlannedExperiment:
 def _check_long_enough(problem: EstimationProblem, duration: float) -> None:
     """Refuse a motion of whose efforts the low-pass filter leaves nothing."""
     joints, low_pass = problem.episodes[0].recording.joints, effort_filter(problem.options.path_cutoff)
-    least = (
-        2.0 * low_pass.settling_time + low_pass.decorrelation_stride(problem.step.time_step) * problem.step.time_step
-    )
+    step = problem.step.time_step
+    least = 2.0 * low_pass.settling_time + low_pass.decorrelation_stride(step) * step
     if joints is not None and joints.effort is not None and duration <= least:
         raise ConfigError(
             f"{duration:g} s are too short to measure efforts that are smoothed at {low_pass.cutoff:g} Hz",

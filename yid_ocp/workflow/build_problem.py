@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from yid_ocp.analysis.convergence import min_grasp_gaps
+from yid_ocp.analysis.discretisation import min_grasp_gaps
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import (
     RunSettings,

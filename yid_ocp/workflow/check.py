@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from yid_ocp.analysis.discretisation import largest_error_growth
 from yid_ocp.analysis.pinocchio_comparison import compare_system_with_pinocchio, compare_urdf_with_pinocchio
-from yid_ocp.analysis.time_step_stability import largest_error_growth
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.recording import Recording

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.analysis.compare import MethodComparison, compare_methods
-from yid_ocp.analysis.paper_comparison import PAPER_ESTIMATES, explain_paper_estimates
+from yid_ocp.analysis.compare import PAPER_ESTIMATES, MethodComparison, compare_methods, explain_paper_estimates
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.problem import EstimationProblem

@@ -9,15 +9,17 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.analysis.convergence import NaturalFrequencies, natural_frequencies
-from yid_ocp.analysis.discretisation_shift import (
+from yid_ocp.analysis.discretisation import (
     DiscretisationShift,
+    NaturalFrequencies,
     RefinedProblem,
+    StepErrorGrowth,
     discretisation_shifts,
     inflate_estimates,
     joint_subdivision,
+    largest_error_growth,
+    natural_frequencies,
 )
-from yid_ocp.analysis.time_step_stability import StepErrorGrowth, largest_error_growth
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.errors import YidError
 from yid_ocp.inference.uncertainty import typical_parameter_sizes

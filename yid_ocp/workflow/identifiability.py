@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from yid_ocp.analysis.cable_memory_check import decide_cable_memory, without_cable_memory
+from yid_ocp.analysis.compare import decide_cable_memory, without_cable_memory
 from yid_ocp.analysis.experiment_design import BaseExperiment
 from yid_ocp.analysis.identifiability import (
     GRASP_OFFSET_PRIOR_STD,

@@ -13,7 +13,6 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.analysis.parameter_dependence import ParameterDependence, parameter_dependences
 from yid_ocp.analysis.sparsity_patterns import (
     SparsityPattern,
     kkt_pattern,
@@ -23,9 +22,10 @@ from yid_ocp.analysis.sparsity_patterns import (
 )
 from yid_ocp.analysis.step_diagnostics import (
     CheckedLinearisation,
-    StepStructure,
+    ParameterDependence,
     linearise_and_check,
     linearise_step_equations,
+    parameter_dependences,
     step_structure,
 )
 from yid_ocp.analysis.step_symbols import EquationEntry, StepSymbols
@@ -117,7 +117,7 @@ def run_inspect(
             "compiled": step.is_compiled,
             "variables": _variables(step),
             "parameters": _parameters(step, set(free)),
-            "equations": _structure_result(step_structure(step)),
+            "equations": step_structure(step),
             "blocks": _blocks(symbols),
             "patterns": {name: _pattern_result(pattern) for name, pattern in patterns.items()},
             "nlp": nlp,
@@ -264,15 +264,6 @@ def _blocks(symbols: StepSymbols) -> dict[str, list[dict[str, Any]]]:
         kind: [{"name": b.name, "meaning": b.meaning, "names": list(b.full_names)} for b in blocks if b.labels]
         for kind, blocks in (("rows", symbols.row_blocks), ("columns", symbols.column_blocks))
     }
-
-
-def _structure_result(structure: StepStructure) -> dict[str, Any]:
-    functions = [
-        {"name": entry.name, "operations": entry.n_operations, "nonzeros": entry.n_nonzeros}
-        for entry in structure.function_sizes
-    ]
-    sizes = {"sizes": structure.dimensions, "unknowns": structure.n_unknowns}
-    return sizes | {"jacobian_nonzeros": structure.jacobian_nonzeros, "functions": functions}
 
 
 def _pattern_result(pattern: SparsityPattern) -> dict[str, Any]:

@@ -220,7 +220,7 @@ def _plan_result(run: RunSettings, found: MotionPlan) -> dict[str, Any]:
 def _scenes(found: MotionPlan | InformativeMotionPlan) -> list[Animation]:
     """The planned motion, as the model has it."""
     system = found.simulator.step.system
-    state = found.state_trajectory if isinstance(found, MotionPlan) else found.rollout.state
+    state = found.rollout.state
     return [
         make_animation(
             "planned",

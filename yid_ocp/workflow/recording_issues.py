@@ -13,14 +13,16 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from yid_ocp.analysis.data_quality import (
+from yid_ocp.analysis.effort_checks import check_efforts
+from yid_ocp.analysis.joint_checks import (
     RecordedJointsModel,
-    check_cable_points,
     check_dynamic_excitation,
-    check_efforts,
-    check_held_points,
     check_joint_excitation,
     check_joint_limits,
+)
+from yid_ocp.analysis.point_checks import (
+    check_cable_points,
+    check_held_points,
     check_object_points,
     check_point_distances,
 )

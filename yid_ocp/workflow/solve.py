@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.analysis.cable_memory_check import decide_cable_memory
-from yid_ocp.analysis.data_quality import check_fit_residuals
+from yid_ocp.analysis.clock_checks import check_fit_residuals
+from yid_ocp.analysis.compare import decide_cable_memory
 from yid_ocp.analysis.profile import with_profile_intervals
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings

@@ -19,7 +19,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.analysis.data_quality.recorded_joints import (
+from yid_ocp.analysis.joint_checks import (
+    VISCOUS_FRICTION_FRACTION,
     RecordedJointsModel,
     SmoothedJointMotion,
     effect_setting_line,
@@ -33,25 +34,19 @@ Array = NDArray[np.float64]
 
 _EFFORT_LIMIT_ERROR_FRACTION, _EFFORT_SPREAD_ERROR_FRACTION = 0.02, 0.1
 """What a robot's model is off by: part of the joint's largest effort, part of the spread of what it needs."""
-_OFFSET_FRACTION, VISCOUS_FRICTION_FRACTION, _COULOMB_FRICTION_FRACTION, _JOINT_SPRING_FRACTION = 0.05, 0.04, 0.02, 0.02
-"""Usual sizes beside a joint's largest effort: of a zero's error, of friction [per rad/s, 1], of a spring [per rad]."""
+_OFFSET_FRACTION, _COULOMB_FRICTION_FRACTION, _JOINT_SPRING_FRACTION = 0.05, 0.02, 0.02
+"""Usual sizes beside a joint's largest effort: of a zero's error, of dry friction, of a spring [per rad]."""
 _GRASP_FORCE_STD, _GRASP_STIFFNESS_STD, _GRASP_QUADRATIC_STIFFNESS_STD, _GRASP_DAMPING_STD = 30.0, 150.0, 1500.0, 30.0
 """Usual sizes of the force on a grasp [N], and by which it changes [N/m, N/m^2, N s/m]."""
-_WRONG_GAIN_FACTOR = 3.0
-"""Usual size of 1/g, and the factor from which a gain counts as wrong."""
+_WRONG_GAIN_FACTOR = 3.0  # usual size of 1/g, and the factor from which a gain counts as wrong
 _MAX_EXPLAINED_RMS = 1.5
 """Root mean square of what is left, in sizes of the model's error, up to which a joint's effort is explained."""
-_WELL_EXPLAINED_RMS = 0.5
-"""The same up to which nothing is left to be explained by a lag."""
-_WRONG_ROBOT_RMS = 3.0
-"""The same from which on it is not this robot's."""
+_WELL_EXPLAINED_RMS = 0.5  # the same up to which nothing is left to be explained by a lag
+_WRONG_ROBOT_RMS = 3.0  # the same from which on it is not this robot's
 _MIN_FITTED_STD, _MAX_FITTED_EFFORT = 1e-12, 1e12  # where numbers end that a fit can be made of
-_MIN_Z = 5.0
-"""Standard deviations from which on a number counts."""
-_INDEPENDENT_SAMPLE_BANDWIDTH = 1.0
-"""Samples further apart than half of its inverse count as independent [Hz]."""
-_MIN_EFFORT = 1e-3
-"""Efforts below this tell nothing [N m]."""
+_MIN_Z = 5.0  # standard deviations from which on a number counts
+_INDEPENDENT_SAMPLE_BANDWIDTH = 1.0  # samples further apart than half of its inverse count as independent [Hz]
+_MIN_EFFORT = 1e-3  # efforts below this tell nothing [N m]
 _LAG_SEARCH_STEP = 0.1
 """Steps in which a lag of efforts behind the motion is looked for; a shorter one is no gross error [s]."""
 _IDLE_COMMAND_FRACTION = 0.2
@@ -79,13 +74,7 @@ class _Fit:
 
 
 def check_efforts(arm: RecordedJointsModel, recording: Recording) -> list[Issue]:
-    """Issues of recorded efforts that disagree with the inverse dynamics of the recorded motion.
-
-    Parameters
-    ----------
-    arm : Arm
-    recording : Recording
-    """
+    """Issues of recorded efforts that disagree with the inverse dynamics of the recorded motion."""
     joints = recording.joints
     motion = None if joints is None else smoothed_joint_motion(joints, arm.joint_names)
     if joints is None or motion is None or motion.effort is None or len(motion.t) < 10:
@@ -93,40 +82,34 @@ def check_efforts(arm: RecordedJointsModel, recording: Recording) -> list[Issue]
     needed = arm.inverse_dynamics(motion.q, motion.v, motion.a)
     largest = np.array([joint.effort_limit for joint in arm.joints])
     size = np.where(np.isfinite(largest), largest, np.maximum(np.max(np.abs(needed), axis=0), 1e-9))
-    found = list(_limits(arm, motion, largest))
+    found = list(_limits(arm, motion.effort, largest))
     most = [float(np.max(np.abs(values), initial=0.0)) for values in (needed, motion.effort)]
-    if not most[0] > _MIN_EFFORT or not max(most) < _MAX_FITTED_EFFORT:
-        return [replace(doubt, recording=recording.name, group="joints") for doubt in found]
-    dead = _dead(
-        motion.effort,
-        needed,
-        _IDLE_COMMAND_FRACTION * size
-        if joints.effort_kind_or_default == "command"
-        else 2 * _EFFORT_LIMIT_ERROR_FRACTION * size,
-    )
-    if dead.any():
-        found.append(_zero(arm, dead))
-    else:
-        # motion to and fro that is late looks turned round, so that comes first
-        found += list(_late(arm, motion, needed, size)) or list(_by_joint(arm, motion, needed, size))
-    return [replace(doubt, recording=recording.name, group="joints") for doubt in found]
+    if most[0] > _MIN_EFFORT and max(most) < _MAX_FITTED_EFFORT:
+        commanded = joints.effort_kind_or_default == "command"
+        least = (_IDLE_COMMAND_FRACTION if commanded else 2 * _EFFORT_LIMIT_ERROR_FRACTION) * size
+        dead = _dead(motion.effort, needed, least)
+        if dead.any():
+            found.append(_zero(arm, dead))
+        else:
+            # motion to and fro that is late looks turned round, so that comes first
+            motion_and_efforts = arm, motion, motion.effort, needed, size
+            found += list(_late(*motion_and_efforts)) or list(_by_joint(*motion_and_efforts))
+    return [replace(issue, recording=recording.name) for issue in found]
 
 
-def _limits(arm: RecordedJointsModel, motion: SmoothedJointMotion, largest: Array) -> Iterator[Issue]:
-    assert motion.effort is not None
-    ratio = np.percentile(np.abs(motion.effort), 99, axis=0) / largest
+def _issue(cause: str, words: str, depth: float, advice: str, joint: str = "", setting: str = "") -> Issue:
+    """An issue of one joint's effort, or of all."""
+    channel = f"effort.{joint}" if joint else "effort"
+    return Issue(cause, words, "not_trusted", depth, advice, "", "joints", channel, setting=setting)
+
+
+def _limits(arm: RecordedJointsModel, effort: Array, largest: Array) -> Iterator[Issue]:
+    ratio = np.percentile(np.abs(effort), 99, axis=0) / largest
     if np.any(ratio > _MAX_EFFORT_RATIO):
         j = int(np.argmax(ratio))
-        yield Issue(
-            "effort_limits",
-            f"the effort of {arm.joint_names[j]} is {ratio[j]:.3g} times what it can bear ({largest[j]:.3g} N m)",
-            "not_trusted",
-            float(ratio[j]) / _MAX_EFFORT_RATIO,
-            "check the unit of efforts (N m) and the robot's description",
-            "",
-            "joints",
-            f"effort.{arm.joint_names[j]}",
-        )
+        words = f"the effort of {arm.joint_names[j]} is {ratio[j]:.3g} times what it can bear ({largest[j]:.3g} N m)"
+        advice = "check the unit of efforts (N m) and the robot's description"
+        yield _issue("effort_limits", words, float(ratio[j]) / _MAX_EFFORT_RATIO, advice, arm.joint_names[j])
 
 
 def _dead(effort: Array, needed: Array, least: Array) -> NDArray[np.bool_]:
@@ -139,159 +122,107 @@ def _dead(effort: Array, needed: Array, least: Array) -> NDArray[np.bool_]:
 def _zero(arm: RecordedJointsModel, dead: NDArray[np.bool_]) -> Issue:
     names = [name for name, off in zip(arm.joint_names, dead, strict=True) if off]
     which = "all joints" if dead.all() else ", ".join(names)
-    return Issue(
-        "effort_zero",
-        f"the effort of {which} is zero throughout, while gravity and motion need more",
-        "not_trusted",
-        1e3,
-        "record efforts; to leave these out, move the arms as measured and switch their efforts off",
-        "",
-        "joints",
-        "effort",
-        setting="model.arms.mode: prescribed, sensors.joints.effort.use: false",
-    )
+    words = f"the effort of {which} is zero throughout, while gravity and motion need more"
+    advice = "record efforts; to leave these out, move the arms as measured and switch their efforts off"
+    setting = "model.arms.mode: prescribed, sensors.joints.effort.use: false"
+    return _issue("effort_zero", words, 1e3, advice, setting=setting)
 
 
-def _by_joint(arm: RecordedJointsModel, motion: SmoothedJointMotion, needed: Array, size: Array) -> Iterator[Issue]:
-    assert motion.effort is not None
-    loaded = _loaded(arm, motion, size)
+def _by_joint(
+    arm: RecordedJointsModel, motion: SmoothedJointMotion, effort: Array, needed: Array, size: Array
+) -> Iterator[Issue]:
+    loaded, factor = _loaded(arm, motion, size), _WRONG_GAIN_FACTOR
     # What is held can add to efforts, but not several times what the arm itself weighs, nor carry nearly all of that.
     # A prior about one holds a gain that is a power of ten away, so efforts are scaled first.
-    ratio = float(np.linalg.norm(needed)) / max(float(np.linalg.norm(motion.effort)), 1e-300)
-    common = 10.0 ** round(math.log10(ratio)) if not 1 / _WRONG_GAIN_FACTOR < ratio < _WRONG_GAIN_FACTOR else 1.0
-    fit = _fitted(arm, motion, common * motion.effort, needed, size)
+    ratio = float(np.linalg.norm(needed)) / max(float(np.linalg.norm(effort)), 1e-300)
+    common = 1.0 if 1 / factor < ratio < factor else 10.0 ** round(math.log10(ratio))
+    fit = _fitted(arm, motion, common * effort, needed, size)
     told = fit.std < np.maximum(0.6 * np.abs(fit.inverse), 0.35)
     sound = told & (fit.left < _MAX_EXPLAINED_RMS) & (np.abs(fit.offset) < 3 * _OFFSET_FRACTION * size)
-    scale = 1.0
     if common != 1.0 and sound.sum() >= 2:
         scale = 1 / (common * max(float(np.median(np.abs(fit.inverse[sound]))), _MIN_FITTED_STD))
-    if not 1 / _WRONG_GAIN_FACTOR < scale < _WRONG_GAIN_FACTOR:
-        yield Issue(
-            "effort_gain",
-            f"efforts are about {scale:.2g} times what gravity and motion need",
-            "not_trusted",
-            max(scale, 1 / scale) / _WRONG_GAIN_FACTOR,
-            f"divide efforts by {1 / common:g}, if their unit is another",
-            channel="effort",
-            recording="",
-        )
+        if not 1 / factor < scale < factor:
+            words = f"efforts are about {scale:.2g} times what gravity and motion need"
+            advice = f"divide efforts by {1 / common:g}, if their unit is another"
+            yield _issue("effort_gain", words, max(scale, 1 / scale) / factor, advice)
     turned = sound & (fit.inverse < -_MIN_Z * fit.std / 2) & (fit.inverse < -0.3)
-    upright = told & (fit.inverse > _MIN_Z * fit.std / 2) & (fit.inverse > 0.3)
-    if turned.sum() >= 2 and not upright.any():
-        depth = float(np.max(-fit.inverse[turned] / fit.std[turned])) / (_MIN_Z / 2)
-        yield _sign("all efforts have", depth, "effort")
-    else:
-        for j in np.flatnonzero(turned):
-            depth = float(-fit.inverse[j] / fit.std[j]) / (_MIN_Z / 2)
-            yield _sign(f"the effort of {arm.joint_names[j]} has", depth, f"effort.{arm.joint_names[j]}")
+    yield from _signs(arm, fit, turned, told & (fit.inverse > _MIN_Z * fit.std / 2) & (fit.inverse > 0.3))
     for j in np.flatnonzero(sound & ~turned):
         inverse, off = float(fit.inverse[j]), abs(float(fit.inverse[j]) - 1) / float(fit.std[j])
-        weak, strong = (
-            inverse > _WRONG_GAIN_FACTOR,
-            0 < inverse < 1 / _WRONG_GAIN_FACTOR and fit.direct[j] > _WRONG_GAIN_FACTOR and not loaded[j],
-        )
-        if off > _MIN_Z and (weak or strong):
-            yield Issue(
-                "effort_gain",
-                f"the effort of {arm.joint_names[j]} is {1 / inverse:.2g} times what gravity and motion need",
-                "not_trusted",
-                off / _MIN_Z,
-                "find out what the number stands for",
-                "",
-                "joints",
-                f"effort.{arm.joint_names[j]}",
-            )
-    # a large zero error looks like a large gain; but then the variation follows as it should
-    off_zero = (
-        (fit.inverse > 0)
-        & (fit.inverse < 1 / _WRONG_GAIN_FACTOR)
-        & (fit.direct > 1 / _WRONG_GAIN_FACTOR)
-        & (fit.direct < _WRONG_GAIN_FACTOR)
-    )
-    offset = np.where(off_zero, fit.shift, fit.offset)
-    calm = (
-        told
-        & (fit.left < _MAX_EXPLAINED_RMS / 1.5)
-        & (off_zero | ((fit.inverse > 1 / _WRONG_GAIN_FACTOR) & (fit.inverse < _WRONG_GAIN_FACTOR)))
-    )
-    for j in np.flatnonzero(calm & ~loaded & (np.abs(offset) > 3 * _OFFSET_FRACTION * size)):
-        # springs that carry part of the weight are no wrong zero
-        balanced = offset[j] * np.mean(needed[:, j]) < 0 and abs(offset[j]) < np.max(np.abs(needed[:, j]))
-        sure = abs(offset[j]) > _MIN_Z * fit.offset_std[j]
-        if sure and not balanced:
-            yield Issue(
-                "effort_offset",
-                f"the zero of the effort of {arm.joint_names[j]} is off by {offset[j]:+.3g} N m",
-                "not_trusted",
-                abs(float(offset[j])) / (3 * _OFFSET_FRACTION * float(size[j])),
-                "let it be estimated, or set the sensor's zero",
-                "",
-                "joints",
-                f"effort.{arm.joint_names[j]}",
-                setting=effect_setting_line("effort_offset", arm.joint_names[j], "offset", float(offset[j])),
-            )
+        strong = 0 < inverse < 1 / factor and fit.direct[j] > factor and not loaded[j]
+        if off > _MIN_Z and (inverse > factor or strong):
+            words = f"the effort of {arm.joint_names[j]} is {1 / inverse:.2g} times what gravity and motion need"
+            yield _issue("effort_gain", words, off / _MIN_Z, "find out what the number stands for", arm.joint_names[j])
+    yield from _offsets(arm, fit, needed, size, told & ~loaded)
     lost = fit.left > _WRONG_ROBOT_RMS
     if arm.has_no_unknown_descendants and lost.sum() > len(arm.joint_names) / 2:
-        yield Issue(
-            "effort_unlike",
+        left = float(np.median(fit.left[lost]))
+        words = (
             f"efforts of {lost.sum()} of {len(arm.joint_names)} joints are not what this robot needs for this motion: "
-            f"{np.median(fit.left[lost]):.2g} times what a robot's model is off by",
-            "not_trusted",
-            float(np.median(fit.left[lost])) / _WRONG_ROBOT_RMS,
-            "check that the recording is this robot's, its unit of time, and the order of joints",
-            "",
-            "joints",
-            "effort",
+            f"{left:.2g} times what a robot's model is off by"
         )
+        advice = "check that the recording is this robot's, its unit of time, and the order of joints"
+        yield _issue("effort_unlike", words, left / _WRONG_ROBOT_RMS, advice)
 
 
-def _sign(who: str, depth: float, channel: str) -> Issue:
-    return Issue(
-        "effort_sign",
-        f"{who} the opposite sign of what gravity and motion need",
-        "not_trusted",
-        depth,
-        "turn the sign; effort is what the motor does to the joint",
-        "",
-        "joints",
-        channel,
-    )
+def _signs(
+    arm: RecordedJointsModel, fit: _Fit, turned: NDArray[np.bool_], upright: NDArray[np.bool_]
+) -> Iterator[Issue]:
+    depth = -fit.inverse / fit.std / (_MIN_Z / 2)
+    cases = [
+        (f"the effort of {arm.joint_names[j]} has", float(depth[j]), arm.joint_names[j]) for j in np.flatnonzero(turned)
+    ]
+    if turned.sum() >= 2 and not upright.any():
+        cases = [("all efforts have", float(np.max(depth[turned])), "")]
+    for who, by, joint in cases:
+        words = f"{who} the opposite sign of what gravity and motion need"
+        yield _issue("effort_sign", words, by, "turn the sign; effort is what the motor does to the joint", joint)
 
 
-def _late(arm: RecordedJointsModel, motion: SmoothedJointMotion, needed: Array, size: Array) -> Iterator[Issue]:
+def _offsets(
+    arm: RecordedJointsModel, fit: _Fit, needed: Array, size: Array, told: NDArray[np.bool_]
+) -> Iterator[Issue]:
+    low, high = 1 / _WRONG_GAIN_FACTOR, _WRONG_GAIN_FACTOR
+    # a large zero error looks like a large gain; but then the variation follows as it should
+    off_zero = (fit.inverse > 0) & (fit.inverse < low) & (fit.direct > low) & (fit.direct < high)
+    offset = np.where(off_zero, fit.shift, fit.offset)
+    calm = told & (fit.left < _MAX_EXPLAINED_RMS / 1.5) & (off_zero | ((fit.inverse > low) & (fit.inverse < high)))
+    for j in np.flatnonzero(calm & (np.abs(offset) > 3 * _OFFSET_FRACTION * size)):
+        # springs that carry part of the weight are no wrong zero
+        balanced = offset[j] * np.mean(needed[:, j]) < 0 and abs(offset[j]) < np.max(np.abs(needed[:, j]))
+        if abs(offset[j]) > _MIN_Z * fit.offset_std[j] and not balanced:
+            name, value = arm.joint_names[j], float(offset[j])
+            words = f"the zero of the effort of {name} is off by {value:+.3g} N m"
+            depth = abs(value) / (3 * _OFFSET_FRACTION * float(size[j]))
+            setting = effect_setting_line("effort_offset", name, "offset", value)
+            yield _issue("effort_offset", words, depth, "let it be estimated, or set the sensor's zero", name, setting)
+
+
+def _late(
+    arm: RecordedJointsModel, motion: SmoothedJointMotion, effort: Array, needed: Array, size: Array
+) -> Iterator[Issue]:
     """Efforts that follow the motion late or early, all alike."""
-    assert motion.effort is not None
     trials = _LAG_SEARCH_STEP * np.arange(-5, 6)
     if motion.t[-1] - motion.t[0] < 4 * trials[-1]:
         return
-    if np.max(_fitted(arm, motion, motion.effort, needed, size).left) < _WELL_EXPLAINED_RMS:
+    if np.max(_fitted(arm, motion, effort, needed, size).left) < _WELL_EXPLAINED_RMS:
         return
     inside = (motion.t >= motion.t[0] + trials[-1]) & (motion.t <= motion.t[-1] - trials[-1])
     kept = replace(motion, t=motion.t[inside], q=motion.q[inside], v=motion.v[inside], a=motion.a[inside])
     costs = []
     for late in trials:
-        moved = np.stack([np.interp(kept.t + late, motion.t, column) for column in motion.effort.T], axis=1)
+        moved = np.stack([np.interp(kept.t + late, motion.t, column) for column in effort.T], axis=1)
         costs.append(_fitted(arm, kept, moved, needed[inside], size).cost)
     at = int(np.argmin(costs))
+    lag = float(trials[at])
     # twice over, so that what friction and grasp take up of a lag does not count
-    if abs(trials[at]) > 0.5 * _LAG_SEARCH_STEP and costs[at] < 0.4 * costs[len(trials) // 2]:
-        yield Issue(
-            "effort_lag",
-            f"efforts fit the motion best {abs(trials[at]):.2g} s {'earlier' if trials[at] > 0 else 'later'} than "
-            "they were recorded",
-            "not_trusted",
-            abs(float(trials[at])) / _LAG_SEARCH_STEP,
-            "shift their times",
-            "",
-            "joints",
-            "effort",
-            setting="; ".join(
-                effect_setting_line("effort_delay", name, "delay", float(trials[at]))
-                for name in joints_by_arm(arm.system)
-            )
-            if abs(trials[at]) <= _LAG_SEARCH_STEP
-            else "",
+    if abs(lag) > 0.5 * _LAG_SEARCH_STEP and costs[at] < 0.4 * costs[len(trials) // 2]:
+        words = (
+            f"efforts fit the motion best {abs(lag):.2g} s {'earlier' if lag > 0 else 'later'} than they were recorded"
         )
+        lines = [effect_setting_line("effort_delay", name, "delay", lag) for name in joints_by_arm(arm.system)]
+        setting = "; ".join(lines) if abs(lag) <= _LAG_SEARCH_STEP else ""
+        yield _issue("effort_lag", words, abs(lag) / _LAG_SEARCH_STEP, "shift their times", setting=setting)
 
 
 def _fitted(arm: RecordedJointsModel, motion: SmoothedJointMotion, effort: Array, needed: Array, size: Array) -> _Fit:
@@ -315,13 +246,11 @@ def _fitted(arm: RecordedJointsModel, motion: SmoothedJointMotion, effort: Array
     shift = effort.mean(axis=0) - explained.mean(axis=0)
     moved, about = explained - explained.mean(axis=0), effort - effort.mean(axis=0)
     direct = np.sum(about * moved, axis=0) / np.maximum(np.sum(moved**2, axis=0), 1e-12)
-    cost = float(
-        np.sum((rows @ found - target) ** 2) + np.sum(((found - (np.arange(len(prior)) < width)) / prior) ** 2)
-    )
+    departure = (found - (np.arange(len(prior)) < width)) / prior
+    cost = float(np.sum((rows @ found - target) ** 2) + np.sum(departure**2))
     own = slice(width, 2 * width)
-    return _Fit(
-        found[:width], std[:width], found[own], std[own], np.sqrt(np.mean(remains**2, axis=0)), direct, shift, cost
-    )
+    left = np.sqrt(np.mean(remains**2, axis=0))
+    return _Fit(found[:width], std[:width], found[own], std[own], left, direct, shift, cost)
 
 
 def _by_itself(
@@ -374,10 +303,6 @@ def _loads(arm: RecordedJointsModel, motion: SmoothedJointMotion) -> tuple[Array
             lever = by_angle[:, g, axis, :]
             squares = [lever * (moved[:, [b]] * moved[:, [c]]) for b in range(3) for c in range(b, 3)]
             columns += [lever, *(lever * moved[:, [b]] for b in range(3)), *squares, lever * speed[:, [axis]]]
-            sizes += [
-                _GRASP_FORCE_STD,
-                *[_GRASP_STIFFNESS_STD] * 3,
-                *[_GRASP_QUADRATIC_STIFFNESS_STD] * 6,
-                _GRASP_DAMPING_STD,
-            ]
+            stiffness = [_GRASP_STIFFNESS_STD] * 3 + [_GRASP_QUADRATIC_STIFFNESS_STD] * 6
+            sizes += [_GRASP_FORCE_STD, *stiffness, _GRASP_DAMPING_STD]
     return np.stack(columns, axis=2), np.array(sizes)

@@ -12,14 +12,14 @@ import numpy as np
 import scipy.interpolate
 from numpy.typing import NDArray
 
-from yid_ocp.analysis.data_quality.clock_synchronization import (
+from yid_ocp.analysis.clock_checks import (
     PositionFunction,
     check_held_point_clock,
     search_clock_error,
     timestamp_correction,
 )
-from yid_ocp.analysis.data_quality.recorded_joints import RecordedJointsModel, effect_setting_line
-from yid_ocp.data.issues import Issue, Severity, median_sample_period
+from yid_ocp.analysis.joint_checks import RecordedJointsModel, effect_setting_line
+from yid_ocp.data.issues import Issue, median_sample_period
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.system import System
@@ -33,16 +33,12 @@ _HELD_POINT_TOLERANCE = 0.01
 """How far a point may be from where the arm holds it: what calibration and a tool's measures leave [m]."""
 _MAX_OBJECT_ERROR_FRACTION = 0.25
 """Part of the object's length by which points may be elsewhere than a model with unknown stiffness says."""
-_MAX_REMAINING_FRACTION = 0.5
-"""A change explains points where it leaves less than this part of their distance."""
+_MAX_REMAINING_FRACTION = 0.5  # a change explains points where it leaves less than this part of their distance
 _UNIT_SCALES = (1e-3, 1e-2, 0.0254, 0.1, 0.3048, 1 / 0.3048, 10.0, 1 / 0.0254, 100.0, 1e3)
 """By what lengths are wrong that are in another unit, or read so, and a power of ten for what was typed wrongly."""
-_MIN_CLOCK_OFFSET = 0.05
-"""Offset between two clocks that explains points far from where they should be [s]."""
-_PATH_SAMPLE_RATE = 50.0
-"""Rate at which the way of the held points is worked out; splines join what lies between [Hz]."""
-_LENGTH_RTOL = 0.2
-"""Part by which lengths that cannot change may seem to."""
+_MIN_CLOCK_OFFSET = 0.05  # offset between two clocks that explains points far from where they should be [s]
+_PATH_SAMPLE_RATE = 50.0  # rate at which the way of the held points is worked out; splines join what lies between [Hz]
+_LENGTH_RTOL = 0.2  # part by which lengths that cannot change may seem to
 
 
 @dataclass(frozen=True)
@@ -71,15 +67,14 @@ def _held_point_frames(system: System, group: PointGroup, choice: SensorUsage) -
 
 def check_held_points(arm: RecordedJointsModel, recording: Recording, choice: _SensorChoices) -> Iterator[Issue]:
     """Issues of points whose positions disagree with the forward kinematics of the recorded angles."""
-    joints = recording.joints
+    joints, tree = recording.joints, arm.system.mechanism
     if joints is None or median_sample_period(joints.t) <= 0:
         return
     for group in recording.points:
         frames = {
             name: frame
             for name, frame in _held_point_frames(arm.system, group, choice(group.name)).items()
-            if arm.is_frame_determined(frame)
-            and arm.system.mechanism.ancestor_joints(arm.system.mechanism.frame(frame).joint_index)
+            if arm.is_frame_determined(frame) and tree.ancestor_joints(tree.frame(frame).joint_index)
         }
         inside = (group.t >= joints.t[0]) & (group.t <= joints.t[-1])
         if not frames or inside.sum() < 3:
@@ -87,55 +82,50 @@ def check_held_points(arm: RecordedJointsModel, recording: Recording, choice: _S
         rows = np.flatnonzero(inside)[:: max(1, int(inside.sum()) // 200)]
         columns = [group.names.index(name) for name in frames]
         seen, t = group.position[rows][:, columns], group.t[rows]
-        course = scipy.interpolate.CubicSpline(
-            joints.t, joints.position[:, [joints.names.index(n) for n in arm.joint_names]], axis=0
-        )
-        place, by_angle = arm.frame_positions(tuple(frames.values()), course(t))
+        angles = joints.position[:, [joints.names.index(name) for name in arm.joint_names]]
+        course, places = scipy.interpolate.CubicSpline(joints.t, angles, axis=0), tuple(frames.values())
+        place, by_angle = arm.frame_positions(places, course(t))
         error = _rms(seen - place)
         noise = _noise(group)
         knots = float(joints.t[0]), float(joints.t[-1])
         dense = np.linspace(*knots, int(np.clip(_PATH_SAMPLE_RATE * (knots[1] - knots[0]), 400, 20_000)))
-        path = scipy.interpolate.CubicSpline(
-            dense, arm.frame_positions(tuple(frames.values()), course(dense))[0], axis=0
-        )
-        if not error > max(_HELD_POINT_TOLERANCE, 5 * noise):
-            for doubt in check_held_point_clock(joints, group, t, seen, by_angle, noise, path):
-                yield replace(doubt, recording=recording.name)
+        path = scipy.interpolate.CubicSpline(dense, arm.frame_positions(places, course(dense))[0], axis=0)
+        allowed = max(_HELD_POINT_TOLERANCE, 5 * noise)
+        if not error > allowed:
+            found = check_held_point_clock(joints, group, t, seen, by_angle, noise, path)
+            yield from (replace(issue, recording=recording.name) for issue in found)
             continue
         changes = [
             *_changed_lengths(seen, place),
             *_changed_names(seen, place, tuple(frames)),
             *_changed_times(path, knots, t, seen),
-            *_changed_zeros(arm, tuple(frames.values()), course(t), seen, (place, by_angle)),
+            *_changed_zeros(arm, places, course(t), seen, (place, by_angle)),
             *_moved(seen, place),
         ]
-        yield _explained(
-            changes, error, max(_HELD_POINT_TOLERANCE, 5 * noise), recording.name, group.name, "point_unlike"
-        )
+        yield _explained(changes, error, allowed, recording.name, group.name)
 
 
-def _explained(
-    changes: Sequence[_Change], error: float, allowed: float, recording: str, group: str, otherwise: str
-) -> Issue:
-    """The doubt that the change which explains most stands for; the first of those that do equally well."""
+def _explained(changes: Sequence[_Change], error: float, allowed: float, recording: str, group: str) -> Issue:
+    """The issue that the change which explains most stands for; the first of those that do equally well."""
     best = min((change.error for change in changes), default=math.inf)
-    chosen = next(
-        (c for c in changes if c.error <= max(1.3 * best, allowed) and c.error < _MAX_REMAINING_FRACTION * error), None
-    )
-    weight: Severity = "not_trusted"
+    good = (c for c in changes if c.error <= max(1.3 * best, allowed) and c.error < _MAX_REMAINING_FRACTION * error)
+    chosen, far = next(good, None), f"points are {error:.3g} m (rms) from where the model has them"
     if chosen is None:
-        what = f"points are {error:.3g} m (rms) from where the model has them, and no simple change explains it"
-        advice = "check the frame of the points, their names and the robot's description"
-        return Issue(otherwise, what, weight, error / allowed, advice, recording, group)
-    what = f"points are {error:.3g} m (rms) from where the model has them; {chosen.words} it is {chosen.error:.2g} m"
+        words, advice = (
+            f"{far}, and no simple change explains it",
+            "check the frame of the points, their names and the robot's description",
+        )
+        return Issue("point_unlike", words, "not_trusted", error / allowed, advice, recording, group)
+    words, where = f"{far}; {chosen.words} it is {chosen.error:.2g} m", "joints" if chosen.channel else group
+    depth = error / allowed
     return Issue(
         chosen.cause,
-        what,
-        weight,
-        error / allowed,
+        words,
+        "not_trusted",
+        depth,
         chosen.advice,
         recording,
-        "joints" if chosen.channel else group,
+        where,
         chosen.channel,
         setting=chosen.setting,
     )
@@ -313,17 +303,10 @@ def check_point_distances(
                 words = f"{said_as} is {far:.3g} m, {bound:.3g} m along the object"
         if worst > 1:
             unit = ratio > 5
-            yield Issue(
-                "point_scale" if unit else "point_reach",
-                words,
-                "not_trusted",
-                worst,
-                f"check the unit of positions (they are {ratio:.2g} times too far)"
-                if unit
-                else "check the frame of the points, the camera's pose and their names",
-                recording.name,
-                group.name,
-            )
+            cause, advice = "point_reach", "check the frame of the points, the camera's pose and their names"
+            if unit:
+                cause, advice = "point_scale", f"check the unit of positions (they are {ratio:.2g} times too far)"
+            yield Issue(cause, words, "not_trusted", worst, advice, recording.name, group.name)
 
 
 def _fixed(system: System, theta: Array, joint: int) -> list[float]:
@@ -334,15 +317,7 @@ def _fixed(system: System, theta: Array, joint: int) -> list[float]:
 def check_object_points(episode: Episode, result: EpisodePrediction, size: float) -> Iterator[Issue]:
     """Issues of object points that disagree grossly with a rollout at the parameters' initial values.
 
-    Gross errors, such as a mirror image, show even where the stiffnesses are wrong.
-
-    Parameters
-    ----------
-    episode : Episode
-    result : EpisodeResult
-        Of a rollout.
-    size : float
-        Of the object [m].
+    Gross errors, such as a mirror image, show even where the stiffnesses are wrong. `size` is that of the object [m].
     """
     for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
         names = samples.sensor.point_names
@@ -360,7 +335,7 @@ def check_object_points(episode: Episode, result: EpisodePrediction, size: float
         best = min(changes, key=lambda change: change.error)
         # a rollout with unknown stiffness is no yardstick for less than a clear answer
         if best.error < _MAX_REMAINING_FRACTION * error and best.error < allowed:
-            yield _explained([best], error, allowed, episode.name, samples.sensor.group_name, "point_unlike")
+            yield _explained([best], error, allowed, episode.name, samples.sensor.group_name)
 
 
 def _changed_pose(seen: Array, place: Array, pose: Array) -> Iterator[_Change]:
@@ -371,13 +346,10 @@ def _changed_pose(seen: Array, place: Array, pose: Array) -> Iterator[_Change]:
         return seen @ by[:3, :3].T + by[:3, 3]
 
     frame = "with the camera's pose applied"
-    yield _Change(
-        "point_frame", frame, "give positions in the world, not in the camera's frame", _rms(moved(pose) - place)
-    )
-    turned = "with the camera's pose the other way round"
-    yield _Change(
-        "point_frame", turned, "the pose is of the camera in the world: invert it", _rms(moved(pose @ pose) - place)
-    )
+    advice = "give positions in the world, not in the camera's frame"
+    yield _Change("point_frame", frame, advice, _rms(moved(pose) - place))
+    turned, advice = "with the camera's pose the other way round", "the pose is of the camera in the world: invert it"
+    yield _Change("point_frame", turned, advice, _rms(moved(pose @ pose) - place))
     for i, axis in enumerate("xyz"):
         flip = np.eye(4)
         flip[i, i] = -1
@@ -396,72 +368,53 @@ def check_cable_points(cable: CableTopology, recording: Recording, gravity: Arra
         if len(edges) < 3:
             continue
         rest = {name: np.asarray(cable.undeformed_positions[name], float) for name in at}
-
-        def lengths(where: Mapping[str, Array], pairs: Sequence[tuple[str, str]] = tuple(edges)) -> Array:
-            return np.array([np.nanmedian(np.linalg.norm(where[a] - where[b], axis=-1)) for a, b in pairs])
-
-        measured, known = lengths(at), lengths(rest)
-        ratio = measured / known
-        typical = float(np.median(ratio))
+        typical = float(np.median(_lengths(at, edges) / _lengths(rest, edges)))
+        found: list[Issue | None] = [_exchanged(at, rest, edges), _upside_down(cable, at, rest, gravity)]
         if abs(typical - 1) > _LENGTH_RTOL:
-            yield Issue(
-                "point_scale",
-                f"edges between points are {typical:.3g} times as long as in the undeformed shape",
-                "not_trusted",
-                abs(math.log(typical)) / math.log(1 + _LENGTH_RTOL),
-                f"divide positions by {typical:.3g}",
-                recording.name,
-                group.name,
-            )
-        else:
-            yield from _exchanged(at, rest, edges, ratio, lengths, recording.name, group.name)
-        yield from _upside_down(cable, at, rest, gravity, recording.name, group.name)
+            words = f"edges between points are {typical:.3g} times as long as in the undeformed shape"
+            depth = abs(math.log(typical)) / math.log(1 + _LENGTH_RTOL)
+            found[0] = Issue("point_scale", words, "not_trusted", depth, f"divide positions by {typical:.3g}", "")
+        for issue in found:
+            if issue is not None:
+                yield replace(issue, recording=recording.name, group=group.name)
 
 
-def _exchanged(
-    at: Mapping[str, Array],
-    rest: Mapping[str, Array],
-    edges: Sequence[tuple[str, str]],
-    ratio: Array,
-    lengths: Callable[[Mapping[str, Array]], Array],
-    recording: str,
-    group: str,
-) -> Iterator[Issue]:
+def _lengths(where: Mapping[str, Array], edges: Sequence[tuple[str, str]]) -> Array:
+    return np.array([np.nanmedian(np.linalg.norm(where[a] - where[b], axis=-1)) for a, b in edges])
+
+
+def _exchanged(at: Mapping[str, Array], rest: Mapping[str, Array], edges: Sequence[tuple[str, str]]) -> Issue | None:
     """Points whose edges have the right length once two of them are exchanged."""
-    off = np.abs(np.log(ratio)) > math.log(1.6)
+    known, most = _lengths(rest, edges), math.log(1.6)
+    ratio = _lengths(at, edges) / known
+    off = np.abs(np.log(ratio)) > most
     if not off.any():
-        return
-    known = lengths(rest)
+        return None
     suspects = sorted({name for edge, bad in zip(edges, off, strict=True) if bad for name in edge})
     best, least = ("", ""), int(off.sum())
     for one, two in itertools.combinations(suspects, 2):
         swapped = {**at, one: at[two], two: at[one]}
-        left = int(np.sum(np.abs(np.log(lengths(swapped) / known)) > math.log(1.6)))
+        left = int(np.sum(np.abs(np.log(_lengths(swapped, edges) / known)) > most))
         if left < least:
             best, least = (one, two), left
     worst = int(np.argmax(np.abs(np.log(ratio))))
-    what = f"the edge {edges[worst][0]} to {edges[worst][1]} is {ratio[worst]:.3g} times as long as undeformed"
-    swap = least < 0.5 * off.sum()
-    yield Issue(
-        "point_swapped" if swap else "point_reach",
-        what + (f"; with {best[0]} and {best[1]} exchanged, {int(off.sum()) - least} edges are right" if swap else ""),
-        "not_trusted",
-        float(abs(math.log(ratio[worst]))) / math.log(1.6),
-        f"exchange {best[0]} and {best[1]}" if swap else "check the names of the points",
-        recording,
-        group,
-    )
+    words = f"the edge {edges[worst][0]} to {edges[worst][1]} is {ratio[worst]:.3g} times as long as undeformed"
+    cause, advice = "point_reach", "check the names of the points"
+    if least < 0.5 * off.sum():
+        words += f"; with {best[0]} and {best[1]} exchanged, {int(off.sum()) - least} edges are right"
+        cause, advice = "point_swapped", f"exchange {best[0]} and {best[1]}"
+    return Issue(cause, words, "not_trusted", float(abs(math.log(ratio[worst]))) / most, advice, "")
 
 
 def _upside_down(
-    cable: CableTopology, at: Mapping[str, Array], rest: Mapping[str, Array], gravity: Array, recording: str, group: str
-) -> Iterator[Issue]:
+    cable: CableTopology, at: Mapping[str, Array], rest: Mapping[str, Array], gravity: Array
+) -> Issue | None:
     """A cable that rises between its clamps by more than its own shape does: gravity points the other way."""
     pull = float(np.linalg.norm(gravity))
     free = [name for name in cable.free_vertices if name in at]
     ends = [name for name in (cable.parent_vertices[0], cable.parent_vertices[-1]) if name in at]
     if pull == 0 or len(ends) < 2 or not free:
-        return
+        return None
     up = -gravity / pull
 
     def rise(where: Mapping[str, Array]) -> float:
@@ -469,16 +422,9 @@ def _upside_down(
         return float(np.nanmean([np.nanmean((where[name] - chord) @ up) for name in free]))
 
     span = sum(float(np.linalg.norm(rest[a] - rest[b])) for a, b in cable.edges if a in rest and b in rest)
-    own = abs(rise(rest))
-    height = rise(at) / span
-    if height > 0.05 + own / span:
-        yield Issue(
-            "point_mirrored",
-            f"the cable's points are on average {height * span:.3g} m above its clamps, against gravity",
-            "not_trusted",
-            height / (0.05 + own / span),
-            "check which axis points up, or set model.gravity",
-            recording,
-            group,
-            setting="model.gravity",
-        )
+    height, allowed = rise(at) / span, 0.05 + abs(rise(rest)) / span
+    if not height > allowed:
+        return None
+    words = f"the cable's points are on average {height * span:.3g} m above its clamps, against gravity"
+    advice, line = "check which axis points up, or set model.gravity", "model.gravity"
+    return Issue("point_mirrored", words, "not_trusted", height / allowed, advice, "", setting=line)

@@ -1,4 +1,4 @@
-"""Offset and drift of point clocks relative to the joint clock.
+"""Offset and drift of point clocks relative to the joint clock, and checks of a fit's residuals.
 
 A point that is seen at the stamp t is where it was at t - late - drift (t - middle), so that to first order
 
@@ -18,25 +18,28 @@ import numpy as np
 import scipy.optimize
 from numpy.typing import NDArray
 
-from yid_ocp.data.issues import Issue, median_sample_period
+from yid_ocp.analysis.joint_checks import effect_setting_line
+from yid_ocp.data.issues import MIN_NOISE_DIFFERENCES, QUALITY_LIMITS, Issue, Severity, median_sample_period
 from yid_ocp.data.recording import JointGroup, PointGroup
+from yid_ocp.inference.null_test import residual_channels
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.episodes import EpisodePrediction
+from yid_ocp.problem.evaluation import Evaluation
+from yid_ocp.problem.measurements import Measurements
 
 Array = NDArray[np.float64]
+
 PositionFunction = Callable[[Array], Array]
 """From times on the joints' clock (N,) to places (N, np, 3) [m]."""
 
-_MIN_Z = 5.0
-"""Standard deviations from which on a clock's error counts."""
+_MIN_Z = 5.0  # standard deviations from which on a clock's error counts
 _MAX_EXPOSURE_TIME = 0.04
 """No sensor takes longer for one sample: a slow camera knows when a frame was taken better than to its period [s]."""
-N_TIME_BLOCKS = 10
-"""Blocks of time whose errors count as independent of each other."""
-_MAX_DRIFT = 0.05
-"""Part by which clocks that were meant to agree may run apart."""
-_DRIFT_SEARCH_STEP = 0.2
-"""How far clocks run apart between two drifts that are tried first [s]."""
-_N_RELINEARIZATIONS = 3
-"""So many times a fit is repeated at the times that the last one found."""
+_N_TIME_BLOCKS = 10  # blocks of time whose errors count as independent of each other
+_MAX_DRIFT = 0.05  # part by which clocks that were meant to agree may run apart
+_DRIFT_SEARCH_STEP = 0.2  # how far clocks run apart between two drifts that are tried first [s]
+_N_RELINEARIZATIONS = 3  # so many times a fit is repeated at the times that the last one found
+_MIN_EXPLAINED_FRACTION = 0.5  # part of what a fit leaves beyond noise that a drift has to explain
 _FRAME_ERROR_STD, _ENCODER_ZERO_STD = 0.02, 0.02
 """Usual errors of a frame [m, rad] and of an encoder's zero [rad], which must not pass for a clock's."""
 
@@ -47,8 +50,6 @@ class ClockError:
 
     Attributes
     ----------
-    first_time, last_time : float
-        First and last time of the group [s].
     stamp_delay, stamp_delay_std : float
         Recorded stamp minus true time, in the middle of the group [s].
     relative_drift, relative_drift_std : float
@@ -102,11 +103,10 @@ def estimate_clock_error(
     residual : ndarray, shape (R,)
         Expected less seen, in units of the noise.
     own : ndarray, shape (R, 2)
-        Its derivatives by how late stamps are in the middle and by how far they run apart; see `clock_sensitivities` [1/s].
+        Its derivatives by offset and accumulated drift; see `clock_sensitivities` [1/s].
     others : ndarray, shape (R, k)
-        Its derivatives by other unknowns.
+        Its derivatives by other unknowns, whose usual sizes are `size`.
     size : ndarray, shape (k,)
-        Their usual sizes.
     span : (float, float)
         First and last time of the group [s].
 
@@ -117,7 +117,7 @@ def estimate_clock_error(
     """
     begin, end = span
     length, data = max(end - begin, 1e-9), len(t)
-    if not np.all(np.sum(own**2, axis=0) > 0) or data < 3 * N_TIME_BLOCKS:
+    if not np.all(np.sum(own**2, axis=0) > 0) or data < 3 * _N_TIME_BLOCKS:
         return None
     rows = np.vstack([np.hstack([own, others]), np.hstack([np.zeros((len(size), 2)), np.diag(1 / size)])])
     target = np.concatenate([residual, np.zeros(len(size))])
@@ -128,10 +128,10 @@ def estimate_clock_error(
     plain = rows[:, 2:]
     base = target - plain @ np.linalg.lstsq(plain, target, rcond=None)[0]
     after, before = (float(np.sum(x[:data] ** 2)) for x in (remains, base))
-    block = np.clip(((t - begin) / length * N_TIME_BLOCKS).astype(int), 0, N_TIME_BLOCKS - 1)
-    scores = np.zeros((N_TIME_BLOCKS, rows.shape[1]))
+    block = np.clip(((t - begin) / length * _N_TIME_BLOCKS).astype(int), 0, _N_TIME_BLOCKS - 1)
+    scores = np.zeros((_N_TIME_BLOCKS, rows.shape[1]))
     np.add.at(scores, block, rows[:data] * remains[:data, None])
-    middle = scores.T @ scores * N_TIME_BLOCKS / (N_TIME_BLOCKS - 1)
+    middle = scores.T @ scores * _N_TIME_BLOCKS / (_N_TIME_BLOCKS - 1)
     mean_square = max(after / max(data - 2 - len(size), 1), 1.0)
     spread = np.maximum(np.diag(inverse @ middle @ inverse), mean_square * np.diag(inverse))
     std = np.sqrt(spread)
@@ -149,8 +149,6 @@ def check_held_point_clock(
 
     Parameters
     ----------
-    joints : JointGroup
-    group : PointGroup
     t : ndarray, shape (N,)
         Times at which they are compared.
     seen : ndarray, shape (N, np, 3)
@@ -159,7 +157,6 @@ def check_held_point_clock(
         Derivative of their places by the angles.
     std : float
         Noise of the points [m]; zero where nobody says.
-    path : callable
     """
     begin, end, step = float(t[0]), float(t[-1]), 0.5 * median_sample_period(joints.t)
     shifted = np.broadcast_to(np.eye(3), (*seen.shape, 3))
@@ -189,45 +186,37 @@ def check_held_point_clock(
 
 
 def _said(found: ClockError, joints: JointGroup, group: PointGroup, matters: bool) -> Iterator[Issue]:
-    limit = clock_offset_tolerance(joints, group)
-    camera = "camera" in group.name.lower() or "camera" in group.sensor.lower() or group.pose is not None
-    use = f"sensors.{group.name}.use: false"
+    limit, late, std = clock_offset_tolerance(joints, group), found.stamp_delay, found.stamp_delay_std
     if found.has_drift and abs(found.accumulated_drift) > limit:
-        yield clock_drift_issue(found, group.name, limit, matters)
-    elif found.has_delay and abs(found.stamp_delay) > limit:
-        known = (
-            f"model.effects: [{{kind: camera_latency, location: camera, values: {{delay: {found.stamp_delay:.3g}}}}}]"
+        yield _clock_drift_issue(found, group.name, limit, matters)
+    elif found.has_delay and abs(late) > limit:
+        words = (
+            f"{group.name} is stamped {1e3 * late:+.3g} ± {1e3 * std:.2g} ms from the joints; "
+            f"{1e3 * limit:.3g} ms are in doubt anyway, as samples stand for a period"
         )
-        yield Issue(
-            "clock_offset",
-            f"{group.name} is stamped {1e3 * found.stamp_delay:+.3g} ± {1e3 * found.stamp_delay_std:.2g} ms from the joints; "
-            f"{1e3 * limit:.3g} ms are in doubt anyway, as samples stand for a period",
-            "not_trusted" if matters else "warning",
-            abs(found.stamp_delay) / limit,
-            f"subtract {found.stamp_delay:.3g} s from their times",
-            "",
-            group.name,
-            "t",
-            setting=known if camera and found.stamp_delay > 0 else use,
-        )
+        camera = "camera" in group.name.lower() or "camera" in group.sensor.lower() or group.pose is not None
+        setting = f"sensors.{group.name}.use: false"
+        if camera and late > 0:
+            setting = effect_setting_line("camera_latency", "camera", "delay", late)
+        advice, severity = f"subtract {late:.3g} s from their times", _severity(matters)
+        yield Issue("clock_offset", words, severity, abs(late) / limit, advice, "", group.name, "t", setting=setting)
 
 
-def clock_drift_issue(found: ClockError, group: str, limit: float, matters: bool) -> Issue:
+def _severity(matters: bool) -> Severity:
+    return "not_trusted" if matters else "warning"
+
+
+def _clock_drift_issue(found: ClockError, group: str, limit: float, matters: bool) -> Issue:
     """The data-quality issue of a drifting point clock."""
-    first, last = found.stamp_delay - 0.5 * found.accumulated_drift, found.stamp_delay + 0.5 * found.accumulated_drift
-    return Issue(
-        "clock_drift",
-        f"{group} is stamped {1e3 * first:+.3g} ms from the joints at its beginning, {1e3 * last:+.3g} ms at its end: "
-        f"its clock runs {1e3 * abs(found.relative_drift):.2g} ± {1e3 * found.relative_drift_std:.1g} parts per thousand too "
-        f"{'fast' if found.relative_drift > 0 else 'slowly'}",
-        "not_trusted" if matters else "warning",
-        abs(found.accumulated_drift) / limit,
-        timestamp_correction(found.stamp_delay, found.relative_drift, 0.5 * (found.first_time + found.last_time)),
-        "",
-        group,
-        "t",
-        setting=f"sensors.{group}.use: false",
+    late, drift, whole = found.stamp_delay, found.relative_drift, found.accumulated_drift
+    words = (
+        f"{group} is stamped {1e3 * (late - 0.5 * whole):+.3g} ms from the joints at its beginning, "
+        f"{1e3 * (late + 0.5 * whole):+.3g} ms at its end: its clock runs {1e3 * abs(drift):.2g} ± "
+        f"{1e3 * found.relative_drift_std:.1g} parts per thousand too {'fast' if drift > 0 else 'slowly'}"
     )
+    advice = timestamp_correction(late, drift, 0.5 * (found.first_time + found.last_time))
+    setting = f"sensors.{group}.use: false"
+    return Issue("clock_drift", words, _severity(matters), abs(whole) / limit, advice, "", group, "t", setting=setting)
 
 
 def timestamp_correction(late: float, drift: float, middle: float) -> str:
@@ -245,7 +234,6 @@ def search_clock_error(
 
     Parameters
     ----------
-    path : callable
     knots : (float, float)
         First and last time at which it is known [s].
     t : ndarray, shape (N,)
@@ -278,3 +266,100 @@ def search_clock_error(
         lambda x: min(error(x[0], x[1] / span), 1e300), [late, drift * span], method="Nelder-Mead"
     )
     return float(fine.x[0]), float(fine.x[1]) / span
+
+
+# -- residuals of a fit ------------------------------------------------------------------------------------------------
+
+
+def check_fit_residuals(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> list[Issue]:
+    """New data-quality issues found in the residuals of a fit: drifting clocks and overstated noise.
+
+    A constant offset of a camera's clock looks like damping that the model lacks; to tell the two is a diagnosis's task
+    (effect `camera_latency`). One that grows over a recording is a clock's.
+    """
+    if not evaluation.ok or evaluation.jacobian is None or problem.data_noise_unit != 1.0:
+        return []
+    known = {(issue.cause, issue.recording, issue.group) for issue in problem.options.data_issues}
+    found = [*_drifts(problem, x, evaluation), *_overstated(problem, evaluation)]
+    return [issue for issue in found if (issue.cause, issue.recording, issue.group) not in known]
+
+
+def _drifts(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Iterator[Issue]:
+    assert evaluation.jacobian is not None
+    times = np.zeros(len(evaluation.residual))
+    for series in residual_channels(problem):
+        times[series.residual_indices] = series.t
+    size = np.ones(len(problem.initial_unknowns))
+    for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episode_predictions, strict=True)):
+        joints, slices = episode.recording.joints, problem.residual_rows.measurements[i]
+        own = slice(slices[0].start, slices[-1].stop) if slices else slice(0)
+        for k, samples in enumerate(episode.measurements):
+            group = next((g for g in episode.recording.points if g.name == samples.sensor.group_name), None)
+            few = samples.n_residuals < MIN_NOISE_DIFFERENCES
+            if joints is None or group is None or few or not samples.sensor.point_names:
+                continue
+            late = _by_lateness(problem, x, i, samples, result)
+            at = slice(slices[k].start - own.start, slices[k].stop - own.start)
+            t = times[own]
+            span = float(np.min(t[at])), float(np.max(t[at]))
+            columns = np.zeros((len(t), 3))  # the first is for what a filter expects, which is no derivative
+            columns[at, 1:] = clock_sensitivities(t[at], late[samples.is_used], span)
+            whitening = problem.whitening_filters[i]
+            if whitening is not None:
+                columns = whitening.whiten(columns, None)[0]
+            jacobian = evaluation.jacobian[own] * problem.unknown_scales
+            error = estimate_clock_error(t, evaluation.residual[own], columns[:, 1:], jacobian, size, span)
+            limit = clock_offset_tolerance(joints, group)
+            if error is None or not error.has_drift or not abs(error.accumulated_drift) > limit:
+                continue
+            if error.explained_excess_fraction > _MIN_EXPLAINED_FRACTION:
+                yield _clock_drift_issue(error, group.name, limit, True)
+
+
+def _by_lateness(
+    problem: EstimationProblem, x: Array, i: int, samples: Measurements, result: EpisodePrediction
+) -> Array:
+    """Whitened prediction less measurement per second that the stamps are late, shape (M, k)."""
+    theta = problem.predictor.episode_theta(problem.episodes[i], problem.split(x, i)[0])
+    state = result.rollout.state
+    none = np.zeros((*state.shape, len(problem.unknowns.free_parameters)))
+    steps = np.ones(samples.value.shape[1])
+    ahead, behind = (
+        problem.predictor.readings_along_trajectory(samples.delayed_by(s * steps), state, none, theta)[0]
+        for s in (-1.0, 1.0)
+    )
+    return np.asarray(samples.weight * (ahead - behind) / (2 * problem.step.time_step))
+
+
+def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[Issue]:
+    """Groups whose residuals, also summed over blocks of time as what lasts for long sums up, are far below noise."""
+    by_group: dict[str, list[tuple[float, float, int]]] = {}
+    units = {}
+    for series in residual_channels(problem):
+        r = evaluation.residual[series.residual_indices]
+        if len(r) < MIN_NOISE_DIFFERENCES:
+            continue
+        sums = np.array([part.sum() / math.sqrt(len(part)) for part in np.array_split(r, _N_TIME_BLOCKS)])
+        entry = float(r @ r), float(sums @ sums) / _N_TIME_BLOCKS * len(r), len(r)
+        by_group.setdefault(series.group, []).append(entry)
+        units[series.group] = series.unit
+    for group, parts in by_group.items():
+        count = sum(entry[2] for entry in parts)
+        free = count - len(problem.initial_unknowns)
+        if free < 0.5 * count:
+            continue
+        seen = math.sqrt(max(sum(entry[i] for entry in parts) for i in (0, 1)) / free)
+        if not seen < 1 / QUALITY_LIMITS.max_overstatement_ratio:
+            continue
+        stated = [s.std[s.is_used] for e in problem.episodes for s in e.measurements if s.sensor.group_name == group]
+        usual = float(np.median(np.concatenate(stated)))
+        unit, least = units[group], QUALITY_LIMITS.max_overstatement_ratio
+        words = (
+            f"the fit leaves {seen * usual:.2g} {unit} of {group}, all slow errors counted; "
+            f"{usual:.2g} {unit} is stated"
+        )
+        advice = "state the noise that is there: as stated every ± is too wide, and a small gap is not seen"
+        setting = "" if problem.has_process_noise else f"sensors.{group}.std: {seen * usual:.2g}"
+        severity = 1 / (least * max(seen, 1e-9))
+        where = group.partition(".")[0]
+        yield Issue("noise_overstated", words, "warning", severity, advice, "", where, setting=setting)

@@ -1,0 +1,444 @@
+"""Errors of links and time steps: shift of estimates, natural frequencies, gaps of open grasps, numerical stability."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import casadi as ca
+import numpy as np
+import scipy.optimize
+from numpy.typing import ArrayLike, NDArray
+
+from yid_ocp.inference.linearized_residual import bounded_least_squares_step
+from yid_ocp.inference.uncertainty import ParameterEstimate, verdict_by_relative_std
+from yid_ocp.inference.whitening import whitened_at
+from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
+from yid_ocp.integrator.rollout import simulate
+from yid_ocp.integrator.statics import Equilibrium, EquilibriumSolver
+from yid_ocp.integrator.step import Step, compile_step
+from yid_ocp.integrator.step_model import Rollout, TrackingFeedback
+from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.system import System
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
+from yid_ocp.problem.unknown_vector import INITIAL_STATE_PREFIX
+
+Array = NDArray[np.float64]
+
+_START_ANGLE_PREFIX = f"{INITIAL_STATE_PREFIX}q."
+_NORMAL_QUANTILE_95 = 1.96
+_EXTRAPOLATION_FACTOR = 2.0
+"""Distance to the limit of many links or short steps over the move of one halving, where the error falls as their size:
+m + m/2 + m/4 + ... What falls faster has less to go."""
+
+
+@dataclass(frozen=True)
+class DiscretisationShift:
+    """Shift of one estimate with every link divided in two, and with half the time step, in its own unit.
+
+    None where not tried or where the finer model could not be rolled out.
+    """
+
+    links: float | None = None
+    time_step: float | None = None
+
+    def inflated_std(self, std: float) -> float:
+        """Standard deviation combined, in quadrature, with the shifts that exceed it.
+
+        Such a shift counts `_EXTRAPOLATION_FACTOR` times: the extrapolated distance from the limit of a fine model.
+        """
+        found = [move for move in (self.links, self.time_step) if move is not None and abs(move) > std]
+        return math.hypot(std, *(_EXTRAPOLATION_FACTOR * move for move in found)) if found else std
+
+
+@dataclass(frozen=True)
+class RefinedProblem:
+    """An estimation problem with a finer discretisation, and how its unknowns map to the coarse ones.
+
+    Attributes
+    ----------
+    parameter_factors : mapping of str to float
+        Factor from a coarse parameter to the same physical object in the finer model; 1 for absent names.
+    subdivided_joints : mapping of str to tuple of str
+        For each joint of a divided link, the fine joints that share its angle.
+    """
+
+    problem: EstimationProblem
+    parameter_factors: Mapping[str, float] = field(default_factory=dict)
+    subdivided_joints: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def parameter_factor(self, name: str) -> float:
+        """Coarse-to-fine factor of an unknown, whose name may include its recording."""
+        return float(self.parameter_factors.get(name.split("[")[0], 1.0))
+
+    def unknowns_from_coarse(self, names: Sequence[str], x: Array) -> Array:
+        """The fine problem's unknowns that correspond to a coarse unknown vector, clipped to the bounds.
+
+        In an estimated initial state, divided links share their angle and begin at rest.
+        """
+        made, at = self.problem.initial_unknowns, {name: i for i, name in enumerate(self.problem.unknown_names)}
+        for name, value in zip(names, x, strict=True):
+            base, bracket, recording = name.partition("[")
+            joint = base.rpartition(".")[2] if base.startswith(INITIAL_STATE_PREFIX) else ""
+            parts = self.subdivided_joints.get(joint)
+            if parts is None and name in at:
+                made[at[name]] = value * self.parameter_factor(name)
+            elif parts is not None and base.startswith(_START_ANGLE_PREFIX):
+                for part in parts:
+                    made[at[f"{_START_ANGLE_PREFIX}{part}{bracket}{recording}"]] = value / len(parts)
+        return np.clip(made, *self.problem.bounds)
+
+    def equilibrium_guesses_from_coarse(self, coarse: System, found: EquilibriumGuesses) -> EquilibriumGuesses:
+        """Initial guesses for the fine model's equilibria, from the coarse ones."""
+        return tuple(None if q is None else self._shape(coarse, q) for q in found)
+
+    def _shape(self, coarse: System, q: Array) -> Array:
+        tree = self.problem.system.mechanism
+        fine = np.zeros(len(tree.joints))
+        for name, angle in zip(coarse.mechanism.joint_names, q, strict=True):
+            parts = self.subdivided_joints.get(name, (name,))
+            fine[[tree.joint_index(part) for part in parts]] = angle / len(parts)
+        return fine
+
+
+def joint_subdivision(coarse: System, fine: System) -> dict[str, tuple[str, ...]]:
+    """For each divided joint of the coarse model, the names of the fine joints that replace it."""
+    found = {}
+    for segment in coarse.segment_layouts:
+        links = fine.segment_layout(segment.name).link_joints
+        times = len(links) // len(segment.link_joints)
+        for i, joints in enumerate(segment.link_joints):
+            for axis, joint in enumerate(joints):
+                found[joint] = tuple(links[times * i + k][axis] for k in range(times))
+    return {joint: parts for joint, parts in found.items() if len(parts) > 1}
+
+
+def discretisation_shifts(
+    refined: RefinedProblem,
+    coarse: EstimationProblem,
+    x: Array,
+    at_x: Evaluation,
+    *,
+    model_difference_only: bool = False,
+) -> dict[str, float] | str:
+    """Shift of each shared free parameter by one Gauss-Newton step of a finer model from the coarse unknowns x (nx,).
+
+    Data, bounds and priors are those of the coarse problem. With `model_difference_only` the coarse model's prediction
+    replaces the data, so that away from an estimate only the difference between the two models counts. `at_x` is the
+    coarse problem's evaluation there.
+
+    Returns
+    -------
+    dict of str to float, or str
+        In the coarse parameters' units; a message where the step cannot be made.
+    """
+    point = refined.unknowns_from_coarse(coarse.unknown_names, x)
+    warm = refined.equilibrium_guesses_from_coarse(coarse.system, at_x.equilibrium_guesses)
+    weighted = any(own is not None for own in coarse.whitening_filters)
+    problem = whitened_at(refined.problem, point, warm, rounds=2) if weighted else refined.problem
+    evaluation = problem.evaluate(point, equilibrium_guesses=warm)
+    if not evaluation.ok or evaluation.jacobian is None:
+        return evaluation.message
+    residual = evaluation.residual
+    if model_difference_only:
+        if problem.residual_rows != coarse.residual_rows:
+            return "the finer model is compared at other samples"
+        residual = residual - at_x.residual
+    lower, upper = (bound - point for bound in problem.bounds)
+    scale = problem.unknown_scales
+    step = scale * bounded_least_squares_step(evaluation.jacobian * scale, residual, 0.0, lower / scale, upper / scale)
+    at = {name: i for i, name in enumerate(problem.unknown_names)}
+    return {name: float(step[at[name]]) / refined.parameter_factor(name) for name in problem.shared_parameters}
+
+
+def inflate_estimates(
+    estimates: Mapping[str, ParameterEstimate],
+    found: Mapping[str, DiscretisationShift],
+    sizes: Mapping[str, float] | None = None,
+) -> dict[str, ParameterEstimate]:
+    """Estimates whose standard deviation, interval and verdict include their discretisation shift.
+
+    A verdict is only ever lowered. `sizes` are typical ones, as in `inference.uncertainty.parameter_verdict`.
+    """
+    counted = dict(estimates)
+    for name, own in found.items():
+        entry = counted[name]
+        std = own.inflated_std(entry.std)
+        if not entry.free or not std > entry.std:
+            continue
+        said = _worse_verdict(entry.verdict, verdict_by_relative_std(entry.value, std, (sizes or {}).get(name, 0.0)))
+        interval = entry.interval
+        if interval is not None:
+            further = _NORMAL_QUANTILE_95 * math.sqrt(std**2 - entry.std**2)
+            low, high = interval
+            low = None if low is None else max(low - further, entry.lower)
+            interval = low, None if high is None else min(high + further, entry.upper)
+        counted[name] = replace(entry, std=std, verdict=said, interval=interval)
+    return counted
+
+
+def _worse_verdict(before: str, after: str) -> str:
+    """The worse of two verdicts; `before` where either is not one of the three ranked ones."""
+    ranks = ("identifiable", "weak", "not_identifiable")
+    if before not in ranks or after not in ranks:
+        return before
+    return max(before, after, key=ranks.index)
+
+
+_DAMPING_PARAMETERS = ("damping", "twist_damping")
+
+
+@dataclass(frozen=True)
+class NaturalFrequencies:
+    """Natural frequencies of one step map about an equilibrium, its robot held still.
+
+    Attributes
+    ----------
+    frequencies_hz : ndarray, shape (k,)
+        Undamped, ascending [Hz].
+    n_unstable_modes : int
+        Number of damped modes that still grow from step to step: the equilibrium is unstable, or the time step is too
+        long for the tension that the grasps put on the object.
+    message : str
+        Why there are no frequencies, empty otherwise.
+    """
+
+    frequencies_hz: Array
+    n_unstable_modes: int = 0
+    message: str = ""
+
+
+def _with_prescribed_joints(system: System) -> System:
+    """The system with its driven joints prescribed."""
+    return replace(system, driven=(), servos={}, prescribed=(*system.driven, *system.prescribed))
+
+
+def natural_frequencies(
+    system: System,
+    posture: Mapping[str, float],
+    theta: Array,
+    time_step: float,
+    force_split: ForceSplit = "symmetric",
+    constraint_force: ConstraintForcePlacement = "midpoint",
+    guess: Array | None = None,
+) -> NaturalFrequencies:
+    """Natural frequencies of a system's step map about an equilibrium, from the eigenvalues of A_k without damping.
+
+    Parameters
+    ----------
+    posture : mapping of str to float
+        Driven and prescribed coordinates [rad or m], held still.
+    theta : ndarray, shape (ntheta,)
+    time_step : float
+        h [s]; the midpoint rule lowers a frequency f to atan(pi f h)/(pi h).
+    force_split, constraint_force : str
+        As in `compile_step`; the split affects growth, not the undamped frequencies.
+    guess : ndarray, shape (n,), optional
+        Configuration from which rest is sought.
+    """
+    still = _with_prescribed_joints(system)
+    if not still.free_indices:
+        return NaturalFrequencies(np.zeros(0), message="every coordinate is prescribed, nothing can swing")
+    step = compile_step(still, time_step, force_split, constraint_force, use_compiler=False)
+    known = np.array([posture[name] for name in still.prescribed])
+    rest = EquilibriumSolver(step).solve(known, theta, guess=guess)
+    if not rest.is_converged:
+        return NaturalFrequencies(np.zeros(0), message=rest.message)
+    undamped = theta.copy()
+    for i, name in enumerate(system.parameters.names):
+        if name.rpartition(".")[2] in _DAMPING_PARAMETERS:
+            undamped[i] = 0.0
+    angles = np.sort(np.angle(_eigenvalues(step, rest, known, undamped)))
+    turning = angles[(angles > 1e-7) & (angles < math.pi - 1e-7)]
+    growing = int(np.sum(np.abs(_eigenvalues(step, rest, known, theta)) > 1 + 1e-6))
+    return NaturalFrequencies(turning / (2 * math.pi * time_step), growing)
+
+
+def _eigenvalues(step: Step, rest: Equilibrium, known: Array, theta: Array) -> Array:
+    """Eigenvalues of A at rest that belong to motion, not to what the constraints take away."""
+    n = step.system.n_coordinates
+    q, p, z = rest.state[:n], rest.state[n : 2 * n], rest.state[2 * n :]
+    a, _, _ = step.jacobians(q, p, np.zeros(0), theta, (known, known), z, names=())
+    free = np.array(step.system.free_indices)
+    rows = np.concatenate([free, n + free])
+    values: Array = np.linalg.eigvals(a[np.ix_(rows, rows)])
+    return values[np.abs(values) > 0.2]
+
+
+def min_grasp_gaps(system: System, posture: Mapping[str, float], theta: Array) -> dict[str, float]:
+    """Smallest remaining gap of each grasp [m], by name: the robot's joints are fixed, the object may bend.
+
+    `posture` are driven and prescribed coordinates [rad or m]; lengths are taken from `theta`.
+    """
+    if not system.grasps:
+        return {}
+    q = ca.SX.sym("q", system.n_coordinates)
+    kinematics = forward_kinematics(system.mechanism, q)
+    symbols = ca.vertcat(system.parameters.symbols, *system.internal_coordinates.values())
+    numbers = np.concatenate([theta, np.zeros(len(system.internal_coordinates))])
+    ends = [grasp.constraint_residual(kinematics)[:3] for grasp in system.grasps]
+    phi = ca.substitute(ca.vertcat(*ends), symbols, ca.SX(ca.DM(numbers)))
+    known = [system.mechanism.joint_index(name) for name in posture]
+    free = [i for i in range(system.n_coordinates) if i not in known]
+    full = np.zeros(system.n_coordinates)
+    full[known] = list(posture.values())
+    function = ca.Function("phi", [q], [phi, ca.jacobian(phi, q)[:, free]])
+
+    def at(x: Array) -> Array:
+        full[free] = x
+        return full
+
+    best: Array | None = None
+    for seed in range(4):
+        start = np.random.default_rng(seed).normal(scale=0.1, size=len(free))
+        # a little stiffness keeps the search from winding the object up
+        found = scipy.optimize.least_squares(
+            lambda x: np.concatenate([np.array(function(at(x))[0]).ravel(), 1e-4 * x]),
+            start,
+            lambda x: np.vstack([np.array(ca.densify(function(at(x))[1])), 1e-4 * np.eye(len(free))]),
+            max_nfev=100,
+        )
+        gap = np.array(function(at(found.x))[0]).ravel()
+        if best is None or np.linalg.norm(gap) < np.linalg.norm(best):
+            best = gap
+        if np.linalg.norm(best) < 1e-3:
+            break
+    assert best is not None
+    distances = np.linalg.norm(best.reshape(-1, 3), axis=1)
+    return {grasp.name: float(distance) for grasp, distance in zip(system.grasps, distances, strict=True)}
+
+
+_N_CHECKED_NODES, _MIN_CHECKED_NODES = 24, 4
+"""Nodes at which the linearised step is looked at: of all motions together, and of one at least."""
+
+_MAX_GROWTH_DECADES = 6.0
+"""Powers of ten by which an alternating error may grow: from the rounding of a step (1e-12) to what no sensor sees."""
+
+
+@dataclass(frozen=True)
+class StepErrorGrowth:
+    """Growth of errors that alternate in sign from step to step along one motion.
+
+    What a body does by itself goes on in one direction for several steps; a mode of the linearised step whose
+    eigenvalue has a negative real part turns back at every step, and is the method's own. Where its magnitude exceeds
+    one, the equations no longer follow the body, however well Newton solves them.
+
+    Attributes
+    ----------
+    growth_decades : float
+        Powers of ten by which such an error grows over the stretch of the motion on which it grows most.
+    max_step_factor : float
+        Largest growth in one step.
+    max_growth_time : float
+        Time of this largest growth, from the start of the motion [s].
+    """
+
+    recording_name: str
+    growth_decades: float
+    max_step_factor: float
+    max_growth_time: float
+    time_step: float
+
+    @property
+    def is_stable(self) -> bool:
+        """Whether rounding errors stay below sensor resolution."""
+        return self.growth_decades <= _MAX_GROWTH_DECADES
+
+    @property
+    def description(self) -> str:
+        """A sentence on the stability and, where unstable, on the remedy."""
+        step = f"{self.recording_name}: the step of {self.time_step:g} s is"
+        if self.is_stable:
+            return f"{step} stable along the motion"
+        grows = f"grows by {100 * (self.max_step_factor - 1):.2g} % in a step at {self.max_growth_time:.3g} s"
+        return (
+            f"{step} not stable: an error that alternates from step to step {grows}; "
+            f"take a shorter problem.time_step ({self.time_step / 2:g} s, say)"
+        )
+
+
+def _error_growth_along(
+    step: Step,
+    theta: ArrayLike,
+    rollout: Rollout,
+    feedback: TrackingFeedback | None = None,
+    name: str = "motion",
+    looks: int = _N_CHECKED_NODES,
+) -> StepErrorGrowth:
+    """Growth of alternating errors along a rollout, up to its first failed step.
+
+    The eigenvalues of A_k - B_k K_k are taken at some nodes (A_k by the implicit function theorem, so that the
+    constraints are in it), their largest alternating magnitude counts for the steps in between in its logarithm, and
+    the stretch of the largest sum is what grows. A step at which Newton failed or the derivatives are singular ends the
+    motion.
+    """
+    failed = np.flatnonzero(~np.isfinite(rollout.state).all(axis=1))
+    steps = (int(failed[0]) if len(failed) else len(rollout.state)) - 1
+    nodes = np.unique(np.linspace(0, max(steps - 1, 0), looks).astype(int)) if steps > 0 else np.zeros(0, int)
+    at, magnitudes = [], []
+    for node in nodes:
+        found = _alternating_mode_magnitude(step, np.asarray(theta, float), rollout, int(node), feedback)
+        if found is None:
+            break
+        at.append(int(node))
+        magnitudes.append(found)
+    if not at:
+        return StepErrorGrowth(name, 0.0, 0.0, 0.0, step.time_step)
+    rates = np.log10(np.maximum(np.interp(np.arange(at[-1] + 1), at, magnitudes), 1e-3))
+    worst = int(np.argmax(magnitudes))
+    return StepErrorGrowth(name, _largest_sum(rates), magnitudes[worst], at[worst] * step.time_step, step.time_step)
+
+
+def _alternating_mode_magnitude(
+    step: Step, theta: Array, rollout: Rollout, node: int, feedback: TrackingFeedback | None
+) -> float | None:
+    """Largest magnitude of the eigenvalues of A - B K with negative real part at a node; None where A is not finite."""
+    system, sizes = step.system, step.sizes
+    n, fixed = system.n_coordinates, list(system.prescribed_indices)
+    state, after = rollout.state[node], rollout.state[node + 1]
+    a, by_torque, _ = step.jacobians(
+        state[:n], state[n : 2 * n], rollout.torque[node], theta, (state[fixed], after[fixed]), state[2 * n :], names=()
+    )
+    if feedback is not None:
+        a[:, feedback.state_indices] -= by_torque @ feedback.gain[node]
+    if not np.isfinite(a).all():
+        return None
+    moving = np.setdiff1d(np.arange(sizes["nx"]), [*fixed, *(n + index for index in fixed)])
+    values = np.linalg.eigvals(a[np.ix_(moving, moving)])
+    return float(np.max(np.abs(values[values.real < 0]), initial=0.0))
+
+
+def _largest_sum(rates: Array) -> float:
+    """Largest sum over a stretch, zero where all shrink (Kadane)."""
+    best = running = 0.0
+    for rate in rates:
+        running = max(0.0, running + float(rate))
+        best = max(best, running)
+    return best
+
+
+def largest_error_growth(problem: EstimationProblem, x: ArrayLike) -> StepErrorGrowth | None:
+    """The largest error growth among a problem's recordings, at unknowns x (nx,); None where none has an initial state.
+
+    Of a failed rollout it is that along the part before the failure.
+    """
+    predictor, system = problem.predictor, problem.system
+    found = []
+    looks = max(_N_CHECKED_NODES // len(problem.episodes), _MIN_CHECKED_NODES)
+    for i, episode in enumerate(problem.episodes):
+        shared, offset = problem.split(x, i)
+        theta = predictor.episode_theta(episode, shared)
+        begin = predictor.initial_state(episode, theta, offset, ())
+        if begin.failure_message:
+            continue
+        inputs = predictor.tracking_inputs(episode, theta, (), begin.state)
+        feedback = inputs.corrected_feedback(
+            episode.tracking_feedback, system.driven_indices, episode.measured_driven_angles
+        )
+        rollout = simulate(
+            problem.step, theta, begin.state, episode.grid.steps, inputs.torque, inputs.prescribed_path, feedback
+        )
+        found.append(_error_growth_along(problem.step, theta, rollout, feedback, episode.name, looks))
+    return max(found, key=lambda growth: (growth.growth_decades, growth.max_step_factor), default=None)

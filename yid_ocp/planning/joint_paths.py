@@ -1,0 +1,515 @@
+"""Settings, joint paths and equilibria of planned motions, and their simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Annotated, Literal
+
+import casadi as ca
+import numpy as np
+from annotated_types import Ge, Gt, Le
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+from scipy.optimize import least_squares
+
+from yid_ocp.errors import ConfigError, ModelError, nearest_name_hint
+from yid_ocp.integrator.rollout import simulate
+from yid_ocp.integrator.statics import Equilibrium, EquilibriumSolver
+from yid_ocp.integrator.step import Step
+from yid_ocp.integrator.step_model import Rollout, SensitivityDirections
+from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.system import System
+from yid_ocp.options import OptionInfo
+from yid_ocp.parallel import CASADI_LOCK
+
+Array = NDArray[np.float64]
+
+_Vector3 = tuple[float, float, float]
+_PlanGoal = Literal["place", "path", "box", "information"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanLimits:
+    """Limits of the motion; joints also keep the position, velocity and effort limits of the URDF."""
+
+    velocity_fraction: Annotated[float, Gt(0), Le(1), OptionInfo("part of the URDF's velocity limits that is used")] = (
+        0.9
+    )
+    max_acceleration: Annotated[float, Gt(0), OptionInfo("of every joint", "rad/s^2 or m/s^2")] = 20.0
+    effort_fraction: Annotated[float, Gt(0), Le(1), OptionInfo("part of the URDF's effort limits that is used")] = 0.9
+    max_spring_angle: Annotated[
+        float | None, Gt(0), OptionInfo("of every spring of the object; none when absent", "rad")
+    ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanOptions:
+    """Goal, duration and numerics of a planned motion of the arms."""
+
+    goal: Annotated[
+        _PlanGoal,
+        OptionInfo(
+            "bring a point to a place, there along a path, or there with points kept inside a box; or move so that the "
+            "recordings tell most"
+        ),
+    ] = "place"
+    point: Annotated[str | None, OptionInfo("frame that is to arrive: a tip of the object, T3:50%, a gripper")] = None
+    target_position: Annotated[_Vector3 | None, OptionInfo("where to, in the world; or give a shift", "m")] = None
+    target_offset: Annotated[_Vector3 | None, OptionInfo("where to, from where the point rests at the start", "m")] = (
+        None
+    )
+    waypoint_offsets: Annotated[
+        tuple[_Vector3, ...], OptionInfo("of a path: shifts on the way, passed at equal times", "m")
+    ] = ()
+    box: Annotated[tuple[_Vector3, _Vector3] | None, OptionInfo("lowest and highest corner in the world", "m")] = None
+    frames_in_box: Annotated[
+        tuple[str, ...] | None, OptionInfo("frames kept inside the box; all points of the object")
+    ] = None
+    start_joint_positions: Annotated[
+        Mapping[str, float] | None,
+        OptionInfo(
+            "joints at the start, at rest; when absent those with which the first recording begins, else those of the "
+            "arms' first grasp of the undeformed object",
+            "rad or m",
+        ),
+    ] = None
+    duration: Annotated[float, Gt(0), Le(60), OptionInfo("of the arms' motion", "s")] = 1.5
+    hold_duration: Annotated[
+        float, Gt(0), Le(60), OptionInfo("after it, the arms at rest and the point in its place", "s")
+    ] = 0.5
+    n_spline_coefficients: Annotated[
+        int, Ge(2), Le(40), OptionInfo("unknowns of each joint's spline of degree 5, its end included")
+    ] = 7
+    minimize_duration: Annotated[
+        bool, OptionInfo("whether the shortest duration is sought with which the goal is reached")
+    ] = False
+    position_tolerance: Annotated[float, Gt(0), OptionInfo("distance that counts as reached", "m")] = 1e-3
+    rest_speed_tolerance: Annotated[float, Gt(0), OptionInfo("speed of the point that counts as rest", "m/s")] = 0.01
+    effort_weight: Annotated[
+        float, Ge(0), OptionInfo("weight of the mean squared effort in parts of its limit; raise it for calm motions")
+    ] = 0.0
+    minimize_parameter_sensitivity: Annotated[
+        bool, OptionInfo("whether the error that comes of the parameters' uncertainty is minimised along")
+    ] = False
+    identify: Annotated[
+        tuple[str, ...] | None,
+        OptionInfo("of information: parameters that are to be told most precisely together; all free ones when absent"),
+    ] = None
+    discriminate: Annotated[
+        tuple[str, ...] | None, OptionInfo("of information: effects, kind@location, that are to be told apart")
+    ] = None
+    n_random_starts: Annotated[
+        int,
+        Ge(1),
+        Le(1000),
+        OptionInfo("of information: random motions from which the search begins; the best is kept"),
+    ] = 5
+    seed: Annotated[int, Ge(0), OptionInfo("of these motions")] = 0
+    limits: Annotated[PlanLimits, OptionInfo("of joints and springs")] = field(default_factory=PlanLimits)
+    max_iterations: Annotated[
+        int,
+        Ge(1),
+        OptionInfo(
+            "limit on evaluations of a search, each time the limits are sharpened; of information, on its rounds"
+        ),
+    ] = 100
+
+
+class FramePositions:
+    """Function for world positions of named frames and their Jacobian by the configuration.
+
+    Raises `ConfigError` for a frame that does not exist.
+    """
+
+    def __init__(self, system: System, names: Sequence[str]) -> None:
+        for name in names:
+            if not system.mechanism.has_frame(name):
+                raise ConfigError(
+                    f"there is no frame '{name}'", where="plan", hint=nearest_name_hint(name, system.point_frames)
+                )
+        self.names = tuple(names)
+        with CASADI_LOCK:
+            q, theta = ca.SX.sym("q", system.n_coordinates), ca.vertcat(*(entry.symbol for entry in system.parameters))
+            kinematics = forward_kinematics(system.mechanism, q)
+            at = ca.vertcat(ca.SX(0, 1), *(kinematics.frame_position(name) for name in names))
+            slope = ca.densify(ca.jacobian(at, q))
+            self._function = ca.Function("points", [q, theta], [ca.densify(at), ca.vec(slope.T)])
+
+    def positions_and_jacobian(self, q: Array, theta: Array) -> tuple[Array, Array]:
+        """Positions (N, 3 np) [m] and their Jacobian (N, 3 np, n) at configurations (N, n)."""
+        at, slope = (np.array(x).T for x in self._function(np.asarray(q).T, np.asarray(theta)))
+        return at, slope.reshape(len(at), at.shape[1], np.shape(q)[1])
+
+
+_SPLINE_DEGREE = 5
+_N_REST_CONTROL_POINTS = 3  # control points alike at either end: no velocity and no acceleration there
+
+
+@dataclass(frozen=True)
+class SplinePath:
+    """Spline path of joints from rest to rest: q(t) = first + sum_k basis_k(t) w_k, constant after `duration`.
+
+    A spline of degree 5 with clamped ends lies within the hull of its control points, and so do its derivatives:
+    limits on these hold at all times, not at nodes alone.
+
+    Attributes
+    ----------
+    duration : float
+        [s]
+    n_coefficients : int
+        K, coefficients of each joint; the last one is its displacement at the end.
+    """
+
+    duration: float
+    n_coefficients: int
+
+    @property
+    def knots(self) -> Array:
+        """Knot vector of the spline [s]."""
+        inner = np.linspace(0.0, self.duration, self._controls - _SPLINE_DEGREE + 1)
+        return np.concatenate([np.zeros(_SPLINE_DEGREE), inner, np.full(_SPLINE_DEGREE, self.duration)])
+
+    @property
+    def _controls(self) -> int:
+        return 2 * _N_REST_CONTROL_POINTS + self.n_coefficients - 1
+
+    def control_point_matrix(self, order: int = 0) -> Array:
+        """Matrix from the coefficients to the control points of a derivative, shape (..., K)."""
+        spread = np.zeros((self._controls, self.n_coefficients))
+        ends, free = _N_REST_CONTROL_POINTS, self.n_coefficients - 1
+        spread[ends : ends + free, :-1] = np.eye(free)
+        spread[-ends:, -1] = 1.0
+        knots = self.knots
+        for i in range(order):
+            degree = _SPLINE_DEGREE - i
+            width = knots[degree + 1 + i : len(knots) - 1 - i] - knots[1 + i : len(knots) - degree - 1 - i]
+            spread = degree * np.diff(spread, axis=0) / width[:, None]
+        return spread
+
+    def basis_values(self, t: Array, order: int = 0) -> Array:
+        """Values of the basis functions, or of a derivative of them, at times, shape (N, K)."""
+        knots = self.knots
+        own = knots[order : len(knots) - order]
+        inside = np.minimum(np.asarray(t, float), self.duration)
+        values = BSpline(own, self.control_point_matrix(order), _SPLINE_DEGREE - order)(inside)
+        return np.asarray(np.where((np.asarray(t) > self.duration)[:, None] & (order > 0), 0.0, values))
+
+    def straight_line_coefficients(self, change: Array) -> Array:
+        """Coefficients of a straight line in joint space with displacement `change` (nj,), shape (K, nj)."""
+        t = np.linspace(0.0, self.duration, 200)
+        s = t / self.duration
+        smooth = s**3 * (10 - 15 * s + 6 * s**2)
+        share = np.linalg.lstsq(self.basis_values(t)[:, :-1], smooth - self.basis_values(t)[:, -1], rcond=None)[0]
+        return np.append(share, 1.0)[:, None] * np.asarray(change, float)[None, :]
+
+
+@dataclass(frozen=True, eq=False)
+class PathSimulator:
+    """Simulator of a system, initially at rest, whose prescribed joints follow a spline path.
+
+    Attributes
+    ----------
+    step : Step
+        Every joint that moves is prescribed; nothing is driven.
+    theta : ndarray, shape (ntheta,)
+    hold_duration : float
+        Time for which the joints stand still at the end [s].
+    """
+
+    step: Step
+    theta: Array
+    start_equilibrium: Equilibrium
+    path: SplinePath
+    hold_duration: float
+
+    @property
+    def joint_indices(self) -> list[int]:
+        """Configuration indices of the moved joints."""
+        return list(self.step.system.prescribed_indices)
+
+    @property
+    def start_positions(self) -> Array:
+        """Start positions of the moved joints, shape (nc,) [rad or m]."""
+        return np.asarray(self.start_equilibrium.state[self.joint_indices])
+
+    def coefficient_bounds(self) -> tuple[Array, Array]:
+        """Lowest and highest coefficients that keep the joints' position limits, shape (K, nc) each."""
+        shape = (self.path.n_coefficients, 1)
+        lower, upper = (np.tile(side - self.start_positions, shape) for side in joint_position_limits(self.step.system))
+        return lower, upper
+
+    @cached_property
+    def node_times(self) -> Array:
+        """Times of the nodes, shape (N + 1,) [s]."""
+        moving = round(self.path.duration / self.step.time_step)
+        standing = max(1, round(self.hold_duration / self.step.time_step))
+        return np.asarray(self.step.time_step * np.arange(moving + standing + 1))
+
+    @cached_property
+    def standstill_nodes(self) -> NDArray[np.int64]:
+        """Indices of the nodes at which the joints stand still at the end."""
+        return np.flatnonzero(self.node_times >= self.path.duration - 1e-9)
+
+    @cached_property
+    def _basis(self) -> Array:
+        return self.path.basis_values(self.node_times)
+
+    def joint_positions(self, w: Array) -> Array:
+        """Positions of the moved joints at the nodes, shape (N + 1, nc), for coefficients (K, nc)."""
+        return self.start_positions + self._basis @ w
+
+    def simulate_path(self, w: Array, slopes: bool = False, names: Sequence[str] = ()) -> Rollout:
+        """Simulate the path of coefficients (K, nc), with derivatives by named parameters, then by the coefficients."""
+        directions = None
+        if slopes or names:
+            size = w.size if slopes else 0
+            nodes, nc = len(self.node_times), len(self.joint_indices)
+            by_path = np.zeros((nodes, nc, len(names) + size))
+            start = np.zeros((len(self.start_equilibrium.state), len(names) + size))
+            if slopes:
+                by_path[:, :, len(names) :] = np.einsum("tk,ji->tjki", self._basis, np.eye(nc)).reshape(nodes, nc, size)
+            if names:
+                known, guess = self.start_positions, self.start_configuration
+                rest = EquilibriumSolver(self.step).solve(known, self.theta, guess=guess, names=names)
+                start[:, : len(names)] = rest.state_by_theta
+            directions = SensitivityDirections(tuple(names), start, None, by_path)
+        begin, steps, path = self.start_equilibrium.state, len(self.node_times) - 1, self.joint_positions(w)
+        return simulate(self.step, self.theta, begin, steps, path=path, directions=directions)
+
+    def trajectories(self, frames: FramePositions, state: Array) -> Array:
+        """Positions of frames along states (N, nx), shape (N, frames, 3) [m]."""
+        q = state[:, : self.step.system.n_coordinates]
+        return frames.positions_and_jacobian(q, self.theta)[0].reshape(len(state), -1, 3)
+
+    @property
+    def start_configuration(self) -> Array:
+        """Configuration at the start, shape (n,)."""
+        return np.asarray(self.start_equilibrium.state[: self.step.system.n_coordinates])
+
+
+_TRAVEL_WEIGHT = 1e-2  # of a joint's travel [rad] beside the distance to the place in units of what counts as reached
+_MIN_POINT_MOBILITY = 1e-9  # motion of the point by a joint's, in metres per radian or metre, that counts as none
+REACHED_TOLERANCE_FACTOR = 1.5  # of that unit: beyond it a place is out of reach
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedMotion:
+    """A planned motion of the arms and its rollout.
+
+    Attributes
+    ----------
+    spline_coefficients : ndarray, shape (K, nc)
+    is_successful : bool
+        Whether a motion within the limits reaches the goal, or the search for the best one converged.
+    """
+
+    simulator: PathSimulator
+    spline_coefficients: Array
+    rollout: Rollout
+    is_successful: bool
+    message: str
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the moved joints."""
+        return self.simulator.step.system.prescribed
+
+    @property
+    def t(self) -> Array:
+        """Times of the nodes, shape (N + 1,) [s]."""
+        return self.simulator.node_times
+
+    @property
+    def joint_positions(self) -> Array:
+        """Joint positions, shape (N + 1, nc) [rad or m]."""
+        return self.simulator.joint_positions(self.spline_coefficients)
+
+    @property
+    def joint_velocities(self) -> Array:
+        """Joint velocities, shape (N + 1, nc) [rad/s or m/s]."""
+        return self.simulator.path.basis_values(self.t, 1) @ self.spline_coefficients
+
+    @property
+    def joint_accelerations(self) -> Array:
+        """Joint accelerations, shape (N + 1, nc) [rad/s^2 or m/s^2]."""
+        return self.simulator.path.basis_values(self.t, 2) @ self.spline_coefficients
+
+    @property
+    def joint_efforts(self) -> Array:
+        """Required joint efforts, the last row repeated, shape (N + 1, nc) [N m or N]."""
+        return np.vstack([self.rollout.effort, self.rollout.effort[-1:]])
+
+    @cached_property
+    def point_trajectories(self) -> dict[str, Array]:
+        """Trajectories of the system's points and of the one with a target by name, each of shape (N + 1, 3) [m]."""
+        names = self._point_names
+        places = self.simulator.trajectories(FramePositions(self.simulator.step.system, names), self.rollout.state)
+        return {name: places[:, i] for i, name in enumerate(names)}
+
+    @property
+    def _point_names(self) -> tuple[str, ...]:
+        return self.simulator.step.system.point_frames
+
+
+@dataclass(frozen=True)
+class EndEquilibrium:
+    """An equilibrium at which the point rests near its target.
+
+    Attributes
+    ----------
+    joint_positions : ndarray, shape (nc,)
+        Moved joints [rad or m].
+    target_distance : float
+        Distance of the point from its target [m].
+    joints_at_limit : tuple of str
+        Joints that stand at a limit of theirs.
+    """
+
+    joint_positions: Array
+    equilibrium: Equilibrium
+    target_distance: float
+    joints_at_limit: tuple[str, ...]
+
+
+def joint_position_limits(system: System) -> tuple[Array, Array]:
+    """Lower and upper limits of the moved joints, shape (nc,) each."""
+    joints = [system.mechanism.joints[i] for i in system.prescribed_indices]
+    return np.array([joint.lower_limit for joint in joints]), np.array([joint.upper_limit for joint in joints])
+
+
+def ordered_start_positions(system: System, posture: Mapping[str, float]) -> Array:
+    """Start positions of the moved joints, given by name, as an array of shape (nc,).
+
+    Raises `ConfigError` where a joint is missing, does not exist, or stands outside its range.
+    """
+    for name in posture:
+        if name not in system.prescribed:
+            raise ConfigError(
+                f"'{name}' is no joint that moves",
+                where="plan.start_joint_positions",
+                hint=nearest_name_hint(name, system.prescribed),
+            )
+    missing = [name for name in system.prescribed if name not in posture]
+    if missing:
+        raise ConfigError(
+            f"the posture says nothing of {', '.join(missing)}",
+            where="plan.start_joint_positions",
+            allowed="every joint that moves",
+            hint="leave plan.start_joint_positions out to begin where the arms first grasp the undeformed object",
+        )
+    chosen = np.array([float(posture[name]) for name in system.prescribed])
+    for name, value, low, high in zip(system.prescribed, chosen, *joint_position_limits(system), strict=True):
+        if not low - 1e-9 <= value <= high + 1e-9:
+            over = low - value if value < low else value - high
+            raise ConfigError(
+                f"{name} starts at {value:.4g}, {over:.3g} beyond its limit",
+                where="plan.start_joint_positions",
+                allowed=f"{low:.4g} to {high:.4g}",
+            )
+    return chosen
+
+
+def solve_start_equilibrium(step: Step, theta: Array, posture: Array, guess: Array | None = None) -> Equilibrium:
+    """Solve for the equilibrium at which a motion begins, near a configuration where one is given.
+
+    Raises `ModelError` where there is none, for example because a grasp cannot be closed.
+    """
+    rest = EquilibriumSolver(step).solve(posture, theta, guess=guess)
+    if not rest.is_converged:
+        raise ModelError(
+            f"the motion cannot begin: {rest.message}",
+            where="plan.start_joint_positions",
+            allowed="a posture at which every grasp holds the object at rest",
+            hint="give plan.start_joint_positions or a recording, which begins where the object is held; or correct "
+            "model.grasp",
+        )
+    return rest
+
+
+def check_standstill_limits(step: Step, theta: Array, rest: Equilibrium, limits: PlanLimits, when: str) -> None:
+    """Raise `ConfigError` where efforts or spring angles exceed their limits although the arms stand still."""
+    system = step.system
+    effort = simulate(step, theta, rest.state, 1).effort[0]
+    joints = [system.mechanism.joints[i] for i in system.prescribed_indices]
+    springs = sorted({system.mechanism.joint_index(spring.joint_name) for spring in system.elastic_joints})
+    largest = np.inf if limits.max_spring_angle is None else limits.max_spring_angle
+    able, names = limits.effort_fraction, system.mechanism.joint_names
+    rows = [
+        (j.name, "effort_fraction", "N m or N", u, able * j.effort_limit) for j, u in zip(joints, effort, strict=True)
+    ]
+    rows += [(names[i], "max_spring_angle", "rad", rest.state[i], largest) for i in springs]
+    for name, which, unit, value, limit in rows:
+        if not abs(value) <= limit * (1 + 1e-9):
+            raise ConfigError(
+                f"{name} at rest {when} takes {value:.4g} {unit}, {abs(value) - limit:.3g} beyond its limit",
+                where=f"plan.limits.{which}",
+                allowed=f"up to {limit:.4g} {unit}",
+                hint=f"raise plan.limits.{which} where the machine allows it, or take another posture or place",
+            )
+
+
+def solve_end_equilibrium(
+    step: Step, theta: Array, start: Equilibrium, point: FramePositions, place: Array, tolerance: float
+) -> EndEquilibrium:
+    """Solve for joint positions within their limits, near the start, at which the point rests nearest to its target.
+
+    Raises `ConfigError` where no joint moves the point.
+    """
+    statics, system = EquilibriumSolver(step), step.system
+    joints, n = list(system.prescribed_indices), system.n_coordinates
+    first = start.state[joints]
+    guess = [start.state[:n]]
+    last: list[tuple[Array, tuple[Array, Array]]] = []
+
+    def at(x: Array) -> tuple[Array, Array]:
+        # the search asks for residual and slope of a point one after the other
+        if not last or not np.array_equal(last[-1][0], x):
+            last[:] = [(np.array(x), rows(x))]
+        return last[-1][1]
+
+    def rows(x: Array) -> tuple[Array, Array]:
+        rest = statics.solve(x, theta, guess=guess[0])
+        if not rest.is_converged:
+            return np.full(3 + len(x), 1e3), np.zeros((3 + len(x), len(x)))
+        guess[0] = rest.state[:n]
+        where, by_q = point.positions_and_jacobian(rest.state[None, :n], theta)
+        slope = by_q[0, :3] @ rest.state_by_known_coordinates[:n]
+        value = np.concatenate([(where[0, :3] - place) / tolerance, _TRAVEL_WEIGHT * (x - first)])
+        return value, np.vstack([slope / tolerance, _TRAVEL_WEIGHT * np.eye(len(x))])
+
+    reach = point.positions_and_jacobian(start.state[None, :n], theta)[1][0, :3]
+    if np.abs(reach @ start.state_by_known_coordinates[:n]).max(initial=0.0) < _MIN_POINT_MOBILITY:
+        raise ConfigError(
+            f"no arm moves '{point.names[0]}'",
+            where="plan.point",
+            allowed="a point of what an arm holds or carries",
+            hint="set model.grasp, or name another point",
+        )
+    lower, upper = joint_position_limits(system)
+    begin = np.clip(first, lower + 1e-6, upper - 1e-6)
+    found = least_squares(
+        lambda x: at(x)[0], begin, jac=lambda x: at(x)[1], bounds=(lower, upper), x_scale=1.0, max_nfev=100
+    )
+    rest = statics.solve(found.x, theta, guess=guess[0])
+    where, _ = point.positions_and_jacobian(rest.state[None, :n], theta)
+    distance = float(np.linalg.norm(where[0, :3] - place)) if rest.is_converged else np.inf
+    near = (found.x - lower < 1e-3) | (upper - found.x < 1e-3)
+    limits = tuple(name for name, one in zip(system.prescribed, near, strict=True) if one)
+    return EndEquilibrium(found.x, rest, distance, limits)
+
+
+def check_target_reachable(end: EndEquilibrium, name: str, place: Array, tolerance: float) -> None:
+    """Raise `ConfigError` where the point cannot rest at its target."""
+    if end.target_distance <= REACHED_TOLERANCE_FACTOR * tolerance:
+        return
+    known = np.isfinite(end.target_distance)
+    off = f"{1e3 * end.target_distance:.3g} mm off" if known else "nowhere, as no posture near it is at rest"
+    limits = f", with {', '.join(end.joints_at_limit)} at the joint's limit" if end.joints_at_limit else ""
+    raise ConfigError(
+        f"the goal is out of reach: '{name}' comes to rest {off}{limits}",
+        where=f"plan.target_position ({', '.join(f'{x:.4g}' for x in place)} m in the world)",
+        allowed="a place at which the point can rest",
+        hint="take a nearer place, a smaller plan.target_offset, or another plan.start_joint_positions to begin with",
+    )
