@@ -10,14 +10,13 @@ import re
 import sys
 from dataclasses import replace
 from html.parser import HTMLParser
-from pathlib import Path
 
 import numpy as np
 import plotly.offline
 import pytest
 
 from yid_ocp.errors import OutputError
-from yid_ocp.report import figures, sections
+from yid_ocp.report import figures
 from yid_ocp.report.html import _format_number, write_report
 from yid_ocp.report.sections import REPORT_SECTIONS, ReportData
 from yid_ocp.workflow.solve import solve_result
@@ -139,9 +138,9 @@ def test_a_new_section_is_a_file_and_a_template(solved, tmp_path, monkeypatch):
     assert REPORT_SECTIONS["weather"].prepare_context(ReportData("x", "", {"format": "other/1"})) is None
 
 
-def test_every_file_of_sections_is_found():
-    folder = Path(sections.__file__).parent
-    assert set(REPORT_SECTIONS) == {path.stem for path in folder.glob("*.py")} - {"__init__", "base"}
+def test_every_template_has_its_section(repository):
+    templates = {path.stem for path in (repository / "yid_ocp" / "report" / "templates").glob("*.html")}
+    assert templates - {"page", "blocks"} == set(REPORT_SECTIONS)
 
 
 def test_without_the_extra_there_is_a_notice_and_no_report(solved, tmp_path, monkeypatch, caplog):
