@@ -275,10 +275,10 @@ COMMANDS: tuple[CliCommand, ...] = (
     CliCommand(
         "completion",
         "print what makes a shell complete commands, options, files and settings",
-        "shell_support",
+        "completion",
         _completion,
     ),
-    CliCommand("schema", "print the JSON Schema of configuration files, for editors", "shell_support", _schema),
+    CliCommand("schema", "print the JSON Schema of configuration files, for editors", "schema", _schema),
 )
 
 
@@ -372,7 +372,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         printed as `yid-error/1` as well: kind, what, where, allowed, hint and exit_code.
     """
     if "_ARGCOMPLETE" in os.environ:
-        import_module("yid_ocp.workflow.shell_support").complete_arguments(build_argument_parser())
+        import_module("yid_ocp.workflow.completion").complete_arguments(build_argument_parser())
     as_json = "--json" in (sys.argv[1:] if argv is None else argv)
     try:
         arguments = build_argument_parser().parse_args(argv)

@@ -178,7 +178,7 @@ def test_errors_are_json_where_that_is_asked_for(cli, pendulum, tmp_path, monkey
         "what": "there is no key 'iteration'",
         "where": "--set solver.iteration",
         "allowed": "name, max_iterations, step_tolerance, cost_tolerance, initial_damping",
-        "hint": "did you mean 'max_iterations'?",
+        "hint": "did you mean 'max_iterations'?; names changed in this version: see the table in CHANGELOG.md",
         "exit_code": 2,
     }
     assert "did you mean 'max_iterations'?" in wrong.err
@@ -333,7 +333,7 @@ def test_inspect_agrees_with_finite_differences(cli, tmp_path, monkeypatch, urdf
     monkeypatch.chdir(tmp_path)
     (tmp_path / "free.yaml").write_text(
         f"model:\n  robot: {urdf_folder / 'double_pendulum.urdf'}\n  arms: {{mode: driven}}\n"
-        "problem: {compiler: false}\n"
+        "problem: {use_compiler: false}\n"
     )
     done = cli("inspect", "free.yaml", "--out", "i")
     assert done.code == 0, done.err

@@ -1,24 +1,19 @@
-"""The commands `completion` and `schema`: what shells and editors need of commands and settings."""
+"""The command `completion`: what makes a shell complete commands, options, files and settings."""
 
 from __future__ import annotations
 
 import argparse
 import importlib
-import json
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 from yid_ocp.errors import ConfigError, YidError
-from yid_ocp.files import write_text
 
 _EXPORT_FORMATS = ("mjcf", "urdf", "sdf", "yaml", "csv", "mcap")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    if arguments.command == "schema":
-        return _write_schema(arguments)
     try:
         library = importlib.import_module("argcomplete")
     except ImportError as error:
@@ -70,15 +65,3 @@ def _settings(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[st
         return settable_keys(prefix, given)
     except YidError:
         return settable_keys(prefix)
-
-
-def _write_schema(arguments: argparse.Namespace) -> int:
-    from yid_ocp.config.schema import config_json_schema  # as above
-
-    text = json.dumps(config_json_schema(), indent=1)
-    if arguments.out is None:
-        print(text)
-    else:
-        write_text(Path(arguments.out), text + "\n")
-        print(arguments.out)
-    return 0
