@@ -286,7 +286,7 @@ def test_an_experiment_has_its_recordings_noise_and_step(drawn):
     case, _ = of_category(drawn(conditions=RecordingConditions(3, noise, simulation)), "null")
     assert [entry.name for entry in case.estimation_recordings] == [f"case_007_estimate_{i}" for i in range(3)]
     assert len(drawn.made) == 4
-    assert all((made["noise"], made["simulation"]) == (noise, simulation) for made in drawn.made)
+    assert all((made["arm_noise"], made["simulation"]) == (noise, simulation) for made in drawn.made)
     assert len({made["seed"] for made in drawn.made}) == 4
 
 
@@ -359,6 +359,10 @@ def test_no_case_is_no_ensemble():
 # -- sizes ------------------------------------------------------------------------------------------------------------
 
 
+def detectable(of, columns, **shapes):
+    return DetectableEffect.from_signature(signature(of, columns, **shapes))
+
+
 @pytest.mark.parametrize(
     ("of", "column", "wanted", "largest"),
     [(DAMPER, 100.0, 3.0, 0.2), (DAMPER, 100.0, 10.0, 0.2), (FRICTION, 0.5, 1.0, 3.0), (TILT, 50.0, 3.0, 0.5)],
@@ -368,7 +372,7 @@ def test_an_effect_is_so_many_times_its_detectable_size_or_as_large_as_expected(
     ensemble = drawn()
     columns = [[column]] if len(of.amplitude_names) == 1 else [[0.6 * column, 0.8 * column]]
     for seed in range(5):
-        found, multiple = ensemble._sized(signature(of, columns), np.random.default_rng(seed), wanted)
+        found, multiple = ensemble._sized(detectable(of, columns), np.random.default_rng(seed), wanted)
         values = np.array(list(found.values.values()))
         assert found.label == of.label
         seen = abs(float(np.array(columns[0]) @ values))
@@ -380,29 +384,29 @@ def test_an_effect_is_so_many_times_its_detectable_size_or_as_large_as_expected(
 
 
 def test_sizes_count_from_the_neutral_value_in_the_range_and_keep_the_shape(drawn):
-    found, multiple = drawn()._sized(signature(SOLID, [[50.0]], s=0.25), np.random.default_rng(2), 3.0)
+    found, multiple = drawn()._sized(detectable(SOLID, [[50.0]], s=0.25), np.random.default_rng(2), 3.0)
     assert found.values == {"a": pytest.approx(1 + 3 * 3.858 / 50), "s": 0.25}
     assert multiple == pytest.approx(3.0)
-    far, less = drawn()._sized(signature(SOLID, [[1.0]], s=0.25), np.random.default_rng(2), 3.0)
+    far, less = drawn()._sized(detectable(SOLID, [[1.0]], s=0.25), np.random.default_rng(2), 3.0)
     assert far.values["a"] == pytest.approx(3.0)
     assert less == pytest.approx(2.0 / 3.858)
 
 
 def test_amplitudes_go_either_way(drawn):
     ensemble = drawn()
-    made = [ensemble._sized(signature(TILT, [[30.0, 40.0]]), np.random.default_rng(s), 1.0)[0] for s in range(20)]
+    made = [ensemble._sized(detectable(TILT, [[30.0, 40.0]]), np.random.default_rng(s), 1.0)[0] for s in range(20)]
     signs = {(found.values["rx"] > 0, found.values["ry"] > 0) for found in made}
     assert len(signs) == 4
 
 
 def test_an_effect_that_nothing_sees_has_no_size(drawn):
-    assert drawn()._sized(signature(DAMPER, [[0.0]]), np.random.default_rng(1), 1.0) is None
+    assert drawn()._sized(detectable(DAMPER, [[0.0]]), np.random.default_rng(1), 1.0) is None
 
 
 def test_what_is_detectable_is_a_threshold(monkeypatch, drawn):
     monkeypatch.setattr(module, "make_candidate_effects", lambda *_: [DAMPER])
     ensemble = CaseGenerator(problem(), 1, limits=Thresholds(detection_z=2.0))
-    found, multiple = ensemble._sized(signature(DAMPER, [[100.0]]), np.random.default_rng(1), 3.0)
+    found, multiple = ensemble._sized(detectable(DAMPER, [[100.0]]), np.random.default_rng(1), 3.0)
     assert found.values["tau"] == pytest.approx(0.06)
     assert multiple == pytest.approx(3.0)
 

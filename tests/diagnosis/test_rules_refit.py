@@ -86,7 +86,7 @@ def solved(monkeypatch):
     """Solvers that go nowhere, every std one tenth; `runs` are the solvers' starts, `losses` what was judged."""
     made = SimpleNamespace(runs=[], failed=[], losses=[])
 
-    def run(problem, x, callback):
+    def run(problem, x, callback, evaluate=None):
         values = problem.named_values(x)
         failed = problem.cost(values) is None
         (made.failed if failed else made.runs).append(values)

@@ -304,7 +304,7 @@ def test_a_shape_that_may_as_well_lie_within_is_not_out_of_it():
 
     assert [odd(3.0, std) for std in (0.49, 0.51, math.inf)] == [True, False, False]
     assert [odd(0.02, std) for std in (0.014, 0.016)] == [True, False]
-    assert odd(3.0, 0.51, away=1.0)
+    assert odd(3.0, 0.51, min_z=1.0)
     # a fit with such a shape counts as one with a shape to be expected
     values, near = (
         {"wide@x.a": 9.0, "wide@x.s": 3.0},
@@ -335,7 +335,9 @@ def ranked(**decreases):
 
 
 def shortlisted(scores, table, places=(), **limits):
-    return [of.kind for of, _ in _refit_shortlist(scores, table, Thresholds(**{"surest": 0} | limits), places)]
+    return [
+        of.kind for of, _ in _refit_shortlist(scores, table, Thresholds(**{"n_refit_lowest_p": 0} | limits), places)
+    ]
 
 
 def test_the_best_are_refitted_and_those_that_can_stand_in_for_them():
@@ -344,11 +346,11 @@ def test_the_best_are_refitted_and_those_that_can_stand_in_for_them():
     matrix[0, 4] = matrix[1, 3] = 0.95
     matrix[2, 0] = 0.99
     table = alike([s.effect.label for s in scores], matrix)
-    assert shortlisted(scores, table, refits=2) == ["a", "b", "d", "e"]
-    assert shortlisted(scores, table, refits=1) == ["a", "e"]
-    assert shortlisted(scores, table, refits=2, alike=0.96) == ["a", "b"]
-    assert shortlisted(scores, table, refits=9) == ["a", "b", "c", "d", "e"]
-    assert shortlisted(scores[:4], table, refits=2) == ["a", "b", "d"]
+    assert shortlisted(scores, table, n_refit_per_round=2) == ["a", "b", "d", "e"]
+    assert shortlisted(scores, table, n_refit_per_round=1) == ["a", "e"]
+    assert shortlisted(scores, table, n_refit_per_round=2, signature_overlap=0.96) == ["a", "b"]
+    assert shortlisted(scores, table, n_refit_per_round=9) == ["a", "b", "c", "d", "e"]
+    assert shortlisted(scores[:4], table, n_refit_per_round=2) == ["a", "b", "d"]
 
 
 def test_as_many_more_as_are_refitted_and_each_once():
@@ -356,7 +358,7 @@ def test_as_many_more_as_are_refitted_and_each_once():
     matrix = np.eye(5)
     matrix[0, 2:] = matrix[1, 2:] = 0.95
     table = alike([s.effect.label for s in scores], matrix)
-    assert shortlisted(scores, table, refits=2) == ["a", "b", "c", "d"]
+    assert shortlisted(scores, table, n_refit_per_round=2) == ["a", "b", "c", "d"]
     [(of, step), *_] = _refit_shortlist(scores, table, LIMITS)
     assert (of.kind, step) == ("a", {"a@x.a": 9.0})
 
@@ -366,16 +368,16 @@ def test_the_surest_are_refitted_wherever_they_stand():
     scores[3] = score(scores[3].effect, p=1e-30, decrease=6.0, statistic=100.0)
     scores[2] = score(scores[2].effect, p=1e-30, decrease=7.0, statistic=90.0)
     table = alike([s.effect.label for s in scores], np.eye(4))
-    assert shortlisted(scores, table, refits=1, surest=1) == ["a", "d"]
-    assert shortlisted(scores, table, refits=1, surest=2) == ["a", "d", "c"]
-    assert shortlisted(scores, table, refits=4, surest=2) == ["a", "b", "c", "d"]
+    assert shortlisted(scores, table, n_refit_per_round=1, n_refit_lowest_p=1) == ["a", "d"]
+    assert shortlisted(scores, table, n_refit_per_round=1, n_refit_lowest_p=2) == ["a", "d", "c"]
+    assert shortlisted(scores, table, n_refit_per_round=4, n_refit_lowest_p=2) == ["a", "b", "c", "d"]
 
 
 def test_the_best_of_every_place_of_the_gap_is_refitted():
     scores = [score(effect(label), p=1e-9, decrease=9.0 - i) for i, label in enumerate(("a@x", "b@y", "c@y", "d@z"))]
     table = alike([s.effect.label for s in scores], np.eye(4))
-    assert shortlisted(scores, table, ("y",), refits=1) == ["a", "b"]
-    assert shortlisted(scores, table, ("z", "y", "x", "nowhere"), refits=1) == ["a", "d", "b"]
+    assert shortlisted(scores, table, ("y",), n_refit_per_round=1) == ["a", "b"]
+    assert shortlisted(scores, table, ("z", "y", "x", "nowhere"), n_refit_per_round=1) == ["a", "d", "b"]
 
 
 # -- one effect after the other ---------------------------------------------------------------------------------------
@@ -471,7 +473,7 @@ def test_where_a_fit_has_left_an_earlier_run_candidates_are_tried_from_there_too
     first, chosen, added = rounds.compose(moved=True)
     assert (first, chosen) == (["b", "a", "c"], ["b"])
     assert rounds.refits == [([], ["a", "b", "c"], 0.0), ([], ["a", "b", "c"], None)]
-    assert added[0].fit.values["k"] == 7.0
+    assert added[0].refitted_model.values["k"] == 7.0
     # once an effect is in, and where the earlier run's model does not run, nothing is tried from there
     assert Rounds(monkeypatch, losses).compose(moved=True)[1] == ["a"]
 
