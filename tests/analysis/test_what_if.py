@@ -35,10 +35,10 @@ def tube_ranking(held_tube):
 def test_the_experiment_as_it_is_agrees_with_the_analysis(held_tube, tube_ranking):
     ranking, _ = tube_ranking
     info = identifiability(held_tube)
-    assert ranking.base.changes == ()
-    assert ranking.base.verdicts == {name: entry.verdict for name, entry in info.parameters.items()}
+    assert ranking.unchanged_experiment.changes == ()
+    assert ranking.unchanged_experiment.verdicts == {name: entry.verdict for name, entry in info.parameters.items()}
     for name, entry in info.parameters.items():
-        assert ranking.base.std_relative[name] == pytest.approx(entry.std_relative, rel=1e-5)
+        assert ranking.unchanged_experiment.std_relative[name] == pytest.approx(entry.std_relative, rel=1e-5)
 
 
 def test_a_predicted_sensor_tells_what_it_tells_when_it_is_there(held_tube, tube_ranking):
@@ -61,14 +61,14 @@ def test_changes_are_ranked_and_the_smallest_set_is_a_pair(tube_ranking):
     assert keys == sorted(keys)
     names = {entry.changes[0] for entry in ranking.single_changes}
     assert {"weld", "torque", "arm:T1_marker", "camera:T1_marker", "camera:w_T1", "rate:30"} <= names
-    assert not any(entry.complete for entry in ranking.single_changes)
+    assert not any(entry.is_fully_identifiable for entry in ranking.single_changes)
     # more light and more points never tell less
     for entry in ranking.single_changes:
         if entry.changes[0].startswith(("camera:", "arm:", "rate:")):
-            assert entry.gain >= ranking.base.gain - 1e-9
+            assert entry.gain >= ranking.unchanged_experiment.gain - 1e-9
     # the tube is turned only by a weld, and what that takes is felt only in torques
-    assert {frozenset(entry.changes) for entry in ranking.smallest} == {frozenset({"weld", "torque"})}
-    assert ranking.smallest[0].complete
+    assert {frozenset(entry.changes) for entry in ranking.smallest_sufficient_sets} == {frozenset({"weld", "torque"})}
+    assert ranking.smallest_sufficient_sets[0].is_fully_identifiable
     assert ranking.n_evaluated_sets > len(ranking.single_changes)
     assert "working out weld grasps in place of points" in told
 

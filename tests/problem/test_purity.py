@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from small_problems import swinging_pendulum
 
 from yid_ocp.data import read_recording
+from yid_ocp.inference.linearized_residual import residual_without_weak_priors
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 
@@ -167,5 +168,5 @@ def test_the_residual_says_what_its_rows_are(pendulum):
     assert stated[np.flatnonzero(stated)[0]] == pytest.approx(0.01 / problem.options.start_configuration_std)
     # a factor of two of the ten that call one standard deviation
     assert sorted(evaluation.residual[rows.weak_priors]) == pytest.approx([0.0, np.log10(2.0)])
-    residual, jacobian = problem.residual_without_weak_priors(evaluation)
+    residual, jacobian = residual_without_weak_priors(problem, evaluation)
     assert len(residual) == len(jacobian) == rows.stated_priors.stop

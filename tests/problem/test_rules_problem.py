@@ -12,6 +12,7 @@ import scipy.optimize
 from small_problems import PENDULUM, H, pendulum_step, recording, seen, taken
 
 from yid_ocp.errors import ConfigError, DataError
+from yid_ocp.inference.linearized_residual import residual_without_weak_priors
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import _joint_mass_matrices, mass_matrix_diagonal, truncate_episode
@@ -217,7 +218,7 @@ def test_the_residual_is_made_of_measurements_then_priors(make):
     assert (rows.data, rows.stated_priors, rows.weak_priors) == (slice(0, 228), slice(228, 229), slice(229, 230))
     np.testing.assert_allclose(evaluation.residual[228:], [2.0, math.log(7.0 / 6.0) / math.log(5.0)])
     assert evaluation.cost == pytest.approx(0.5 * evaluation.residual @ evaluation.residual)
-    residual, jacobian = problem.residual_without_weak_priors(evaluation)
+    residual, jacobian = residual_without_weak_priors(problem, evaluation)
     np.testing.assert_array_equal(residual, evaluation.residual[:229])
     np.testing.assert_array_equal(jacobian, evaluation.jacobian[:229])
     assert ResidualRows.from_episodes((), 2, 3) == ResidualRows((), slice(0, 0), slice(0, 2), slice(2, 5))
@@ -232,7 +233,7 @@ def test_the_papers_rows_are_metres_and_inform_in_units_of_the_noise(make, state
     # 75 coordinates of 2 cm and 39 of 5 cm in each recording
     noise = stated or math.sqrt((75 * 0.02**2 + 39 * 0.05**2) / 114)
     assert problem.data_noise_unit == pytest.approx(noise)
-    residual, jacobian = problem.residual_without_weak_priors(evaluation)
+    residual, jacobian = residual_without_weak_priors(problem, evaluation)
     data = problem.residual_rows.data
     np.testing.assert_allclose(residual[data], evaluation.residual[data] / noise)
     np.testing.assert_allclose(jacobian[data], evaluation.jacobian[data] / noise)
@@ -310,7 +311,7 @@ def held(free_step, make, roll):
 
 @pytest.mark.parametrize(("configuration", "velocity"), [(0.05, 0.2), (0.01, 0.05), (1.0, 5.0)])
 def test_a_held_out_start_balances_its_prior_and_its_first_moments(make, held, configuration, velocity):
-    options = {"initial_state": "estimated", "configuration_std": configuration, "velocity_std": velocity}
+    options = {"initial_state": "estimated", "start_configuration_std": configuration, "start_velocity_std": velocity}
     problem = make(held_out=held, **options)
     x = problem.initial_unknowns
     short = truncate_episode(problem.held_out[1], 20)
@@ -428,7 +429,7 @@ def test_a_problem_cannot_be_changed_through_its_parameters(make):
         ({"free": ("elbow.stiffness", "elbow.stiffness")}, "named twice"),
         ({"free": ("elbow.stiff",)}, "elbow.stiffness"),
         ({"local_parameters": ("elbow.damping",)}, "'elbow.damping' is not free"),
-        ({"priors": {"elbow.damping": 0.1}}, "'elbow.damping' is not free"),
+        ({"prior_stds": {"elbow.damping": 0.1}}, "'elbow.damping' is not free"),
         ({"values": {"elbow.stiffness": -1.0}}, "elbow.stiffness"),
     ],
 )
