@@ -46,11 +46,11 @@ def counted(monkeypatch):
     calls = SimpleNamespace(count=0)
 
     class Counting:
-        def run(self, *arguments):
+        def minimize_cost(self, *arguments):
             calls.count += 1
             return REFIT_SOLVER.minimize_cost(*arguments)
 
-    monkeypatch.setattr(import_module("yid_ocp.diagnosis.refit_with_effects"), "SOLVER", Counting())
+    monkeypatch.setattr(import_module("yid_ocp.diagnosis.refit"), "REFIT_SOLVER", Counting())
     return calls
 
 
@@ -60,11 +60,11 @@ class Interrupting:
     def __init__(self, after: int) -> None:
         self.left = after
 
-    def stage(self, text: str) -> None: ...
+    def begin_stage(self, text: str) -> None: ...
 
-    def iterate(self, entry) -> None: ...
+    def report_iterate(self, entry) -> None: ...
 
-    def advance(self, done: int, total: int, text: str) -> None:
+    def report_parts_done(self, done: int, total: int, text: str) -> None:
         self.left -= text.startswith("refitted")
         if self.left <= 0:
             raise KeyboardInterrupt
