@@ -24,14 +24,14 @@ def bench(repository):
 
 @pytest.fixture(scope="module")
 def twin(bench):
-    system = bench.paper_system(2)
+    system = bench.baxter_foam_y_system(2)
     return system, bench.played(system, seed=3, duration=3.0)
 
 
 def test_changes_shrink_as_those_of_a_rule_of_order_two(bench, twin):
     system, run = twin
-    fine = bench.recorded_sensitivities(system, run, 1, 0.0, "fine")
-    estimates = {step: bench.estimate_errors(system, fine, step) for step in bench.STEPS[:3]}
+    fine = bench.recorded(system, run, 1, 0.0, "fine")
+    estimates = {step: bench.estimated(system, fine, step) for step in bench.STEPS[:3]}
     ratios = np.concatenate(list(bench.orders(estimates).values()))
     seen = ratios[np.isfinite(ratios)]
     assert len(seen) >= 2
@@ -42,8 +42,8 @@ def test_changes_shrink_as_those_of_a_rule_of_order_two(bench, twin):
 
 def test_estimates_with_ten_and_five_milliseconds_agree(bench, twin):
     system, run = twin
-    recording = bench.recorded_sensitivities(system, run, 20, 1.0, "recorded")
-    estimates = {step: bench.estimate_errors(system, recording, step) for step in bench.STEPS[:2]}
+    recording = bench.recorded(system, run, 20, 1.0, "recorded")
+    estimates = {step: bench.estimated(system, recording, step) for step in bench.STEPS[:2]}
     assert max(bench.moved(estimates).values()) < 0.3
     truth = np.array([bench.TRUTH[name] for name in bench.FREE])
     assert np.max(np.abs(estimates[0.01].values - truth) / estimates[0.01].std) < 3.0
