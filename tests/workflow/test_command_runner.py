@@ -12,7 +12,10 @@ import pytest
 from yid_ocp.report.terminal import SummaryStatement
 from yid_ocp.solvers import Iterate
 from yid_ocp.workflow.command_runner import (
+    EXIT_DONE,
+    EXIT_FAILED,
     NULL_PROGRESS,
+    CommandResult,
     LineProgress,
     _BarProgress,
     _format_duration,
@@ -156,25 +159,21 @@ def test_what_is_shown_depends_on_who_looks(capsys, monkeypatch):
         report(progress)
 
 
-class Outcome:
-    def __init__(self, folder) -> None:
-        self.folder, self.result = folder, {"a": 1}
-
-
-@pytest.mark.parametrize("quiet", [True, False])
-def test_a_command_ends_with_its_table_and_its_folder(tmp_path, monkeypatch, capsys, quiet):
+@pytest.mark.parametrize(("quiet", "reached"), [(True, True), (False, True), (False, False)])
+def test_a_command_ends_with_its_table_and_its_folder(tmp_path, monkeypatch, capsys, quiet, reached):
     monkeypatch.chdir(tmp_path)
 
     def work(progress):
         progress.begin_stage("working")
-        return Outcome(tmp_path / "runs" / "x")
+        return CommandResult(folder, {"a": 1}, is_successful=reached)
 
+    folder = tmp_path / "runs" / "x"
     said = [SummaryStatement("a = 1"), SummaryStatement("done")]
-    outcome = run_and_print(work, lambda result: said if result == {"a": 1} else [], asked(quiet=quiet))
+    code = run_and_print(asked(quiet=quiet), work, lambda result: said if result == {"a": 1} else [])
     captured = capsys.readouterr()
-    assert outcome.folder == tmp_path / "runs" / "x"
+    assert code == (EXIT_DONE if reached else EXIT_FAILED)
     if quiet:
-        assert (captured.out, captured.err) == (f"{outcome.folder}\n", "")
+        assert (captured.out, captured.err) == (f"{folder}\n", "")
     else:
         assert (captured.out, captured.err) == ("a = 1\ndone\nrun folder: runs/x\n", "working ...\n")
 
@@ -182,5 +181,5 @@ def test_a_command_ends_with_its_table_and_its_folder(tmp_path, monkeypatch, cap
 def test_a_folder_elsewhere_is_named_in_full(tmp_path, monkeypatch, capsys):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    run_and_print(lambda progress: Outcome(tmp_path / "there"), lambda result: [], asked())
+    run_and_print(asked(), lambda progress: CommandResult(tmp_path / "there", {"a": 1}), lambda result: [])
     assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "there")
