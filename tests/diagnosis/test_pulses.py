@@ -81,15 +81,15 @@ def test_what_is_no_pulse(values, seed):
 def test_the_threshold_grows_with_what_the_model_may_be_wrong_by():
     values = bell(3.0, 3.5, 0.3)
     assert len(sure(history(values))) == 1
-    assert sure(history(values, error=0.3 + 0 * T)) == []
+    assert sure(history(values, model_error_std=0.3 + 0 * T)) == []
 
 
 def test_friction_that_holds_may_change_by_twice_itself_wherever_a_joint_stands_still():
     values = bell(3.0, 3.5, 0.3)
     at_rest = np.where((T > 2.9) & (T < 3.3), 0.2, 0.0)
-    assert sure(history(values, held=at_rest)) == []
-    assert len(sure(history(values, held=at_rest / 4))) == 1
-    assert len(sure(history(values, held=np.where(T > 6, 0.2, 0.0)))) == 1
+    assert sure(history(values, friction_limit=at_rest)) == []
+    assert len(sure(history(values, friction_limit=at_rest / 4))) == 1
+    assert len(sure(history(values, friction_limit=np.where(T > 6, 0.2, 0.0)))) == 1
 
 
 def test_what_lasts_longer_than_the_longest_event_is_the_models():
@@ -103,7 +103,7 @@ def test_a_filter_widens_what_is_seen_and_not_what_is_told():
     cutoff = 3.0
     narrow = 0.8 * np.where((fine > 4) & (fine < 4.3), np.sin(np.pi * (fine - 4) / 0.3) ** 2, 0)
     seen = np.interp(T, fine, LowPassFilter(cutoff)(fine, narrow[:, None])[:, 0])
-    (pulse,) = sure(history(seen, noise=0.005, cutoff=cutoff, error=0.01 + 0 * T))
+    (pulse,) = sure(history(seen, noise=0.005, filter_cutoff=cutoff, model_error_std=0.01 + 0 * T))
     assert pulse.end_time - pulse.start_time < 0.5
     assert pulse.impulse == pytest.approx(0.8 * 0.15, rel=0.15)
     assert pulse.evaluate_at(T, cutoff) == pytest.approx(seen, abs=0.06)
@@ -121,7 +121,7 @@ def test_the_evidence_is_a_gaussians():
     """Sigma^-1 y and the evidence against dense algebra."""
     from yid_ocp.diagnosis.pulse_detection import _MODEL_ERROR_TIME, _SLOW_FORCE_TIME, _Rest
 
-    made = history(bell(3.0, 3.5, 0.3), held=0.1 + 0 * T)
+    made = history(bell(3.0, 3.5, 0.3), friction_limit=0.1 + 0 * T)
     rest = _Rest.of(made, 2.0, 0.05, 0.2)
     apart = np.abs(T[:, None] - T)
     quick = np.full(len(T), math.sqrt(0.06**2 + 0.05**2 + 0.1**2 / 3))

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -78,9 +78,18 @@ class DisturbanceEvent:
 
     def to_dict(self) -> dict[str, Any]:
         """As in result.json."""
-        keys = {"start_time": "from", "end_time": "to", "peak_value": "peak", "impulse_std": "std"}
-        names = [field.name for field in fields(self) if field.name != "detected_pulse"]
-        return {keys.get(name, name): getattr(self, name) for name in names}
+        return {
+            "recording": self.recording,
+            "location": self.location,
+            "channel": self.channel,
+            "kind": self.kind,
+            "from": self.start_time,
+            "to": self.end_time,
+            "impulse": self.impulse,
+            "peak": self.peak_value,
+            "unit": self.unit,
+            "std": self.impulse_std,
+        }
 
 
 @dataclass(frozen=True)
