@@ -218,7 +218,8 @@ def test_report_says_what_drifted_and_writes_the_history(tmp_path):
     outcome = run_report(folders, tmp_path / "history")
     written = json.loads((tmp_path / "history" / "history.json").read_text(encoding="utf-8"))
     assert written["format"] == "yid-history/1"
-    assert outcome.history.drifted_parameters == ("beam.bend",)
+    assert outcome.result == written
+    assert [name for name, entry in written["parameters"].items() if entry["drifted"]] == ["beam.bend"]
     assert [entry["name"] for entry in written["runs"] if entry["distrusted"]] == [str(folders[3])]
     assert "beam.bend is not the same in all runs" in (tmp_path / "history" / "report.html").read_text(encoding="utf-8")
     later = folder_of(tmp_path / "later", baseline={"runs": [str(folders[0])]})
