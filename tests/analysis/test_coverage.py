@@ -46,11 +46,11 @@ def report(record_property, hits: dict[str, list[bool]]) -> float:
 @pytest.mark.slow
 def test_coverage_on_a_pendulum(pendulum, twin, record_property):
     empty = pendulum()
-    truth = dict(zip(empty.names, empty.start, strict=True))
+    truth = dict(zip(empty.unknown_names, empty.initial_unknowns, strict=True))
     profile: dict[str, list[bool]] = {name: [] for name in truth}
     gaussian: dict[str, list[bool]] = {name: [] for name in truth}
     for seed in range(TWINS):
-        recording = twin(empty, empty.start, 1000 + seed)
+        recording = twin(empty, empty.initial_unknowns, 1000 + seed)
         problem = pendulum(recording, {"elbow.stiffness": 3.0, "elbow.damping": 0.1, "elbow.rest": 0.1})
         info = identifiability(problem, solve(problem, GaussNewton()), start="known", intervals="all")
         for name, value in truth.items():

@@ -121,7 +121,7 @@ def test_with_encoders_the_outcome_does_not_depend_on_the_tracking_filter(urdf_f
     for g in (9.0, gain):
         feedback = {"feedback": "proportional", "proportional_gains": (g,)}
         problem = small_gap(problem_of(urdf_folder, encoders=True, feedback=feedback, size=0.1), size=0.1)
-        weighted = whitened_at(problem, problem.start)
+        weighted = whitened_at(problem, problem.initial_unknowns)
         rows = problem.residual_rows.data
         found = weighted.evaluate(problem.initial_unknowns)
         r, jacobian = found.residual[rows], found.jacobian[rows]
@@ -236,7 +236,7 @@ def test_jacobians_of_innovations_are_those_of_differences(urdf_folder):
         ]
         numeric = (ends[0] - ends[1]) / (2 * step[i])
         np.testing.assert_allclose(numeric, found.jacobian[:, i], atol=2e-5 * np.abs(found.jacobian[:, i]).max())
-    cost, gradient, again = weighted.gradient(x)
+    cost, gradient, again = weighted.cost_and_gradient(x)
     assert (cost, again.jacobian) == (pytest.approx(found.cost), None)
     np.testing.assert_allclose(gradient, found.jacobian.T @ found.residual, rtol=1e-9)
 

@@ -233,7 +233,11 @@ def test_the_group_that_explains_the_residual_is_taken_in(monkeypatch, column):
     assert set(at_work) == {source}
     reference, nothing = Dense(models, found.group_variance), Dense(models, NOTHING)
     own, other = ("sensor", "plant") if source is BIAS else ("plant", "sensor")
-    assert found.log_evidence[own] == found.log_evidence["both"] == pytest.approx(reference.evidence - nothing.evidence)
+    assert (
+        found.log_evidence[own]
+        == found.log_evidence["both"]
+        == pytest.approx(reference.log_evidence - nothing.log_evidence)
+    )
     assert found.log_evidence[own] > found.log_evidence[other] + 5
     assert found.log_evidence["none"] == 0.0
     assert found.log_evidence_drop == NOTHING | {source: pytest.approx(reference.log_evidence - nothing.log_evidence)}
@@ -251,7 +255,7 @@ def test_several_groups_are_taken_in_while_the_evidence_rises_enough(monkeypatch
         assert found.log_evidence_drop[source] == pytest.approx(full - less, rel=1e-6)
     assert found.gap_origin == "both"
     assert sum(v > 0 for v in smoothed(monkeypatch, models, max_unknown_groups=2).group_variance.values()) == 2
-    assert not any(smoothed(monkeypatch, models, worth=1e6).group_variance.values())
+    assert not any(smoothed(monkeypatch, models, min_log_bayes_factor=1e6).group_variance.values())
 
 
 def test_noise_alone_takes_nothing_in(monkeypatch):
@@ -326,7 +330,7 @@ def test_known_noise_of_torques_is_as_strong_at_low_frequencies_as_the_unknown_f
         problem=SimpleNamespace(step=SimpleNamespace(time_step=0.005)),
     )
     reference = np.array([2.0, 5.0, 4.0])
-    unknowns = SimpleNamespace(unknown_names=("b", "free", "a", "encoder.a"), forced=(1, 2, 0), reference=reference)
+    unknowns = SimpleNamespace(names=("b", "free", "a", "encoder.a"), forced=(1, 2, 0), reference=reference)
     known = smoother_model._torque_noise(course, unknowns, span, decay)
     # autocovariances of a force with memory, summed over all lags, are those of held white noise
     lags = 1 + 2 * sum(decay**k for k in range(1, 200))

@@ -244,13 +244,13 @@ class _State:
     """All recordings at given variances.
 
     `passes` of the recordings, `shift` (ntheta,) of the free parameters in units of their scales, its covariance
-    `spread` (ntheta, ntheta), and the log `evidence`.
+    `spread` (ntheta, ntheta), and the `log_evidence`.
     """
 
     passes: tuple[_Pass, ...]
     shift: Array
     spread: Array
-    evidence: float
+    log_evidence: float
 
 
 def _run(models: Sequence[LinearResidualModel], variance: Mapping[UnknownGroup, float], smooth: bool = True) -> _State:
@@ -301,7 +301,7 @@ def _refined(
             for s, v in variance.items()
         }
         after = _run(models, trial)
-        if not after.evidence > state.evidence + 0.05:
+        if not after.log_evidence > state.log_evidence + 0.05:
             break
         variance, state = trial, after
     return variance, state
@@ -331,7 +331,7 @@ def _selected(
         if not outcomes:
             return variance, state
         (evidence, size), source = max(zip(outcomes, promising, strict=True), key=lambda pair: pair[0][0])
-        if not evidence > state.evidence + limits.min_log_bayes_factor:
+        if not evidence > state.log_evidence + limits.min_log_bayes_factor:
             return variance, state
         variance, state = _refined(models, variance | {source: size})
     return variance, state
@@ -430,9 +430,11 @@ def run_smoother(
         for side, own in sides.items():
             done = [entry for entry in found.values() if {s for s, v in entry[0].items() if v} <= set(own)]
             found[side] = done[0] if done else _selected(models, own, none, nothing, limits)
-        evidence = {"none": 0.0} | {side: state.evidence - nothing.evidence for side, (_, state) in found.items()}
+        evidence = {"none": 0.0} | {
+            side: state.log_evidence - nothing.log_evidence for side, (_, state) in found.items()
+        }
         # what is chosen greedily among all may end behind a choice among fewer
-        variance, state = max(found.values(), key=lambda entry: entry[1].evidence)
+        variance, state = max(found.values(), key=lambda entry: entry[1].log_evidence)
         before, after, taken, samples = _explained(models, variance, nothing, state)
         degrees = max(float(samples) - len(nothing.shift), 1.0)
         weight = _weights(models, variance, state)
@@ -448,7 +450,7 @@ def run_smoother(
             max(degrees - taken, 1.0),
             evidence,
             limits.min_log_bayes_factor,
-            _instead(models, variance, state.evidence, weight, limits),
+            _instead(models, variance, state.log_evidence, weight, limits),
         )
 
 
@@ -540,7 +542,7 @@ def _weights(
     weight = dict.fromkeys(variance, 0.0)
     for source in [s for s, v in variance.items() if v]:
         less = _run(models, variance | {source: 0.0}, smooth=False)
-        weight[source] = max(state.evidence - less.evidence, 0.0)
+        weight[source] = max(state.log_evidence - less.log_evidence, 0.0)
     return weight
 
 
