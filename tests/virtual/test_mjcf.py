@@ -84,7 +84,7 @@ def test_what_mujoco_cannot_express_is_refused() -> None:
     with pytest.raises(ModelError, match="compliant"):
         mujoco_xml(replace(system, grasps=(grasp,)))
     with pytest.raises(ModelError, match="'B_0_x' is rigid"):
-        mujoco_xml(replace(system, compliant={"B_0_x": ca.SX(0)}))
+        mujoco_xml(replace(system, joint_compliances={"B_0_x": ca.SX(0)}))
     with pytest.raises(ModelError, match="has a mass"):
         mujoco_xml(System.build(floating_clamp("clamp")))
     beam = flexible_object([Segment("B", 0.5, 0.2, 0.01)])
@@ -93,6 +93,8 @@ def test_what_mujoco_cannot_express_is_refused() -> None:
     with pytest.raises(ModelError, match="more than six"):
         mujoco_xml(System.build(floating_clamp("clamp"), objects=[(beam, "clamp", None)]))
     with pytest.raises(ModelError, match="sits on a joint that carries no mass"):
-        mujoco_xml(replace(SYSTEMS[1], points=("bare",), mechanism=replace(tree, frames={**tree.frames, "bare": bare})))
+        mujoco_xml(
+            replace(SYSTEMS[1], point_frames=("bare",), mechanism=replace(tree, frames={**tree.frames, "bare": bare}))
+        )
     with pytest.raises(ConfigError, match="time_step"):
         mujoco_xml(system, time_step=0.0)

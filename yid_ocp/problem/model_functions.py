@@ -160,6 +160,7 @@ class InputCorrections:
         angle, effort = ca.SX.sym("angle", count), ca.SX.sym("effort", count)
         true_angle, true_effort = self._corrected(angle, effort)
         theta = system.parameters.symbols
+        self._chosen = ca.vertcat(ca.SX(0, 1), *(system.parameters[name].symbol for name in names))
         late = ca.vertcat(ca.SX(0, 1), *(self._delay(f"torque.{joint}", False) for joint in system.driven))
         self.corrects_angles = _depends(true_angle, theta)
         self.corrects_efforts = _depends(true_effort, theta)
@@ -170,7 +171,6 @@ class InputCorrections:
             for kind, joints in (("torque", system.driven), ("joints.effort", system.prescribed))
         }
         self.lags_torque = self._lags["torque"] is not None
-        self._chosen = ca.vertcat(ca.SX(0, 1), *(system.parameters[name].symbol for name in names))
         self._late = ca.Function("delay", [theta], [late, ca.jacobian(late, self._chosen)])
         slope = ca.vertcat(ca.SX(0, 1), *(ca.jacobian(true_effort[i], effort[i]) for i in range(count)))
         outputs = [true_angle, true_effort, ca.densify(slope)]
