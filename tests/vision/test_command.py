@@ -178,7 +178,7 @@ def test_the_examples_run(cli, repository, tmp_path, name):
 def test_a_flag_keeps_the_told_pose(repository, monkeypatch):
     asked = []
     monkeypatch.setattr(command, "run_track", lambda run, *rest: asked.append(run.track.options.calibration.fix_pose))
-    monkeypatch.setattr(command, "run_and_print", lambda arguments, work, *rest: work(None))
+    monkeypatch.setattr(command, "run_and_print", lambda arguments, work, *rest: work(None) or 0)
     config = str(repository / "configs" / "track_single_arm.yaml")
     assert main(["track", config]) == main(["track", config, "--fix-pose"]) == 0
     assert asked == [False, True]
