@@ -24,7 +24,7 @@ def test_all_together_change_nothing(mode, benches, all_effects, sensors) -> Non
     effects = all_effects(bench.system)
     plain, full = bench.run(bench.plain), bench.run(bench.step(*effects))
     assert full.rollout.status.is_converged
-    assert full.rollout.status.iterations <= 1.5 * plain.rollout.status.iterations
+    assert full.rollout.status.newton_iterations <= 1.5 * plain.rollout.status.newton_iterations
     assert largest(bench.nominal_part(full) - bench.nominal_part(plain), bench.nominal_part(plain)) < 1e-10
     assert largest(full.rollout.multipliers - plain.rollout.multipliers, plain.rollout.multipliers) < 1e-10
     watched = [sensors.camera, sensors.arm] + ([sensors.effort] if mode == "prescribed" else [])
@@ -44,7 +44,7 @@ def test_alone_it_changes_nothing_and_has_a_slope(kind, benches) -> None:
     plain, run = bench.run(bench.plain, steps=3), bench.run(step, names=effect.parameters.names, steps=3)
     assert run.rollout.status.is_converged
     assert largest(bench.nominal_part(run) - bench.nominal_part(plain), bench.nominal_part(plain)) < 1e-10
-    assert np.all(np.isfinite(run.rollout.by_state))
+    assert np.all(np.isfinite(run.rollout.state_sensitivity))
     q, p, z = np.split(run.start, [step.sizes["n"], 2 * step.sizes["n"]])
     a, _, _ = step.jacobians(q, p, bench.torque[0], run.theta, internal=z)
     assert np.max(np.abs(a)) < 1e6

@@ -223,7 +223,7 @@ def test_ranges_of_strong_joints_follow_their_limits() -> None:
     for kind in ("joint_viscous", "joint_stribeck", "joint_spring", "rotor_inertia", "effort_offset"):
         first, plain = (make_effect(kind, "j0", s).definitions[0] for s in (strong, system))
         assert first.upper == pytest.approx(6 * plain.upper)
-        assert first.prior_ranges[1] == pytest.approx(6 * plain.prior_ranges[1])
+        assert first.prior_range[1] == pytest.approx(6 * plain.prior_range[1])
     # what the first joint bears, the hand may hold
     assert make_effect("point_mass", "hand", strong).definitions[0].upper == pytest.approx(60.0)
 
@@ -232,5 +232,5 @@ def test_a_mass_on_the_object_may_weigh_as_much_as_the_object() -> None:
     system = baxter_foam_y_system(1)
     whole = 0.064 + 0.015 + 0.016
     mass = make_effect("point_mass", "w_T1", system).definitions[0]
-    assert mass.prior_ranges[1] == pytest.approx(whole, rel=0.05)
+    assert mass.prior_range[1] == pytest.approx(whole, rel=0.05)
     assert mass.upper >= whole
