@@ -104,11 +104,11 @@ def test_compiled_and_interpreted_agree_with_every_effect(cases) -> None:
     step = compile_step(case.step.system, case.step.time_step)
     assert step.is_compiled
     fast, slow = bench.run(step, case.values, case.names, case.start, STEPS).rollout, case.run.rollout
-    for field in ("state", "multipliers", "by_state", "by_multipliers"):
+    for field in ("state", "multipliers", "state_sensitivity", "multipliers_sensitivity"):
         one, other = getattr(fast, field), getattr(slow, field)
         assert np.max(np.abs(one - other)) <= 1e-8 * np.max(np.abs(other)), field
     weight = np.random.default_rng(1).normal(size=slow.state.shape)
-    exact = np.einsum("kx,kxd->d", weight, slow.by_state)
+    exact = np.einsum("kx,kxd->d", weight, slow.state_sensitivity)
     for s, rollout in ((step, fast), (case.step, slow)):
         gradient = adjoint_gradient(s, case.run.theta, rollout, case.names, weight)
         assert gradient.by_theta == pytest.approx(exact, rel=1e-6, abs=1e-8 * np.max(np.abs(exact)))

@@ -166,6 +166,7 @@ class InputCorrections:
         self.corrects_efforts = _depends(true_effort, theta)
         self.angles_depend_on_effort = _depends(true_angle, effort)
         self.delays_torque = _depends(late, theta)
+        self._chosen = ca.vertcat(ca.SX(0, 1), *(system.parameters[name].symbol for name in names))
         self._lags = {
             kind: self._lag_function(kind, joints)
             for kind, joints in (("torque", system.driven), ("joints.effort", system.prescribed))
