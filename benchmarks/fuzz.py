@@ -65,7 +65,7 @@ parameters:
   elbow.damping: {{free: true}}
 problem: {{path_cutoff: 20, use_compiler: false, time_step: 0.01}}
 solver: {{name: gauss_newton, max_iterations: 2}}
-output: {{report: false}}
+output: {{write_report: false}}
 """
 
 NUMBERS = (

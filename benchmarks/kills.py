@@ -50,9 +50,9 @@ model:
   robot: package:baxter
   arms: {{joints: [left_s0, left_s1, left_e0, left_e1, left_w0, left_w1, left_w2]}}
   object: {{kind: foam_y}}
-  grasp: {{left: {{holder: left_gripper, held: w_T2}}}}
+  grasp: {{left: {{holder_frame: left_gripper, held_frame: w_T2}}}}
 recordings: {{estimate: [{data}/joints.h5]}}
-track: {{frames: {data}/frames, pictures: 1}}
+track: {{frames_path: {data}/frames, n_drawn_frames: 1}}
 """
 Random = np.random.Generator
 
@@ -133,7 +133,7 @@ class Room:
         return (self.folder / "said.txt").read_text(errors="replace")[-600:]
 
     def look(self, after: str, hidden: bool) -> None:
-        """Whether what stands in the room is whole; `is_hidden`: whether a killed run may have left its hidden folder."""
+        """Whether what stands in the room is whole; `hidden`: whether a killed run may have left its hidden folder."""
         for path in self.folder.iterdir():
             if path.name.startswith(".") and path.is_dir() and not hidden:
                 self.wrong.append(f"after {after}, {path.name} is left")
