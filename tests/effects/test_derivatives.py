@@ -67,7 +67,11 @@ def test_sensitivities_agree_with_differences(kind, mode, where, cases) -> None:
             for sign in (1, -1)
         )
         rollout = case.run.rollout
-        for field, by in (("state", "by_state"), ("multipliers", "by_multipliers"), ("effort", "by_effort")):
+        for field, by in (
+            ("state", "state_sensitivity"),
+            ("multipliers", "multipliers_sensitivity"),
+            ("effort", "effort_sensitivity"),
+        ):
             numeric = (getattr(above, field) - getattr(below, field)) / (2 * width)
             exact = getattr(rollout, by)[..., column]
             if exact.size == 0:
