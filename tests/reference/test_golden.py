@@ -91,11 +91,11 @@ def test_model_numbers(case):
     trep, system, _, theta = case
     values = dict(zip(system.parameters.names, theta, strict=True))
     mechanism = system.mechanism.with_numeric_values({name: values[name] for name in system.mechanism.parameters.names})
-    springs = {spring.joint: spring.stiffness for spring in system.elastic_joints}
+    springs = {spring.joint_name: spring.stiffness for spring in system.elastic_joints}
     assert len(mechanism.joints) == len(trep.model["nodes"])
     for joint, node in zip(mechanism.joints, trep.model["nodes"], strict=True):
-        assert joint.parent == node["parent"]
-        np.testing.assert_allclose(number(joint.placement.matrix()), node["X"], rtol=0, atol=1e-10)
+        assert joint.parent_index == node["parent"]
+        np.testing.assert_allclose(number(joint.placement.homogeneous_matrix()), node["X"], rtol=0, atol=1e-10)
         np.testing.assert_array_equal(joint.axis, np.eye(3)["xyz".index(node["axis"])])
         body = merge_bodies(joint.bodies)
         if body is None:
@@ -116,7 +116,7 @@ def test_model_tips_and_grasps(case):
     mechanism = system.mechanism.with_numeric_values()
     for name, tip in trep.model["tips"].items():
         frame = mechanism.frame(TIPS[name])
-        assert frame.joint == tip["node"]
-        np.testing.assert_allclose(number(frame.placement.matrix()), tip["X"], rtol=0, atol=1e-10)
-    grasps = [[grasp.holder_frame, grasp.held] for grasp in system.grasps]
+        assert frame.joint_index == tip["node"]
+        np.testing.assert_allclose(number(frame.placement.homogeneous_matrix()), tip["X"], rtol=0, atol=1e-10)
+    grasps = [[grasp.holder_frame, grasp.held_frame] for grasp in system.grasps]
     assert grasps == [[TIPS[holder], TIPS[held]] for holder, held in trep.model["grasps"]]

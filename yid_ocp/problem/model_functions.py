@@ -160,7 +160,6 @@ class InputCorrections:
         angle, effort = ca.SX.sym("angle", count), ca.SX.sym("effort", count)
         true_angle, true_effort = self._corrected(angle, effort)
         theta = system.parameters.symbols
-        self._chosen = ca.vertcat(ca.SX(0, 1), *(system.parameters[name].symbol for name in names))
         late = ca.vertcat(ca.SX(0, 1), *(self._delay(f"torque.{joint}", False) for joint in system.driven))
         self.corrects_angles = _depends(true_angle, theta)
         self.corrects_efforts = _depends(true_effort, theta)
