@@ -104,11 +104,11 @@ def test_a_place_that_does_as_well_is_told(twice):
 def test_it_is_named_beside_the_place_but_its_own_other_unknowns_are_not():
     same = UnknownGroup("here", "push")
     seen = SimpleNamespace(
-        weight={HERE: 9.0, LIKE: 0.0, same: 0.0},
-        detectable=dict.fromkeys((HERE, LIKE, same), 0.5),
-        variance={HERE: 1.0, LIKE: 0.0, same: 0.0},
-        traces=(),
-        instead={HERE: (LIKE, same)},
+        log_evidence_drop={HERE: 9.0, LIKE: 0.0, same: 0.0},
+        detectable_std=dict.fromkeys((HERE, LIKE, same), 0.5),
+        group_variance={HERE: 1.0, LIKE: 0.0, same: 0.0},
+        smoothed_unknowns=(),
+        alternative_groups={HERE: (LIKE, same)},
     )
     first, *_ = localise_gap(seen)
     assert (first.location, first.indistinguishable_from) == ("here", ("there",))

@@ -93,7 +93,7 @@ def test_the_filter_gives_the_evidence_and_the_posterior_of_dense_algebra(seed):
     gain = np.diag(prior) @ design.T @ np.linalg.inv(total)
     mean = unknown @ gain @ observed
     covariance = np.diag(prior) - gain @ design @ np.diag(prior)
-    assert done.chi2_per_sample == pytest.approx(mean, rel=1e-8, abs=1e-10)
+    assert done.mean == pytest.approx(mean, rel=1e-8, abs=1e-10)
     expected = np.einsum("jdw,wv,jdv->jd", unknown, covariance, unknown)
     assert done.covariance == pytest.approx(expected, rel=1e-8, abs=1e-10)
     left = np.linalg.solve(total, observed)
@@ -252,7 +252,7 @@ def test_a_push_is_found_where_and_when_it_was(driven, joint, name, push):
     column = trace.unknown_names.index(name)
     middle = (trace.interval_edges[:-1] >= 0.9) & (trace.interval_edges[1:] <= 1.25)
     size = trace.reference_std[column] * trace.posterior_mean[middle, column]
-    assert np.abs(size).chi2_per_sample() == pytest.approx(push, rel=0.35)
+    assert np.abs(size).mean() == pytest.approx(push, rel=0.35)
     edges, names, values = informed_z_scores(found)
     assert values.shape == (len(edges) - 1, len(names))
     assert np.isfinite(values[:, names.index(name)]).any()

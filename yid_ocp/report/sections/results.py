@@ -205,14 +205,14 @@ def informative_motion_context(findings: ReportData) -> Mapping[str, Any] | None
     if found is None:
         return None
     empty = np.zeros(0)
-    unit = partial(joint_channel_unit, found.simulator.step.system, found.joints)
+    unit = partial(joint_channel_unit, found.simulator.step.system, found.joint_names)
     courses = {
-        f"joints, from the start [{unit('position')}]": found.position - found.position[0],
-        f"velocity [{unit('velocity')}]": found.velocity,
-        f"effort [{unit('effort')}]": found.effort,
+        f"joints, from the start [{unit('position')}]": found.joint_positions - found.joint_positions[0],
+        f"velocity [{unit('velocity')}]": found.joint_velocities,
+        f"effort [{unit('effort')}]": found.joint_efforts,
     }
     curves = [
-        TimePlot(words, empty, empty, {name: (found.t, values[:, i]) for i, name in enumerate(found.joints)})
+        TimePlot(words, empty, empty, {name: (found.t, values[:, i]) for i, name in enumerate(found.joint_names)})
         for words, values in courses.items()
     ]
     return {"figures": [figure_html(lines_over_time_figure(curve)) for curve in curves]}
@@ -224,22 +224,25 @@ def planned_motion_context(findings: ReportData) -> Mapping[str, Any] | None:
     found = findings.section_data.get("plan")
     if found is None:
         return None
-    where = found.points.get(findings.result["point"])
+    where = found.point_trajectories.get(findings.result["point"])
     empty = np.zeros(0)
-    unit = partial(joint_channel_unit, found.simulator.step.system, found.joints)
+    unit = partial(joint_channel_unit, found.simulator.step.system, found.joint_names)
     curves = []
     if where is not None:
-        off = 1e3 * (where - found.place)
+        off = 1e3 * (where - found.target_position)
         lines = {axis: (found.t, off[:, i]) for i, axis in enumerate("xyz")}
         curves.append(TimePlot("from the place [mm]", empty, empty, lines, 1e3 * findings.result["tolerance"]))
-    moved = {name: (found.t, found.position[:, i] - found.position[0, i]) for i, name in enumerate(found.joints)}
+    moved = {
+        name: (found.t, found.joint_positions[:, i] - found.joint_positions[0, i])
+        for i, name in enumerate(found.joint_names)
+    }
     curves.append(TimePlot(f"joints, from the start [{unit('position')}]", empty, empty, moved))
     curves.append(
         TimePlot(
             f"effort [{unit('effort')}]",
             empty,
             empty,
-            {n: (found.t, found.effort[:, i]) for i, n in enumerate(found.joints)},
+            {n: (found.t, found.joint_efforts[:, i]) for i, n in enumerate(found.joint_names)},
         )
     )
     return {"figures": [figure_html(lines_over_time_figure(curve)) for curve in curves]}
