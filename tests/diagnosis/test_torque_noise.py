@@ -189,7 +189,8 @@ def test_a_filter_is_about_the_torque_that_is_left_beside_an_effect(sprung):
     problem, made = sprung
     nominal = fit_nominal_model(problem, made)
     made = replace(made, problem=nominal.problem)
-    spring, offset = (next(e for e in made.candidate_effects if e.kind == kind) for kind in ("joint_spring", "effort_offset"))
+    kinds = ("joint_spring", "effort_offset")
+    spring, offset = (next(e for e in made.candidate_effects if e.kind == kind) for kind in kinds)
     k, rest = "joint_spring@shoulder.stiffness", "joint_spring@shoulder.rest_angle"
     found = refit_with_effects(made, [spring], {**nominal.values, k: 0.3, rest: 1.0})
     other = refit_with_effects(made, [offset], nominal.values)
