@@ -33,7 +33,7 @@ def arm_with_cable(links: int, mode: str) -> System:
     }
     cable = flexible_object([Segment("cable", 1.0, 0.1, 0.006, links=links, joint_axes="xy", **how)], name="cable")
     robot = read_urdf("package:ur5", joints=list(JOINTS))
-    parts = {"objects": [(cable, "tool0", None)], "points": ("w_cable",), "damping": dict.fromkeys(JOINTS, 1.0)}
+    parts = {"objects": [(cable, "tool0", None)], "point_frames": ("w_cable",), "damping": dict.fromkeys(JOINTS, 1.0)}
     return System.build(robot, **parts, **{mode: list(JOINTS)})
 
 

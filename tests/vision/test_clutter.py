@@ -57,7 +57,7 @@ def emptied(things):
 @pytest.mark.parametrize(
     ("things", "junction"),
     [
-        (lambda k: [pole([1.05 + 0.02 * k, -0.75, -0.9], 1.5, 0.12), pole([1.05, -0.6, -0.1], 0.1, 0.3)], 0.9),
+        (lambda k: [pole([1.1 + 0.02 * k, -0.75, -0.9], 1.5, 0.12), pole([1.1, -0.6, -0.1], 0.1, 0.3)], 0.9),
         (lambda k: [box([0.85, -0.5, -0.3], [0.2, 0.2, 0.2])], 0.9),
         (lambda k: [box([0.93, 0.0, -0.5], [0.1, 0.3, 0.1])], 0.5),  # before the trunk, touching it
         (lambda k: [pole([0.9, -0.25, -0.93], 1.6, 0.02)], 0.9),  # as thick as the branch that touches it
