@@ -86,7 +86,7 @@ def twice():
                 one.sample_count,
             )
         )
-    kept = {**vars(model), "intervals": tuple(intervals), "sources": (HERE, LIKE, OTHER)}
+    kept = {**vars(model), "intervals": tuple(intervals), "unknown_groups": (HERE, LIKE, OTHER)}
     return type(model)(**kept)
 
 
