@@ -5,8 +5,8 @@
 Free vertices are all but the two held at each end. A prediction knows the held vertices throughout and the free ones in
 the first two frames; its error is the root mean square Euclidean distance over free vertices and later frames. Values
 are per unit weight: the linear density is nominal, as no force was measured. `nominal` and `undeformed rest` are the
-model with the measured undeformed shape as its rest shape, at guessed and at fitted stiffness and damping; for `with_fitted_initial_state`
-the rest shape was estimated as well.
+model with the measured undeformed shape as its rest shape, at guessed and at fitted stiffness and damping; for
+`with_fitted_initial_state` the rest shape was estimated as well.
 """
 
 from __future__ import annotations

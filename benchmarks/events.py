@@ -132,7 +132,8 @@ def main() -> int:
             hits = [label for label in own.get(event.recording, ()) if matches(event, label)]
             said = f"true {hits[0]['impulse']:+.3f}" if hits else ""
             print(
-                f"{event.recording:20} {event.channel:9} {event.start_time:5.2f} to {event.end_time:5.2f} s  {event.peak_value:+.2f} "
+                f"{event.recording:20} {event.channel:9} {event.start_time:5.2f} to {event.end_time:5.2f} s  "
+                f"{event.peak_value:+.2f} "
                 f"{event.unit}  {event.impulse:+.3f} ± {event.impulse_std:.3f} {event.unit} s  {said}"
             )
         score = scored(events.disturbances, falls, own, UNLABELLED.get(machine))

@@ -58,7 +58,8 @@ def recorded(plan: InformativeMotionPlan, seed: int) -> Recording:
     posture = dict(zip(plan.joint_names, map(float, plan.simulator.start_positions), strict=True))
     simulation = replace(ROUGH.simulation, duration=float(plan.t[-1]))
     experiment = VirtualExperiment(
-        motion=movement, initial_joint_angles=posture, simulation=simulation, arm_noise=ROUGH.noise(1), camera=PointCamera(), seed=seed,
+        motion=movement, initial_joint_angles=posture, simulation=simulation, arm_noise=ROUGH.noise(1),
+        camera=PointCamera(), seed=seed,
         recording_name=f"planned_{seed}",
     )  # fmt: skip
     return run_virtual_experiment(baxter_foam_y_system(1), TRUTH, experiment)
@@ -83,7 +84,8 @@ def parameter(starts: int, recordings: int) -> None:
     print("\n".join(aligned_table_lines(rows)))
     known = plan.parameter_precisions[SOUGHT]
     print(
-        f"expected: {100 * known.std_recorded:.3g} % before, {100 * known.std_planned:.3g} % after, verdict {known.verdict}"
+        f"expected: {100 * known.std_recorded:.3g} % before, "
+        f"{100 * known.std_planned:.3g} % after, verdict {known.verdict}"
     )
     print(f"starts, nat as judged: {', '.join(f'{start.configured_criterion:.3g}' for start in plan.start_results)}")
     print(f"limits reached: {dict(plan.active_limits)}; unseen: {', '.join(plan.unobservable_parameters)}")
@@ -124,7 +126,8 @@ def pair(name: str, starts: int, share: float) -> None:
         movement = PlannedMovement(plan.joint_names, plan.simulator.path, plan.spline_coefficients)
         posture = dict(zip(plan.joint_names, map(float, plan.simulator.start_positions), strict=True))
         experiment = VirtualExperiment(
-            motion=movement, initial_joint_angles=posture, simulation=SimulationOptions(float(plan.t[-1])), seed=NOISE_SEED + seed,
+            motion=movement, initial_joint_angles=posture, simulation=SimulationOptions(float(plan.t[-1])),
+            seed=NOISE_SEED + seed,
             recording_name=f"planned_{seed}",
         )  # fmt: skip
         planned.append(run_injected_experiment(baxter_foam_y_system(1), TRUTH, case.withheld, experiment))

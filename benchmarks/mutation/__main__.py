@@ -3,9 +3,10 @@
     python benchmarks/mutation [--mutants N] [--seed S] [--in PACKAGE] [--file NAME] [--jobs N] [--rules] [--again]
 
 First the named breaks of `breaks.yaml`, each against the tests named beside it; then so many mutants, drawn by the seed
-over diagnosis/, analysis/, problem/, inference/ and what all solvers share (see `PACKAGES` and `places.py`), each against
-those tests of its package's folder that run the changed statement, tests of rules first, then file by file, the quickest
-first, up to the first failure or three times the time that they take without a change. Tests marked `slow` stay out.
+over diagnosis/, analysis/, problem/, inference/ and what all solvers share (see `PACKAGES` and `places.py`), each
+against those tests of its package's folder that run the changed statement, tests of rules first, then file by file,
+the quickest first, up to the first failure or three times the time that they take without a change. Tests marked
+`slow` stay out.
 
 What was found goes to a JSON file as it is found; an interrupted run goes on from there as long as sources and tests
 are the same. `--again` is for the time in which tests are being written: what was killed counts as killed, whatever was

@@ -61,7 +61,8 @@ def test_steepest_descent_goes_wrong_exactly_where_nothing_is_found(problem):
 
 def test_nothing_to_agree_on(repository, tmp_path, capsys):
     config = repository / "configs" / "springs_series_ends.yaml"
-    methods = "compare.methods={gauss_newton: {}, single_shooting: {max_iterations: 3}, multiple_shooting: {max_iterations: 2}}"
+    methods = "compare.methods={gauss_newton: {}, single_shooting: {max_iterations: 3}, "
+    methods += "multiple_shooting: {max_iterations: 2}}"
     assert main(["compare", str(config), "--out", str(tmp_path / "run"), "--set", methods]) == 0
     text = capsys.readouterr().out
     assert "single_shooting did not converge" in text

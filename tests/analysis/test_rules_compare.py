@@ -102,7 +102,8 @@ def test_parameters_that_are_not_found_are_explained():
     other = run("single_shooting", a_b=estimate(12.3456), c=estimate(4.5), d=estimate(1.0), e=estimate(2.0))
     said = _explanations([best, other], best.solution.parameters, {"a.b": 11.25}, False)
     assert said == [
-        "a.b (truth 11.25) is weakly determined: where it ends is the method's choice (gauss_newton 10, single_shooting 12.3)",
+        "a.b (truth 11.25) is weakly determined: where it ends is the method's choice "
+        "(gauss_newton 10, single_shooting 12.3)",
         "c cannot be found: where it ends is the method's choice (gauss_newton 3, single_shooting 4.5)",
     ]
 

@@ -24,7 +24,8 @@ def test_written_back_it_is_the_same_run(repository, tmp_path, name):
 
 def test_written_back_every_setting_is_there(written):
     text = (
-        "solver: {name: single_shooting, max_iterations: 3}\ncompare: {methods: {single_shooting: {cost_tolerance: 2}}}\n"
+        "solver: {name: single_shooting, max_iterations: 3}\n"
+        "compare: {methods: {single_shooting: {cost_tolerance: 2}}}\n"
         "track: {options: {filters: {max_depth_behind_base: null}}}\n"
     )
     run = load_config(written(text))

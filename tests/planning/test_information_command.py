@@ -30,7 +30,8 @@ parameters:
   elbow.damping: {{free: true}}
 problem: {{use_compiler: false, path_cutoff: 15.0, feedback: none}}
 plan:
-  {{goal: information, duration: 0.8, hold_duration: 0.4, n_spline_coefficients: 3, n_random_starts: 2, limits: {{max_acceleration: 15.0}}}}
+  {{goal: information, duration: 0.8, hold_duration: 0.4, n_spline_coefficients: 3, n_random_starts: 2,
+    limits: {{max_acceleration: 15.0}}}}
 """
 PAIR = ("joint_coulomb@shoulder", "joint_viscous@shoulder")
 

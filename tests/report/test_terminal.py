@@ -166,7 +166,8 @@ def test_verdicts_of_a_comparison_weigh_all_noise():
     """The methods themselves do not, so that nothing of theirs is to be trusted."""
     doubtful = solved(parameters={"a": parameter("not_trusted", 7.0)}, fit=BAD)
     compared = {
-        "methods": {"single_shooting": doubtful}, "reference": "single_shooting", "published": {}, "truth": {}, "explained": [],
+        "methods": {"single_shooting": doubtful}, "reference": "single_shooting", "published": {}, "truth": {},
+        "explained": [],
         "agree": True, "judged": solved(parameters={"a": parameter("identifiable", 9.0)}), "disturbed": True,
         "published_explained": [],
     }  # fmt: skip

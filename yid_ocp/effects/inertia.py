@@ -164,7 +164,7 @@ class Payload(EffectBase):
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definitions of mass [kg], above -`_MAX_REMOVED_MASS_FRACTION` of the link's, first moments mx, my, mz [kg m]."""
+        """Mass [kg], above -`_MAX_REMOVED_MASS_FRACTION` of the link's, first moments mx, my, mz [kg m]."""
         upper, expected = _bearable(system, location)
         lower = -_MAX_REMOVED_MASS_FRACTION * carried_body(system, system.mechanism.frame(location).joint_index).mass
         moments = (

@@ -71,7 +71,7 @@ def prediction_error_entry(
 def channels_worse_than_baseline(
     entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]
 ) -> list[dict[str, Any]]:
-    """Channels of `prediction_error_entry` entries that a model-free baseline predicts clearly better than the model."""
+    """Channels of `prediction_error_entry` entries that a baseline without a model predicts clearly better."""
     worse = []
     for entry in entries:
         for channel, error in entry["rmse"].items():
