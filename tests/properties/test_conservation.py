@@ -83,7 +83,8 @@ def test_linear_momentum_along_free_rails(gantry, roll, momentum, seed):
     rollout = roll(gantry.step, gantry.theta, q, p, 200)
     assert rollout.status.is_converged, rollout.status.message
     kept = rollout.state[:, gantry.n : gantry.n + 2]
-    assert np.max(np.abs(kept - kept[0])) < 1e-9 * max(1.0, np.max(np.abs(kept[0])))
+    # what Newton leaves in each of 200 steps adds up
+    assert np.max(np.abs(kept - kept[0])) < 200 * 2e-11 * max(1.0, np.max(np.abs(kept[0])))
 
 
 @pytest.mark.parametrize("name", ["mixed_joints", "turntable", "arm", "cable", "foam_y"])

@@ -58,8 +58,8 @@ def solved(recording, links):
 def test_what_a_chain_too_coarse_gives_is_not_to_be_trusted(recording):
     solution = solved(recording, COARSE)
     assert solution.status == Status.CONVERGED
-    assert solution.fit.chi2_per_dof > 2
-    assert not solution.fit.explains
+    assert solution.goodness_of_fit.chi2_per_dof > 2
+    assert not solution.goodness_of_fit.explains
     assert {solution.parameters[name].verdict for name in TRUTH} == {"not_trusted"}
     bend = solution.parameters["cable.bend"]
     assert abs(bend.value - TRUTH["cable.bend"]) > 3 * bend.std, "so far off that trust would mislead"
@@ -68,7 +68,7 @@ def test_what_a_chain_too_coarse_gives_is_not_to_be_trusted(recording):
 @pytest.mark.slow
 def test_with_as_many_links_as_there_are_it_is_found(recording):
     solution = solved(recording, FINE)
-    assert solution.fit.explains
+    assert solution.goodness_of_fit.explains
     for name, truth in TRUTH.items():
         entry = solution.parameters[name]
         assert entry.verdict == "identifiable", name
