@@ -143,7 +143,7 @@ def test_bag_order_of_joints_may_change(tmp_path: Path) -> None:
     first = joint_state(("a", "b"), START, position=[1.0, 2.0])
     second = joint_state(("b", "a"), START + SECOND, position=[4.0, 3.0])
     path = write_bag(tmp_path, "bag", [("/joint_states", START, first), ("/joint_states", START + SECOND, second)])
-    assert np.array_equal(joints_of(read_bag(path, joints=["a", "b"])).position, [[1, 2], [3, 4]])
+    assert np.array_equal(joints_of(read_any(path, joints=["a", "b"])).position, [[1, 2], [3, 4]])
     assert np.array_equal(np.sort(joints_of(read_bag(path)).position), [[1, 2], [3, 4]])
 
 
@@ -155,12 +155,12 @@ def test_bag_with_different_sets_of_joints(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="2 different sets of joints") as caught:
         read_bag(path)
     assert "--joints" in caught.value.hint
-    assert read_bag(path, joints=["b"]).joint_names == ("b",)
+    assert read_any(path, joints=["b"]).joint_names == ("b",)
     with pytest.raises(DataError, match="no joint 'fingr'") as caught:
-        read_bag(path, joints=["a", "fingr"])
+        read_any(path, joints=["a", "fingr"])
     assert caught.value.hint == "did you mean 'finger'?"
     with pytest.raises(DataError, match="never come in one message"):
-        read_bag(path, joints=["a", "finger"])
+        read_any(path, joints=["a", "finger"])
 
 
 def two_arms(rate: int = 200, effort: bool = True) -> Messages:
@@ -189,11 +189,11 @@ def test_bag_with_several_joint_topics(tmp_path: Path) -> None:
     assert np.allclose(joints.position[:, 1], joints.t - 0.005)
     assert np.array_equal(joints.channels["effort"][:, 1], 2.0 * np.arange(len(joints.t)))
     assert any("/left were interpolated to the times of /right" in note for note in recording.notes)
-    alone = read_bag(path, joint_topics=["/right"])
+    alone = read_any(path, joint_topics=["/right"])
     assert alone.joint_names == ("b",)
     assert any(note.startswith("/left was left out") for note in alone.notes)
     with pytest.raises(DataError, match="on the topic '/rigth'") as caught:
-        read_bag(path, joint_topics=["/rigth"])
+        read_any(path, joint_topics=["/rigth"])
     assert caught.value.hint == "did you mean '/right'?"
 
 
@@ -222,7 +222,7 @@ def test_commands_are_held_until_the_next(tmp_path: Path) -> None:
         stamp = START + (5 * k + 1) * SECOND // 100 + 1000
         messages.append(("/command", stamp, joint_state(("a",), stamp, position=[10.0 + k])))
     path = write_bag(tmp_path, "mcap", messages)
-    joints = joints_of(read_bag(path, joint_topics=["/left"], command_topic="/command"))
+    joints = joints_of(read_any(path, joint_topics=["/left"], command_topic="/command"))
     wanted = [10.0] * 7 + [11.0] * 5 + [12.0] * 5 + [13.0] * 3
     assert np.array_equal(joints.channels["position_command"][:, 0], wanted)
 
@@ -242,7 +242,7 @@ def twelve_topics() -> Messages:
 
 def test_a_bag_of_twelve_topics(tmp_path: Path) -> None:
     path = write_bag(tmp_path, "mcap", twelve_topics())
-    recording = read_bag(
+    recording = read_any(
         path, points={"/mocap/tip": "cable:100%", "/vrpn/hand/pose": "hand", "/tf:middle": "cable:50%"}
     )
     assert recording.joint_names == ("a", "b")
@@ -286,12 +286,12 @@ def test_a_preview_says_what_looks_like_degrees_and_millimetres(tmp_path: Path) 
 
 def test_an_orientation_becomes_points_on_the_axes(tmp_path: Path) -> None:
     path = write_bag(tmp_path, "mcap", [("/hand/pose", START, pose(START, (1.0, 2.0, 3.0)))])
-    (points,) = read_bag(path, pose_axes=0.1).points
+    (points,) = read_any(path, pose_axes=0.1).points
     assert points.names == ("hand", "hand_x", "hand_y", "hand_z")
     # the quarter turn about z takes x to y and y to -x
     assert np.allclose(points.position[0], [[1, 2, 3], [1, 2.1, 3], [0.9, 2, 3], [1, 2, 3.1]])
     with pytest.raises(DataError, match="pose_axes = 0"):
-        read_bag(path, pose_axes=0.0)
+        read_any(path, pose_axes=0.0)
 
 
 def test_currents_become_torques(tmp_path: Path) -> None:
@@ -302,16 +302,16 @@ def test_currents_become_torques(tmp_path: Path) -> None:
         "torque_constants": {"*": 0.1, "b": 0.2},
         "gears": {"b": 50.0},
     }
-    torques = joints_of(read_bag(path, **options)).channels["effort"]
+    torques = joints_of(read_any(path, **options)).channels["effort"]
     assert np.allclose(torques, 1e-3 * efforts * [0.1, 0.2 * 50])
     with pytest.raises(DataError, match="effort of 'a' is a current, and its torque constant is not given"):
-        read_bag(path, units={"effort": "A"}, torque_constants={"b": 1.0})
+        read_any(path, units={"effort": "A"}, torque_constants={"b": 1.0})
     with pytest.raises(DataError, match="but the efforts are no currents"):
-        read_bag(path, torque_constants={"*": 1.0})
+        read_any(path, torque_constants={"*": 1.0})
 
 
 def test_joints_are_renamed(tmp_path: Path) -> None:
-    joints = joints_of(read_bag(write_bag(tmp_path, "mcap", two_arms()), joints=["b=elbow", "a"]))
+    joints = joints_of(read_any(write_bag(tmp_path, "mcap", two_arms()), joints=["b=elbow", "a"]))
     assert set(joints.names) == {"elbow", "a"}
     at = joints.names.index("elbow")
     assert np.allclose(joints.position[:, at], joints.t - 0.005)
@@ -344,7 +344,7 @@ def test_bag_points_of_two_frames(tmp_path: Path) -> None:
     path = write_bag(tmp_path, "bag", messages)
     with pytest.raises(DataError, match="points of the same name"):
         read_bag(path)
-    recording = read_bag(path, points={"/a/tip": "tip", "/b/tip": "seen_tip"})
+    recording = read_any(path, points={"/a/tip": "tip", "/b/tip": "seen_tip"})
     assert recording.joints is None
     assert [(g.name, g.frame, g.names) for g in recording.points] == [
         ("points_base_link", "base/link", ("tip",)),
@@ -352,7 +352,7 @@ def test_bag_points_of_two_frames(tmp_path: Path) -> None:
     ]
     assert recording.duration == 1.0
     with pytest.raises(DataError, match="no points on the topic '/c'"):
-        read_bag(path, points={"/c": "tip"})
+        read_any(path, points={"/c": "tip"})
 
 
 @pytest.mark.parametrize(

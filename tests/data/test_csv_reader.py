@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from recording_examples import joints_of, table
 
-from yid_ocp.data.readers import preview_file
+from yid_ocp.data.readers import preview_file, read_any
 from yid_ocp.data.readers.csv import read_csv
 from yid_ocp.errors import DataError
 
@@ -21,7 +21,7 @@ def test_csv_conventional_columns(tmp_path: Path) -> None:
         "\n"
         "0.5, 0.3, 0.4, 3, 4, 0, 1, , , \n",
     )
-    recording = read_csv(path, clock="nominal", sensor="camera", frame="base", description="two joints")
+    recording = read_any(path, clock="nominal", sensor="camera", frame="base", description="two joints")
     joints = joints_of(recording)
     assert joints.names == ("a", "b")
     assert joints.clock == "nominal"
@@ -39,7 +39,7 @@ def test_csv_conventional_columns(tmp_path: Path) -> None:
 def test_csv_units_are_converted(tmp_path: Path) -> None:
     path = table(tmp_path, "time,q_a,velocity_a,effort_a,p_x,p_y,p_z\n0,180,60,1000,1,2,3\n500,90,0,0,0,0,0\n")
     units = {"t": "ms", "position": "deg", "velocity": "rpm", "effort": "N mm", "points": "mm"}
-    recording = read_csv(path, units=units)
+    recording = read_any(path, units=units)
     joints = joints_of(recording)
     assert np.allclose(joints.t, [0.0, 0.5])
     assert np.allclose(joints.position[:, 0], [math.pi, math.pi / 2])
@@ -47,13 +47,13 @@ def test_csv_units_are_converted(tmp_path: Path) -> None:
     assert joints.channels["effort"][0, 0] == pytest.approx(1.0)
     assert np.allclose(recording.points[0].position[0, 0], [0.001, 0.002, 0.003])
     with pytest.raises(DataError, match="reaches 180 rad"):
-        read_csv(path, units={"t": "ms"})
+        read_any(path, units={"t": "ms"})
 
 
 def test_csv_columns_given(tmp_path: Path) -> None:
     path = table(tmp_path, "stamp;angle;label;X;Y;Z\n0;0.1;start;1;2;3\n1;0.2;;4;5;6\n")
     columns = {"stamp": "t", "angle": "position:elbow", "label": "skip", "X": "x:tip", "Y": "y:tip", "Z": "z:tip"}
-    recording = read_csv(path, columns=columns, delimiter=";")
+    recording = read_any(path, columns=columns, delimiter=";")
     assert recording.joint_names == ("elbow",)
     assert np.array_equal(recording.points[0].position[:, 0], [[1, 2, 3], [4, 5, 6]])
 
@@ -110,7 +110,7 @@ def test_csv_errors(case: str, tmp_path: Path) -> None:
     text, options, message, hint = CSV_ERRORS[case]
     path = table(tmp_path, text)
     with pytest.raises(DataError, match=message.replace("(", r"\(")) as caught:
-        read_csv(path, **options)
+        read_any(path, **options)
     assert "run" in caught.value.where
     assert hint in caught.value.hint
 
@@ -138,11 +138,11 @@ def test_csv_that_is_no_text(tmp_path: Path) -> None:
 def test_a_table_without_a_header(tmp_path: Path) -> None:
     path = table(tmp_path, "0,0.1,5\n1,0.2,6\n")
     columns = {"1": "t", "2": "position:a", "3": "effort:a"}
-    joints = joints_of(read_csv(path, header=False, columns=columns))
+    joints = joints_of(read_any(path, header=False, columns=columns))
     assert np.array_equal(joints.position[:, 0], [0.1, 0.2])
     assert np.array_equal(joints.channels["effort"][:, 0], [5, 6])
     with pytest.raises(DataError, match="no header row") as caught:
-        read_csv(path, columns=columns)
+        read_any(path, columns=columns)
     assert "--no-header --columns t," in caught.value.hint
 
 
@@ -150,8 +150,8 @@ def test_patterns_of_columns(tmp_path: Path) -> None:
     path = table(tmp_path, "stamp,a_pos,b_pos,a_tau,b_tau,b_ref\n0,1,2,3,4,5\n1,6,7,8,9,10\n")
     columns = {"stamp": "t", "*_pos": "position:*", "*_tau": "effort:*", "b_*": "skip", "b_pos": "position:elbow"}
     with pytest.raises(DataError, match="no column for effort of 'elbow'"):
-        read_csv(path, columns=columns)
-    joints = joints_of(read_csv(path, columns={**columns, "b_tau": "effort:elbow"}))
+        read_any(path, columns=columns)
+    joints = joints_of(read_any(path, columns={**columns, "b_tau": "effort:elbow"}))
     assert joints.names == ("a", "elbow")
     assert np.array_equal(joints.channels["effort"], [[3, 4], [8, 9]])
 
@@ -161,17 +161,17 @@ def test_bad_lines_are_refused_or_skipped_and_counted(tmp_path: Path) -> None:
     path = table(tmp_path, text)
     with pytest.raises(DataError, match="'fast'"):
         read_csv(path)
-    recording = read_csv(path, skip_bad_lines=True)
+    recording = read_any(path, skip_bad_lines=True)
     assert np.array_equal(joints_of(recording).t, [0, 2, 5, 6, 7])
     assert recording.notes == ("3 of 8 lines were bad and left out (line 3, 5, 6)",)
     mostly = table(tmp_path, "t,q_a\n0,1\n1,fast\n2,slow\n")
     with pytest.raises(DataError, match="2 of 3 lines are no rows of 2 numbers"):
-        read_csv(mostly, skip_bad_lines=True)
+        read_any(mostly, skip_bad_lines=True)
 
 
 def test_joints_and_points_are_chosen_and_renamed(tmp_path: Path) -> None:
     path = table(tmp_path, "t,q_a,q_b,m1_x,m1_y,m1_z,m2_x,m2_y,m2_z\n0,1,2,3,3,3,4,4,4\n")
-    recording = read_csv(path, joints=["b=elbow"], points={"m2": "cable:100%"})
+    recording = read_any(path, joints=["b=elbow"], points={"m2": "cable:100%"})
     assert (recording.joint_names, recording.point_names) == (("elbow",), ("cable:100%",))
     assert joints_of(recording).position[0, 0] == 2
     assert recording.points[0].position[0, 0, 0] == 4
@@ -200,7 +200,7 @@ def test_the_preview_counts_bad_lines_and_guesses_units(tmp_path: Path) -> None:
     assert contents.reader_options["units"] == {"position": "deg", "points": "mm", "t": "ms"}
     assert contents.reader_options["skip_bad_lines"] is True
     assert contents.notes[0] == "1 of 9 lines are no rows of numbers"
-    joints = joints_of(read_csv(path, **contents.reader_options))
+    joints = joints_of(read_any(path, **contents.reader_options))
     assert joints.t[1] == pytest.approx(0.01)
     assert joints.position[0, 0] == pytest.approx(math.pi / 2)
 
@@ -213,7 +213,7 @@ def test_telemetry_of_isaac_sims_identification(tmp_path: Path) -> None:
         "# a pause\n0.02, 0.5, 0.6, 3, 4, 0.7, 0.8\n",
         encoding="utf-8",
     )
-    joints = read_csv(path, joints=["1=shoulder", "2=elbow"]).joints
+    joints = read_any(path, joints=["1=shoulder", "2=elbow"]).joints
     assert joints is not None
     assert joints.names == ("shoulder", "elbow")
     np.testing.assert_array_equal(joints.t, [0.0, 0.02])

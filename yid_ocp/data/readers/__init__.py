@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import os
 from collections.abc import Callable
+from dataclasses import fields, replace
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
@@ -50,15 +51,17 @@ def read_any(path: str | os.PathLike[str], *, progress: Progress = NULL_PROGRESS
     path = Path(path)
     known_as = _format_of(path)
     reader = READERS[known_as]
-    known = [name for name in inspect.signature(reader).parameters if name not in ("path", "progress")]
+    parameters = inspect.signature(reader).parameters
+    default = parameters["options"].default if "options" in parameters else None
+    known = [name for name in parameters if name not in ("path", "progress")]
+    if default:
+        known = [entry.name for entry in fields(default)]
     for name in options:
         if name not in known:
-            raise DataError(
-                f"the reader of '{known_as}' files has no option '{name}'",
-                where=str(path),
-                **unknown_name_details(name, known),
-            )
-    return reader(path, **options, **_told(reader, progress))
+            what = f"the reader of '{known_as}' files has no option '{name}'"
+            raise DataError(what, where=str(path), **unknown_name_details(name, known))
+    given = {"options": replace(default, **options)} if default else options
+    return reader(path, **given, **_told(reader, progress))
 
 
 def preview_file(path: str | os.PathLike[str], progress: Progress = NULL_PROGRESS) -> FileContents:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +16,7 @@ import numpy as np
 from yid_ocp.data.readers.base import (
     PREVIEWS,
     READERS,
+    ConversionOptions,
     FileContents,
     FileSource,
     check_point_names,
@@ -29,7 +32,8 @@ from yid_ocp.files import file_sha256
 from yid_ocp.progress import NULL_PROGRESS, Progress
 
 _PROGRESS_INTERVAL = 5000  # messages from one word of progress to the next
-_JOINT_STATE = "sensor_msgs/msg/JointState"
+JOINT_STATE = "sensor_msgs/msg/JointState"
+"""Type of the messages with the joints."""
 _POINT_STAMPED = "geometry_msgs/msg/PointStamped"
 _POSES = (
     "geometry_msgs/msg/PoseStamped",
@@ -38,14 +42,17 @@ _POSES = (
 )
 _TREES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _PLACES = (_POINT_STAMPED, *_POSES)
-_KNOWN = (_JOINT_STATE, *_PLACES)
+_KNOWN = (JOINT_STATE, *_PLACES)
 _PLAIN_WORDS = ("pose", "point", "position", "transform", "odom")
 """Last parts of topics that say what a message is, not what was seen."""
 
 
+# -- an open bag ------------------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
-class _Message:
-    """One message of a bag: source, time of recording and header stamp [ns], and the decoded contents."""
+class BagMessage:
+    """One message of a bag: source, time of recording and header stamp [ns], and its contents or where they stand."""
 
     source: str
     logged: int
@@ -54,25 +61,121 @@ class _Message:
 
 
 @dataclass(frozen=True)
-class _Topic:
-    """A topic of a bag with its type, number of messages, and the reason why it cannot be used, if it cannot."""
+class BagTopic:
+    """A topic of a bag with its type and number of messages."""
 
     name: str
     kind: str
     count: int
 
 
+class OpenBag:
+    """An open ROS 1 bag, ROS 2 bag or MCAP file, with its `topics` and the `reader` of rosbags.
+
+    Raises
+    ------
+    DataError
+        If `rosbags` is not installed or the bag cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            from rosbags.highlevel import AnyReader
+            from rosbags.typesys import Stores, get_typestore
+        except ImportError as error:
+            hint = "pip install 'yid-ocp[bags]'"
+            raise DataError("reading bags needs the package rosbags", where=str(path), hint=hint) from error
+        self.path = path
+        counted: Counter[tuple[str, str]] = Counter()
+        with self.reading():
+            # older ROS 2 bags do not hold the definitions of their messages; these have not changed since
+            self.reader: Any = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+            self.reader.open()
+            for c in self.reader.connections:
+                counted[c.topic, c.msgtype] += c.msgcount
+        self.topics = tuple(BagTopic(topic, kind, count) for (topic, kind), count in sorted(counted.items()))
+
+    @contextmanager
+    def reading(self) -> Iterator[None]:
+        """Damage that is found within is a `DataError`."""
+        try:
+            yield
+        except Exception as error:  # rosbags lets through whatever a damaged file makes struct, sqlite3 or zstd raise
+            what, where = f"the bag cannot be read ({type(error).__name__}: {error})", str(self.path)
+            allowed = "a ROS 1 .bag, a ROS 2 folder with metadata.yaml, or an .mcap or .db3 file of ROS 2"
+            hint = "check with `ros2 bag info` or `rosbag info`; a bag cut off by a crash needs `ros2 bag reindex`"
+            raise DataError(what, where=where, allowed=allowed, hint=hint) from error
+
+    def topics_of(self, *kinds: str) -> list[str]:
+        """Topics of some types."""
+        return [topic.name for topic in self.topics if topic.kind in kinds]
+
+    def check_topic(self, name: str, known: Sequence[str], noun: str) -> None:
+        """Raise `DataError` if a topic is not among the known ones."""
+        if name not in known:
+            what = f"there are no {noun} on the topic '{name}'"
+            raise DataError(what, where=str(self.path), **unknown_name_details(name, known))
+
+    def nothing_usable(self, what: str, allowed: str) -> DataError:
+        """Error of a bag that holds only other topics."""
+        held = ", ".join(f"{topic.name} ({topic.kind})" for topic in self.topics) or "no topics at all"
+        return DataError(what, where=str(self.path), allowed=allowed, hint=f"it holds {held}")
+
+
+def bag_clock(
+    messages: Sequence[BagMessage], origins: Sequence[BagMessage] | None = None
+) -> Callable[[BagMessage], float]:
+    """Seconds of a message since the first one, or since the first of `origins`."""
+    # one message without a stamp makes the two clocks incomparable, so then no stamp is used
+    stamped = all(message.stamp > 0 for message in (*messages, *(origins or ())))
+    origin = min((message.stamp if stamped else message.logged for message in origins or messages), default=0)
+
+    def seconds(message: BagMessage) -> float:
+        # integers first: nanoseconds since 1970 do not fit into a float
+        return ((message.stamp if stamped else message.logged) - origin) * 1e-9
+
+    return seconds
+
+
+# -- joints and points of a bag ---------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
-class _Bag:
-    """What a bag holds: its topics, the messages that can be used, in the order of their topics' types, and seconds."""
+class _Contents:
+    """A bag and the messages of it that can be used, in its order."""
 
-    topics: tuple[_Topic, ...]
-    states: tuple[_Message, ...]
-    places: tuple[_Message, ...]
+    bag: OpenBag
+    states: tuple[BagMessage, ...]
+    places: tuple[BagMessage, ...]
 
-    def of(self, kind: str) -> list[str]:
-        """Topics of a type."""
-        return [topic.name for topic in self.topics if topic.kind == kind]
+
+@dataclass(frozen=True)
+class BagOptions(ConversionOptions):
+    """What is read of a bag, and what is kept of it.
+
+    Joints are needed where the messages of a topic do not all have the same ones; messages that lack one are skipped.
+    Points are named by topic, or by `TOPIC:CHILD` for a frame of `/tf`; all topics of points, poses and transforms
+    under the last telling part of their names where absent, and none of `/tf`.
+
+    Attributes
+    ----------
+    joint_topics : sequence of str, optional
+        Topics of the joint states; all that there are when absent.
+    command_topic : str, optional
+        Topic of joint states whose positions are what the controller asked for: `position_command`, held in between.
+    pose_axes : float, optional
+        Distance from a pose's origin [m] at which NAME_x, NAME_y and NAME_z on its axes become points too, so that
+        its orientation is kept.
+    """
+
+    joint_topics: Sequence[str] | None = None
+    command_topic: str | None = None
+    pose_axes: float | None = None
+    sensor: str = "unknown"  # what saw the points
+    description: str = ""  # what was recorded
+
+
+_DEFAULTS = BagOptions()
 
 
 @READERS.register(".bag")
@@ -80,19 +183,7 @@ class _Bag:
 @READERS.register(".db3")
 @READERS.register("folder")
 def read_bag(
-    path: str | os.PathLike[str],
-    *,
-    joint_topics: Sequence[str] | None = None,
-    command_topic: str | None = None,
-    joints: Sequence[str] | None = None,
-    points: Mapping[str, str] | None = None,
-    pose_axes: float | None = None,
-    units: Mapping[str, str] | None = None,
-    torque_constants: Mapping[str, float] | None = None,
-    gears: Mapping[str, float] | None = None,
-    sensor: str = "unknown",
-    description: str = "",
-    progress: Progress = NULL_PROGRESS,
+    path: str | os.PathLike[str], options: BagOptions = _DEFAULTS, progress: Progress = NULL_PROGRESS
 ) -> Recording:
     """Read a ROS 1 bag, a ROS 2 bag folder or an MCAP file.
 
@@ -101,70 +192,39 @@ def read_bag(
     are the headers' stamps (the times of recording if a message has none), from the first message on. A joint channel
     that is empty, or NaN throughout, was not measured and is left out. Topics that are not used are in `notes`.
 
-    Parameters
-    ----------
-    path : path-like
-        The bag.
-    joint_topics : sequence of str, optional
-        Topics of the joint states; all that there are when absent.
-    command_topic : str, optional
-        Topic of joint states whose positions are what the controller asked for: `position_command`, held in between.
-    joints : sequence of str, optional
-        Joints to keep, `name` or `recorded=name`, in this order; messages that lack one of them are skipped. Needed
-        where the messages of a topic do not all have the same joints.
-    points : mapping of str to str, optional
-        Topic, or `TOPIC:CHILD` for a frame of `/tf`, to name of the point; all topics of points, poses and transforms
-        under the last telling part of their names where absent, and none of `/tf`.
-    pose_axes : float, optional
-        Distance from a pose's origin [m] at which NAME_x, NAME_y and NAME_z on its axes become points too, so that
-        its orientation is kept.
-    units, torque_constants, gears
-        As `yid_ocp.data.readers.base.convert_to_si_and_validate`.
-    sensor : str
-        What saw the points.
-    description : str
-        What was recorded.
-
-    Returns
-    -------
-    Recording
-        The checked recording.
-
     Raises
     ------
     DataError
         If `rosbags` is not installed, the bag cannot be read, holds no such topic or leaves a choice open, or as
-        `validate`.
+        `validate_recording`.
     """
     path = Path(path)
     digest = file_sha256(path)
+    pose_axes = options.pose_axes
     if pose_axes is not None and not 0 < pose_axes < float("inf"):
         raise DataError(f"pose_axes = {pose_axes:g}", where=str(path), allowed="a distance above 0 [m]")
-    trees = tuple(source for source in points or () if ":" in source)
-    bag = _bag(path, trees, progress)
-    groups, notes, used = _joints(bag, joint_topics, command_topic, joints, str(path))
-    seen = _named_places(bag, points, str(path))
+    bag = _contents(path, tuple(source for source in options.points or () if ":" in source), progress)
+    groups, notes = _joints(bag, options, str(path))
+    seen = _named_places(bag, options.points, str(path))
     if not groups and not seen:
         allowed = f"topics of the types {', '.join((*_KNOWN, _TREES[0]))}"
-        held = ", ".join(f"{topic.name} ({topic.kind})" for topic in bag.topics) or "no topics at all"
-        what = "the bag has no joint states and no points"
-        raise DataError(what, where=str(path), allowed=allowed, hint=f"it holds {held}")
-    messages = [*(m for entry in groups for m in entry.messages), *(m for entries in seen.values() for _, m in entries)]
-    seconds = _clock(messages)
+        raise bag.bag.nothing_usable("the bag has no joint states and no points", allowed)
+    places = [message for entries in seen.values() for _, message in entries]
+    seconds = bag_clock([*(m for entry in groups for m in entry.messages), *places])
     joint_group, more = _on_one_clock(groups, seconds, str(path))
     found = []
     for frame, entries in seen.items():
+        position = _positions(_with_axes(entries, pose_axes), seconds, str(path))
         name = "points" if len(seen) == 1 else "points_" + frame.replace("/", "_")
-        found.append(_point_group(name, frame, sensor, _with_axes(entries, pose_axes), seconds, str(path)))
-    used |= {message.source.partition(":")[0] for entries in seen.values() for _, message in entries}
-    turned = {m.source for entries in seen.values() for _, m in entries if m.content.axes is not None}
+        found.append(PointGroup(name, *position, None, options.sensor, frame))
+    used = {entry.topic for entry in groups} | {message.source.partition(":")[0] for message in places}
+    turned = {message.source for message in places if message.content.axes is not None}
     if turned and pose_axes is None:
         more = (*more, f"orientations of {', '.join(sorted(turned))} were left out (pose_axes keeps them)")
-    left = [
-        f"{topic.name} was left out ({topic.kind}, {topic.count})" for topic in bag.topics if topic.name not in used
-    ]
-    raw = Recording(joint_group, tuple(found), description, path.name, path.stem, digest, notes=(*notes, *more, *left))
-    return convert_to_si_and_validate(raw, str(path), units=units, torque_constants=torque_constants, gears=gears)
+    left = [f"{t.name} was left out ({t.kind}, {t.count})" for t in bag.bag.topics if t.name not in used]
+    own = options.description, path.name, path.stem, digest
+    raw = Recording(joint_group, tuple(found), *own, notes=(*notes, *more, *left))
+    return convert_to_si_and_validate(raw, str(path), replace(options, joints=None, points=None))
 
 
 @PREVIEWS.register(".bag")
@@ -175,12 +235,12 @@ def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
     """What a bag holds: its topics, what they would become, and units that their values look like."""
     path = Path(path)
     file_sha256(path)
-    bag = _bag(path, None, progress)
+    bag = _contents(path, None, progress)
     names = _names_of(bag)
     options: dict[str, Any] = {}
     notes: list[str] = []
-    sources = [_preview_source(topic, bag, names) for topic in bag.topics]
-    states = bag.of(_JOINT_STATE)
+    sources = [_preview_source(topic, bag, names) for topic in bag.bag.topics]
+    states = bag.bag.topics_of(JOINT_STATE)
     owners: dict[str, list[str]] = {}
     for message in bag.states:
         for joint in message.content.name:
@@ -203,69 +263,44 @@ def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
     return FileContents(tuple(sources), options, (*notes, *why))
 
 
-# -- reading ----------------------------------------------------------------------------------------------------------
-
-
-def _bag(path: Path, trees: Sequence[str] | None, progress: Progress) -> _Bag:
+def _contents(path: Path, trees: Sequence[str] | None, progress: Progress) -> _Contents:
     """Decode what can be used of a bag; of trees of transforms the named frames, all of them for None."""
-    try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        hint = "pip install 'yid-ocp[bags]'"
-        raise DataError("reading bags needs the package rosbags", where=str(path), hint=hint) from error
-    states: list[_Message] = []
-    places: list[_Message] = []
+    states: list[BagMessage] = []
+    places: list[BagMessage] = []
     wanted_kinds = _KNOWN if trees is not None and not trees else (*_KNOWN, *_TREES)
-    try:
-        # older ROS 2 bags do not hold the definitions of their messages; these have not changed since
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            counted: dict[tuple[str, str], int] = {}
-            for c in reader.connections:
-                key = (c.topic, c.msgtype)
-                counted[key] = counted.get(key, 0) + c.msgcount
-            wanted = [connection for connection in reader.connections if connection.msgtype in wanted_kinds]
-            total = sum(connection.msgcount for connection in wanted)
-            # an empty selection would mean all topics, images included
-            for done, (connection, logged, data) in enumerate(reader.messages(wanted) if wanted else ()):
-                if done % _PROGRESS_INTERVAL == 0:
-                    progress.report_parts_done(done, total, "messages")
-                content: Any = reader.deserialize(data, connection.msgtype)
-                if connection.msgtype in _TREES:
-                    places += [
-                        m for m in _tree(connection.topic, logged, content) if trees is None or m.source in trees
-                    ]
-                    continue
-                message = _Message(connection.topic, int(logged), _stamp(content), _plain(content, connection.msgtype))
-                (states if connection.msgtype == _JOINT_STATE else places).append(message)
-    except Exception as error:  # rosbags lets through whatever a damaged file makes struct, sqlite3 or zstd raise
-        raise damaged_bag_error(path, error) from error
-    topics = tuple(_Topic(topic, kind, count) for (topic, kind), count in sorted(counted.items()))
-    return _Bag(topics, tuple(states), tuple(places))
-
-
-def damaged_bag_error(path: Path, error: Exception) -> DataError:
-    """Error that says that a bag cannot be read and what to do."""
-    what, where = f"the bag cannot be read ({type(error).__name__}: {error})", str(path)
-    allowed = "a ROS 1 .bag, a ROS 2 folder with metadata.yaml, or an .mcap or .db3 file of ROS 2"
-    hint = "check with `ros2 bag info` or `rosbag info`; a bag cut off by a crash needs `ros2 bag reindex`"
-    return DataError(what, where=where, allowed=allowed, hint=hint)
+    bag = OpenBag(path)
+    with bag.reading(), closing(bag.reader) as reader:
+        wanted = [connection for connection in reader.connections if connection.msgtype in wanted_kinds]
+        total = sum(connection.msgcount for connection in wanted)
+        # an empty selection would mean all topics, images included
+        for done, (connection, logged, data) in enumerate(reader.messages(wanted) if wanted else ()):
+            if done % _PROGRESS_INTERVAL == 0:
+                progress.report_parts_done(done, total, "messages")
+            content: Any = reader.deserialize(data, connection.msgtype)
+            if connection.msgtype in _TREES:
+                found = _tree(connection.topic, logged, content)
+                places += [message for message in found if trees is None or message.source in trees]
+                continue
+            plain = _plain(content, connection.msgtype)
+            message = BagMessage(connection.topic, int(logged), _stamp(content), plain)
+            (states if connection.msgtype == JOINT_STATE else places).append(message)
+    return _Contents(bag, tuple(states), tuple(places))
 
 
 def _stamp(content: Any) -> int:
     return int(content.header.stamp.sec) * 10**9 + int(content.header.stamp.nanosec)
 
 
-def _tree(topic: str, logged: int, content: Any) -> Iterator[_Message]:
+def _tree(topic: str, logged: int, content: Any) -> Iterator[BagMessage]:
     for transform in content.transforms:
         plain = _plain(transform, _POSES[2])
-        yield _Message(f"{topic}:{transform.child_frame_id.strip('/')}", int(logged), _stamp(transform), plain)
+        yield BagMessage(f"{topic}:{transform.child_frame_id.strip('/')}", int(logged), _stamp(transform), plain)
 
 
 def _plain(content: Any, kind: str) -> SimpleNamespace:
     """What is needed of a message, in Python's types: a bag brings definitions of its own, which may be damaged."""
     frame = str(content.header.frame_id)
-    if kind == _JOINT_STATE:
+    if kind == JOINT_STATE:
         names = [str(name) for name in content.name]
         values = {key: np.asarray(getattr(content, key), float).ravel() for key in ("position", "velocity", "effort")}
         return SimpleNamespace(frame=frame, name=names, **values)
@@ -284,19 +319,6 @@ def _triple(content: Any) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _clock(messages: Sequence[_Message]) -> Callable[[_Message], float]:
-    """Seconds of a message since the first one."""
-    # one message without a stamp makes the two clocks incomparable, so then no stamp is used
-    stamped = all(message.stamp > 0 for message in messages)
-    origin = min((message.stamp if stamped else message.logged for message in messages), default=0)
-
-    def seconds(message: _Message) -> float:
-        # integers first: nanoseconds since 1970 do not fit into a float
-        return ((message.stamp if stamped else message.logged) - origin) * 1e-9
-
-    return seconds
-
-
 # -- joints -----------------------------------------------------------------------------------------------------------
 
 
@@ -307,21 +329,17 @@ class _States:
     topic: str
     names: tuple[str, ...]
     wanted: tuple[str, ...]
-    messages: tuple[_Message, ...]
+    messages: tuple[BagMessage, ...]
     command: bool = False
 
 
-def _joints(
-    bag: _Bag, topics: Sequence[str] | None, command: str | None, joints: Sequence[str] | None, where: str
-) -> tuple[list[_States], tuple[str, ...], set[str]]:
-    """Choose topics, joints and the messages that have them; with what was left out and the topics used."""
-    known = bag.of(_JOINT_STATE)
+def _joints(bag: _Contents, options: BagOptions, where: str) -> tuple[list[_States], tuple[str, ...]]:
+    """Choose topics, joints and the messages that have them; with what was left out."""
+    known, topics, command = bag.bag.topics_of(JOINT_STATE), options.joint_topics, options.command_topic
     for topic in (*(topics or ()), *((command,) if command else ())):
-        if topic not in known:
-            what = f"there are no joint states on the topic '{topic}'"
-            raise DataError(what, where=where, **unknown_name_details(topic, known))
+        bag.bag.check_topic(topic, known, "joint states")
     chosen = [topic for topic in (known if topics is None else topics) if topic != command]
-    wanted = None if joints is None else parse_renamings(joints, "joint", where)
+    wanted = None if options.joints is None else parse_renamings(options.joints, "joint", where)
     found, notes = [], []
     if wanted is not None:
         _check_together(bag, chosen, wanted, where)
@@ -350,7 +368,7 @@ def _joints(
             what = f"no message of '{command}' has all joints"
             raise DataError(what, where=where, allowed=", ".join(names) or "joints of another topic")
         found.append(_States(command, names, tuple(n for entry in found for n in entry.wanted), tuple(kept), True))
-    return found, tuple(notes), {entry.topic for entry in found}
+    return found, tuple(notes)
 
 
 def _own(wanted: Mapping[str, str], sets: Iterable[Sequence[str]]) -> tuple[str, ...]:
@@ -358,7 +376,7 @@ def _own(wanted: Mapping[str, str], sets: Iterable[Sequence[str]]) -> tuple[str,
     return max((tuple(name for name in wanted if name in names) for names in sets), key=len, default=())
 
 
-def _check_together(bag: _Bag, topics: Sequence[str], wanted: Mapping[str, str], where: str) -> None:
+def _check_together(bag: _Contents, topics: Sequence[str], wanted: Mapping[str, str], where: str) -> None:
     sets = {tuple(message.content.name): message.source for message in bag.states if message.source in topics}
     known = sorted({name for names in sets for name in names})
     allowed = "; ".join(dict.fromkeys(", ".join(names) for names in sets)) or "no joints were recorded"
@@ -373,7 +391,7 @@ def _check_together(bag: _Bag, topics: Sequence[str], wanted: Mapping[str, str],
 
 
 def _on_one_clock(
-    groups: Sequence[_States], seconds: Callable[[_Message], float], where: str
+    groups: Sequence[_States], seconds: Callable[[BagMessage], float], where: str
 ) -> tuple[JointGroup | None, tuple[str, ...]]:
     if not groups:
         return None, ()
@@ -387,7 +405,7 @@ def _on_one_clock(
     return together, notes
 
 
-def _joint_group(entry: _States, seconds: Callable[[_Message], float], where: str) -> JointGroup:
+def _joint_group(entry: _States, seconds: Callable[[BagMessage], float], where: str) -> JointGroup:
     states = sorted(entry.messages, key=seconds)
     t = np.array([seconds(message) for message in states])
     channels: dict[str, Any] = {}
@@ -412,30 +430,27 @@ def _joint_group(entry: _States, seconds: Callable[[_Message], float], where: st
 # -- points -----------------------------------------------------------------------------------------------------------
 
 
-_MessagesByFrame = dict[str, list[tuple[str, _Message]]]
+_MessagesByFrame = dict[str, list[tuple[str, BagMessage]]]
 
 
-def _names_of(bag: _Bag) -> dict[str, str]:
+def _names_of(bag: _Contents) -> dict[str, str]:
     """Topics that become points by themselves, and the last part of each that says what was seen."""
     names = {}
-    for topic in (topic.name for topic in bag.topics if topic.kind in _PLACES):
+    for topic in bag.bag.topics_of(*_PLACES):
         parts = [part for part in topic.split("/") if part]
         telling = [part for part in parts if part.lower() not in _PLAIN_WORDS]
         names[topic] = (telling or parts)[-1]
     return names
 
 
-def _named_places(bag: _Bag, points: Mapping[str, str] | None, where: str) -> _MessagesByFrame:
+def _named_places(bag: _Contents, points: Mapping[str, str] | None, where: str) -> _MessagesByFrame:
     """Sort the points by frame of reference, each with its name."""
     present = sorted({message.source for message in bag.places})
     names = _names_of(bag) if points is None else dict(points)
-    for source in names:
-        if source not in present and points is not None:
-            trees = [topic.name for topic in bag.topics if topic.kind in _TREES]
-            what = f"there are no points on the topic '{source}'"
-            raise DataError(
-                what, where=where, **unknown_name_details(source, [*present, *(f"{tree}:FRAME" for tree in trees)])
-            )
+    known = [*present, *(f"{tree}:FRAME" for tree in bag.bag.topics_of(*_TREES))]
+    for source in () if points is None else names:
+        if source not in present:
+            bag.bag.check_topic(source, known, "points")
     check_point_names(names, where)
     groups: _MessagesByFrame = {}
     for message in bag.places:
@@ -445,7 +460,7 @@ def _named_places(bag: _Bag, points: Mapping[str, str] | None, where: str) -> _M
     return groups
 
 
-def _with_axes(entries: Iterable[tuple[str, _Message]], distance: float | None) -> Iterator[tuple[str, _Message]]:
+def _with_axes(entries: Iterable[tuple[str, BagMessage]], distance: float | None) -> Iterator[tuple[str, BagMessage]]:
     """The points, and of poses three more along the axes where a distance is given."""
     for name, message in entries:
         yield name, message
@@ -472,14 +487,10 @@ def _matrix(quaternion: Sequence[float]) -> Array:
     )
 
 
-def _point_group(
-    name: str,
-    frame: str,
-    sensor: str,
-    entries: Iterable[tuple[str, _Message]],
-    seconds: Callable[[_Message], float],
-    where: str,
-) -> PointGroup:
+def _positions(
+    entries: Iterable[tuple[str, BagMessage]], seconds: Callable[[BagMessage], float], where: str
+) -> tuple[tuple[str, ...], Array, Array]:
+    """Names, times and positions (N, np, 3) of some points, NaN where one was not seen."""
     seen: dict[tuple[float, str], tuple[float, float, float]] = {}
     for point, message in entries:
         key, position = (seconds(message), point), message.content.point
@@ -491,19 +502,19 @@ def _point_group(
     array = np.full((len(times), len(names), 3), np.nan)
     for (time, point), coordinates in seen.items():
         array[rows[time], columns[point]] = coordinates
-    return PointGroup(name, tuple(names), np.array(times), array, None, sensor, frame)
+    return tuple(names), np.array(times), array
 
 
 # -- preview ----------------------------------------------------------------------------------------------------------
 
 
-def _preview_source(topic: _Topic, bag: _Bag, names: Mapping[str, str]) -> FileSource:
+def _preview_source(topic: BagTopic, bag: _Contents, names: Mapping[str, str]) -> FileSource:
     own = [m for m in (*bag.states, *bag.places) if m.source.partition(":")[0] == topic.name]
     logged = [message.logged for message in own]
     span = 1e-9 * (max(logged) - min(logged)) if logged else 0.0
     rate = (topic.count - 1) / span if span > 0 else float("nan")
     becomes, note = "", "not a type that is understood"
-    if topic.kind == _JOINT_STATE:
+    if topic.kind == JOINT_STATE:
         joints = list(dict.fromkeys(joint for message in own for joint in message.content.name))
         becomes, note = f"joints {', '.join(joints)}", ""
     elif topic.name in names:
@@ -515,7 +526,7 @@ def _preview_source(topic: _Topic, bag: _Bag, names: Mapping[str, str]) -> FileS
     return FileSource(topic.name, topic.kind, topic.count, rate, becomes, note if topic.count else "no messages")
 
 
-def _for_guess(bag: _Bag) -> Recording | None:
+def _for_guess(bag: _Contents) -> Recording | None:
     """Angles and points as they stand in a bag, whatever joints they are of, to see what units they have."""
     widest = [float(np.nanmax(np.abs(m.content.position), initial=0.0)) for m in bag.states]
     joints = JointGroup(("any",), np.arange(float(len(widest))) * 1e-3, np.array(widest)[:, None]) if widest else None

@@ -139,51 +139,39 @@ def parse_renamings(entries: Iterable[str], noun: str, where: str) -> dict[str, 
     return found
 
 
-def convert_to_si_and_validate(
-    raw: Recording,
-    where: str,
-    *,
-    joints: Sequence[str] | None = None,
-    points: Mapping[str, str] | None = None,
-    units: Mapping[str, str] | None = None,
-    torque_constants: Mapping[str, float] | None = None,
-    gears: Mapping[str, float] | None = None,
-) -> Recording:
-    """Convert a raw recording to SI units, select its joints and points, and validate it.
+@dataclass(frozen=True)
+class ConversionOptions:
+    """Which joints and points of a file are kept, under which names, and in which units it has them."""
 
-    Parameters
-    ----------
-    raw : Recording
-        As it stands in the file.
-    where : str
-        What errors call it.
-    joints : sequence of str, optional
-        Joints to keep, `name` or `recorded=name`, in this order; all of them when absent.
-    points : mapping of recorded name to name, optional
-        Points to keep; all of them when absent.
-    units : mapping of quantity to unit, optional
-        Of `t`, a joint channel or `points`, where it is not SI.
-    torque_constants, gears : mapping of joint or pattern to float, optional
-        Where `effort` is a motor's current: torque per current [N m/A], and turns of the motor per turn of the joint
-        (1 where a joint has none).
+    joints: Sequence[str] | None = None  # `name` or `recorded=name`, in this order; all of them when absent
+    points: Mapping[str, str] | None = None  # recorded name to name; all of them when absent
+    units: Mapping[str, str] | None = None  # of `t`, a joint channel or `points`, where it is not SI
+    # where `effort` is a motor's current, by joint or pattern: torque per current [N m/A], and turns of the motor per
+    # turn of the joint (1 where a joint has none)
+    torque_constants: Mapping[str, float] | None = None
+    gears: Mapping[str, float] | None = None
+
+
+def convert_to_si_and_validate(raw: Recording, where: str, options: ConversionOptions) -> Recording:
+    """Convert a recording as it stands in a file to SI units, select its joints and points, and validate it.
 
     Raises
     ------
     DataError
         A joint, point, quantity or unit that is not known, a current without torque constants, as `validate_recording`.
     """
-    factors = _factors(units or {}, where)
+    units, points = options.units or {}, options.points
+    factors = _factors(units, where)
     group = raw.joints
-    if group is not None and joints is not None:
-        group = _chosen_joints(group, parse_renamings(joints, "joint", where), where)
+    if group is not None and options.joints is not None:
+        group = _chosen_joints(group, parse_renamings(options.joints, "joint", where), where)
     seen = raw.points if points is None else _chosen_points(raw.points, points, where)
     if group is not None:
         channels: dict[str, Any] = {name: factors[name] * values for name, values in group.channels.items()}
         if "effort" in channels:
-            current = _spaceless((units or {}).get("effort", "")) in _CURRENTS
-            channels["effort"] = channels["effort"] * _torque_factors(
-                group.names, current, torque_constants or {}, gears or {}, where
-            )
+            current = _spaceless(units.get("effort", "")) in _CURRENTS
+            constants, gears = options.torque_constants or {}, options.gears or {}
+            channels["effort"] = channels["effort"] * _torque_factors(group.names, current, constants, gears, where)
         group = replace(group, t=factors["t"] * group.t, **channels)
     seen = tuple(
         replace(

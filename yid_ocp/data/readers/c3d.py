@@ -14,7 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.data.hdf5_io import check_readable_in_fork
-from yid_ocp.data.readers.base import PREVIEWS, READERS, FileContents, FileSource, convert_to_si_and_validate
+from yid_ocp.data.readers.base import (
+    PREVIEWS,
+    READERS,
+    ConversionOptions,
+    FileContents,
+    FileSource,
+    convert_to_si_and_validate,
+)
 from yid_ocp.data.recording import Array, PointGroup, Recording
 from yid_ocp.errors import DataError
 from yid_ocp.files import file_sha256
@@ -81,7 +88,7 @@ def read_c3d(
     group = PointGroup("points", found.names, found.t, found.position, None, sensor, frame, None, "nominal")
     notes = tuple(f"{entry.name} was left out ({entry.note})" for entry in found.others)
     raw = Recording(None, (group,), description, path.name, path.stem, digest, notes=notes)
-    return convert_to_si_and_validate(raw, str(path), points=points, units={**own, **(units or {})})
+    return convert_to_si_and_validate(raw, str(path), ConversionOptions(points=points, units={**own, **(units or {})}))
 
 
 @PREVIEWS.register(".c3d")

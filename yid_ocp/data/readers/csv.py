@@ -7,6 +7,7 @@ import math
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from yid_ocp.data.readers.base import (
     PREVIEWS,
     READERS,
     SKIP_COLUMN,
+    ConversionOptions,
     FileContents,
     FileSource,
     convert_to_si_and_validate,
@@ -36,36 +38,12 @@ _LISTED = 5
 """Numbers of bad lines that a note lists."""
 
 
-@READERS.register(".csv")
-def read_csv(
-    path: str | os.PathLike[str],
-    *,
-    columns: Mapping[str, str] | None = None,
-    header: bool = True,
-    skip_bad_lines: bool = False,
-    delimiter: str = ",",
-    joints: Sequence[str] | None = None,
-    points: Mapping[str, str] | None = None,
-    units: Mapping[str, str] | None = None,
-    torque_constants: Mapping[str, float] | None = None,
-    gears: Mapping[str, float] | None = None,
-    clock: ClockKind = "recorded",
-    sensor: str = "unknown",
-    frame: str = "world",
-    description: str = "",
-) -> Recording:
-    """Read a table with one row per time.
+@dataclass(frozen=True)
+class CsvOptions(ConversionOptions):
+    """How a table is read, and what is kept of it.
 
-    Columns are understood by their names: `t` or `time`; a channel and a joint, `q_<joint>`, `position_<joint>`,
-    `velocity_<joint>`, `effort_<joint>` and so on; `q1`, `dq1` and `cmd1` as in telemetry of Isaac Sim's system
-    identification, position, velocity and commanded position of joint 1; else a point and an axis, `<point>_x`,
-    `<point>_y`, `<point>_z`. An empty cell is NaN; lines that begin with `#` are comments. Where a table has joints and
-    points, a row in which all cells of one of them are empty is a time at which only the other was measured.
-
-    Parameters
+    Attributes
     ----------
-    path : path-like
-        The table.
     columns : mapping of column to meaning, optional
         Where its name does not say it: `t`, `channel:joint`, `axis:point`, or `skip`. A `*` in a column's name stands
         for any text, which a `*` in the meaning repeats: `*_pos` is `position:*`.
@@ -73,45 +51,47 @@ def read_csv(
         Whether the first row has names; where not, columns are called `1`, `2` and so on.
     skip_bad_lines : bool
         Whether a line with another number of cells, or a cell that is no number, is left out and counted in `notes`.
-    delimiter : str
-        One character between cells.
-    joints, points, units, torque_constants, gears
-        As `yid_ocp.data.readers.base.convert_to_si_and_validate`.
     clock : {'recorded', 'nominal'}
         Whether the times were measured.
-    sensor, frame : str
-        What saw the points, and their frame of reference.
-    description : str
-        What was recorded.
+    """
 
-    Returns
-    -------
-    Recording
-        The checked recording, in SI units, its points in one group called `points`.
+    columns: Mapping[str, str] | None = None
+    header: bool = True
+    skip_bad_lines: bool = False
+    delimiter: str = ","  # one character between cells
+    clock: ClockKind = "recorded"
+    sensor: str = "unknown"  # what saw the points
+    frame: str = "world"  # their frame of reference
+    description: str = ""  # what was recorded
+
+
+_DEFAULTS = CsvOptions()
+
+
+@READERS.register(".csv")
+def read_csv(path: str | os.PathLike[str], options: CsvOptions = _DEFAULTS) -> Recording:
+    """Read a table with one row per time; its points become one group called `points`.
+
+    Columns are understood by their names: `t` or `time`; a channel and a joint, `q_<joint>`, `position_<joint>`,
+    `velocity_<joint>`, `effort_<joint>` and so on; `q1`, `dq1` and `cmd1` as in telemetry of Isaac Sim's system
+    identification, position, velocity and commanded position of joint 1; else a point and an axis, `<point>_x`,
+    `<point>_y`, `<point>_z`. An empty cell is NaN; lines that begin with `#` are comments. Where a table has joints and
+    points, a row in which all cells of one of them are empty is a time at which only the other was measured.
 
     Raises
     ------
     DataError
-        If the file, a column, a cell, an option or a unit cannot be understood, or as `validate`.
+        If the file, a column, a cell, an option or a unit cannot be understood, or as `validate_recording`.
     """
     path = Path(path)
     digest = file_sha256(path)
-    meanings, table, notes = _read_table(path, delimiter, columns or {}, header, skip_bad_lines)
-    raw = _raw(meanings, table, str(path), clock, sensor, frame)
-    made = Recording(raw.joints, raw.points, description, path.name, path.stem, digest, notes=notes)
-    return convert_to_si_and_validate(
-        made, str(path), joints=joints, points=points, units=units, torque_constants=torque_constants, gears=gears
-    )
+    meanings, table, notes = _read_table(path, options)
+    raw = _raw(meanings, table, str(path), options)
+    made = Recording(raw.joints, raw.points, options.description, path.name, path.stem, digest, notes=notes)
+    return convert_to_si_and_validate(made, str(path), options)
 
 
-def _raw(
-    meanings: Sequence[tuple[str, str]],
-    table: Array,
-    where: str,
-    clock: ClockKind = "recorded",
-    sensor: str = "unknown",
-    frame: str = "world",
-) -> Recording:
+def _raw(meanings: Sequence[tuple[str, str]], table: Array, where: str, options: CsvOptions = _DEFAULTS) -> Recording:
     """The table's joints and points in its own units."""
     t = table[:, meanings.index(("t", ""))]
     joint_names, channels = _joint_columns(meanings, table, where)
@@ -123,10 +103,10 @@ def _raw(
     group, seen = None, []
     if joint_names:
         own: dict[str, Any] = {name: values[joint_rows] for name, values in channels.items()}
-        group = JointGroup(joint_names, t[joint_rows], clock=clock, **own)
+        group = JointGroup(joint_names, t[joint_rows], clock=options.clock, **own)
     if point_names:
-        at = t[point_rows]
-        seen = [PointGroup("points", point_names, at, position[point_rows], None, sensor, frame, None, clock)]
+        said = options.sensor, options.frame, None, options.clock
+        seen = [PointGroup("points", point_names, t[point_rows], position[point_rows], None, *said)]
     return Recording(group, tuple(seen))
 
 
@@ -215,29 +195,27 @@ def _rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
         raise DataError(what, where=str(path), allowed="CSV with one header row, in UTF-8") from error
 
 
-def _read_table(
-    path: Path, delimiter: str, columns: Mapping[str, str], header: bool, skip_bad_lines: bool
-) -> tuple[list[tuple[str, str]], Array, tuple[str, ...]]:
+def _read_table(path: Path, options: CsvOptions) -> tuple[list[tuple[str, str]], Array, tuple[str, ...]]:
     """The columns that mean something: meanings, table, shape (rows, columns), in its own units, and what was bad."""
-    lines = _rows(path, delimiter)
+    lines = _rows(path, options.delimiter)
     number, first = next(lines, (1, []))
     names = [cell.strip() for cell in first]
-    _check_header(names, path, delimiter, header)
+    _check_header(names, path, options)
     rows: list[list[float]] = []
     bad: list[int] = []
-    if not header:
+    if not options.header:
         names = [str(i + 1) for i in range(len(first))]
-    meanings = _meanings(names, columns, f"{path}, line {number}")
+    meanings = _meanings(names, options.columns or {}, f"{path}, line {number}")
 
     def read(line: int, cells: Sequence[str]) -> None:
         try:
             rows.append(_numbers(cells, names, meanings, f"{path}, line {line}"))
         except DataError:
-            if not skip_bad_lines:
+            if not options.skip_bad_lines:
                 raise
             bad.append(line)
 
-    if not header:
+    if not options.header:
         read(number, first)
     for line, cells in lines:
         read(line, cells)
@@ -257,17 +235,17 @@ def _read_table(
     return [meaning for meaning in meanings if meaning], np.array(rows), notes
 
 
-def _check_header(header: Sequence[str], path: Path, delimiter: str, named: bool) -> None:
+def _check_header(header: Sequence[str], path: Path, options: CsvOptions) -> None:
     if not any(header):
         raise DataError("the table is empty", where=str(path), allowed=_ALLOWED)
-    if named and all(_is_number(cell) for cell in header):
+    if options.header and all(_is_number(cell) for cell in header):
         hint = "say so: --no-header --columns t,position:JOINT,..., one meaning for every column"
         raise DataError("the table has no header row", where=f"{path}, line 1", allowed=_ALLOWED, hint=hint)
     if len(header) == 1:
-        others = [repr(mark) for mark in ";\t, " if mark in header[0] and mark != delimiter]
+        others = [repr(mark) for mark in ";\t, " if mark in header[0] and mark != options.delimiter]
         hint = f"set delimiter={others[0]}" if others else ""
         raise DataError(f"the table has one column, '{header[0]}'", where=str(path), allowed=_ALLOWED, hint=hint)
-    repeated = [name for name in header if header.count(name) > 1] if named else []
+    repeated = [name for name in header if header.count(name) > 1] if options.header else []
     if repeated:
         raise DataError(f"two columns are called '{repeated[0]}'", where=f"{path}, line 1")
 

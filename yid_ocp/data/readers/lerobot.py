@@ -15,6 +15,7 @@ import numpy as np
 from yid_ocp.data.readers.base import (
     PREVIEWS,
     READERS,
+    ConversionOptions,
     FileContents,
     FileSource,
     convert_to_si_and_validate,
@@ -73,7 +74,7 @@ def read_lerobot(
     joints : sequence of str, optional
         Joints to keep, `name` or `recorded=name`, in this order: a gripper that is not in the model is left out so.
     units, torque_constants, gears
-        As `yid_ocp.data.readers.base.convert_to_si_and_validate`. Many of these robots record degrees.
+        As `yid_ocp.data.readers.base.ConversionOptions`. Many of these robots record degrees.
     description : str
         What was recorded.
 
@@ -101,9 +102,7 @@ def read_lerobot(
         notes=tuple(f"{name} was left out ({why})" for name, why in left),
     )
     where = f"{dataset.folder}, episode {episode}"
-    return convert_to_si_and_validate(
-        raw, where, joints=joints, units=units, torque_constants=torque_constants, gears=gears
-    )
+    return convert_to_si_and_validate(raw, where, ConversionOptions(joints, None, units, torque_constants, gears))
 
 
 @PREVIEWS.register("LeRobot dataset")
