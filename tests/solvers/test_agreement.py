@@ -12,6 +12,7 @@ import pytest
 from yid_ocp.data import read_recording
 from yid_ocp.errors import SolverError
 from yid_ocp.integrator.step import compile_step, compile_step_like
+from yid_ocp.model import Parameters
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import GaussNewton, MultipleShooting, SingleShooting, Status, SteepestDescent, solve
 from yid_ocp.solvers.symbolic_transcription import transcribe
@@ -154,7 +155,8 @@ def test_estimated_start_gives_the_same_optimum_in_both_formulations(make_proble
 def test_bounds_are_respected(one_arm, recording, make_problem):
     problem = make_problem(free=("T1.bend", "T2.bend"), duration=0.5)
     system = problem.system
-    narrow = replace(system, parameters=system.parameters.with_bounds({"T1.bend": (0.0, 15.0)}))
+    entries = Parameters(replace(p, upper=15.0) if p.name == "T1.bend" else p for p in system.parameters)
+    narrow = replace(system, parameters=entries)
     step = compile_step_like(problem.step, narrow)
     problem = EstimationProblem(step, [recording], problem.free, problem.options)
     for solver in (GaussNewton(), SingleShooting(), CONDENSED):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.integrator.step import compile_step_like
+from yid_ocp.model import Parameters
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers.initial_guess import guess_node_states
 
@@ -66,7 +67,8 @@ def test_what_fits_is_the_rollout_and_what_does_not_is_rest_where_the_arm_was(pr
 
 
 def test_bounds_hold_larger_parameters_back(one_arm, recording):
-    parameters = one_arm.system.parameters.with_bounds({"T1.bend": (0.0, 12.0)})
+    entries = one_arm.system.parameters
+    parameters = Parameters(replace(p, upper=12.0) if p.name == "T1.bend" else p for p in entries)
     system = replace(one_arm.system, parameters=parameters)
     step = compile_step_like(one_arm, system)
     problem = EstimationProblem(step, [recording], ("T1.bend", "T2.bend"), ProblemOptions(duration=0.1))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -26,41 +26,31 @@ class Segment:
 
     Attributes
     ----------
-    name : str
     length : float
         [m]; ignored when `link_lengths` is given.
     mass : float
         Of the whole segment, spread along its length [kg].
-    radius : float, optional
-        [m]; of the solid cylinder that gives each link's inertia. None where `cross_section` is given.
-    links : int
-        Number of equal links.
-    link_lengths : sequence of float, optional
-        Unequal links [m], base to tip.
-    parent : str, optional
-        Segment on which it grows; None for the root.
-    parent_link_index : int, optional
-        It leaves at the tip of this link of the parent (0-based); the last one when absent.
-    rest_rotation : (3, 3) array_like, optional
-        Of its first link at rest in the frame of the parent's link (of the root's frame for the root).
-    link_rest_rotations : sequence of (3, 3) array_like, optional
-        Rest rotation of every later link in the frame of the one before (a measured undeformed shape).
-    bend, twist : float
-        Nominal stiffness of every joint [N m/rad], or rigidity [N m^2] when `stiffness_per_curvature` is set.
-    damping : float
-        Viscous damping of every coordinate [N m s/rad] ([N m^2 s] when `stiffness_per_curvature` is set).
-    twist_damping : float, optional
-        Damping of the twists where it differs from that of the bends.
+    radius, cross_section : float or (float, float)
+        [m]; one of the two: of the solid cylinder that gives each link's inertia, or the extents of a rectangular
+        section along the links' x and y axes.
+    links, link_lengths : int or sequence of float
+        Number of equal links, or unequal ones [m], base to tip.
+    parent, parent_link_index : str and int, optional
+        Segment on which it grows, None for the root, and the link of it at whose tip it leaves; the last when absent.
+    rest_rotation, link_rest_rotations : (3, 3) array_like and a sequence of such, optional
+        At rest, of its first link in the frame of the parent's link (of the root's frame for the root), and of every
+        later link in the frame of the one before (a measured undeformed shape).
+    bend, twist, damping, twist_damping : float
+        Of every joint [N m/rad], [N m s/rad]; with `stiffness_per_curvature` a rigidity [N m^2], [N m^2 s]. Twists
+        have the damping of the bends where `twist_damping` is None.
     stiffness_per_curvature : bool
-        Whether bend, twist and damping are per curvature: a joint between links of length a and b then has
-        2/(a + b) times the value, and the first joint of a clamped segment 2/a.
+        A joint between links of length a and b then has 2/(a + b) times the value, and the first joint of a clamped
+        segment 2/a.
     clamped_at_base : bool
         Whether the first joint turns about the tip of a rigid wall or clamp (only matters with
         `stiffness_per_curvature`); otherwise it sits between the parent's link and the first one.
     joint_axes : str
         Axes of the turns at each joint, base to tip; about those left out the segment is rigid.
-    cross_section : (float, float), optional
-        Extents of a rectangular cross section along the links' x and y axes [m], in place of `radius`.
     link_length_parameters : bool
         Whether every link has a length parameter of its own (`SEGMENT.length_0`, ...) in place of `SEGMENT.length`,
         for markers that sit elsewhere in every recording; masses do not follow them.
@@ -164,8 +154,6 @@ def flexible_object(
         Parents first.
     root_placement : array_like, shape (4, 4), optional
         Placement of the root; the origin when absent.
-    name : str
-        Name of the mechanism.
     gravity_fraction : float
         Part of its weight that the object has, its inertia unchanged; less than one where something else bears it.
 
@@ -186,9 +174,8 @@ def flexible_object(
     for segment in segments:
         _check(segment, parts.layouts)
         _add_segment(parts, segment, root, fraction)
-    lines = {segment.name: _line(segment) for segment in segments}
-    mechanism = Mechanism(name, tuple(parts.joints), parts.frames, Parameters(parts.parameters), lines)
-    return FlexibleObject(mechanism, tuple(parts.elastic), tuple(parts.layouts.values()))
+    tree = Mechanism(name, tuple(parts.joints), parts.frames, Parameters(parts.parameters), parts.chains)
+    return FlexibleObject(tree, tuple(parts.elastic), tuple(parts.layouts.values()))
 
 
 @dataclass(frozen=True)
@@ -200,76 +187,65 @@ class _Parts:
     joints: list[Joint] = field(default_factory=list)
     elastic: list[ElasticJoint] = field(default_factory=list)
     layouts: dict[str, SegmentLayout] = field(default_factory=dict)
+    chains: dict[str, LinkChain] = field(default_factory=dict)
 
 
 def _add_segment(parts: _Parts, segment: Segment, root: Placement, gravity_fraction: ca.SX | None) -> None:
     """Append a segment's links to the object."""
     own = _segment_parameters(segment)
     parts.parameters.extend(own.values())
-    mass, cross = own["mass"].symbol, _cross_section(own)
-    shares = _shares(segment)
+    mass, shares = own["mass"].symbol, _length_shares(segment)
+    square_x, square_y, radius = _cross_section(own)
     if segment.link_length_parameters:
         lengths = tuple(own[f"length_{i}"].symbol for i in range(len(shares)))
     else:
-        lengths = tuple(own["length"].symbol * float(share) for share in shares)
-    later: Sequence[ArrayLike | None] = (
-        [None] * (len(shares) - 1) if segment.link_rest_rotations is None else segment.link_rest_rotations
-    )
-    rotations = [_rotation(entry) for entry in (segment.rest_rotation, *later)]
-    before: ca.SX | None
-    if segment.parent is None:
-        carrier = Frame(-1, root)
-        before = (
-            None
-            if segment.clamped_edge_length is None or segment.clamped_at_base
-            else ca.SX(segment.clamped_edge_length)
-        )
-    else:
+        lengths = tuple(own["length"].symbol * share for share in shares)
+    edge, carrier = segment.clamped_edge_length, Frame(-1, root)
+    before = None if edge is None else ca.SX(edge)
+    if segment.parent is not None:
         above = parts.layouts[segment.parent]
         at = len(above.link_joints) - 1 if segment.parent_link_index is None else segment.parent_link_index
-        carrier = parts.frames[f"{segment.parent}_{at}_tip"]
-        before = None if segment.clamped_at_base else above.link_lengths[at]
+        carrier, before = parts.frames[f"{segment.parent}_{at}_tip"], above.link_lengths[at]
+    before = None if segment.clamped_at_base else before
+    later = segment.link_rest_rotations
+    rotations = [segment.rest_rotation, *([None] * (len(shares) - 1) if later is None else later)]
     links: list[tuple[str, ...]] = []
-    for i, length in enumerate(lengths):
-        along = ca.vertcat(0, 0, length)
-        slender = length**2 / 12
-        squares = ca.vertcat(slender + cross.y, slender + cross.x, cross.x + cross.y)
-        share = mass * float(shares[i])
+    for i, (length, rotation) in enumerate(zip(lengths, rotations, strict=True)):
+        along, slender = ca.vertcat(0, 0, length), length**2 / 12
+        squares = ca.vertcat(slender + square_y, slender + square_x, square_x + square_y)
+        share = mass * shares[i]
         body = Inertia(share, along / 2, ca.diag(squares) * share, gravity_fraction)
-        turned = carrier.placement @ Placement(ca.SX(ca.DM(rotations[i])), ca.SX(ca.DM.zeros(3)))
-        names = tuple(f"{segment.name}_{i}_{axis}" for axis in segment.joint_axes)
-        _add_link(parts, segment, names, Frame(carrier.joint_index, turned), body)
-        parts.elastic.extend(_springs(segment, names, own, _per_joint(segment, length, before)))
-        links.append(names)
-        carrier = Frame(len(parts.joints) - 1, Placement(ca.SX(ca.DM.eye(3)), along))
+        turn = np.eye(3) if rotation is None else snap_to_unit_entries(np.asarray(rotation, float))
+        parent, placement = (
+            carrier.joint_index,
+            carrier.placement @ Placement(ca.SX(ca.DM(turn)), ca.SX(ca.DM.zeros(3))),
+        )
+        # rigidities are converted to stiffnesses
+        factor = ca.SX(1)
+        if segment.stiffness_per_curvature:
+            both = length if before is None else length + before
+            factor = (2 if before is not None or segment.clamped_at_base else 1) / both
+        links.append(tuple(f"{segment.name}_{i}_{axis}" for axis in segment.joint_axes))
+        for name, axis in zip(links[-1], segment.joint_axes, strict=True):
+            bodies = (body,) if name == links[-1][-1] else ()
+            parts.joints.append(Joint(name, "revolute", parent, placement, UNIT_AXES[axis], bodies))
+            parent, placement = len(parts.joints) - 1, Placement.identity()
+            kind: Literal["bend", "twist"] = "twist" if axis == "z" else "bend"
+            damping = own.get("twist_damping", own["damping"]) if kind == "twist" else own["damping"]
+            stiffness = own[kind].symbol * factor
+            spring = ElasticJoint(name, segment.name, kind, axis, stiffness, damping.symbol * factor, ca.SX(0))
+            parts.elastic.append(spring)
+        carrier, before = Frame(parent, Placement(ca.SX(ca.DM.eye(3)), along)), length
         parts.frames[f"{segment.name}_{i}_tip"] = carrier
-        before = length
     parts.frames[f"w_{segment.name}"] = carrier
-    layout = SegmentLayout(segment.name, tuple(links), lengths, cross.radius, mass, segment.parent)
-    parts.layouts[segment.name] = layout
-
-
-def _add_link(parts: _Parts, segment: Segment, names: Sequence[str], at: Frame, body: Inertia) -> None:
-    """Append the joints before a link, the last of which carries its body."""
-    parent, placement = at.joint_index, at.placement
-    for name, axis in zip(names, segment.joint_axes, strict=True):
-        bodies = (body,) if name == names[-1] else ()
-        parts.joints.append(Joint(name, "revolute", parent, placement, UNIT_AXES[axis], bodies))
-        parent, placement = len(parts.joints) - 1, Placement.identity()
-
-
-def _springs(
-    segment: Segment, names: Sequence[str], own: Mapping[str, Parameter], factor: ca.SX
-) -> Iterator[ElasticJoint]:
-    """Springs and dampers of the joints before a link; `factor` converts rigidities to stiffnesses."""
-    for name, axis in zip(names, segment.joint_axes, strict=True):
-        kind: Literal["bend", "twist"] = "twist" if axis == "z" else "bend"
-        damping = own.get("twist_damping", own["damping"]) if kind == "twist" else own["damping"]
-        yield ElasticJoint(name, segment.name, kind, axis, own[kind].symbol * factor, damping.symbol * factor, ca.SX(0))
+    parts.chains[segment.name] = LinkChain(tuple(f"{segment.name}_{i}_tip" for i in range(len(shares))), shares)
+    parts.layouts[segment.name] = SegmentLayout(segment.name, tuple(links), lengths, radius, mass, segment.parent)
 
 
 def polyline_rotations(vertices: ArrayLike, initial_frame: ArrayLike | None = None) -> list[NDArray[np.float64]]:
-    """Rotation from each edge's frame to the next one's by the smallest angle (no twist).
+    """Rotation from each edge's frame to the next one's by the smallest angle (no twist), one (3, 3) for every edge.
+
+    They are what `Segment.rest_rotation` and `Segment.link_rest_rotations` take.
 
     Parameters
     ----------
@@ -277,11 +253,6 @@ def polyline_rotations(vertices: ArrayLike, initial_frame: ArrayLike | None = No
         Undeformed centre line [m].
     initial_frame : array_like, shape (3, 3), optional
         Frame before the first edge, whose z axis is the direction it continues; the world's when absent.
-
-    Returns
-    -------
-    list of ndarray, shape (3, 3)
-        One for every edge, to be used as `Segment.rest_rotation` and `Segment.link_rest_rotations`.
 
     Raises
     ------
@@ -311,121 +282,91 @@ def _shortest_turn(direction: NDArray[np.float64]) -> NDArray[np.float64]:
     return axis_angle_rotation(axis / sine, sine, cosine)
 
 
-def _rotation(matrix: ArrayLike | None) -> NDArray[np.float64]:
-    return np.eye(3) if matrix is None else snap_to_unit_entries(np.asarray(matrix, float))
-
-
-def _shares(segment: Segment) -> NDArray[np.float64]:
+def _length_shares(segment: Segment) -> tuple[float, ...]:
     if segment.link_lengths is None:
-        return np.full(segment.links, 1.0 / segment.links)
+        return (1.0 / segment.links,) * segment.links
     lengths = np.asarray(segment.link_lengths, float)
-    return lengths / lengths.sum()
+    return tuple(map(float, lengths / lengths.sum()))
 
 
-def _line(segment: Segment) -> LinkChain:
-    parts = tuple(map(float, _shares(segment)))
-    return LinkChain(tuple(f"{segment.name}_{i}_tip" for i in range(len(parts))), parts)
-
-
-def _per_joint(segment: Segment, length: ca.SX, before: ca.SX | None) -> ca.SX:
-    if not segment.stiffness_per_curvature:
-        return ca.SX(1)
-    if before is None:
-        return 2 / length if segment.clamped_at_base else 1 / length
-    return 2 / (length + before)
-
-
-@dataclass(frozen=True)
-class _CrossSection:
+def _cross_section(own: Mapping[str, Parameter]) -> tuple[ca.SX, ca.SX, ca.SX]:
     """Mean squares of x and y over a section [m^2], and its equivalent radius [m]."""
-
-    x: ca.SX
-    y: ca.SX
-    radius: ca.SX
-
-
-def _cross_section(own: Mapping[str, Parameter]) -> _CrossSection:
     if "radius" in own:
         radius = own["radius"].symbol
-        return _CrossSection(radius**2 / 4, radius**2 / 4, radius)
+        return radius**2 / 4, radius**2 / 4, radius
     x, y = own["size_x"].symbol, own["size_y"].symbol
-    return _CrossSection(x**2 / 12, y**2 / 12, ca.sqrt(x**2 + y**2) / 2)
+    return x**2 / 12, y**2 / 12, ca.sqrt(x**2 + y**2) / 2
 
 
 def _segment_parameters(segment: Segment) -> dict[str, Parameter]:
     per, rate = ("N m^2", "N m^2 s") if segment.stiffness_per_curvature else ("N m/rad", "N m s/rad")
-    length = float(np.sum(segment.link_lengths)) if segment.link_lengths is not None else segment.length
-    small = 1e-9
-    entries = {
-        **(
-            {
-                f"length_{i}": (length * float(share), "m", small, f"length of link {i}")
-                for i, share in enumerate(_shares(segment))
-            }
-            if segment.link_length_parameters
-            else {"length": (length, "m", small, "length of the segment")}
-        ),
-        "mass": (segment.mass, "kg", small, "mass of the segment"),
-        **(
-            {"radius": (segment.radius, "m", small, "radius of the solid cylinder")}
-            if segment.radius is not None
-            else {
-                f"size_{axis}": (size, "m", small, f"extent of the section along {axis}")
-                for axis, size in zip("xy", segment.cross_section or (), strict=True)
-            }
-        ),
-        "bend": (segment.bend, per, 0.0, "bending stiffness of every joint, about x and y"),
-        "twist": (segment.twist, per, 0.0, "twisting stiffness of every joint, about z"),
-        "damping": (segment.damping, rate, 0.0, "viscous damping of every coordinate"),
-    }
+    length = segment.length if segment.link_lengths is None else float(np.sum(segment.link_lengths))
+    small, shares = 1e-9, enumerate(_length_shares(segment))
+    rows = [("length", length, "m", small, "length of the segment")]
+    if segment.link_length_parameters:
+        rows = [(f"length_{i}", length * share, "m", small, f"length of link {i}") for i, share in shares]
+    rows.append(("mass", segment.mass, "kg", small, "mass of the segment"))
+    if segment.radius is not None:
+        rows.append(("radius", segment.radius, "m", small, "radius of the solid cylinder"))
+    for axis, size in zip("xy", segment.cross_section or (), strict=False):
+        rows.append((f"size_{axis}", size, "m", small, f"extent of the section along {axis}"))
+    rows += [
+        ("bend", segment.bend, per, 0.0, "bending stiffness of every joint, about x and y"),
+        ("twist", segment.twist, per, 0.0, "twisting stiffness of every joint, about z"),
+        ("damping", segment.damping, rate, 0.0, "viscous damping of every coordinate"),
+    ]
     if segment.twist_damping is not None:
-        entries["twist_damping"] = (segment.twist_damping, rate, 0.0, "viscous damping of the twists")
+        rows.append(("twist_damping", segment.twist_damping, rate, 0.0, "viscous damping of the twists"))
     return {
         key: Parameter(f"{segment.name}.{key}", value, unit, lower, math.inf, text)
-        for key, (value, unit, lower, text) in entries.items()
+        for key, value, unit, lower, text in rows
     }
 
 
-def _check(segment: Segment, known: dict[str, SegmentLayout]) -> None:
-    where = f"segment {segment.name}"
-    if segment.name in known:
-        raise ModelError(f"two segments are called '{segment.name}'", where=where)
-    if segment.parent is not None and segment.parent not in known:
-        raise ModelError(
-            f"parent '{segment.parent}' of segment '{segment.name}' does not come before it",
-            where=where,
-            hint=nearest_name_hint(segment.parent, known),
-        )
-    if (segment.radius is None) == (segment.cross_section is None):
-        raise ModelError(
+def _check(segment: Segment, known: Mapping[str, SegmentLayout]) -> None:
+    name, parent, at, axes = segment.name, segment.parent, segment.parent_link_index, segment.joint_axes
+    section, lengths, turns = segment.cross_section, segment.link_lengths, segment.link_rest_rotations
+    sizes = {"mass": segment.mass, **({"length": segment.length} if lengths is None else {})}
+    sizes |= {} if segment.radius is None else {"radius": segment.radius}
+    sizes |= {f"cross_section[{i}]": size for i, size in enumerate(section or ())}
+    count, links = segment.links if lengths is None else len(lengths), 0
+    if parent is not None and parent in known:
+        links = len(known[parent].link_joints)
+    far, apart = f"parent '{parent}' of segment '{name}' does not come before it", set(axes) <= set(UNIT_AXES)
+    rules: list[tuple[bool, str, str, str]] = [
+        (name in known, f"two segments are called '{name}'", "", ""),
+        (parent is not None and parent not in known, far, "", nearest_name_hint(str(parent), known)),
+        (
+            (segment.radius is None) == (section is None),
             "a segment needs a radius or a section",
-            where=where,
-            allowed="one of the two",
-            hint="cross_section: [0.001, 0.08]",
-        )
-    sizes = {"mass": segment.mass}
-    if segment.link_lengths is None:
-        sizes["length"] = segment.length
-    sizes |= {"radius": segment.radius} if segment.radius is not None else {}
-    sizes |= {f"cross_section[{i}]": size for i, size in enumerate(segment.cross_section or ())}
-    for quantity, value in sizes.items():
-        if not (math.isfinite(value) and value > 0):
-            raise ModelError(f"{quantity} = {value}", where=where, allowed="a positive number in SI units")
-    if segment.link_lengths is None and segment.links < 1:
-        raise ModelError(f"links = {segment.links}", where=where, allowed="a whole number from 1")
-    if segment.link_lengths is not None and not min(segment.link_lengths, default=0.0) > 0:
-        raise ModelError("a link has no length", where=where, allowed="positive lengths [m]")
-    count = len(segment.link_lengths) if segment.link_lengths is not None else segment.links
-    if segment.link_rest_rotations is not None and len(segment.link_rest_rotations) != count - 1:
-        raise ModelError(
-            f"{len(segment.link_rest_rotations)} link rotations for {count} links", where=where, allowed=f"{count - 1}"
-        )
-    if segment.parent_link_index is not None and segment.parent is not None:
-        links = len(known[segment.parent].link_joints)
-        if not 0 <= segment.parent_link_index < links:
-            raise ModelError(
-                f"parent_link_index = {segment.parent_link_index}", where=where, allowed=f"0 to {links - 1}"
-            )
-    axes = segment.joint_axes
-    if not axes or len(set(axes)) < len(axes) or not set(axes) <= set(UNIT_AXES):
-        raise ModelError(f"joint_axes = '{axes}'", where=where, allowed="letters of x, y, z, each at most once")
+            "one of the two",
+            "cross_section: [0.001, 0.08]",
+        ),
+        *(
+            (not (math.isfinite(value) and value > 0), f"{what} = {value}", "a positive number in SI units", "")
+            for what, value in sizes.items()
+        ),
+        (lengths is None and count < 1, f"links = {count}", "a whole number from 1", ""),
+        (lengths is not None and not min(lengths, default=0.0) > 0, "a link has no length", "positive lengths [m]", ""),
+        (
+            turns is not None and len(turns) != count - 1,
+            f"{0 if turns is None else len(turns)} link rotations for {count} links",
+            f"{count - 1}",
+            "",
+        ),
+        (
+            at is not None and parent is not None and not 0 <= at < links,
+            f"parent_link_index = {at}",
+            f"0 to {links - 1}",
+            "",
+        ),
+        (
+            not axes or len(set(axes)) < len(axes) or not apart,
+            f"joint_axes = '{axes}'",
+            "letters of x, y, z, each at most once",
+            "",
+        ),
+    ]
+    for is_wrong, what, allowed, hint in rules:
+        if is_wrong:
+            raise ModelError(what, where=f"segment {name}", allowed=allowed, hint=hint)

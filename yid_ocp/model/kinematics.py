@@ -22,7 +22,6 @@ class Kinematics:
 
     Attributes
     ----------
-    mechanism : Mechanism
     joint_rotations : tuple of casadi.SX, each (3, 3)
         Of each joint's moving frame, to the world.
     joint_origins : tuple of casadi.SX, each (3, 1)
@@ -38,7 +37,7 @@ class Kinematics:
 
     def frame_pose(self, frame: str | Frame) -> Placement:
         """Pose of a frame in the world."""
-        entry = self.mechanism.frame(frame) if isinstance(frame, str) else frame
+        entry = self._frame(frame)
         if entry.joint_index < 0:
             return entry.placement
         return (
@@ -51,20 +50,21 @@ class Kinematics:
 
     def position_jacobian(self, frame: str | Frame) -> ca.SX:
         """Derivative of a frame's position by the configuration, shape (3, n)."""
-        entry = self.mechanism.frame(frame) if isinstance(frame, str) else frame
-        point = self.frame_position(entry)
-        columns = [ca.SX(3, 1)] * len(self.joint_screws)
-        for j in self.mechanism.ancestor_joints(entry.joint_index):
-            columns[j] = self.joint_screws[j][3:] + cross_product(self.joint_screws[j][:3], point)
-        return ca.horzcat(*columns) if columns else ca.SX(3, 0)
+        point = self.frame_position(frame)
+        return self._columns(frame, lambda screw: screw[3:] + cross_product(screw[:3], point))
 
     def angular_jacobian(self, frame: str | Frame) -> ca.SX:
         """Angular velocity of a frame per configuration rate, in the world, shape (3, n)."""
-        entry = self.mechanism.frame(frame) if isinstance(frame, str) else frame
+        return self._columns(frame, lambda screw: screw[:3])
+
+    def _frame(self, frame: str | Frame) -> Frame:
+        return self.mechanism.frame(frame) if isinstance(frame, str) else frame
+
+    def _columns(self, frame: str | Frame, column: Callable[[ca.SX], ca.SX]) -> ca.SX:
         columns = [ca.SX(3, 1)] * len(self.joint_screws)
-        for j in self.mechanism.ancestor_joints(entry.joint_index):
-            columns[j] = self.joint_screws[j][:3]
-        return ca.horzcat(*columns) if columns else ca.SX(3, 0)
+        for j in self.mechanism.ancestor_joints(self._frame(frame).joint_index):
+            columns[j] = column(self.joint_screws[j])
+        return ca.horzcat(ca.SX(3, 0), *columns)
 
 
 @dataclass(frozen=True)
@@ -84,11 +84,9 @@ class RigidBodyDerivatives:
     Attributes
     ----------
     lagrangian_by_q, lagrangian_by_v : casadi.SX, shape (n, 1)
-        dL/dq and dL/dv.
     kinetic_energy, potential_energy : casadi.SX
         [J]
-    S, D, F, B : casadi.SX, shape (6, n)
-    G : casadi.SX, shape (3, n)
+    S, D, F, B, G : casadi.SX, shape (6, n), G (3, n)
     """
 
     lagrangian_by_q: ca.SX
@@ -118,14 +116,7 @@ def motion_cross_force_product(a: ca.SX, f: ca.SX) -> ca.SX:
 
 
 def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
-    """Poses and screws of all joints at a configuration.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-    q : casadi.SX, shape (n, 1)
-        Configuration [rad or m].
-    """
+    """Poses and screws of all joints at a configuration q, shape (n, 1) [rad or m]."""
     rotations: list[ca.SX] = []
     origins: list[ca.SX] = []
     screws: list[ca.SX] = []
@@ -149,13 +140,7 @@ def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
 def rigid_body_derivatives(kinematics: Kinematics, v: ca.SX, gravity: ca.SX) -> RigidBodyDerivatives:
     """Energies and first derivatives of the Lagrangian of a mechanism's bodies.
 
-    Parameters
-    ----------
-    kinematics : Kinematics
-    v : casadi.SX, shape (n, 1)
-        Velocity [rad/s or m/s].
-    gravity : casadi.SX, shape (3, 1)
-        Acceleration of free fall in the world frame [m/s^2].
+    `v` is the velocity, shape (n, 1) [rad/s or m/s], `gravity` that of the world frame, shape (3, 1) [m/s^2].
     """
     joints, S = kinematics.mechanism.joints, kinematics.joint_screws
     velocity: list[ca.SX] = []
@@ -182,17 +167,9 @@ def rigid_body_derivatives(kinematics: Kinematics, v: ca.SX, gravity: ca.SX) -> 
     def columns(entries: Sequence[ca.SX], rows: int) -> ca.SX:
         return ca.densify(ca.horzcat(ca.SX(rows, 0), *entries))
 
-    return RigidBodyDerivatives(
-        ca.densify(ca.vertcat(*by_q)) if joints else ca.SX(0, 1),
-        ca.densify(ca.vertcat(*by_v)) if joints else ca.SX(0, 1),
-        kinetic,
-        potential,
-        columns(S, 6),
-        columns(D, 6),
-        columns(F, 6),
-        columns(B, 6),
-        columns(G, 3),
-    )
+    gradients = [ca.densify(ca.vertcat(ca.SX(0, 1), *entries)) for entries in (by_q, by_v)]
+    vectors = [columns(entries, rows) for entries, rows in ((S, 6), (D, 6), (F, 6), (B, 6), (G, 3))]
+    return RigidBodyDerivatives(*[*gradients, kinetic, potential, *vectors])
 
 
 @dataclass
@@ -249,20 +226,15 @@ def _moved(kinematics: Kinematics, velocity: Sequence[ca.SX], gravity: ca.SX) ->
 
 def mass_matrix(rigid: RigidBodyDerivatives, mechanism: Mechanism) -> ca.SX:
     """M = L_vv of the bodies, shape (n, n), from the closed form of `RigidBodyDerivatives`."""
-    return _from_pairs(mechanism, lambda i, j: (_dot(rigid.S, i, rigid.F, j), _dot(rigid.S, i, rigid.F, j)))
+    return _from_pairs(mechanism, lambda i, j: (_dot(rigid.S, i, rigid.F, j),) * 2)
 
 
 def lagrangian_second_derivatives(rigid: RigidBodyDerivatives, mechanism: Mechanism) -> tuple[ca.SX, ca.SX, ca.SX]:
     """(L_qq, L_qv, L_vv) of the bodies, each (n, n), from `RigidBodyDerivatives`; L_qv[row q, column v]."""
-
-    def by_qq(i: int, j: int) -> tuple[ca.SX, ca.SX]:
-        entry = _dot(rigid.D, i, rigid.B, j) + ca.dot(rigid.S[:3, i], rigid.G[:, j])
-        return entry, entry
-
-    def by_qv(i: int, j: int) -> tuple[ca.SX, ca.SX]:
-        return _dot(rigid.D, i, rigid.F, j), _dot(rigid.S, i, rigid.B, j)
-
-    return _from_pairs(mechanism, by_qq), _from_pairs(mechanism, by_qv), mass_matrix(rigid, mechanism)
+    S, D, F, B, G = rigid.S, rigid.D, rigid.F, rigid.B, rigid.G
+    by_qq = _from_pairs(mechanism, lambda i, j: (_dot(D, i, B, j) + _dot(S[:3, :], i, G, j),) * 2)
+    by_qv = _from_pairs(mechanism, lambda i, j: (_dot(D, i, F, j), _dot(S, i, B, j)))
+    return by_qq, by_qv, mass_matrix(rigid, mechanism)
 
 
 def _dot(a: ca.SX, i: int, b: ca.SX, j: int) -> ca.SX:
@@ -270,13 +242,13 @@ def _dot(a: ca.SX, i: int, b: ca.SX, j: int) -> ca.SX:
 
 
 def _from_pairs(mechanism: Mechanism, entry: Callable[[int, int], tuple[ca.SX, ca.SX]]) -> ca.SX:
+    """The matrix of (upper, lower) entries for every joint j and its ancestors i."""
     n = len(mechanism.joints)
     matrix = ca.SX(n, n)
     for j in range(n):
         for i in mechanism.ancestor_joints(j):
             upper, lower = entry(i, j)
-            matrix[j, i] = lower
-            matrix[i, j] = upper
+            matrix[j, i], matrix[i, j] = lower, upper  # on the diagonal the upper one stays
     return matrix
 
 

@@ -10,7 +10,7 @@ from typing import Literal
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import ModelError, nearest_name_hint
@@ -20,14 +20,7 @@ from yid_ocp.model.rotations import snap_to_unit_entries
 
 @dataclass(frozen=True)
 class Placement:
-    """A rigid transform whose entries may depend on parameters.
-
-    Attributes
-    ----------
-    rotation : casadi.SX, shape (3, 3)
-    translation : casadi.SX, shape (3, 1)
-        [m]
-    """
+    """A rigid transform, shapes (3, 3) and (3, 1) [m], whose entries may depend on parameters."""
 
     rotation: ca.SX
     translation: ca.SX
@@ -94,8 +87,6 @@ class Joint:
 
     Attributes
     ----------
-    name : str
-    kind : "revolute" or "prismatic"
     parent_index : int
         Index of the parent joint, -1 for the world.
     placement : Placement
@@ -104,10 +95,8 @@ class Joint:
         Unit vector in the joint frame.
     bodies : tuple of Inertia
         Everything rigidly attached to the moving side.
-    lower_limit, upper_limit : float
-        Range [rad or m].
-    effort_limit, velocity_limit : float
-        [N m or N], [rad/s or m/s]
+    lower_limit, upper_limit, effort_limit, velocity_limit : float
+        [rad or m], [N m or N], [rad/s or m/s]
     """
 
     name: str
@@ -150,15 +139,15 @@ class LinkChain:
     tip_frames: tuple[str, ...]
     length_fractions: tuple[float, ...]
 
-    def locate_arc_length(self, length_fraction: float) -> tuple[str, float]:
+    def _locate(self, length_fraction: float) -> tuple[str, float]:
         """Tip frame of the link that contains a fraction of the arc length (0 to 1), and the fraction of that link."""
         before = 0.0
         for tip, own in zip(self.tip_frames, self.length_fractions, strict=True):
             # what ends a link belongs to it, not to the next one
             if length_fraction <= before + own * (1 + 1e-9) or tip == self.tip_frames[-1]:
-                return tip, min((length_fraction - before) / own, 1.0)
+                break
             before += own
-        raise ModelError("a line has no links")
+        return tip, min((length_fraction - before) / own, 1.0)
 
 
 @dataclass(frozen=True, repr=False)
@@ -167,13 +156,10 @@ class Mechanism(ReprMixin):
 
     Attributes
     ----------
-    name : str
-    joints : tuple of Joint
-    frames : mapping of str to Frame
     parameters : Parameters
         Those on which placements and inertias depend.
-    link_chains : mapping of str to Line
-        Chains of straight links along which `NAME:40%` names a point by arc length.
+    link_chains : mapping of str to LinkChain
+        Along which `NAME:40%` names a point by arc length.
     """
 
     name: str
@@ -183,12 +169,10 @@ class Mechanism(ReprMixin):
     link_chains: Mapping[str, LinkChain] = field(default_factory=dict)
 
     def _summary(self) -> ReprSummary:
-        rows = [("joint", "type", "moves with"), *((j.name, j.kind, self._carrier(j)) for j in self.joints)]
+        carriers = ("the world", *self.joint_names)
+        rows = [("joint", "type", "moves with"), *((j.name, j.kind, carriers[j.parent_index + 1]) for j in self.joints)]
         joints, frames = count_with_noun(len(self.joints), "joint"), count_with_noun(len(self.frames), "frame")
         return ReprSummary(f"{self.name}, {joints} and {frames}", rows)
-
-    def _carrier(self, joint: Joint) -> str:
-        return "the world" if joint.parent_index < 0 else self.joints[joint.parent_index].name
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
@@ -216,11 +200,7 @@ class Mechanism(ReprMixin):
 
         Such a point lies on the straight link that reaches there and turns with it, so that it stays where it is on the
         object however many links that has; where links have length parameters of their own, by their nominal lengths.
-
-        Raises
-        ------
-        ModelError
-            No such frame or line (with the nearest name), or no percentage from 0 to 100.
+        `ModelError` where there is no such frame (with the nearest name) or no percentage from 0 to 100.
         """
         if name in self.frames:
             return self.frames[name]
@@ -228,7 +208,7 @@ class Mechanism(ReprMixin):
         if not self.has_frame(name):
             known = (*self.frames, *(f"{entry}:{said}" for entry in self.link_chains if said))
             raise ModelError(f"there is no frame '{name}'", where=self.name, hint=nearest_name_hint(name, known))
-        tip, part = self.link_chains[line].locate_arc_length(_fraction(name, said))
+        tip, part = self.link_chains[line]._locate(_fraction(name, said))
         end = self.frames[tip]
         return Frame(end.joint_index, Placement(end.placement.rotation, part * end.placement.translation))
 
@@ -243,16 +223,9 @@ class Mechanism(ReprMixin):
     def with_mechanism(
         self, other: Mechanism, frame: str | None = None, placement: ArrayLike | None = None
     ) -> Mechanism:
-        """This mechanism with another one attached to one of its frames.
+        """This mechanism with another one, of other joint and frame names, attached to one of its frames.
 
-        Parameters
-        ----------
-        other : Mechanism
-            Its joint and frame names must differ from this one's.
-        frame : str, optional
-            Where its root goes; the world when absent.
-        placement : array_like, shape (4, 4), optional
-            Of its root in that frame.
+        `frame` is where its root goes (the world when absent), `placement` the root's pose in it, shape (4, 4).
         """
         root = Placement.identity() if placement is None else Placement.from_matrix(placement)
         at = -1
@@ -284,17 +257,7 @@ class Mechanism(ReprMixin):
         )
 
     def with_frame(self, name: str, frame: str | None, placement: ArrayLike) -> Mechanism:
-        """The mechanism with one additional frame.
-
-        Parameters
-        ----------
-        name : str
-            Not that of another frame.
-        frame : str or None
-            What it is fixed to; the world for None.
-        placement : array_like, shape (4, 4)
-            Of the new frame in that one.
-        """
+        """The mechanism with one additional frame, at a pose (4, 4) in the one it is fixed to (the world for None)."""
         if name in self.frames:
             raise ModelError(f"there is a frame '{name}' already", where=self.name)
         carrier = Frame(-1, Placement.identity()) if frame is None else self.frame(frame)
@@ -303,12 +266,10 @@ class Mechanism(ReprMixin):
 
     def with_numeric_values(self, values: Mapping[str, float] | None = None) -> Mechanism:
         """The mechanism with numbers in place of its parameters, which are then empty."""
-        return self._evaluated(self.parameters.symbols, self.parameters.vector(values))
+        symbols, theta = self.parameters.symbols, self.parameters.vector(values)
 
-    def _evaluated(self, symbols: ca.SX, theta: NDArray[np.float64]) -> Mechanism:
         def number(expression: ca.SX) -> ca.SX:
-            function = ca.Function("number", [symbols], [expression])
-            return ca.SX(ca.densify(function(theta)))
+            return ca.SX(ca.densify(ca.Function("number", [symbols], [expression])(theta)))
 
         return replace(self.map_expressions(number), parameters=Parameters())
 
@@ -329,14 +290,9 @@ class Mechanism(ReprMixin):
         return replace(self, joints=joints, frames=frames)
 
     def with_inserted_joints(self, index: int, chain: Sequence[Joint]) -> Mechanism:
-        """The mechanism with a chain of joints inserted at an index; nothing is attached to the chain yet.
+        """The mechanism with a chain of joints inserted from an index on, to which nothing is attached yet.
 
-        Parameters
-        ----------
-        index : int
-            Index of the first new joint; it and what follows move back.
-        chain : sequence of Joint
-            The first one's parent stands before `index`, every other one's is the one before it whatever it says.
+        The first joint's parent stands before `index`, every other one's is the one before it whatever it says.
         """
         count = len(chain)
 
@@ -353,9 +309,8 @@ class Mechanism(ReprMixin):
 
 def _fraction(name: str, said: str) -> float:
     """Fraction of a length from a percentage in a frame's name."""
-    number = said.strip().removesuffix("%")
     try:
-        value = float(number) if said.strip().endswith("%") else math.nan
+        value = float(said.strip().removesuffix("%")) if said.strip().endswith("%") else math.nan
     except ValueError:
         value = math.nan
     if not 0.0 <= value <= 100.0:

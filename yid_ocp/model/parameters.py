@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -24,14 +25,8 @@ class Parameter:
     ----------
     name : str
         `owner.quantity`, for example `T1.bend`; for an effect `kind@location.quantity`.
-    value : float
-        Nominal value, in `unit`.
-    unit : str
-        SI unit, `1` for a pure number.
-    lower, upper : float
-        Physical bounds, infinite where there are none.
-    description : str
-        What it is, in a few words.
+    value, lower, upper : float
+        Nominal value and physical bounds, in the SI `unit` (`1` for a pure number).
     symbol : casadi.SX
         The scalar that stands for it in symbolic expressions.
     """
@@ -59,20 +54,13 @@ class Parameter:
 
 
 class Parameters(ReprMixin):
-    """The ordered, immutable set of a model's parameters, which defines the order of `theta`.
-
-    Parameters
-    ----------
-    entries : iterable of Parameter
-        Names must be unique.
-    """
+    """The ordered, immutable set of a model's parameters (unique names), which defines the order of `theta`."""
 
     def __init__(self, entries: Iterable[Parameter] = ()) -> None:
         self._entries = tuple(entries)
         self._index = {entry.name: i for i, entry in enumerate(self._entries)}
         if len(self._index) != len(self._entries):
-            names = [entry.name for entry in self._entries]
-            twice = sorted({name for name in names if names.count(name) > 1})
+            twice = sorted(name for name, count in Counter(self.names).items() if count > 1)
             raise ConfigError(
                 f"parameter named twice: {', '.join(twice)}", hint="give each part of the model its own name"
             )
@@ -111,21 +99,9 @@ class Parameters(ReprMixin):
         return self._index[name]
 
     def vector(self, values: Mapping[str, float] | None = None) -> _Vector:
-        """The vector theta of nominal values, some of them replaced.
+        """The vector theta of nominal values, some of them replaced, shape (ntheta,).
 
-        Parameters
-        ----------
-        values : mapping of str to float, optional
-            Replacements by name.
-
-        Returns
-        -------
-        ndarray, shape (ntheta,)
-
-        Raises
-        ------
-        ConfigError
-            Unknown name, or a value that is not finite.
+        `ConfigError` for an unknown name or a value that is not finite.
         """
         theta = np.array([entry.value for entry in self._entries], dtype=float)
         for name, value in (values or {}).items():
@@ -136,21 +112,10 @@ class Parameters(ReprMixin):
 
     def with_values(self, values: Mapping[str, float]) -> Parameters:
         """The same parameters (and symbols) with other nominal values."""
-        for name in values:
-            self.index(name)
-        return Parameters(
-            replace(entry, value=float(values[entry.name])) if entry.name in values else entry
-            for entry in self._entries
-        )
-
-    def with_bounds(self, bounds: Mapping[str, tuple[float, float]]) -> Parameters:
-        """The same parameters (and symbols) with other bounds."""
-        for name in bounds:
-            self.index(name)
-        return Parameters(
-            replace(entry, lower=bounds[entry.name][0], upper=bounds[entry.name][1]) if entry.name in bounds else entry
-            for entry in self._entries
-        )
+        changed = list(self._entries)
+        for name, value in values.items():
+            changed[self.index(name)] = replace(self[name], value=float(value))
+        return Parameters(changed)
 
     def with_added(self, *others: Iterable[Parameter]) -> Parameters:
         """These parameters followed by others."""

@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 Matrix = NDArray[np.float64]
 
-
 # URDF writers round pi to a dozen digits; entries this close to 0 and 1 are meant to be exactly that.
 _SNAP_TOLERANCE = 1e-11
 
@@ -33,14 +32,10 @@ def homogeneous_transform(rotation: ArrayLike, translation: ArrayLike) -> Matrix
 
 def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Matrix:
     """Rotation matrix Rz(yaw) Ry(pitch) Rx(roll), the URDF convention [rad]."""
-    cr, sr, cp, sp, cy, sy = *_cs(roll), *_cs(pitch), *_cs(yaw)
-    return np.array(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ]
-    )
+    cr, sr, cp, sp, cy, sy = (f(angle) for angle in (roll, pitch, yaw) for f in (math.cos, math.sin))
+    x = [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr]
+    y = [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr]
+    return np.array([x, y, [-sp, cp * sr, cp * cr]])
 
 
 def rpy_from_rotation(rotation: Matrix) -> tuple[float, float, float]:
@@ -48,7 +43,7 @@ def rpy_from_rotation(rotation: Matrix) -> tuple[float, float, float]:
     # the roll is taken in the frame that yaw and pitch leave, which holds at and near pitch = 90 degrees too
     yaw = math.atan2(rotation[1, 0], rotation[0, 0])
     pitch = math.atan2(-rotation[2, 0], math.hypot(rotation[0, 0], rotation[1, 0]))
-    c, s = _cs(yaw)
+    c, s = math.cos(yaw), math.sin(yaw)
     return math.atan2(s * rotation[0, 2] - c * rotation[1, 2], c * rotation[1, 1] - s * rotation[0, 1]), pitch, yaw
 
 
@@ -77,10 +72,6 @@ def symbolic_rotation_from_rpy(roll: ca.SX, pitch: ca.SX, yaw: ca.SX | None = No
     """Rotation matrix Rz(yaw) Ry(pitch) Rx(roll) of symbolic angles [rad], shape (3, 3); without yaw Ry Rx."""
     turned = symbolic_axis_rotation((0.0, 1.0, 0.0), pitch) @ symbolic_axis_rotation((1.0, 0.0, 0.0), roll)
     return ca.densify(turned if yaw is None else symbolic_axis_rotation((0.0, 0.0, 1.0), yaw) @ turned)
-
-
-def _cs(angle: float) -> tuple[float, float]:
-    return math.cos(angle), math.sin(angle)
 
 
 def _skew(u: Matrix) -> Matrix:

@@ -17,14 +17,10 @@ TORQUE_LIMIT_POWER = 16
 """Exponent p of a servo's smooth torque limit, demand / (1 + |demand/limit|^p)^(1/p)."""
 UNLIMITED_EFFORT = 2e4
 """Effort limits from this value on mean that there is none [N m or N]."""
-_DEFAULT_FULL_TORQUE_ERROR = 0.05
-"""Position error at which a servo of unknown gain reaches its torque limit [rad or m]."""
-_DEFAULT_DAMPING_TIME = 0.1
-"""Default ratio of a servo's damping to its gain [s]."""
-_DEFAULT_GAIN = 50.0
-"""Default gain of a servo without an effort limit [N m/rad or N/m]."""
-_MAX_COMMAND_DELAY = 0.5
-"""Upper bound of a servo's command delay [s]."""
+_DEFAULT_FULL_TORQUE_ERROR = 0.05  # at which a servo of unknown gain reaches its torque limit [rad or m]
+_DEFAULT_GAIN = 50.0  # of a servo without an effort limit [N m/rad or N/m]
+_DEFAULT_DAMPING_TIME = 0.1  # a servo's damping over its gain [s]
+_MAX_COMMAND_DELAY = 0.5  # [s]
 
 
 @dataclass(frozen=True)
@@ -37,15 +33,7 @@ class RobotJointSpring:
 
 @dataclass(frozen=True)
 class PositionServoOptions:
-    """How an arm's controller follows commanded positions.
-
-    Attributes
-    ----------
-    command_interpolation : "held" or "interpolated"
-        What servos follow between two commands.
-    has_gravity_compensation : bool
-        Whether the controller carries the robot's own weight.
-    """
+    """What servos follow between two commands, and whether the controller carries the robot's own weight."""
 
     command_interpolation: CommandInterpolation = "held"
     has_gravity_compensation: bool = False
@@ -61,16 +49,8 @@ class PositionServo:
 
     Attributes
     ----------
-    gain : casadi.SX
-        [N m/rad or N/m]
-    damping : casadi.SX
-        [N m s/rad or N s/m]
-    command_delay : casadi.SX
-        [s]
-    torque_limit_tightness : casadi.SX
-        [(N m)^-p]
-    command_interpolation : "held" or "interpolated"
-        What it follows between two commands.
+    gain, damping, command_delay, torque_limit_tightness : casadi.SX
+        [N m/rad or N/m], [N m s/rad or N s/m], [s], [(N m)^-p]
     """
 
     gain: ca.SX
@@ -97,12 +77,12 @@ class PositionServo:
 
 def joint_damping_parameters(tree: Mechanism, wanted: Mapping[str, float]) -> dict[str, Parameter]:
     """Parameters `JOINT.damping` of the named joints, by joint."""
-    found = {}
-    for joint, value in wanted.items():
+    for joint in wanted:
         tree.joint_index(joint)
-        text = f"viscous damping of {joint}"
-        found[joint] = Parameter(f"{joint}.damping", value, "N m s/rad", 0.0, math.inf, text)
-    return found
+    return {
+        joint: Parameter(f"{joint}.damping", value, "N m s/rad", 0.0, math.inf, f"viscous damping of {joint}")
+        for joint, value in wanted.items()
+    }
 
 
 def joint_spring_parameters(tree: Mechanism, joint: str, spring: RobotJointSpring) -> tuple[Parameter, Parameter]:
@@ -152,9 +132,8 @@ def _servo_parameters(joint: Joint) -> list[Parameter]:
 
 def without_gravity(tree: Mechanism) -> Mechanism:
     """The robot without gravity on its bodies, as when its controller compensates its own weight."""
-    none = ca.SX(0)
     joints = tuple(
-        replace(joint, bodies=tuple(replace(body, gravity_fraction=none) for body in joint.bodies))
+        replace(joint, bodies=tuple(replace(body, gravity_fraction=ca.SX(0)) for body in joint.bodies))
         for joint in tree.joints
     )
     return replace(tree, joints=joints)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal, Protocol, TypedDict, Unpack, runtime_checkable
 
 import casadi as ca
 import numpy as np
@@ -38,14 +38,12 @@ _GRASP_EQUATION_NAMES: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Grasp:
-    """A holonomic constraint between a frame of the robot (or a clamp) and a frame of the object.
+    """A holonomic constraint: the origins of a robot's (or a clamp's) frame and of an object's frame coincide.
 
     Attributes
     ----------
     name : str
         `left`, `right`, `gripper`, or a clamp's name.
-    holder_frame, held_frame : str
-        Frames; their origins coincide.
     kind : "point", "axis" or "weld"
         3 equations (positions), 5 (and the direction of the z axes), 6 (and the orientation).
     held_orientation : casadi.SX, shape (3, 3)
@@ -54,10 +52,8 @@ class Grasp:
         Where the grasped point sits in the holder's frame [m].
     axial_slip : casadi.SX
         How far the grasped point has crept along the object's z axis [m].
-    compliance : casadi.SX
-        C in phi(q_{k+1}) = C lam_k / h [m/N]; zero for a rigid grasp.
-    relaxation_time : casadi.SX, optional
-        T in phi(q_{k+1}) + T (phi(q_{k+1}) - phi(q_k)) / h = C lam_k / h, damping over stiffness of the grasp [s].
+    compliance, relaxation_time : casadi.SX
+        C [m/N], zero when rigid, and T [s] in phi(q_{k+1}) + T (phi(q_{k+1}) - phi(q_k)) / h = C lam_k / h.
     """
 
     name: str
@@ -77,7 +73,7 @@ class Grasp:
 
     @property
     def equation_names(self) -> tuple[str, ...]:
-        """Names of the equations: `left.x`, ..., then tilts for `axis` or rotations for `weld`."""
+        """Names of the equations: `left.x`, ..., then tilts or rotations."""
         return tuple(f"{self.name}.{part}" for part in _GRASP_EQUATION_NAMES[self.kind])
 
     def map_expressions(self, change: Callable[[ca.SX], ca.SX]) -> Grasp:
@@ -123,19 +119,14 @@ class MidpointState:
 
     Attributes
     ----------
-    system : System
-    kinematics : Kinematics
-        At `q`.
     q, v : casadi.SX, shape (n, 1)
-        (q_k + q_{k+1})/2 and (q_{k+1} - q_k)/h.
+        (q_k + q_{k+1})/2, where `kinematics` is, and (q_{k+1} - q_k)/h.
     z, z_rate : casadi.SX, shape (nz, 1)
-        The same of all internal coordinates.
+        The same of all internal coordinates; `internal_rows` has the row of each by name.
     u : casadi.SX, shape (nu, 1)
         Motor torques held over the step [N m], or what servos are commanded [rad or m].
     constraint_force : casadi.SX, shape (m, 1)
         lam_k / h [N or N m].
-    internal_rows : mapping of str to int
-        Row of each internal coordinate in `z`, by name.
     h : casadi.SX
         Length of the step [s].
     """
@@ -158,15 +149,10 @@ class NodeState:
 
     Attributes
     ----------
-    system : System
-    kinematics : Kinematics
-        At `q`.
-    q : casadi.SX, shape (n, 1)
-    z : casadi.SX, shape (nz, 1)
+    q, z : casadi.SX, shape (n, 1) and (nz, 1)
+        `kinematics` is at q; `internal_rows` has the row of each internal coordinate in z by name.
     effort : casadi.SX, shape (n, 1)
         Torque at every joint that has one: the motor torque where driven, the predicted effort where prescribed.
-    internal_rows : mapping of str to int
-        Row of each internal coordinate in `z`, by name.
     camera_pose : Placement or None
         Pose in the world of the camera that measures; None for any other sensor.
     marked_frame : str or None
@@ -185,17 +171,12 @@ class NodeState:
 
 @dataclass(frozen=True)
 class ForceWithDerivatives:
-    """A dissipative generalized force F(q, v) of wrenches on bodies, with its derivatives in closed form.
+    """A dissipative generalized force F(q, v) of wrenches on bodies, shape (n, 1) [N m or N], and its derivatives.
 
-    With S_j and D_j as in `RigidBodyDerivatives`, for i an ancestor of joint j or j itself:
+    With S_j and D_j as in `RigidBodyDerivatives` and the columns of A and T, shape (6, n), for i an ancestor of joint j
+    or j itself:
 
         dF_j/dv_i = dF_i/dv_j = S_i . A_j       dF_j/dq_i = D_i . A_j       dF_i/dq_j = S_i . T_j
-
-    Attributes
-    ----------
-    force : casadi.SX, shape (n, 1)
-        [N m or N]
-    A, T : casadi.SX, shape (6, n)
     """
 
     force: ca.SX
@@ -211,15 +192,12 @@ class StepTerms:
     ----------
     lagrangian : casadi.SX
         Scalar added to L(q, v) [J].
-    generalized_force : casadi.SX, optional, shape (n, 1)
-        Generalized force F(q, v, u, z) [N m or N].
-    dissipative_force : casadi.SX, optional, shape (n, 1)
-        The part of the force that only takes energy out, in proportion to velocity [N m or N].
-    internal_equations : mapping of str to casadi.SX
-        Equation (= 0) of each internal coordinate that the term owns, at the midpoint.
-    static_equations : mapping of str to casadi.SX
-        Equation (= 0) that takes its place in a static equilibrium, where its own says nothing or cannot hold.
-    force_with_derivatives : ClosedForce, optional
+    generalized_force, dissipative_force : casadi.SX, optional, shape (n, 1)
+        F(q, v, u, z), and its part that only takes energy out, in proportion to velocity [N m or N].
+    internal_equations, static_equations : mapping of str to casadi.SX
+        Equation (= 0) of each of the effect's internal coordinates at the midpoint, and what takes its place in a
+        static equilibrium where its own says nothing or cannot hold.
+    force_with_derivatives : ForceWithDerivatives, optional
         A dissipative force on bodies whose slopes are given, because differentiating it would cost too much.
     """
 
@@ -270,46 +248,70 @@ class RecordingErrorEffect(Effect, Protocol):
     """Interface of an effect on recorded inputs and times.
 
     Recorded torques drive the model, recorded angles prescribe it or are followed: there the reading is known and the
-    true value is sought, the opposite of `measure`.
+    true value is sought, the opposite of `distorted_reading`.
     """
 
     def corrected_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
         """The true value for a recorded `joints.position.JOINT` or `joints.effort.JOINT`, at the true `effort`."""
 
     def added_delay(self, channel: str, camera: bool) -> ca.SX:
-        """How long before its recorded time a sample was true [s].
+        """How long before its recorded time a sample was true [s]; `channel` as in `distorted_reading`.
 
-        `channel` is as in `measure`, or `torque.JOINT` for a recorded torque that drives the model: it then acts so
-        much later than it was recorded.
+        A recorded torque that drives the model is `torque.JOINT`: it acts so much later than it was recorded.
         """
 
     def lag_time_constant(self, channel: str) -> ca.SX:
-        """Time constant with which a torque follows the recorded one, or a recorded effort the true one [s].
+        """Time constant of a `torque.JOINT` behind its record, or of `joints.effort.JOINT` behind the true one [s]."""
 
-        `channel` is `torque.JOINT` or `joints.effort.JOINT`.
-        """
+
+class SystemOptions(TypedDict, total=False):
+    """What `System.build` takes beside mechanism and effects.
+
+    Attributes
+    ----------
+    objects : sequence of (FlexibleObject, frame, placement)
+        Each hung on a frame of what came before (None: the world) at a 4x4 placement (None: identity).
+    driven, prescribed : sequence of str
+        Joint names; no joint may be both.
+    damping : float or mapping
+        Viscous damping of the robot's joints [N m s/rad]; becomes the parameters `JOINT.damping`.
+    gravity : array_like, shape (3,)
+        [m/s^2]; 9.81 along -z when absent.
+    point_frames : sequence of str
+        Frames that sensors may see, points along a segment as `T1:40%`; the segments' tips `w_*` when absent.
+    springs : mapping of str to RobotJointSpring
+        By joint of the robot; become the parameters `JOINT.stiffness` and `JOINT.rest`.
+    servos : PositionServoOptions
+        What the inputs of driven joints command; adds `JOINT.servo_gain`, `servo_damping`, `servo_delay` and
+        `servo_torque_limit`.
+    """
+
+    objects: Sequence[tuple[FlexibleObject, str | None, ArrayLike | None]]
+    grasps: Sequence[Grasp]
+    driven: Sequence[str]
+    prescribed: Sequence[str]
+    damping: float | Mapping[str, float]
+    gravity: ArrayLike
+    point_frames: Sequence[str] | None
+    springs: Mapping[str, RobotJointSpring]
+    servos: PositionServoOptions | None
 
 
 @dataclass(frozen=True, repr=False)
 class System(ReprMixin):
-    """A mechanism with springs, dampers, grasps, inputs and effects.
+    """A mechanism (arms first, left then right, then the object) with springs, dampers, grasps, inputs and effects.
 
     Attributes
     ----------
-    mechanism : Mechanism
-        Arms first (left, then right), then the object.
     parameters : Parameters
         Fixes the order of theta.
-    elastic_joints : tuple of ElasticJoint
     joint_damping : mapping of joint name to casadi.SX
         Viscous coefficients of joints that are not elastic [N m s/rad].
-    grasps : tuple of Grasp
-    driven : tuple of str
-        Joints with an input, in the order of u: a motor torque, or what a servo is commanded.
-    servos : mapping of joint name to Servo
+    driven, prescribed : tuple of str
+        Joints with an input, in the order of u (a motor torque, or what a servo is commanded), and those whose
+        coordinate is known, in the order of s.
+    servos : mapping of joint name to PositionServo
         Of all driven joints, or of none.
-    prescribed : tuple of str
-        Joints whose coordinate is known, in the order of s.
     gravity : casadi.SX, shape (3, 1)
         [m/s^2], in the world frame.
     recorded_time_scale : casadi.SX
@@ -320,10 +322,8 @@ class System(ReprMixin):
     joint_relaxation_times : mapping of joint name to float
         Relaxation time T of some compliant coordinates [s]: q + T dq/dt = compliance x torque. A massless one needs it
         to forget a start that does not fit its load.
-    segment_layouts : tuple of SegmentLayout
     point_frames : tuple of str
         Frames that a sensor may see.
-    effects : tuple of Effect
     """
 
     mechanism: Mechanism
@@ -344,85 +344,49 @@ class System(ReprMixin):
 
     @staticmethod
     def build(
-        mechanism: Mechanism | None = None,
-        *,
-        objects: Sequence[tuple[FlexibleObject, str | None, ArrayLike | None]] = (),
-        grasps: Sequence[Grasp] = (),
-        driven: Sequence[str] = (),
-        prescribed: Sequence[str] = (),
-        damping: float | Mapping[str, float] = 0.0,
-        gravity: ArrayLike = (0.0, 0.0, -9.81),
-        point_frames: Sequence[str] | None = None,
-        effects: Sequence[Effect] = (),
-        springs: Mapping[str, RobotJointSpring] | None = None,
-        servos: PositionServoOptions | None = None,
+        mechanism: Mechanism | None = None, *, effects: Sequence[Effect] = (), **options: Unpack[SystemOptions]
     ) -> System:
-        """A system from a robot, objects, grasps and effects.
-
-        Parameters
-        ----------
-        mechanism : Mechanism, optional
-            The robot; none for an object alone.
-        objects : sequence of (FlexibleObject, frame, placement)
-            Each hung on a frame of what came before (None: the world) at a 4x4 placement (None: identity).
-        grasps : sequence of Grasp
-        driven, prescribed : sequence of str
-            Joint names; no joint may be both.
-        damping : float or mapping
-            Viscous damping of the robot's joints [N m s/rad]; becomes the parameters `JOINT.damping`.
-        gravity : array_like, shape (3,)
-            [m/s^2]
-        point_frames : sequence of str, optional
-            Frames that sensors may see, points along a segment as `T1:40%`; the segments' tips `w_*` when absent.
-        effects : sequence of Effect
-        springs : mapping of str to Spring, optional
-            By joint of the robot; become the parameters `JOINT.stiffness` and `JOINT.rest`.
-        servos : PositionServos, optional
-            What the inputs of driven joints command; adds the parameters `JOINT.servo_gain`, `servo_damping`,
-            `servo_delay` and `servo_torque_limit`.
-
-        Returns
-        -------
-        System
+        """A system from a robot (none for an object alone), effects, and what `SystemOptions` lists.
 
         Raises
         ------
         ModelError
             A name that does not exist or is used twice, no joint at all, a joint both driven and prescribed.
         """
-        acceleration = np.asarray(gravity, float)
-        if acceleration.shape != (3,) or not np.all(np.isfinite(acceleration)):
-            raise ModelError(f"gravity = {acceleration}", allowed="three numbers [m/s^2]")
+        gravity = np.asarray(options.get("gravity", (0.0, 0.0, -9.81)), float)
+        if gravity.shape != (3,) or not np.all(np.isfinite(gravity)):
+            raise ModelError(f"gravity = {gravity}", allowed="three numbers [m/s^2]")
         tree = mechanism if mechanism is not None else Mechanism("system", (), {})
-        wanted = dict(damping) if isinstance(damping, Mapping) else dict.fromkeys(tree.joint_names, float(damping))
+        driven, prescribed = tuple(options.get("driven", ())), tuple(options.get("prescribed", ()))
+        damping, servos = options.get("damping", 0.0), options.get("servos")
+        wanted = damping if isinstance(damping, Mapping) else dict.fromkeys(tree.joint_names, float(damping))
         dampers = joint_damping_parameters(tree, wanted)
         entries = list(dampers.values())
         elastic: list[ElasticJoint] = []
-        for joint, spring in (springs or {}).items():
+        for joint, spring in options.get("springs", {}).items():
             stiffness, rest = joint_spring_parameters(tree, joint, spring)
             entries += [stiffness, rest]
             elastic.append(ElasticJoint(joint, joint, "bend", "", stiffness.symbol, ca.SX(0), rest.symbol))
         moved, own = ({}, []) if servos is None else build_joint_servos(tree, driven, servos.command_interpolation)
-        entries += own
         tree = without_gravity(tree) if servos is not None and servos.has_gravity_compensation else tree
         segments: list[SegmentLayout] = []
-        for item, frame, placement in objects:
+        for item, frame, placement in options.get("objects", ()):
             tree = tree.with_mechanism(item.mechanism, frame, placement)
             elastic += item.elastic_joints
             segments += item.segment_layouts
-        tips = (name for name in tree.frames if name.startswith("w_"))
-        seen = tuple(tips if point_frames is None else point_frames)
+        seen, grasps = options.get("point_frames"), tuple(options.get("grasps", ()))
+        seen = tuple((name for name in tree.frames if name.startswith("w_")) if seen is None else seen)
         _check_names(tree, grasps, driven, prescribed, seen)
         system = System(
             tree,
-            tree.parameters.with_added(entries),
+            tree.parameters.with_added(entries, own),
             tuple(elastic),
             {joint: parameter.symbol for joint, parameter in dampers.items()},
-            tuple(grasps),
-            tuple(driven),
+            grasps,
+            driven,
             moved,
-            tuple(prescribed),
-            ca.SX(ca.DM(acceleration)),
+            prescribed,
+            ca.SX(ca.DM(gravity)),
             segment_layouts=tuple(segments),
             point_frames=seen,
         )
@@ -441,12 +405,10 @@ class System(ReprMixin):
         kinds = {"driven": len(self.driven), "prescribed": len(self.prescribed)}
         kinds["passive"] = self.n_coordinates - sum(kinds.values())
         moved = ", ".join(f"{count} {kind}" for kind, count in kinds.items() if count)
-        parts = [
-            f"{count_with_noun(self.n_coordinates, 'coordinate')} ({moved})",
-            count_with_noun(self.n_constraints, "constraint"),
-        ]
+        counts = f"{count_with_noun(self.n_coordinates, 'coordinate')} ({moved})"
+        parts = [self.mechanism.name, counts, count_with_noun(self.n_constraints, "constraint")]
         parts += [f"{effect.kind}@{effect.location}" for effect in self.effects]
-        return ReprSummary(f"{self.mechanism.name}, {', '.join(parts)}", self.parameters._summary().table_rows)
+        return ReprSummary(", ".join(parts), self.parameters._summary().table_rows)
 
     @property
     def n_coordinates(self) -> int:
@@ -515,13 +477,10 @@ class System(ReprMixin):
 
     def viscous_force(self, v: ca.SX) -> ca.SX:
         """Generalized force of all viscous dampers, shape (n, 1) [N m]."""
-        force = [ca.SX(0)] * self.n_coordinates
-        for spring in self.elastic_joints:
-            index = self.mechanism.joint_index(spring.joint_name)
-            force[index] = force[index] - spring.damping * v[index]
-        for joint, coefficient in self.joint_damping.items():
-            index = self.mechanism.joint_index(joint)
-            force[index] = force[index] - coefficient * v[index]
+        force, index = [ca.SX(0)] * self.n_coordinates, self.mechanism.joint_index
+        dampers = [(spring.joint_name, spring.damping) for spring in self.elastic_joints]
+        for joint, coefficient in (*dampers, *self.joint_damping.items()):
+            force[index(joint)] = force[index(joint)] - coefficient * v[index(joint)]
         return ca.vertcat(*force)
 
     def input_force(self, u: ca.SX, q: ca.SX, v: ca.SX) -> ca.SX:
@@ -558,32 +517,20 @@ def _check_names(
         raise ModelError("the system has no joint", hint="give a robot, an object, or both")
     for joint in [*driven, *prescribed]:
         tree.joint_index(joint)
-    for kind, names in (
-        ("driven joints", list(driven)),
-        ("prescribed joints", list(prescribed)),
-        ("grasps", [grasp.name for grasp in grasps]),
-    ):
-        repeated = sorted({name for name in names if names.count(name) > 1})
-        if repeated:
+    named = {"driven joints": driven, "prescribed joints": prescribed, "grasps": [grasp.name for grasp in grasps]}
+    for kind, names in named.items():
+        if repeated := sorted({name for name in names if names.count(name) > 1}):
             raise ModelError(f"'{repeated[0]}' is named twice among the {kind}", allowed="each name once")
     if both := sorted(set(driven) & set(prescribed)):
         raise ModelError(f"joint '{both[0]}' is both driven and prescribed", allowed="one of the two")
-    for grasp in grasps:
-        tree.frame(grasp.holder_frame)
-        tree.frame(grasp.held_frame)
-    for point in points:
-        tree.frame(point)
+    for frame in [*(name for grasp in grasps for name in (grasp.holder_frame, grasp.held_frame)), *points]:
+        tree.frame(frame)
 
 
 def floating_clamp(name: str, frame: str | None = None) -> Mechanism:
-    """A massless mechanism of one frame with six coordinates (x, y, z, then rotations about x, y, z).
+    """A massless mechanism of one frame, called `frame` or as the clamp, with six coordinates.
 
-    Parameters
-    ----------
-    name : str
-        Joints become `NAME_x`, `NAME_y`, `NAME_z`, `NAME_rx`, `NAME_ry`, `NAME_rz`; the moving frame is `NAME`.
-    frame : str, optional
-        Another name for the moving frame.
+    Joints are `NAME_x`, `NAME_y`, `NAME_z`, then `NAME_rx`, `NAME_ry`, `NAME_rz`, which turn about x, y, z.
     """
     kinds: tuple[tuple[str, Literal["revolute", "prismatic"]], ...] = (("", "prismatic"), ("r", "revolute"))
     joints = tuple(

@@ -10,7 +10,7 @@ import site
 import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Iterable, Mapping, Sequence, Set
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -31,32 +31,22 @@ from yid_ocp.model.rotations import (
     snap_to_unit_entries,
 )
 
-# Stands for no limit where URDF asks for a number.
-_UNLIMITED_VALUE = 1e9
-
-# Of metres, radians, kilograms and kg m^2; squares of more would not be finite for long.
-_MAX_NUMBER = 1e12
-
-# Of digits in the file: how far principal moments may miss what they have to be.
-_PRINCIPAL_MOMENT_RTOL = 1e-2
-
-log = logging.getLogger(__name__)
-
+_UNLIMITED_VALUE = 1e9  # stands for no limit where URDF asks for a number
+_MAX_NUMBER = 1e12  # of m, rad, kg and kg m^2; squares of more would not be finite for long
+_PRINCIPAL_MOMENT_RTOL = (
+    1e-2  # how far, for want of digits in the file, principal moments may miss what they have to be
+)
 _MOVABLE_JOINT_TYPES = {"revolute", "continuous", "prismatic"}
+_TENSOR_KEYS = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
+
+_Carrier = str | None
+log = logging.getLogger(__name__)
 
 
 def example_robot_urdf(robot: str) -> Path:
-    """Path of a robot's URDF file in the installed example-robot-data package.
+    """Path of a robot's URDF file in the installed example-robot-data package; `ModelError` where there is none.
 
-    Parameters
-    ----------
-    robot : str
-        `baxter`, `panda`, `ur5`, or `folder/file.urdf` below the package's robots folder.
-
-    Raises
-    ------
-    ModelError
-        The package is not installed, or has no such robot.
+    `robot` is `baxter`, `panda`, `ur5`, or `folder/file.urdf` below the package's robots folder.
     """
     roots = [Path(p) / "cmeel.prefix/share/example-robot-data/robots" for p in [*sys.path, *site.getsitepackages()]]
     roots += [Path(sys.prefix) / "share/example-robot-data/robots"]
@@ -76,16 +66,8 @@ def example_robot_urdf(robot: str) -> Path:
 def resolve_urdf_path(robot: str | Path) -> Path:
     """Path of a robot's URDF file from its name in the settings; the file need not exist.
 
-    Parameters
-    ----------
-    robot : str or Path
-        A URDF file, `package:NAME` for one of example-robot-data, or `default:NAME.urdf` for a small mechanism that
-        ships with this package.
-
-    Raises
-    ------
-    ModelError
-        The package has no such robot.
+    The name is a file, `package:NAME` for a robot of example-robot-data, or `default:NAME.urdf` for a small mechanism
+    that ships with this package; `ModelError` where there is no such robot.
     """
     scheme, _, name = str(robot).partition(":")
     if scheme == "package":
@@ -113,7 +95,6 @@ def read_urdf(
     path: str | Path,
     joints: Sequence[str] | None = None,
     locked: Mapping[str, float] | None = None,
-    name: str | None = None,
     parametric: bool = True,
     exclude_links: Sequence[str] = (),
 ) -> Mechanism:
@@ -122,14 +103,12 @@ def read_urdf(
     Parameters
     ----------
     path : str or Path
-        As `resolve_urdf_path`: a URDF file, `package:baxter` (any folder of example-robot-data), `default:NAME.urdf`.
+        As `resolve_urdf_path` takes it.
     joints : sequence of str, optional
         Names of the joints to keep as degrees of freedom, which are then ordered as given as far as parents come
         first; all movable ones when absent.
     locked : mapping of str to float, optional
         Value at which a joint that is not kept is locked [rad or m]; zero, or the nearest bound, when absent.
-    name : str, optional
-        Name of the mechanism; that of the robot in the file when absent.
     parametric : bool
         Whether each kept joint's bodies get the parameter `joint.mass` [kg] (inertia in proportion).
     exclude_links : sequence of str
@@ -145,26 +124,30 @@ def read_urdf(
     ModelError
         Missing or malformed file, unknown joint, joint type that is not revolute, continuous, prismatic or fixed.
     """
-    kept, locked = joints, dict(locked or {})
-    file = _file(path)
-    robot = _parsed(file)
-    links = _checked(robot, file, (*(kept or ()), *locked))
-    dropped = _with_all_below(exclude_links, links, str(file))
+    file, locked = resolve_urdf_path(path), dict(locked or {})
+    if not is_file(file):
+        raise ModelError(f"there is no URDF file '{file}'", hint="give a path, or package:NAME for example-robot-data")
+    robot, where, named = _parsed(file), str(file), (*(joints or ()), *locked)
+    root = _check_tree(robot, where, named)
+    dropped = _with_all_below(exclude_links, robot, where)
     for joint in robot.joints:
-        if joint.child in dropped and joint.name in (*(kept or ()), *locked):
-            raise ModelError(f"joint '{joint.name}' carries a link that is left out", where=str(file))
-    following = _mimicked(robot, kept, locked, str(file))
-    movable = [
-        joint.name for joint in robot.joints if joint.type in _MOVABLE_JOINT_TYPES and joint.name not in following
-    ]
-    found = _walk(links, dropped, movable if kept is None else kept, locked, str(file))
-    order = _parents_first(found.joints, movable if kept is None else kept)
+        if joint.child in dropped and joint.name in named:
+            raise ModelError(f"joint '{joint.name}' carries a link that is left out", where=where)
+    following = _mimicked(robot, joints, locked, where)
+    if joints is None:
+        joints = [j.name for j in robot.joints if j.type in _MOVABLE_JOINT_TYPES and j.name not in following]
+    placed, bodies, frames = _walk(robot, root, dropped, joints, locked, where)
+    order: list[str] = []
+    waiting = [name for name in dict.fromkeys(joints) if name in placed]
+    while waiting:  # parents before children
+        order.append(next(name for name in waiting if placed[name][0] is None or placed[name][0] in order))
+        waiting.remove(order[-1])
 
     parameters: list[Parameter] = []
     made: list[Joint] = []
     for entry in order:
-        carrier, at, source = found.joints[entry]
-        carried = merge_bodies(found.bodies.get(entry, ()))
+        carrier, at, source = placed[entry]
+        carried = merge_bodies(bodies.get(entry, ()))
         if carried is not None and parametric:
             mass = float(carried.mass)
             parameter = Parameter(f"{entry}.mass", mass, "kg", 0.0, math.inf, f"mass of what {entry} carries")
@@ -172,43 +155,11 @@ def read_urdf(
             carried = replace(carried.scaled_by(parameter.symbol / mass), mass=parameter.symbol)
         parent = order.index(carrier) if carrier is not None else -1
         made.append(_joint(source, parent, Placement.from_matrix(at), () if carried is None else (carried,)))
-    named = {
+    links = {
         link: Frame(-1 if carrier is None else order.index(carrier), Placement.from_matrix(at))
-        for link, (carrier, at) in found.frames.items()
+        for link, (carrier, at) in frames.items()
     }
-    return Mechanism(name or robot.name, tuple(made), named, Parameters(parameters))
-
-
-@dataclass(frozen=True)
-class _Link:
-    """A link of the file with the joints that leave it."""
-
-    name: str
-    inertial: Any
-    joints: tuple[Any, ...]
-
-
-@dataclass(frozen=True)
-class _Found:
-    """Carrier joint (None: the world) and placement in its frame of every kept joint, body and link.
-
-    Attributes
-    ----------
-    joints : mapping of joint name to (carrier, placement (4, 4), the file's joint)
-    bodies : mapping of carrier to bodies in its frame
-    frames : mapping of link name to (carrier, placement (4, 4))
-    """
-
-    joints: dict[str, tuple[str | None, Matrix, Any]] = field(default_factory=dict)
-    bodies: dict[str | None, list[Inertia]] = field(default_factory=dict)
-    frames: dict[str, tuple[str | None, Matrix]] = field(default_factory=dict)
-
-
-def _file(path: str | Path) -> Path:
-    file = resolve_urdf_path(path)
-    if not is_file(file):
-        raise ModelError(f"there is no URDF file '{file}'", hint="give a path, or package:NAME for example-robot-data")
-    return file
+    return Mechanism(robot.name, tuple(made), links, Parameters(parameters))
 
 
 def _parsed(file: Path) -> Any:
@@ -217,9 +168,8 @@ def _parsed(file: Path) -> Any:
     try:
         _check_numbers(ElementTree.parse(file).getroot(), str(file))  # yourdfpy reads what it can and says nothing
         with contextlib.redirect_stderr(io.StringIO()):
-            return yourdfpy.URDF.load(
-                str(file), build_scene_graph=False, load_meshes=False, load_collision_meshes=False
-            ).robot
+            options = dict.fromkeys(("build_scene_graph", "load_meshes", "load_collision_meshes"), False)
+            return yourdfpy.URDF.load(str(file), **options).robot
     except ModelError:
         raise
     except Exception as error:  # yourdfpy and lxml raise many kinds for a malformed file
@@ -235,36 +185,32 @@ def _check_numbers(robot: ElementTree.Element, where: str) -> None:
         inertials = owner.findall("inertial")
         if len(inertials) > 1:
             raise ModelError(f"{name} has {len(inertials)} inertials", where=where, allowed="one, or none")
-        parts = (*owner.findall("origin"), *owner.findall("axis"), *owner.findall("inertial/origin"))
-        for part in parts:
+        for part in (*owner.findall("origin"), *owner.findall("axis"), *owner.findall("inertial/origin")):
             for key in {"xyz", "rpy"} & set(part.attrib):
                 _numbers(part.attrib[key], 3, f"{name}: {part.tag} {key}", where)
         for limit in owner.findall("limit"):
             for key, text in limit.attrib.items():
                 _numbers(text, 1, f"{name}: limit {key}", where, infinite=True)
         for inertial in inertials:
-            mass = inertial.find("mass")
+            mass, tensor = inertial.find("mass"), inertial.find("inertia")
             if mass is None or _numbers(mass.get("value", ""), 1, f"{name}: mass", where)[0] < 0:
                 what = "has an inertial without a mass" if mass is None else "has a negative mass"
                 raise ModelError(f"{name} {what}", where=where, allowed="a mass of zero or more [kg]")
-            tensor = inertial.find("inertia")
             if tensor is not None:
-                for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"):
+                for key in _TENSOR_KEYS:
                     _numbers(tensor.get(key, ""), 1, f"{name}: inertia {key}", where)
 
 
 def _numbers(text: str, count: int, what: str, where: str, infinite: bool = False) -> list[float]:
-    words = text.split()
     try:
-        numbers = [float(word) for word in words]
+        numbers = [float(word) for word in text.split()]
     except ValueError:
         numbers = []
     wrong = any(math.isnan(value) or (abs(value) > _MAX_NUMBER and not infinite) for value in numbers)
     if len(numbers) != count or wrong:
         allowed = "one number" if count == 1 else f"{count} numbers"
-        raise ModelError(
-            f"{what} is '{text[:60]}'", where=where, allowed=f"{allowed}, at most {_MAX_NUMBER:g}, with blanks between"
-        )
+        allowed = f"{allowed}, at most {_MAX_NUMBER:g}, with blanks between"
+        raise ModelError(f"{what} is '{text[:60]}'", where=where, allowed=allowed)
     return numbers
 
 
@@ -273,20 +219,12 @@ def _check_bodies(link: str, tensor: Matrix, where: str) -> None:
     least, middle, most = np.linalg.eigvalsh(0.5 * (tensor + tensor.T))
     values = ", ".join(f"{value:.3g}" for value in (least, middle, most))
     if least < -_PRINCIPAL_MOMENT_RTOL * max(most, -least):
-        raise ModelError(
-            f"link '{link}' has a negative moment of inertia (principal moments {values} kg m^2)",
-            where=where,
-            allowed="three that are zero or more",
-            hint="correct the inertia, or leave the link out",
-        )
+        what = f"link '{link}' has a negative moment of inertia (principal moments {values} kg m^2)"
+        hint = "correct the inertia, or leave the link out"
+        raise ModelError(what, where=where, allowed="three that are zero or more", hint=hint)
     if least + middle < (1 - _PRINCIPAL_MOMENT_RTOL) * most:
-        log.warning(
-            "%s: link '%s' has principal moments of inertia of %s kg m^2, which no body has: the largest is at most "
-            "the sum of the others",
-            where,
-            link,
-            values,
-        )
+        what = "%s: link '%s' has principal moments of inertia of %s kg m^2, which no body has: the largest is at most "
+        log.warning(what + "the sum of the others", where, link, values)
 
 
 def _mimicked(robot: Any, wanted: Collection[str] | None, locked: dict[str, float], where: str) -> set[str]:
@@ -295,32 +233,25 @@ def _mimicked(robot: Any, wanted: Collection[str] | None, locked: dict[str, floa
     following = {name: joint.mimic for name, joint in joints.items() if joint.mimic is not None}
     for name, mimic in following.items():
         if wanted is not None and name in wanted:
-            raise ModelError(
-                f"joint '{name}' follows '{mimic.joint}' (mimic) and cannot move on its own",
-                where=where,
-                hint=f"leave it out of the joints; it is locked then, at the place that belongs to '{mimic.joint}'",
-            )
+            what = f"joint '{name}' follows '{mimic.joint}' (mimic) and cannot move on its own"
+            hint = f"leave it out of the joints; it is locked then, at the place that belongs to '{mimic.joint}'"
+            raise ModelError(what, where=where, hint=hint)
         if mimic.joint not in joints:
-            raise ModelError(
-                f"joint '{name}' follows a joint '{mimic.joint}' that is not there",
-                where=where,
-                hint=nearest_name_hint(str(mimic.joint), joints),
-            )
+            what, hint = f"joint '{name}' follows a joint '{mimic.joint}' that is not there", str(mimic.joint)
+            raise ModelError(what, where=where, hint=nearest_name_hint(hint, joints))
         if name in locked:
             continue
         if wanted is None or mimic.joint in wanted:
-            log.warning(
-                "%s: joint '%s' follows '%s'; couplings are not modelled, so it is locked", where, name, mimic.joint
-            )
+            what = "%s: joint '%s' follows '%s'; couplings are not modelled, so it is locked"
+            log.warning(what, where, name, mimic.joint)
         factor = 1.0 if mimic.multiplier is None else float(mimic.multiplier)
         offset = 0.0 if mimic.offset is None else float(mimic.offset)
         locked[name] = factor * _locked_value(joints[mimic.joint], locked) + offset
     return set(following)
 
 
-def _checked(robot: Any, file: Path, wanted: Sequence[str]) -> dict[str, _Link]:
-    """The links by name, the root first, after a check of all joints and links."""
-    where = str(file)
+def _check_tree(robot: Any, where: str, wanted: Sequence[str]) -> str:
+    """Name of the root link, after a check of all joints and links, and of the names of wanted joints."""
     for joint in robot.joints:
         if joint.type not in _MOVABLE_JOINT_TYPES | {"fixed"}:
             allowed = "revolute, continuous, prismatic, fixed"
@@ -331,76 +262,61 @@ def _checked(robot: Any, file: Path, wanted: Sequence[str]) -> dict[str, _Link]:
     for name in wanted:
         if name not in known:
             raise ModelError(f"there is no movable joint '{name}'", where=where, hint=nearest_name_hint(name, known))
-    names = [link.name for link in robot.links]
+    names, below = [link.name for link in robot.links], [joint.child for joint in robot.joints]
     for joint in robot.joints:
         for link in (joint.parent, joint.child):
             if link not in names:
-                raise ModelError(
-                    f"joint '{joint.name}' names a link '{link}' that is not there",
-                    where=where,
-                    hint=nearest_name_hint(str(link), names),
-                )
-    below = [joint.child for joint in robot.joints]
+                what, hint = f"joint '{joint.name}' names a link '{link}' that is not there", str(link)
+                raise ModelError(what, where=where, hint=nearest_name_hint(hint, names))
     roots = [name for name in dict.fromkeys(names) if name not in below]
     if len(roots) != 1:
         raise ModelError(f"the URDF has {len(roots)} root links", where=where, allowed="exactly one")
-    for kind, entries in (
-        ("links are called", names),
-        ("joints are called", [joint.name for joint in robot.joints]),
-        ("joints carry the link", below),
-    ):
-        repeated = sorted({entry for entry in entries if entries.count(entry) > 1})
-        if repeated:
+    kinds = {"links are called": names, "joints are called": [joint.name for joint in robot.joints]}
+    for kind, entries in (kinds | {"joints carry the link": below}).items():
+        if repeated := sorted({entry for entry in entries if entries.count(entry) > 1}):
             raise ModelError(f"two {kind} '{repeated[0]}'", where=where, allowed="a tree with unique names")
-    links = {
-        link.name: _Link(link.name, link.inertial, tuple(j for j in robot.joints if j.parent == link.name))
-        for link in robot.links
-    }
-    return {roots[0]: links[roots[0]], **links}
+    return str(roots[0])
 
 
 def _walk(
-    links: Mapping[str, _Link], dropped: Set[str], kept: Collection[str], locked: Mapping[str, float], where: str
-) -> _Found:
-    """Collect joints, bodies and frames from the root on, and merge what is fixed together."""
-    root = next(iter(links))
-    found = _Found()
-    stack: list[tuple[str, str | None, Matrix]] = [(root, None, np.eye(4))]
+    robot: Any, root: str, dropped: Set[str], kept: Collection[str], locked: Mapping[str, float], where: str
+) -> tuple[dict[str, tuple[_Carrier, Matrix, Any]], dict[_Carrier, list[Inertia]], dict[str, tuple[_Carrier, Matrix]]]:
+    """Kept joints, bodies by carrier, and links from the root on, each with carrier and placement (4, 4) in its frame.
+
+    A carrier is a kept joint, None for the world; what is fixed together is merged.
+    """
+    links = {link.name: link.inertial for link in robot.links}
+    joints: dict[str, tuple[_Carrier, Matrix, Any]] = {}
+    bodies: dict[_Carrier, list[Inertia]] = {}
+    frames: dict[str, tuple[_Carrier, Matrix]] = {}
+    stack: list[tuple[str, _Carrier, Matrix]] = [(root, None, np.eye(4))]
     while stack:
         link, carrier, at = stack.pop()
-        found.frames[link] = (carrier, at)
-        inertial = links[link].inertial
+        frames[link] = (carrier, at)
+        inertial = links[link]
         if inertial is not None and inertial.mass:
-            origin = np.eye(4) if inertial.origin is None else np.asarray(inertial.origin, float)
             tensor = np.zeros((3, 3)) if inertial.inertia is None else np.asarray(inertial.inertia, float)
             if carrier is not None:
                 _check_bodies(link, tensor, where)
             body = Inertia.from_values(float(inertial.mass), np.zeros(3), tensor)
-            found.bodies.setdefault(carrier, []).append(body.transformed_by(Placement.from_matrix(at @ origin)))
-        for joint in links[link].joints:
-            if joint.child in dropped:
+            place = Placement.from_matrix(at @ _origin(inertial))
+            bodies.setdefault(carrier, []).append(body.transformed_by(place))
+        for joint in robot.joints:
+            if joint.parent != link or joint.child in dropped:
                 continue
-            origin = np.eye(4) if joint.origin is None else np.asarray(joint.origin, float)
             if joint.name in kept:
-                found.joints[joint.name] = (carrier, at @ origin, joint)
+                joints[joint.name] = (carrier, at @ _origin(joint), joint)
                 stack.append((joint.child, joint.name, np.eye(4)))
             else:
-                stack.append((joint.child, carrier, at @ origin @ _locked_motion(joint, locked)))
-    loose = sorted(set(links) - set(found.frames) - dropped)
+                stack.append((joint.child, carrier, at @ _origin(joint) @ _locked_motion(joint, locked)))
+    loose = sorted(set(links) - set(frames) - dropped)
     if loose:
         raise ModelError(f"link '{loose[0]}' does not hang on '{root}'", where=where, allowed="one tree")
-    return found
+    return joints, bodies, frames
 
 
-def _parents_first(joints: Mapping[str, tuple[str | None, Matrix, Any]], wanted: Sequence[str]) -> list[str]:
-    """The joints in the wanted order, parents before children."""
-    order: list[str] = []
-    waiting = [name for name in dict.fromkeys(wanted) if name in joints]
-    while waiting:
-        ready = next(name for name in waiting if joints[name][0] is None or joints[name][0] in order)
-        order.append(ready)
-        waiting.remove(ready)
-    return order
+def _origin(element: Any) -> Matrix:
+    return np.eye(4) if element.origin is None else np.asarray(element.origin, float)
 
 
 def _joint(source: Any, parent: int, placement: Placement, bodies: tuple[Inertia, ...]) -> Joint:
@@ -446,17 +362,15 @@ def _locked_value(joint: Any, locked: Mapping[str, float]) -> float:
     return locked.get(joint.name, min(max(0.0, low), high))
 
 
-def _with_all_below(without: Sequence[str], links: Mapping[str, _Link], where: str) -> set[str]:
-    found: set[str] = set()
-    waiting = list(without)
+def _with_all_below(excluded: Sequence[str], robot: Any, where: str) -> set[str]:
+    found, waiting, links = set[str](), list(excluded), [link.name for link in robot.links]
     while waiting:
         link = waiting.pop()
         if link not in links:
-            raise ModelError(
-                f"there is no link '{link}' to leave out", where=where, hint=nearest_name_hint(link, links)
-            )
+            what, hint = f"there is no link '{link}' to leave out", nearest_name_hint(link, links)
+            raise ModelError(what, where=where, hint=hint)
         found.add(link)
-        waiting += [joint.child for joint in links[link].joints]
+        waiting += [joint.child for joint in robot.joints if joint.parent == link]
     return found
 
 
@@ -478,9 +392,8 @@ def mechanism_to_urdf(mechanism: Mechanism, values: Mapping[str, float] | None =
         frame = mechanism.frames.get(wanted)
         if frame is None:
             return wanted
-        same = frame.joint_index == joint and np.array_equal(
-            np.array(ca.DM(frame.placement.homogeneous_matrix())), np.eye(4)
-        )
+        place = np.array(ca.DM(frame.placement.homogeneous_matrix()))
+        same = frame.joint_index == joint and np.array_equal(place, np.eye(4))
         return wanted if same else link_name(f"{wanted}_", joint)
 
     links = [link_name("world", -1)] + [link_name(f"{joint.name}_link", i) for i, joint in enumerate(mechanism.joints)]
@@ -511,17 +424,11 @@ def _write_link(robot: ElementTree.Element, name: str, joint: Joint) -> None:
     ElementTree.SubElement(inertial, "origin", xyz=_digits(np.array(ca.DM(body.center_of_mass)).ravel()), rpy="0 0 0")
     ElementTree.SubElement(inertial, "mass", value=_digits([float(body.mass)]))
     tensor = np.array(ca.DM(body.inertia_about_com))
-    keys = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
-    ElementTree.SubElement(inertial, "inertia", {key: _digits([tensor[ij]]) for key, ij in keys.items()})
+    ElementTree.SubElement(inertial, "inertia", {key: _digits([tensor[ij]]) for key, ij in _TENSOR_KEYS.items()})
 
 
 def _write_joint(robot: ElementTree.Element, joint: Joint, parent: str, child: str) -> None:
-    values = {
-        "lower": joint.lower_limit,
-        "upper": joint.upper_limit,
-        "effort": joint.effort_limit,
-        "velocity": joint.velocity_limit,
-    }
+    values = {key: getattr(joint, f"{key}_limit") for key in ("lower", "upper", "effort", "velocity")}
     limits = {key: _digits([max(-_UNLIMITED_VALUE, min(value, _UNLIMITED_VALUE))]) for key, value in values.items()}
     kind: str = joint.kind
     if kind == "revolute" and math.isinf(joint.lower_limit) and math.isinf(joint.upper_limit):

@@ -21,8 +21,7 @@ from yid_ocp.effects import make_effect
 from yid_ocp.errors import YidError, nearest_name_hint
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model import FlexibleObject, Grasp, Mechanism, System
-from yid_ocp.model.objects import ObjectKind
-from yid_ocp.model.objects.base import CableTopology
+from yid_ocp.model.objects.base import CableTopology, ClampedObject
 from yid_ocp.model.parameters import Parameters
 from yid_ocp.model.rotations import rotation_from_rpy
 from yid_ocp.model.servos_and_springs import PositionServoOptions, RobotJointSpring
@@ -57,9 +56,8 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
     model = run.model
     input_files(run)
     load_plugins(run)
-    cable = build_cable(run)
-    if model.object is not None and cable is not None:
-        return _clamped_system(run, model.object, cable)
+    if isinstance(model.object, ClampedObject):
+        return _clamped_system(run, model.object)
     robot = _robot(run)
     joints = () if robot is None else robot.joint_names
     held = clamp_mechanism(run)
@@ -146,15 +144,19 @@ def _completed(run: RunSettings, system: System, finer: int = 1) -> System:
     return replace(system, parameters=_set_parameters(run, system.parameters, finer))
 
 
-def _clamped_system(run: RunSettings, item: ObjectKind, cable: CableTopology) -> System:
+def _clamped_system(run: RunSettings, item: ClampedObject) -> System:
     """The system of an object that brings its clamps."""
+    cable = build_cable(run)
+    assert run.model.object is not None
+    assert cable is not None
+    kind = run.model.object.kind
     for key in ("robot", "grasp", "springs", "clamps", "frames"):
         if getattr(run.model, key):
-            what = f"a {item.kind} takes no {key}: its clamps hold it"
+            what = f"a {kind} takes no {key}: its clamps hold it"
             raise run.config_error(what, "model", key, hint=f"remove {key}")
     recordings = read_recordings(run, "estimate")
     if not recordings:
-        what = f"a {item.kind}'s lengths come from recordings"
+        what = f"a {kind}'s lengths come from recordings"
         raise run.config_error(what, "recordings", "estimate", hint="list at least one")
     with locate_errors(run, "model", "object"):
         system = item.clamped_system(median_edge_lengths(cable.edges, recordings), run.model.gravity)
@@ -164,7 +166,7 @@ def _clamped_system(run: RunSettings, item: ObjectKind, cable: CableTopology) ->
 def build_cable(run: RunSettings) -> CableTopology | None:
     """Measured vertices and clamps of a run's object that brings its clamps, None for another object."""
     with locate_errors(run, "model", "object"):
-        return None if run.model.object is None else run.model.object.topology()
+        return run.model.object.topology() if isinstance(run.model.object, ClampedObject) else None
 
 
 def _robot(run: RunSettings) -> Mechanism | None:

@@ -16,6 +16,7 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
 from yid_ocp.integrator.step import Step
 from yid_ocp.model import System
+from yid_ocp.model.objects.base import ClampedObject
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.sensors.joints import EFFORT_GROUP, POSITION_GROUP, is_measured_by_arm
@@ -59,7 +60,7 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
             sensors[group] = replace(sensors.get(group, SensorOptions()), use=False)
     cable = build_cable(run)
     own = marker_parameter_values(run, system, recordings)
-    if cable is not None and run.model.object is not None:
+    if cable is not None and isinstance(run.model.object, ClampedObject):
         for group in {group.name for recording in recordings for group in recording.points}:
             said = sensors.get(group, SensorOptions())
             sensors[group] = said if said.points is not None else replace(said, points=cable.free_vertices)

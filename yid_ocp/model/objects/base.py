@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Protocol, Self, runtime_checkable
 
 import numpy as np
 from annotated_types import Ge, Le
@@ -48,19 +48,10 @@ class MountSettings:
 
 @dataclass(frozen=True)
 class ClampPath:
-    """How a prescribed clamp (`floating_clamp`) follows two measured points.
+    """How a prescribed `floating_clamp` follows two measured points: its origin is at one, z looks at another.
 
-    Attributes
-    ----------
-    clamp_name : str
-        Name of the clamp.
-    origin_point : str
-        Point at which its origin sits.
-    z_axis_point : str
-        Point to which its z axis looks.
-    roll_convention : "level" or "transported"
-        What the points do not tell, the turn about z: with `level` the third angle stays zero (x axis across world y);
-        with `transported` the clamp never turns about its own z axis, from `level` at the first node on.
+    What the points do not tell is the turn about z: with `level` the third angle stays zero (x axis across world y);
+    with `transported` the clamp never turns about its own z axis, from `level` at the first node on.
     """
 
     clamp_name: str
@@ -76,13 +67,12 @@ class CableTopology:
     Attributes
     ----------
     parent_vertices : tuple of str
-        Vertices of the parent from one clamp to the other; the first two and the last two are held.
+        Vertices of the parent, the segment `parent_segment`, from one clamp to the other; the first two and the last
+        two are held.
     child_vertices : mapping of str to tuple of str
         Name of each child to its vertices, the first one that of the parent at which it leaves.
     undeformed_positions : mapping of str to array_like, shape (3,)
         Every vertex of the cable at rest without load [m], in any frame.
-    parent_segment : str
-        Segment name of the parent.
     """
 
     parent_vertices: tuple[str, ...]
@@ -91,19 +81,14 @@ class CableTopology:
     parent_segment: str = "parent"
 
     def __post_init__(self) -> None:
-        if len(self.parent_vertices) < 5:
-            raise ModelError(
-                f"the parent has {len(self.parent_vertices)} vertices",
-                where="cable",
-                allowed="5 or more: two held at each end",
-            )
+        free = self.parent_vertices[2:-2]
+        if not free:
+            what, allowed = f"the parent has {len(self.parent_vertices)} vertices", "5 or more: two held at each end"
+            raise ModelError(what, where="cable", allowed=allowed)
         for name, vertices in self.child_vertices.items():
-            if len(vertices) < 2 or vertices[0] not in self.parent_vertices[2:-2]:
-                raise ModelError(
-                    f"child '{name}' does not leave the parent at one of its free vertices",
-                    where="cable",
-                    allowed=", ".join(self.parent_vertices[2:-2]),
-                )
+            if len(vertices) < 2 or vertices[0] not in free:
+                what = f"child '{name}' does not leave the parent at one of its free vertices"
+                raise ModelError(what, where="cable", allowed=", ".join(free))
         for vertex in self.vertices:
             if vertex not in self.undeformed_positions:
                 hint = nearest_name_hint(vertex, self.undeformed_positions)
@@ -160,7 +145,6 @@ class InitObject:
         Without its mount.
     start_values : mapping of parameter to (float, str)
         Where the search for each free parameter starts, with a comment.
-    parameters_comment : str
     stands_in_world : bool
         Whether it stands where the settings say, and arms hold its ends; or else a frame of the robot carries its root.
     """
@@ -184,7 +168,6 @@ class InitTemplate:
         `ConfigError` where something is missing.
     further_numbers : mapping of str to str
         Names beside length, mass and radius that `--number NAME=VALUE` takes, with their meanings.
-    has_branches : bool
     """
 
     default_links: int
@@ -231,14 +214,13 @@ def bending_start_values(segments: Sequence[Segment], rigidity_ratio: float) -> 
 class ObjectKind:
     """A kind of flexible object, whose fields are its settings; one class in one file, registered in `OBJECTS`.
 
-    A class overrides `kind`, and `model_segments`, `build` or `clamped_system`, and what else differs.
+    A class overrides `kind`, and `model_segments` or `build`, and what else differs; one that is a system of its own is
+    a `ClampedObject` as well.
 
     Attributes
     ----------
     default_link_refinement : bool
         Whether `solve` looks at twice the links where nothing is said: not where the links are the object's definition.
-    brings_clamps : bool
-        Whether it is a system of its own (`clamped_system`), held by clamps that follow measured points.
     init_templates : mapping of str to InitTemplate
         Words of `init --object`.
     settings_examples : mapping of section to str
@@ -246,7 +228,6 @@ class ObjectKind:
     """
 
     default_link_refinement: ClassVar[bool] = False
-    brings_clamps: ClassVar[bool] = False
     init_templates: ClassVar[Mapping[str, InitTemplate]] = {}
     settings_examples: ClassVar[Mapping[str, str]] = {}
 
@@ -257,14 +238,9 @@ class ObjectKind:
         return []
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
-        """The object, to be placed by `placement`.
+        """The object, to be placed by `placement`, each link divided.
 
-        Parameters
-        ----------
-        damping : float
-            Of every coordinate [N m s/rad], or per curvature rate [N m^2 s] where the segments say so.
-        link_division : int
-            Into how many links each one is divided.
+        `damping` is that of every coordinate [N m s/rad], or per curvature rate [N m^2 s] where the segments say so.
         """
         return flexible_object(self.model_segments(damping, link_division))
 
@@ -304,17 +280,19 @@ class ObjectKind:
         names = {key: Path(file).name for key, file in self.input_files().items()}
         return replace(self, **names)
 
-    def topology(self) -> CableTopology | None:
-        """Measured vertices and clamps of an object that brings its clamps, None for another."""
-        return None
+
+@runtime_checkable
+class ClampedObject(Protocol):
+    """A kind of object that is a system of its own, held by clamps that follow measured points."""
+
+    def topology(self) -> CableTopology:
+        """Measured vertices and clamps; `DataError` or `ModelError` where they do not fit together."""
 
     def clamped_system(self, edge_lengths: Mapping[tuple[str, str], float], gravity: _Vector3) -> System:
-        """The whole system of an object that brings its clamps, from its measured edge lengths [m]."""
-        raise NotImplementedError
+        """The whole system, from its measured edge lengths [m]."""
 
     def recording_parameters(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
         """Parameter values that one recording's edge lengths [m] give, where not all recordings share them."""
-        return {}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -327,17 +305,17 @@ class MountedObject(ObjectKind):
     mount: Annotated[MountSettings | None, OptionInfo("where its root sits; the world's origin when absent")] = None
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
-        """The object, to be placed by `placement`; parameters as in `ObjectKind.build`."""
+        """The object, each link divided."""
         return flexible_object(self.model_segments(damping, link_division), gravity_fraction=self.gravity_fraction)
 
     @property
     def placement(self) -> tuple[str | None, Array | None]:
-        """Frame that carries the object's root (the world when None), and the root's pose in it, shape (4, 4)."""
+        """Frame that carries the root, and the root's pose in it, shape (4, 4)."""
         return (None, None) if self.mount is None else (self.mount.parent_frame, self.mount.pose)
 
     @property
     def stands_in_world(self) -> bool:
-        """Whether nothing moves the object's root."""
+        """Whether nothing moves the root."""
         return self.mount is None or not self.mount.parent_frame
 
 

@@ -16,7 +16,7 @@ rigidity of B at a density rho means B/rho [N m^2 per kg/m], or B/(rho g) per un
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -28,7 +28,7 @@ from annotated_types import Ge, Gt, Le, Len
 from numpy.typing import NDArray
 
 from yid_ocp.errors import DataError, ModelError, nearest_name_hint
-from yid_ocp.model.flexible import UNIT_AXES, FlexibleObject, Segment, flexible_object, polyline_rotations
+from yid_ocp.model.flexible import UNIT_AXES, ElasticJoint, FlexibleObject, Segment, flexible_object, polyline_rotations
 from yid_ocp.model.mechanism import Frame, LinkChain, Mechanism, Placement
 from yid_ocp.model.objects.base import END_CLAMP as _END_CLAMP
 from yid_ocp.model.objects.base import OBJECTS, CableTopology, ObjectKind
@@ -43,11 +43,8 @@ _Vector3 = tuple[float, float, float]
 _START_ROLL_PARAMETER, _END_ROLL_PARAMETER = f"{_START_CLAMP}.roll", f"{_END_CLAMP}.roll"
 _REST_ANGLE_SUFFIX = ".rest"
 START_SPEED_SCALE_PARAMETER = "start.speed_scale"
-# Keeps load/stiffness finite where a stiffness is zero [N m/rad].
-_MIN_STIFFNESS = 1e-9
+_MIN_STIFFNESS = 1e-9  # keeps load/stiffness finite where a stiffness is zero [N m/rad]
 _START_EDGE_FRAME, _LAST_EDGE_FRAME = f"{_START_CLAMP}_edge", "last_edge"
-
-
 # Parameters of a joint whose rest angle is told from the start: its angle there [rad] and the torque it bears [N m].
 START_SHAPE_SUFFIXES = ("start", "load")
 # Parameter that is told the root mean square speed of the measured points at the start [m/s].
@@ -56,14 +53,9 @@ START_SPEED_PARAMETER = "start.speed"
 
 @dataclass(frozen=True)
 class CableBranchOptions:
-    """Nominal properties of one branch of a cable.
+    """Nominal properties of one branch of a cable: rigidities [N m^2] and damping per curvature rate [N m^2 s].
 
-    Attributes
-    ----------
-    bend_rigidity, twist_rigidity : float
-        Rigidity [N m^2]; in a configuration under `parameters`.
-    bend_damping : float
-        Viscous damping per curvature rate [N m^2 s]; in a configuration under `parameters`.
+    In a configuration these three are set under `parameters`.
     """
 
     bend_rigidity: float = 1.5e-3
@@ -80,14 +72,8 @@ class CableOptions:
     With a `shape_memory` each joint rests at (1 - memory) x undeformed + memory x (start angle - load/stiffness), the
     load being what the joint bears at the recording's start if the cable is at rest there. It becomes the parameter
     `SEGMENT.memory` and counts less for a recording that starts in motion, by the factor
-    1/(1 + (start speed/`start.speed_scale`)^2).
-
-    Attributes
-    ----------
-    default_branch : BranchOptions
-        Of branches that are not named.
-    gravity : tuple of float
-        [m/s^2]
+    1/(1 + (start speed/`start.speed_scale`)^2). Branches that are not named have the `default_branch`; `gravity` is in
+    [m/s^2].
     """
 
     branches: Annotated[Mapping[str, CableBranchOptions], OptionInfo("by name, parent and children")] = field(
@@ -124,13 +110,7 @@ class CableOptions:
 
 
 def read_vertex_positions(path: str | Path) -> dict[str, Array]:
-    """Vertex positions [m] by name, from a CSV table with the columns point, x, y, z [m].
-
-    Raises
-    ------
-    DataError
-        No such file, missing columns, or an entry that is not a number.
-    """
+    """Vertex positions [m] by name, from a CSV table with the columns point, x, y, z; `DataError` of another file."""
     try:
         with Path(path).open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
@@ -174,26 +154,11 @@ def estimable_parameters(cable: CableTopology, options: CableOptions | None = No
 def cable_system(
     lengths: Mapping[tuple[str, str], float], cable: CableTopology, options: CableOptions | None = None
 ) -> System:
-    """The system of a cable held by two clamps.
+    """The system of a cable held by two clamps, from the length of every one of its edges [m].
 
-    Parameters
-    ----------
-    lengths : mapping of edge to float
-        Length of every one of the cable's edges [m].
-    cable : Cable
-    options : CableOptions, optional
-
-    Returns
-    -------
-    System
-        Prescribed: the twelve coordinates of `clamp_start` and `clamp_end`. Frames: every vertex by its name,
-        `junction_CHILD`, and `last_edge`. Parameters: those of each segment (`parent.bend`, ...), `clamp_start.length`,
-        `clamp_start.roll` and, where welded, `clamp_end.roll` [rad].
-
-    Raises
-    ------
-    ModelError
-        A cable that does not fit together.
+    Prescribed are the twelve coordinates of `clamp_start` and `clamp_end`. Frames: every vertex by its name,
+    `junction_CHILD`, and `last_edge`. Parameters: those of each segment (`parent.bend`, ...), `clamp_start.length`,
+    `clamp_start.roll` and, where welded, `clamp_end.roll` [rad]. `ModelError` of a cable that does not fit together.
     """
     options = options or CableOptions()
     item = flexible_object(_segments(cable, lengths, options), name="cable")
@@ -201,22 +166,19 @@ def cable_system(
         item = _with_rest_angles(item)
     if options.shape_memory is not None:
         item = _with_memory(item, options.shape_memory)
-    clamps = _start_clamp(lengths[cable.parent_vertices[0], cable.parent_vertices[1]], cable).with_mechanism(
-        floating_clamp(_END_CLAMP)
-    )
-    end_roll = Parameter(_END_ROLL_PARAMETER, 0.0, "rad", -np.pi, np.pi, "roll of the end clamp about the last edge")
+    clamps = _start_clamp(lengths[cable.parent_vertices[0], cable.parent_vertices[1]], cable)
+    clamps = clamps.with_mechanism(floating_clamp(_END_CLAMP))
+    rotation = ca.SX(ca.DM.eye(3))
     if options.end_clamp == "weld":
+        text = "roll of the end clamp about the last edge"
+        end_roll = Parameter(_END_ROLL_PARAMETER, 0.0, "rad", -np.pi, np.pi, text)
         clamps = replace(clamps, parameters=clamps.parameters.with_added([end_roll]))
-    rotation = (
-        symbolic_axis_rotation(UNIT_AXES["z"], end_roll.symbol) if options.end_clamp == "weld" else ca.SX(ca.DM.eye(3))
-    )
+        rotation = symbolic_axis_rotation(UNIT_AXES["z"], end_roll.symbol)
     return System.build(
         clamps,
         objects=((_with_vertices(item, cable, lengths), _START_EDGE_FRAME, None),),
         grasps=(Grasp(_END_CLAMP, _END_CLAMP, _LAST_EDGE_FRAME, options.end_clamp, rotation),),
-        prescribed=tuple(
-            f"{clamp}_{prefix}{axis}" for clamp in (_START_CLAMP, _END_CLAMP) for prefix in ("", "r") for axis in "xyz"
-        ),
+        prescribed=clamps.joint_names,
         damping={},
         gravity=options.gravity,
         point_frames=cable.vertices,
@@ -224,54 +186,42 @@ def cable_system(
 
 
 def _with_rest_angles(item: FlexibleObject) -> FlexibleObject:
-    entries = [
-        Parameter(
-            f"{spring.joint_name}{_REST_ANGLE_SUFFIX}",
-            0.0,
-            "rad",
-            -np.pi,
-            np.pi,
-            "rest angle beside the undeformed shape's",
-        )
-        for spring in item.elastic_joints
-        if spring.deformation == "bend"
-    ]
-    rest = {entry.name: entry.symbol for entry in entries}
+    text = "rest angle beside the undeformed shape's"
+    bends = (spring.joint_name for spring in item.elastic_joints if spring.deformation == "bend")
+    rest = {name: Parameter(f"{name}{_REST_ANGLE_SUFFIX}", 0.0, "rad", -np.pi, np.pi, text) for name in bends}
     elastic = (
-        replace(s, rest_angle=s.rest_angle + rest.get(f"{s.joint_name}{_REST_ANGLE_SUFFIX}", 0))
+        replace(s, rest_angle=s.rest_angle + (rest[s.joint_name].symbol if s.joint_name in rest else 0))
         for s in item.elastic_joints
     )
+    return _with_parameters(item, rest.values(), elastic)
+
+
+def _with_parameters(
+    item: FlexibleObject, entries: Iterable[Parameter], elastic: Iterable[ElasticJoint]
+) -> FlexibleObject:
     tree = replace(item.mechanism, parameters=item.mechanism.parameters.with_added(entries))
     return replace(item, mechanism=tree, elastic_joints=tuple(elastic))
 
 
 def _with_memory(item: FlexibleObject, memory: float) -> FlexibleObject:
-    shares = {
-        s.name: Parameter(f"{s.name}.memory", memory, "1", 0.0, 1.0, "share of the start's shape in the rest shape")
-        for s in item.segment_layouts
-    }
+    text = "share of the start's shape in the rest shape"
+    shares = {s.name: Parameter(f"{s.name}.memory", memory, "1", 0.0, 1.0, text) for s in item.segment_layouts}
     speed = Parameter(START_SPEED_PARAMETER, 0.0, "m/s", 0.0, np.inf, "speed of the vertices at the recording's start")
-    scale = Parameter(
-        START_SPEED_SCALE_PARAMETER, 0.3, "m/s", 1e-3, np.inf, "start speed at which the memory counts half"
-    )
+    text = "start speed at which the memory counts half"
+    scale = Parameter(START_SPEED_SCALE_PARAMETER, 0.3, "m/s", 1e-3, np.inf, text)
     trust = 1 / (1 + (speed.symbol / scale.symbol) ** 2)
     entries, elastic = [*shares.values(), speed, scale], []
+    told = (("rad", "angle at the recording's start"), ("N m", "torque borne at the recording's start"))
     for spring in item.elastic_joints:
-        angle = Parameter(
-            f"{spring.joint_name}.{START_SHAPE_SUFFIXES[0]}", 0.0, "rad", description="angle at the recording's start"
-        )
-        load = Parameter(
-            f"{spring.joint_name}.{START_SHAPE_SUFFIXES[1]}",
-            0.0,
-            "N m",
-            description="torque borne at the recording's start",
+        angle, load = (
+            Parameter(f"{spring.joint_name}.{suffix}", 0.0, unit, description=text)
+            for suffix, (unit, text) in zip(START_SHAPE_SUFFIXES, told, strict=True)
         )
         entries += [angle, load]
         shift = angle.symbol - load.symbol / (spring.stiffness + _MIN_STIFFNESS)
         share = trust * shares[spring.segment_name].symbol
         elastic.append(replace(spring, rest_angle=spring.rest_angle + share * (shift - spring.rest_angle)))
-    tree = replace(item.mechanism, parameters=item.mechanism.parameters.with_added(entries))
-    return replace(item, mechanism=tree, elastic_joints=tuple(elastic))
+    return _with_parameters(item, entries, elastic)
 
 
 def _with_vertices(
@@ -299,18 +249,13 @@ def _start_clamp(length: float, cable: CableTopology) -> Mechanism:
     roll = Parameter(_START_ROLL_PARAMETER, 0.0, "rad", -np.pi, np.pi, "roll of the start clamp about the first edge")
     edge = Parameter(f"{_START_CLAMP}.length", length, "m", 1e-9, np.inf, "length of the first edge")
     carrier = clamp.frame(_START_CLAMP)
-    tip = Frame(
-        carrier.joint_index,
-        Placement(symbolic_axis_rotation(UNIT_AXES["z"], roll.symbol), ca.vertcat(0, 0, edge.symbol)),
-    )
+    turn = symbolic_axis_rotation(UNIT_AXES["z"], roll.symbol)
+    tip = Frame(carrier.joint_index, Placement(turn, ca.vertcat(0, 0, edge.symbol)))
     frames = {**clamp.frames, cable.parent_vertices[0]: carrier, cable.parent_vertices[1]: tip, _START_EDGE_FRAME: tip}
     return Mechanism(_START_CLAMP, clamp.joints, frames, Parameters([roll, edge]))
 
 
 def _segments(cable: CableTopology, lengths: Mapping[tuple[str, str], float], options: CableOptions) -> list[Segment]:
-    def of(chain: Sequence[str]) -> list[float]:
-        return [lengths[edge] for edge in pairwise(chain)]
-
     parent = cable.parent_vertices
     turns = polyline_rotations(cable.undeformed_polyline(parent))
     # rest frame of every parent edge, from which children's directions are measured
@@ -326,12 +271,9 @@ def _segments(cable: CableTopology, lengths: Mapping[tuple[str, str], float], op
             junction = parent.index(chain[0])
             own, before = polyline_rotations(cable.undeformed_polyline(chain), carried[junction - 1]), None
             at = junction - 2
-        rest = (
-            own
-            if options.undeformed_rest_shape
-            else [own[0] if at is not None else np.eye(3), *[np.eye(3)] * (len(own) - 1)]
-        )
-        edges = of(chain)
+        if not options.undeformed_rest_shape:
+            own = [own[0] if at is not None else np.eye(3), *[np.eye(3)] * (len(own) - 1)]
+        edges = [lengths[edge] for edge in pairwise(chain)]
         segments.append(
             Segment(
                 name,
@@ -341,8 +283,8 @@ def _segments(cable: CableTopology, lengths: Mapping[tuple[str, str], float], op
                 link_lengths=edges,
                 parent=None if at is None else cable.parent_segment,
                 parent_link_index=at,
-                rest_rotation=rest[0],
-                link_rest_rotations=rest[1:],
+                rest_rotation=own[0],
+                link_rest_rotations=own[1:],
                 bend=branch.bend_rigidity,
                 twist=branch.twist_rigidity,
                 damping=branch.bend_damping,
@@ -361,7 +303,6 @@ def _segments(cable: CableTopology, lengths: Mapping[tuple[str, str], float], op
 class Cable(CableOptions, ObjectKind):
     """A branched cable held at both ends by clamps that follow measured points; lengths come from recordings."""
 
-    brings_clamps = True
     settings_examples: ClassVar[Mapping[str, str]] = {
         "model.object, kind: cable": """\
 model:

@@ -5,21 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from annotated_types import Ge, Le
 
-from yid_ocp.errors import OutputError
 from yid_ocp.model.flexible import FlexibleObject, Segment, flexible_object
 from yid_ocp.model.objects.base import OBJECTS, InitObject, InitTemplate, MountedObject
 from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
-from yid_ocp.model.urdf import mechanism_to_urdf
 from yid_ocp.options import OptionInfo
 
-Y_FOOT_POSITION = (0.85, 0.0, -0.93)
-"""Position of the trunk's foot in the world, Baxter's `base` [m]."""
+_FOOT_POSE = homogeneous_transform(np.eye(3), (0.85, 0.0, -0.93))  # of the trunk in Baxter's `base` [m]
 
 
 def y_segments() -> tuple[Segment, ...]:
@@ -35,23 +31,10 @@ def y_segments() -> tuple[Segment, ...]:
 def y_object(links: int = 4, gravity_fraction: float = 1.0) -> FlexibleObject:
     """The paper's foam Y as a flexible object, its trunk's foot at (0.85, 0, -0.93) m.
 
-    Parameters
-    ----------
-    links : int
-        Rigid links of every tube; the nominal stiffness per joint is that of four links.
-    gravity_fraction : float
-        See `flexible_object`.
+    The nominal stiffness per joint is that of four links, however many rigid `links` every tube has.
     """
     segments = [replace(segment, links=links) for segment in y_segments()]
-    return flexible_object(segments, homogeneous_transform(np.eye(3), Y_FOOT_POSITION), "y_object", gravity_fraction)
-
-
-def write_y_urdf(path: str | Path) -> None:
-    """Write the paper's Y object as a URDF file; `OutputError` where that fails."""
-    try:
-        Path(path).write_text(mechanism_to_urdf(y_object().mechanism), encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"the URDF cannot be written: {error.strerror}", where=str(path)) from error
+    return flexible_object(segments, _FOOT_POSE, "y_object", gravity_fraction)
 
 
 def _init_object(numbers: Mapping[str, Any], links: int) -> InitObject:
@@ -86,12 +69,10 @@ model:
     def model_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
         """The three tubes; the nominal stiffness per joint is that of four links, whatever `links` says."""
         n = link_division
-        return [
-            replace(s, links=self.links * n, bend=s.bend * n, twist=s.twist * n, damping=damping * n)
-            for s in y_segments()
-        ]
+        links = self.links * n
+        return [replace(s, links=links, bend=s.bend * n, twist=s.twist * n, damping=damping * n) for s in y_segments()]
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
-        """The object, its foot at (0.85, 0, -0.93) m without a mount; parameters as in `ObjectKind.build`."""
-        root = homogeneous_transform(np.eye(3), Y_FOOT_POSITION) if self.mount is None else None
+        """The object, its foot at (0.85, 0, -0.93) m without a mount."""
+        root = _FOOT_POSE if self.mount is None else None
         return flexible_object(self.model_segments(damping, link_division), root, "y_object", self.gravity_fraction)

@@ -66,22 +66,12 @@ parameters:
 
     def model_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
         """The rod as a segment without taper."""
-        return [
-            Segment(
-                _SEGMENT,
-                self.length,
-                self.mass,
-                self.base_radius,
-                self.links * link_division,
-                damping=damping,
-                stiffness_per_curvature=True,
-                clamped_at_base=True,
-                joint_axes=self.joint_axes,
-            )
-        ]
+        sizes = self.length, self.mass, self.base_radius, self.links * link_division
+        rod = Segment(_SEGMENT, *sizes, damping=damping, stiffness_per_curvature=True, clamped_at_base=True)
+        return [replace(rod, joint_axes=self.joint_axes)]
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
-        """The object, to be placed by `placement`; parameters as in `ObjectKind.build`."""
+        """The object, each link divided."""
         return _tapered(super().build(damping, link_division), self.tip_radius / self.base_radius)
 
 
