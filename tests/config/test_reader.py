@@ -11,7 +11,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from yid_ocp.config.reader import DEFAULT_CONFIG, load_config
-from yid_ocp.config.setting_keys import section_variants
+from yid_ocp.config.schema import section_variants
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.errors import ConfigError
 from yid_ocp.options import (

@@ -12,7 +12,8 @@ from small_problems import pendulum_step, taken
 from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording
 from yid_ocp.data.recording_hdf5 import write_recording
-from yid_ocp.report.summaries import _planning_command, plan_summary
+from yid_ocp.report.diagnosis_summaries import _planning_command
+from yid_ocp.report.summaries import plan_summary
 from yid_ocp.report.terminal import terminal_lines
 from yid_ocp.workflow.plan import next_plan_settings, run_plan
 

@@ -11,14 +11,7 @@ from yid_ocp.effects import make_effect
 from yid_ocp.model.flexible import Segment, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
-from yid_ocp.report.animation import (
-    _MAX_FRAMES,
-    _POSITION_SCALE,
-    ModelTrajectory,
-    StickFigure,
-    make_animation,
-    recording_animation,
-)
+from yid_ocp.report.animation import ModelTrajectory, make_animation, recording_animation
 
 
 def point(system: System, name: str, q: np.ndarray) -> np.ndarray:
@@ -29,31 +22,37 @@ def point(system: System, name: str, q: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def posture(single_arm):
-    return np.random.default_rng(0).uniform(-0.5, 0.5, size=(3, single_arm.n_coordinates))
+def posed(single_arm):
+    """Three postures, and the picture of the arm and the object in them."""
+    q = np.random.default_rng(0).uniform(-0.5, 0.5, size=(3, single_arm.n_coordinates))
+    return q, drawn(single_arm, q)
 
 
-def test_places_are_those_of_the_model(single_arm, posture):
-    skeleton = StickFigure(single_arm, single_arm.parameters.vector())
-    places = skeleton.positions_at(posture)
-    assert set(skeleton.point_indices) == set(single_arm.point_frames)
-    for name, k in skeleton.point_indices.items():
-        for q, now in zip(posture, places, strict=True):
+def drawn(system: System, q: np.ndarray):
+    told = ModelTrajectory("predicted", system, system.parameters.vector(), np.arange(len(q)), q)
+    return make_animation("a", [told]).motions[0]
+
+
+def test_places_are_those_of_the_model(single_arm, posed):
+    postures, motion = posed
+    assert set(motion.point_indices) == set(single_arm.point_frames)
+    for name, k in motion.point_indices.items():
+        for q, now in zip(postures, motion.positions, strict=True):
             np.testing.assert_allclose(now[k], point(single_arm, name, q), atol=1e-12)
 
 
-def test_sticks_are_the_links_of_the_object_and_the_arm(single_arm, posture):
-    skeleton = StickFigure(single_arm, single_arm.parameters.vector())
-    places = skeleton.positions_at(posture)
-    own = [stick for stick in skeleton.sticks if stick.is_object_part]
+def test_sticks_are_the_links_of_the_object_and_the_arm(posed):
+    _, motion = posed
+    places = motion.positions
+    own = [stick for stick in motion.sticks if stick.is_object_part]
     lengths = sorted(
         float(np.linalg.norm(places[0, a] - places[0, b])) for a, b in (stick.end_indices for stick in own)
     )
     links = sorted(4 * [0.813 / 4] + 4 * [0.610 / 4] + 4 * [0.737 / 4])
     np.testing.assert_allclose(lengths, links, atol=1e-9)
     assert sorted({stick.radius for stick in own}) == pytest.approx([0.019, 0.025, 0.032])
-    assert len(skeleton.arm_sticks) >= 6
-    for stick in skeleton.sticks:  # rigid, whatever the posture
+    assert len(motion.sticks) - len(own) >= 6
+    for stick in motion.sticks:  # rigid, whatever the posture
         a, b = stick.end_indices
         assert np.ptp(np.linalg.norm(places[:, a] - places[:, b], axis=1)) < 1e-9
 
@@ -62,9 +61,8 @@ def test_what_an_effect_puts_under_the_object_is_no_arm():
     bare = System.build(objects=[(flexible_object([Segment("rod", 0.4, 0.1, 0.01, links=2)]), None, None)])
     system = bare.with_effects([make_effect("mount_compliance", "base", bare, {"stiffness": 12.0})])
     assert any("@" in name for name in system.mechanism.joint_names)
-    skeleton = StickFigure(system, system.parameters.vector())
-    assert len(skeleton.sticks) == 2
-    assert skeleton.arm_sticks == ()
+    sticks = drawn(system, np.zeros((1, system.n_coordinates))).sticks
+    assert [stick.is_object_part for stick in sticks] == [True, True]
 
 
 def test_a_scene_has_what_was_measured_beside_what_was_predicted(single_arm):
@@ -79,7 +77,7 @@ def test_a_scene_has_what_was_measured_beside_what_was_predicted(single_arm):
     told = ModelTrajectory("predicted", single_arm, single_arm.parameters.vector(), t, q)
     made = make_animation("a", [told], recording)
     assert [motion.name for motion in made.motions] == ["predicted", "measured"]
-    assert len(made.t) == _MAX_FRAMES
+    assert len(made.t) == 150
     predicted, measured = made.motions
     assert measured.sticks
     assert not any(stick.is_object_part for stick in measured.sticks), "an object's shape is not measured"
@@ -93,12 +91,12 @@ def test_a_scene_has_what_was_measured_beside_what_was_predicted(single_arm):
     np.testing.assert_array_equal(measured.is_new_measurement[:, 0], near <= 0.5 * np.median(np.diff(made.t)))
     np.testing.assert_array_equal(measured.positions[np.argmin(abs(made.t - 0.5)), k], seen[0, 0])
     arm, recorded = measured.sticks[0].end_indices[1], np.where(np.isin(np.arange(n), at), q[:1] + 0.01, q[:1])
-    moved = StickFigure(single_arm, single_arm.parameters.vector()).positions_at(recorded)
+    moved = drawn(single_arm, recorded).positions
     np.testing.assert_allclose(measured.positions[0, arm], moved[0, arm], atol=1e-9)
     page = made.to_dict()
     assert page["motions"][1]["places"][0][3 * k] is None
-    first = np.array(page["motions"][0]["places"][0]).reshape(-1, 3) / _POSITION_SCALE
-    np.testing.assert_allclose(first, predicted.positions[0], atol=0.51 / _POSITION_SCALE)
+    first = np.array(page["motions"][0]["places"][0]).reshape(-1, 3) / page["scale"]
+    np.testing.assert_allclose(first, predicted.positions[0], atol=0.51 / page["scale"])
 
 
 def test_a_recording_alone_is_a_scene_where_it_has_places(single_arm):

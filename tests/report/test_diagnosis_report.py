@@ -184,7 +184,7 @@ def test_a_ranking_says_what_lies_beyond_its_axis():
 def test_a_band_is_shaded_about_the_noise():
     t = np.linspace(0.0, 1.0, 5)
     figure = figures.time_plots_figure(
-        [TimePlot("error", t[:0], t[:0], {"line": (t, t)}, 0.2)], "red", {"line": "blue"}
+        [TimePlot("error", {"line": (t, t)}, band_half_height=0.2)], "red", {"line": "blue"}
     )
     assert (figure.layout.shapes[0].y0, figure.layout.shapes[0].y1) == (-0.2, 0.2)
 
@@ -208,7 +208,7 @@ def test_events_are_marked_on_the_time_axis_told_and_listed(found, tmp_path):
 
 def test_spans_are_shaded():
     t = np.linspace(0, 3, 31)
-    figure = figures.time_plots_figure([TimePlot("a", t, t, {}, marked_intervals=[(1.0, 2.0)])], "#000000", {})
+    figure = figures.time_plots_figure([TimePlot("a", {}, t, t, marked_intervals=[(1.0, 2.0)])], "#000000", {})
     (shape,) = figure.layout.shapes
     assert (shape.x0, shape.x1) == (1.0, 2.0)
 

@@ -13,10 +13,10 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.diagnosis.blind import CaseScore, score_ensemble
 from yid_ocp.errors import ConfigError, DataError, OutputError
 from yid_ocp.files import to_json_types
+from yid_ocp.report.diagnosis_summaries import blind_markdown
 from yid_ocp.report.html import write_report
 from yid_ocp.report.png_figures import draw_blind_results
 from yid_ocp.report.sections import ReportData
-from yid_ocp.report.tables import blind_markdown
 from yid_ocp.workflow import blind
 from yid_ocp.workflow.blind import run_blind
 from yid_ocp.workflow.blind_experiments import EXPERIMENT_VARIATIONS, list_experiments

@@ -22,7 +22,7 @@ from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.synthetic_recording import recording_from_prediction
-from yid_ocp.report.model_summaries import _noise_words
+from yid_ocp.report.summaries import _noise_words
 from yid_ocp.report.tables import torque_offset_rows
 from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.solvers import GaussNewton, solve

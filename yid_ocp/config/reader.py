@@ -21,8 +21,7 @@ from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent, ScalarEvent
 
-from yid_ocp.config import setting_keys
-from yid_ocp.config.setting_keys import SectionVariants, section_variants, unknown_key_error
+from yid_ocp.config.schema import SectionVariants, iter_settable_keys, section_variants, unknown_key_error
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.errors import ConfigError, nearest_name_hint
 from yid_ocp.options import (
@@ -86,7 +85,7 @@ def settable_keys(prefix: str, path: str | Path | None = None) -> list[str]:
         The file cannot be read.
     """
     data = {} if path is None else _parse(_read(Path(path)), str(path))[0]
-    return list(setting_keys.iter_settable_keys(RunSettings, prefix, data))
+    return list(iter_settable_keys(RunSettings, prefix, data))
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------
@@ -207,11 +206,14 @@ def _override(data: dict[str, Any], places: dict[_KeyPath, str], text: str) -> N
 
 def _merged(hint: Any, before: Any, value: Any, path: _KeyPath, places: dict[_KeyPath, str]) -> Any:
     """What stands at a key once a value is set there: sections of one kind merge, all else is replaced."""
-    if not (value and isinstance(before, dict) and isinstance(value, dict)) or _another(hint, before, value):
+    sections = section_variants(hint)
+    merges = bool(value) and isinstance(before, dict) and isinstance(value, dict)
+    if merges and sections is not None and sections.selector_key in value:
+        merges = sections.selected_variant(value) == sections.selected_variant(before)
+    if not merges:
         for known in [known for known in places if known[: len(path)] == path]:
             del places[known]
         return value
-    sections = section_variants(hint)
     keys = {} if sections is None else sections.variant_options(sections.selected_variant({**before, **value}))
     for name, entry in value.items():
         kind = keys[name].type_hint if name in keys else mapping_value_type(hint)
@@ -219,47 +221,30 @@ def _merged(hint: Any, before: Any, value: Any, path: _KeyPath, places: dict[_Ke
     return before
 
 
-def _another(hint: Any, before: dict[str, Any], value: dict[str, Any]) -> bool:
-    """Whether a section chooses another kind or method, with other keys, than the one that stands there."""
-    sections = section_variants(hint)
-    return (
-        sections is not None
-        and sections.selector_key in value
-        and sections.selected_variant(value) != sections.selected_variant(before)
-    )
-
-
 def _key_path(hint: Any, parts: list[str], origin: str, raw: Any) -> tuple[tuple[str, ...], Any]:
     """Split a dotted key by the settings' types, and say which type stands there; names such as T1.bend keep dots."""
     if not parts:
         return (), hint
-    sections = section_variants(hint)
+    name, rest = parts[0], parts[1:]
+    sections, values = section_variants(hint), mapping_value_type(hint)
+    inner = section_variants(values)
     if sections is not None:
         known = sections.variant_options(sections.selected_variant(raw))
-        if parts[0] not in known:
-            raise unknown_key_error(RunSettings, parts[0], known, origin)
-        return _below(parts[0], _key_path(known[parts[0]].type_hint, parts[1:], origin, _inner(raw, parts[0])))
-    values = mapping_value_type(hint)
-    if values is None:
-        raise ConfigError(f"there are no keys below '{parts[0]}'", where=origin, hint="shorten the key")
-    inner = section_variants(values)
-    if inner is not None and inner.selector_key == "name":
-        inner = inner.for_name(parts[0], origin)
-        return _below(parts[0], _key_path(next(iter(inner.classes.values())), parts[1:], origin, None))
-    known = {} if inner is None else inner.variant_options()
-    cut = next((i for i in range(len(parts) - 1, 0, -1) if parts[i] in known), len(parts))
-    if isinstance(raw, dict) and ".".join(parts[:-1]) in raw and cut == len(parts) and known:
-        raise unknown_key_error(RunSettings, parts[-1], known, origin)
-    name = ".".join(parts[:cut])
-    return _below(name, _key_path(values, parts[cut:], origin, _inner(raw, name)))
-
-
-def _below(name: str, found: tuple[tuple[str, ...], Any]) -> tuple[tuple[str, ...], Any]:
-    return (name, *found[0]), found[1]
-
-
-def _inner(raw: Any, name: str) -> Any:
-    return raw.get(name) if isinstance(raw, dict) else None
+        if name not in known:
+            raise unknown_key_error(name, known, origin)
+        below = known[name].type_hint
+    elif values is None:
+        raise ConfigError(f"there are no keys below '{name}'", where=origin, hint="shorten the key")
+    elif inner is not None and inner.selector_key == "name":
+        below = inner.for_name(name, origin).classes[""]
+    else:
+        known = {} if inner is None else inner.variant_options()
+        cut = next((i for i in range(len(parts) - 1, 0, -1) if parts[i] in known), len(parts))
+        if isinstance(raw, dict) and ".".join(parts[:-1]) in raw and cut == len(parts) and known:
+            raise unknown_key_error(parts[-1], known, origin)
+        name, rest, below = ".".join(parts[:cut]), parts[cut:], values
+    path, found = _key_path(below, rest, origin, raw.get(name) if isinstance(raw, dict) else None)
+    return (name, *path), found
 
 
 # -- values -----------------------------------------------------------------------------------------------------------
@@ -315,7 +300,7 @@ class _Reader:
         known, kind = sections.variant_options(word), sections.classes[word]
         for name in raw:
             if name not in known:
-                raise unknown_key_error(RunSettings, name, known, self.where((*path, name)), ".".join(map(str, path)))
+                raise unknown_key_error(name, known, self.where((*path, name)), ".".join(map(str, path)))
         values: dict[str, Any] = {}
         for name, option in dataclass_options(kind).items():
             if name in raw:
@@ -338,17 +323,13 @@ class _Reader:
 
     def _wrong(self, raw: Any, hint: Any, path: _KeyPath) -> ConfigError:
         unit = next((m.unit for m in split_annotated(hint)[1] if isinstance(m, OptionInfo) and m.unit), "")
-        hint_text = ""
+        advice = ""
         if isinstance(raw, str) and (match := re.fullmatch(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*([^\d\s].*)", raw)):
-            hint_text = f"write the number alone, in {unit}" if unit else "write the number alone"
+            advice = f"write the number alone, in {unit}" if unit else "write the number alone"
             if unit and match[2].strip() != unit:
-                hint_text += f": convert it from {match[2].strip()}"
-        return ConfigError(
-            f"{self._name(path)} = {_shown(raw)} is not allowed",
-            where=self.where(path),
-            allowed=describe_type(hint),
-            hint=hint_text,
-        )
+                advice += f": convert it from {match[2].strip()}"
+        what = f"{self._name(path)} = {_shown(raw)} is not allowed"
+        return ConfigError(what, where=self.where(path), allowed=describe_type(hint), hint=advice)
 
     @staticmethod
     def _name(path: _KeyPath) -> str:

@@ -1,77 +1,198 @@
-"""Documentation of the configuration: a JSON Schema for editors, Markdown tables, and an example of every section."""
+"""Allowed keys of each configuration section, from the settings classes: for reader, `--set`, and JSON Schema."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import MISSING
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import MISSING, dataclass
+from typing import Any, Literal, get_args
 
 from pydantic import TypeAdapter
 
-from yid_ocp.config.setting_keys import SectionVariants, section_variants
 from yid_ocp.config.settings import RunSettings
-from yid_ocp.model.objects import OBJECTS
+from yid_ocp.errors import ConfigError, unknown_name_details
 from yid_ocp.options import (
     Option,
     OptionInfo,
+    RegistryChoice,
     dataclass_options,
-    describe_type,
     mapping_value_type,
     sequence_entry_type,
     split_annotated,
+    union_members,
 )
 
-_PAGE_HEAD = """\
-# Settings
 
-Every key of a configuration file. NAME stands for a name of yours or of the model. Units are SI and stand in brackets;
-`needed` keys have no default, and where none is shown it is nothing at all (`null`). Any key may be set on the command
-line as well, `--set problem.time_step=0.005`; a section merges with what stands there, key by key, and an empty one
-empties it. How to choose links, time step and split: [choosing.md](choosing.md); recordings and their units:
-[recordings.md](recordings.md). This page is made from the code; CONTRIBUTING.md has the command.
-"""
+@dataclass(frozen=True)
+class SectionVariants:
+    """Alternative settings classes of one configuration section, and the key that selects one.
+
+    Attributes
+    ----------
+    classes : mapping of str to type
+        By the word that chooses one; a single one under the empty word.
+    selector_key : str
+        Which key holds the word, empty where there is no choice.
+    default_variant : str
+        The word where the key is absent, empty where it must be given.
+    variant_noun : str
+        What the classes are.
+    is_nullable : bool
+        Whether there may be none.
+    """
+
+    classes: Mapping[str, type]
+    selector_key: str = ""
+    default_variant: str = ""
+    variant_noun: str = ""
+    is_nullable: bool = False
+
+    def selected_variant(self, raw: Any) -> Any:
+        """Value of the selector key in a raw section; the default where the key is absent."""
+        given = raw if self.selector_key and isinstance(raw, dict) else {}
+        return given.get(self.selector_key, self.default_variant)
+
+    def variant_options(self, word: Any = "") -> Mapping[str, Option]:
+        """Options by key of the selected class; of the first class where the value selects none."""
+        known = isinstance(word, str) and word in self.classes
+        options = dataclass_options(self.classes[word] if known else next(iter(self.classes.values())))
+        if self.selector_key in ("", *options):
+            return options
+        return {self.selector_key: Option(Literal[tuple(self.classes)], self.default_variant), **options}
+
+    def for_name(self, name: str, where: str) -> SectionVariants:
+        """Classes allowed under one name of a mapping: the registered class of that name, or all."""
+        if self.selector_key != "name":
+            return self
+        if name not in self.classes:
+            raise self.unknown_variant_error(name, where)
+        return SectionVariants({"": self.classes[name]})
+
+    def unknown_variant_error(self, word: object, where: str) -> ConfigError:
+        """The error for a missing or unknown value of the selector key."""
+        if not word:
+            what = f"the key '{self.selector_key}' is missing"
+            return ConfigError(what, where=where, allowed=", ".join(self.classes))
+        what = f"there is no {self.variant_noun} '{word}'"
+        return ConfigError(what, where=where, **unknown_name_details(str(word), self.classes))
+
+
+def section_variants(hint: Any) -> SectionVariants | None:
+    """Alternative settings classes that a type annotation allows; None for other types."""
+    bare, markers = split_annotated(hint)
+    nullable = type(None) in get_args(bare)
+    among = next((marker for marker in markers if isinstance(marker, RegistryChoice)), None)
+    if among is not None:
+        registry = among.registry
+        classes = {name: registry[name] for name in registry}
+        return SectionVariants(classes, among.selector_key, among.default_name, registry.entry_noun, nullable)
+    kinds = [split_annotated(member)[0] for member in union_members(bare)]
+    if len(kinds) != 1 or not dataclasses.is_dataclass(kinds[0]):
+        return None
+    return SectionVariants({"": kinds[0]}, is_nullable=nullable)
+
+
+def unknown_key_error(name: str, known: Iterable[str], where: str, within: str = "") -> ConfigError:
+    """The error for an unknown key, with the nearest allowed key and the sections that have this key."""
+    said = unknown_name_details(name, known)
+    homes = list(dict.fromkeys(_sections_with_key(RunSettings, name)))
+    hints = [said["hint"]] if said["hint"] else []
+    hints += [f"'{name}' is a key of {', '.join(homes[:3])}"] if homes else []
+    hints.append("names changed in this version: see the table in CHANGELOG.md")
+    if ":" in name:
+        hints = ["put a space behind the colon, as in {" + name.replace(":", ": ") + "}"]
+    what = f"there is no key '{name}'" + (f" in {within}" if within else "")
+    return ConfigError(what, where=where, allowed=said["allowed"], hint="; ".join(hints))
+
+
+def iter_settable_keys(hint: Any, prefix: str, raw: Any, at: str = "") -> Iterator[str]:
+    """Yield completions of a dotted key prefix, up to the next dot or to `=` where a value follows.
+
+    Parameters
+    ----------
+    hint : Any
+        Type of what stands at `at`.
+    raw : Any
+        What a file says there: its names count where users choose them.
+    at : str
+        The keys before, each with its dot.
+    """
+    sections, values = section_variants(hint), mapping_value_type(hint)
+    named = section_variants(values)
+    below: dict[str, Any] = {}
+    if sections is not None:
+        options = sections.variant_options(sections.selected_variant(raw))
+        below = {name: option.type_hint for name, option in options.items()}
+    elif named is not None and named.selector_key == "name":
+        below = dict(named.classes)
+    elif values is not None and isinstance(raw, dict):
+        below = dict.fromkeys(raw, values)
+    for name, inner in below.items():
+        path = f"{at}{name}"
+        if prefix.startswith(f"{path}."):
+            yield from iter_settable_keys(inner, prefix, raw.get(name) if isinstance(raw, dict) else None, f"{path}.")
+        elif path.startswith(prefix):
+            yield path + ("=" if section_variants(inner) is None and mapping_value_type(inner) is None else ".")
+
+
+def _sections_with_key(hint: Any, name: str, at: str = "") -> Iterator[str]:
+    """Yield descriptions of the sections that have a key; NAME represents a user-chosen name."""
+    for inner, step in ((mapping_value_type(hint), ".NAME"), (sequence_entry_type(hint), "")):
+        if inner is not None:
+            yield from _sections_with_key(inner, name, at + step)
+    sections = section_variants(hint)
+    if sections is None:
+        return
+    having = [word for word, kind in sections.classes.items() if name in dataclass_options(kind)]
+    if having:
+        choice = "" if len(having) == len(sections.classes) else f" with {sections.selector_key}: {', '.join(having)}"
+        yield (f"`{at}`" if at else "the file itself") + choice
+    for kind in sections.classes.values():
+        for key, option in dataclass_options(kind).items():
+            yield from _sections_with_key(option.type_hint, name, f"{at}.{key}" if at else key)
+
+
+# -- JSON Schema ------------------------------------------------------------------------------------------------------
 
 
 def config_json_schema() -> dict[str, Any]:
     """JSON Schema of a configuration file, as plain data."""
     head = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "yid-ocp configuration"}
-    return head | _of(RunSettings)
+    return head | _described_schema(RunSettings)
 
 
-def _of(hint: Any) -> dict[str, Any]:
-    about = _about(hint)
+def _described_schema(hint: Any) -> dict[str, Any]:
+    about = option_info(hint)
     text = about.description + (f" [{about.unit}]" if about.unit else "")
-    return _bare(hint) | ({"description": text} if text else {})
+    return _type_schema(hint) | ({"description": text} if text else {})
 
 
-def _bare(hint: Any) -> dict[str, Any]:
+def _type_schema(hint: Any) -> dict[str, Any]:
     sections, entries, values = section_variants(hint), sequence_entry_type(hint), mapping_value_type(hint)
     if sections is not None:
-        parts = [_section(sections, word) for word in sections.classes]
+        parts = [_section_schema(sections, word) for word in sections.classes]
         parts += [{"type": "null"}] if sections.is_nullable else []
         return parts[0] if len(parts) == 1 else {"anyOf": parts}
     if entries is not None and section_variants(entries) is not None:
-        return {"type": "array", "items": _of(entries)}
+        return {"type": "array", "items": _described_schema(entries)}
     inner = section_variants(values)
     if inner is not None and inner.selector_key == "name":
-        named = {name: _section(inner.for_name(name, ""), "") for name in inner.classes}
+        named = {name: _section_schema(inner.for_name(name, ""), "") for name in inner.classes}
         return {"type": "object", "properties": named, "additionalProperties": False}
     if inner is not None:
-        return {"type": "object", "additionalProperties": _of(values)}
+        return {"type": "object", "additionalProperties": _described_schema(values)}
     return TypeAdapter(hint).json_schema()
 
 
-def _section(sections: SectionVariants, word: str) -> dict[str, Any]:
+def _section_schema(sections: SectionVariants, word: str) -> dict[str, Any]:
     kind = sections.classes[word]
     properties: dict[str, Any] = {}
     required = []
     if sections.selector_key == "name":
         properties["name"] = {"const": word, "description": f"the {sections.variant_noun}"}
     for name, option in dataclass_options(kind).items():
-        properties[name] = _of(option.type_hint)
+        properties[name] = _described_schema(option.type_hint)
         default = option.default_value
         if default is MISSING:
             required.append(name)
@@ -85,231 +206,7 @@ def _section(sections: SectionVariants, word: str) -> dict[str, Any]:
     return result | ({"required": required} if required else {})
 
 
-def _about(hint: Any) -> OptionInfo:
-    return next(
-        (marker for marker in reversed(split_annotated(hint)[1]) if isinstance(marker, OptionInfo)), OptionInfo()
-    )
-
-
-# -- for people -------------------------------------------------------------------------------------------------------
-
-
-def settings_markdown() -> str:
-    """Markdown page of all settings with meaning, allowed values and default."""
-    lines = _PAGE_HEAD.splitlines()
-    tables = {title: (text, rows) for title, text, rows in _tables(RunSettings, "")}
-    for title, (text, rows) in tables.items():
-        lines += ["", f"## {title}", "", text, "", "| key | meaning | allowed | default |", "|---|---|---|---|", *rows]
-        lines += ["", "```yaml", *SETTINGS_EXAMPLES.get(title, "").splitlines(), "```"]
-    return "\n".join(lines) + "\n"
-
-
-def _tables(hint: Any, path: str) -> Iterator[tuple[str, str, list[str]]]:
-    """Title, first sentence and rows of a section and of all below it."""
-    sections = section_variants(hint)
-    for word, kind in sections.classes.items() if sections is not None else ():
-        options = dataclass_options(kind)
-        title = (
-            f"{path}, {sections.selector_key}: {word}"
-            if sections is not None and sections.selector_key
-            else path or "The file"
-        )
-        yield title, (kind.__doc__ or "").splitlines()[0], [_row(*item) for item in options.items()]
-        for name, option in options.items():
-            yield from _tables(option.type_hint, f"{path}.{name}" if path else name)
-    values, entries = mapping_value_type(hint), sequence_entry_type(hint)
-    named = section_variants(values)
-    if values is not None and (named is None or named.selector_key != "name"):
-        yield from _tables(values, f"{path}.NAME")
-    if entries is not None:
-        yield from _tables(entries, path)
-
-
-def _row(name: str, option: Option) -> str:
-    default = "needed" if option.default_value is MISSING else _default(option.default_value)
-    cells = (f"`{name}`", _about(option.type_hint).description, describe_type(option.type_hint), default)
-    return "| " + " | ".join(cells) + " |"
-
-
-def _default(value: Any) -> str:
-    if value is None or value in ({}, "") or dataclasses.is_dataclass(value):
-        return ""
-    if isinstance(value, Mapping):
-        return ", ".join(f"`{name}`" for name in value)
-    return "`.inf`" if value == math.inf else f"`{json.dumps(value)}`"
-
-
-SETTINGS_EXAMPLES: Mapping[str, str] = {
-    **{section: text for kind in OBJECTS for section, text in OBJECTS[kind].settings_examples.items()},
-    "The file": """\
-description: A cable of 1 m, swung by a UR5
-model: {robot: package:ur5, object: {kind: segments, segments: {cable: {length: 1.0, mass: 0.1, radius: 0.005}}}}
-recordings: {estimate: [swing.h5], held_out: [other_swing.h5]}
-parameters: {cable.bend: {free: true, initial: 0.05}, cable.damping: {free: true}}
-""",
-    "model": """\
-model:
-  robot: package:baxter
-  arms: {mode: driven}
-  object: {kind: foam_y}
-  grasp:
-    left: {holder_frame: left_gripper, held_frame: w_T2}
-  damping: {left_s0: 0.2, object: 0.05}    # [N m s/rad]
-  points: [w_T3, T1:40%]
-  effects:
-    - {kind: kelvin_voigt, location: T1, values: {tau: 0.02}}
-""",
-    "model.clamps.NAME": """\
-model:
-  clamps:
-    hand: {origin_point: marker_a, z_axis_point: marker_b, roll_convention: transported}
-""",
-    "model.extra_meshes": """\
-model:
-  extra_meshes:
-    - {mesh: gripper.stl, parent_frame: left_hand}
-    - {box: [0.8, 1.2, 0.05], xyz: [0.9, 0.0, -0.4]}  # a table [m]
-""",
-    "model.arms": """\
-model:
-  arms:
-    joints: [panda_joint1, panda_joint2, panda_joint4]
-    mode: prescribed
-    locked_joints: {panda_joint3: 0.4}              # [rad]
-    exclude_links: [panda_hand]
-""",
-    "model.arms.servo": """\
-model:
-  arms:
-    mode: servo
-    servo: {command_interpolation: interpolated, has_gravity_compensation: true}
-""",
-    "model.frames.NAME": """\
-model:
-  frames:
-    tool: {parent_frame: panda_link8, xyz: [0.0, 0.0, 0.12]}    # [m]
-""",
-    "model.grasp.NAME": """\
-model:
-  grasp:
-    right: {holder_frame: right_gripper, held_frame: w_T3, kind: axis, rpy: [0.0, 1.5708, 0.0]}    # [rad]
-""",
-    "model.springs.NAME": """\
-model:
-  springs:
-    elbow: {stiffness: 12.0, rest_position: 0.3, damping: 0.1}    # [N m/rad], [rad], [N m s/rad]
-""",
-    "model.effects": """\
-model:
-  effects:
-    - {kind: joint_coulomb, location: left_s0}
-parameters:
-  joint_coulomb@*: {free: true}
-""",
-    "recordings": """\
-recordings:
-  estimate: [day_1.h5, day_2.h5]
-  held_out: [day_3.h5]
-""",
-    "import": """\
-import:
-  joint_topics: [/left/joint_states, /right/joint_states]
-  points: {/mocap/tip: cable:100%}
-  units: {position: deg, points: mm}
-""",
-    "sensors.NAME": """\
-sensors:
-  points_camera: {std: 0.005, frames: {marker_7: w_T1}}    # [m]
-  joints.effort: {std: 0.1, bias_std: 0.3, effort_kind: sample}   # [N m]
-""",
-    "parameters.NAME": """\
-parameters:
-  "*.bend": {free: true, initial: 3.0}
-  T1.bend: {bounds: [5.0, 50.0]}             # over what the pattern says
-  T1.twist: {free: true, prior_std: 2.0}
-""",
-    "problem": """\
-problem:
-  time_step: 0.005                           # [s]
-  initial_state: estimated
-  path_cutoff: 15.0                          # [Hz]
-""",
-    "solver, name: gauss_newton": """\
-solver: {name: gauss_newton, max_iterations: 100}
-""",
-    "solver, name: multiple_shooting": """\
-solver: {name: multiple_shooting, hessian: exact, ipopt: {max_cpu_time: 600}}
-""",
-    "solver, name: single_shooting": """\
-solver: {name: single_shooting, max_iterations: 400}
-""",
-    "solver, name: steepest_descent": """\
-solver: {name: steepest_descent, first_trial_step: spectral, nonmonotone_memory: 10}
-""",
-    "compare": """\
-compare:
-  methods:
-    gauss_newton: {}
-    multiple_shooting: {condensing: true}
-""",
-    "diagnosis": """\
-diagnosis:
-  candidates: [kelvin_voigt, joint_coulomb, payload@left_gripper]
-  max_effects: 2
-""",
-    "track": """\
-track:
-  frames_path: clouds/                            # folder
-  length_unit: mm
-  n_drawn_frames: 5
-""",
-    "track.virtual_frames": """\
-track:
-  virtual_frames: {duration: 3.0, frame_rate: 5.0, latency: 0.04}    # [s], [Hz], [s]
-""",
-    "track.options": """\
-track:
-  options: {max_distance_in_radii: 0.7, tracked_points: [w_T1, w_T3]}
-""",
-    "track.options.filters": """\
-track:
-  options:
-    filters: {box_lower: [0.2, -0.8, -0.9], box_upper: [1.5, 0.8, 0.8], robot_padding: 0.02}    # [m]
-""",
-    "track.options.skeleton": """\
-track:
-  options:
-    skeleton: {neighbour_radius: 0.05, segment_neighbours: 30}     # [m]
-""",
-    "track.options.shape_fit": """\
-track:
-  options:
-    shape_fit: {surface_loss_scales: [], surface_noise_std: 0.004}  # [m]
-""",
-    "track.options.calibration": """\
-track:
-  options:
-    calibration: {fix_pose: true, translation_prior_std: 0.01}    # a hand-eye calibration, known to 1 cm [m]
-""",
-    "track.options.clock": """\
-track:
-  options:
-    clock: {initial_offset: 0.08, search_half_width: 0.05}      # [s]
-""",
-    "plan": """\
-plan:
-  goal: place
-  point: w_T3
-  target_offset: [0.05, 0.0, 0.1]                    # [m]
-  duration: 1.0                              # [s]
-  parameter_run: runs/my_solve
-""",
-    "plan.limits": """\
-plan:
-  limits: {velocity_fraction: 0.5, max_acceleration: 10.0, max_spring_angle: 0.8}    # a part, [rad/s^2], [rad]
-""",
-    "output": """\
-output: {runs_folder: /data/runs, write_report: false}
-""",
-}
-"""YAML from the top of a file, by the title of its section in docs/settings.md."""
+def option_info(hint: Any) -> OptionInfo:
+    """Meaning and unit of an option's type; empty ones where it has none."""
+    markers = reversed(split_annotated(hint)[1])
+    return next((marker for marker in markers if isinstance(marker, OptionInfo)), OptionInfo())

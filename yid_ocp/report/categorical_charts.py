@@ -18,7 +18,9 @@ from yid_ocp.report.figures import (
     LINE_COLORS,
     SEQUENTIAL_COLORSCALE,
     TEXT_COLOR,
-    apply_page_style,
+    asymmetric_bars,
+    line_color,
+    page_figure,
 )
 
 if TYPE_CHECKING:
@@ -27,62 +29,57 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _MIN_CLOSURE_PERCENT = -50.0  # lower end of an axis of closures [%]
+_SYMBOLS = ("circle", "diamond", "square", "cross")
+
+
+def _rows_figure(height: int, names: Sequence[str], title: str) -> plotly.graph_objects.Figure:
+    """An empty figure with one named row for each name, the first on top."""
+    figure = page_figure(height, title, "")
+    figure.update_yaxes(autorange="reversed", categoryorder="array", categoryarray=list(names), automargin=True)
+    return figure
 
 
 def estimates_figure(
     values: Mapping[str, tuple[float, float | None, float, bool]], unit: str
 ) -> plotly.graph_objects.Figure:
     """Figure of estimates ± 2 std and initial values, one row per parameter: (value, std, initial, found)."""
-    import plotly.graph_objects as go
-
     names = list(values)
-    figure = go.Figure()
+    figure = _rows_figure(110 + 34 * len(names), names, unit)
     marker = {"color": GRID_COLOR, "size": 10, "symbol": "diamond", "line": {"color": TEXT_COLOR, "width": 1}}
     figure.add_scatter(x=[values[name][2] for name in names], y=names, mode="markers", name="start", marker=marker)
-    for found, word, color in (
-        (True, "estimate", LINE_COLORS[0]),
-        (False, "estimate that cannot be trusted", LINE_COLORS[1]),
-    ):
+    labels = {True: "estimate", False: "estimate that cannot be trusted"}
+    for (found, label), color in zip(labels.items(), LINE_COLORS, strict=False):
         chosen = [name for name in names if values[name][3] == found]
-        error_x = {"type": "data", "array": [2 * (values[name][1] or 0.0) for name in chosen], "color": color}
-        x = [values[name][0] for name in chosen]
-        marker = {"color": color, "size": 10}
         figure.add_scatter(
-            x=x, y=chosen, mode="markers", name=word, marker=marker, error_x=error_x, showlegend=bool(chosen)
-        )
+            x=[values[name][0] for name in chosen], y=chosen, mode="markers", name=label, showlegend=bool(chosen),
+            marker={"color": color, "size": 10},
+            error_x={"type": "data", "array": [2 * (values[name][1] or 0.0) for name in chosen], "color": color},
+        )  # fmt: skip
     largest = max([abs(number) for value, _, initial, _ in values.values() for number in (value, initial)] or [1.0])
-    figure = apply_page_style(figure, 110 + 34 * len(names), unit, "")
     lowest = min(0.0, *(value for value, *_ in values.values()))
     figure.update_xaxes(range=[lowest - 0.05 * largest, 1.6 * largest])
-    figure.update_yaxes(
-        autorange="reversed", categoryorder="array", categoryarray=names, automargin=True, tickfont={"size": 11}
-    )
+    figure.update_yaxes(tickfont={"size": 11})
     return figure
 
 
-_ValuesBySource = Mapping[str, Mapping[str, tuple[float, float | None]]]
-"""Of every parameter, by who says it: value and standard deviation."""
-
-
-def values_by_source_figure(rows: _ValuesBySource, unit: str) -> plotly.graph_objects.Figure:
+def values_by_source_figure(
+    rows: Mapping[str, Mapping[str, tuple[float, float | None]]], unit: str
+) -> plotly.graph_objects.Figure:
     """Figure of values ± 2 std from several sources, one row per parameter and one color per source."""
-    import plotly.graph_objects as go
-
     sources = list(dict.fromkeys(source for row in rows.values() for source in row))
-    names, figure = list(rows), go.Figure()
+    names = list(rows)
+    figure = page_figure(110 + max(36, 14 * len(sources)) * len(names), unit, "")
     spread = 0.6 / max(len(sources), 1)
     for i, source in enumerate(sources):
         own = [(k, *rows[name][source]) for k, name in enumerate(names) if source in rows[name]]
-        color = LINE_COLORS[i % len(LINE_COLORS)]
-        symbol = ("circle", "diamond", "square", "cross")[i // len(LINE_COLORS) % 4]
+        color, symbol = line_color(i), _SYMBOLS[i // len(LINE_COLORS) % len(_SYMBOLS)]
         figure.add_scatter(
             x=[value for _, value, _ in own], y=[k + spread * (i - (len(sources) - 1) / 2) for k, *_ in own],
             mode="markers", name=source, marker={"color": color, "size": 8, "symbol": symbol},
             error_x={"type": "data", "array": [2 * (std or 0.0) for *_, std in own], "color": color, "thickness": 1.2},
         )  # fmt: skip
-    numbers = [value for row in rows.values() for value, _ in row.values()]
-    figure = apply_page_style(figure, 110 + max(36, 14 * len(sources)) * len(names), unit, "")
-    low, high = min([0.0, *numbers]), max([0.0, *numbers])
+    numbers = [0.0, *(value for row in rows.values() for value, _ in row.values())]
+    low, high = min(numbers), max(numbers)
     # bars of what cannot be told would squeeze all others
     figure.update_xaxes(range=[low - 0.1 * (high - low or 1.0), high + 0.25 * (high - low or 1.0)])
     figure.update_yaxes(
@@ -91,24 +88,37 @@ def values_by_source_figure(rows: _ValuesBySource, unit: str) -> plotly.graph_ob
     return figure
 
 
+def _heat_figure(
+    height: int, names: tuple[Sequence[str], Sequence[str]], parts: Array, titles: tuple[str, str], tickangle: int
+) -> plotly.graph_objects.Figure:
+    """Figure of numbers between 0 and 1 for each pair of a row's and a column's name."""
+    rows, columns = (list(own) for own in names)
+    figure = page_figure(height, titles[1], titles[0])
+    figure.add_heatmap(
+        x=columns, y=rows, z=parts.tolist(), zmin=0.0, zmax=1.0, showscale=False, xgap=1, ygap=1,
+        colorscale=SEQUENTIAL_COLORSCALE, texttemplate="%{text}",
+    )  # fmt: skip
+    every = {"type": "category", "tickmode": "array", "title_standoff": 6, "showgrid": False, "automargin": True}
+    figure.update_xaxes(tickangle=tickangle, tickvals=columns, **every)
+    figure.update_yaxes(autorange="reversed", tickvals=rows, **every)
+    return figure
+
+
 def confusion_figure(
     rows: Sequence[str], columns: Sequence[str], counts: Array, row: str, column: str
 ) -> plotly.graph_objects.Figure:
     """Confusion-matrix figure of counts, colored by the fraction of their row."""
-    import plotly.graph_objects as go
-
     parts = counts / np.maximum(counts.sum(1, keepdims=True), 1.0)
-    figure = go.Figure()
-    figure.add_heatmap(
-        x=list(columns), y=list(rows), z=parts.tolist(), zmin=0.0, zmax=1.0, showscale=False, xgap=1, ygap=1,
-        colorscale=SEQUENTIAL_COLORSCALE, text=[[f"{n:.0f}" if n else "" for n in line] for line in counts],
-        texttemplate="%{text}", hovertemplate="%{y}: said %{x}<extra></extra>",
-    )  # fmt: skip
-    figure = apply_page_style(figure, 200 + 24 * len(rows), column, row)
-    every = {"type": "category", "tickmode": "array", "title_standoff": 6, "showgrid": False, "automargin": True}
-    figure.update_xaxes(tickangle=-50, tickvals=list(columns), **every)
-    figure.update_yaxes(autorange="reversed", tickvals=list(rows), **every)
-    return figure
+    figure = _heat_figure(200 + 24 * len(rows), (rows, columns), parts, (row, column), -50)
+    text = [[f"{n:.0f}" if n else "" for n in line] for line in counts]
+    return figure.update_traces(text=text, hovertemplate="%{y}: said %{x}<extra></extra>")
+
+
+def matrix_figure(names: Sequence[str], values: Array, row: str, column: str) -> plotly.graph_objects.Figure:
+    """Parts of a whole `values` (n, n), between 0 and 1, in per cent for every pair of names."""
+    figure = _heat_figure(190 + 27 * len(names), (names, names), values, (row, column), -40)
+    text = [[f"{100 * v:.0f}" if v >= 0.095 else "" for v in line] for line in values]
+    return figure.update_traces(text=text, hovertemplate="%{y} explained by %{x}: %{z:.2f}<extra></extra>")
 
 
 @dataclass(frozen=True)
@@ -134,42 +144,34 @@ def before_after_figure(
     words : (str, str, str)
         For before, after and the marks.
     """
-    import plotly.graph_objects as go
-
-    figure = go.Figure()
-    names = list(rows)
-    moved = [(name, row) for name, row in rows.items() if row.after is not None]
+    figure = _rows_figure(110 + 32 * len(rows), list(rows), axis)
+    moved = [(name, row.before, row.after) for name, row in rows.items() if row.after is not None]
     figure.add_scatter(
-        x=[x for _, row in moved for x in (row.before, row.after, None)],
-        y=[y for name, _ in moved for y in (name, name, None)],
+        x=[x for _, before, after in moved for x in (before, after, None)],
+        y=[y for name, *_ in moved for y in (name, name, None)],
         mode="lines", line={"color": GRID_COLOR, "width": 6}, hoverinfo="skip", showlegend=False,
     )  # fmt: skip
     hollow = {"color": BACKGROUND_COLOR, "size": 11, "line": {"color": BEFORE_COLOR, "width": 2.5}}
     full = {"color": AFTER_COLOR, "size": 11}
+    tick = {"symbol": "line-ns", "size": 16, "line": {"color": TEXT_COLOR, "width": 2.5}}
+    numbers: list[float] = []
     for entries, word, marker, color in (
         ([(n, r.before, r.before_std) for n, r in rows.items()], words[0], hollow, BEFORE_COLOR),
-        ([(n, r.after, r.after_std) for n, r in moved], words[1], full, AFTER_COLOR),
+        ([(n, r.after, r.after_std) for n, r in rows.items()], words[1], full, AFTER_COLOR),
+        ([(n, r.reference, 0.0) for n, r in rows.items()], words[2], tick, TEXT_COLOR),
     ):
-        spread = [2 * std if np.isfinite(std) else 0.0 for _, _, std in entries]
+        known = [(name, value, std) for name, value, std in entries if value is not None]
+        spread = [2 * std if np.isfinite(std) else 0.0 for *_, std in known]
         bars = {"type": "data", "array": spread, "color": color, "thickness": 1.2} if any(spread) else None
-        if entries:
-            figure.add_scatter(
-                x=[value for _, value, _ in entries], y=[name for name, _, _ in entries], mode="markers", name=word,
-                marker=marker, error_x=bars,
-            )  # fmt: skip
-    marked = [(name, row.reference) for name, row in rows.items() if row.reference is not None]
-    if marked:
-        tick = {"symbol": "line-ns", "size": 16, "line": {"color": TEXT_COLOR, "width": 2.5}}
-        x, y = [mark for _, mark in marked], [name for name, _ in marked]
-        figure.add_scatter(x=x, y=y, mode="markers", name=words[2], marker=tick)
-    figure = apply_page_style(figure, 110 + 32 * len(names), axis, "")
-    numbers = [x for row in rows.values() for x in (row.before, row.after, row.reference) if x is not None]
+        x, y = [value for _, value, _ in known], [name for name, *_ in known]
+        numbers += x
+        if known:
+            figure.add_scatter(x=x, y=y, mode="markers", name=word, marker=marker, error_x=bars)
     if min(numbers) > 0 and max(numbers) > 30 * min(numbers):
         figure.update_xaxes(type="log", exponentformat="power", dtick="D2" if max(numbers) < 1e3 * min(numbers) else 1)
     else:
         # bars of what cannot be told would squeeze all others
         figure.update_xaxes(range=[min(0.0, 1.1 * min(numbers)), 1.15 * max([*numbers, 1e-12])])
-    figure.update_yaxes(autorange="reversed", categoryorder="array", categoryarray=names, automargin=True)
     return figure
 
 
@@ -179,12 +181,11 @@ class TimeMapRow:
 
     Attributes
     ----------
-    name, group : str
+    group : str
         Rows of one group stand together.
     values : ndarray, shape (J,)
         NaN where there is nothing to show.
     hover_texts : sequence of str, length J
-        Shown under the pointer.
     """
 
     name: str
@@ -203,39 +204,34 @@ def time_map_figure(edges: Array, rows: Sequence[TimeMapRow], axis: str) -> plot
     axis : str
         What the colors are.
     """
-    import plotly.graph_objects as go
-
     values = np.array([row.values for row in rows])
     seen = np.abs(values[np.isfinite(values)])
     # even to the eye from one standard deviation to thousands
     limit = max(3.0, float(np.quantile(seen, 0.98))) if seen.size else 3.0
     marks = [m for m in ((0, 1, 3, 10) if limit < 20 else (0, 10, 100, 1000, 10000)) if m <= limit]
     marks = sorted({-m for m in marks} | set(marks))
-    bar = {"thickness": 14, "x": 1.2, "tickvals": [float(_even(m)) for m in marks], "ticktext": [str(m) for m in marks]}
-    figure = go.Figure()
+    bar = {"thickness": 14, "x": 1.2, "tickvals": _even(marks).tolist(), "ticktext": [str(m) for m in marks]}
+    figure = page_figure(120 + max(17 * len(rows), 100), "time [s]", "")
     figure.add_heatmap(
-        x=edges.tolist(), y=list(range(len(rows))), z=[_listed(_even(row)) for row in values],
+        x=edges.tolist(), y=list(range(len(rows))),
+        z=[[v if np.isfinite(v) else None for v in row.tolist()] for row in _even(values)],
         text=[list(row.hover_texts) for row in rows], hoverinfo="text", zmin=-_even(limit), zmax=_even(limit),
         colorscale=DIVERGING_COLORSCALE, colorbar=bar,
     )  # fmt: skip
-    figure = apply_page_style(figure, 120 + max(17 * len(rows), 100), "time [s]", "")
     figure.update_layout(plot_bgcolor=GRID_COLOR, margin={"r": 150, "t": 40})
     figure.add_annotation(
         x=0, xref="paper", xanchor="left", y=1, yref="paper", yanchor="bottom", text=f"color: {axis}", showarrow=False
     )
     figure.update_xaxes(showgrid=False, range=[float(edges[0]), float(edges[-1])])
-    names = [row.name for row in rows]
     figure.update_yaxes(
-        showgrid=False, range=[len(rows) - 0.5, -0.5], tickvals=list(range(len(rows))), ticktext=names,
-        automargin=True, tickfont={"size": 11},
+        showgrid=False, range=[len(rows) - 0.5, -0.5], tickvals=list(range(len(rows))),
+        ticktext=[row.name for row in rows], automargin=True, tickfont={"size": 11},
     )  # fmt: skip
     groups = [row.group for row in rows]
     for group in dict.fromkeys(groups):
         own = [i for i, entry in enumerate(groups) if entry == group]
-        figure.add_annotation(
-            x=1.01, xref="paper", y=(own[0] + own[-1]) / 2, text=group, showarrow=False, xanchor="left",
-            font={"size": 11},
-        )  # fmt: skip
+        at = {"x": 1.01, "xref": "paper", "y": (own[0] + own[-1]) / 2, "xanchor": "left"}
+        figure.add_annotation(text=group, showarrow=False, font={"size": 11}, **at)
         if own[0]:
             figure.add_hline(y=own[0] - 0.5, line={"color": TEXT_COLOR, "width": 1})
     return figure
@@ -272,33 +268,26 @@ def candidate_ranking_figure(
     """
     from plotly.subplots import make_subplots
 
-    done = [
-        (entry.name, *entry.closure_interval_percent) for entry in entries if entry.closure_interval_percent is not None
-    ]
+    done = {entry.name: entry.closure_interval_percent for entry in entries if entry.closure_interval_percent}
     last = 2 if done else 1
     figure = make_subplots(rows=1, cols=last, shared_yaxes=True, horizontal_spacing=0.08)
+    figure = page_figure(100 + 28 * len(entries), "", "", base=figure)
     figure.add_bar(
         x=[entry.predicted_decrease for entry in entries], y=[entry.name for entry in entries], orientation="h",
         width=0.55, marker={"color": LINE_COLORS[1]}, showlegend=False, row=1, col=last,
     )  # fmt: skip
-    figure = apply_page_style(figure, 100 + 28 * len(entries), "", "")
     figure.update_xaxes(title_text=promised, rangemode="tozero", row=1, col=last)
     if done:
-        bars = {
-            "type": "data",
-            "symmetric": False,
-            "array": [high - value for _, value, _, high in done],
-            "arrayminus": [value - low for _, value, low, _ in done],
-        }
+        values, lows, highs = zip(*done.values(), strict=True)
         figure.add_scatter(
-            x=[value for _, value, _, _ in done], y=[name for name, *_ in done], mode="markers", showlegend=False,
-            marker={"color": LINE_COLORS[0], "size": 11}, error_x=bars, row=1, col=1,
+            x=values, y=list(done), mode="markers", showlegend=False, row=1, col=1,
+            marker={"color": LINE_COLORS[0], "size": 11}, error_x=asymmetric_bars(values, lows, highs),
         )  # fmt: skip
         # what makes a prediction worse can do so without end
-        left = min([0.0, *(max(low, _MIN_CLOSURE_PERCENT) for _, _, low, _ in done)]) - 6
+        left = min([0.0, *(max(low, _MIN_CLOSURE_PERCENT) for low in lows)]) - 6
         figure.update_xaxes(title_text=closed, range=[left, 108], row=1, col=1)
         figure.add_vline(x=0, line={"color": TEXT_COLOR, "width": 1}, row=1, col=1)
-        for name, value, _, _ in done:
+        for name, (value, *_) in done.items():
             if value < left:
                 text = f"◀ {value:.0f}"
                 figure.add_annotation(x=left, y=name, text=text, showarrow=False, xanchor="left", row=1, col=1)
@@ -306,33 +295,3 @@ def candidate_ranking_figure(
     figure.update_yaxes(type="category", categoryorder="array", categoryarray=names, automargin=True)
     figure.update_yaxes(range=[-0.6, len(names) - 0.4])
     return figure
-
-
-def matrix_figure(names: Sequence[str], values: Array, row: str, column: str) -> plotly.graph_objects.Figure:
-    """Parts of a whole, in per cent, for every pair of names.
-
-    Parameters
-    ----------
-    values : ndarray, shape (n, n)
-        Between 0 and 1.
-    row, column : str
-        What stands at the side and below.
-    """
-    import plotly.graph_objects as go
-
-    figure = go.Figure()
-    figure.add_heatmap(
-        x=list(names), y=list(names), z=values.tolist(), zmin=0.0, zmax=1.0, showscale=False, xgap=1, ygap=1,
-        colorscale=SEQUENTIAL_COLORSCALE,
-        text=[[f"{100 * v:.0f}" if v >= 0.095 else "" for v in line] for line in values], texttemplate="%{text}",
-        hovertemplate="%{y} explained by %{x}: %{z:.2f}<extra></extra>",
-    )  # fmt: skip
-    figure = apply_page_style(figure, 190 + 27 * len(names), column, row)
-    every = {"type": "category", "tickmode": "array", "tickvals": list(names), "title_standoff": 6}
-    figure.update_xaxes(showgrid=False, tickangle=-40, automargin=True, **every)
-    figure.update_yaxes(showgrid=False, autorange="reversed", automargin=True, **every)
-    return figure
-
-
-def _listed(values: Array) -> list[float | None]:
-    return [float(v) if np.isfinite(v) else None for v in values]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -47,13 +47,14 @@ DARK_MODE_COLORS: Mapping[str, str] = {
 """What every color becomes on a dark page; figures use no other colors."""
 _MAX_CURVE_POINTS = 1200  # points of a curve; beyond this the page grows and the eye sees no more
 _MAX_SINGLE_PRECISION_TIME = 1e4  # times from which single precision loses milliseconds [s]
-_ROW_HEIGHT, _LOW_ROW_HEIGHT, _ROW_GAP, _TOP_MARGIN, _BOTTOM_MARGIN = (
-    130,
-    76,
-    30,
-    64,
-    44,
-)  # heights in a figure of rows [px]
+_ROW_HEIGHT, _LOW_ROW_HEIGHT, _ROW_GAP = 130, 76, 30  # in a figure of rows [px]
+_TOP_MARGIN, _BOTTOM_MARGIN = 64, 44  # [px]
+_SHADE = {"fillcolor": GRID_COLOR, "opacity": 0.7, "line_width": 0, "layer": "below"}
+
+
+def line_color(i: int) -> str:
+    """Color of the line number i."""
+    return LINE_COLORS[i % len(LINE_COLORS)]
 
 
 def figure_html(figure: plotly.graph_objects.Figure) -> str:
@@ -66,21 +67,41 @@ def figure_html(figure: plotly.graph_objects.Figure) -> str:
     )
 
 
-def cost_history_figure(costs: Sequence[float], notes: Sequence[str]) -> plotly.graph_objects.Figure:
-    """Figure of the cost at every accepted point, one curve per intermediate horizon."""
+def page_figure(
+    height: int, x: str, y: str, log_y: bool = False, base: plotly.graph_objects.Figure | None = None
+) -> plotly.graph_objects.Figure:
+    """A figure, an empty one or `base`, with height [px], axis titles, colors and fonts of the page."""
     import plotly.graph_objects as go
 
-    figure = go.Figure()
-    begin = 0
-    stages = 0
-    for i in range(1, len(costs) + 1):
-        if i == len(costs) or notes[i] != notes[begin]:
-            line = {"color": LINE_COLORS[stages % len(LINE_COLORS)]}
-            name = notes[begin] or "whole recordings"
-            x = list(range(begin, i))
-            figure.add_scatter(x=x, y=list(costs[begin:i]), mode="lines+markers", name=name, line=line)
-            begin, stages = i, stages + 1
-    return apply_page_style(figure, 320, "accepted point", "cost", log_y=True)
+    figure = go.Figure() if base is None else base
+    figure.update_layout(
+        height=height,
+        margin={"l": 70, "r": 20, "t": 30, "b": 45},
+        paper_bgcolor="rgba(0,0,0,0)",
+        plot_bgcolor="rgba(0,0,0,0)",
+        font={"family": "system-ui, sans-serif", "size": 13, "color": TEXT_COLOR},
+        legend={"orientation": "h", "y": 1.0, "yanchor": "bottom", "x": 0},
+        hovermode="closest",
+        modebar={"bgcolor": "rgba(0,0,0,0)", "color": MEASURED_COLOR, "activecolor": LINE_COLORS[0]},
+    )
+    style = {"gridcolor": GRID_COLOR, "zeroline": False, "linecolor": GRID_COLOR}
+    figure.update_xaxes(title_text=x or None, **style)
+    figure.update_yaxes(title_text=y or None, **style)
+    if log_y:
+        figure.update_yaxes(type="log", exponentformat="power")
+    return figure
+
+
+def cost_history_figure(costs: Sequence[float], notes: Sequence[str]) -> plotly.graph_objects.Figure:
+    """Figure of the cost at every accepted point, one curve per intermediate horizon."""
+    figure = page_figure(320, "accepted point", "cost", log_y=True)
+    ends = [i for i in range(1, len(costs) + 1) if i == len(costs) or notes[i] != notes[i - 1]]
+    for stage, (begin, end) in enumerate(zip([0, *ends], ends, strict=False)):
+        figure.add_scatter(
+            x=list(range(begin, end)), y=list(costs[begin:end]), mode="lines+markers",
+            name=notes[begin] or "whole recordings", line={"color": line_color(stage)},
+        )  # fmt: skip
+    return figure
 
 
 @dataclass(frozen=True)
@@ -90,20 +111,19 @@ class TimePlot:
     Attributes
     ----------
     axis_title : str
-        Of its axis, with the unit.
-    t, measured : ndarray, shape (M,)
+        With the unit.
+    lines : mapping of name to (t, value)
+    t, measured : ndarray, shape (M,), optional
     band_half_height : float or None
         Half the height of what is shaded about zero.
     marked_intervals : sequence of (float, float)
         Stretches of time that are marked.
-    is_low_row : bool
-        Whether its row is a low one.
     """
 
     axis_title: str
-    t: Array
-    measured: Array
     lines: Mapping[str, tuple[Array, Array]]
+    t: Array = field(default_factory=lambda: np.zeros(0))
+    measured: Array = field(default_factory=lambda: np.zeros(0))
     band_half_height: float | None = None
     marked_intervals: Sequence[tuple[float, float]] = ()
     is_low_row: bool = False
@@ -135,8 +155,8 @@ def prediction_and_residual_plots(
         drawn[next(iter(lines))] = course
     left = {name: _broken_at_gaps(t[seen], factor * (values - measured)[seen]) for name, values in lines.items()}
     noise = float(np.median(std[seen])) if seen.any() else 0.0
-    above = TimePlot(f"{title} [{unit}]", t, measured, drawn)
-    return above, TimePlot(f"residual [{shown}]", t[:0], t[:0], left, 2 * factor * noise or None, is_low_row=True)
+    above = TimePlot(f"{title} [{unit}]", drawn, t, measured)
+    return above, TimePlot(f"residual [{shown}]", left, band_half_height=2 * factor * noise or None, is_low_row=True)
 
 
 def _broken_at_gaps(t: Array, values: Array) -> tuple[Array, Array]:
@@ -160,48 +180,39 @@ def time_plots_figure(
     """
     from plotly.subplots import make_subplots
 
-    names = list(dict.fromkeys(name for curve in curves for name in curve.lines))
-    colors = dict(lines or {name: LINE_COLORS[i % len(LINE_COLORS)] for i, name in enumerate(names)})
+    names = dict.fromkeys(name for curve in curves for name in curve.lines)
+    colors = lines or {name: line_color(i) for i, name in enumerate(names)}
     heights = [_LOW_ROW_HEIGHT if curve.is_low_row else _ROW_HEIGHT for curve in curves]
     inner = sum(heights) + _ROW_GAP * (len(curves) - 1)
     figure = make_subplots(
         rows=len(curves), cols=1, shared_xaxes=True, vertical_spacing=_ROW_GAP / inner, row_heights=heights
     )
+    figure = page_figure(inner + _TOP_MARGIN + _BOTTOM_MARGIN, "", "", base=figure)
     told: set[str] = set()
     for row, curve in enumerate(curves, start=1):
-        keep = _thinned(len(curve.t))
+        at = {"row": row, "col": 1}
         if len(curve.t):
             marker = {"color": dots, "size": 3 if len(curve.t) > 60 else 6}
             figure.add_scatter(
-                x=_times(curve.t[keep]), y=_short(curve.measured[keep]), mode="markers", marker=marker,
-                name="measured", showlegend="measured" not in told, legendgroup="measured", row=row, col=1,
+                **_thinned(curve.t, curve.measured), mode="markers", marker=marker,
+                name="measured", showlegend="measured" not in told, legendgroup="measured", **at,
             )  # fmt: skip
             told.add("measured")
         for name, (t, value) in curve.lines.items():
-            keep = _thinned(len(t))
             # what is measured seldom may have neighbours on neither side
             mode = "lines+markers" if curve.is_low_row and len(t) <= 60 else "lines"
             figure.add_scatter(
-                x=_times(t[keep]), y=_short(value[keep]), mode=mode, name=name, showlegend=name not in told,
-                legendgroup=name, line={"color": colors[name], "width": 1.5}, marker={"size": 4}, row=row, col=1,
+                **_thinned(t, value), mode=mode, name=name, showlegend=name not in told,
+                legendgroup=name, line={"color": colors[name], "width": 1.5}, marker={"size": 4}, **at,
             )  # fmt: skip
             told.add(name)
         if curve.band_half_height is not None:
-            shade = {"fillcolor": GRID_COLOR, "opacity": 0.7, "line_width": 0, "layer": "below"}
-            figure.add_hrect(y0=-curve.band_half_height, y1=curve.band_half_height, row=row, col=1, **shade)
+            figure.add_hrect(y0=-curve.band_half_height, y1=curve.band_half_height, **at, **_SHADE)
         for begin, end in curve.marked_intervals:
-            figure.add_vrect(
-                x0=begin, x1=end, row=row, col=1, fillcolor=AFTER_COLOR, opacity=0.2, line_width=0, layer="below"
-            )
-    figure = apply_page_style(figure, inner + _TOP_MARGIN + _BOTTOM_MARGIN, "", "")
-    figure.update_yaxes(nticks=4)
-    for row, curve in enumerate(curves, start=1):
+            figure.add_vrect(x0=begin, x1=end, **at, **_SHADE | {"fillcolor": AFTER_COLOR, "opacity": 0.2})
         # beside a low row a turned title has no room, and collides with that of the next one
-        top = figure.layout[f"yaxis{row if row > 1 else ''}"].domain[1]
-        figure.add_annotation(
-            text=curve.axis_title, x=0, xref="paper", xanchor="left", y=top, yref="paper", yanchor="bottom",
-            showarrow=False, font={"size": 12},
-        )  # fmt: skip
+        _add_axis_title(figure, curve, figure.layout[f"yaxis{row if row > 1 else ''}"].domain[1])
+    figure.update_yaxes(nticks=4)
     figure.update_layout(
         margin={"l": 54, "r": 12, "t": _TOP_MARGIN, "b": _BOTTOM_MARGIN},
         legend={"y": 1 + 22 / inner, "yanchor": "bottom"},
@@ -210,100 +221,90 @@ def time_plots_figure(
     return figure
 
 
+def _add_axis_title(figure: plotly.graph_objects.Figure, curve: TimePlot, y: float) -> None:
+    at = {"x": 0, "xref": "paper", "xanchor": "left", "y": y, "yref": "paper", "yanchor": "bottom"}
+    figure.add_annotation(text=curve.axis_title, showarrow=False, font={"size": 12}, **at)
+
+
 def lines_over_time_figure(curve: TimePlot) -> plotly.graph_objects.Figure:
     """Figure of the lines of one plot, each in its own color."""
-    import plotly.graph_objects as go
-
-    figure = go.Figure()
+    figure = page_figure(320 + 8 * len(curve.lines), "time [s]", "")
     for i, (name, (t, value)) in enumerate(curve.lines.items()):
-        keep, style = _thinned(len(t)), {"color": LINE_COLORS[i % len(LINE_COLORS)], "width": 1.5}
-        style |= {"dash": _LINE_DASHES[i // len(LINE_COLORS) % len(_LINE_DASHES)]}
-        figure.add_scatter(x=_times(t[keep]), y=_short(value[keep]), mode="lines", name=name, line=style)
+        dash = _LINE_DASHES[i // len(LINE_COLORS) % len(_LINE_DASHES)]
+        style = {"color": line_color(i), "width": 1.5, "dash": dash}
+        figure.add_scatter(**_thinned(t, value), mode="lines", name=name, line=style)
     if curve.band_half_height is not None:
-        shade = {"fillcolor": GRID_COLOR, "opacity": 0.7, "line_width": 0, "layer": "below"}
-        figure.add_hrect(y0=-curve.band_half_height, y1=curve.band_half_height, **shade)
+        figure.add_hrect(y0=-curve.band_half_height, y1=curve.band_half_height, **_SHADE)
     # the legend below takes as many rows as the screen is narrow
     below = {"orientation": "h", "y": -0.22, "yanchor": "top", "x": 0, "font": {"size": 11}}
-    figure = apply_page_style(figure, 320 + 8 * len(curve.lines), "time [s]", "")
     figure.update_layout(legend=below, margin={"t": 30})
-    figure.add_annotation(
-        text=curve.axis_title, x=0, xref="paper", xanchor="left", y=1, yref="paper", yanchor="bottom", showarrow=False,
-        font={"size": 12},
-    )  # fmt: skip
+    _add_axis_title(figure, curve, 1)
     return figure
 
 
 def residual_histogram_figure(residuals: Mapping[str, Array]) -> plotly.graph_objects.Figure:
     """Histogram figure of whitened residuals per sensor group, with the standard normal density."""
-    import plotly.graph_objects as go
-
+    figure = page_figure(340, "residual in standard deviations", "density")
     edge = max([4.0, *(float(np.quantile(np.abs(r), 0.995)) for r in residuals.values() if len(r))])
-    figure = go.Figure()
     for i, (name, values) in enumerate(residuals.items()):
         bins = np.linspace(-edge, edge, int(np.clip(2 * np.sqrt(len(values)), 8, 60)) + 1)
         density, _ = np.histogram(np.clip(values, -edge, edge), bins=bins, density=True)
-        line = {"color": LINE_COLORS[i % len(LINE_COLORS)], "shape": "hvh"}
-        middle = 0.5 * (bins[1:] + bins[:-1])
-        label = f"{name} ({len(values)} values)"
-        figure.add_scatter(x=middle.tolist(), y=density.tolist(), mode="lines", line=line, name=label)
+        figure.add_scatter(
+            x=(0.5 * (bins[1:] + bins[:-1])).tolist(), y=density.tolist(), mode="lines",
+            line={"color": line_color(i), "shape": "hvh"}, name=f"{name} ({len(values)} values)",
+        )  # fmt: skip
     even = np.linspace(-edge, edge, 121)
     normal = np.exp(-0.5 * even**2) / np.sqrt(2 * np.pi)
-    figure.add_scatter(
-        x=even.tolist(),
-        y=normal.tolist(),
-        mode="lines",
-        line={"color": TEXT_COLOR, "dash": "dot"},
-        name="standard normal",
-    )
-    return apply_page_style(figure, 340, "residual in standard deviations", "density")
+    line = {"color": TEXT_COLOR, "dash": "dot"}
+    figure.add_scatter(x=even.tolist(), y=normal.tolist(), mode="lines", line=line, name="standard normal")
+    return figure
 
 
 def cost_over_time_figure(costs: Mapping[str, tuple[Sequence[float], Sequence[float]]]) -> plotly.graph_objects.Figure:
     """Figure of each method's relative excess cost over wall time, from (seconds, cost)."""
-    import plotly.graph_objects as go
-
-    figure = go.Figure()
+    figure = page_figure(340, "wall time [s]", "cost over its lowest, less one", log_y=True)
     for i, (name, (seconds, cost)) in enumerate(costs.items()):
         known = [(s, c) for s, c in zip(seconds, cost, strict=True) if np.isfinite(c)]
         if known:
-            least = min(c for _, c in known)
             figure.add_scatter(
-                x=[s for s, _ in known], y=[max(c / max(least, 1e-300) - 1.0, 1e-9) for _, c in known],
-                mode="lines+markers", name=name, line={"color": LINE_COLORS[i % len(LINE_COLORS)]},
+                x=[s for s, _ in known], y=relative_excess([c for _, c in known]),
+                mode="lines+markers", name=name, line={"color": line_color(i)},
             )  # fmt: skip
-    return apply_page_style(figure, 340, "wall time [s]", "cost over its lowest, less one", log_y=True)
+    return figure
+
+
+def relative_excess(costs: Sequence[float]) -> list[float]:
+    """Costs over the lowest of them, less one; at least 1e-9."""
+    least = max(min(costs), 1e-300)
+    return [max(cost / least - 1.0, 1e-9) for cost in costs]
+
+
+def asymmetric_bars(values: Sequence[float], low: Sequence[float], high: Sequence[float]) -> dict[str, Any]:
+    """Error bars of values from `low` to `high`."""
+    above, below = np.maximum(np.subtract(high, values), 0.0), np.maximum(np.subtract(values, low), 0.0)
+    return {"type": "data", "symmetric": False, "array": above.tolist(), "arrayminus": below.tolist()}
 
 
 def rate_intervals_figure(
-    curves: Mapping[str, Mapping[float, Mapping[str, float]]],
-    x: str,
-    y: str,
-    log_x: bool = False,
-    diagonal: bool = False,
+    curves: Mapping[str, Mapping[float, Mapping[str, float]]], x: str, y: str, is_calibration: bool
 ) -> plotly.graph_objects.Figure:
-    """Figure of rates between 0 and 1 with intervals; each entry has `rate`, `low` and `high`."""
-    import plotly.graph_objects as go
+    """Figure of rates between 0 and 1 with intervals; each entry has `rate`, `low` and `high`.
 
-    figure = go.Figure()
-    if diagonal:
+    A calibration has its diagonal, all others a logarithmic axis.
+    """
+    figure = page_figure(340, x, y)
+    if is_calibration:
         line = {"color": MEASURED_COLOR, "dash": "dot"}
         figure.add_scatter(x=[0, 1], y=[0, 1], mode="lines", line=line, showlegend=False, hoverinfo="skip")
-    for i, (name, known) in enumerate(curves.items()):
-        own = list(known.values())
-        bars = {
-            "type": "data",
-            "symmetric": False,
-            "array": [max(entry["high"] - entry["rate"], 0.0) for entry in own],
-            "arrayminus": [max(entry["rate"] - entry["low"], 0.0) for entry in own],
-        }
-        figure.add_scatter(
-            x=list(known), y=[entry["rate"] for entry in own], mode="lines+markers", name=name, error_y=bars,
-            line={"color": LINE_COLORS[i % len(LINE_COLORS)]},
-        )  # fmt: skip
-    figure = apply_page_style(figure, 340, x, y)
-    figure.update_yaxes(range=[-0.03, 1.03])
-    if log_x:
+    else:
         figure.update_xaxes(type="log")
+    for i, (name, known) in enumerate(curves.items()):
+        rates, low, high = ([entry[key] for entry in known.values()] for key in ("rate", "low", "high"))
+        figure.add_scatter(
+            x=list(known), y=rates, mode="lines+markers", name=name, error_y=asymmetric_bars(rates, low, high),
+            line={"color": line_color(i)},
+        )  # fmt: skip
+    figure.update_yaxes(range=[-0.03, 1.03])
     return figure
 
 
@@ -311,53 +312,19 @@ def profile_likelihood_figure(
     curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], level: float
 ) -> plotly.graph_objects.Figure:
     """Profile-likelihood figure: increase of chi2 over the parameter's value relative to the estimate."""
-    import plotly.graph_objects as go
-
-    figure = go.Figure()
+    figure = page_figure(380, "value over best value", "chi2 above the best")
     for i, (name, (ratio, delta)) in enumerate(curves.items()):
-        line = {"color": LINE_COLORS[i % len(LINE_COLORS)], "dash": "solid" if i < len(LINE_COLORS) else "dash"}
+        line = {"color": line_color(i), "dash": "solid" if i < len(LINE_COLORS) else "dash"}
         figure.add_scatter(x=list(ratio), y=list(delta), mode="lines+markers", name=name, line=line)
     figure.add_hline(y=level, line={"color": TEXT_COLOR, "dash": "dot"}, annotation_text="95 %")
-    figure = apply_page_style(figure, 380, "value over best value", "chi2 above the best")
     figure.update_xaxes(type="log", range=[-1.0, 1.0])
     figure.update_yaxes(range=[-0.2, 2.5 * level])
     return figure
 
 
-def _thinned(count: int) -> NDArray[np.int64]:
-    if count <= _MAX_CURVE_POINTS:
-        return np.arange(count)
-    return np.unique(np.linspace(0, count - 1, _MAX_CURVE_POINTS).astype(np.int64))
-
-
-def _short(values: Array) -> NDArray[np.float32]:
-    """Single precision, which the eye cannot tell from double and which takes half the room in a page."""
-    return np.asarray(values, np.float32)
-
-
-def _times(t: Array) -> NDArray[np.floating]:
-    return np.asarray(t, float) if len(t) and np.nanmax(np.abs(t)) > _MAX_SINGLE_PRECISION_TIME else _short(t)
-
-
-def apply_page_style(
-    figure: plotly.graph_objects.Figure, height: int, x: str, y: str, log_y: bool = False
-) -> plotly.graph_objects.Figure:
-    """The given figure after setting height, axis titles, colors and fonts of the page."""
-    layout: dict[str, Any] = {
-        "height": height,
-        "margin": {"l": 70, "r": 20, "t": 30, "b": 45},
-        "paper_bgcolor": "rgba(0,0,0,0)",
-        "plot_bgcolor": "rgba(0,0,0,0)",
-        "font": {"family": "system-ui, sans-serif", "size": 13, "color": TEXT_COLOR},
-        "legend": {"orientation": "h", "y": 1.0, "yanchor": "bottom", "x": 0},
-        "hovermode": "closest",
-        "modebar": {"bgcolor": "rgba(0,0,0,0)", "color": MEASURED_COLOR, "activecolor": LINE_COLORS[0]},
-    }
-    figure.update_layout(**layout)
-    figure.update_xaxes(title_text=x or None, gridcolor=GRID_COLOR, zeroline=False, linecolor=GRID_COLOR)
-    figure.update_yaxes(gridcolor=GRID_COLOR, zeroline=False, linecolor=GRID_COLOR)
-    if y:
-        figure.update_yaxes(title_text=y)
-    if log_y:
-        figure.update_yaxes(type="log", exponentformat="power")
-    return figure
+def _thinned(t: Array, values: Array) -> dict[str, NDArray[np.floating]]:
+    """At most `_MAX_CURVE_POINTS` of a curve, in single precision, which takes half the room in a page."""
+    count = len(t)
+    keep = np.unique(np.linspace(0, count - 1, min(count, _MAX_CURVE_POINTS)).astype(np.int64))
+    is_late = count and np.nanmax(np.abs(t[keep])) > _MAX_SINGLE_PRECISION_TIME
+    return {"x": np.asarray(t[keep], float if is_late else np.float32), "y": np.asarray(values[keep], np.float32)}

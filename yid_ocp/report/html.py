@@ -11,7 +11,7 @@ from importlib import util
 from pathlib import Path
 
 from yid_ocp.files import write_text
-from yid_ocp.report.figures import DARK_MODE_COLORS
+from yid_ocp.report.figures import DARK_MODE_COLORS, figure_html
 from yid_ocp.report.sections import REPORT_SECTIONS, ReportData, render_sections
 from yid_ocp.report.terminal import CodeBlock, SummaryStatement, SummaryTable
 from yid_ocp.solvers.fit_messages import VERDICT_WORDS
@@ -51,16 +51,21 @@ def write_report(path: Path, findings: ReportData) -> bool:
     environment = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters |= {"number": _format_number, "listed": _column_classes, "verdict": _VERDICTS.get}
-    environment.tests |= {
-        "statement": lambda block: isinstance(block, SummaryStatement),
-        "table": lambda block: isinstance(block, SummaryTable),
-        "command": lambda block: isinstance(block, CodeBlock),
+    environment.filters |= {
+        "number": _format_number,
+        "listed": _column_classes,
+        "verdict": _VERDICTS.get,
+        "drawn": figure_html,
     }
-    sections = render_sections(findings, environment)
-    shared = _shared(path)
+    blocks = {"statement": SummaryStatement, "table": SummaryTable, "command": CodeBlock}
+    environment.tests |= {name: lambda block, kind=kind: isinstance(block, kind) for name, kind in blocks.items()}
+    shared = _shared_script(path)
     page = environment.get_template("page.html").render(
-        findings=findings, sections=sections, dark=DARK_MODE_COLORS, shared=shared, packed="" if shared else _packed()
+        findings=findings,
+        sections=render_sections(findings, environment),
+        dark=DARK_MODE_COLORS,
+        shared=shared,
+        packed="" if shared else _packed_script(),
     )
     write_text(path, page)
     return True
@@ -89,14 +94,14 @@ def _script_name() -> str:
     return f"plotly-{plotly.offline.get_plotlyjs_version()}.min.js"
 
 
-def _shared(path: Path) -> str:
+def _shared_script(path: Path) -> str:
     """Where a page finds a script that it shares, relative to itself; empty where there is none."""
     folders = [path.parent, *path.parent.parents][: _SHARED_SCRIPT_LEVELS + 1]
     found = next((folder / _script_name() for folder in folders if (folder / _script_name()).is_file()), None)
     return "" if found is None else Path(os.path.relpath(found, path.parent)).as_posix()
 
 
-def _packed() -> str:
+def _packed_script() -> str:
     """Plotly's script as text that the page unpacks: a third of its size."""
     import plotly.offline
 
@@ -111,12 +116,10 @@ def _format_number(value: object, digits: int = 4) -> str:
 
 
 def _column_classes(table: SummaryTable) -> list[str]:
-    """CSS class of every column (`_format_number`, `long` or `text`); empty for columns without an entry."""
-    head, *body = table.rows
-    columns = [[row[i] for row in body] for i in range(len(head))]
+    """CSS class of every column (`number`, `long` or `text`); empty for columns without an entry."""
     kinds: list[str] = []
-    for cells in columns:
-        numbers, longest = all(map(_NUMBER.match, cells)), max(map(len, cells), default=0)
-        named = any(cells) or head[len(kinds)]
-        kinds.append("" if not named else "number" if numbers else "long" if longest > _WRAP_LENGTH else "text")
+    for head, *cells in zip(*table.rows, strict=True):
+        wide = max(map(len, cells), default=0) > _WRAP_LENGTH
+        kind = "number" if all(map(_NUMBER.match, cells)) else "long" if wide else "text"
+        kinds.append(kind if head or any(cells) else "")
     return kinds

@@ -12,11 +12,14 @@ import numpy as np
 from yid_ocp.analysis.compare import MethodComparison
 from yid_ocp.analysis.sparsity_patterns import NamedRange, SparsityPattern
 from yid_ocp.errors import OutputError
-from yid_ocp.report.figures import LINE_COLORS
+from yid_ocp.report.figures import LINE_COLORS, asymmetric_bars, relative_excess
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+CALIBRATION_LABELS = {"intervals": "intervals of effects' parameters", "p_values": "p-values of clean recordings"}
+"""Kinds of the calibration of a blind validation."""
 
 
 def draw_convergence(path: Path, comparison: MethodComparison) -> None:
@@ -33,18 +36,15 @@ def draw_convergence(path: Path, comparison: MethodComparison) -> None:
     by_iteration, by_time = figure.subplots(1, 2, sharey=True)
     for run in comparison.method_results:
         history = [entry for entry in run.solution.history if np.isfinite(entry.cost) and not entry.note]
-        if not history:
-            continue
-        least = min(entry.cost for entry in history)
-        relative = [max(entry.cost / max(least, 1e-300) - 1.0, 1e-9) for entry in history]
-        by_iteration.plot(range(len(history)), relative, marker=".", label=run.method)
-        by_time.plot([entry.seconds for entry in history], relative, marker=".", label=run.method)
+        if history:
+            relative = relative_excess([entry.cost for entry in history])
+            by_iteration.plot(range(len(history)), relative, marker=".", label=run.method)
+            by_time.plot([entry.seconds for entry in history], relative, marker=".", label=run.method)
     for axes, label in ((by_iteration, "iteration"), (by_time, "wall time [s]")):
         if axes.get_xlim()[1] > 2.0:  # below that it is linear all over, and has no ticks of its own
             axes.set_xscale("symlog", linthresh=1.0)
-        axes.set_yscale("log")
+        axes.set(yscale="log", xlabel=label)
         axes.set_xlim(left=0.0)
-        axes.set_xlabel(label)
         axes.grid(alpha=0.3)
     by_iteration.set_ylabel("cost over its lowest value, less one")
     by_iteration.legend()
@@ -73,15 +73,9 @@ def draw_blind_results(folder: Path, result: Mapping[str, Any]) -> None:
     )
     for key, label, shift in lines:
         known = {float(size): own[key] for size, own in result["detection_intervals"].items()}
-        _rates(axes, [shift * size for size in known], list(known.values()), label)
-    axes.set_xscale("log")
-    axes.set_xlabel("size over the detectable size")
-    axes.set_ylabel("part of the cases")
-    axes.set_ylim(-0.03, 1.03)
-    axes.grid(alpha=0.3)
-    if result["detection"]:
-        axes.legend(loc="lower right")
-    _save(figure, folder / "detection.png")
+        _draw_rates(axes, [shift * size for size in known], list(known.values()), label)
+    axes.set(xscale="log", xlabel="size over the detectable size", ylabel="part of the cases", ylim=(-0.03, 1.03))
+    _save_rates(figure, folder / "detection.png", "lower right")
 
     shown = result["confusion"]
     rows, columns = shown["true"], shown["said"]
@@ -92,40 +86,42 @@ def draw_blind_results(folder: Path, result: Mapping[str, Any]) -> None:
     if rows:
         axes.imshow(parts, cmap="Blues", vmin=0.0, vmax=1.0)
     for i, j in zip(*np.nonzero(counts), strict=True):
-        colour = "white" if parts[i, j] > 0.5 else "black"
-        axes.text(j, i, f"{counts[i, j]:.0f}", ha="center", va="center", fontsize=8, color=colour)
+        color = "white" if parts[i, j] > 0.5 else "black"
+        axes.text(j, i, f"{counts[i, j]:.0f}", ha="center", va="center", fontsize=8, color=color)
     axes.set_xticks(range(len(columns)), columns, rotation=90)
     axes.set_yticks(range(len(rows)), rows)
-    axes.set_xlabel("said first")
-    axes.set_ylabel("true")
+    axes.set(xlabel="said first", ylabel="true")
     _save(figure, folder / "confusion.png")
 
     figure = Figure(figsize=(5.0, 4.6), layout="constrained")
     axes = figure.subplots()
     axes.plot([0, 1], [0, 1], color="grey", linewidth=1)
-    words = {"intervals": "intervals of effects' parameters", "p_values": "p-values of clean recordings"}
-    for key, label in words.items():
+    for key, label in CALIBRATION_LABELS.items():
         entries = [entry for entry in result["calibration"][key] if entry["of"]]
-        _rates(axes, [entry["level"] for entry in entries], entries, label)
-    axes.set_xlabel("promised")
-    axes.set_ylabel("kept")
-    axes.grid(alpha=0.3)
-    if any(entry["of"] for key in words for entry in result["calibration"][key]):
-        axes.legend(loc="upper left")
-    _save(figure, folder / "calibration.png")
+        _draw_rates(axes, [entry["level"] for entry in entries], entries, label)
+    axes.set(xlabel="promised", ylabel="kept")
+    _save_rates(figure, folder / "calibration.png", "upper left")
 
 
-def _rates(axes: Any, places: list[float], rates: list[Mapping[str, Any]], label: str) -> None:
+def _draw_rates(axes: Axes, places: list[float], rates: list[Mapping[str, Any]], label: str) -> None:
     if rates:
-        values = np.array([own["rate"] for own in rates])
-        low, high = (np.array([own[key] for own in rates]) for key in ("low", "high"))
-        spread = [np.maximum(values - low, 0.0), np.maximum(high - values, 0.0)]
+        values, low, high = ([own[key] for own in rates] for key in ("rate", "low", "high"))
+        bars = asymmetric_bars(values, low, high)
+        spread = [bars["arrayminus"], bars["array"]]
         axes.errorbar(places, values, yerr=spread, marker="o", capsize=3, label=label)
 
 
-def _save(figure: Figure, path: Path) -> None:
+def _save_rates(figure: Figure, path: Path, legend_place: str) -> None:
+    (axes,) = figure.axes
+    axes.grid(alpha=0.3)
+    if axes.get_legend_handles_labels()[1]:
+        axes.legend(loc=legend_place)
+    _save(figure, path)
+
+
+def _save(figure: Figure, path: Path, dpi: int = 120) -> None:
     try:
-        figure.savefig(path, dpi=120)
+        figure.savefig(path, dpi=dpi, format="png")
     except OSError as error:
         raise OutputError(f"the picture cannot be written: {error.strerror}", where=str(path)) from error
 
@@ -139,8 +135,6 @@ def draw_sparsity_patterns(path: Path, layout: Sequence[Sequence[SparsityPattern
 
     Parameters
     ----------
-    path : Path
-        PNG to write.
     layout : sequence of sequence of SparsityPattern
         What stands beside what; patterns without rows or columns are left out.
 
@@ -149,70 +143,55 @@ def draw_sparsity_patterns(path: Path, layout: Sequence[Sequence[SparsityPattern
     OutputError
         The file cannot be written.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     rows = [kept for row in layout if (kept := [entry for entry in row if entry.nonzero_mask.size])]
     heights = [max(_inches(entry.nonzero_mask.shape[0]) for entry in row) for row in rows]
-    widths = [sum(_inches(entry.nonzero_mask.shape[1]) for entry in row) for row in rows]
-    figure = Figure(figsize=(max(widths, default=4.0), max(sum(heights), 1.0)), layout="constrained")
-    FigureCanvasAgg(figure)
+    widths = [[_inches(entry.nonzero_mask.shape[1]) for entry in row] for row in rows]
+    size = (max(map(sum, widths), default=4.0), max(sum(heights), 1.0))
+    figure = Figure(figsize=size, layout="constrained")
     parts = figure.subfigures(max(len(rows), 1), 1, squeeze=False, height_ratios=heights or None)[:, 0]
-    for part, row in zip(parts, rows, strict=False):
-        shares = [_inches(entry.nonzero_mask.shape[1]) for entry in row]
+    for part, row, shares in zip(parts, rows, widths, strict=False):
         for axes, entry in zip(part.subplots(1, len(row), squeeze=False, width_ratios=shares)[0], row, strict=True):
-            _draw(axes, entry)
-    try:
-        figure.savefig(path, dpi=110, format="png")
-    except OSError as error:
-        raise OutputError(f"the picture cannot be written: {error.strerror}", where=str(path)) from error
+            _draw_pattern(axes, entry)
+    _save(figure, path, dpi=110)
 
 
 def _inches(count: int) -> float:
     return 2.2 + float(np.clip(0.085 * count, 1.2, 11.0))
 
 
-def _draw(axes: Axes, pattern: SparsityPattern) -> None:
+def _draw_pattern(axes: Axes, pattern: SparsityPattern) -> None:
     from matplotlib.colors import ListedColormap
 
-    shown = pattern.nonzero_mask.astype(int)
-    height, width = pattern.nonzero_mask.shape
-    words = [f"{height} x {width}, {pattern.n_nonzeros} entries can differ from zero"]
-    if pattern.marked_mask is not None:
-        shown[pattern.nonzero_mask & pattern.marked_mask] = 2
-        words.append(f"dark: {np.count_nonzero(shown == 2)} {pattern.mark_label}")
-    colors = ListedColormap(
-        ["white", _STRUCTURAL_COLOR if pattern.marked_mask is not None else _NONZERO_COLOR, _NONZERO_COLOR]
-    )
+    shown, marked = pattern.nonzero_mask.astype(int), pattern.marked_mask
+    height, width = shown.shape
+    title = f"{pattern.title}\n{height} x {width}, {pattern.n_nonzeros} entries can differ from zero"
+    if marked is not None:
+        shown[pattern.nonzero_mask & marked] = 2
+        title += f"\ndark: {np.count_nonzero(shown == 2)} {pattern.mark_label}"
+    colors = ListedColormap(["white", _NONZERO_COLOR if marked is None else _STRUCTURAL_COLOR, _NONZERO_COLOR])
     axes.imshow(shown, cmap=colors, vmin=0, vmax=2, interpolation="none", aspect="equal", origin="upper")
-    for edges, line in ((pattern.row_blocks, axes.axhline), (pattern.column_blocks, axes.axvline)):
-        for span in edges[1:]:
-            if span.stop > span.start:
-                line(span.start - 0.5, color=_BLOCK_EDGE_COLOR, linewidth=0.7)
-    axes.set_title(f"{pattern.title}\n" + "\n".join(words), fontsize=9)
-    for axis, labels, spans in (
-        (axes.xaxis, pattern.column_labels, pattern.column_blocks),
-        (axes.yaxis, pattern.row_labels, pattern.row_blocks),
+    axes.set_title(title, fontsize=9)
+    for axis, labels, blocks, line, add_axis, place in (
+        (axes.xaxis, pattern.column_labels, pattern.column_blocks, axes.axvline, axes.secondary_xaxis, "top"),
+        (axes.yaxis, pattern.row_labels, pattern.row_blocks, axes.axhline, axes.secondary_yaxis, "right"),
     ):
-        places, names = _ticks(labels, spans)
+        for block in blocks[1:]:
+            if block.stop > block.start:
+                line(block.start - 0.5, color=_BLOCK_EDGE_COLOR, linewidth=0.7)
+        places, names = _ticks(labels, blocks)
         axis.set_ticks(places, labels=names, fontsize=5.5)
-    axes.tick_params(axis="x", labelrotation=90, length=2)
-    axes.tick_params(axis="y", length=2)
-    named = [span for span in pattern.column_blocks if span.stop > span.start]
-    # names of narrow neighbours would be written over each other
-    narrow = len(named) > 8 or any(span.stop - span.start < 0.03 * pattern.nonzero_mask.shape[1] for span in named)
-    top = axes.secondary_xaxis("top")
-    top.set_xticks([_middle(s) for s in named], labels=[s.name for s in named], fontsize=8, color=_BLOCK_EDGE_COLOR)
-    named = [span for span in pattern.row_blocks if span.stop > span.start]
-    right = axes.secondary_yaxis("right")
-    right.set_yticks([_middle(s) for s in named], labels=[s.name for s in named], fontsize=8, color=_BLOCK_EDGE_COLOR)
-    for side in (top, right):
-        side.tick_params(length=0)
-    top.tick_params(axis="x", labelrotation=90 if narrow else 0)
-
-
-def _middle(span: NamedRange) -> float:
-    return 0.5 * (span.start + span.stop - 1)
+        axis.set_tick_params(length=2)
+        named = [block for block in blocks if block.stop > block.start]
+        middles = [0.5 * (block.start + block.stop - 1) for block in named]
+        opposite = add_axis(place)
+        side = opposite.xaxis if place == "top" else opposite.yaxis
+        side.set_ticks(middles, labels=[block.name for block in named], fontsize=8, color=_BLOCK_EDGE_COLOR)
+        # names of narrow neighbours would be written over each other
+        narrow = len(named) > 8 or any(block.stop - block.start < 0.03 * width for block in named)
+        side.set_tick_params(length=0, labelrotation=90 if narrow and place == "top" else 0)
+    axes.tick_params(axis="x", labelrotation=90)
 
 
 def _ticks(labels: Sequence[str], spans: Sequence[NamedRange]) -> tuple[list[float], list[str]]:

@@ -2,44 +2,21 @@
 
 from __future__ import annotations
 
-import shlex
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from pathlib import Path
+import statistics
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from yid_ocp.report.model_summaries import check_summary, inspect_summary, simulate_summary
-from yid_ocp.report.run_comparison_tables import (
-    MAX_TERMINAL_PARAMETERS,
-    baseline_rows,
-    batch_rows,
-    batch_sentences,
-    counterfactual_rows,
-    history_rows,
-    history_sentences,
-    parameter_spread_rows,
-    run_consistency_rows,
-)
+from yid_ocp.report.diagnosis_summaries import batch_summary, blind_summary, diagnose_summary, history_summary
 from yid_ocp.report.tables import (
-    baseline_legend,
-    blind_sentences,
-    blind_tables,
+    MAX_SINGLE_CHANNELS,
+    bounds_text,
+    channel_unit,
     discretisation_sentences,
     display_scale_and_unit,
-    effect_distance_rows,
-    event_rows,
     format_error_and_unit,
-    gap_error_rows,
-    gap_location_rows,
-    held_out_error_rows,
-    information_sentences,
     issue_blocks,
-    median_error_rows,
-    parameter_information_rows,
-    plan_joint_rows,
-    plan_sentences,
+    misfit_blocks,
     torque_offset_rows,
-    worse_than_baseline_sentences,
 )
 from yid_ocp.report.terminal import (
     CodeBlock,
@@ -52,37 +29,36 @@ from yid_ocp.report.terminal import (
 )
 from yid_ocp.solvers.fit_messages import VERDICT_WORDS, fit_message, interval_text, parameter_text, percent_text
 
+_BASELINE_DESCRIPTIONS = {
+    "stays": "points stay where they were first seen",
+    "zero": "an effort of zero",
+    "moves_with_clamps": "points move with the mean of the clamps",
+    "linear_carry": "the clamps' motion carried along the cable",
+}
+_MAX_DIRECTIONS = 8
+_MAX_INSPECTED_PARAMETERS = 12  # free parameters of which `inspect` speaks; result.json has all
+
+
+# -- solve and compare ------------------------------------------------------------------------------------------------
+
 
 def solve_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
     """Summary blocks of a `yid-solve/1` result."""
     free = {name: entry for name, entry in result["parameters"].items() if entry["free"]}
     failed = result["status"] == "failed"
-    blocks: list[SummaryBlock] = [] if failed else _misfit(result["fit"])
+    blocks: list[SummaryBlock] = [] if failed else misfit_blocks(result["fit"])
     blocks += [*issue_blocks(result), SummaryTable(_estimate_rows(free, failed), "Parameters", is_key_table=True)]
     rows: TableRows = [("channel", "error (rms)", "unit", "samples")]
     rows += [(c, *format_error_and_unit(e["rmse"], e["unit"]), str(e["n"])) for c, e in result["residuals"].items()]
     blocks += nonempty_tables(SummaryTable(rows, "Errors where it was fitted"))
-    for entry in result["held_out"]:
-        if "message" in entry:
-            text = f"held-out recording {entry['recording']} could not be predicted: {entry['message']}"
-            blocks.append(SummaryStatement(text))
-    rows = [("held-out recording", "channel", "error (rms)", "unit", "without a model")]
-    predicted = held_out_error_rows(result)
-    for row in [*predicted, *median_error_rows(predicted)]:
-        error, unit = format_error_and_unit(row.rmse, row.unit)
-        without = ", ".join(
-            f"{format_error_and_unit(other, row.unit)[0]} ({name})" for name, other in row.baselines.items()
-        )
-        rows.append((row.recording, row.channel, error, unit, without))
-    blocks += nonempty_tables(SummaryTable(rows, "Errors on held-out recordings, never touched by the fit"))
-    blocks += make_statements([baseline_legend(predicted)])
+    blocks += _held_out_blocks(result)
     blocks += nonempty_tables(SummaryTable(torque_offset_rows(result), "How far the torques are off"))
     blocks += make_statements([*discretisation_sentences(result), *result.get("discretisation_notes", ())])
     if failed:
         said = "the values are the best point that was reached; nothing can be said about how sure they are"
         blocks.append(SummaryStatement(said, "verdict"))
     else:
-        blocks += _unsure(free)
+        blocks += make_statements(_found_and_lost(free), "verdict")
         if result["fit"]["explains"]:
             blocks.append(SummaryStatement(fit_message(result["fit"]["chi2_per_dof"], True), "conclusion"))
     blocks += make_statements([result.get("safeguard", "")])
@@ -93,37 +69,66 @@ def solve_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
 def _estimate_rows(free: Mapping[str, Mapping[str, Any]], failed: bool) -> TableRows:
     rows: TableRows = [("parameter", "value", "± std", "95 % interval", "unit", "verdict", "start", "bounds")]
     for name, entry in free.items():
-        known = not failed and entry["std"] is not None
-        std = f"{entry['std']:.2g}" if known and entry["verdict"] != "at_bound" else ""
+        known = not failed and entry["std"] is not None and entry["verdict"] != "at_bound"
+        std = f"{entry['std']:.2g}" if known else ""
         interval = "" if failed or entry["interval"] is None else interval_text(*entry["interval"])
         verdict = "" if failed else VERDICT_WORDS[entry["verdict"]]
-        low = "-inf" if entry["lower"] is None else f"{entry['lower']:.4g}"
-        high = "inf" if entry["upper"] is None else f"{entry['upper']:.4g}"
         own = (f"{entry['value']:.4g}", std, interval, entry["unit"], verdict, f"{entry['initial']:.4g}")
-        rows.append((name, *own, f"{low} to {high}"))
+        rows.append((name, *own, bounds_text(entry, 4)))
     return rows
 
 
-def _misfit(fit: Mapping[str, Any]) -> list[SummaryBlock]:
-    """What has to be said before anything else: a guess does better, or the model does not explain the recordings."""
-    said = worse_than_baseline_sentences(fit.get("worse_than_guess", ()))
-    return make_statements(
-        [*said, *([] if fit["explains"] else [fit_message(fit["chi2_per_dof"], False)])], "conclusion"
-    )
+def _held_out_blocks(result: Mapping[str, Any]) -> list[SummaryBlock]:
+    """Errors of each shown channel, in each recording and over three or more, with those of guesses without a model."""
+    units = {channel: entry["unit"] for channel, entry in result["residuals"].items()}
+    found: dict[str, list[tuple[str, float, dict[str, float]]]] = {}
+    rows: TableRows = [("held-out recording", "channel", "error (rms)", "unit", "without a model")]
+
+    def enter(recording: str, channel: str, rmse: float, guesses: Mapping[str, float]) -> None:
+        unit = channel_unit(units, channel)
+        without = (f"{format_error_and_unit(other, unit)[0]} ({name})" for name, other in guesses.items())
+        rows.append((recording, channel, *format_error_and_unit(rmse, unit), ", ".join(without)))
+
+    for entry in result["held_out"]:
+        for channel in _shown_channels(entry["rmse"]):
+            guesses = {name: errors[channel] for name, errors in entry["baselines"].items() if channel in errors}
+            own = (entry["recording"], entry["rmse"][channel], guesses)
+            found.setdefault(channel, []).append(own)
+            enter(own[0], channel, *own[1:])
+    for channel, own_errors in found.items():
+        if len(own_errors) > 2:
+            recordings, errors, guessed = zip(*own_errors, strict=True)
+            shared = [name for name in guessed[0] if all(name in each for each in guessed)]
+            medians = {name: statistics.median(each[name] for each in guessed) for name in shared}
+            enter(f"median of {len(recordings)}", channel, statistics.median(errors), medians)
+    named = dict.fromkeys(name for errors in found.values() for *_, guesses in errors for name in guesses)
+    legend = "; ".join(f"{name}, {_BASELINE_DESCRIPTIONS[name]}" for name in named if name in _BASELINE_DESCRIPTIONS)
+    lost = (entry for entry in result["held_out"] if "message" in entry)
+    return [
+        *make_statements(f"held-out recording {e['recording']} could not be predicted: {e['message']}" for e in lost),
+        *nonempty_tables(SummaryTable(rows, "Errors on held-out recordings, never touched by the fit")),
+        *make_statements([f"without a model: {legend}" if legend else ""]),
+    ]
 
 
-def _unsure(free: Mapping[str, Mapping[str, Any]]) -> list[SummaryBlock]:
-    """Sentences on the parameters that are found, and on those that are not."""
+def _shown_channels(errors: Mapping[str, float]) -> list[str]:
+    """Groups of many members without their members, groups of few as their members."""
+    hidden: set[str] = set()
+    for group in errors:
+        members = {channel for channel in errors if channel.startswith(f"{group}.")}
+        hidden |= members if len(members) > MAX_SINGLE_CHANNELS else {group} if members else set()
+    return [channel for channel in errors if channel not in hidden]
+
+
+def _found_and_lost(free: Mapping[str, Mapping[str, Any]]) -> list[str]:
     by = {v: [name for name, entry in free.items() if entry["verdict"] == v] for v in VERDICT_WORDS}
     found, weak, bound, lost = (by[v] for v in ("identifiable", "weak", "at_bound", "not_identifiable"))
-    said = (
-        [
+    said = []
+    if found:
+        said.append(
             f"{len(found)} of {len(free)} free parameters are found to within 10 % of their value or, near zero, of "
             f"their usual size: {', '.join(found)}"
-        ]
-        if found
-        else []
-    )
+        )
     if lost:
         said.append(f"{VERDICT_WORDS['not_identifiable']} from these recordings: {', '.join(lost)}")
     if weak:
@@ -132,71 +137,27 @@ def _unsure(free: Mapping[str, Mapping[str, Any]]) -> list[SummaryBlock]:
             said.append("`yid-ocp identifiability` gives intervals that need not be symmetric")
     if bound:
         said.append(f"the search ended at a bound of {', '.join(bound)}: what is beyond it was not tried")
-    return make_statements(said, "verdict")
-
-
-def plan_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
-    """Summary blocks of a `yid-plan/1` result."""
-    blocks: list[SummaryBlock] = [
-        SummaryTable(list(plan_joint_rows(result)), "What it asks of the joints", is_key_table=True)
-    ]
-    if result["goal"] == "information":
-        told = (
-            SummaryTable(list(parameter_information_rows(result)), "What it tells"),
-            SummaryTable(list(effect_distance_rows(result)), "Effects"),
-        )
-        blocks += nonempty_tables(*told)
-        said = information_sentences(result)
-    else:
-        said = plan_sentences(result)
-    ended = SummaryStatement(f"{result['status']}: {result['message']}", "conclusion")
-    return [*blocks, *make_statements(said, "verdict"), ended]
-
-
-def track_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
-    """Summary blocks of a `yid-track/1` result."""
-    truth = result["truth_errors"]
-    heads = ("error, median [mm]", "error, largest [mm]") if truth else ("", "")
-    rows: TableRows = [("point", "frames", "± std [mm]", *heads)]
-    for name, entry in result["points"].items():
-        cells = ["" if entry["std"] is None else f"{1e3 * entry['std']:.1f}"]
-        cells += [f"{1e3 * truth[name][key]:.1f}" if name in truth else "" for key in ("median", "largest")]
-        rows.append((name, str(entry["frames"]), *cells))
-    good = sum(not frame["reason"] for frame in result["frames"])
-    spent = 1e3 * result["fit_seconds"]
-    said = f"{good} of {len(result['frames'])} frames are good, the fit took {spent:.0f} ms each"
-    dropped = [f"dropped {number}: {reason}" for reason, number in result["dropped"].items()]
-    if result["refused"]:
-        said = result["refused"]
-    return [
-        *issue_blocks(result),
-        *([SummaryTable(rows, "Points", is_key_table=True)] if result["points"] else []),
-        SummaryStatement(said, "verdict"),
-        *make_statements([*dropped, result["camera"]["message"], *result["sizes"]["messages"]]),
-        *make_statements(
-            [*([result["root"]] if result["root"] else []), *(thing["text"] for thing in result["things"])]
-        ),
-    ]
+    return said
 
 
 def compare_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
     """Summary blocks of a `yid-compare/1` result."""
     methods: dict[str, Any] = result["methods"]
     judged, disturbed = result["judged"], result["disturbed"]
-    free = [name for name, entry in judged["parameters"].items() if entry["free"]]
     runs = methods | ({"all noise": judged} if disturbed else {})
     beside = [key for key in ("published", "truth") if result[key]]
     rows: TableRows = [("parameter", *runs, *beside, "verdict")]
-    for name in free:
-        cells = []
-        for entry in runs.values():
-            found = entry["parameters"][name]
-            # elsewhere a curvature tells nothing of how sure it is
-            ended = entry["status"] not in ("stalled", "failed")
-            known = (found["std"], found["interval"]) if ended else (None, None)
-            cells.append(parameter_text(found["value"], *known))
-        others = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
-        rows.append((name, *cells, *others, VERDICT_WORDS[judged["parameters"][name]["verdict"]]))
+    for name, own in judged["parameters"].items():
+        if own["free"]:
+            cells = []
+            for entry in runs.values():
+                found = entry["parameters"][name]
+                # elsewhere a curvature tells nothing of how sure it is
+                ended = entry["status"] not in ("stalled", "failed")
+                known = (found["std"], found["interval"]) if ended else (None, None)
+                cells.append(parameter_text(found["value"], *known))
+            others = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
+            rows.append((name, *cells, *others, VERDICT_WORDS[own["verdict"]]))
     said = [f"{n} did not converge: {e['message']}" for n, e in methods.items() if e["status"] != "converged"]
     said += [f"{name} differs: {sentence}" for name, entry in methods.items() for sentence in entry["disagreements"]]
     said += result["explained"]
@@ -205,13 +166,12 @@ def compare_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
             "the methods are compared by the sensors' noise alone; the column 'all noise' and the verdicts weigh the "
             "noise that drives the motion as well"
         )
-    said += result["published_explained"]
     return [
-        *_misfit(judged["fit"]),
+        *misfit_blocks(judged["fit"]),
         *issue_blocks(result),
         SummaryTable(rows, "Parameters by method", is_key_table=True),
         SummaryTable(_efforts(methods), "What it took"),
-        *make_statements(said),
+        *make_statements([*said, *result["published_explained"]]),
         *make_statements(_agreement(result), "conclusion"),
     ]
 
@@ -237,180 +197,313 @@ def _agreement(result: Mapping[str, Any]) -> list[str]:
 
 def _efforts(methods: Mapping[str, Mapping[str, Any]]) -> TableRows:
     entries = methods.values()
-    costs = [entry["whitened_cost"] for entry in entries]
-    rows: TableRows = [("", *methods)]
-    rows.append(("status", *(entry["status"] for entry in entries)))
-    rows.append(("cost (whitened)", *("failed" if cost is None else f"{cost:.6g}" for cost in costs)))
-    ratios = [entry["fit"]["chi2_per_dof"] for entry in entries]
-    rows.append(("chi2 per degree of freedom", *("unknown" if r is None else f"{r:.3g}" for r in ratios)))
+    costs = (entry["whitened_cost"] for entry in entries)
+    ratios = (entry["fit"]["chi2_per_dof"] for entry in entries)
+    rows: TableRows = [
+        ("", *methods),
+        ("status", *(entry["status"] for entry in entries)),
+        ("cost (whitened)", *("failed" if cost is None else f"{cost:.6g}" for cost in costs)),
+        ("chi2 per degree of freedom", *("unknown" if r is None else f"{r:.3g}" for r in ratios)),
+    ]
     units = {c: own["unit"] for entry in entries for c, own in entry["residuals"].items()}
     for channel in sorted({c for e in entries for h in e["held_out"] for c in h.get("rmse", {})}):
-        members = [unit for name, unit in units.items() if name == channel or name.startswith(f"{channel}.")]
-        unit = members[0] if members else ""
+        unit = channel_unit(units, channel)
         errors = [[h["rmse"][channel] for h in e["held_out"] if channel in h.get("rmse", {})] for e in entries]
         cells = (format_error_and_unit(sum(e) / len(e), unit)[0] if e else "failed" for e in errors)
-        rows.append(
-            (f"held out: {channel} [{display_scale_and_unit(unit)[1]}]" if unit else f"held out: {channel}", *cells)
-        )
-    rows.append(("iterations", *(str(entry["iterations"]) for entry in entries)))
-    rows.append(("evaluations", *(str(entry["evaluations"]) for entry in entries)))
-    rows.append(("wall time [s]", *(f"{entry['wall_seconds']:.2f}" for entry in entries)))
-    rows.append(("CPU time [s]", *(f"{entry['cpu_seconds']:.2f}" for entry in entries)))
-    rows.append(("peak memory [MiB]", *(f"{entry['peak_memory_mib']:.0f}" for entry in entries)))
+        rows.append((f"held out: {channel}" + (f" [{display_scale_and_unit(unit)[1]}]" if unit else ""), *cells))
+    for words, key, form in (
+        ("iterations", "iterations", "d"),
+        ("evaluations", "evaluations", "d"),
+        ("wall time [s]", "wall_seconds", ".2f"),
+        ("CPU time [s]", "cpu_seconds", ".2f"),
+        ("peak memory [MiB]", "peak_memory_mib", ".0f"),
+    ):
+        rows.append((words, *(f"{entry[key]:{form}}" for entry in entries)))
     return rows
+
+
+# -- identifiability and plan -----------------------------------------------------------------------------------------
 
 
 def identifiability_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
     """Summary blocks of a `yid-identifiability/1` result."""
-    if not result["parameters"]:
+    parameters: Mapping[str, Any] = result["parameters"]
+    if not parameters:
         text = f"{result['status']}: {result['message']}; there is no point at which to judge"
         return [SummaryStatement(text, "verdict")]
-    unsure = "± if start and grasps were unknown"
-    rows: TableRows = [
-        ("parameter", "value", "±", unsure, "± if all else were known", "95 % interval", "unit", "verdict")
-    ]
-    for name, entry in result["parameters"].items():
-        spread = (_percent(entry[key]) for key in ("std_relative", "std_relative_unknown", "std_alone"))
+    unsure = ("±", "± if start and grasps were unknown", "± if all else were known")
+    rows: TableRows = [("parameter", "value", *unsure, "95 % interval", "unit", "verdict")]
+    for name, entry in parameters.items():
+        spread = (_relative(entry[key]) for key in ("std_relative", "std_relative_unknown", "std_alone"))
         interval = "" if entry["interval"] is None else interval_text(*entry["interval"])
         rows.append((name, f"{entry['value']:.4g}", *spread, interval, entry["unit"], VERDICT_WORDS[entry["verdict"]]))
-    blocks: list[SummaryBlock] = [] if result["fit"] is None else _misfit(result["fit"])
+    blocks: list[SummaryBlock] = [] if result["fit"] is None else misfit_blocks(result["fit"])
     blocks += [*issue_blocks(result), SummaryTable(rows, "Parameters", is_key_table=True)]
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
-    if len(hidden) > 8:
-        hidden = [*hidden[:8], f"and {len(hidden) - 8} more directions, in result.json"]
-    blocks += make_statements(hidden)
+    said = hidden[:_MAX_DIRECTIONS]
+    if len(hidden) > _MAX_DIRECTIONS:
+        said.append(f"and {len(hidden) - _MAX_DIRECTIONS} more directions, in result.json")
     if not result["profiles"]:
-        blocks.append(
-            SummaryStatement(
-                "intervals of parameters are worked out on request: --intervals NAME,NAME or --intervals all"
-            )
-        )
-    blocks += make_statements(
-        f"{name}: {note}" for name, entry in result["profiles"].items() for note in entry["notes"]
-    )
-    blocks += [] if result["what_if"] is None else _what_if(result["what_if"], list(result["parameters"]))
-    found = [name for name, entry in result["parameters"].items() if entry["verdict"] == "identifiable"]
-    said = f"{len(found) or 'none'} of {len(result['parameters'])} parameters can be found from these recordings"
-    blocks.append(SummaryStatement(said, "conclusion"))
-    lost = [name for name in found if result["parameters"][name]["verdict_unknown"] != "identifiable"]
-    if lost:
-        blocks.append(SummaryStatement(f"not found if start and grasps were unknown: {', '.join(lost)}", "verdict"))
-    return blocks
+        said.append("intervals of parameters are worked out on request: --intervals NAME,NAME or --intervals all")
+    said += [f"{name}: {note}" for name, entry in result["profiles"].items() for note in entry["notes"]]
+    blocks += [*make_statements(said), *_what_if(result["what_if"], len(parameters))]
+    found = [name for name, entry in parameters.items() if entry["verdict"] == "identifiable"]
+    text = f"{len(found) or 'none'} of {len(parameters)} parameters can be found from these recordings"
+    lost = [name for name in found if parameters[name]["verdict_unknown"] != "identifiable"]
+    unknown = f"not found if start and grasps were unknown: {', '.join(lost)}" if lost else ""
+    return [*blocks, SummaryStatement(text, "conclusion"), *make_statements([unknown], "verdict")]
 
 
-def _what_if(asked: Mapping[str, Any], names: Sequence[str]) -> list[SummaryBlock]:
+def _what_if(asked: Mapping[str, Any] | None, count: int) -> list[SummaryBlock]:
+    if asked is None:
+        return []
     rows: TableRows = [("change", "found", "gain [nat]", "")]
     for entry in [asked["base"], *asked["singles"], *asked["smallest"]]:
         gain = "" if entry["gain"] is None else f"{entry['gain']:.1f}"
-        rows.append((entry["words"], f"{entry['identifiable']} of {len(names)}", gain, entry["message"]))
+        rows.append((entry["words"], f"{entry['identifiable']} of {count}", gain, entry["message"]))
     said = "with no set of up to three changes can all of them be found"
     if asked["smallest"]:
         said = f"fewest changes with which all of them can be found: {asked['smallest'][0]['words']}"
     return [SummaryTable(rows, "What another experiment would tell"), SummaryStatement(said, "verdict")]
 
 
-def _percent(value: float | None) -> str:
+def _relative(value: float | None) -> str:
     return "unknown" if value is None else f"{percent_text(value)} %" if value < 10 else f"{value:.2g} times"
 
 
-def _known(name: str, quantity: Mapping[str, Any], refitted: bool) -> str:
-    unit = "" if quantity["unit"] == "1" else f" {quantity['unit']}"
-    if quantity["std"] is None:
-        return f"{name} unknown" if refitted else f"{name} = {quantity['value']:.3g}{unit}"
-    return f"{name} = {quantity['value']:.3g} ± {quantity['std']:.2g}{unit}"
+def plan_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
+    """Summary blocks of a `yid-plan/1` result."""
+
+    def percent(share: float | None) -> str:
+        return "" if share is None else f"{100 * share:.0f} %"
+
+    rows: TableRows = [("joint", "travel [rad or m]", "largest velocity, of its limit", "largest effort, of its limit")]
+    for name, own in result["joints"].items():
+        travel = own["travel"] if own["travel"] > 1e-9 else 0.0
+        rows.append((name, f"{travel:.3g}", percent(own["velocity"]), percent(own["effort"])))
+    ended = SummaryStatement(f"{result['status']}: {result['message']}", "conclusion")
+    kind = _information_blocks if result["goal"] == "information" else _place_blocks
+    return [SummaryTable(rows, "What it asks of the joints", is_key_table=True), *kind(result), ended]
 
 
-_MAX_CANDIDATES = 15  # candidates that are listed; result.json has them all
+def _place_blocks(result: Mapping[str, Any]) -> list[SummaryBlock]:
+    if result["error"] is None or result["swing"] is None:
+        text = "the motion at which the search ended cannot be simulated to its end; nothing is known of where it leads"
+        return [SummaryStatement(text, "verdict")]
+    place = ", ".join(f"{x:.4g}" for x in result["place"])
+    said = [
+        f"in {result['duration']:g} s '{result['point']}' goes to ({place}) m; in the {result['settle']:g} s after "
+        f"that it is at most {1e3 * result['error']:.3g} mm from there, and no point of the object is faster than "
+        f"{1e3 * result['swing']:.3g} mm/s, as the model has it"
+    ]
+    if result["off_path"] is not None:
+        said.append(f"on the way it is at most {1e3 * result['off_path']:.3g} mm from where its path is at that time")
+    if result["std"] is not None:
+        std = ", ".join(f"{1e3 * x:.2g}" for x in result["std"])
+        said.append(f"what is not known of the parameters makes that uncertain by ({std}) mm, one standard deviation")
+        lost = result["from"]["uncertainty_unknown"]
+        said += [f"not counted, as their uncertainty is not known: {', '.join(lost)}"] if lost else []
+    elif result["from"]["run"] is None:
+        said.append("the parameters are those of the configuration, so nothing is said of how uncertain that is")
+    return make_statements(said, "verdict")
 
 
-def diagnose_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
-    """Summary blocks of a `yid-diagnosis/2` result."""
-    blocks = [*issue_blocks(result), SummaryStatement(result["summary"], "verdict")]
-    blocks += nonempty_tables(SummaryTable(gap_error_rows(result), "Errors on held-out recordings", is_key_table=True))
-    rows: TableRows = [("candidate", "parameters", "closure alone", "score", "p")]
-    for entry in result["which"][:_MAX_CANDIDATES]:
-        known = {name: q for name, q in entry["parameters"].items() if q["value"] is not None}
-        values = ", ".join(_known(name, quantity, entry["closure"] is not None) for name, quantity in known.items())
-        closed = "" if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
-        label = f"{entry['kind']}@{entry['location']}"
-        p = f"{entry['p_value']:.2g}" if entry["p_value"] > 1e-12 else "< 1e-12"
-        rows.append((label, values, closed, f"{entry['score']:.3g}", p))
-    blocks += nonempty_tables(
-        SummaryTable(gap_location_rows(result), "Where"),
-        SummaryTable(event_rows(result), "Events"),
-        SummaryTable(rows, "Candidates"),
+def _information_blocks(result: Mapping[str, Any]) -> list[SummaryBlock]:
+    rows: TableRows = [("parameter", "from the recordings", "from this motion", "from both", "verdict of this motion")]
+    for name, own in result["parameters"].items():
+        stds = (own[f"std_relative_{when}"] for when in ("before", "after", "together"))
+        cells = ("unknown" if std is None else f"± {100 * std:.2g} %" for std in stds)
+        rows.append((name, *cells, VERDICT_WORDS[own["verdict"]]))
+    effects: TableRows = [("effect", "beside what could be", "apart in the recordings", "apart in this motion")]
+    for own in result["distances"]:
+        apart = (f"{own[when]:.3g} std" for when in ("before", "after"))
+        effects.append((own["effect"], own["explained_by"], *apart))
+    starts, best = result["starts"], result["starts"][result["best"]]
+    gains = sorted((s["judged"] for s in starts if s["judged"] is not None), reverse=True)
+    others = f"; {len(starts)} starts ended at {gains[0]:.3g} to {gains[-1]:.3g} nat" if len(gains) > 1 else ""
+    reached = [f"{what} of {', '.join(names)}" for what, names in result["limits_reached"].items()]
+    unseen = tuple(f"{name} is" for name in result["unseen"])
+    said = [
+        f"start {result['best'] + 1} of {len(starts)} tells most: {best['value'] - best['first']:.3g} nat more than "
+        f"the random motion from which it came{others}",
+        f"what limits it: {'; '.join(reached)}" if reached else "it reaches no limit",
+        *(f"{name}: no motion, no sensor sees it to first order; {what}" for name, what in result["unseen"].items()),
+        *(f"left open by this motion: {words}" for words in result["open"] if not words.startswith(unseen)),
+    ]
+    if result["from"]["run"] is None:
+        said.append("the parameters are those of the configuration; where the true ones differ, so does what is told")
+    tables = nonempty_tables(SummaryTable(rows, "What it tells"), SummaryTable(effects, "Effects"))
+    return [*tables, *make_statements(said, "verdict")]
+
+
+# -- models, recordings and frames ------------------------------------------------------------------------------------
+
+
+def check_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
+    """Summary blocks of a `yid-check/1` result."""
+    model = result["model"]
+    size = (
+        f"model: {model['n']} coordinates, {model['m']} constraints, {model['nu']} driven, {model['nc']} prescribed, "
+        f"{model['ntheta']} parameters"
     )
-    left = len(result["which"]) - _MAX_CANDIDATES
-    said = [f"{left} more candidates are in result.json"] if left > 0 else []
-    if result.get("unseen"):
-        said.append(f"these recordings could not show: {', '.join(result['unseen'])}")
-    blocks += make_statements(said)
-    blocks += nonempty_tables(
-        SummaryTable(baseline_rows(result), "Since the baseline"),
-        SummaryTable(counterfactual_rows(result), "Without the effects, and with them"),
-        SummaryTable(torque_offset_rows(result), "How far the torques are off"),
-    )
-    if result.get("doubts"):
-        blocks.append(SummaryStatement("what is in doubt about the recordings may be what the verdict is about"))
-    if result["next_plan"] is not None:
-        blocks.append(SummaryStatement("to separate what looks alike, plan a motion:"))
-        blocks.append(CodeBlock(_planning_command(result["next_plan"])))
-    ended = f"verdict: {result['verdict'].replace('_', ' ')} ({sum(result['seconds'].values()):.1f} s)"
-    return [*blocks, SummaryStatement(ended)]
-
-
-def history_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
-    """Summary blocks of a `yid-history/1` result."""
+    rows: TableRows = [("recording", "use", "group", "samples", "rate", "longest gap", "noise (median)")]
+    rests = []
+    for entry in result["recordings"]:
+        use = "held out" if entry["role"] == "held_out" else "estimate"
+        for name, group in entry["groups"].items():
+            taken = (str(group["samples"]), f"{group['rate']:.4g} Hz", f"{group['longest_gap']:.3g} s")
+            rows.append((entry["recording"], use, name, *taken, _noise_words(entry["noise"], name)))
+        rest = entry.get("equilibrium")
+        said = [] if rest is None else ["equilibrium found" if rest["found"] else f"no equilibrium: {rest['message']}"]
+        gaps = [f"{name} {1e3 * gap:.2g} mm" for name, gap in entry["grasp_gaps"].items()]
+        said += ["grasp gaps " + ", ".join(gaps)] if gaps else []
+        rests.append(f"{entry['recording']}: {'; '.join(said)}" if said else "")
+    moved = discretisation_sentences(result)
+    ended = "nothing stands in the way of a run"
+    if result.get("doubts") or result["warnings"]:
+        ended = f"a run is possible; see {'what is in doubt' if result.get('doubts') else 'the warnings'}"
     return [
-        SummaryTable(history_rows(result), "Parameters", is_key_table=True),
-        SummaryTable(run_consistency_rows(result), "Runs"),
-        *make_statements(history_sentences(result), "verdict"),
+        *make_statements([size, *(entry["words"] for entry in result["mechanics"].values() if entry["agrees"])]),
+        *nonempty_tables(SummaryTable(rows, "Recordings", is_key_table=True)),
+        *make_statements(rests),
+        *_convergence(result["convergence"]),
+        *make_statements(["if the initial values were the estimates:", *moved] if moved else []),
+        *issue_blocks(result),
+        *make_statements((f"warning: {text}" for text in result["warnings"]), "verdict"),
+        SummaryStatement(ended, "conclusion"),
     ]
 
 
-def _planning_command(section: Mapping[str, Any]) -> str:
-    words = ["yid-ocp", "plan", str(Path(section["parameter_run"]) / "config.yaml")]
-    for key, value in section.items():
-        text = f"[{', '.join(value)}]" if isinstance(value, list) else str(value)
-        words += ["--set", f"plan.{key}={text}"]
-    return shlex.join(words)
+def _noise_words(noise: Mapping[str, Any], name: str) -> str:
+    """Noise of a recorded group, or of its channels; with the expected offset and whether it was estimated."""
+    said = []
+    for part in ("", ".effort", ".position"):
+        known = noise.get(f"{name}{part}")
+        if known is not None and known["std"] is not None:
+            words = " ".join(format_error_and_unit(known["std"], known["unit"]))
+            words += f", offset {known['bias_std']:.3g}" if known.get("bias_std") else ""
+            said.append(words + (" (estimated)" if known.get("estimated") else ""))
+    return "; ".join(said)
 
 
-def blind_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
-    """Summary blocks of a `yid-blind/1` result."""
-    score, *others, cases = (SummaryTable(rows, title) for title, rows in blind_tables(result).items())
-    said = make_statements(blind_sentences(result), "verdict")
-    return [replace(score, is_key_table=True), *nonempty_tables(*others, replace(cases, is_page_only=True)), *said]
+def _convergence(convergence: Mapping[str, Any]) -> list[SummaryBlock]:
+    blocks: list[SummaryBlock] = []
+    for key, head in (("links", "links"), ("time_step", "time step [s]")):
+        rows: TableRows = [(head, "lowest frequencies [Hz]", "")]
+        for row in convergence[key]:
+            remark = row["message"] or (f"{row['growing']} modes grow" if row["growing"] else "")
+            rows.append((f"{row['value']:g}", ", ".join(f"{f:.4g}" for f in row["hertz"]), remark))
+        blocks += nonempty_tables(SummaryTable(rows, f"Frequencies by {head}"))
+    return [*blocks, *make_statements([f"frequencies: {convergence['message']}" if convergence["message"] else ""])]
 
 
-def batch_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
-    """Summary blocks of a `yid-batch/1` result."""
-    links = {entry["name"]: f"{entry['folder']}/report.html" for entry in result["runs"] if entry["folder"]}
-    blocks: list[SummaryBlock] = [
-        SummaryTable(batch_rows(result, MAX_TERMINAL_PARAMETERS), "Runs", is_key_table=True, links=links)
+def inspect_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
+    """Summary blocks of a `yid-inspect/1` result."""
+    roles = [entry["role"] for entry in result["variables"]]
+    counts = [f"{roles.count(role)} {role}" for role in ("driven", "prescribed", "free") if role in roles]
+    equations, linear = result["equations"], result["linearisation"]
+    size = f"coordinates: {len(roles)} ({', '.join(counts)}), constraints: {equations['sizes']['m']}"
+    parameters: TableRows = [("parameter", "value", "unit", "bounds", "")]
+    for name, entry in result["parameters"].items():
+        free = "free" if entry["free"] else ""
+        parameters.append((name, f"{entry['value']:.6g}", entry["unit"], bounds_text(entry, 6), free))
+    functions: TableRows = [("function", "operations", "nonzeros")]
+    functions += [(f["name"], str(f["operations"]), str(f["nonzeros"])) for f in equations["functions"]]
+    blocks = [
+        SummaryStatement(size, "verdict"),
+        SummaryTable(parameters, "Parameters", is_key_table=True),
+        SummaryTable(functions, "Functions"),
     ]
-    blocks += nonempty_tables(SummaryTable(parameter_spread_rows(result), "Parameters over all runs"))
-    whole = batch_rows(result)
-    if len(whole[0]) > len(batch_rows(result, MAX_TERMINAL_PARAMETERS)[0]):
-        blocks.append(SummaryTable(whole, "Runs with all parameters", is_page_only=True, links=links))
-    if result["history"] is not None:
-        blocks.append(SummaryTable(run_consistency_rows(result["history"]), "Each run against the others"))
-    return [*blocks, *make_statements(batch_sentences(result), "verdict")]
+    for kind, head in (("rows", "equations of a step"), ("columns", "variables of a step")):
+        rows: TableRows = [(head, "", "first", "")]
+        rows += [(b["name"], str(len(b["names"])), b["names"][0], b["meaning"]) for b in result["blocks"][kind]]
+        blocks.append(SummaryTable(rows, head.capitalize()))
+    said = f"linearised at {linear['at']}: spectral radius of A {linear['spectral_radius']:.6g}"
+    rows = [("matrix", "norm", "largest difference from finite differences")]
+    for name, norm in linear["norms"].items():
+        rows.append((name, f"{norm:.4g}", f"{linear['finite_difference_errors'][name]:.1e}"))
+    blocks += [*_patterns(result), SummaryStatement(said, "verdict"), SummaryTable(rows, "Linearised step")]
+    blocks += make_statements(["matrices: linearisation.h5", *_dependence(result)])
+    for entry in result["entries"]:
+        value = "unknown" if entry["value"] is None else f"{entry['value']:.6g}"
+        blocks += [CodeBlock("\n".join(entry["lines"]))]
+        blocks += [] if entry["zero"] else [CodeBlock(f"which is {value} at {linear['at']}")]
+    return [*blocks, *make_statements([f"exported: {', '.join(result['exported'])}" if result["exported"] else ""])]
+
+
+def _dependence(result: Mapping[str, Any]) -> list[str]:
+    free = [entry for name, entry in result["dependence"].items() if result["parameters"][name]["free"]]
+    shown, left = free[:_MAX_INSPECTED_PARAMETERS], len(free) - _MAX_INSPECTED_PARAMETERS
+    asked = (result["dependence"][name] for name in result["asked"])
+    said = [entry["words"] for entry in [*shown, *(entry for entry in asked if entry not in shown)]]
+    said += [f"and {left} more free parameters, in result.json"] if left > 0 else []
+    if any(entry["seen"] is None for entry in free):
+        said.append("what sensors see to first order is looked for about a rest, which this is not")
+    return [*said, "where every parameter enters: result.json; all equations and names: equations.txt"]
+
+
+def _patterns(result: Mapping[str, Any]) -> list[SummaryBlock]:
+    rows: TableRows = [("matrix (sparsity.png)", "size", "can differ from zero", "do at this point")]
+    for name, entry in result["patterns"].items():
+        height, width = entry["shape"]
+        if height and width:
+            rows.append((name, f"{height} x {width}", str(entry["nonzeros"]), str(entry["at_point"])))
+    nlp, said = result["nlp"], ""
+    if nlp is not None:
+        size = nlp["variables"] + nlp["constraints"]
+        said = (
+            f"KKT matrix of the NLP with a node at every step (kkt.png): {size} x {size}, {nlp['variables']} "
+            f"variables, {nlp['constraints']} constraints; {nlp['jacobian_nonzeros']} entries of the constraints' "
+            f"Jacobian and {nlp['hessian_nonzeros']} of their Hessian can differ from zero"
+        ) + (f"; without {', '.join(nlp['left_out'])}" if nlp["left_out"] else "")
+    return [SummaryTable(rows, "Patterns"), *make_statements([said])]
+
+
+def simulate_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
+    """Summary blocks of a `yid-simulate/1` result."""
+    if result["status"] == "failed":
+        return [SummaryStatement(f"failed: {result['message']}", "verdict")]
+    rows: TableRows = [("group", "samples")]
+    rows += [(name, str(entry["samples"])) for name, entry in result["groups"].items()]
+    said = SummaryStatement(f"{result['duration']:g} s in recording.h5", "verdict")
+    return [SummaryTable(rows, "Recorded", is_key_table=True), said]
+
+
+def track_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
+    """Summary blocks of a `yid-track/1` result."""
+    truth = result["truth_errors"]
+    heads = ("error, median [mm]", "error, largest [mm]") if truth else ("", "")
+    rows: TableRows = [("point", "frames", "± std [mm]", *heads)]
+    for name, entry in result["points"].items():
+        cells = ["" if entry["std"] is None else f"{1e3 * entry['std']:.1f}"]
+        cells += [f"{1e3 * truth[name][key]:.1f}" if name in truth else "" for key in ("median", "largest")]
+        rows.append((name, str(entry["frames"]), *cells))
+    good = sum(not frame["reason"] for frame in result["frames"])
+    spent = 1e3 * result["fit_seconds"]
+    said = result["refused"] or f"{good} of {len(result['frames'])} frames are good, the fit took {spent:.0f} ms each"
+    dropped = (f"dropped {number}: {reason}" for reason, number in result["dropped"].items())
+    notes = [*dropped, result["camera"]["message"], *result["sizes"]["messages"], result["root"]]
+    return [
+        *issue_blocks(result),
+        *nonempty_tables(SummaryTable(rows, "Points", is_key_table=True)),
+        SummaryStatement(said, "verdict"),
+        *make_statements([*notes, *(thing["text"] for thing in result["things"])]),
+    ]
 
 
 def export_summary(manifest: Mapping[str, Any]) -> list[SummaryBlock]:
     """Summary blocks of a `yid-export/1` manifest."""
-    said = [*manifest["effects"].items(), *((f"grasp {name}", own) for name, own in manifest.get("grasps", {}).items())]
+    rows: TableRows = [("of the model", "in the file", "how, or why not")]
     effects = {name.rpartition(".")[0] for name in manifest["parameters"] if "@" in name}
-    said += [
-        (name, entry)
+    changed = {
+        name: entry
         for name, entry in manifest["parameters"].items()
         if entry["status"] != "native" and name.rpartition(".")[0] not in effects
-    ]
-    rows: TableRows = [("of the model", "in the file", "how, or why not")]
-    rows += [(name, entry["status"], entry["how"]) for name, entry in said]
-    blocks = nonempty_tables(SummaryTable(rows))
-    gate = manifest["gate"]
+    }
+    grasps = {f"grasp {name}": entry for name, entry in manifest.get("grasps", {}).items()}
+    for name, entry in (manifest["effects"] | grasps | changed).items():
+        rows.append((name, entry["status"], entry["how"]))
+    blocks, gate = nonempty_tables(SummaryTable(rows)), manifest["gate"]
     if gate is None:
         return blocks
     if gate["status"] != "done":
@@ -422,11 +515,8 @@ def export_summary(manifest: Mapping[str, Any]) -> list[SummaryBlock]:
     blocks.append(SummaryTable(rows))
     if gate["fall"] is not None:
         held = "held-out recordings" if gate["which"] == "held_out" else "the recordings that were fitted"
-        blocks.append(
-            SummaryStatement(
-                f"replayed in MuJoCo, the error beyond noise on {held} falls by {100 * gate['fall']:.3g} %"
-            )
-        )
+        text = f"replayed in MuJoCo, the error beyond noise on {held} falls by {100 * gate['fall']:.3g} %"
+        blocks.append(SummaryStatement(text))
     return blocks
 
 

@@ -13,17 +13,16 @@ from yid_ocp.data.readers import FileContents
 
 TableRows = list[Sequence[str]]
 _StatementKind = Literal["note", "verdict", "conclusion"]
+_PROSE_WIDTH, _NOTE_WIDTH, _MAX_UNWRAPPED_NOTE = 100, 118, 200
+"""Widths to which sentences and notes are wrapped, and characters of a note that is left in one line."""
 
 
 @dataclass(frozen=True)
 class SummaryStatement:
     """One sentence of a summary, with its importance.
 
-    Attributes
-    ----------
-    kind : "note", "verdict" or "conclusion"
-        Verdicts are what the command was asked for, a conclusion is what they come to: a page begins with conclusions,
-        then has the verdicts.
+    Verdicts are what the command was asked for, a conclusion is what they come to: a page begins with conclusions, then
+    has the verdicts.
     """
 
     text: str
@@ -37,11 +36,11 @@ class SummaryTable:
     Attributes
     ----------
     title : str
-        Stands above it on a page.
+        For pages.
     is_key_table : bool
         Whether it stands beside the verdict on a page.
     is_page_only : bool
-        Whether it is for pages alone.
+        Whether it is left out on a terminal.
     links : mapping of str to str
         Pages that cells of the first column lead to.
     """
@@ -63,9 +62,9 @@ class CodeBlock:
 SummaryBlock = SummaryStatement | SummaryTable | CodeBlock
 
 
-def make_statements(texts: Iterable[str], weight: _StatementKind = "note") -> list[SummaryBlock]:
+def make_statements(texts: Iterable[str], kind: _StatementKind = "note") -> list[SummaryBlock]:
     """Statements made from all non-empty texts."""
-    return [SummaryStatement(text, weight) for text in texts if text]
+    return [SummaryStatement(text, kind) for text in texts if text]
 
 
 def nonempty_tables(*tables: SummaryTable) -> list[SummaryBlock]:
@@ -73,22 +72,14 @@ def nonempty_tables(*tables: SummaryTable) -> list[SummaryBlock]:
     return [table for table in tables if len(table.rows) > 1]
 
 
-_PROSE_WIDTH, _NOTE_WIDTH, _MAX_UNWRAPPED_NOTE = 100, 118, 200
-"""Widths to which sentences and notes are wrapped, and characters of a note that is left in one line."""
-
-
 def terminal_lines(blocks: Sequence[SummaryBlock]) -> list[str]:
     """Text lines of summary blocks: aligned tables, wrapped sentences and notes."""
     result: list[str] = []
     for block in blocks:
         if isinstance(block, SummaryTable):
-            if block.is_page_only:
-                continue
-            result += (
-                ["", *aligned_table_lines(block.rows), ""]
-                if result and result[-1]
-                else [*aligned_table_lines(block.rows), ""]
-            )
+            if not block.is_page_only:
+                space = [""] if result and result[-1] else []
+                result += [*space, *aligned_table_lines(block.rows), ""]
         elif isinstance(block, CodeBlock):
             result += [f"  {line}" for line in block.text.splitlines()]
         elif block.text.endswith("."):
@@ -105,8 +96,7 @@ def recording_summary_lines(recording: Recording) -> list[str]:
     rows: TableRows = [("group", "samples", "names")]
     for group in recording.groups:
         rows.append((getattr(group, "name", "joints"), str(len(group.t)), ", ".join(group.names)))
-    notes = ["", *(f"note: {note}" for note in recording.notes)] if recording.notes else []
-    return [*aligned_table_lines(rows), "", f"{recording.duration:g} s", *notes]
+    return [*aligned_table_lines(rows), "", f"{recording.duration:g} s", *_note_lines(recording.notes)]
 
 
 def file_contents_lines(contents: FileContents) -> list[str]:
@@ -115,15 +105,16 @@ def file_contents_lines(contents: FileContents) -> list[str]:
     for source in contents.sources:
         rate = f"{source.mean_rate:.4g}" if math.isfinite(source.mean_rate) else ""
         rows.append((source.name, source.kind, str(source.n_samples), rate, source.imported_as or "-", source.note))
-    return [
-        *aligned_table_lines(rows),
-        *(["", *(f"note: {note}" for note in contents.notes)] if contents.notes else []),
-    ]
+    return [*aligned_table_lines(rows), *_note_lines(contents.notes)]
+
+
+def _note_lines(notes: Sequence[str]) -> list[str]:
+    return ["", *(f"note: {note}" for note in notes)] if notes else []
 
 
 def aligned_table_lines(rows: TableRows) -> list[str]:
     """Rows as aligned lines, the first one as head; columns without an entry are left out."""
-    kept = [i for i in range(len(rows[0])) if any(row[i] for row in rows)]
-    widths = [max(len(row[i]) for row in rows) for i in kept]
-    told = ["  ".join(row[i].ljust(width) for i, width in zip(kept, widths, strict=True)).rstrip() for row in rows]
-    return [told[0], "  ".join("-" * width for width in widths), *told[1:]]
+    columns = [column for column in zip(*rows, strict=True) if any(column)]
+    widths = [max(map(len, column)) for column in columns]
+    lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in zip(*columns, strict=True)]
+    return [lines[0], "  ".join("-" * width for width in widths), *lines[1:]]

@@ -37,11 +37,11 @@ from yid_ocp.errors import ConfigError, OutputError, YidError
 from yid_ocp.files import to_json_types, write_json, write_text
 from yid_ocp.parallel import LOCAL_WORKERS, Task, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.progress import NULL_PROGRESS, Progress
+from yid_ocp.report.diagnosis_summaries import blind_markdown
 from yid_ocp.report.html import write_report
 from yid_ocp.report.png_figures import draw_blind_results
 from yid_ocp.report.sections import ReportData
 from yid_ocp.report.summaries import blind_summary
-from yid_ocp.report.tables import blind_markdown
 from yid_ocp.version import installed_versions, package_source_hash
 from yid_ocp.workflow.blind_experiments import (
     EXPERIMENT_VARIATIONS,

@@ -79,7 +79,10 @@ REPORT_SECTIONS: Registry[ReportSection] = Registry("report section")
 
 
 def register_section(name: str, order: int, title: str) -> Callable[[_PrepareContext], _PrepareContext]:
-    """Decorator that registers a function as the section `name`, rendered by `NAME.html`, lower orders first."""
+    """Decorator that registers a function as the section `name`, lower orders first.
+
+    What it returns is rendered by `NAME.html`, or by `figures.html` (pairs of title and figure) where there is none.
+    """
 
     def enter(prepare: _PrepareContext) -> _PrepareContext:
         REPORT_SECTIONS.register(name)(ReportSection(order, title, prepare))
@@ -107,6 +110,6 @@ def render_sections(findings: ReportData, environment: jinja2.Environment) -> li
     for name in sorted(REPORT_SECTIONS, key=lambda entry: REPORT_SECTIONS[entry].order):
         context = REPORT_SECTIONS[name].prepare_context(findings)
         if context is not None:
-            html = environment.get_template(f"{name}.html").render(context)
+            html = environment.select_template([f"{name}.html", "figures.html"]).render(context)
             result.append({"name": name, "title": REPORT_SECTIONS[name].title, "html": html})
     return result

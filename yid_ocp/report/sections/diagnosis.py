@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from yid_ocp.diagnosis import DiagnosisResult
 from yid_ocp.diagnosis.diagnosis_messages import overspeed_messages
@@ -22,45 +22,44 @@ from yid_ocp.report.figures import TimePlot
 from yid_ocp.report.sections.base import ReportData, register_section
 from yid_ocp.report.tables import display_scale_and_unit, format_error_and_unit
 
-Array = NDArray[np.float64]
-
 _MAX_CANDIDATES = 15  # candidates; the rest is in result.json
 _MAX_MAPS = 3  # recordings of which a map is drawn; trajectories.h5 has them all
 _MAX_CHANNELS = 3  # held-out channels
 _NOMINAL_LABEL, _EXTENDED_LABEL = "nominal model", "with the effects"
 _MODEL_COLORS = {_NOMINAL_LABEL: figures.BEFORE_COLOR, _EXTENDED_LABEL: figures.AFTER_COLOR}
-_HeldOutPrediction = tuple[Episode, EpisodePrediction, EpisodePrediction]
+_EVENT_COLORS = {
+    "event": figures.AFTER_COLOR,
+    "allowed": figures.MEASURED_COLOR,
+    "allowed, other side": figures.MEASURED_COLOR,
+}
 
 
 @dataclass(frozen=True)
 class _Chapter:
-    """A titled part of the section: sentences and figures."""
+    """A titled part of the section: sentences and titled figures."""
 
     title: str
     sentences: Sequence[str]
-    pictures: Sequence[tuple[str, str]] = ()
+    figures: Sequence[tuple[str, Any]] = ()
 
 
 @register_section("diagnosis", 5, "The gap and what makes it")
-def diagnosis_context(findings: ReportData) -> Mapping[str, Any] | None:
-    """Template context: chapters on gap, events, locations, candidates, curves and changed parameters."""
+def _diagnosis(findings: ReportData) -> Mapping[str, Any] | None:
+    """Chapters on gap, events, locations, candidates, curves and changed parameters."""
     result = findings.result
-    if result.get("format") != "yid-diagnosis/2":
-        return None
     finding: DiagnosisResult | None = findings.section_data.get("finding")
-    chapters: dict[str, _Chapter | None] = {}
-    if finding is not None:
-        chapters = {
-            "gap": _gap(finding),
-            "events": _events(finding),
-            "where": _where(finding),
-            "which": _which(finding, result),
-            "alike": _alike(finding, result),
-            "curves": _curves(finding, findings.section_data["predictions"]),
-            "absorbed": _absorbed(finding),
-        }
-    shown = [chapter for chapter in chapters.items() if chapter[1] is not None]
-    return {"chapters": dict(shown)} if shown else None
+    if result.get("format") != "yid-diagnosis/2" or finding is None:
+        return None
+    chapters = {
+        "gap": _gap(finding),
+        "events": _events(finding),
+        "where": _where(finding),
+        "which": _which(finding, result),
+        "alike": _alike(finding, result),
+        "curves": _curves(finding, findings.section_data["predictions"]),
+        "absorbed": _absorbed(finding),
+    }
+    return {"chapters": {name: chapter for name, chapter in chapters.items() if chapter is not None}}
 
 
 # -- the gap ----------------------------------------------------------------------------------------------------------
@@ -68,36 +67,23 @@ def diagnosis_context(findings: ReportData) -> Mapping[str, Any] | None:
 
 def _gap(finding: DiagnosisResult) -> _Chapter:
     before, after = finding.nominal_model.held_out_loss.channel_rmse, finding.final_model.held_out_loss.channel_rmse
-    floor = _floor(finding)
+    floor, changed = _floor(finding), bool(finding.accepted_effects)
     by_unit: dict[str, dict[str, BeforeAfter]] = {}
     for channel, (error, unit) in before.items():
-        later = after[channel][0] if finding.accepted_effects and channel in after else None
-        by_unit.setdefault(unit, {})[channel] = BeforeAfter(error, later, reference=floor.get(channel))
-    pictures = []
-    for unit, rows in by_unit.items():
         factor, shown = display_scale_and_unit(unit)
-        scaled = {
-            name: BeforeAfter(
-                factor * row.before,
-                None if row.after is None else factor * row.after,
-                reference=None if row.reference is None else factor * row.reference,
-            )
-            for name, row in rows.items()
-        }
-        words = (_NOMINAL_LABEL, _EXTENDED_LABEL, "noise alone")
-        pictures.append(
-            (
-                "",
-                figures.figure_html(
-                    categorical_charts.before_after_figure(scaled, f"held-out error (rms) [{shown}]", words)
-                ),
-            )
-        )
+        later = factor * after[channel][0] if changed and channel in after else None
+        reference = factor * floor[channel] if channel in floor else None
+        by_unit.setdefault(shown, {})[channel] = BeforeAfter(factor * error, later, reference=reference)
+    words = (_NOMINAL_LABEL, _EXTENDED_LABEL, "noise alone")
+    shown_figures = [
+        ("", categorical_charts.before_after_figure(rows, f"held-out error (rms) [{unit}]", words))
+        for unit, rows in by_unit.items()
+    ]
     first, last = finding.nominal_held_out_test.chi2_per_dof, finding.remaining_test.chi2_per_dof
     sentences = [
         "Errors on recordings that no fit has touched, channel by channel; the tick is what noise alone gives."
     ]
-    if finding.accepted_effects:
+    if changed:
         names = " and ".join(effect.label for effect in finding.accepted_effects)
         falls = {c: 1 - after[c][0] / e for c, (e, _) in before.items() if c in after and e > 0}
         sentences.append(
@@ -105,15 +91,15 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
         )
         if falls:
             most, least = max(falls, key=lambda c: falls[c]), min(falls, key=lambda c: falls[c])
-            said = f"The error of {most} changes most, from {_amount(*before[most])} to {_amount(*after[most])}"
+            errors = (" ".join(format_error_and_unit(*model[most])) for model in (before, after))
             worse = f"; {least} gets worse by {-100 * falls[least]:.0f} %" if falls[least] < -0.02 else ""
-            sentences.append(f"{said}{worse}.")
+            sentences.append(f"The error of {most} changes most, from {' to '.join(errors)}{worse}.")
     else:
         sentences.append(
             f"No effect is named, so no error is shown after it; chi² per degree of freedom is {first:.3g} (one is "
             "noise alone)."
         )
-    return _Chapter("How large the gap is", sentences, pictures)
+    return _Chapter("How large the gap is", sentences, shown_figures)
 
 
 def _floor(finding: DiagnosisResult) -> dict[str, float]:
@@ -127,10 +113,6 @@ def _floor(finding: DiagnosisResult) -> dict[str, float]:
     return {entry.channel: math.sqrt(width.get(entry.channel, 1)) * entry.noise_std for entry in finding.noise_floor}
 
 
-def _amount(value: float, unit: str) -> str:
-    return " ".join(format_error_and_unit(value, unit))
-
-
 # -- where ------------------------------------------------------------------------------------------------------------
 
 
@@ -138,64 +120,69 @@ def _where(finding: DiagnosisResult) -> _Chapter | None:
     smoothed = finding.smoother_result
     if smoothed is None:
         return None
-    noticed = [place.location for place in finding.gap_locations if place.is_observable]
-    silent = [place.location for place in finding.gap_locations if not place.is_observable]
+    noticed, silent = (
+        ", ".join(place.location for place in finding.gap_locations if place.is_observable is seen)
+        for seen in (True, False)
+    )
     sentences = [
         "Every coordinate was given an unknown force, every grasp an unknown offset and every measured point an "
         "unknown bias, free to change in time; the fewest groups of them that explain the residual were kept.",
         _side(smoothed),
-        f"A gap would have shown at {', '.join(noticed)}." if noticed else "",
-        f"It would not have shown at {', '.join(silent)}: these motions and sensors cannot tell." if silent else "",
+        f"A gap would have shown at {noticed}." if noticed else "",
+        f"It would not have shown at {silent}: these motions and sensors cannot tell." if silent else "",
     ]
     left = [f"{p.location} ({100 * p.gap_share:.0f} %)" for p in finding.remaining_gap_locations if p.gap_share > 0.1]
     if finding.accepted_effects and left:
         sentences.append(f"What the effects leave lies in {', '.join(left)}.")
-    pictures = []
+    maps = []
     for i, trace in enumerate(smoothed.smoothed_unknowns[:_MAX_MAPS]):
         kept = [k for k, source in enumerate(trace.unknown_groups) if smoothed.group_variance[source] > 0]
-        kept.sort(
-            key=lambda k: (
-                -smoothed.log_evidence_drop[trace.unknown_groups[k]],
-                trace.unknown_groups[k].location,
-                trace.unknown_groups[k].kind,
-            )
-        )
         if not kept:
             break
-        _, _, values = informed_z_scores(smoothed, i, finding.thresholds.informed_fraction)
-        shown = unknown_units(finding.nominal_model.problem.system, trace)
-        axis = "value in its standard deviations"
-        blank = not np.any(np.isfinite(values))
-        if blank:
-            prior = np.sqrt([smoothed.group_variance[source] for source in trace.unknown_groups])
-            values = trace.posterior_mean / np.where(prior > 0, prior, np.nan)
-            axis = "value in standard deviations expected beforehand"
-        rows = []
-        for k in kept:
-            size, unit = trace.reference_std[k], shown[k]
-            texts = [
-                f"{trace.unknown_names[k]}, {trace.interval_edges[j]:.2f} to {trace.interval_edges[j + 1]:.2f} s: "
-                f"{trace.posterior_mean[j, k] * size:.3g} ± {trace.posterior_std[j, k] * size:.2g} {unit}"
-                for j in range(len(trace.posterior_mean))
-            ]
-            source = trace.unknown_groups[k]
-            group = f"{source.location} {source.kind} [{unit}]"
-            rows.append(TimeMapRow(trace.unknown_names[k], group, values[:, k], texts))
-        pictures.append(
-            (
-                f"Recording {trace.recording}",
-                figures.figure_html(categorical_charts.time_map_figure(trace.interval_edges, rows, axis)),
-            )
-        )
-        if i == 0:
-            sentences.append(_surest(smoothed, shown, None if blank else values))
-    if pictures:
+        figure, sentence = _time_map(finding, smoothed, i, kept)
+        maps.append((f"Recording {trace.recording}", figure))
+        sentences += [sentence] if i == 0 else []
+    if maps:
         sentences.append("Red is a force, offset or bias in the positive direction, blue in the negative one.")
     else:
         sentences.append("No group of unknowns explains the residual better than chance, so there is no map.")
     if len(smoothed.smoothed_unknowns) > _MAX_MAPS:
         sentences.append(f"{len(smoothed.smoothed_unknowns) - _MAX_MAPS} more recordings are in trajectories.h5.")
-    return _Chapter("Where it is, and when", [text for text in sentences if text], pictures)
+    return _Chapter("Where it is, and when", [text for text in sentences if text], maps)
+
+
+def _time_map(finding: DiagnosisResult, smoothed: SmootherResult, i: int, kept: list[int]) -> tuple[Any, str]:
+    """Map of the unknowns `kept` over recording i, and a sentence on the surest value."""
+    trace = smoothed.smoothed_unknowns[i]
+    groups, names, edges = trace.unknown_groups, trace.unknown_names, trace.interval_edges
+    kept = sorted(kept, key=lambda k: (-smoothed.log_evidence_drop[groups[k]], groups[k].location, groups[k].kind))
+    _, _, values = informed_z_scores(smoothed, i, finding.thresholds.informed_fraction)
+    units = unknown_units(finding.nominal_model.problem.system, trace)
+    mean, std = trace.posterior_mean * trace.reference_std, trace.posterior_std * trace.reference_std
+    axis = "value in its standard deviations"
+    if np.any(np.isfinite(values)):
+        j, k = divmod(int(np.nanargmax(np.abs(values))), values.shape[1])
+        sentence = (
+            f"Grey is where the data do not say; the surest value is that of {names[k]} between {edges[j]:.2f} and "
+            f"{edges[j + 1]:.2f} s, {mean[j, k]:.3g} ± {std[j, k]:.2g} {units[k]}."
+        )
+    else:
+        prior = np.sqrt([smoothed.group_variance[source] for source in groups])
+        values = trace.posterior_mean / np.where(prior > 0, prior, np.nan)
+        axis = "value in standard deviations expected beforehand"
+        sentence = (
+            "Nowhere do the data say more than half of what can be said of a single value, so that values are shown in "
+            "units of the standard deviation expected beforehand: take the picture for a hint only."
+        )
+    rows = []
+    for k in kept:
+        texts = [
+            f"{names[k]}, {edges[j]:.2f} to {edges[j + 1]:.2f} s: {mean[j, k]:.3g} ± {std[j, k]:.2g} {units[k]}"
+            for j in range(len(mean))
+        ]
+        group = f"{groups[k].location} {groups[k].kind} [{units[k]}]"
+        rows.append(TimeMapRow(names[k], group, values[:, k], texts))
+    return categorical_charts.time_map_figure(edges, rows, axis), sentence
 
 
 def _side(smoothed: SmootherResult) -> str:
@@ -216,22 +203,6 @@ def _side(smoothed: SmootherResult) -> str:
     )
 
 
-def _surest(smoothed: SmootherResult, shown: Sequence[str], ratio: Array | None) -> str:
-    """The value farthest from zero in its standard deviations, `ratio` (J, nd); None where the data inform none."""
-    trace = smoothed.smoothed_unknowns[0]
-    if ratio is None:
-        return (
-            "Nowhere do the data say more than half of what can be said of a single value, so that values are shown in "
-            "units of the standard deviation expected beforehand: take the picture for a hint only."
-        )
-    j, k = divmod(int(np.nanargmax(np.abs(ratio))), ratio.shape[1])
-    value, std = (array[j, k] * trace.reference_std[k] for array in (trace.posterior_mean, trace.posterior_std))
-    return (
-        f"Grey is where the data do not say; the surest value is that of {trace.unknown_names[k]} between "
-        f"{trace.interval_edges[j]:.2f} and {trace.interval_edges[j + 1]:.2f} s, {value:.3g} ± {std:.2g} {shown[k]}."
-    )
-
-
 # -- events -----------------------------------------------------------------------------------------------------------
 
 
@@ -247,33 +218,21 @@ def _events(finding: DiagnosisResult) -> _Chapter | None:
         else "",
         *overspeed_messages(events),
     ]
-    pictures = []
-    for name in dict.fromkeys(force.recording for force in events.force_series):
-        curves = []
-        for force in (f for f in events.force_series if f.recording == name):
-            own = [e for e in events.for_recording(name) if e.channel == force.channel and e.detected_pulse is not None]
-            shape = sum(
-                (e.detected_pulse.evaluate_at(force.t) for e in own if e.detected_pulse is not None),
-                np.zeros(len(force.t)),
-            )
-            lines = {
-                "event": (force.t, shape),
-                "allowed": (force.t, force.allowed_model_error),
-                "allowed, other side": (force.t, -force.allowed_model_error),
-            }
-            spans = [(event.start_time, event.end_time) for event in own]
-            curves.append(
-                TimePlot(f"{force.channel} [{force.unit}]", force.t, force.force, lines, marked_intervals=spans)
-            )
-        colors = {
-            "event": figures.AFTER_COLOR,
-            "allowed": figures.MEASURED_COLOR,
-            "allowed, other side": figures.MEASURED_COLOR,
-        }
-        pictures.append(
-            (f"Recording {name}", figures.figure_html(figures.time_plots_figure(curves, figures.BEFORE_COLOR, colors)))
-        )
-    return _Chapter("What happened beside it", [text for text in sentences if text], pictures)
+    by_recording: dict[str, list[TimePlot]] = {}
+    for force in events.force_series:
+        found = [event for event in events.for_recording(force.recording) if event.channel == force.channel]
+        pulses = [(e.detected_pulse, e.start_time, e.end_time) for e in found if e.detected_pulse is not None]
+        shape = sum((pulse.evaluate_at(force.t) for pulse, *_ in pulses), np.zeros(len(force.t)))
+        courses = (shape, force.allowed_model_error, -force.allowed_model_error)
+        lines = {name: (force.t, values) for name, values in zip(_EVENT_COLORS, courses, strict=True)}
+        title, spans = f"{force.channel} [{force.unit}]", [(begin, end) for _, begin, end in pulses]
+        plot = TimePlot(title, lines, force.t, force.force, marked_intervals=spans)
+        by_recording.setdefault(force.recording, []).append(plot)
+    shown = [
+        (f"Recording {name}", figures.time_plots_figure(plots, figures.BEFORE_COLOR, _EVENT_COLORS))
+        for name, plots in by_recording.items()
+    ]
+    return _Chapter("What happened beside it", [text for text in sentences if text], shown)
 
 
 # -- which ------------------------------------------------------------------------------------------------------------
@@ -283,40 +242,30 @@ def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
     promised, percent = _promised(finding)
     entries = []
     for entry in result["which"][:_MAX_CANDIDATES]:
-        name = f"{entry['kind']}@{entry['location']}"
-        closed = None
+        name, closed = f"{entry['kind']}@{entry['location']}", None
         if entry["closure"] is not None and None not in entry["closure_ci"]:
-            closed = (100 * entry["closure"], 100 * entry["closure_ci"][0], 100 * entry["closure_ci"][1])
+            low, high = entry["closure_ci"]
+            closed = (100 * entry["closure"], 100 * low, 100 * high)
         entries.append(RankedCandidate(name, closed, promised.get(name, 0.0)))
     if not entries:
         return None
-    done = sorted(
-        (e for e in entries if e.closure_interval_percent is not None),
-        key=lambda e: -(e.closure_interval_percent or (0.0,))[0],
-    )
+    done = {e.name: e.closure_interval_percent for e in entries if e.closure_interval_percent is not None}
     unit = "as a part of the excess over noise" if percent else "as a fall of the sum of squares; 7 is chance at 1 %"
     promise = f"hat each promises to first order where the model was fitted, {unit}."
     if done:
-        said = [
-            "{} {:.3g} % ({:.3g} to {:.3g} %)".format(e.name, *e.closure_interval_percent)
-            for e in done[:3]
-            if e.closure_interval_percent
-        ]
+        best = sorted(done.items(), key=lambda entry: -entry[1][0])[:3]
+        said = ", ".join(f"{name} {closed:.3g} % ({low:.3g} to {high:.3g} %)" for name, (closed, low, high) in best)
         sentences = [
             "Left: refitted together with the stiffnesses, each alone, and judged on held-out motions, with the 95 % "
-            f"interval; 100 % closes the gap, less than zero predicts worse. Closed by {', '.join(said)}.",
+            f"interval; 100 % closes the gap, less than zero predicts worse. Closed by {said}.",
             f"Right: w{promise}",
         ]
     else:
         sentences = [f"W{promise}", "No candidate promised enough to be refitted."]
     # beside each other on a phone there is room for a word
-    picture = figures.figure_html(
-        categorical_charts.candidate_ranking_figure(
-            entries, "closed [%]", "promised [%]" if percent else "promised [1]"
-        )
-    )
+    axes = ("closed [%]", "promised [%]" if percent else "promised [1]")
     title = "What each effect could explain" if finding.verdict == "no_gap" else "Which effect makes it"
-    return _Chapter(title, sentences, [("", picture)])
+    return _Chapter(title, sentences, [("", categorical_charts.candidate_ranking_figure(entries, *axes))])
 
 
 def _promised(finding: DiagnosisResult) -> tuple[dict[str, float], bool]:
@@ -337,33 +286,30 @@ def _alike(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
         return None
     at = [labels.index(name) for name in names]
     values = finding.confusability.overlap_fractions[np.ix_(at, at)]
-    pairs = [
-        (min(values[i, j], values[j, i]), names[i], names[j])
-        for i in range(len(names))
-        for j in range(i + 1, len(names))
-    ]
-    close = [
-        f"{a} and {b} ({100 * v:.0f} %)"
-        for v, a, b in sorted(pairs, reverse=True)
-        if v >= finding.thresholds.signature_overlap
-    ]
-    listed = f"{', '.join(close[:5])}{f' and {len(close) - 5} more' if len(close) > 5 else ''}"
-    v, a, b = max(pairs)
+    pairs = sorted(
+        ((min(values[i, j], values[j, i]), names[i], names[j]) for i, j in combinations(range(len(names)), 2)),
+        reverse=True,
+    )
+    said = [(v, f"{a} and {b} ({100 * v:.0f} %)") for v, a, b in pairs]
+    close = [text for v, text in said if v >= finding.thresholds.signature_overlap]
+    listed = ", ".join(close[:5]) + (f" and {len(close) - 5} more" if len(close) > 5 else "")
     sentences = [
         "Per cent of the row's trace in the recordings that the column could make as well, beyond what the stiffnesses "
         "can; 100 % cannot be told apart by these motions and sensors, whatever the residual is.",
-        f"Alike: {listed}." if close else f"No two of them are alike; the closest are {a} and {b} ({100 * v:.0f} %).",
+        f"Alike: {listed}." if close else f"No two of them are alike; the closest are {said[0][1]}.",
     ]
-    picture = categorical_charts.matrix_figure(names, values, "trace of", "explained by [%]")
-    return _Chapter("What could be mistaken for what", sentences, [("", figures.figure_html(picture))])
+    figure = categorical_charts.matrix_figure(names, values, "trace of", "explained by [%]")
+    return _Chapter("What could be mistaken for what", sentences, [("", figure)])
 
 
 # -- curves and parameters --------------------------------------------------------------------------------------------
 
 
-def _curves(finding: DiagnosisResult, predicted: Sequence[_HeldOutPrediction]) -> _Chapter | None:
+def _curves(
+    finding: DiagnosisResult, predicted: Sequence[tuple[Episode, EpisodePrediction, EpisodePrediction]]
+) -> _Chapter | None:
     changed = bool(finding.accepted_effects)
-    found: list[tuple[float, str, TimePlot, TimePlot]] = []
+    found: list[tuple[float, str, tuple[TimePlot, TimePlot]]] = []
     for episode, before, after in predicted:
         for k, samples in enumerate(episode.measurements):
             sensor = samples.sensor
@@ -374,59 +320,51 @@ def _curves(finding: DiagnosisResult, predicted: Sequence[_HeldOutPrediction]) -
                 if changed:
                     lines[_EXTENDED_LABEL] = after.predicted_outputs[k][:, column]
                 seen = np.isfinite(y) & np.isfinite(std)
-                if not seen.any():
-                    continue
-                squares = [float(np.sum(((line - y)[seen] / std[seen]) ** 2)) for line in lines.values()]
-                name = channel if sensor.outputs_per_channel == 1 else f"{channel}, {'xyz'[column % 3]}"
-                pair = figures.prediction_and_residual_plots(name, sensor.unit, t, y, std, lines)
-                found.append((squares[0] - (squares[1] if changed else 0.0), episode.name, *pair))
+                if seen.any():
+                    squares = [float(np.sum(((line - y)[seen] / std[seen]) ** 2)) for line in lines.values()]
+                    name = channel if sensor.outputs_per_channel == 1 else f"{channel}, {'xyz'[column % 3]}"
+                    pair = figures.prediction_and_residual_plots(name, sensor.unit, t, y, std, lines)
+                    found.append((squares[0] - (squares[1] if changed else 0.0), episode.name, pair))
     if not found:
         return None
-    found.sort(key=lambda entry: -entry[0])
     # the same joint in every recording would say the same thing again
-    best: dict[str, tuple[float, str, TimePlot, TimePlot]] = {}
-    for entry in found:
-        best.setdefault(entry[2].axis_title, entry)
-    chosen = list(best.values())[:_MAX_CHANNELS]
-    pictures = []
-    for recording in dict.fromkeys(entry[1] for entry in chosen):
-        curves = [curve for _, name, *pair in chosen if name == recording for curve in pair]
-        pictures.append(
-            (
-                f"Recording {recording}, held out",
-                figures.figure_html(figures.time_plots_figure(curves, figures.MEASURED_COLOR, _MODEL_COLORS)),
-            )
-        )
-    what = "change most with the effects" if changed else "the nominal model misses most"
-    sentences = [
-        f"The {len(chosen)} held-out coordinates or joints that {what}, measured and predicted; below each "
-        "the error, with two standard deviations of the noise shaded: what is right stays within."
+    best: dict[str, tuple[str, tuple[TimePlot, TimePlot]]] = {}
+    for _, recording, pair in sorted(found, key=lambda entry: -entry[0]):
+        best.setdefault(pair[0].axis_title, (recording, pair))
+    by_recording: dict[str, list[TimePlot]] = {}
+    for recording, pair in list(best.values())[:_MAX_CHANNELS]:
+        by_recording.setdefault(recording, []).extend(pair)
+    shown = [
+        (f"Recording {name}, held out", figures.time_plots_figure(plots, figures.MEASURED_COLOR, _MODEL_COLORS))
+        for name, plots in by_recording.items()
     ]
-    return _Chapter("Measured and predicted", sentences, pictures)
+    what, count = "change most with the effects" if changed else "the nominal model misses most", len(best)
+    sentences = [
+        f"The {min(count, _MAX_CHANNELS)} held-out coordinates or joints that {what}, measured and predicted; below "
+        "each the error, with two standard deviations of the noise shaded: what is right stays within."
+    ]
+    return _Chapter("Measured and predicted", sentences, shown)
 
 
 def _absorbed(finding: DiagnosisResult) -> _Chapter | None:
     if not finding.accepted_effects or not finding.nominal_changes:
         return None
     by_unit: dict[str, dict[str, BeforeAfter]] = {}
+    moved = []
     for entry in finding.nominal_changes:
-        std = finding.nominal_model.std.get(entry.name, 0.0)
-        by_unit.setdefault(entry.unit, {})[entry.name] = BeforeAfter(
-            entry.value_before, entry.value_after, std, entry.std_after
-        )
+        std, before, after = finding.nominal_model.std.get(entry.name, 0.0), entry.value_before, entry.value_after
+        by_unit.setdefault(entry.unit, {})[entry.name] = BeforeAfter(before, after, std, entry.std_after)
+        if abs(after - before) > 0.1 * max(abs(before), 1e-9):
+            text = f"{entry.name} goes from {before:.3g} to {after:.3g} {entry.unit}"
+            moved.append((abs(after - before) / max(abs(before), 1e-9), text))
     words = ("fitted without the effects", _EXTENDED_LABEL, "")
-    pictures = [
-        ("", figures.figure_html(categorical_charts.before_after_figure(rows, f"value [{unit}]", words)))
-        for unit, rows in by_unit.items()
+    shown = [
+        ("", categorical_charts.before_after_figure(rows, f"value [{unit}]", words)) for unit, rows in by_unit.items()
     ]
-    moved = [
-        e for e in finding.nominal_changes if abs(e.value_after - e.value_before) > 0.1 * max(abs(e.value_before), 1e-9)
-    ]
-    moved.sort(key=lambda e: -abs(e.value_after - e.value_before) / max(abs(e.value_before), 1e-9))
-    said = ", ".join(f"{e.name} goes from {e.value_before:.3g} to {e.value_after:.3g} {e.unit}" for e in moved[:4])
+    said = ", ".join(text for _, text in sorted(moved, key=lambda entry: -entry[0])[:4])
     sentences = [
         "A missing effect hides in the parameters that are free: this is how they move when it is added. Bars are two "
         "standard deviations, cut where they leave the picture.",
         f"{said}." if said else "None of them moves by more than a tenth.",
     ]
-    return _Chapter("What the stiffnesses had absorbed", sentences, pictures)
+    return _Chapter("What the stiffnesses had absorbed", sentences, shown)

@@ -10,6 +10,7 @@ import numpy as np
 
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.model.system import System
+from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.report import figures
 from yid_ocp.report.animation import Animation, ModelTrajectory, make_animation
@@ -18,89 +19,86 @@ from yid_ocp.report.sections.base import ReportData, joint_channel_unit, registe
 from yid_ocp.sensors import Sensor
 
 _MAX_RECORDINGS = 4  # recordings; a page with more is slow to open
+_MAX_PICTURES = 24  # a page with more is too heavy to open; result.json and trajectories.h5 have them all
+_MAX_LISTED_RECORDINGS = 3  # recordings that are drawn
+_MAX_POINTS = 6  # points of a group; more are in the recording
+_SHOWN_CHANNELS = ("position", "velocity", "effort", "position_command")
 _ROLE_LABELS = {"estimate": "estimated on", "held_out": "held out"}
 
 
 @register_section("scene", 3, "In motion")
-def animation_context(findings: ReportData) -> Mapping[str, Any] | None:
-    """Template context: the command's animations, else the predicted motion of each recording, held-out first."""
-    scenes = [entry for entry in findings.animations or _predicted(findings) if len(entry.t) > 1]
-    told = json.dumps([entry.to_dict() for entry in scenes[:_MAX_RECORDINGS]], separators=(",", ":")).replace(
-        "<", "\\u003c"
-    )
-    both = any(
-        len({motion.name for motion in entry.motions} - {"measured"}) < len(entry.motions) > 1 for entry in scenes
-    )
-    return {"scenes": told, "both": both} if scenes else None
+def _animation(findings: ReportData) -> Mapping[str, Any] | None:
+    """The command's animations, else the predicted motion of each recording, held-out first."""
+    scenes = [entry for entry in findings.animations or _predicted_motions(findings) if len(entry.t) > 1]
+    told = json.dumps([entry.to_dict() for entry in scenes[:_MAX_RECORDINGS]], separators=(",", ":"))
+    names = [[motion.name for motion in entry.motions] for entry in scenes]
+    both = any("measured" in own and len(own) > 1 for own in names)
+    return {"scenes": told.replace("<", "\\u003c"), "both": both} if scenes else None
 
 
-def _predicted(findings: ReportData) -> Sequence[Animation]:
-    problem, solution = findings.problem, findings.solution
-    if problem is None or solution is None:
-        return []
+def _predicted_motions(findings: ReportData) -> Sequence[Animation]:
     result = []
-    for role, episode, outcome in sorted(findings.predicted_episodes, key=lambda entry: entry[0] != "held_out")[
-        :_MAX_RECORDINGS
-    ]:
-        theta, _ = problem.split(solution.x, problem.episodes.index(episode) if role == "estimate" else 0)
-        own = problem.predictor.episode_theta(episode, theta)
+    episodes = sorted(findings.predicted_episodes, key=lambda entry: entry[0] != "held_out")
+    for role, episode, outcome in episodes[:_MAX_RECORDINGS]:
+        problem, own = _problem_and_theta(findings, role, episode)
         q = outcome.rollout.state[:, : problem.system.n_coordinates]
         told = ModelTrajectory("predicted", problem.system, own, episode.grid.node_times, q)
         result.append(make_animation(f"{episode.name} ({_ROLE_LABELS[role]})", [told], episode.recording))
     return result
 
 
-_MAX_PICTURES = 24  # a page with more is too heavy to open; result.json and trajectories.h5 have them all
+def _problem_and_theta(findings: ReportData, role: str, episode: Episode) -> tuple[EstimationProblem, np.ndarray]:
+    """The problem of a prediction, and the parameters (ntheta,) found for one of its recordings."""
+    problem, solution = findings.problem, findings.solution
+    assert problem is not None
+    assert solution is not None
+    theta, _ = problem.split(solution.x, problem.episodes.index(episode) if role == "estimate" else 0)
+    return problem, problem.predictor.episode_theta(episode, theta)
 
 
 @register_section("fit", 20, "How well it fits")
-def fit_quality_context(findings: ReportData) -> Mapping[str, Any] | None:
-    """Template context: measured and predicted values with residuals over time, and a residual histogram."""
-    if findings.problem is None or not findings.predicted_episodes:
+def _fit_quality(findings: ReportData) -> Mapping[str, Any] | None:
+    """Measured and predicted values with residuals over time, and a residual histogram."""
+    found: list[tuple[str, list[TimePlot]]] = []
+    whitened: dict[str, list[np.ndarray]] = {}
+    for role, episode, outcome in findings.predicted_episodes if findings.problem is not None else ():
+        for title, curves in _fitted_curves(findings, role, episode, outcome):
+            found.append((f"{title} in {episode.name} ({_ROLE_LABELS[role]})", curves))
+        for samples, predicted in zip(episode.measurements, outcome.predicted_outputs, strict=True):
+            if role == "estimate":
+                ratio = (predicted - samples.value) / samples.std
+                whitened.setdefault(samples.sensor.group_name, []).append(ratio[np.isfinite(ratio)])
+    if not found:
         return None
-    pictures: list[tuple[str, str]] = []
-    left = 0
-    for role, episode, outcome in findings.predicted_episodes:
-        for title, curves in _pictures(findings, role, episode, outcome):
-            if len(pictures) < _MAX_PICTURES:
-                role_words = "held out" if role == "held_out" else "estimated on"
-                pictures.append(
-                    (
-                        f"{title} in {episode.name} ({role_words})",
-                        figures.figure_html(figures.time_plots_figure(curves)),
-                    )
-                )
-            else:
-                left += 1
-    residuals = _whitened(findings)
-    histogram = figures.figure_html(figures.residual_histogram_figure(residuals)) if residuals else None
-    return {"pictures": pictures, "left": left, "histogram": histogram}
+    residuals = {group: np.concatenate(parts) for group, parts in whitened.items() if any(map(len, parts))}
+    return {
+        "figures": [(title, figures.time_plots_figure(curves)) for title, curves in found[:_MAX_PICTURES]],
+        "left": max(len(found) - _MAX_PICTURES, 0),
+        "histogram": figures.residual_histogram_figure(residuals) if residuals else None,
+    }
 
 
-def _pictures(
+def _fitted_curves(
     findings: ReportData, role: str, episode: Episode, outcome: EpisodePrediction
 ) -> list[tuple[str, list[TimePlot]]]:
-    assert findings.problem is not None
-    step = findings.problem.step.time_step
+    """Title and curves of each point, or of all joints of a group together."""
     found = []
     for samples, predicted in zip(episode.measurements, outcome.predicted_outputs, strict=True):
-        t = episode.grid.start_time + step * (samples.node + samples.fraction)
-        sensor, course = samples.sensor, None
-        if sensor.outputs_per_channel == 3 and len(t) < episode.grid.steps / 2:
+        sensor, grid, course = samples.sensor, episode.grid, None
+        t = grid.start_time + grid.time_step * (samples.node + samples.fraction)
+        is_point = sensor.outputs_per_channel == 3
+        if is_point and len(t) < grid.steps / 2:
             course = _course(findings, role, episode, outcome, sensor)
-        for c, channel in (
-            enumerate(sensor.channel_names) if sensor.outputs_per_channel == 3 else [(0, sensor.group_name)]
-        ):
-            columns = (
-                [3 * c + i for i in range(3)] if sensor.outputs_per_channel == 3 else range(len(sensor.channel_names))
-            )
+        names = sensor.channel_names
+        parts = {name: range(3 * c, 3 * c + 3) for c, name in enumerate(names)} if is_point else {}
+        for title, columns in (parts or {sensor.group_name: range(len(names))}).items():
             curves: list[TimePlot] = []
             for i in columns:
-                name = "xyz"[i % 3] if sensor.outputs_per_channel == 3 else sensor.channel_names[i].rsplit(".", 1)[1]
+                name = "xyz"[i % 3] if is_point else names[i].rsplit(".", 1)[1]
                 told = (t, samples.value[:, i], samples.std[:, i], {"predicted": predicted[:, i]})
-                smooth = None if course is None else (episode.grid.node_times, course[:, i])
+                smooth = None if course is None else (grid.node_times, course[:, i])
                 curves += figures.prediction_and_residual_plots(name, sensor.unit, *told, smooth)
-            found.append((channel, curves))
+            found.append((title, curves))
     return found
 
 
@@ -108,62 +106,41 @@ def _course(
     findings: ReportData, role: str, episode: Episode, outcome: EpisodePrediction, sensor: Sensor
 ) -> np.ndarray:
     """What a sensor of points would have seen at every node, for one that looks seldom, shape (N + 1, k)."""
-    problem, solution = findings.problem, findings.solution
-    assert problem is not None
-    assert solution is not None
-    theta, _ = problem.split(solution.x, problem.episodes.index(episode) if role == "estimate" else 0)
+    problem, own = _problem_and_theta(findings, role, episode)
     n, state = problem.system.n_coordinates, outcome.rollout.state
     efforts = np.zeros((len(state), n))
-    own = problem.predictor.episode_theta(episode, theta)
     seen = problem.model_functions.compiled_sensor(sensor, ())(state[:, :n], state[:, 2 * n :], efforts, own)
     return np.asarray(seen[0][:, :, 0])
 
 
-def _whitened(findings: ReportData) -> dict[str, np.ndarray]:
-    found: dict[str, list[np.ndarray]] = {}
-    for role, episode, outcome in findings.predicted_episodes:
-        if role != "estimate":
-            continue
-        for samples, predicted in zip(episode.measurements, outcome.predicted_outputs, strict=True):
-            ratio = (predicted - samples.value) / samples.std
-            found.setdefault(samples.sensor.group_name, []).append(ratio[np.isfinite(ratio)])
-    return {group: np.concatenate(parts) for group, parts in found.items() if sum(map(len, parts))}
-
-
-_MAX_LISTED_RECORDINGS = 3  # recordings that are drawn
-_MAX_POINTS = 6  # points of a group; more are in the recording
-_SHOWN_CHANNELS = ("position", "velocity", "effort", "position_command")
-
-
 @register_section("recorded", 30, "What was recorded")
-def recorded_signals_context(findings: ReportData) -> Mapping[str, Any] | None:
-    """Template context: recorded joint channels and points over time."""
+def _recorded_signals(findings: ReportData) -> Mapping[str, Any] | None:
+    """Recorded joint channels and points over time."""
     recordings: list[Recording] = findings.section_data.get("recordings", [])[:_MAX_LISTED_RECORDINGS]
     system: System | None = findings.section_data.get("system")
-    pictures = [
-        (f"{title} of {recording.name}", figures.figure_html(figures.lines_over_time_figure(curve)))
+    shown = [
+        (f"{title} of {recording.name}", figures.lines_over_time_figure(curve))
         for recording in recordings
-        for title, curve in _curves(recording, system)
+        for title, curve in _recorded_curves(recording, system)
     ]
-    return {"pictures": pictures} if pictures else None
+    return {"figures": shown} if shown else None
 
 
-def _curves(recording: Recording, system: System | None) -> list[tuple[str, TimePlot]]:
-    empty, found = np.zeros(0), []
+def _recorded_curves(recording: Recording, system: System | None) -> list[tuple[str, TimePlot]]:
+    found = []
     for group in recording.groups:
         if isinstance(group, JointGroup):
             for channel in _SHOWN_CHANNELS:
-                unit = joint_channel_unit(system, group.names, channel)
                 values = group.channels.get(channel)
                 if values is not None:
+                    words, unit = channel.replace("_", " "), joint_channel_unit(system, group.names, channel)
                     lines = {name: (group.t, values[:, i]) for i, name in enumerate(group.names)}
-                    title = f"{channel.replace('_', ' ')} [{unit}]"
-                    found.append((f"Joints: {channel.replace('_', ' ')}", TimePlot(title, empty, empty, lines)))
-            continue
-        lines = {
-            f"{name}.{axis}": (group.t, group.position[:, i, c])
-            for i, name in enumerate(group.names[:_MAX_POINTS])
-            for c, axis in enumerate("xyz")
-        }
-        found.append((f"Points: {group.name}", TimePlot("position [m]", empty, empty, lines)))
+                    found.append((f"Joints: {words}", TimePlot(f"{words} [{unit}]", lines)))
+        else:
+            lines = {
+                f"{name}.{axis}": (group.t, group.position[:, i, c])
+                for i, name in enumerate(group.names[:_MAX_POINTS])
+                for c, axis in enumerate("xyz")
+            }
+            found.append((f"Points: {group.name}", TimePlot("position [m]", lines)))
     return found

@@ -1,0 +1,252 @@
+"""Makes `settings.md`: every setting with meaning, allowed values and default, and an example of every section."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import MISSING
+from pathlib import Path
+from typing import Any
+
+from yid_ocp.config.schema import option_info, section_variants
+from yid_ocp.config.settings import RunSettings
+from yid_ocp.model.objects import OBJECTS
+from yid_ocp.options import Option, dataclass_options, describe_type, mapping_value_type, sequence_entry_type
+
+HEAD = """\
+# Settings
+
+Every key of a configuration file. NAME stands for a name of yours or of the model. Units are SI and stand in brackets;
+`needed` keys have no default, and where none is shown it is nothing at all (`null`). Any key may be set on the command
+line as well, `--set problem.time_step=0.005`; a section merges with what stands there, key by key, and an empty one
+empties it. How to choose links, time step and split: [choosing.md](choosing.md); recordings and their units:
+[recordings.md](recordings.md). This page is made from the code; CONTRIBUTING.md has the command.
+"""
+
+
+def page() -> str:
+    """Markdown page of all settings with meaning, allowed values and default."""
+    lines = HEAD.splitlines()
+    sections = {title: (text, rows) for title, text, rows in tables(RunSettings, "")}
+    for title, (text, rows) in sections.items():
+        lines += ["", f"## {title}", "", text, "", "| key | meaning | allowed | default |", "|---|---|---|---|", *rows]
+        lines += ["", "```yaml", *EXAMPLES.get(title, "").splitlines(), "```"]
+    return "\n".join(lines) + "\n"
+
+
+def tables(hint: Any, path: str) -> Iterator[tuple[str, str, list[str]]]:
+    """Title, first sentence and rows of a section and of all below it."""
+    sections = section_variants(hint)
+    for word, kind in sections.classes.items() if sections is not None else ():
+        options = dataclass_options(kind)
+        title = (
+            f"{path}, {sections.selector_key}: {word}"
+            if sections is not None and sections.selector_key
+            else path or "The file"
+        )
+        yield title, (kind.__doc__ or "").splitlines()[0], [row(*item) for item in options.items()]
+        for name, option in options.items():
+            yield from tables(option.type_hint, f"{path}.{name}" if path else name)
+    values, entries = mapping_value_type(hint), sequence_entry_type(hint)
+    named = section_variants(values)
+    if values is not None and (named is None or named.selector_key != "name"):
+        yield from tables(values, f"{path}.NAME")
+    if entries is not None:
+        yield from tables(entries, path)
+
+
+def row(name: str, option: Option) -> str:
+    """The row of one key in a section's table."""
+    usual = "needed" if option.default_value is MISSING else default(option.default_value)
+    cells = (f"`{name}`", option_info(option.type_hint).description, describe_type(option.type_hint), usual)
+    return "| " + " | ".join(cells) + " |"
+
+
+def default(value: Any) -> str:
+    """A default as it stands in a table; empty for none and for sections."""
+    if value is None or value in ({}, "") or dataclasses.is_dataclass(value):
+        return ""
+    if isinstance(value, Mapping):
+        return ", ".join(f"`{name}`" for name in value)
+    return "`.inf`" if value == math.inf else f"`{json.dumps(value)}`"
+
+
+EXAMPLES: Mapping[str, str] = {
+    **{section: text for kind in OBJECTS for section, text in OBJECTS[kind].settings_examples.items()},
+    "The file": """\
+description: A cable of 1 m, swung by a UR5
+model: {robot: package:ur5, object: {kind: segments, segments: {cable: {length: 1.0, mass: 0.1, radius: 0.005}}}}
+recordings: {estimate: [swing.h5], held_out: [other_swing.h5]}
+parameters: {cable.bend: {free: true, initial: 0.05}, cable.damping: {free: true}}
+""",
+    "model": """\
+model:
+  robot: package:baxter
+  arms: {mode: driven}
+  object: {kind: foam_y}
+  grasp:
+    left: {holder_frame: left_gripper, held_frame: w_T2}
+  damping: {left_s0: 0.2, object: 0.05}    # [N m s/rad]
+  points: [w_T3, T1:40%]
+  effects:
+    - {kind: kelvin_voigt, location: T1, values: {tau: 0.02}}
+""",
+    "model.clamps.NAME": """\
+model:
+  clamps:
+    hand: {origin_point: marker_a, z_axis_point: marker_b, roll_convention: transported}
+""",
+    "model.extra_meshes": """\
+model:
+  extra_meshes:
+    - {mesh: gripper.stl, parent_frame: left_hand}
+    - {box: [0.8, 1.2, 0.05], xyz: [0.9, 0.0, -0.4]}  # a table [m]
+""",
+    "model.arms": """\
+model:
+  arms:
+    joints: [panda_joint1, panda_joint2, panda_joint4]
+    mode: prescribed
+    locked_joints: {panda_joint3: 0.4}              # [rad]
+    exclude_links: [panda_hand]
+""",
+    "model.arms.servo": """\
+model:
+  arms:
+    mode: servo
+    servo: {command_interpolation: interpolated, has_gravity_compensation: true}
+""",
+    "model.frames.NAME": """\
+model:
+  frames:
+    tool: {parent_frame: panda_link8, xyz: [0.0, 0.0, 0.12]}    # [m]
+""",
+    "model.grasp.NAME": """\
+model:
+  grasp:
+    right: {holder_frame: right_gripper, held_frame: w_T3, kind: axis, rpy: [0.0, 1.5708, 0.0]}    # [rad]
+""",
+    "model.springs.NAME": """\
+model:
+  springs:
+    elbow: {stiffness: 12.0, rest_position: 0.3, damping: 0.1}    # [N m/rad], [rad], [N m s/rad]
+""",
+    "model.effects": """\
+model:
+  effects:
+    - {kind: joint_coulomb, location: left_s0}
+parameters:
+  joint_coulomb@*: {free: true}
+""",
+    "recordings": """\
+recordings:
+  estimate: [day_1.h5, day_2.h5]
+  held_out: [day_3.h5]
+""",
+    "import": """\
+import:
+  joint_topics: [/left/joint_states, /right/joint_states]
+  points: {/mocap/tip: cable:100%}
+  units: {position: deg, points: mm}
+""",
+    "sensors.NAME": """\
+sensors:
+  points_camera: {std: 0.005, frames: {marker_7: w_T1}}    # [m]
+  joints.effort: {std: 0.1, bias_std: 0.3, effort_kind: sample}   # [N m]
+""",
+    "parameters.NAME": """\
+parameters:
+  "*.bend": {free: true, initial: 3.0}
+  T1.bend: {bounds: [5.0, 50.0]}             # over what the pattern says
+  T1.twist: {free: true, prior_std: 2.0}
+""",
+    "problem": """\
+problem:
+  time_step: 0.005                           # [s]
+  initial_state: estimated
+  path_cutoff: 15.0                          # [Hz]
+""",
+    "solver, name: gauss_newton": """\
+solver: {name: gauss_newton, max_iterations: 100}
+""",
+    "solver, name: multiple_shooting": """\
+solver: {name: multiple_shooting, hessian: exact, ipopt: {max_cpu_time: 600}}
+""",
+    "solver, name: single_shooting": """\
+solver: {name: single_shooting, max_iterations: 400}
+""",
+    "solver, name: steepest_descent": """\
+solver: {name: steepest_descent, first_trial_step: spectral, nonmonotone_memory: 10}
+""",
+    "compare": """\
+compare:
+  methods:
+    gauss_newton: {}
+    multiple_shooting: {condensing: true}
+""",
+    "diagnosis": """\
+diagnosis:
+  candidates: [kelvin_voigt, joint_coulomb, payload@left_gripper]
+  max_effects: 2
+""",
+    "track": """\
+track:
+  frames_path: clouds/                            # folder
+  length_unit: mm
+  n_drawn_frames: 5
+""",
+    "track.virtual_frames": """\
+track:
+  virtual_frames: {duration: 3.0, frame_rate: 5.0, latency: 0.04}    # [s], [Hz], [s]
+""",
+    "track.options": """\
+track:
+  options: {max_distance_in_radii: 0.7, tracked_points: [w_T1, w_T3]}
+""",
+    "track.options.filters": """\
+track:
+  options:
+    filters: {box_lower: [0.2, -0.8, -0.9], box_upper: [1.5, 0.8, 0.8], robot_padding: 0.02}    # [m]
+""",
+    "track.options.skeleton": """\
+track:
+  options:
+    skeleton: {neighbour_radius: 0.05, segment_neighbours: 30}     # [m]
+""",
+    "track.options.shape_fit": """\
+track:
+  options:
+    shape_fit: {surface_loss_scales: [], surface_noise_std: 0.004}  # [m]
+""",
+    "track.options.calibration": """\
+track:
+  options:
+    calibration: {fix_pose: true, translation_prior_std: 0.01}    # a hand-eye calibration, known to 1 cm [m]
+""",
+    "track.options.clock": """\
+track:
+  options:
+    clock: {initial_offset: 0.08, search_half_width: 0.05}      # [s]
+""",
+    "plan": """\
+plan:
+  goal: place
+  point: w_T3
+  target_offset: [0.05, 0.0, 0.1]                    # [m]
+  duration: 1.0                              # [s]
+  parameter_run: runs/my_solve
+""",
+    "plan.limits": """\
+plan:
+  limits: {velocity_fraction: 0.5, max_acceleration: 10.0, max_spring_angle: 0.8}    # a part, [rad/s^2], [rad]
+""",
+    "output": """\
+output: {runs_folder: /data/runs, write_report: false}
+""",
+}
+"""YAML from the top of a file, by the title of its section in docs/settings.md."""
+
+if __name__ == "__main__":
+    Path(__file__).with_name("settings.md").write_text(page(), encoding="utf-8")

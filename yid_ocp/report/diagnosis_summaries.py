@@ -1,0 +1,367 @@
+"""Summaries of a diagnosis, of its blind validation, and of several runs side by side."""
+
+from __future__ import annotations
+
+import shlex
+import statistics
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from yid_ocp.report.tables import (
+    format_error_and_unit,
+    issue_blocks,
+    p_value_text,
+    torque_offset_rows,
+)
+from yid_ocp.report.terminal import (
+    CodeBlock,
+    SummaryBlock,
+    SummaryStatement,
+    SummaryTable,
+    TableRows,
+    make_statements,
+    nonempty_tables,
+)
+from yid_ocp.solvers.fit_messages import VERDICT_WORDS, parameter_text
+
+_MIN_GAP_SHARE, _MAX_WINDOWS = 0.005, 6  # of places that are listed
+_MAX_CANDIDATES = 15  # candidates that are listed; result.json has them all
+_MAX_TERMINAL_PARAMETERS = 6  # parameters that have a column of their own on a terminal; result.json has all
+_FOUND_VERDICTS = ("identifiable", "weak", None)
+"""Verdicts of parameters whose values count; a diagnosis gives its parameters none."""
+
+
+# -- one diagnosis ----------------------------------------------------------------------------------------------------
+
+
+def diagnose_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
+    """Summary blocks of a `yid-diagnosis/2` result."""
+    left = len(result["which"]) - _MAX_CANDIDATES
+    blocks = [
+        *issue_blocks(result),
+        SummaryStatement(result["summary"], "verdict"),
+        *nonempty_tables(
+            SummaryTable(_gap_error_rows(result), "Errors on held-out recordings", is_key_table=True),
+            SummaryTable(_gap_location_rows(result), "Where"),
+            SummaryTable(_event_rows(result), "Events"),
+            SummaryTable(_candidate_rows(result), "Candidates"),
+        ),
+        *make_statements([
+            f"{left} more candidates are in result.json" if left > 0 else "",
+            f"these recordings could not show: {', '.join(result['unseen'])}" if result.get("unseen") else "",
+        ]),
+        *nonempty_tables(
+            SummaryTable(_baseline_rows(result), "Since the baseline"),
+            SummaryTable(_counterfactual_rows(result), "Without the effects, and with them"),
+            SummaryTable(torque_offset_rows(result), "How far the torques are off"),
+        ),
+    ]  # fmt: skip
+    if result.get("doubts"):
+        blocks.append(SummaryStatement("what is in doubt about the recordings may be what the verdict is about"))
+    if result["next_plan"] is not None:
+        blocks.append(SummaryStatement("to separate what looks alike, plan a motion:"))
+        blocks.append(CodeBlock(_planning_command(result["next_plan"])))
+    ended = f"verdict: {result['verdict'].replace('_', ' ')} ({sum(result['seconds'].values()):.1f} s)"
+    return [*blocks, SummaryStatement(ended)]
+
+
+def _gap_error_rows(result: Mapping[str, Any]) -> TableRows:
+    before, steps = result["gap"]["before"], result.get("steps", ())
+    rows: TableRows = [("held-out channel", "nominal", *(f"+ {step['added']}" for step in steps), "unit")]
+    for channel, error in before["rmse"].items():
+        errors = [error, *(step["rmse"].get(channel) for step in steps)]
+        shown = [format_error_and_unit(value, before["unit"][channel]) for value in errors]
+        rows.append((channel, *(text for text, _ in shown), shown[0][1]))
+    return rows
+
+
+def _gap_location_rows(result: Mapping[str, Any]) -> TableRows:
+    rows: TableRows = [("where", "share of the gap", "when [s]")]
+    for place in result.get("where", ()):
+        if place["share"] > _MIN_GAP_SHARE:
+            when = ", ".join(f"{begin:.3g} to {end:.3g}" for begin, end in place["windows"][:_MAX_WINDOWS])
+            more = ", …" if len(place["windows"]) > _MAX_WINDOWS else ""
+            rows.append((place["location"], f"{100 * place['share']:.1f} %", when + more))
+    return rows
+
+
+def _event_rows(result: Mapping[str, Any]) -> TableRows:
+    rows: TableRows = [("event", "recording", "from [s]", "to [s]", "peak", "impulse", "unit")]
+    for own in result.get("events", ()):
+        peak, impulse = ("–" if own[key] is None else f"{own[key]:.3g}" for key in ("peak", "impulse"))
+        impulse += f" ± {own['std']:.2g}" if own["impulse"] is not None and own["std"] is not None else ""
+        times = ("–" if own[key] is None else f"{own[key]:.4g}" for key in ("from", "to"))
+        rows.append((own["channel"], own["recording"], *times, peak, impulse, f"{own['unit']}, {own['unit']} s"))
+    return rows
+
+
+def _candidate_rows(result: Mapping[str, Any]) -> TableRows:
+    rows: TableRows = [("candidate", "parameters", "closure alone", "score", "p")]
+    for entry in result["which"][:_MAX_CANDIDATES]:
+        values = []
+        for name, own in entry["parameters"].items():
+            unit = "" if own["unit"] == "1" else f" {own['unit']}"
+            if own["value"] is not None and own["std"] is not None:
+                values.append(f"{name} = {own['value']:.3g} ± {own['std']:.2g}{unit}")
+            elif own["value"] is not None:
+                values.append(f"{name} = {own['value']:.3g}{unit}" if entry["closure"] is None else f"{name} unknown")
+        closed = "" if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
+        numbers = (f"{entry['score']:.3g}", p_value_text(entry["p_value"]))
+        rows.append((f"{entry['kind']}@{entry['location']}", ", ".join(values), closed, *numbers))
+    return rows
+
+
+def _baseline_rows(result: Mapping[str, Any]) -> TableRows:
+    """Parameters in the baseline and now."""
+    rows: TableRows = [("parameter", "baseline", "now", "unit", "moved by", "")]
+    for name, entry in (result.get("baseline") or {"parameters": {}})["parameters"].items():
+        values = (parameter_text(entry[when], entry[f"{when}_std"], None) for when in ("before", "now"))
+        moved = "not informed" if entry["score"] is None else f"{entry['score']:+.2g} std"
+        rows.append((name, *values, entry["unit"], moved, "changed" if entry["changed"] else ""))
+    return rows
+
+
+def _counterfactual_rows(result: Mapping[str, Any]) -> TableRows:
+    rows: TableRows = [("channel", "made", "without a diagnosis", "effects removed or added", "unit")]
+    found = result.get("counterfactual") or {}
+    for key, made in (("removed", "without the effects"), ("added", "with the effects")):
+        for channel, entry in found.get(key, {"rmse": {}})["rmse"].items():
+            errors = (f"{entry[part]:.3g}" for part in ("without_diagnosis", "counterfactual"))
+            rows.append((channel, made, *errors, entry["unit"]))
+    return rows
+
+
+def _planning_command(section: Mapping[str, Any]) -> str:
+    words = ["yid-ocp", "plan", str(Path(section["parameter_run"]) / "config.yaml")]
+    for key, value in section.items():
+        text = f"[{', '.join(value)}]" if isinstance(value, list) else str(value)
+        words += ["--set", f"plan.{key}={text}"]
+    return shlex.join(words)
+
+
+# -- blind validation -------------------------------------------------------------------------------------------------
+
+
+def blind_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
+    """Summary blocks of a `yid-blind/1` result."""
+    score, *others, cases = _blind_tables(result)
+    count, right, alarms = len(result["marks"]), *(result["intervals"][key] for key in ("kind_first", "false_alarms"))
+    said = [f"{count} {'case' if count == 1 else 'cases'} of seed {result['seed']}, drawn for {result['purpose']}"]
+    if right["of"]:
+        said.append(f"of {right['of']} gaps found, {right['count']} were named right: kind and place first")
+    if alarms["of"]:
+        said.append(f"of {alarms['of']} clean recordings, {alarms['count']} gave a false alarm")
+    tables = nonempty_tables(*others, replace(cases, is_page_only=True))
+    return [replace(score, is_key_table=True), *tables, *make_statements(said, "verdict")]
+
+
+def blind_markdown(result: Mapping[str, Any]) -> list[str]:
+    """The tables of a `yid-blind/1` result as Markdown, an empty line between two."""
+    lines: list[str] = []
+    for head, *rows in (table.rows for table in _blind_tables(result)):
+        lines += ["", *(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))]
+    return lines[1:]
+
+
+def _blind_tables(result: Mapping[str, Any]) -> list[SummaryTable]:
+    """Score, detection by size, experiments, cases, and thresholds where they were calibrated."""
+    sure = {name: _rate(own) for name, own in result["intervals"].items()}
+    marks: TableRows = [
+        ("what", "value, and its binomial 95 % interval"),
+        ("false alarms on clean data", sure["false_alarms"]),
+        ("true kind and place first, of the gaps found", sure["kind_first"]),
+        ("among the first two", sure["kind_in_two"]),
+        ("place first", sure["location_first"]),
+        ("what was named, alone or as not separable, holds the truth", sure["sets_cover"]),
+        ("how many were named, on average", _number(result["set_size"], ".2f")),
+        ("unknown said of effects that the library never had", sure["unknown_outside"]),
+        ("unknown said of effects taken out of it", sure["unknown_left_out"]),
+        ("place first of both", sure["unknown_location"]),
+        ("both of a pair, each alone or in a set of three", sure["pairs_right"]),
+        ("both of a pair, each alone", sure["pairs_named"]),
+        ("closure over that of the true effect refitted", _share(result["closure_of_best"])),
+        ("median error of the effects' parameters", _share(result["parameter_error"], 1)),
+        ("their 95 % intervals that hold the truth", sure["interval_coverage"]),
+        ("time of one diagnosis", _number(result["seconds"], ".0f", " s")),
+    ]
+    head = ("size / detectable", "cases", "gap seen", "kind and place first", "alone or in a set of three")
+    sizes: TableRows = [head]
+    for size, entry in result["detection"].items():
+        own = result["detection_intervals"][size]
+        sizes.append((size, str(entry["cases"]), *(_rate(own[key]) for key in ("gap", "first", "right"))))
+    experiments: TableRows = [("experiment", "cases", "false alarms", "right")]
+    for name, own in result["experiments"].items():
+        experiments.append((name, str(own["cases"]), _rate(own["false_alarms"]), _rate(own["right"])))
+    told = ("case", "experiment", "sort", "truth", "size", "verdict", "added")
+    cases: TableRows = [(*told, "not separable", "place", "closure", "best", "time")]
+    for entry in result["marks"]:
+        wrong = "" if entry["right"] or entry["category"] == "finer_chain" else " (wrong)"
+        kept = (entry[key] for key in ("case", "experiment", "category", "truth"))
+        found = (_number(entry["multiple"], ".3g"), entry["verdict"] + wrong, entry["answer"])
+        place = (", ".join(entry["confusable"]) or "-", "right" if entry["location_first"] else "-")
+        shares = (_share(entry["closure"]), _share(entry["best"]))
+        cases.append((*kept, *found, *place, *shares, _number(entry["seconds"], ".0f", " s")))
+    tables = {"Score": marks, "Detection by size": sizes, "Experiments": experiments, "Cases": cases}
+    if result.get("calibration_of_thresholds") is not None:
+        tables["Thresholds"] = _threshold_rows(result["calibration_of_thresholds"])
+    return [SummaryTable(rows, title) for title, rows in tables.items()]
+
+
+def _threshold_rows(calibration: Mapping[str, Any]) -> TableRows:
+    """Quantiles of a `yid-calibration/1` beside what is set."""
+    kinds = {"clean": "clean recordings", "named": "effects named right", "refitted": "effects refitted"}
+    head = ("diagnosis.", "is", "advised", "what", "quantile", "coverage", "of", "effects beyond it, by size")
+    rows: TableRows = [(*head, "strange ones beyond it")]
+    for own in calibration["rules"].values():
+        name, value = own["setting"], _number(own["quantile"], ".3g")
+        sizes = ", ".join(f"{size}: {_rate(found)}" for size, found in own["effects_beyond"].items())
+        cells = (f"{own['is']:.3g}", f"{calibration['settings'][name]:.3g}", own["statistic"], value)
+        cases = (_share(own["coverage"]), f"{own['cases']} {kinds[own['of']]}", sizes or "-")
+        rows.append((name, *cells, *cases, _rate(own["strange_beyond"])))
+    return rows
+
+
+def _number(value: float | None, form: str, unit: str = "") -> str:
+    return "-" if value is None else f"{value:{form}}{unit}"
+
+
+def _share(value: float | None, digits: int = 0) -> str:
+    return "-" if value is None else f"{100 * value:.{digits}f} %"
+
+
+def _rate(own: Mapping[str, Any]) -> str:
+    if not own["of"]:
+        return "-"
+    return f"{_share(own['rate'])} ({own['count']} of {own['of']}, {_share(own['low'])} to {_share(own['high'])})"
+
+
+# -- several runs -----------------------------------------------------------------------------------------------------
+
+
+def batch_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
+    """Summary blocks of a `yid-batch/1` result."""
+    runs = result["runs"]
+    found: dict[str, list[Mapping[str, Any]]] = {}
+    for entry in runs:
+        for name, own in entry["parameters"].items():
+            if own["value"] is not None:
+                found.setdefault(name, []).append(own)
+    names = sorted(found, key=lambda name: -len(found[name]))
+    units = {name: entries[-1]["unit"] for name, entries in found.items()}
+    links = {entry["name"]: f"{entry['folder']}/report.html" for entry in runs if entry["folder"]}
+    few, every = (_batch_rows(runs, names[:count], units) for count in (_MAX_TERMINAL_PARAMETERS, None))
+    spread: TableRows = [("parameter", "runs", "smallest", "median", "largest", "unit")]
+    for name in names:
+        values = [own["value"] for own in found[name] if own["verdict"] in _FOUND_VERDICTS]
+        if len(values) > 1:
+            numbers = (min(values), statistics.median(values), max(values))
+            spread.append((name, str(len(values)), *(f"{x:.4g}" for x in numbers), found[name][0]["unit"]))
+    blocks: list[SummaryBlock] = [
+        SummaryTable(few, "Runs", is_key_table=True, links=links),
+        *nonempty_tables(SummaryTable(spread, "Parameters over all runs")),
+    ]
+    if len(names) > _MAX_TERMINAL_PARAMETERS:
+        blocks.append(SummaryTable(every, "Runs with all parameters", is_page_only=True, links=links))
+    ended = ", ".join(f"{count} {status}" for status, count in Counter(entry["status"] for entry in runs).items())
+    said = [f"{len(runs)} {'run' if len(runs) == 1 else 'runs'}: {ended}."]
+    said += [f"{entry['name']}: {entry['message'].splitlines()[0]}." for entry in runs if not entry["ok"]]
+    alike = result["history"]
+    if alike is not None:
+        blocks.append(SummaryTable(_consistency_rows(alike), "Each run against the others"))
+        drifted, wrong = _drifted_and_distrusted(alike)
+        verb = "is" if len(drifted) == 1 else "are"
+        same = "No parameter differs among the runs by more than they state."
+        said.append(f"{', '.join(drifted)} {verb} not the same in all runs." if drifted else same)
+        said += [f"Distrust {', '.join(wrong)}: without it the others agree, or agree far better."] if wrong else []
+    return [*blocks, *make_statements(said, "verdict")]
+
+
+def _batch_rows(runs: Sequence[Mapping[str, Any]], names: Sequence[str], units: Mapping[str, str]) -> TableRows:
+    heads = [f"{name} [{units[name]}]" if units[name] else name for name in names]
+    rows: TableRows = [("run", "status", "chi2/n", "effects", *heads, "time")]
+    for entry in runs:
+        cells = []
+        for own in (entry["parameters"].get(name, {"value": None}) for name in names):
+            if own["value"] is None:
+                cells.append("")
+            elif own["verdict"] in _FOUND_VERDICTS:
+                cells.append(parameter_text(own["value"], own["std"], None))
+            else:
+                cells.append(VERDICT_WORDS[own["verdict"]])
+        fit = "" if entry["chi2_per_dof"] is None else f"{entry['chi2_per_dof']:.3g}"
+        time = "" if entry["seconds"] is None else f"{entry['seconds']:.1f} s"
+        rows.append((entry["name"], entry["status"], fit, ", ".join(entry["effects"]), *cells, time))
+    return rows
+
+
+def history_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
+    """Summary blocks of a `yid-history/1` result."""
+    runs = [entry["name"] for entry in result["runs"]]
+    rows: TableRows = [("parameter", *runs, "together", "unit", "p", "")]
+    for name, entry in result["parameters"].items():
+        known = entry["values"]
+        cells = (parameter_text(known[r]["value"], known[r]["std"], None) if r in known else "" for r in runs)
+        p = "" if len(known) < 2 else p_value_text(entry["p_value"])
+        together = parameter_text(entry["mean"], entry["mean_std"], None)
+        rows.append((name, *cells, together, entry["unit"], p, "drifted" if entry["drifted"] else ""))
+    return [
+        SummaryTable(rows, "Parameters", is_key_table=True),
+        SummaryTable(_consistency_rows(result), "Runs"),
+        *make_statements(_history_sentences(result), "verdict"),
+    ]
+
+
+def _consistency_rows(history: Mapping[str, Any]) -> TableRows:
+    """Each run of a `yid-history/1` tested against all others."""
+    rows: TableRows = [("run", "differs from the others", "p", "most in", "model explains it", "")]
+    for entry in history["runs"]:
+        apart = (f"chi2 {entry['chi2']:.3g} of {entry['degrees']}", p_value_text(entry["p_value"]), entry["worst"])
+        said = ("yes" if entry["explains"] else "no", "distrust" if entry["distrusted"] else "")
+        rows.append((entry["name"], *apart, *said))
+    return rows
+
+
+def _drifted_and_distrusted(history: Mapping[str, Any]) -> tuple[list[str], list[str]]:
+    drifted = [name for name, entry in history["parameters"].items() if entry["drifted"]]
+    return drifted, [entry["name"] for entry in history["runs"] if entry["distrusted"]]
+
+
+def _history_sentences(result: Mapping[str, Any]) -> list[str]:
+    runs, (drifted, wrong) = result["runs"], _drifted_and_distrusted(result)
+    text = []
+    if not drifted and result["p_value"] >= result["level"]:
+        p = _relation(result["p_value"])
+        text.append(f"Nothing drifted: all {len(runs)} runs agree within what they state (p {p}).")
+    elif not drifted:
+        text.append(
+            f"Together the runs differ (p {_relation(result['p_value'])}), though no parameter alone does: look at "
+            "what they have in common."
+        )
+    for name in drifted:
+        entry = result["parameters"][name]
+        first, *_, last = (own["value"] for own in entry["values"].values())
+        text.append(
+            f"{name} is not the same in all runs: {first:.4g} in the first, {last:.4g} {entry['unit']} in the last "
+            f"(p {_relation(entry['p_value'])})."
+        )
+    if wrong:
+        text.append(f"Distrust {' and '.join(wrong)}: without it the others agree, or agree far better.")
+    elif drifted and len(runs) == 2:
+        text.append("Two runs that differ do not say which of them to distrust; a third one would.")
+    elif drifted:
+        text.append("No single run stands apart from the others.")
+    poor = [entry["name"] for entry in runs if not entry["explains"]]
+    if poor:
+        text.append(
+            f"The model did not explain the recordings of {', '.join(poor)}: the ± there counts the misfit and may "
+            "still be too small."
+        )
+    return text
+
+
+def _relation(p_value: float) -> str:
+    text = p_value_text(p_value)
+    return text if text.startswith("<") else f"= {text}"
