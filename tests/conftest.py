@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
+import sys
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 
 import casadi as ca
 import hypothesis
@@ -171,6 +173,27 @@ def violation():
         return np.array(ca.Function("phi", [e.q1, e.theta, e.time_step], [phi])(q, theta, step.time_step)).ravel()
 
     return evaluate
+
+
+@pytest.fixture(scope="session")
+def benchmark_module(repository):
+    """benchmark_module(name, **neighbours): a module of benchmarks/, which imports those that stand beside it.
+
+    A package of the same name may be loaded already (`coverage`); it stays so.
+    """
+
+    def load(name: str, **neighbours: ModuleType) -> ModuleType:
+        spec = importlib.util.spec_from_file_location(name, repository / "benchmarks" / f"{name}.py")
+        module = importlib.util.module_from_spec(spec)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.syspath_prepend(repository / "benchmarks")
+            for key, value in {name: module, **neighbours}.items():
+                patch.setitem(sys.modules, key, value)
+            spec.loader.exec_module(module)
+        sys.modules.setdefault(name, module)  # dataclasses look their module up
+        return module
+
+    return load
 
 
 @pytest.fixture

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from types import ModuleType
-
 import pytest
-from test_coverage_benchmark import loaded
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.workflow.build_problem import build_problem
@@ -21,30 +17,25 @@ QUICK = {
 }
 SLOW = pytest.mark.slow
 CONFIGS = [pytest.param(name, marks=SLOW if name == "deft_bdlo1" else ()) for name in sorted(QUICK)]
+CASES = [
+    pytest.param(config.values[0], name, marks=config.marks) for config in CONFIGS for name in QUICK[config.values[0]]
+]
 
 
 @pytest.fixture(scope="module")
-def benchmark(repository: Path) -> ModuleType:
-    """The module benchmarks/nonsense.py."""
-    return loaded(repository / "benchmarks", "nonsense")
+def benchmark(benchmark_module):
+    return benchmark_module("nonsense")
 
 
-def test_there_are_at_least_forty_cases_each_with_a_name_of_its_own(benchmark: ModuleType) -> None:
+def test_there_are_at_least_forty_cases_each_with_a_name_of_its_own(benchmark):
     names = [(case.config, case.name) for case in benchmark.cases()]
     assert len(set(names)) == len(names) >= 40
     assert {config for config, _ in names} == set(QUICK)
     assert {(config, name) for config, some in QUICK.items() for name in some} <= set(names)
 
 
-@pytest.mark.parametrize(
-    ("config", "name"),
-    [
-        pytest.param(config, name, marks=SLOW if config == "deft_bdlo1" else ())
-        for config, some in QUICK.items()
-        for name in some
-    ],
-)
-def test_a_wrong_recording_is_named(benchmark: ModuleType, tmp_path: Path, config: str, name: str) -> None:
+@pytest.mark.parametrize(("config", "name"), CASES)
+def test_a_wrong_recording_is_named(benchmark, tmp_path, config, name):
     case = next(case for case in benchmark.cases() if (case.config, case.name) == (config, name))
     if benchmark.clean_recording(case) is None:
         pytest.skip(f"its recording is not here: {benchmark.REAL[config]}")
@@ -53,7 +44,7 @@ def test_a_wrong_recording_is_named(benchmark: ModuleType, tmp_path: Path, confi
 
 
 @pytest.mark.parametrize("config", CONFIGS)
-def test_shipped_recordings_are_not_in_doubt(repository: Path, config: str) -> None:
+def test_shipped_recordings_are_not_in_doubt(repository, config):
     run = load_config(repository / "configs" / f"{config}.yaml")
     files = [recording_path(path) for path in (*run.recordings.estimate, *run.recordings.held_out)]
     missing = [file for file in files if not file.is_file()]
@@ -65,16 +56,14 @@ def test_shipped_recordings_are_not_in_doubt(repository: Path, config: str) -> N
 @pytest.mark.parametrize(
     "config", ["single_arm_no_vision", "single_arm_vision", "dual_arm_no_vision", "dual_arm_vision"]
 )
-def test_exact_torques_are_not_in_doubt(repository: Path, clean: Path, config: str) -> None:
+def test_exact_torques_are_not_in_doubt(repository, clean, config):
     files = [f"recordings.{role}=[{clean / config}_{role}.h5]" for role in ("estimate", "held_out")]
     run = load_config(repository / "configs" / f"{config}.yaml", files)
     assert build_problem(run).options.data_issues == ()
 
 
 @SLOW
-def test_nine_of_ten_wrong_recordings_are_named_and_nothing_is_found_on_the_others(
-    benchmark: ModuleType, tmp_path: Path
-) -> None:
+def test_nine_of_ten_wrong_recordings_are_named_and_nothing_is_found_on_the_others(benchmark, tmp_path):
     here = [case for case in benchmark.cases() if benchmark.clean_recording(case) is not None]
     entries = [benchmark.tried(case, tmp_path / str(i)) for i, case in enumerate(here)]
     assert sum(entry["named"] for entry in entries) >= 0.9 * len(entries)

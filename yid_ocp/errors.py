@@ -24,10 +24,8 @@ class YidError(Exception):
 
     def __init__(self, what: str, *, where: str = "", allowed: str = "", hint: str = "") -> None:
         self.what, self.where, self.allowed, self.hint = what, where, allowed, hint
-        lines = [what]
         parts = (("where", where), ("allowed", allowed), ("try", hint))
-        lines += [f"  {label}: {text}" for label, text in parts if text]
-        super().__init__("\n".join(lines))
+        super().__init__("\n".join([what, *(f"  {label}: {text}" for label, text in parts if text)]))
 
 
 class ConfigError(YidError):

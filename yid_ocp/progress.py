@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from dataclasses import dataclass
 from typing import Protocol
 
 
@@ -13,22 +14,18 @@ class AcceptedIterate(Protocol):
     @property
     def iteration(self) -> int:
         """Number of the iteration."""
-        ...
 
     @property
     def cost(self) -> float:
         """Cost at the point."""
-        ...
 
     @property
     def seconds(self) -> float:
         """Wall time since the search started [s]."""
-        ...
 
     @property
     def note(self) -> str:
         """Remark on the point, such as the number of its starting point."""
-        ...
 
 
 class Progress(Protocol):
@@ -36,15 +33,12 @@ class Progress(Protocol):
 
     def begin_stage(self, text: str) -> None:
         """Report that a new stage of the work begins."""
-        ...
 
     def report_iterate(self, entry: AcceptedIterate) -> None:
         """Report that a search accepted a point."""
-        ...
 
     def report_parts_done(self, done: int, total: int, text: str) -> None:
         """Report that `done` of `total` parts of the stage are finished; `text` names the last or next one."""
-        ...
 
 
 class NullProgress:
@@ -60,19 +54,19 @@ class NullProgress:
         """Ignore the report."""
 
 
+@dataclass(frozen=True)
 class LoggingProgress(NullProgress):
     """Progress as log messages."""
 
-    def __init__(self, log: logging.Logger) -> None:
-        self._log = log
+    log: logging.Logger
 
     def begin_stage(self, text: str) -> None:
         """Log the name of the stage."""
-        self._log.info("%s", text)
+        self.log.info("%s", text)
 
     def report_parts_done(self, done: int, total: int, text: str) -> None:
         """Log the number of finished parts."""
-        self._log.info("%d of %d, %s", done, total, text)
+        self.log.info("%d of %d, %s", done, total, text)
 
 
 class ParallelProgress:

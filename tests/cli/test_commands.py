@@ -54,11 +54,6 @@ def test_every_command_is_a_file_of_workflow(repository):
     assert len({row.name for row in COMMANDS}) == len({row.workflow_module for row in COMMANDS}) == len(COMMANDS)
 
 
-def test_no_command_and_unknown_command(cli):
-    assert cli().code == 2
-    assert cli("slove").code == 2
-
-
 def test_solve_finds_what_the_efforts_say(cli, pendulum, pendulum_data, tmp_path):
     done = cli("solve", pendulum)
     assert done.code == 0, done.err
@@ -144,18 +139,10 @@ def test_without_the_extra_report(pendulum, tmp_path):
     assert not (tmp_path / "run" / "report.html").exists()
 
 
-def test_quiet_prints_the_folder_alone(cli, pendulum, tmp_path):
-    done = cli("solve", pendulum, "--quiet", "--out", tmp_path / "here")
-    assert done.code == 0
-    assert done.out.strip() == str(tmp_path / "here")
-    assert done.err == ""
-
-
-def test_set_changes_the_run(cli, pendulum, tmp_path):
-    done = cli(
-        "solve", pendulum, "--out", "a", "--set", "parameters.elbow.damping.free=false", "--set", "problem.duration=0.5"
-    )
-    assert done.code == 0
+def test_quiet_prints_the_folder_alone_and_set_changes_the_run(cli, pendulum, tmp_path):
+    settings = ("parameters.elbow.damping.free=false", "problem.duration=0.5")
+    done = cli("solve", pendulum, "--quiet", "--out", tmp_path / "a", *(f"--set={setting}" for setting in settings))
+    assert (done.code, done.out.strip(), done.err) == (0, str(tmp_path / "a"), "")
     result = json.loads((tmp_path / "a" / "result.json").read_text())
     assert not result["parameters"]["elbow.damping"]["free"]
     assert result["residuals"]["joints.effort.shoulder"]["n"] < 60
@@ -217,6 +204,7 @@ def test_a_notice_is_shown_once(cli, pendulum, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        ([], ("COMMAND",)),
         (["slove"], ("there is no command 'slove'", "did you mean 'solve'?")),
         (["check"], ("the following arguments are required: CONFIG.yaml", "where: yid-ocp check", "--help")),
         (["check", "a.yaml", "b.yaml"], ("'b.yaml' is one argument too many",)),
@@ -254,6 +242,9 @@ def test_check(cli, pendulum, tmp_path):
     assert "100 Hz" in done.out
     assert "run folder: c" in done.out
     assert not any("effort_kind" in text for text in result["warnings"])
+    assert set(result["mechanics"]) == {"built", "file"}
+    assert all(entry["agrees"] for entry in result["mechanics"].values())
+    assert "double_pendulum.urdf as read: mass matrix, weight and inverse dynamics are Pinocchio's within" in done.out
 
 
 def test_check_says_what_kind_of_torque_is_assumed(cli, pendulum, pendulum_data, tmp_path):
@@ -296,7 +287,9 @@ def test_check_refines_links_and_time_step(cli, tmp_path, monkeypatch):
 
 
 def test_inspect(cli, pendulum, tmp_path):
-    done = cli("inspect", pendulum, "--out", "i")
+    entries = ("del[elbow], elbow.damping", "p1[shoulder]", "elbow.mass")
+    asked = [part for entry in entries for part in ("--entry", entry)]
+    done = cli("inspect", pendulum, "--out", "i", *asked, "--export", "eq")
     assert done.code == 0, done.err
     folder = tmp_path / "i"
     result = json.loads((folder / "result.json").read_text())
@@ -317,46 +310,15 @@ def test_inspect(cli, pendulum, tmp_path):
     assert damping["best"] == "joints.effort"
     assert damping["along"] > 0
     assert damping["words"] in " ".join(done.out.split())
-    # what is not free is in the result alone
-    assert "elbow.mass enters" not in done.out
+    # what is neither free nor asked for is in the result alone
+    assert "shoulder.mass enters" not in done.out
     assert result["dependence"]["elbow.mass"]["words"].startswith("elbow.mass enters 4 rows")
     assert result["dependence"]["elbow.mass"]["along"] is None
     lines = (folder / "equations.txt").read_text().splitlines()
     assert any(line.startswith("del[elbow]: ") for line in lines)
-    assert (result["entries"], result["exported"]) == ([], [])
     with h5py.File(folder / "linearisation.h5") as file:
         assert file["A"].shape == (4, 4)
         assert file["B_theta"].shape == (4, len(result["parameters"]))
-
-
-def test_inspect_agrees_with_finite_differences(cli, tmp_path, monkeypatch, urdf_folder):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "free.yaml").write_text(
-        f"model:\n  robot: {urdf_folder / 'double_pendulum.urdf'}\n  arms: {{mode: driven}}\n"
-        "problem: {use_compiler: false}\n"
-    )
-    done = cli("inspect", "free.yaml", "--out", "i")
-    assert done.code == 0, done.err
-    result = json.loads((tmp_path / "i" / "result.json").read_text())
-    assert all(error < 1e-6 for error in result["linearisation"]["finite_difference_errors"].values())
-    assert result["equations"]["unknowns"] == 2
-    assert result["equations"]["jacobian_nonzeros"] == 4
-
-
-def test_inspect_prints_entries_and_exports_equations(cli, pendulum, tmp_path):
-    asked = (
-        "--entry",
-        "del[elbow], elbow.damping",
-        "--entry",
-        "p1[shoulder]",
-        "--entry",
-        "elbow.mass",
-        "--export",
-        "eq",
-    )
-    done = cli("inspect", pendulum, "--out", "i", *asked)
-    assert done.code == 0, done.err
-    result = json.loads((tmp_path / "i" / "result.json").read_text())
     assert [entry["title"] for entry in result["entries"]] == ["d del[elbow] / d elbow.damping", "p1[shoulder]"]
     assert result["asked"] == ["elbow.mass"]
     assert result["dependence"]["elbow.mass"]["words"] in " ".join(done.out.split())
@@ -376,6 +338,20 @@ def test_inspect_prints_entries_and_exports_equations(cli, pendulum, tmp_path):
     assert {"rows.casadi", "equations.c", "equations.tex", "names.json"} <= files
 
 
+def test_inspect_agrees_with_finite_differences(cli, tmp_path, monkeypatch, urdf_folder):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "free.yaml").write_text(
+        f"model:\n  robot: {urdf_folder / 'double_pendulum.urdf'}\n  arms: {{mode: driven}}\n"
+        "problem: {use_compiler: false}\n"
+    )
+    done = cli("inspect", "free.yaml", "--out", "i")
+    assert done.code == 0, done.err
+    result = json.loads((tmp_path / "i" / "result.json").read_text())
+    assert all(error < 1e-6 for error in result["linearisation"]["finite_difference_errors"].values())
+    assert result["equations"]["unknowns"] == 2
+    assert result["equations"]["jacobian_nonzeros"] == 4
+
+
 @pytest.mark.parametrize(
     ("entry", "said"),
     [
@@ -391,15 +367,6 @@ def test_a_wrong_entry_leaves_nothing_behind(cli, pendulum, tmp_path, entry, sai
     assert said in done.err
     assert not (tmp_path / "i").exists()
     assert not (tmp_path / "eq").exists()
-
-
-def test_check_compares_with_another_library(cli, pendulum, tmp_path):
-    done = cli("check", pendulum, "--out", "c")
-    assert done.code == 0, done.err
-    mechanics = json.loads((tmp_path / "c" / "result.json").read_text())["mechanics"]
-    assert set(mechanics) == {"built", "file"}
-    assert all(entry["agrees"] for entry in mechanics.values())
-    assert "double_pendulum.urdf as read: mass matrix, weight and inverse dynamics are Pinocchio's within" in done.out
 
 
 def test_check_warns_of_a_file_that_another_library_reads_otherwise(cli, pendulum, monkeypatch):

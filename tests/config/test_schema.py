@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import runpy
 from types import SimpleNamespace
 
@@ -13,11 +12,6 @@ from ruamel.yaml import YAML
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import config_json_schema
 from yid_ocp.errors import ConfigError
-
-
-def test_the_one_beside_the_configurations_is_current(repository):
-    kept = json.loads((repository / "configs" / "schema.json").read_text(encoding="utf-8"))
-    assert kept == config_json_schema(), "regenerate it with  yid-ocp schema --out configs/schema.json"
 
 
 @pytest.fixture(scope="module")

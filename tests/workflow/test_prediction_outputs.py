@@ -164,7 +164,7 @@ def test_offsets_of_all_recordings_are_told_with_what_was_expected(step):
 def test_where_offsets_are_no_part_of_the_model_nothing_is_said(step):
     problem = problem_of(step, bias=0.0)
     assert estimated_torque_offsets(whitened_at(problem, problem.initial_unknowns), problem.initial_unknowns) == {}
-    assert torque_offset_rows({"torque_offsets": {}}) == torque_offset_rows({}) == []
+    assert len(torque_offset_rows({"torque_offsets": {}})) == len(torque_offset_rows({})) == 1, "a head alone"
 
 
 def offset_entry(value, prior=0.3):

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any, TypeVar
 
 from yid_ocp.parallel.threads_and_processes import limit_threads, max_threads
@@ -18,18 +20,17 @@ _Answer = TypeVar("_Answer")
 
 
 class _Abandoned(BaseException):
-    """Raised in an item that waits for an answer after another item failed."""
+    """Raised in an item that waits for an answer that will not come."""
 
 
 @dataclass(eq=False)
 class _Request:
-    """Arguments of one item for one function."""
+    """Arguments of one item for one function, and what becomes of them."""
 
     rank: int
     function: Callable[[list[Any]], list[Any]]
     questions: list[Any]
-    answers: list[Any] | None = None
-    error: BaseException | None = None
+    answers: Future[list[Any]] = field(default_factory=Future)
 
 
 @dataclass(eq=False)
@@ -46,22 +47,14 @@ class _March:
         """Wait for the answers to a request, and let another item run meanwhile."""
         self.running.release()
         try:
-            return self._answers(request)
-        finally:
-            self.running.acquire()
-
-    def _answers(self, request: _Request) -> list[Any]:
-        with self.changed:
-            self.waiting.append(request)
-            self.changed.notify_all()
-            while request.answers is None and request.error is None:
+            with self.changed:
                 if self.abandoned:
                     raise _Abandoned
-                self.changed.wait()
-        if request.error is not None:
-            raise request.error
-        assert request.answers is not None
-        return request.answers
+                self.waiting.append(request)
+                self.changed.notify_all()
+            return request.answers.result()
+        finally:
+            self.running.acquire()
 
     def leave(self) -> None:
         """Register that one thread has no more items."""
@@ -73,14 +66,35 @@ class _March:
         """Answer all requests whenever all threads wait, until no thread is left."""
         while True:
             with self.changed:
+                self.waiting = [request for request in self.waiting if not request.answers.done()]
                 self.changed.wait_for(lambda: len(self.waiting) == self.live)
                 if not self.live:
                     return
-                requests, self.waiting = sorted(self.waiting, key=lambda request: request.rank), []
-            for group in _by_function(requests):
+                groups: dict[Any, list[_Request]] = {}
+                for request in sorted(self.waiting, key=lambda request: request.rank):
+                    groups.setdefault(request.function, []).append(request)
+            for group in groups.values():
                 _answer(group)
-            with self.changed:
-                self.changed.notify_all()
+
+    def abandon(self) -> None:
+        """End all items that wait, now or later."""
+        with self.changed:
+            self.abandoned = True
+            for request in self.waiting:
+                if not request.answers.done():
+                    request.answers.set_exception(_Abandoned())
+
+
+def _answer(requests: Sequence[_Request]) -> None:
+    """Call one function for several requests and distribute its results."""
+    try:
+        found = iter(requests[0].function([question for request in requests for question in request.questions]))
+    except Exception as error:
+        for request in requests:
+            request.answers.set_exception(error)
+        return
+    for request in requests:
+        request.answers.set_result(list(islice(found, len(request.questions))))
 
 
 _HERE = threading.local()
@@ -139,33 +153,10 @@ def map_with_batched_calls(function: Callable[[_Item], _Result], items: Iterable
             thread.start()
         march.answer_until_done()
     finally:
-        with march.changed:
-            march.abandoned = True
-            march.changed.notify_all()
+        march.abandon()
         for thread in team:
             if thread.ident is not None:
                 thread.join()
     if errors:
         raise errors[min(errors)]
     return [results[index] for index in range(len(entries))]
-
-
-def _by_function(requests: Sequence[_Request]) -> list[list[_Request]]:
-    groups: dict[Any, list[_Request]] = {}
-    for request in requests:
-        groups.setdefault(request.function, []).append(request)
-    return list(groups.values())
-
-
-def _answer(requests: Sequence[_Request]) -> None:
-    """Call one function for several requests and distribute its results."""
-    try:
-        answers = requests[0].function([question for request in requests for question in request.questions])
-    except Exception as error:
-        for request in requests:
-            request.error = error
-        return
-    at = 0
-    for request in requests:
-        request.answers = answers[at : at + len(request.questions)]
-        at += len(request.questions)

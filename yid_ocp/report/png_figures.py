@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -111,7 +111,7 @@ def _draw_rates(axes: Axes, places: list[float], rates: list[Mapping[str, Any]],
         axes.errorbar(places, values, yerr=spread, marker="o", capsize=3, label=label)
 
 
-def _save_rates(figure: Figure, path: Path, legend_place: str) -> None:
+def _save_rates(figure: Figure, path: Path, legend_place: Literal["lower right", "upper left"]) -> None:
     (axes,) = figure.axes
     axes.grid(alpha=0.3)
     if axes.get_legend_handles_labels()[1]:
@@ -173,9 +173,10 @@ def _draw_pattern(axes: Axes, pattern: SparsityPattern) -> None:
     colors = ListedColormap(["white", _NONZERO_COLOR if marked is None else _STRUCTURAL_COLOR, _NONZERO_COLOR])
     axes.imshow(shown, cmap=colors, vmin=0, vmax=2, interpolation="none", aspect="equal", origin="upper")
     axes.set_title(title, fontsize=9)
-    for axis, labels, blocks, line, add_axis, place in (
-        (axes.xaxis, pattern.column_labels, pattern.column_blocks, axes.axvline, axes.secondary_xaxis, "top"),
-        (axes.yaxis, pattern.row_labels, pattern.row_blocks, axes.axhline, axes.secondary_yaxis, "right"),
+    top, right = axes.secondary_xaxis("top").xaxis, axes.secondary_yaxis("right").yaxis
+    for axis, side, labels, blocks, line in (
+        (axes.xaxis, top, pattern.column_labels, pattern.column_blocks, axes.axvline),
+        (axes.yaxis, right, pattern.row_labels, pattern.row_blocks, axes.axhline),
     ):
         for block in blocks[1:]:
             if block.stop > block.start:
@@ -185,12 +186,10 @@ def _draw_pattern(axes: Axes, pattern: SparsityPattern) -> None:
         axis.set_tick_params(length=2)
         named = [block for block in blocks if block.stop > block.start]
         middles = [0.5 * (block.start + block.stop - 1) for block in named]
-        opposite = add_axis(place)
-        side = opposite.xaxis if place == "top" else opposite.yaxis
         side.set_ticks(middles, labels=[block.name for block in named], fontsize=8, color=_BLOCK_EDGE_COLOR)
         # names of narrow neighbours would be written over each other
         narrow = len(named) > 8 or any(block.stop - block.start < 0.03 * width for block in named)
-        side.set_tick_params(length=0, labelrotation=90 if narrow and place == "top" else 0)
+        side.set_tick_params(length=0, labelrotation=90 if narrow and side is top else 0)
     axes.tick_params(axis="x", labelrotation=90)
 
 

@@ -409,7 +409,7 @@ def inspect_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
         parameters.append((name, f"{entry['value']:.6g}", entry["unit"], bounds_text(entry, 6), free))
     functions: TableRows = [("function", "operations", "nonzeros")]
     functions += [(f["name"], str(f["operations"]), str(f["nonzeros"])) for f in equations["functions"]]
-    blocks = [
+    blocks: list[SummaryBlock] = [
         SummaryStatement(size, "verdict"),
         SummaryTable(parameters, "Parameters", is_key_table=True),
         SummaryTable(functions, "Functions"),

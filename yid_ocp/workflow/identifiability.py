@@ -35,13 +35,13 @@ from yid_ocp.analysis.what_if import (
 )
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings
+from yid_ocp.files import from_plain_data, to_plain_data
 from yid_ocp.inference.null_test import GapCriteria
 from yid_ocp.model.system import System
 from yid_ocp.parallel import Task, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.summaries import identifiability_summary
-from yid_ocp.serialization import from_plain_data, to_plain_data
 from yid_ocp.solvers import Iterate, Solution, Status, solve
 from yid_ocp.workflow.build import build_step, build_system, system_with_second_arm
 from yid_ocp.workflow.build_problem import build_problem

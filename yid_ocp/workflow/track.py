@@ -20,13 +20,12 @@ from yid_ocp.config.settings import OutputSettings, RecordingSettings, RunSettin
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.errors import DataError, OutputError, YidError
-from yid_ocp.files import file_sha256, json_sha256, os_error_reason, write_text
+from yid_ocp.files import file_sha256, from_plain_data, json_sha256, os_error_reason, to_plain_data, write_text
 from yid_ocp.model.system import System
 from yid_ocp.parallel import InlineExecutor, Task, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.animation import ModelTrajectory, make_animation
 from yid_ocp.report.summaries import track_summary
-from yid_ocp.serialization import from_plain_data, to_plain_data
 from yid_ocp.vision.calibration import CameraCalibration
 from yid_ocp.vision.camera_registration import (
     CLOCK_DRIFT_INDEX,

@@ -180,12 +180,16 @@ def _identifiability(findings: ReportData) -> Mapping[str, Any] | None:
 @register_section("information", 10, "The motion that tells most")
 def _informative_motion(findings: ReportData) -> Mapping[str, Any] | None:
     """Joint positions, velocities and efforts over time."""
-    return _planned_motion(findings, "information")
+    return _motion_figures(findings, "information")
 
 
 @register_section("plan", 10, "The planned motion")
-def _planned_motion(findings: ReportData, key: str = "plan") -> Mapping[str, Any] | None:
-    """Distance of the point from its target or velocities, and joints over time."""
+def _planned_motion(findings: ReportData) -> Mapping[str, Any] | None:
+    """Distance of the point from its target, joint positions and efforts over time."""
+    return _motion_figures(findings, "plan")
+
+
+def _motion_figures(findings: ReportData, key: str) -> Mapping[str, Any] | None:
     found = findings.section_data.get(key)
     if found is None:
         return None
