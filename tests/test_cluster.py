@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 from here import Here
+from light_tasks import deadly, squared
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.errors import WorkerError
@@ -26,39 +27,20 @@ from yid_ocp.workflow.blind import run_blind
 distributed = pytest.importorskip("distributed", reason="clusters need Dask: pip install 'yid-ocp[cluster]'")
 
 
-def squared(number: int, marks: str) -> int:
-    """A task that says which process began it, and when it ended."""
-    begun = Path(marks) / f"{number}.{os.getpid()}.begun"
-    begun.write_text("")
-    time.sleep(0.15)
-    begun.with_suffix(".ended").write_text("")
-    return number**2
-
-
-def deadly(number: int) -> int:
-    if number == 1:
-        os._exit(7)
-    return number
-
-
 def tasks(marks: Path, count: int = 12) -> list[Task]:
-    marks.mkdir()
+    marks.mkdir(exist_ok=True)
     return [Task(f"task {i}", {"number": i, "marks": str(marks)}) for i in range(count)]
 
 
 @pytest.fixture(scope="module")
 def scheduler():
     """Address of a scheduler with two workers of one thread each, and the cluster itself."""
-    with distributed.LocalCluster(
-        n_workers=2,
-        threads_per_worker=1,
-        processes=True,
-        dashboard_address=None,
-        host="127.0.0.1",
-        scheduler_kwargs={"allowed_failures": 1},
-    ) as cluster:
+    where = {"dashboard_address": None, "host": "127.0.0.1", "scheduler_kwargs": {"allowed_failures": 1}}
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, **where) as cluster:
         cluster.wait_for_workers(2, timeout=60)
-        yield SimpleNamespace(address=cluster.scheduler_address, cluster=cluster)
+        yield SimpleNamespace(
+            address=cluster.scheduler_address, cluster=cluster, config=WorkerConfig(None, cluster.scheduler_address)
+        )
 
 
 def recover(cluster: Any) -> None:
@@ -94,9 +76,7 @@ def test_a_killed_worker_loses_nothing_and_nothing_counts_twice(scheduler, tmp_p
                 os.kill(killed[0], signal.SIGKILL)
                 return
 
-    found = run_tasks(
-        squared, tasks(marks), tmp_path / "there", WorkerConfig(scheduler_address=scheduler.address), kill_one
-    )
+    found = run_tasks(squared, tasks(marks), tmp_path / "there", scheduler.config, kill_one)
     assert len(killed) == 1
     assert [entry.error for entry in found] == [""] * 12
     begun, ended = ([path.stem.partition(".")[0] for path in marks.glob(f"*.{what}")] for what in ("begun", "ended"))
@@ -107,19 +87,13 @@ def test_a_killed_worker_loses_nothing_and_nothing_counts_twice(scheduler, tmp_p
     assert [entry.value for entry in found] == [entry.value for entry in here] == [i**2 for i in range(12)]
     files = {path.name: json.loads(path.read_text()) for path in (tmp_path / "there").iterdir()}
     assert sorted(entry["name"] for entry in files.values()) == sorted(entry.name for entry in found)
-    again = run_tasks(
-        squared, [Task("", {"number": i, "marks": str(marks)}) for i in range(12)], tmp_path / "there"
-    )  # whoever did them, they are done
+    # whoever did them, they are done
+    again = run_tasks(squared, [Task("", task.arguments) for task in tasks(marks)], tmp_path / "there")
     assert all(entry.was_resumed for entry in again)
 
 
 def test_a_task_that_ends_every_worker_fails_alone(scheduler, tmp_path, caplog):
-    found = run_tasks(
-        deadly,
-        [Task(str(i), {"number": i}) for i in range(3)],
-        tmp_path,
-        WorkerConfig(scheduler_address=scheduler.address),
-    )
+    found = run_tasks(deadly, [Task(str(i), {"number": i}) for i in range(3)], tmp_path, scheduler.config)
     assert [entry.value for entry in found] == [0, None, 2]
     assert found[1].error == "every worker that tried it ended abruptly"
     recover(scheduler.cluster)
@@ -129,12 +103,11 @@ def test_a_worker_of_another_version_is_refused(scheduler, tmp_path, monkeypatch
     other = {**software_fingerprint(), "yid-ocp": "99.0", "code": "b" * 64}
     monkeypatch.setattr("yid_ocp.parallel.dask_cluster.software_fingerprint", lambda: other)
     with pytest.raises(WorkerError, match=r"of another version: yid-ocp \S+ instead of 99.0, code \w+ instead of bbb"):
-        WorkerConfig(scheduler_address=scheduler.address).check_available()
-    monkeypatch.setattr(
-        "yid_ocp.parallel.dask_cluster.software_fingerprint", lambda: {**software_fingerprint(), "python": "2.7"}
-    )
+        scheduler.config.check_available()
+    older = {**software_fingerprint(), "python": "2.7"}
+    monkeypatch.setattr("yid_ocp.parallel.dask_cluster.software_fingerprint", lambda: older)
     with pytest.raises(WorkerError, match=r"python 3\.\S+ instead of 2.7"):
-        WorkerConfig(scheduler_address=scheduler.address).check_available()
+        scheduler.config.check_available()
 
 
 def test_what_a_worker_cannot_import_or_see_is_said(scheduler, tmp_path, monkeypatch):
@@ -158,13 +131,10 @@ def test_workers_of_several_threads_are_refused():
         WorkerConfig(scheduler_address=cluster.scheduler_address).check_available()
 
 
-@pytest.mark.parametrize(
-    ("address", "words"),
-    [("127.0.0.1:1", "no scheduler answers"), ("nowhere", "no scheduler answers"), ("a:b:c", "no scheduler answers")],
-)
-def test_a_scheduler_that_is_not_there_is_said(address, words, monkeypatch):
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "nowhere", "a:b:c"])
+def test_a_scheduler_that_is_not_there_is_said(address, monkeypatch):
     monkeypatch.setattr("yid_ocp.parallel.dask_cluster._CONNECT_TIMEOUT", 0.5)
-    with pytest.raises(WorkerError, match=words) as caught:
+    with pytest.raises(WorkerError, match="no scheduler answers") as caught:
         WorkerConfig(scheduler_address=address).check_available()
     assert address in str(caught.value)
     assert "dask scheduler" in str(caught.value)
@@ -180,10 +150,8 @@ def test_a_scheduler_file_will_do(scheduler, tmp_path):
     file = tmp_path / "scheduler.json"
     with distributed.Client(scheduler.address, set_as_default=False) as client:
         client.write_scheduler_file(str(file))
-    found = run_tasks(
-        deadly, [Task("", {"number": 5})], tmp_path / "results", WorkerConfig(scheduler_address=str(file))
-    )
-    assert found[0].value == 5
+    [found] = run_tasks(deadly, [Task("", {"number": 5})], tmp_path / "results", WorkerConfig(None, str(file)))
+    assert found.value == 5
 
 
 @pytest.mark.parametrize(("failures", "refused"), [(2, False), (3, True)])
@@ -235,7 +203,7 @@ def test_a_blind_proof_survives_a_killed_worker(scheduler, pendulum, tmp_path):
     )
     run = load_config(pendulum, (*settings, "diagnosis.candidates=[joint_viscous, joint_coulomb]"))
     killing = Killing(scheduler)
-    there = run_blind([run], tmp_path / "there", CASES, 3, killing, WorkerConfig(scheduler_address=scheduler.address))
+    there = run_blind([run], tmp_path / "there", CASES, 3, killing, scheduler.config)
     assert killing.killed
     here = run_blind([run], tmp_path / "here", CASES, 3, workers=Here())
     for own in (there.result, here.result):

@@ -94,11 +94,15 @@ def threads():
 # -- kept and resumed -------------------------------------------------------------------------------------------------
 
 
-def test_results_come_in_the_order_of_the_tasks(tmp_path, threads):
-    found = run_tasks(slow, tasks_of(5), tmp_path, threads)
-    assert [(entry.name, entry.value) for entry in found] == [(f"task {i}", i) for i in range(5)]
-    assert not any(entry.error or entry.was_resumed for entry in found)
+def test_results_come_in_the_order_of_the_tasks_and_progress_is_told_of_each(tmp_path, threads):
+    told: list[tuple[int, int, str]] = []
+    run_tasks(slow, tasks_of(1), tmp_path, threads)
+    found = run_tasks(slow, tasks_of(5), tmp_path, threads, lambda *what: told.append(what))
+    assert [(entry.name, entry.value, entry.error) for entry in found] == [(f"task {i}", i, "") for i in range(5)]
+    assert [entry.was_resumed for entry in found] == [True, False, False, False, False]
     assert found[0].seconds >= 0.1
+    assert [entry[:2] for entry in told] == [(i, 5) for i in range(1, 6)]
+    assert {entry[2] for entry in told[1:]} == {f"task {i}" for i in range(1, 5)}
 
 
 def test_what_is_done_is_not_done_again(tmp_path, threads):
@@ -107,18 +111,13 @@ def test_what_is_done_is_not_done_again(tmp_path, threads):
     again = run_tasks(counted, tasks_of(4, calls=str(calls)), folder, threads)
     assert sorted(calls.read_text().split()) == ["0", "1", "2", "3"]
     assert [entry.was_resumed for entry in again] == [True, True, True, False]
-    assert [entry.value for entry in again[:3]] == [entry.value for entry in first]
+    assert [(entry.value, entry.seconds) for entry in again[:3]] == [(entry.value, entry.seconds) for entry in first]
     assert again[2].value == {"twice": 4, "pair": [2, None]}
-    assert again[0].seconds == first[0].seconds
-
-
-def test_the_name_does_not_count_and_equal_tasks_are_done_once(tmp_path, threads):
-    calls = tmp_path / "calls"
-    pair = [Task(name, {"number": 1, "calls": str(calls)}) for name in ("a", "b")]
-    found = run_tasks(counted, pair, tmp_path / "results", threads)
-    assert [entry.name for entry in found] == ["a", "b"]
-    assert found[0].value == found[1].value
-    assert calls.read_text().split() == ["1"]
+    # the name does not count, and equal tasks are done once
+    pair = [Task(name, {"number": 7, "calls": str(calls)}) for name in ("a", "b")]
+    found = run_tasks(counted, pair, folder, threads)
+    assert [(entry.name, entry.value["twice"]) for entry in found] == [("a", 14), ("b", 14)]
+    assert calls.read_text().split().count("7") == 1
 
 
 def half(text: str) -> str:
@@ -169,21 +168,16 @@ def test_a_changed_input_is_done_again(tmp_path, threads):
     assert not resumed(moved.rename(tmp_path / "b" / "other"))
 
 
-def test_other_sources_and_another_function_do_not_count(tmp_path, threads, monkeypatch):
-    def resumed(function: Any) -> bool:
-        (result,) = run_tasks(function, tasks_of(1), tmp_path, threads)
+@pytest.mark.parametrize("code", [None, "of a folder"])
+def test_results_depend_on_the_function_and_on_the_sources_that_are_named(tmp_path, threads, monkeypatch, code):
+    def resumed(function: Any, code: str | None) -> bool:
+        (result,) = run_tasks(function, tasks_of(1), tmp_path, threads, code=code)
         return result.was_resumed
 
-    assert [resumed(slow), resumed(slow), resumed(fragile)] == [False, True, False]
+    assert [resumed(slow, code), resumed(slow, code), resumed(fragile, code)] == [False, True, False]
     monkeypatch.setattr("yid_ocp.parallel.resumable_tasks.package_source_hash", lambda: "99")
-    assert [resumed(slow), resumed(slow)] == [False, True]
-
-
-def test_results_may_depend_on_less_than_the_whole_package(tmp_path, threads, monkeypatch):
-    run_tasks(slow, tasks_of(1), tmp_path, threads, code="of a folder")
-    monkeypatch.setattr("yid_ocp.parallel.resumable_tasks.package_source_hash", lambda: "99")
-    assert run_tasks(slow, tasks_of(1), tmp_path, threads, code="of a folder")[0].was_resumed
-    assert not run_tasks(slow, tasks_of(1), tmp_path, threads, code="of another")[0].was_resumed
+    assert resumed(slow, code) is (code is not None)
+    assert not resumed(slow, "of another folder")
 
 
 def test_a_worker_of_other_sources_does_nothing(tmp_path, threads, monkeypatch):
@@ -216,14 +210,6 @@ def test_paths_are_absolute_for_workers_elsewhere(tmp_path, threads, monkeypatch
     Path("text").write_text("four")
     (found,) = run_tasks(place, [Task("", {"file": Path("text"), "more": [Path("text")]})], Path("results"), threads)
     assert found.value == [str(tmp_path / "text")] * 2
-
-
-def test_progress_is_told_of_every_task(tmp_path, threads):
-    told: list[tuple[int, int, str]] = []
-    run_tasks(slow, tasks_of(1), tmp_path, threads)
-    run_tasks(slow, tasks_of(3), tmp_path, threads, lambda *what: told.append(what))
-    assert [entry[:2] for entry in told] == [(1, 3), (2, 3), (3, 3)]
-    assert {entry[2] for entry in told[1:]} == {"task 1", "task 2"}
 
 
 # -- what is wrong ----------------------------------------------------------------------------------------------------
@@ -307,20 +293,16 @@ def test_an_executor_that_breaks_leaves_what_was_done(tmp_path):
 # -- processes --------------------------------------------------------------------------------------------------------
 
 
-def test_one_worker_and_two_find_the_same(tmp_path):
-    results = []
+def test_one_process_and_two_find_the_same(tmp_path):
+    here = multiprocessing.current_process().name
     for workers in (1, 2):
         with process_pool(workers) as pool:
-            results.append(run_tasks(slow, tasks_of(4), tmp_path / str(workers), pool))
-    assert [entry.value for entry in results[0]] == [entry.value for entry in results[1]] == [0, 1, 2, 3]
-    names = [sorted(path.name for path in (tmp_path / folder).iterdir()) for folder in ("1", "2")]
-    assert names[0] == names[1]
-    assert len(names[0]) == 4
-
-
-def test_tasks_run_in_processes_of_their_own(tmp_path):
-    (found,) = run_tasks(process_name, tasks_of(1), tmp_path)
-    assert found.value != multiprocessing.current_process().name
+            found = run_tasks(process_name, tasks_of(4), tmp_path / str(workers), pool)
+        assert [entry.error for entry in found] == [""] * 4
+        assert 1 <= len({entry.value for entry in found} - {here}) <= workers
+    one, two = (sorted(path.name for path in (tmp_path / folder).iterdir()) for folder in ("1", "2"))
+    assert one == two
+    assert len(one) == 4
 
 
 def test_processes_share_the_threads_of_the_machine(tmp_path, monkeypatch):

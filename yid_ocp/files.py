@@ -61,6 +61,16 @@ def write_json(path: Path, data: Any) -> None:
     write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
 
 
+def make_folder(folder: str | os.PathLike[str], what: str = "the folder") -> Path:
+    """Make a folder and those above it where they are absent; OutputError where that is refused."""
+    path = Path(folder)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{what} cannot be made ({os_error_reason(error)})", where=str(path)) from error
+    return path
+
+
 def is_file(path: Path) -> bool:
     """Whether there is a file of that name; False for names that are too long or invalid."""
     return os.path.isfile(path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -21,8 +20,7 @@ from yid_ocp.analysis.step_symbols import (
     escape_latex,
     format_expressions,
 )
-from yid_ocp.errors import OutputError
-from yid_ocp.files import atomic_write, write_text
+from yid_ocp.files import atomic_write, make_folder, write_json, write_text
 from yid_ocp.integrator.codegen import casadi_c_source, parameter_jacobian_function
 from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_derivatives
 from yid_ocp.model.mechanism import merge_bodies
@@ -30,7 +28,6 @@ from yid_ocp.model.system import System
 
 Array = NDArray[np.float64]
 
-_FORMAT = "yid-equations/1"
 _MAX_JACOBIAN_OPERATIONS = 60_000  # operations; longer C keeps a compiler busy for minutes
 _ARGUMENT_NAMES = ("q0", "q1", "p0", "z0", "z1", "lam", "u", "theta", "time_step")
 
@@ -57,7 +54,7 @@ _FORCE_AND_CONSTRAINT_TERMS = {
 
 
 def _exported_step_functions(symbols: StepSymbols) -> tuple[ca.Function, ...]:
-    """The CasADi functions of a step that `export_step_functions` writes.
+    """The CasADi functions that `export_step_functions` writes.
 
     `rows` (del, internal, constraint, p1) and `rows_by_theta` of `_ARGUMENT_NAMES`, `rows_by_unknowns` (by q1, z1, lam)
     where it is not too large, `points` (q, theta) to the places of the sensors' points [m], and `mechanics` (q, v,
@@ -65,15 +62,13 @@ def _exported_step_functions(symbols: StepSymbols) -> tuple[ca.Function, ...]:
     them at zero in the last two.
     """
     e, system = symbols.equations, symbols.equations.system
-    blocks = [block.expressions for block in symbols.row_blocks]
-    names = [block.name for block in symbols.row_blocks]
-    rows = ca.Function("rows", e.arguments, ca.cse(blocks), list(_ARGUMENT_NAMES), names)
+    names, blocks = zip(*((block.name, block.expressions) for block in symbols.row_blocks), strict=True)
     by_rows, by_p1, _ = parameter_jacobian_function(e, system.parameters.names)(*e.arguments)
-    theta = ca.Function("rows_by_theta", e.arguments, [ca.vertcat(by_rows, by_p1)], list(_ARGUMENT_NAMES), ["slope"])
+    parts = {"rows": (ca.cse(list(blocks)), names), "rows_by_theta": ([ca.vertcat(by_rows, by_p1)], ["slope"])}
     slope = ca.cse([ca.jacobian(ca.vertcat(*blocks), ca.vertcat(e.q1, e.z1, e.lam))])
-    made = [rows, theta]
     if count_operations([slope[0].nz[:]], ca.vertcat(*e.arguments)) <= _MAX_JACOBIAN_OPERATIONS:
-        made.append(ca.Function("rows_by_unknowns", e.arguments, slope, list(_ARGUMENT_NAMES), ["slope"]))
+        parts["rows_by_unknowns"] = (slope, ["slope"])
+    made = [ca.Function(name, e.arguments, out, list(_ARGUMENT_NAMES), list(o)) for name, (out, o) in parts.items()]
     q, v = ca.SX.sym("q", system.n_coordinates), ca.SX.sym("v", system.n_coordinates)
     kinematics = forward_kinematics(system.mechanism, q)
     rigid = rigid_body_derivatives(kinematics, v, system.gravity)
@@ -97,31 +92,25 @@ def export_step_functions(
     `names.json` gives the values of theta beside the parameters' names, and the time step [s]. Returns the files
     written; `OutputError` where the folder, made if absent, or a file cannot be written.
     """
-    folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"the folder cannot be made ({error.strerror})", where=str(folder)) from error
+    folder = make_folder(folder)
     functions = _exported_step_functions(symbols)
-    written = []
-    for function in functions:
-        written.append(folder / f"{function.name()}.casadi")
-        with atomic_write(written[-1]) as temporary:
+    written = [folder / f"{function.name()}.casadi" for function in functions]
+    for function, path in zip(functions, written, strict=True):
+        with atomic_write(path) as temporary:
             function.save(str(temporary))
-    source = folder / "equations.c"
+    source, listed = folder / "equations.c", folder / "names.json"
     write_text(source, casadi_c_source("equations", functions))
     parameters = symbols.equations.system.parameters
     values = {p.name: {"value": float(value), "unit": p.unit} for p, value in zip(parameters, theta, strict=True)}
     names = {
-        "format": _FORMAT,
+        "format": "yid-equations/1",
         "functions": {f.name(): {"arguments": f.name_in(), "results": f.name_out()} for f in functions},
         "rows": {block.name: list(block.full_names) for block in symbols.row_blocks},
         "columns": {block.name: list(block.full_names) for block in symbols.column_blocks},
         "parameters": values,
         "time_step": time_step,
     }
-    listed = folder / "names.json"
-    write_text(listed, json.dumps(names, indent=1) + "\n")
+    write_json(listed, names)
     return (*written, source, listed)
 
 
@@ -133,12 +122,12 @@ def write_equation_sheet(path: Path, symbols: StepSymbols, theta: Array, free: S
     system = symbols.equations.system
     values = dict(zip(system.parameters.names, map(float, theta), strict=True))
     lines = [rf"\section*{{One step of {escape_latex(system.mechanism.name)}}}", *_rules(symbols, time_step)]
-    lines += _free_table(system, values, free)
-    lines += _tree_tables(system, values)
-    lines += [r"\section*{Rows}"]
+    if free:
+        rows = [(escape_latex(n), f"${_value(values[n])}$", _unit(system.parameters[n].unit)) for n in free]
+        lines += [r"\section*{Letters that stay}", *_table("lrl", ("parameter", "value", "unit"), rows)]
+    lines += [*_tree_tables(system, values), r"\section*{Rows}"]
     for block in symbols.row_blocks:
-        if block.labels:
-            lines += _rows(symbols, block, values, free)
+        lines += _rows(symbols, block, values, free) if block.labels else []
     write_text(path, _LATEX_PREAMBLE + "\n".join(lines) + "\n\\end{document}\n")
 
 
@@ -162,13 +151,6 @@ def _rules(symbols: StepSymbols, time_step: float) -> list[str]:
         r"The first line holds at free coordinates; at a prescribed one its right side is $-h$ times the effort.",
         *(["Rows of coordinates that a compliance holds are multiplied by it."] if e.system.joint_compliances else []),
     ]
-
-
-def _free_table(system: System, values: dict[str, float], free: Sequence[str]) -> list[str]:
-    if not free:
-        return []
-    rows = [(escape_latex(name), f"${_value(values[name])}$", _unit(system.parameters[name].unit)) for name in free]
-    return [r"\section*{Letters that stay}", *_table("lrl", ("parameter", "value", "unit"), rows)]
 
 
 def _tree_tables(system: System, values: dict[str, float]) -> list[str]:
@@ -248,12 +230,8 @@ def _equation(letter: str, value: str, made: FormulaText) -> str:
 
 def _table(columns: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     body = [" & ".join(row) + r" \\" for row in rows]
-    return [
-        rf"{{\footnotesize\begin{{longtable}}{{{columns}}}",
-        " & ".join(head) + r" \\ \hline",
-        *body,
-        r"\end{longtable}}",
-    ]
+    begin = rf"{{\footnotesize\begin{{longtable}}{{{columns}}}"
+    return [begin, " & ".join(head) + r" \\ \hline", *body, r"\end{longtable}}"]
 
 
 def _value(value: float) -> str:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 from xml.etree.ElementTree import Element, SubElement
 
 import casadi as ca
@@ -138,12 +138,11 @@ class FormatSupport:
     status: _SupportStatus
     how: str
 
-    @staticmethod
-    def worst_of(parts: Iterable[FormatSupport]) -> FormatSupport:
-        """The worst status of several parts that belong together, with the explanations of those that have it."""
-        known = list(parts)
-        status = max((part.status for part in known), key=_ORDER.index)
-        return FormatSupport(status, "; ".join(dict.fromkeys(part.how for part in known if part.status == status)))
+
+def _worst(parts: Sequence[FormatSupport]) -> FormatSupport:
+    """The worst status of several parts that belong together, with the explanations of those that have it."""
+    status = max((part.status for part in parts), key=_ORDER.index)
+    return FormatSupport(status, "; ".join(dict.fromkeys(part.how for part in parts if part.status == status)))
 
 
 # what each format calls the aspects that it has; others it has not
@@ -202,31 +201,21 @@ def effect_support(system: System, values: Mapping[str, float], form: str) -> di
     theta = dict(zip(system.parameters.names, system.parameters.vector(values), strict=True))
     for effect in system.effects:
         label = f"{effect.kind}@{effect.location}"
-        amplitudes = _neutral(effect)
-        if amplitudes and all(theta[name] == neutral for name, neutral in amplitudes.items()):
+        amplitudes, neutral = getattr(effect, "amplitude_names", ()), getattr(effect, "neutral_values", {})
+        if amplitudes and all(theta[name] == neutral[name] for name in amplitudes):
             found[label] = _NEUTRAL
-            continue
-        _, aspects = effect_terms_and_aspects(system, effect, value)
-        parts = (_READING if x == "reading" else _SUPPORT_BY_FORMAT[form][x] for x in sorted(aspects))
-        found[label] = FormatSupport.worst_of(parts)
+        else:
+            _, aspects = effect_terms_and_aspects(system, effect, value)
+            parts = [_READING if x == "reading" else _SUPPORT_BY_FORMAT[form][x] for x in sorted(aspects)]
+            found[label] = _worst(parts)
     return found
-
-
-def _neutral(effect: Any) -> dict[str, float]:
-    """Neutral value of the parameters whose neutral value makes an effect vanish."""
-    neutral: Mapping[str, float] = getattr(effect, "neutral_values", {})
-    return {name: neutral[name] for name in getattr(effect, "amplitude_names", ())}
 
 
 def parameter_support(system: System, effects: Mapping[str, FormatSupport], form: str) -> dict[str, FormatSupport]:
     """Support of a format for every parameter; an effect's parameters have the support of the effect."""
     found = {}
     for entry in system.parameters:
-        owner = entry.name.rpartition(".")[0]
-        if owner in effects:
-            found[entry.name] = effects[owner]
-            continue
-        aspects = aspects_of_parameters(system, entry.symbol)
-        parts = [_SUPPORT_BY_FORMAT[form][aspect] for aspect in sorted(aspects)] or [_UNUSED]
-        found[entry.name] = FormatSupport.worst_of(parts)
+        owner, aspects = entry.name.rpartition(".")[0], sorted(aspects_of_parameters(system, entry.symbol))
+        parts = [_SUPPORT_BY_FORMAT[form][aspect] for aspect in aspects] or [_UNUSED]
+        found[entry.name] = effects[owner] if owner in effects else _worst(parts)
     return found

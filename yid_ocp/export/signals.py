@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from yid_ocp.data import JointGroup, Recording
 from yid_ocp.errors import OutputError
-from yid_ocp.files import atomic_write, os_error_reason
+from yid_ocp.files import atomic_write, make_folder, os_error_reason
 
 Array = NDArray[np.float64]
 _SignalKind = Literal["joints", "point", "vector", "wrench"]
@@ -163,11 +163,7 @@ def export_csv(recording: Recording, folder: str | os.PathLike[str]) -> tuple[Pa
 
     Returns the files written, joints first; `OutputError` where the folder or a file cannot be written.
     """
-    folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"the folder cannot be made ({error.strerror})", where=str(folder)) from error
+    folder = make_folder(folder)
     written = []
     for group in recording.groups:
         if isinstance(group, JointGroup):

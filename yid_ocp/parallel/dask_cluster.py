@@ -46,15 +46,12 @@ def dask_executor(
     try:
         client = _client(distributed, where)
     except AssertionError as error:
-        raise WorkerError(
-            f"Dask's event loop did not start in {_MAX_CLIENT_STARTS} times ten seconds",
-            where=scheduler,
-            allowed="a machine that has time for it",
-            hint="run it again once this machine is less busy",
-        ) from error
+        what = f"Dask's event loop did not start in {_MAX_CLIENT_STARTS} times ten seconds"
+        hint = "run it again once this machine is less busy"
+        raise WorkerError(what, where=scheduler, allowed="a machine that has time for it", hint=hint) from error
     except (OSError, ValueError, TypeError, LookupError) as error:  # TimeoutError is an OSError
         raise WorkerError(
-            f"no scheduler answers: {str(error).splitlines()[0] if str(error) else type(error).__name__}",
+            f"no scheduler answers: {next(iter(str(error).splitlines()), type(error).__name__)}",
             where=scheduler,
             allowed="HOST:PORT of a running `dask scheduler`, or the path of its scheduler file",
             hint="start one with `dask scheduler` and workers with `dask worker HOST:PORT --nthreads 1`",
@@ -73,11 +70,14 @@ def dask_executor(
 
 def _client(distributed: Any, where: dict[str, str]) -> Any:
     """A Dask client; several attempts, because a busy machine may not start its event loop within ten seconds."""
-    for _ in range(_MAX_CLIENT_STARTS - 1):
-        with contextlib.suppress(AssertionError):
+    for attempt in range(1, _MAX_CLIENT_STARTS + 1):
+        try:
             return distributed.Client(**where, timeout=_CONNECT_TIMEOUT, set_as_default=False)
-        log.info("Dask's event loop did not start; it is tried again")
-    return distributed.Client(**where, timeout=_CONNECT_TIMEOUT, set_as_default=False)
+        except AssertionError:
+            if attempt == _MAX_CLIENT_STARTS:
+                raise
+            log.info("Dask's event loop did not start; it is tried again")
+    return None
 
 
 def _refuse_unfit(client: Any, function: _TaskFunction | None, folder: Path | None) -> None:
@@ -100,13 +100,13 @@ def _refuse_unfit(client: Any, function: _TaskFunction | None, folder: Path | No
         if said.split(".")[:2] != here["python"].split("."):  # functions do not travel between these
             raise _unfit(address, [f"python {said} instead of {here['python']}"])
     module = "" if function is None or function.__module__ == "__main__" else function.__module__
-    probe = None if folder is None else folder / f".{secrets.token_hex(8)}.probe"
+    probes = [] if folder is None else [folder / f".{secrets.token_hex(8)}.probe"]
     try:
-        if probe is not None:
+        for probe in probes:
             probe.write_text("", encoding="utf-8")
-        found = client.run(_question(module, "" if probe is None else str(probe)))
+        found = client.run(_question(module, "".join(map(str, probes))))
     finally:
-        if probe is not None:
+        for probe in probes:
             probe.unlink(missing_ok=True)
     for address, said in found.items():
         if isinstance(said, str):

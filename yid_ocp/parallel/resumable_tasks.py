@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from yid_ocp.errors import ConfigError, OutputError, WorkerError, YidError
-from yid_ocp.files import file_sha256, json_sha256, os_error_reason, write_json
+from yid_ocp.files import file_sha256, json_sha256, make_folder, write_json
 from yid_ocp.parallel.dask_cluster import dask_executor, version_mismatch_message
 from yid_ocp.parallel.threads_and_processes import InlineExecutor, process_pool, processor_count
 from yid_ocp.version import fingerprint_differences, package_source_hash, software_fingerprint
@@ -150,15 +150,13 @@ def run_tasks(
         As `WorkerConfig.check_available`.
     """
     own, maker = package_source_hash() if code is None else code, software_fingerprint()
-    jobs = [
-        _Job(function, _anywhere(task), _task_input(function, task, own), folder.absolute(), maker) for task in tasks
-    ]
+    jobs = []
+    for task in tasks:
+        # paths are absolute, because a worker may run in another folder
+        anywhere = replace(task, arguments=_mapped(task.arguments, Path.absolute))
+        jobs.append(_Job(function, anywhere, _task_input(function, task, own), folder.absolute(), maker))
     unique = {job.key: job for job in reversed(jobs)}
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        reason = os_error_reason(error)
-        raise OutputError(f"the folder of results cannot be made ({reason})", where=str(folder)) from error
+    make_folder(folder, "the folder of results")
     kept = {key: job.kept() for key, job in unique.items()}
     found = {key: replace(result, was_resumed=True) for key, result in kept.items() if result is not None}
     if found and progress is not None:
@@ -206,9 +204,8 @@ def _done_by(workers: WorkerConfig | Executor, jobs: Sequence[_Job], finished: _
     with contextlib.ExitStack() as held:
         executor, look = workers, None
         if isinstance(executor, WorkerConfig):
-            executor, look = held.enter_context(
-                dask_executor(executor.scheduler_address, jobs[0].function, jobs[0].folder)
-            )
+            cluster = dask_executor(executor.scheduler_address, jobs[0].function, jobs[0].folder)
+            executor, look = held.enter_context(cluster)
         at_once = 1 if isinstance(executor, InlineExecutor) else len(jobs)
         lost, never = _drain(executor, jobs, at_once, finished, look)
         for job in (*lost, *never):
@@ -220,29 +217,18 @@ def _task_input(function: _TaskFunction, task: Task, code: str) -> dict[str, Any
     if "<" in function.__qualname__:
         raise ValueError(f"{function.__qualname__} does not stand at the top of a module")
     name = f"{function.__module__}.{function.__qualname__}"
-    return {"function": name, "code": code, "arguments": _described(task.arguments)}
+    described = _mapped(task.arguments, lambda path: {"file": path.name, "sha256": file_sha256(path)})
+    return {"function": name, "code": code, "arguments": json.loads(json.dumps(described))}
 
 
-def _anywhere(task: Task) -> Task:
-    """The task with absolute paths, because a worker may run in another folder."""
-
-    def absolute(value: Any) -> Any:
-        if isinstance(value, Path):
-            return value.absolute()
-        if isinstance(value, Mapping):
-            return {key: absolute(entry) for key, entry in value.items()}
-        return [absolute(entry) for entry in value] if isinstance(value, (list, tuple)) else value
-
-    return replace(task, arguments=absolute(task.arguments))
-
-
-def _described(value: Any) -> Any:
+def _mapped(value: Any, change: Callable[[Path], Any]) -> Any:
+    """Plain data with its paths replaced."""
     if isinstance(value, Path):
-        return {"file": value.name, "sha256": file_sha256(value)}
+        return change(value)
     if isinstance(value, Mapping):
-        return {str(key): _described(entry) for key, entry in value.items()}
+        return {key: _mapped(entry, change) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_described(entry) for entry in value]
+        return [_mapped(entry, change) for entry in value]
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     raise TypeError(f"a task takes plain data and paths, not {type(value).__name__}")
@@ -268,12 +254,10 @@ class _Job:
 
     def kept(self) -> TaskResult | None:
         """The result stored in the file; None where there is no complete result of this task."""
-        try:
+        with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
             held = json.loads(self.file.read_text(encoding="utf-8"))
             if held["format"] == _TASK_FORMAT and json_sha256(held["input"]) == self.key:
                 return TaskResult(self.task.name, held["value"], seconds=float(held["seconds"]))
-        except (OSError, ValueError, LookupError, TypeError):
-            pass
         return None
 
 
@@ -343,8 +327,10 @@ def _drain(
                 except (BrokenExecutor, CancelledError):  # so says Dask where its scheduler went away
                     lost.append(job)
                     continue
-                except Exception as error:
-                    text = _words_of_executor(error)
+                except Exception as error:  # the executor gave the task up
+                    name = type(error).__name__
+                    killed = "every worker that tried it ended abruptly"
+                    text = killed if name == "KilledWorker" else f"{name}: {error}"
                 result = None if text else _arrived(job, look is not None)
                 finished(job, result or TaskResult(job.task.name, error=text or "it left no result"))
     except BaseException:
@@ -352,13 +338,6 @@ def _drain(
             future.cancel()
         raise
     return lost, list(queue)
-
-
-def _words_of_executor(error: Exception) -> str:
-    """Error message of an executor that gave up a task."""
-    if type(error).__name__ == "KilledWorker":
-        return "every worker that tried it ended abruptly"
-    return f"{type(error).__name__}: {error}"
 
 
 def _arrived(job: _Job, elsewhere: bool) -> TaskResult | None:
