@@ -5,35 +5,28 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
-import jsonschema
 import pytest
 
-OUTCOME = {
-    "type": "object",
-    "required": ["changes", "words", "std_relative", "verdicts", "identifiable", "gain", "message"],
+VERDICTS = {"identifiable", "weak", "not_identifiable", "at_bound", "not_trusted"}
+PARTS = {
+    "": {"format", "status", "parameters", "directions", "what_if", "inputs", "versions", "correlations"},
+    "parameters": {"value", "unit", "std_relative", "verdict", "interval", "std_alone"},
+    "directions": {"singular_value", "components", "words", "verdict"},
+    "what_if": {"base", "singles", "smallest", "greedy", "searched"},
+    "changes": {"changes", "words", "std_relative", "verdicts", "identifiable", "gain", "message"},
 }
-RESULT = {
-    "type": "object",
-    "required": ["format", "status", "parameters", "directions", "what_if", "inputs", "versions", "correlations"],
-    "properties": {
-        "format": {"const": "yid-identifiability/1"},
-        "parameters": {
-            "additionalProperties": {
-                "required": ["value", "unit", "std_relative", "verdict", "interval", "std_alone"],
-                "properties": {
-                    "verdict": {"enum": ["identifiable", "weak", "not_identifiable", "at_bound", "not_trusted"]},
-                    "interval": {"type": ["array", "null"], "items": {"type": ["number", "null"]}},
-                },
-            }
-        },
-        "directions": {"items": {"required": ["singular_value", "components", "words", "verdict"]}},
-        "what_if": {
-            "type": ["object", "null"],
-            "required": ["base", "singles", "smallest", "greedy", "searched"],
-            "properties": {"base": OUTCOME, "singles": {"items": OUTCOME}, "smallest": {"items": OUTCOME}},
-        },
-    },
-}
+
+
+def check_keys(result):
+    asked = result["what_if"]
+    found = [("", result), *(("parameters", entry) for entry in result["parameters"].values())]
+    found += [("directions", entry) for entry in result["directions"]]
+    if asked is not None:
+        found += [("what_if", asked), *(("changes", e) for e in (asked["base"], *asked["singles"], *asked["smallest"]))]
+    for part, entry in found:
+        assert PARTS[part] <= set(entry), part
+    assert result["format"] == "yid-identifiability/1"
+    assert {entry["verdict"] for entry in result["parameters"].values()} <= VERDICTS
 
 
 def read(folder):
@@ -48,7 +41,7 @@ def test_springs_that_cannot_be_told_apart(cli, repository, tmp_path):
     assert "1/spring_1.stiffness + 1/spring_2.stiffness, as springs in series are" in done.out
     assert "fewest changes with which all of them can be found: coupling_marker, seen by the camera" in done.out
     result = read(tmp_path / "run")
-    jsonschema.validate(result, RESULT)
+    check_keys(result)
     assert result["start"] == "unknown"
     assert result["nuisances"] == 4
     for entry in result["parameters"].values():
@@ -68,7 +61,7 @@ def test_springs_that_can(cli, repository, tmp_path):
     assert done.code == 0, done.err
     assert "2 of 2 parameters can be found" in done.out
     result = read(tmp_path / "run")
-    jsonschema.validate(result, RESULT)
+    check_keys(result)
     assert result["what_if"] is None
     assert result["nuisances"] == 0
     assert result["parameters"]["spring_2.stiffness"]["interval"] is None
@@ -86,27 +79,18 @@ def test_judged_at_the_initial_values_without_solving(cli, repository, tmp_path)
     assert {entry["value"] for entry in result["parameters"].values()} == {100.0}
 
 
-def test_a_pendulum_moved_as_measured(cli, pendulum, tmp_path):
-    done = cli("identifiability", pendulum, "--out", tmp_path / "run", "--set", "output.write_report=false")
-    assert done.code == 0, done.err
-    result = read(tmp_path / "run")
-    assert {entry["verdict"] for entry in result["parameters"].values()} == {"identifiable"}
-
-
-def test_an_interval_of_an_unknown_parameter(cli, repository, tmp_path, left_nothing):
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--intervals", "spring_1.stifness"), "did you mean 'spring_1.stiffness'?"),
+        (("--set", "model.arms.passive_joints=[spring_1, spring_9]"), "there is no joint 'spring_9'"),
+    ],
+)
+def test_names_that_are_not_there_are_refused(cli, repository, tmp_path, left_nothing, options, said):
     file = repository / "configs" / "springs_series_ends.yaml"
-    done = cli("identifiability", file, "--out", tmp_path / "run", "--intervals", "spring_1.stifness")
+    done = cli("identifiability", file, "--out", tmp_path / "run", *options)
     assert done.code == 2
-    assert "did you mean 'spring_1.stiffness'?" in done.err
-    left_nothing()
-
-
-def test_a_passive_joint_that_is_none(cli, repository, tmp_path, left_nothing):
-    file = repository / "configs" / "springs_series_ends.yaml"
-    settings = ("--set", "model.arms.passive_joints=[spring_1, spring_9]")
-    done = cli("identifiability", file, "--out", tmp_path / "run", *settings)
-    assert done.code == 2
-    assert "there is no joint 'spring_9'" in done.err
+    assert said in done.err
     left_nothing()
 
 

@@ -47,18 +47,13 @@ def found(tmp_path_factory, urdf_folder):
     )
     nominal = load_problem(folder / "p.yaml")
     for rub in (0.0, 0.05):
-        for problem_episodes in (nominal.episodes, nominal.held_out):
-            for episode in problem_episodes:
-                theta = nominal.theta
-                swept = nominal.predictor.predict_episode(episode, theta, np.zeros(0), False)
-                effort = np.vstack([swept.rollout.effort, swept.rollout.effort[-1:]])[:151]
-                joints = recordings[episode.name].joints
-                effort = effort + rub * np.sign(np.gradient(joints.position, axis=0)) * [0, 1]
-                effort = effort + 0.02 * rng.standard_normal(effort.shape)
-                write_recording(
-                    replace(recordings[episode.name], joints=replace(joints, effort=effort)),
-                    folder / f"{episode.name}_{rub}.h5",
-                )
+        for episode in (*nominal.episodes, *nominal.held_out):
+            swept = nominal.predictor.predict_episode(episode, nominal.theta, np.zeros(0), False)
+            effort = np.vstack([swept.rollout.effort, swept.rollout.effort[-1:]])[:151]
+            joints = recordings[episode.name].joints
+            effort = effort + rub * np.sign(np.gradient(joints.position, axis=0)) * [0, 1]
+            joints = replace(joints, effort=effort + 0.02 * rng.standard_normal(effort.shape))
+            write_recording(replace(recordings[episode.name], joints=joints), folder / f"{episode.name}_{rub}.h5")
         text = (folder / "p.yaml").read_text().replace("[a.h5]", f"[a_{rub}.h5]").replace("[b.h5]", f"[b_{rub}.h5]")
         (folder / f"p_{rub}.yaml").write_text(text)
     limits = Thresholds(max_effects=1)
@@ -181,14 +176,6 @@ def test_a_ranking_says_what_lies_beyond_its_axis():
     assert [trace.type for trace in alone.data] == ["bar"]
 
 
-def test_a_band_is_shaded_about_the_noise():
-    t = np.linspace(0.0, 1.0, 5)
-    figure = figures.time_plots_figure(
-        [TimePlot("error", {"line": (t, t)}, band_half_height=0.2)], "red", {"line": "blue"}
-    )
-    assert (figure.layout.shapes[0].y0, figure.layout.shapes[0].y1) == (-0.2, 0.2)
-
-
 def test_events_are_marked_on_the_time_axis_told_and_listed(found, tmp_path):
     t = np.linspace(0, 2, 21)
     pulse = DetectedPulse(0.5, 1.0, 0.7, False, 0.05, 1e-9)
@@ -206,19 +193,8 @@ def test_events_are_marked_on_the_time_axis_told_and_listed(found, tmp_path):
     assert 'id="events"' not in page_of(found["no_gap"], tmp_path / "plain.html")
 
 
-def test_spans_are_shaded():
+def test_bands_and_spans_are_shaded():
     t = np.linspace(0, 3, 31)
-    figure = figures.time_plots_figure([TimePlot("a", {}, t, t, marked_intervals=[(1.0, 2.0)])], "#000000", {})
-    (shape,) = figure.layout.shapes
-    assert (shape.x0, shape.x1) == (1.0, 2.0)
-
-
-def test_long_names_of_rows_have_the_room_they_need():
-    name = "effort_offset@panda_joint1.offset"
-    made = [
-        categorical_charts.estimates_figure({name: (1.0, 0.1, 0.0, True)}, "N m"),
-        categorical_charts.values_by_source_figure({name: {"run": (1.0, 0.1)}}, "N m"),
-        categorical_charts.before_after_figure({name: BeforeAfter(2.0, 1.0)}, "x", ("1", "2", "3")),
-        categorical_charts.matrix_figure([name], np.eye(1), "row", "column"),
-    ]
-    assert all(figure.layout.yaxis.automargin for figure in made)
+    plots = [TimePlot("a", {"line": (t, t)}, t, t, 0.2, [(1.0, 2.0)])]
+    band, span = figures.time_plots_figure(plots, "#000000", {"line": "blue"}).layout.shapes
+    assert (band.y0, band.y1, span.x0, span.x1) == (-0.2, 0.2, 1.0, 2.0)

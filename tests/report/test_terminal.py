@@ -34,6 +34,20 @@ def solved(**changes) -> dict:
     } | changes  # fmt: skip
 
 
+def compared(**changes) -> dict:
+    return {
+        "methods": {"gauss_newton": solved()}, "reference": "gauss_newton", "published": {}, "truth": {},
+        "explained": [], "agree": True, "judged": solved(), "disturbed": False, "published_explained": [],
+    } | changes  # fmt: skip
+
+
+def information(**changes) -> dict:
+    return {
+        "status": "converged", "message": "", "parameters": {}, "directions": [], "profiles": {}, "what_if": None,
+        "fit": GOOD,
+    } | changes  # fmt: skip
+
+
 def judged(said: str) -> dict:
     return {
         "value": 2.0, "unit": "N m/rad", "std_relative": 0.5, "std_relative_unknown": 0.6, "std_alone": 0.3,
@@ -60,16 +74,9 @@ def test_every_verdict_has_its_words():
 def test_a_verdict_reads_alike_in_every_command(said):
     words, name = VERDICT_WORDS[said], f"p_{said}"
     assert words in line_of(told("solve_summary", solved()), name)
-    compared = {
-        "methods": {"gauss_newton": solved()}, "reference": "gauss_newton", "published": {}, "truth": {},
-        "explained": [], "agree": True, "judged": solved(), "disturbed": False, "published_explained": [],
-    }  # fmt: skip
-    assert words in line_of(told("compare_summary", compared), name)
-    information = {
-        "format": "yid-identifiability/1", "status": "converged", "message": "", "parameters": {name: judged(said)},
-        "directions": [], "profiles": {}, "what_if": None, "fit": GOOD,
-    }  # fmt: skip
-    assert words in line_of(told("identifiability_summary", information), name)
+    assert words in line_of(told("compare_summary", compared()), name)
+    result = information(parameters={name: judged(said)})
+    assert words in line_of(told("identifiability_summary", result), name)
 
 
 def test_a_solve_says_what_is_not_found():
@@ -101,20 +108,10 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said_bu
     lines = told("solve_summary", said)
     assert lines[0] == "worse than a guess without a model: w_T2 of run, 50 mm against 20 mm (stays)"
     assert lines[4:6] == ["and so for 2 more channels, in result.json", first]
-    compared = {
-        "methods": {"gauss_newton": said}, "reference": "gauss_newton", "published": {}, "truth": {}, "explained": [],
-        "agree": True, "judged": said, "disturbed": False, "published_explained": [],
-    }  # fmt: skip
-    lines = told("compare_summary", compared)
+    lines = told("compare_summary", compared(methods={"gauss_newton": said}, judged=said))
     assert first in lines[:6]
     assert "the model does not explain the recordings, so agreement of methods says nothing of the truth" in lines
-    judgement = {
-        "parameters": {"a": judged("not_trusted")},
-        "directions": [],
-        "profiles": {},
-        "what_if": None,
-        "fit": BAD,
-    }
+    judgement = information(parameters={"a": judged("not_trusted")}, fit=BAD)
     assert told("identifiability_summary", judgement)[0] == first
 
 
@@ -143,12 +140,9 @@ def test_a_failed_solve_says_nothing_of_its_parameters():
 
 def test_a_comparison_without_a_parameter_that_is_found_has_nothing_to_agree_on():
     weak = solved(parameters={"a": parameter("weak")})
-    compared = {
-        "methods": {"single_shooting": weak, "other": weak | {"status": "failed", "whitened_cost": None}},
-        "reference": "single_shooting", "published": {"a": 1.0}, "truth": {}, "explained": [], "agree": True,
-        "judged": weak, "disturbed": False, "published_explained": ["a = 1 of the paper: unexplained"],
-    }  # fmt: skip
-    lines = told("compare_summary", compared)
+    methods = {"single_shooting": weak, "other": weak | {"status": "failed", "whitened_cost": None}}
+    beside = {"published": {"a": 1.0}, "published_explained": ["a = 1 of the paper: unexplained"]}
+    lines = told("compare_summary", compared(methods=methods, judged=weak, **beside))
     assert "no parameter can be found from these recordings, so there is nothing to agree on" in lines
     assert line_of(lines, "cost (whitened)").split()[-2:] == ["5", "failed"]
     assert line_of(lines, "a").split()[1:4] == ["2", "±", "0.1"]
@@ -156,22 +150,15 @@ def test_a_comparison_without_a_parameter_that_is_found_has_nothing_to_agree_on(
     assert "published" in lines[0]
     assert "truth" not in lines[0]
     assert "a = 1 of the paper: unexplained" in lines
-    found = compared | {"methods": {"single_shooting": solved()}, "judged": solved()}
-    assert "all methods agree within their uncertainty on the parameters that are found" in told(
-        "compare_summary", found
-    )
+    said = "all methods agree within their uncertainty on the parameters that are found"
+    assert said in told("compare_summary", compared())
 
 
 def test_verdicts_of_a_comparison_weigh_all_noise():
     """The methods themselves do not, so that nothing of theirs is to be trusted."""
     doubtful = solved(parameters={"a": parameter("not_trusted", 7.0)}, fit=BAD)
-    compared = {
-        "methods": {"single_shooting": doubtful}, "reference": "single_shooting", "published": {}, "truth": {},
-        "explained": [],
-        "agree": True, "judged": solved(parameters={"a": parameter("identifiable", 9.0)}), "disturbed": True,
-        "published_explained": [],
-    }  # fmt: skip
-    lines = told("compare_summary", compared)
+    sure = solved(parameters={"a": parameter("identifiable", 9.0)})
+    lines = told("compare_summary", compared(methods={"single_shooting": doubtful}, judged=sure, disturbed=True))
     assert lines[0].split()[:3] == ["parameter", "single_shooting", "all"]
     assert line_of(lines, "a").split() == ["a", "7", "±", "0.1", "9", "±", "0.1", "found"]
     assert not any("does not explain" in line for line in lines)
@@ -182,8 +169,7 @@ def test_verdicts_of_a_comparison_weigh_all_noise():
 def test_what_if_names_the_fewest_changes_or_that_there_are_none():
     base = {"words": "as it is", "identifiable": 0, "gain": None, "message": ""}
     asked = {"base": base, "singles": [base | {"words": "a camera", "gain": 2.0}], "smallest": []}
-    result = {"status": "", "parameters": {"a": judged("weak")}, "directions": [], "profiles": {}, "what_if": asked}
-    result["fit"] = None
+    result = information(parameters={"a": judged("weak")}, what_if=asked, fit=None)
     lines = told("identifiability_summary", result)
     assert "with no set of up to three changes can all of them be found" in lines
     assert lines[-1] == "none of 1 parameters can be found from these recordings"

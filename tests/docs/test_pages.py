@@ -1,0 +1,188 @@
+"""The code, commands and names of the pages run and exist as they stand."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+
+import pytest
+from ruamel.yaml import YAML
+
+from yid_ocp.analysis.step_symbols import StepSymbols
+from yid_ocp.cli import build_argument_parser
+from yid_ocp.config.reader import load_config
+from yid_ocp.config.settings import EffectSettings
+from yid_ocp.effects import EFFECTS
+from yid_ocp.effects.base import EffectBase
+from yid_ocp.export.equations import _MAX_JACOBIAN_OPERATIONS
+from yid_ocp.files import file_sha256
+from yid_ocp.integrator.discrete import discrete_equations
+from yid_ocp.model.system import RecordingErrorEffect
+from yid_ocp.solvers.nonlinear_program import NonlinearProgram
+from yid_ocp.workflow.build import build_system
+
+
+@pytest.fixture
+def page(repository):
+    return lambda name: (repository / "docs" / f"{name}.md").read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def run_script(repository):
+    """Run code in a process of its own, whose registered kinds are no other test's; returns what it printed."""
+
+    def run(code: str, folder, *arguments: str) -> str:
+        code = f"import sys\nsys.path[:0] = [{str(repository)!r}, '']\n{code}"
+        command = [sys.executable, "-c", code, *arguments]
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    return run
+
+
+def blocks(text: str, language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
+
+
+@pytest.mark.parametrize("name", ["tutorial", "inspection"])
+def test_commands_exist(page, repository, name):
+    [block] = blocks(page(name), "sh")
+    for line in block.strip().splitlines():
+        program, *arguments = shlex.split(line)
+        assert program == "yid-ocp"
+        said = build_argument_parser().parse_args(arguments)
+        assert name == "tutorial" or (repository / said.config).is_file()
+
+
+def test_the_tutorial_runs(page, run_script, repository):
+    run_script("\n".join(blocks(page("tutorial"), "python")), repository)
+
+
+# -- program.md -------------------------------------------------------------------------------------------------------
+
+CHECKS = """
+values = ca.Function("k", [mine.w], [k])(found["x"])
+assert solver.stats()["success"]
+assert abs(float(values[1] / values[0]) - 1.4) < 1e-6, values
+plain = nlp.make_solver("ipopt", hessian="exact", ipopt={"print_level": 0, "sb": "yes"})
+free = plain(**nlp.solver_arguments)
+assert abs(float(free["x"][0]) - 199.459) < 0.01
+assert float(found["f"]) > float(free["f"])
+assert local.jacobian.size_out(0) == (len(step.residual_names), v.numel())
+"""
+
+
+def test_the_program_runs(page, run_script, repository):
+    code = blocks(page("program"), "python")
+    assert len(code) == 3
+    assert sum(bool(line.strip()) for line in code[1].splitlines()) <= 6, "five lines of one's own, and one to print"
+    printed = run_script("\n".join([*code, CHECKS]), repository)
+    assert "theta (2, 1) ('spring_1.stiffness', 'spring_2.stiffness')" in printed
+    assert "q[springs_series] (3, 401)" in printed
+    named = set(re.findall(r"`nlp\.(\w+)", page("program")))
+    assert {"w", "p", "f", "g", "hessian", "solver_arguments"} <= named
+    assert named <= {*NonlinearProgram.__dataclass_fields__, *vars(NonlinearProgram)}
+
+
+# -- inspection.md ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def symbols(repository) -> StepSymbols:
+    system = build_system(load_config(repository / "configs/dual_arm_vision.yaml"))
+    return StepSymbols.from_equations(discrete_equations(system))
+
+
+def test_entries_and_names_are_those_of_the_equations(page, symbols):
+    text = page("inspection")
+    [commands] = blocks(text, "sh")
+    for entry in re.findall(r"--entry '(.*?)'", commands):
+        assert symbols.equation_entry(entry).title.split(" / ")[0].removeprefix("d ") == entry.split(",")[0]
+    lines = symbols.equation_entry("del[T2_3_z], T2.twist").text_lines
+    assert "\n".join(f"    {line}" for line in lines) in text
+    listed = re.findall(r"`((?:del|constraint|p1|q0|p0|u|q1|lam)\[[\w.]+\])`", text)
+    assert len(listed) > 6
+    assert set(listed) <= {*symbols.row_names, *symbols.column_names}
+    assert f"{_MAX_JACOBIAN_OPERATIONS:_}".replace("_", " ") in text
+
+
+def test_the_script_of_the_inspection_runs(page, repository, monkeypatch, capsys):
+    [script] = blocks(page("inspection"), "python")
+    monkeypatch.chdir(repository)
+    exec(compile(script, "inspection.md", "exec"), {})
+    assert "d del[T1_0_x] / d T1.bend = -h/2*0.5*(q0[T1_0_x] + q1[T1_0_x])" in capsys.readouterr().out
+
+
+# -- extending.md -----------------------------------------------------------------------------------------------------
+
+
+def test_the_worked_example_of_an_effect_runs(page, run_script, tmp_path):
+    named = re.findall(r"```python ?(\S*)\n(.*?)```", page("extending"), re.DOTALL)
+    assert named[0][0] == "churning.py"
+    for name, block in named:
+        if name:
+            (tmp_path / name).write_text(block, encoding="utf-8")
+    run_script("\n".join(block for name, block in named if not name), tmp_path)
+    [block] = blocks(page("extending"), "yaml")
+    [entry] = YAML(typ="safe", pure=True).load(block)["model"]["effects"]
+    said = EffectSettings(**entry)
+    assert (said.kind, said.location, said.values) == ("joint_churning", "left_e1", {"c": 0.3})
+
+
+def test_the_plugins_run_from_a_configuration(page, run_script, pendulum_data, tmp_path):
+    files = dict(re.findall(r"```python (\S+)\n(.*?)```", page("extending"), re.DOTALL))
+    [block] = blocks(page("extending"), "yaml plugins")
+    said = YAML(typ="safe", pure=True).load(block)
+    for name in said["plugins"]:
+        (tmp_path / name).write_text(files[name], encoding="utf-8")
+    assert [(e["kind"], e["location"]) for e in said["model"]["effects"]] == [("pole", "w_rod")]
+    effects = "[{kind: pole, location: tip, values: {strength: 0.02}}, {kind: thrust, location: tip}]"
+    given = pendulum_data.text.replace("model:\n", f"plugins: {said['plugins']}\nmodel:\n  points: [tip]\n", 1)
+    text = given.replace("  springs:", f"  effects: {effects}\n  springs:")
+    (tmp_path / "drawn.yaml").write_text(text, encoding="utf-8")
+    code = "from yid_ocp.cli import main; sys.exit(main())"
+    run_script(code, tmp_path, "solve", "drawn.yaml", "--out", "run", "--set", "output.write_report=false")
+    result = json.loads((tmp_path / "run" / "result.json").read_text(encoding="utf-8"))
+    assert result["parameters"]["shoulder.stiffness"]["verdict"] == "identifiable"
+    assert result["inputs"][str(tmp_path / "magnet.py")] == file_sha256(tmp_path / "magnet.py")
+    assert set(result["inputs"]) >= {str(tmp_path / name) for name in said["plugins"]}
+
+
+def test_the_methods_of_an_effect_that_the_page_names_exist(page):
+    rows = re.findall(r"^\| `(\w+)\((.*?)\)` \|.*\| (.*?) \|$", page("extending"), re.MULTILINE)
+    needed = {"apply_to_system", "step_terms", "distorted_reading", "corrected_reading", "added_delay"}
+    assert {name for name, _, _ in rows} >= needed
+    for name, arguments, examples in rows:
+        code = getattr(EffectBase, name).__code__
+        assert list(code.co_varnames[1 : code.co_argcount]) == arguments.split(", ")
+        assert hasattr(RecordingErrorEffect, name)
+        for kind in re.findall(r"`(\w+)`", examples):
+            assert kind in EFFECTS
+            assert getattr(EFFECTS[kind], name) is not getattr(EffectBase, name)
+
+
+# -- first_steps.ipynb ------------------------------------------------------------------------------------------------
+
+
+def test_the_notebook_runs_and_shows_what_it_was_made_with(repository, monkeypatch):
+    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    pytest.importorskip("ipykernel")
+    pytest.importorskip("pandas")
+    path = [str(repository), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, path)))
+    kept = nbformat.read(repository / "docs" / "first_steps.ipynb", as_version=4)
+    nbformat.validate(kept)
+    made = nbformat.from_dict(kept)
+    nbclient.NotebookClient(made, timeout=600, kernel_name="python3").execute(cwd=str(repository))
+    cells = [(old, new) for old, new in zip(kept.cells, made.cells, strict=True) if old.cell_type == "code"]
+    assert len(cells) >= 6
+    for old, new in cells:
+        kinds = [sorted(output.get("data", ())) for output in old.outputs]
+        assert kinds == [sorted(output.get("data", ())) for output in new.outputs], old.source
+        shown = [output["data"]["text/html"] for output in new.outputs if "text/html" in output.get("data", {})]
+        assert all("<table" in text for text in shown)
