@@ -71,22 +71,6 @@ def test_configuration(cli, pendulum, left_nothing, old, new, words):
     left_nothing()
 
 
-@pytest.mark.parametrize(
-    ("setting", "words"),
-    [
-        ("problem.time_stp=0.01", ("--set problem.time_stp", "did you mean 'time_step'?")),
-        ("problem.time_step=fast", ("--set problem.time_step", "a number")),
-        ("parameters.shoulder.stiffness.initail=3", ("did you mean 'initial'?",)),
-        ("problem.time_step", ("KEY=VALUE",)),
-        ("problem.time_step.deeper=1", ("no keys below 'deeper'",)),
-        ("problem.time_step=[1", ("not valid YAML",)),
-    ],
-)
-def test_settings_over_the_file(cli, pendulum, left_nothing, setting, words):
-    assert_refused(cli("solve", pendulum, "--set", setting), *words)
-    left_nothing()
-
-
 def test_no_such_configuration(cli, pendulum):
     assert_refused(
         cli("solve", pendulum.parent / "pendolum.yaml"), "no such configuration", "did you mean 'pendulum.yaml'?"
@@ -98,16 +82,17 @@ def test_no_such_configuration(cli, pendulum):
     assert_refused(cli("solve", pendulum.parent / "latin.yaml"), "UTF-8")
 
 
-def test_nothing_to_solve(cli, pendulum, left_nothing):
+def test_nothing_to_solve(cli, pendulum, pendulum_data, left_nothing):
     assert_refused(cli("solve", pendulum, "--set", "parameters={}"), "no parameter is free")
     assert_refused(cli("solve", pendulum, "--set", "recordings.estimate=[]"), "no recording to estimate on")
     assert_refused(cli("solve", pendulum, "--set", "model={}"), "neither a robot nor an object")
-    left_nothing()
-
-
-def test_a_recording_cannot_be_held_out_and_used(cli, pendulum, pendulum_data):
+    assert_refused(cli("solve", pendulum, "--set", "problem.time_step"), "KEY=VALUE")
     same = pendulum_data.folder / "estimate.h5"
     assert_refused(cli("solve", pendulum, "--set", f"recordings.held_out=[{same}]"), "both estimated on and held out")
+    missing = "recordings.estimate=[default:dual_arm_vison_estimate.h5]"
+    said = ("no such recording", "did you mean 'dual_arm_vision_estimate.h5'?")
+    assert_refused(cli("solve", pendulum, "--set", missing), *said)
+    left_nothing()
 
 
 def altered(pendulum_data, tmp_path, change):
@@ -173,11 +158,6 @@ def test_a_truncated_recording(cli, pendulum, pendulum_data, tmp_path, left_noth
         done = cli("solve", pendulum, "--set", f"recordings.estimate=[{name}]")
         assert_refused(done, name)
     left_nothing()
-
-
-def test_a_default_recording_that_does_not_exist(cli, pendulum):
-    done = cli("solve", pendulum, "--set", "recordings.estimate=[default:dual_arm_vison_estimate.h5]")
-    assert_refused(done, "no such recording", "did you mean 'dual_arm_vision_estimate.h5'?")
 
 
 def test_a_grasp_out_of_reach(cli, tmp_path, monkeypatch, repository, left_nothing):

@@ -12,7 +12,7 @@ from yid_ocp.workflow.run_inputs import recording_path
 PAPER = ("single_arm_no_vision", "single_arm_vision", "dual_arm_no_vision", "dual_arm_vision")
 # settings that make each run quick: fewer links, a short horizon, interpreted where that is faster than compiling
 COARSE = (
-    "model.object.links=2",
+    "model.object.links=1",
     "problem.duration=0.3",
     "solver.max_iterations=2",
     "problem.use_compiler=false",
@@ -30,7 +30,7 @@ QUICK = {
     "double_pendulum": ("problem.duration=3.0",),
     "servo_arm": (
         "problem.duration=0.5",
-        "model.object.segments.rod.links=2",
+        "model.object.segments.rod.links=1",
         "solver.max_iterations=3",
         "problem.use_compiler=false",
         *UNREFINED,

@@ -221,6 +221,11 @@ def test_compared_methods(written):
         ("compare.methods.newton.max_iterations=3", "did you mean 'gauss_newton'?"),
         ("solver.max_iterations=-3", "a whole number from 1"),
         ("solver.time_step=0.01", "'time_step' is a key of `problem`"),
+        ("problem.time_stp=0.01", "did you mean 'time_step'?"),
+        ("problem.time_step=fast", "a number"),
+        ("parameters.shoulder.stiffness.initail=3", "did you mean 'parameters.shoulder.stiffness.initial'?"),
+        ("problem.time_step.deeper=1", "no keys below 'deeper'"),
+        ("problem.time_step=[1", "not valid YAML"),
     ],
 )
 def test_refused_settings_over_the_file(setting, message):

@@ -30,11 +30,14 @@ def step(urdf_folder):
 
 
 @pytest.fixture(scope="module")
-def folder(step, tmp_path_factory):
+def symbols(step):
+    return StepSymbols.from_equations(step.equations)
+
+
+@pytest.fixture(scope="module")
+def folder(step, symbols, tmp_path_factory):
     folder = tmp_path_factory.mktemp("export") / "deep" / "folder"
-    written = export_step_functions(
-        StepSymbols.from_equations(step.equations), folder, step.system.parameters.vector(), step.time_step
-    )
+    written = export_step_functions(symbols, folder, step.system.parameters.vector(), step.time_step)
     assert [path.name for path in written] == [*(f"{name}.casadi" for name in FUNCTIONS), "equations.c", "names.json"]
     assert sorted(path.name for path in folder.iterdir()) == sorted(path.name for path in written)
     return folder
@@ -55,8 +58,8 @@ def compared(function, reference, values):
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_what_is_loaded_back_has_the_same_values(step, folder, name):
-    reference = {f.name(): f for f in _exported_step_functions(StepSymbols.from_equations(step.equations))}[name]
+def test_what_is_loaded_back_has_the_same_values(step, symbols, folder, name):
+    reference = {f.name(): f for f in _exported_step_functions(symbols)}[name]
     loaded = ca.Function.load(str(folder / f"{name}.casadi"))
     assert loaded.name_in() == reference.name_in()
     assert loaded.name_out() == reference.name_out()
@@ -76,17 +79,8 @@ def test_the_loaded_rows_vanish_along_a_step(step, folder):
     torque = rest.holding_torque + 0.5
     q1, p1, lam, status = step(q0, p0, torque, theta, None, z0)
     assert status.is_converged
-    found = rows(
-        q0=q0,
-        q1=q1,
-        p0=p0,
-        z0=z0,
-        z1=status.internal_coordinates,
-        lam=lam,
-        u=torque,
-        theta=theta,
-        time_step=step.time_step,
-    )
+    state = {"q0": q0, "q1": q1, "p0": p0, "z0": z0, "z1": status.internal_coordinates, "lam": lam, "u": torque}
+    found = rows(**state, theta=theta, time_step=step.time_step)
     for name in ("del", "internal", "constraint"):
         assert np.max(np.abs(found[name].full()), initial=0.0) < 1e-9, name
     np.testing.assert_allclose(found["p1"].full().ravel(), p1, atol=1e-12)
@@ -147,8 +141,7 @@ def test_the_c_file_compiles_to_the_same_values(step, folder, tmp_path):
         compared(ca.external(name, str(library)), ca.Function.load(str(folder / f"{name}.casadi")), arguments(step))
 
 
-def test_names_say_what_stands_where(step, folder):
-    symbols = StepSymbols.from_equations(step.equations)
+def test_names_say_what_stands_where(symbols, folder):
     names = json.loads((folder / "names.json").read_text())
     assert names["format"] == "yid-equations/1"
     assert list(names["functions"]) == list(FUNCTIONS)
@@ -159,16 +152,12 @@ def test_names_say_what_stands_where(step, folder):
     assert names["time_step"] == 0.01
 
 
-def test_a_large_jacobian_is_left_to_the_reader(step, monkeypatch):
+def test_a_large_jacobian_is_left_to_the_reader(symbols, monkeypatch):
     monkeypatch.setattr(exported, "_MAX_JACOBIAN_OPERATIONS", 10)
-    assert "rows_by_unknowns" not in [
-        f.name() for f in _exported_step_functions(StepSymbols.from_equations(step.equations))
-    ]
+    assert "rows_by_unknowns" not in [function.name() for function in _exported_step_functions(symbols)]
 
 
-def test_a_folder_that_cannot_be_made_is_said(step, tmp_path):
+def test_a_folder_that_cannot_be_made_is_said(step, symbols, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot be made"):
-        export_step_functions(
-            StepSymbols.from_equations(step.equations), tmp_path / "file" / "x", step.system.parameters.vector(), 0.01
-        )
+        export_step_functions(symbols, tmp_path / "file" / "x", step.system.parameters.vector(), 0.01)
