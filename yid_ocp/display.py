@@ -6,8 +6,7 @@ import html
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-_MAX_TABLE_ROWS = 30
-"""Largest number of table rows in a notebook; further rows are only counted."""
+_MAX_TABLE_ROWS = 30  # largest number of table rows in a notebook; further rows are only counted
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
 
-_RERAISE_INTERVAL = 2.0
-"""Time after which a suppressed interruption is raised again [s]."""
-
-_FORCED_EXIT_DELAY = 10.0
-"""Time after which a process that does not end is killed [s]."""
-
+_RERAISE_INTERVAL = 2.0  # time after which a suppressed interruption is raised again [s]
+_FORCED_EXIT_DELAY = 10.0  # time after which a process that does not end is killed [s]
 _TERMINATION_SIGNALS = tuple(
     signal.Signals[name] for name in ("SIGINT", "SIGTERM", "SIGHUP") if name in signal.Signals.__members__
 )

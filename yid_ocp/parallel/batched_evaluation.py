@@ -11,8 +11,7 @@ from typing import Any, TypeVar
 
 from yid_ocp.parallel.threads_and_processes import limit_threads, max_threads
 
-_MAX_CONCURRENT_ITEMS = 8
-"""Largest number of concurrent items, equal to the largest batch size."""
+_MAX_CONCURRENT_ITEMS = 8  # largest number of concurrent items, equal to the largest batch size
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 _Query = TypeVar("_Query")

@@ -14,10 +14,8 @@ from typing import Any
 from yid_ocp.errors import WorkerError
 from yid_ocp.version import fingerprint_differences, software_fingerprint
 
-_CONNECT_TIMEOUT = 15.0
-"""Timeout for the connection to a scheduler [s]."""
-_MAX_CLIENT_STARTS = 3
-"""Number of attempts to start a client's event loop."""
+_CONNECT_TIMEOUT = 15.0  # timeout for the connection to a scheduler [s]
+_MAX_CLIENT_STARTS = 3  # number of attempts to start a client's event loop
 _TaskFunction = Callable[..., Any]
 log = logging.getLogger(__name__)
 

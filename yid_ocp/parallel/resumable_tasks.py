@@ -34,8 +34,7 @@ from yid_ocp.version import fingerprint_differences, package_source_hash, softwa
 _TASK_FORMAT = "yid-task/1"
 _RESULT_FILE_TIMEOUT = 60.0
 """Timeout until a result file written by another machine is visible, as on network file systems [s]."""
-_WORKER_CHECK_INTERVAL = 60.0
-"""Time without a finished task after which it is checked that there are workers [s]."""
+_WORKER_CHECK_INTERVAL = 60.0  # time without a finished task after which it is checked that there are workers [s]
 log = logging.getLogger(__name__)
 _TaskFunction = Callable[..., Any]
 TaskProgressCallback = Callable[[int, int, str], None]

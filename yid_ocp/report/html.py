@@ -13,7 +13,7 @@ from pathlib import Path
 from yid_ocp.files import write_text
 from yid_ocp.report.figures import DARK_MODE_COLORS, figure_html
 from yid_ocp.report.sections import REPORT_SECTIONS, ReportData, render_sections
-from yid_ocp.report.terminal import CodeBlock, SummaryStatement, SummaryTable
+from yid_ocp.report.terminal import CodeBlock, SummaryTable
 from yid_ocp.solvers.fit_messages import VERDICT_WORDS
 
 log = logging.getLogger(__name__)
@@ -51,23 +51,14 @@ def write_report(path: Path, findings: ReportData) -> bool:
     environment = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters |= {
-        "number": _format_number,
-        "listed": _column_classes,
-        "verdict": _VERDICTS.get,
-        "drawn": figure_html,
-    }
-    blocks = {"statement": SummaryStatement, "table": SummaryTable, "command": CodeBlock}
-    environment.tests |= {name: lambda block, kind=kind: isinstance(block, kind) for name, kind in blocks.items()}
-    shared = _shared_script(path)
-    page = environment.get_template("page.html").render(
-        findings=findings,
-        sections=render_sections(findings, environment),
-        dark=DARK_MODE_COLORS,
-        shared=shared,
-        packed="" if shared else _packed_script(),
-    )
-    write_text(path, page)
+    filters = {"number": _format_number, "listed": _column_classes, "verdict": _VERDICTS.get, "drawn": figure_html}
+    environment.filters |= filters
+    environment.tests["table"] = lambda block: isinstance(block, SummaryTable)
+    environment.tests["command"] = lambda block: isinstance(block, CodeBlock)
+    sections, shared = render_sections(findings, environment), _shared_script(path)
+    packed = "" if shared else _packed_script()
+    known = {"findings": findings, "sections": sections, "dark": DARK_MODE_COLORS, "shared": shared, "packed": packed}
+    write_text(path, environment.get_template("page.html").render(known))
     return True
 
 

@@ -19,7 +19,7 @@ from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.report import categorical_charts, figures
 from yid_ocp.report.categorical_charts import BeforeAfter, RankedCandidate, TimeMapRow
 from yid_ocp.report.figures import TimePlot
-from yid_ocp.report.sections.base import ReportData, register_section
+from yid_ocp.report.sections import ReportData, register_section
 from yid_ocp.report.tables import display_scale_and_unit, format_error_and_unit
 
 _MAX_CANDIDATES = 15  # candidates; the rest is in result.json

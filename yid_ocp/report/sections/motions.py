@@ -15,7 +15,7 @@ from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.report import figures
 from yid_ocp.report.animation import Animation, ModelTrajectory, make_animation
 from yid_ocp.report.figures import TimePlot
-from yid_ocp.report.sections.base import ReportData, joint_channel_unit, register_section
+from yid_ocp.report.sections import ReportData, joint_channel_unit, register_section
 from yid_ocp.sensors import Sensor
 
 _MAX_RECORDINGS = 4  # recordings; a page with more is slow to open

@@ -15,7 +15,7 @@ from yid_ocp.analysis.profile import CHI2_QUANTILE_95
 from yid_ocp.report import categorical_charts, figures
 from yid_ocp.report.figures import TimePlot, lines_over_time_figure
 from yid_ocp.report.png_figures import CALIBRATION_LABELS
-from yid_ocp.report.sections.base import ReportData, joint_channel_unit, register_section
+from yid_ocp.report.sections import ReportData, joint_channel_unit, register_section
 from yid_ocp.report.summaries import SUMMARY_BY_FORMAT
 from yid_ocp.report.terminal import SummaryBlock, SummaryStatement, SummaryTable
 
