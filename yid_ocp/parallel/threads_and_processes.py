@@ -12,8 +12,7 @@ from typing import Any, Generic, TypeVar
 
 from yid_ocp.errors import ConfigError
 
-THREADS_VARIABLE = "YID_OCP_THREADS"
-"""Environment variable with the number of threads per process; by default the number of processors."""
+_THREADS_VARIABLE = "YID_OCP_THREADS"  # number of threads per process; by default that of processors
 _SHARE = threading.local()
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -48,9 +47,9 @@ def max_threads() -> int:
     ConfigError
         `YID_OCP_THREADS` is no number of threads.
     """
-    said = os.environ.get(THREADS_VARIABLE, "")
+    said = os.environ.get(_THREADS_VARIABLE, "")
     if said and not (said.isdecimal() and int(said)):
-        raise ConfigError(f"{THREADS_VARIABLE} is '{said}'", where="environment", allowed="a whole number from 1")
+        raise ConfigError(f"{_THREADS_VARIABLE} is '{said}'", where="environment", allowed="a whole number from 1")
     own = int(said) if said else processor_count()
     return min(own, getattr(_SHARE, "count", own))
 
@@ -115,7 +114,7 @@ def process_pool(workers: int | None = None) -> ProcessPoolExecutor:
 
 
 def _begin_worker(threads: int) -> None:
-    os.environ[THREADS_VARIABLE] = str(threads)
+    os.environ[_THREADS_VARIABLE] = str(threads)
     for name in ("SIGINT", "SIGHUP"):  # a terminal sends them to all; the parent says when to end
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)

@@ -83,7 +83,7 @@ class ModelTrajectory:
     t: Array
     q: Array
 
-    def q_at(self, t: Array) -> Array:
+    def _q_at(self, t: Array) -> Array:
         """Configurations (F, n) at other times, on straight lines between the known ones."""
         return np.stack([np.interp(t, self.t, column) for column in self.q.T], axis=1)
 
@@ -177,7 +177,7 @@ def make_animation(title: str, told: Sequence[ModelTrajectory], recording: Recor
     motions = []
     for entry in told:
         figure = _StickFigure(entry.system, entry.theta)
-        positions = figure.positions_at(entry.q_at(t))
+        positions = figure.positions_at(entry._q_at(t))
         motions.append(_AnimatedMotion(entry.name, figure.sticks, positions, figure.point_indices))
     if recording is not None:
         motions.append(_measured_motion(told[0], recording, t))
@@ -200,7 +200,7 @@ def _measured_motion(told: ModelTrajectory, recording: Recording, t: Array) -> _
     sticks: list[_Stick] = []
     places = np.full((len(t), 0, 3), np.nan)
     if joints is not None and moved and moved <= {*recorded} and joints.position is not None:
-        q = told.q_at(t)
+        q = told._q_at(t)
         for name in recorded:
             column = joints.position[:, joints.names.index(name)]
             q[:, system.mechanism.joint_index(name)] = np.interp(t, joints.t, column)
