@@ -123,4 +123,4 @@ def solution(method="gauss_newton", status=Status.CONVERGED, cost=1.0, **paramet
     """What a method found; names are written with underscores for dots."""
     named = {name.replace("_", "."): entry for name, entry in parameters.items()}
     x = np.array([entry.value for entry in named.values()])
-    return Solution(status, "done", tuple(named), x, np.eye(len(x)), named, cost, GOOD, (), 1, 1, 0.1, None, method)
+    return Solution(status, "done", tuple(named), x, np.eye(len(x)), named, cost, GOOD, (), 1, 0.1, None, method)

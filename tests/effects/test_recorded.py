@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -54,13 +56,18 @@ def recording(bench, effort: bool = True, camera: bool = True) -> Recording:
     return Recording(joints, tuple(groups), name="made")
 
 
-def problem(bench, kinds, *, neutral=False, feedback="none", free=(), **options) -> EstimationProblem:
+@cache
+def effects_and_step(bench, kinds: tuple[str, ...], neutral: bool):
     effects = [
         make_effect(kind, place, bench.system, {} if neutral else values)
         for kind in kinds
         for place, values in KINDS[kind].items()
     ]
-    step = compile_step(bench.system.with_effects(effects), H, use_compiler=False)
+    return effects, compile_step(bench.system.with_effects(effects), H, use_compiler=False)
+
+
+def problem(bench, kinds, *, neutral=False, feedback="none", free=(), **options) -> EstimationProblem:
+    effects, step = effects_and_step(bench, tuple(kinds), neutral)
     names = tuple(name for effect in effects for name in effect.parameters.names)
     settings = ProblemOptions(
         path_cutoff=float("inf"),

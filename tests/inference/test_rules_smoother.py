@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import threadpoolctl
 
+from yid_ocp.diagnosis.localise import localise_gap
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.inference import smoother, smoother_model
 from yid_ocp.inference.smoother_model import IntervalModel, LinearResidualModel, UnknownGroup
@@ -204,12 +205,12 @@ def test_variances_stay_within_their_range():
 
 def test_the_best_variance_of_a_group_is_searched_over_all_sizes():
     models = [made(3, size=np.array([30.0, 0.0, 0.0])), made(4, size=np.array([20.0, 0.0, 0.0]))]
-    evidence, size = smoother._largest_evidence(smoother._bases(models, NOTHING), FORCE)
+    [(evidence, size)] = smoother._largest_evidences(models, NOTHING, [FORCE])
     assert evidence == pytest.approx(Dense(models, NOTHING | {FORCE: size}).log_evidence, rel=1e-9)
     assert evidence > Dense(models, NOTHING | {FORCE: 4 * size}).log_evidence
     assert evidence > Dense(models, NOTHING | {FORCE: size / 4}).log_evidence
     base = NOTHING | {OTHER_FORCE: 1.0}
-    more, at = smoother._largest_evidence(smoother._bases(models, base), FORCE)
+    [(more, at)] = smoother._largest_evidences(models, base, [FORCE])
     assert more == pytest.approx(Dense(models, base | {FORCE: at}).log_evidence, rel=1e-9)
     # a group may hold several unknowns, and some of them errors that are known
     both = [
@@ -217,7 +218,7 @@ def test_the_best_variance_of_a_group_is_searched_over_all_sizes():
         for model in models
     ]
     some = {FORCE: 0.0, BIAS: 0.3}
-    most, here = smoother._largest_evidence(smoother._bases(both, some), FORCE)
+    [(most, here)] = smoother._largest_evidences(both, some, [FORCE])
     assert most == pytest.approx(smoother._run(both, some | {FORCE: here}, smooth=False).log_evidence, rel=1e-9)
     assert most > smoother._run(both, some, smooth=False).log_evidence + 1
 
@@ -320,6 +321,22 @@ def test_what_would_be_noticed_comes_from_the_model_alone(monkeypatch):
     assert more.detectable_std == {s: pytest.approx(2 * v) for s, v in found.detectable_std.items()}
 
 
+@pytest.mark.parametrize("unknown", [0, 2])
+def test_what_is_said_of_one_unknowns_history_is_that_of_dense_algebra(unknown):
+    model = made(5)
+    variance = dict(zip(SOURCES, (0.8, 0.0, 2.5), strict=True))
+    reference = Dense([model], variance)
+    state, rows = np.zeros((STATES, COUNT)), []
+    for j, interval in enumerate(model.intervals):
+        now = np.eye(COUNT)[j]
+        rows.append(interval.state_jacobian @ state + np.outer(interval.unknown_jacobian[:, unknown], now))
+        state = interval.state_transition @ state + np.outer(interval.unknown_input_matrix[:, unknown], now)
+    response = np.vstack([*rows, np.zeros((len(reference.y) - COUNT * ROWS, COUNT))])
+    score, information = smoother.force_likelihood_terms(model, variance, unknown)
+    assert score == pytest.approx(response.T @ reference.inverse @ reference.y, rel=1e-7, abs=1e-9)
+    assert information == pytest.approx(response.T @ reference.inverse @ response, rel=1e-7, abs=1e-9)
+
+
 def test_known_noise_of_torques_is_as_strong_at_low_frequencies_as_the_unknown_force_for_it():
     held, span, decay = 3 * 0.005, 0.1, 0.7
     errors = SimpleNamespace(sample_of_step=np.repeat(np.arange(20), 3), torque_std=np.array([0.4, 0.2]))
@@ -338,3 +355,41 @@ def test_known_noise_of_torques_is_as_strong_at_low_frequencies_as_the_unknown_f
     np.testing.assert_allclose(known, [(white[1] + 0.3**2) / 4.0, 0.0, white[0] / 16.0, 0.0], rtol=1e-9)
     course.episode.input_errors = None
     np.testing.assert_array_equal(smoother_model._torque_noise(course, unknowns, span, decay), np.zeros(4))
+
+
+HERE, LIKE, OTHER = UnknownGroup("here", "force"), UnknownGroup("there", "push"), UnknownGroup("elsewhere", "force")
+
+
+def test_a_place_that_does_as_well_is_told():
+    """Two unknowns at two places do the same, a third something else, and the first one is at work."""
+    model, intervals, rng = made(2), [], np.random.default_rng(0)
+    for one in model.intervals:
+        by, drive = one.unknown_jacobian.copy(), one.unknown_input_matrix.copy()
+        by[:, 1] = by[:, 0] + 0.02 * rng.standard_normal(len(by))
+        drive[:, 1] = drive[:, 0]
+        observed = 0.1 * one.negative_residual_jacobian
+        observed[:, 0] += 8.0 * by[:, 0]
+        changed = {"negative_residual_jacobian": observed, "unknown_jacobian": by, "unknown_input_matrix": drive}
+        intervals.append(replace(one, **changed))
+    twice = replace(model, intervals=tuple(intervals), unknown_groups=(HERE, LIKE, OTHER))
+    variance = {HERE: 50.0, LIKE: 0.0, OTHER: 0.0}
+    state = smoother._run([twice], variance)
+    weight = smoother._weights([twice], variance, state)
+    assert weight[HERE] > 100
+    found = smoother._instead([twice], variance, state.log_evidence, weight, Thresholds())
+    assert found == {HERE: (LIKE,)}
+    strict = Thresholds(location_tie=1.0, min_log_bayes_factor=1e-9)
+    assert LIKE not in smoother._instead([twice], variance, state.log_evidence + 1e3, weight, strict)[HERE]
+
+
+def test_it_is_named_beside_the_place_but_its_own_other_unknowns_are_not():
+    same = UnknownGroup("here", "push")
+    seen = SimpleNamespace(
+        log_evidence_drop={HERE: 9.0, LIKE: 0.0, same: 0.0},
+        detectable_std=dict.fromkeys((HERE, LIKE, same), 0.5),
+        group_variance={HERE: 1.0, LIKE: 0.0, same: 0.0},
+        smoothed_unknowns=(),
+        alternative_groups={HERE: (LIKE, same)},
+    )
+    first, *_ = localise_gap(seen)
+    assert (first.location, first.indistinguishable_from) == ("here", ("there",))

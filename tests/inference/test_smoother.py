@@ -1,4 +1,4 @@
-"""The weak-constraint smoother: against dense linear algebra, against the nonlinear rollout, and on twins."""
+"""The weak-constraint smoother: against the nonlinear rollout, on twins, and what pushes amount to."""
 
 from __future__ import annotations
 
@@ -18,8 +18,14 @@ from yid_ocp.diagnosis.localise import (
     merge_intervals,
 )
 from yid_ocp.inference import smoother_model
-from yid_ocp.inference.smoother import _filter, _run, _scores, force_likelihood_terms, run_smoother
-from yid_ocp.inference.smoother_model import IntervalModel, LinearResidualModel, UnknownGroup, linear_residual_models
+from yid_ocp.inference.smoother import run_smoother
+from yid_ocp.inference.smoother_model import (
+    _FORCE_POINT,
+    IntervalModel,
+    _generalized_forces_per_newton,
+    _segment_weights,
+    linear_residual_models,
+)
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
@@ -27,113 +33,7 @@ from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.solvers import GaussNewton, solve
-
-FORCE, BIAS = UnknownGroup("here", "force"), UnknownGroup("camera", "bias")
-
-
-def random_model(seed: int, states=3, unknowns=2, parameters=2, count=4, rows=5) -> LinearResidualModel:
-    rng = np.random.default_rng(seed)
-    intervals = tuple(
-        IntervalModel(
-            rng.standard_normal((rows, 1 + parameters)),
-            rng.standard_normal((rows, states)),
-            rng.standard_normal((rows, unknowns)),
-            0.6 * rng.standard_normal((states, states)),
-            rng.standard_normal((states, unknowns)),
-            np.zeros((1 + parameters, 1 + parameters)),
-            rows,
-        )
-        for _ in range(count)
-    )
-    sources = (FORCE,) * (unknowns - 1) + (BIAS,)
-    return LinearResidualModel(
-        "run",
-        intervals,
-        0.1 * np.arange(count + 1),
-        tuple(f"u{i}" for i in range(unknowns)),
-        sources,
-        np.ones(unknowns),
-        rng.standard_normal((states, unknowns)),
-        0.3 * np.ones(states),
-        0.7,
-        np.zeros(unknowns),
-    )
-
-
-def dense(model: LinearResidualModel, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Design (rows, all disturbances), their covariance, and the unknowns by them."""
-    ns, nd, count = len(model.initial_state_std), len(variance), len(model.intervals)
-    width = ns + nd * count
-    gain = np.sqrt(1 - model.interval_correlation**2)
-    unknown = np.zeros((count, nd, width))
-    for j in range(count):
-        if j:
-            unknown[j] = model.interval_correlation * unknown[j - 1]
-        unknown[j][:, ns + nd * j : ns + nd * (j + 1)] += np.eye(nd) * (gain if j else 1.0)
-    state = np.zeros((ns, width))
-    state[:, :ns] = np.eye(ns)
-    state += model.initial_state_jacobian @ unknown[0]
-    rows = []
-    for j, interval in enumerate(model.intervals):
-        rows.append(interval.state_jacobian @ state + interval.unknown_jacobian @ unknown[j])
-        state = interval.state_transition @ state + interval.unknown_input_matrix @ unknown[j]
-    return np.vstack(rows), np.concatenate([model.initial_state_std**2, np.tile(variance, count)]), unknown
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_the_filter_gives_the_evidence_and_the_posterior_of_dense_algebra(seed):
-    model = random_model(seed)
-    variance = np.array([0.8, 2.5])
-    design, prior, unknown = dense(model, variance)
-    observed = np.vstack([i.negative_residual_jacobian for i in model.intervals])
-    total = design @ np.diag(prior) @ design.T + np.eye(len(design))
-    done = _filter(model, variance, True)
-    assert done.products == pytest.approx(observed.T @ np.linalg.solve(total, observed), rel=1e-9)
-    assert done.log_determinant == pytest.approx(np.linalg.slogdet(total)[1], rel=1e-9)
-    gain = np.diag(prior) @ design.T @ np.linalg.inv(total)
-    mean = unknown @ gain @ observed
-    covariance = np.diag(prior) - gain @ design @ np.diag(prior)
-    assert done.mean == pytest.approx(mean, rel=1e-8, abs=1e-10)
-    expected = np.einsum("jdw,wv,jdv->jd", unknown, covariance, unknown)
-    assert done.covariance == pytest.approx(expected, rel=1e-8, abs=1e-10)
-    left = np.linalg.solve(total, observed)
-    assert np.vstack(done.left) == pytest.approx(left, rel=1e-8, abs=1e-10)
-
-
-@pytest.mark.parametrize("unknown", [0, 1])
-def test_what_is_said_of_one_unknowns_history_is_that_of_dense_algebra(unknown):
-    model = random_model(5)
-    variance = {FORCE: 0.8, BIAS: 2.5}
-    design, prior, _ = dense(model, np.array([variance[source] for source in model.unknown_groups]))
-    observed = np.vstack([i.negative_residual_jacobian for i in model.intervals])
-    # parameters have a prior of three of their sizes
-    total = design @ np.diag(prior) @ design.T + np.eye(len(design)) + 9 * observed[:, 1:] @ observed[:, 1:].T
-    columns = []
-    for at in range(len(model.intervals)):
-        state, rows = np.zeros(len(model.initial_state_std)), []
-        for j, interval in enumerate(model.intervals):
-            value = float(j == at)
-            rows.append(interval.state_jacobian @ state + interval.unknown_jacobian[:, unknown] * value)
-            state = interval.state_transition @ state + interval.unknown_input_matrix[:, unknown] * value
-        columns.append(np.concatenate(rows))
-    response = np.stack(columns, axis=1)
-    score, information = force_likelihood_terms(model, variance, unknown)
-    assert score == pytest.approx(response.T @ np.linalg.solve(total, observed[:, 0]), rel=1e-7, abs=1e-9)
-    assert information == pytest.approx(response.T @ np.linalg.solve(total, response), rel=1e-7, abs=1e-9)
-
-
-def test_the_scores_are_the_slope_of_the_evidence():
-    model = random_model(4)
-    at = {FORCE: 0.9, BIAS: 0.4}
-    state = _run([model], at)
-    for source, (up, down) in _scores([model], state).items():
-        step = 1e-5
-        slope = (
-            _run([model], at | {source: at[source] + step}).log_evidence
-            - _run([model], at | {source: at[source] - step}).log_evidence
-        ) / (2 * step)
-        assert slope == pytest.approx((up - down) / 2, rel=1e-4)
-
+from yid_ocp.virtual.experiment import baxter_foam_y_system
 
 # -- a pendulum with a motor, seen from outside ------------------------------------------------------------------------
 
@@ -292,3 +192,40 @@ def test_effects_take_the_share_that_they_close():
 
 def test_touching_spans_are_one():
     assert merge_intervals([(1.0, 1.5), (0.0, 0.5), (0.5, 1.0), (3.0, 4.0)]) == ((0.0, 1.5), (3.0, 4.0))
+
+
+# -- pushes on segments ------------------------------------------------------------------------------------------------
+
+SYSTEM = baxter_foam_y_system(1)
+THETA = np.array([parameter.value for parameter in SYSTEM.parameters])
+
+
+def test_a_push_is_what_virtual_work_says():
+    q = 0.3 * np.random.default_rng(3).standard_normal((2, SYSTEM.n_coordinates))
+    found = _generalized_forces_per_newton(SYSTEM, THETA, q, ("T1", "T3"))
+    assert found.shape == (2, SYSTEM.n_coordinates, 6)
+    symbol = ca.SX.sym("q", SYSTEM.n_coordinates)
+    at = ca.vertcat(
+        *(forward_kinematics(SYSTEM.mechanism, symbol).frame_position(f"{s}:{_FORCE_POINT}") for s in ("T1", "T3"))
+    )
+    place = ca.Function("place", [symbol, SYSTEM.parameters.symbols], [at])
+    for k, row in enumerate(q):
+        for i in range(SYSTEM.n_coordinates):
+            step = np.zeros(SYSTEM.n_coordinates)
+            step[i] = 1e-6
+            moved = (np.array(place(row + step, THETA)) - np.array(place(row - step, THETA))).ravel() / 2e-6
+            assert found[k, i] == pytest.approx(moved, abs=1e-8)
+
+
+def test_pushes_are_measured_by_the_weight_of_their_segment():
+    found = _segment_weights(SYSTEM, THETA)
+    assert found == pytest.approx({"T1": 9.81 * 0.064, "T2": 9.81 * 0.015, "T3": 9.81 * 0.016})
+
+
+def test_what_cannot_be_pushed_is_not():
+    assert _segment_weights(replace(SYSTEM, segment_layouts=()), THETA) == {}
+    assert _generalized_forces_per_newton(SYSTEM, THETA, np.zeros((4, SYSTEM.n_coordinates)), ()).shape == (
+        4,
+        SYSTEM.n_coordinates,
+        0,
+    )

@@ -8,6 +8,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+from small_problems import pendulum_step, taken
 
 from yid_ocp.data import read_recording
 from yid_ocp.errors import SolverError
@@ -19,6 +20,13 @@ from yid_ocp.solvers.symbolic_transcription import transcribe
 
 FREE = ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twist")
 SEEN = ("T1.bend", "T1.twist", "T2.bend")
+
+
+@pytest.fixture(scope="module")
+def pendulum(urdf_folder):
+    """Two links that swing freely, for what does not depend on the mechanism."""
+    step = pendulum_step(urdf_folder)
+    return EstimationProblem(step, [taken(step, 1)], ("elbow.damping", "elbow.stiffness"))
 
 
 @pytest.fixture(scope="module")
@@ -125,15 +133,11 @@ def test_fifty_variables_from_far_away(two_arms, solver):
         assert solution.parameters[name].value == pytest.approx(reference.value, abs=0.1 * reference.std), name
 
 
-def test_steepest_descent_lowers_the_papers_cost(make_problem):
+def test_steepest_descent_lowers_the_papers_cost_and_with_a_memory_returns_the_best_point(make_problem):
     problem = make_problem(free=("T1.bend", "T2.bend"), duration=2.0, weighting="paper")
     solution = solve(problem, SteepestDescent(max_iterations=60, first_trial_step="spectral"))
     assert solution.history[-1].cost < 0.05 * solution.history[0].cost
     assert solution.parameters["T1.bend"].value == pytest.approx(22.0, rel=0.05)
-
-
-def test_steepest_descent_with_a_memory_returns_the_best_point(make_problem):
-    problem = make_problem(free=("T1.bend", "T2.bend"), duration=2.0, weighting="paper")
     solution = solve(
         problem, SteepestDescent(first_trial_step="spectral", nonmonotone_memory=10, gradient_tolerance=1e-4)
     )
@@ -177,52 +181,48 @@ def test_open_loop_is_for_multiple_shooting(make_problem):
     assert not longer.evaluate(longer.initial_unknowns, derivatives=False).ok
 
 
-def test_limited_memory_is_refused_with_a_reason(short):
-    solver = MultipleShooting(ipopt={"hessian_approximation": "limited-memory"})
-    with pytest.raises(SolverError, match="limited-memory"):
-        solver.minimize_cost(short, short.initial_unknowns, None)
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"hessian": "bfgs"}, "hessian = 'bfgs'"),
+        ({"ipopt": {"hessian_approximation": "limited-memory"}}, "limited-memory"),
+        ({"node_interval": 10}, "node_interval = 10 without condensing"),
+        ({"condensing": True, "node_interval": 1000}, "fewer than one node interval"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused_with_a_reason(pendulum, settings, said):
+    with pytest.raises(SolverError, match=said):
+        MultipleShooting(**settings).minimize_cost(pendulum, pendulum.initial_unknowns, None)
 
 
-def test_recording_shorter_than_a_node_interval(short):
-    with pytest.raises(SolverError, match="fewer than one node interval"):
-        MultipleShooting(condensing=True, node_interval=1000).minimize_cost(short, short.initial_unknowns, None)
-
-
-def test_iteration_limit_is_a_status_with_the_best_point(make_problem):
-    problem = make_problem(free=SEEN, duration=0.4)
-    few = (MultipleShooting(condensing=True, max_iterations=2), MultipleShooting(max_iterations=2))
-    for solver in (GaussNewton(max_iterations=1), *few):
+def test_iteration_limit_is_a_status_with_the_best_point(make_problem, pendulum):
+    arm = make_problem(free=SEEN, duration=0.4)
+    few = [(arm, GaussNewton(max_iterations=1)), (arm, MultipleShooting(condensing=True, max_iterations=2))]
+    few += [(pendulum, MultipleShooting(max_iterations=2, ipopt={"acceptable_iter": 0}))]
+    for problem, solver in few:
         solution = solve(problem, solver)
         assert solution.status == Status.ITERATION_LIMIT
         assert np.all(np.isfinite(solution.x))
         assert "iterations" in solution.message
 
 
-def test_steps_between_nodes_are_eliminated_by_condensing_alone(short):
-    with pytest.raises(SolverError, match="node_interval = 10 without condensing"):
-        MultipleShooting(node_interval=10).minimize_cost(short, short.initial_unknowns, None)
-
-
-def test_more_memory_than_there_is_ends_with_a_status(make_problem, monkeypatch, caplog):
-    problem = make_problem(free=("T1.bend",), duration=0.1)
-    monkeypatch.setattr("yid_ocp.solvers.multiple_shooting.available_memory", lambda: 1e6)
+def test_more_memory_than_there_is_ends_with_a_status(pendulum, monkeypatch, caplog):
+    monkeypatch.setattr("yid_ocp.solvers.multiple_shooting.available_memory", lambda: 1e4)
     with caplog.at_level("INFO"):
-        found = MultipleShooting().minimize_cost(problem, problem.initial_unknowns, None)
+        found = MultipleShooting().minimize_cost(pendulum, pendulum.initial_unknowns, None)
     assert found.status == Status.FAILED
-    assert found.x == pytest.approx(problem.initial_unknowns)
-    assert "of memory, of which 0.001 GB are free" in found.message
-    assert "IPOPT on 1023 unknowns, 1022 equations" in caplog.text
+    assert found.x == pytest.approx(pendulum.initial_unknowns)
+    assert "of memory, of which 1e-05 GB are free" in found.message
+    assert "IPOPT on 104 unknowns, 102 equations" in caplog.text
 
 
-def test_a_program_that_ipopt_cannot_begin_is_a_status_and_silent(make_problem, monkeypatch, capfd):
-    problem = make_problem(free=("T1.bend", "T2.bend"), duration=0.05)
-
+def test_a_program_that_ipopt_cannot_begin_is_a_status_and_silent(pendulum, monkeypatch, capfd):
     def lost(*arguments):
         program = transcribe(*arguments)
         return program.with_user_terms(ca.log(program["theta"][0] - 100.0))
 
     monkeypatch.setattr("yid_ocp.solvers.multiple_shooting.transcribe", lost)
-    found = MultipleShooting(max_iterations=3).minimize_cost(problem, problem.initial_unknowns, None)
+    found = MultipleShooting(max_iterations=3).minimize_cost(pendulum, pendulum.initial_unknowns, None)
     assert found.status in (Status.STALLED, Status.FAILED)
     assert "IPOPT: Invalid_Number_Detected" in found.message
     assert np.all(np.isfinite(found.x))

@@ -49,7 +49,7 @@ def test_a_fit_is_told_with_its_misfit_and_what_follows():
     assert fit_messages.fit_message(1.0449, True).endswith("to within their noise (chi2 per degree of freedom is 1.04)")
     bad = fit_messages.fit_message(9.0, False)
     assert "does not explain the recordings (chi2 per degree of freedom is 9," in bad
-    assert bad.endswith(fit_messages._DIAGNOSE_HINT)
+    assert bad.endswith("run `yid-ocp diagnose`")
 
 
 def test_tables_say_the_same_as_sentences():

@@ -26,56 +26,35 @@ for _family in iter_modules(__path__):
 
 
 def make_effect(kind: str, location: str, system: System, values: Mapping[str, float] | None = None) -> EffectBase:
-    """An effect of a kind at a location, to be added with `System.with_effects`.
+    """An effect of a kind at a location, to be added with `System.with_effects`; see `candidate_effects`.
 
-    Parameters
-    ----------
-    kind : str
-        A registered kind, `kelvin_voigt` for example.
-    location : str
-        Where it sits: a segment, point, arm joint, grasp or arm, `base`, `object`, `world`, `camera` or `clock`.
-    system : System
-        The system that it will be added to.
-    values : mapping of quantity to value, optional
-        Where they are not neutral; a compliance may be given as its `stiffness`.
-
-    Returns
-    -------
-    EffectBase
-        Its parameters are named `kind@location.quantity`.
+    Its parameters are named `kind@location.parameter`. `values` holds what is not neutral, by parameter; a compliance
+    may be given as its `stiffness`.
 
     Raises
     ------
     ConfigError
-        No such kind or quantity, or a value outside its bounds.
+        No such kind or parameter, or a value outside its bounds.
     ModelError
         The system has no such place for it.
     """
-    cls = EFFECTS[kind]
-    places = cls.possible_locations(system)
+    places = EFFECTS[kind].possible_locations(system)
     if location not in places:
-        if not places:
-            said = UnknownNameDetails(allowed="nothing in this system", hint="leave it out")
-        else:
-            said = unknown_name_details(location, places)
+        said = UnknownNameDetails(allowed="nothing in this system", hint="leave it out")
+        said = unknown_name_details(location, places) if places else said
         raise ModelError(f"{kind} does not fit '{location}'", where=f"{kind}@{location}", **said)
-    return base.build_effect(kind, location, system, values)
+    return base.build_effect(kind, location, system, values or {})
 
 
 def candidate_effects(system: System, recorded_sensors: Collection[str]) -> list[tuple[str, str]]:
-    """Every (kind, location) that is possible in a system and visible in a recording.
+    """Every (kind, location) that is possible in a system and visible in a recording, by kind.
 
     Parameters
     ----------
     system : System
         Without the effects in question.
     recorded_sensors : collection of str
-        What was recorded, among `SENSOR_KINDS`.
-
-    Returns
-    -------
-    list of (str, str)
-        By kind, then in the order of the system. What works only on prescribed joints is left out where no effort was
+        What was recorded, among `SENSOR_KINDS`. What works only on prescribed joints is left out where no effort was
         recorded, for there nothing would show it.
 
     Raises
@@ -91,10 +70,6 @@ def candidate_effects(system: System, recorded_sensors: Collection[str]) -> list
     for kind in EFFECTS:
         cls = EFFECTS[kind]
         if cls.required_sensors <= present:
-            found += [(kind, place) for place in cls.candidate_locations(system) if place not in unseen]
+            places = (cls.candidate_locations or cls.possible_locations)(system)
+            found += [(kind, place) for place in places if place not in unseen]
     return found
-
-
-def effect_overview() -> list[tuple[str, str, str]]:
-    """Every kind with its equation and the sensors that it requires."""
-    return [(kind, EFFECTS[kind].equation, ", ".join(sorted(EFFECTS[kind].required_sensors))) for kind in EFFECTS]

@@ -1,14 +1,15 @@
-"""Effects between a motor and its recorded signals: elastic gears, backlash, effort sensing errors, late torque.
+"""Effects between a motor and its recorded signals: gears, encoders, effort sensing, late torque, position servos.
 
 Recorded torques drive the model and recorded angles prescribe or guide it, so that these effects reach a driven joint,
 or the angle of a prescribed one, through `corrected_reading`; the effort that a prescribed joint needs is compared with
-the recorded one through `measure`.
+the recorded one through `distorted_reading`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
+from dataclasses import replace
+from typing import Any, ClassVar
 
 import casadi as ca
 
@@ -16,57 +17,109 @@ from yid_ocp.effects.base import (
     EFFECTS,
     EffectBase,
     ParameterDefinition,
+    compliance,
     force_on_joint,
     joints_by_arm,
     relative_effort_limit,
     robot_joints,
 )
+from yid_ocp.model.servos_and_springs import TORQUE_LIMIT_POWER, UNLIMITED_EFFORT, PositionServo
 from yid_ocp.model.system import MidpointState, NodeState, StepTerms, System
 
 _PLAY_TORQUE = 0.2
 """Torque at which three quarters of the backlash are taken up [N m]."""
+_DEFAULT_EFFORT_LIMIT = 10.0
+"""Assumed effort limit of a joint that has none [N m or N]."""
+_MIN_LIMIT_FRACTION = 0.1
+"""Smallest torque limit that is searched, as a fraction of the joint's effort limit."""
+
+
+def _recorded_joints(system: System) -> tuple[str, ...]:
+    """Names of arm joints that are driven or prescribed."""
+    known = {*system.driven, *system.prescribed}
+    return tuple(name for name in robot_joints(system) if name in known)
+
+
+def _effort_joints(system: System) -> tuple[str, ...]:
+    """Names of arm joints whose recorded effort drives them or is compared."""
+    return tuple(name for name in _recorded_joints(system) if name not in system.servos)
+
+
+def _servo_joints(system: System) -> tuple[str, ...]:
+    """Names of arm joints with a servo."""
+    return tuple(name for name in robot_joints(system) if name in system.servos)
+
+
+def _geared_joints(system: System) -> tuple[str, ...]:
+    """Names of arm joints whose effort is known; of joints with a servo where there are none."""
+    return _effort_joints(system) or _servo_joints(system)
+
+
+def _effort_arms(system: System) -> tuple[str, ...]:
+    """Names of arms with a joint whose recorded effort drives it or is compared."""
+    known = set(_effort_joints(system))
+    return tuple(name for name, joints in joints_by_arm(system).items() if known & set(joints))
+
+
+class _DistortedReading(EffectBase):
+    """An error that is added to the reading of one joint."""
+
+    quantity: ClassVar[str] = "joints.position"
+    required_sensors = frozenset({"joints.position"})
+    possible_locations = _effort_joints
+
+    def _error(self, effort: ca.SX) -> ca.SX:
+        """Measured less true value at an effort, the joint's own where the model knows it, else the recorded one."""
+        raise NotImplementedError
+
+    def _is_own(self, channel: str) -> bool:
+        return channel == f"{self.quantity}.{self.location}"
+
+    def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
+        """The recorded value: the true one plus the error."""
+        if not self._is_own(channel):
+            return output
+        return output + self._error(state.effort[state.system.mechanism.joint_index(self.location)])
+
+    def corrected_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
+        """The true value: the recorded one less the error."""
+        return reading - self._error(effort) if self._is_own(channel) else reading
+
+
+@EFFECTS.register("encoder_offset")
+class EncoderOffset(_DistortedReading):
+    """Measured angle = true angle + offset.
+
+    The model's coordinate stays the true angle: prescribed paths, start postures and what a tracking filter follows are
+    the readings less the offset.
+    """
+
+    equation = "measured angle = true + offset"
+    required_excitation = "how it stands against gravity"
+    possible_locations = _recorded_joints
+    declared_parameters = (
+        ParameterDefinition("offset", "rad", 0.0, -0.3, 0.3, (-0.035, 0.035), "measured less true angle"),
+    )
+
+    def _error(self, effort: ca.SX) -> ca.SX:
+        return self["offset"]
 
 
 @EFFECTS.register("series_elasticity")
-class SeriesElasticity(EffectBase):
-    """An elastic gear with the encoder on the motor's side: measured angle = q + effort/stiffness.
-
-    The effort is the joint's own where the model knows it, else the recorded one.
-    """
+class SeriesElasticity(_DistortedReading):
+    """An elastic gear with the encoder on the motor's side: measured angle = q + effort/stiffness."""
 
     equation = "measured angle = q + effort/stiffness"
     required_excitation = "how hard it pulls at its ends"
-    required_sensors: ClassVar[frozenset[str]] = frozenset({"joints.position", "joints.effort"})
+    required_sensors = frozenset({"joints.position", "joints.effort"})
+    declared_parameters = (compliance("rad/(N m)", 0.02, (1 / 2000, 1 / 100), "gear", "N m/rad"),)
 
-    @classmethod
-    def possible_locations(cls, system: System) -> tuple[str, ...]:
-        """Names of arm joints that are driven or prescribed."""
-        return _recorded(system)
-
-    @classmethod
-    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definition of the gear's compliance [rad/(N m)], reported as stiffness [N m/rad]."""
-        text, reported = "compliance of the gear", "stiffness N m/rad"
-        return (
-            ParameterDefinition(
-                "compliance", "rad/(N m)", 0.0, 0.0, 0.02, (1 / 2000, 1 / 100), text, reported_reciprocal=reported
-            ),
-        )
-
-    def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
-        """The encoder's reading: the joint angle plus the gear's deflection under the effort."""
-        return output + self._give(channel, _effort(state, self.location))
-
-    def corrected_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
-        """The joint angle: the encoder's reading minus the gear's deflection under the effort."""
-        return reading - self._give(channel, effort)
-
-    def _give(self, channel: str, effort: ca.SX) -> ca.SX:
-        return self["compliance"] * effort if channel == f"joints.position.{self.location}" else ca.SX(0)
+    def _error(self, effort: ca.SX) -> ca.SX:
+        return self["compliance"] * effort
 
 
 @EFFECTS.register("backlash")
-class Backlash(EffectBase):
+class Backlash(_DistortedReading):
     """A gear with backlash, encoder on the motor's side: measured angle = q + width/2 tanh(effort/`_PLAY_TORQUE`).
 
     A servo acts on what its encoder reads: there the play z that is taken up solves z = width/2 tanh(torque(q + z)/
@@ -75,12 +128,8 @@ class Backlash(EffectBase):
 
     equation = "measured angle = q + width/2 tanh(effort/0.2 N m)"
     required_excitation = "how hard it pulls at its ends"
-    required_sensors: ClassVar[frozenset[str]] = frozenset({"joints.position"})
-
-    @classmethod
-    def possible_locations(cls, system: System) -> tuple[str, ...]:
-        """Names of arm joints that are driven or prescribed; of joints with a servo where there are none."""
-        return _recorded(system) or tuple(name for name in robot_joints(system) if name in system.servos)
+    possible_locations = _geared_joints
+    declared_parameters = (ParameterDefinition("width", "rad", 0.0, 0.0, 0.1, (0.0, 0.01), "play of the gear"),)
 
     @classmethod
     def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
@@ -105,49 +154,49 @@ class Backlash(EffectBase):
             internal_equations={name: taken},
         )
 
-    @classmethod
-    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definition of the backlash width [rad]."""
-        return (ParameterDefinition("width", "rad", 0.0, 0.0, 0.1, (0.0, 0.01), "play of the gear"),)
+    def _error(self, effort: ca.SX) -> ca.SX:
+        return self["width"] / 2 * ca.tanh(effort / _PLAY_TORQUE)
 
     def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
         """The encoder's reading: the joint angle plus the taken-up backlash."""
-        for name in self.internal_coordinates if channel == f"joints.position.{self.location}" else ():
+        for name in self.internal_coordinates if self._is_own(channel) else ():
             return output + state.z[state.internal_rows[name]]
-        return output + self._give(channel, _effort(state, self.location))
+        return super().distorted_reading(channel, output, state)
 
     def corrected_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
         """The joint angle: the encoder's reading minus the taken-up backlash; unchanged for a joint with a servo."""
         # a servo's coordinate follows from the motion, and its command is of the motor's side
-        return reading if self.internal_coordinates else reading - self._give(channel, effort)
+        return reading if self.internal_coordinates else super().corrected_reading(channel, reading, effort)
 
-    def _give(self, channel: str, effort: ca.SX) -> ca.SX:
-        if channel != f"joints.position.{self.location}":
-            return ca.SX(0)
-        return self["width"] / 2 * ca.tanh(effort / _PLAY_TORQUE)
+
+class _DistortedEffort(_DistortedReading):
+    """An error of a joint's recorded effort."""
+
+    quantity = "joints.effort"
+    required_excitation = "how it stands against gravity"
+    required_sensors = frozenset({"joints.effort"})
 
 
 @EFFECTS.register("effort_gain")
-class EffortGain(EffectBase):
+class EffortGain(_DistortedEffort):
     """Measured effort = scale x true effort; a negative scale is a flipped sign.
 
     Kept inside as 1/scale, by which a recorded torque is multiplied, so that a driven joint's may go through zero.
     """
 
     equation = "measured effort = scale x true"
-    required_excitation = "how it stands against gravity"
-    required_sensors: ClassVar[frozenset[str]] = frozenset({"joints.effort"})
-
-    @classmethod
-    def possible_locations(cls, system: System) -> tuple[str, ...]:
-        """Names of arm joints that are driven or prescribed."""
-        return _recorded(system)
-
-    @classmethod
-    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definition of 1/scale [1], reported as scale."""
-        text, expected = "true over measured effort", (1 / 1.2, 1 / 0.8)
-        return (ParameterDefinition("inverse", "1", 1.0, -1.5, 3.0, expected, text, reported_reciprocal="scale 1"),)
+    declared_parameters = (
+        ParameterDefinition(
+            "inverse",
+            "1",
+            1.0,
+            -1.5,
+            3.0,
+            (1 / 1.2, 1 / 0.8),
+            "true over measured effort",
+            reported_reciprocal="scale 1",
+        ),
+    )
 
     def alternative_start(self, start: Mapping[str, float]) -> Mapping[str, float] | None:
         """A start with the opposite sign of scale where the estimate of 1/scale is at least 1 away from 1; else None.
@@ -162,43 +211,49 @@ class EffortGain(EffectBase):
 
     def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
         """The recorded effort: the true effort times scale."""
-        return output / self["inverse"] if channel == f"joints.effort.{self.location}" else output
+        return output / self["inverse"] if self._is_own(channel) else output
 
     def corrected_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
         """The true effort: the recorded effort divided by scale."""
-        return reading * self["inverse"] if channel == f"joints.effort.{self.location}" else reading
+        return reading * self["inverse"] if self._is_own(channel) else reading
 
 
 @EFFECTS.register("effort_offset")
-class EffortOffset(EffectBase):
+class EffortOffset(_DistortedEffort):
     """Measured effort = true effort + offset."""
 
     equation = "measured effort = true + offset"
-    required_excitation = "how it stands against gravity"
-    required_sensors: ClassVar[frozenset[str]] = frozenset({"joints.effort"})
+    declared_parameters = (
+        ParameterDefinition(
+            "offset",
+            "N m",
+            0.0,
+            -10.0,
+            10.0,
+            (-1.5, 1.5),
+            "measured less true effort",
+            range_scale=relative_effort_limit,
+        ),
+    )
 
-    @classmethod
-    def possible_locations(cls, system: System) -> tuple[str, ...]:
-        """Names of arm joints that are driven or prescribed."""
-        return _recorded(system)
+    def _error(self, effort: ca.SX) -> ca.SX:
+        return self["offset"]
 
-    @classmethod
-    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definition of the offset, measured minus true effort [N m]."""
-        bound, width = (size * relative_effort_limit(system, location) for size in (10.0, 1.5))
-        return (ParameterDefinition("offset", "N m", 0.0, -bound, bound, (-width, width), "measured less true effort"),)
 
-    def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
-        """The recorded effort: the true effort plus the offset."""
-        return output + self["offset"] if channel == f"joints.effort.{self.location}" else output
+class _LateTorque(EffectBase):
+    """Torque that acts after its record; the measured effort of a prescribed joint is early by as much."""
 
-    def corrected_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
-        """The true effort: the recorded effort minus the offset."""
-        return reading - self["offset"] if channel == f"joints.effort.{self.location}" else reading
+    required_excitation = "when it is read"
+    required_sensors = frozenset({"joints.effort"})
+
+    def _lateness(self, channel: str, joints: tuple[str, ...], size: ca.SX) -> ca.SX:
+        """`size` for a torque that drives one of the joints, its negative for their measured efforts, else zero."""
+        signs = {f"{name}.{joint}": sign for name, sign in (("torque", 1), ("joints.effort", -1)) for joint in joints}
+        return signs.get(channel, 0) * size
 
 
 @EFFECTS.register("effort_delay")
-class EffortDelay(EffectBase):
+class EffortDelay(_LateTorque):
     """Torque acts late: what acts at t was recorded at t - delay, interpolated between samples.
 
     For a prescribed arm the recorded effort at t is what the motion needs at t + delay; a negative delay means that the
@@ -206,35 +261,18 @@ class EffortDelay(EffectBase):
     """
 
     equation = "the torque that acts at t was recorded at t - delay"
-    required_excitation = "when it is read"
-    required_sensors: ClassVar[frozenset[str]] = frozenset({"joints.effort"})
-
-    @classmethod
-    def possible_locations(cls, system: System) -> tuple[str, ...]:
-        """Names of arms with a driven or prescribed joint."""
-        known = set(_recorded(system))
-        return tuple(name for name, joints in joints_by_arm(system).items() if known & set(joints))
-
-    @classmethod
-    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definition of the delay from recorded to acting torque [s]."""
-        return (ParameterDefinition("delay", "s", 0.0, -0.2, 0.2, (0.0, 0.1), "how late recorded torque acts"),)
-
-    @classmethod
-    def arm_joints_at_location(cls, location: str, system: System) -> tuple[str, ...]:
-        """Names of the arm's joints."""
-        return joints_by_arm(system)[location]
+    possible_locations = _effort_arms
+    declared_parameters = (
+        ParameterDefinition("delay", "s", 0.0, -0.2, 0.2, (0.0, 0.1), "how late recorded torque acts"),
+    )
 
     def added_delay(self, channel: str, camera: bool) -> ca.SX:
         """The delay for torques that drive the arm's joints, its negative for their measured efforts, else zero [s]."""
-        quantity, _, joint = channel.partition(".") if channel.startswith("torque.") else channel.rpartition(".")
-        if joint not in self.arm_joints:
-            return ca.SX(0)
-        return {"torque": self["delay"], "joints.effort": -self["delay"]}.get(quantity, ca.SX(0))
+        return self._lateness(channel, self.arm_joints, self["delay"])
 
 
 @EFFECTS.register("effort_lag")
-class EffortLag(EffectBase):
+class EffortLag(_LateTorque):
     """Torque follows its command: time_constant dz/dt = command - z, z the torque that acts.
 
     The recorded torque is the command, of a prescribed joint too: the effort that its motion needs follows the recorded
@@ -243,33 +281,94 @@ class EffortLag(EffectBase):
     """
 
     equation = "time_constant dz/dt = command - z"
-    required_excitation = "when it is read"
-    required_sensors: ClassVar[frozenset[str]] = frozenset({"joints.effort"})
-
-    @classmethod
-    def possible_locations(cls, system: System) -> tuple[str, ...]:
-        """Names of arm joints that are driven or prescribed."""
-        return _recorded(system)
+    possible_locations = _effort_joints
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
         """Definition of time_constant [s]; negative values are allowed for prescribed joints."""
-        text = "with which torque follows its command"
-        least = -0.5 if location in system.prescribed else 0.0
+        least, text = -0.5 if location in system.prescribed else 0.0, "with which torque follows its command"
         return (ParameterDefinition("time_constant", "s", 0.0, least, 0.5, (0.0, 0.05), text),)
 
     def lag_time_constant(self, channel: str) -> ca.SX:
         """The time constant for the joint's driving torque, its negative for its measured effort, else zero [s]."""
-        quantity, _, joint = channel.rpartition(".")
-        if joint != self.location:
-            return ca.SX(0)
-        return {"torque": self["time_constant"], "joints.effort": -self["time_constant"]}.get(quantity, ca.SX(0))
+        return self._lateness(channel, (self.location,), self["time_constant"])
 
 
-def _recorded(system: System) -> tuple[str, ...]:
-    known = {*system.driven, *system.prescribed} - set(system.servos)
-    return tuple(name for name in robot_joints(system) if name in known)
+class _ServoChange(EffectBase):
+    """A position servo that deviates from its data sheet."""
+
+    required_excitation = "how hard it accelerates"
+    required_sensors = frozenset({"joints.position"})
+    possible_locations = _servo_joints
+
+    def _changes(self, servo: PositionServo) -> dict[str, Any]:
+        """The fields of the servo that the effect changes."""
+        return {}
+
+    def apply_to_system(self, system: System) -> System:
+        """The system with the changed servo."""
+        servo = system.servos[self.location]
+        return replace(system, servos={**system.servos, self.location: replace(servo, **self._changes(servo))})
 
 
-def _effort(state: NodeState, joint: str) -> ca.SX:
-    return state.effort[state.system.mechanism.joint_index(joint)]
+@EFFECTS.register("servo_gain")
+class ServoGain(_ServoChange):
+    """A servo's demanded torque multiplied by scale: another gain, supply voltage or motor."""
+
+    equation = "demand = scale (gain (u - q) - damping v)"
+    declared_parameters = (
+        ParameterDefinition("scale", "1", 1.0, 0.05, 20.0, (0.3, 3.0), "true over nominal torque of the servo"),
+    )
+
+    def _changes(self, servo: PositionServo) -> dict[str, Any]:
+        return {"gain": servo.gain * self["scale"], "damping": servo.damping * self["scale"]}
+
+
+@EFFECTS.register("servo_delay")
+class ServoDelay(_ServoChange):
+    """Commands act later than the nominal servo delay."""
+
+    equation = "the command that acts at t was given at t - servo_delay - delay"
+    required_excitation = "when it is read"
+    declared_parameters = (
+        ParameterDefinition("delay", "s", 0.0, -0.2, 0.5, (0.0, 0.2), "how late commands act beyond the servo's delay"),
+    )
+
+    def added_delay(self, channel: str, camera: bool) -> ca.SX:
+        """The added delay for the joint's command, zero for other channels [s]."""
+        return self["delay"] if channel == f"torque.{self.location}" else ca.SX(0)
+
+
+@EFFECTS.register("servo_saturation")
+class ServoSaturation(_ServoChange):
+    """An additional torque limit of a servo: demand / (1 + |demand/limit|^16)^(1/16).
+
+    Kept inside as limit^-16, which adds to the model's own limit, is neutral at zero and has a slope there: of the
+    largest torques first. From a tenth beside the limit on it is within 1.2 % of a clip.
+    """
+
+    equation = "torque = demand / (1 + (demand/limit)^16)^(1/16)"
+
+    @classmethod
+    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
+        """Definition of tightness = limit^-16, reported as limit, from `_MIN_LIMIT_FRACTION` of the effort limit."""
+        joint = system.mechanism.joints[system.mechanism.joint_index(location)]
+        known = joint.effort_limit if 0 < joint.effort_limit < UNLIMITED_EFFORT else _DEFAULT_EFFORT_LIMIT
+        torque = "N m" if joint.coordinate_unit == "rad" else "N"
+        highest = (_MIN_LIMIT_FRACTION * known) ** -TORQUE_LIMIT_POWER
+        return (
+            ParameterDefinition(
+                "tightness",
+                f"({torque})^-16",
+                0.0,
+                0.0,
+                highest,
+                (0.0, highest),
+                "largest torque of the servo, to the power -16",
+                reported_reciprocal=f"limit {torque}",
+                reciprocal_power=TORQUE_LIMIT_POWER,
+            ),
+        )
+
+    def _changes(self, servo: PositionServo) -> dict[str, Any]:
+        return {"torque_limit_tightness": servo.torque_limit_tightness + self["tightness"]}

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
@@ -14,14 +13,12 @@ import numpy as np
 from yid_ocp.errors import ConfigError, nearest_name_hint
 from yid_ocp.model.flexible import ElasticJoint
 from yid_ocp.model.kinematics import forward_kinematics
-from yid_ocp.model.mechanism import Inertia, Mechanism, Placement, merge_bodies
+from yid_ocp.model.mechanism import Inertia
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.servos_and_springs import UNLIMITED_EFFORT
-from yid_ocp.model.system import Grasp, MidpointState, NodeState, StepTerms, System
+from yid_ocp.model.system import MidpointState, NodeState, StepTerms, System
 from yid_ocp.registry import Registry
 
-SIGN_SMOOTHING_SPEED = 0.02
-"""Smoothing speed v_s in sgn(v) = tanh(v/v_s) [rad/s]."""
 EXCITATIONS = (
     "how fast it moves",
     "how long it is held",
@@ -38,23 +35,21 @@ _BAXTER_EFFORT_LIMIT = 50.0
 """Effort limit of Baxter's joints [N m], on which the ranges of arm effects are based; they scale with the limit."""
 _SAME_POINT_DISTANCE = 1e-6
 """Points of arms that stay nearer to each other than this in all configurations count as one point [m]."""
+_CLAMP_AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
 @dataclass(frozen=True)
 class ParameterDefinition:
-    """The definition of one parameter of an effect: unit, neutral value, bounds, expected range.
+    """The definition of one parameter of an effect.
 
     Attributes
     ----------
-    name : str
-    unit : str
     neutral_value : float
-        Value at which the effect is absent; for a `is_shape_parameter`, any value, from which a search may start.
+        Value at which the effect is absent; for an `is_shape_parameter`, any value, from which a search may start.
     lower, upper : float
         Physical bounds.
     prior_range : (float, float)
         Range that an engineer would expect.
-    description : str
     is_shape_parameter : bool
         Whether it has no influence while the others are neutral (a relaxation time, a yield angle).
     reported_reciprocal : str
@@ -62,6 +57,8 @@ class ParameterDefinition:
         goes through infinity when it changes its sign.
     reciprocal_power : int
         p in value = reported value^-p.
+    range_scale : callable of (System, location), optional
+        What bounds and range are multiples of at a location; 1 where it is absent.
     """
 
     name: str
@@ -74,6 +71,15 @@ class ParameterDefinition:
     is_shape_parameter: bool = False
     reported_reciprocal: str = ""
     reciprocal_power: int = 1
+    range_scale: Callable[[System, str], float] | None = None
+
+    def at_location(self, system: System, location: str) -> ParameterDefinition:
+        """The definition with the bounds and the range that hold at a location."""
+        if self.range_scale is None:
+            return self
+        scale, (low, high) = self.range_scale(system, location), self.prior_range
+        lower, upper, prior = self.lower * scale, self.upper * scale, (low * scale, high * scale)
+        return replace(self, lower=lower, upper=upper, prior_range=prior, range_scale=None)
 
     @property
     def reported_name_and_unit(self) -> tuple[str, str]:
@@ -102,18 +108,17 @@ class ReportedParameter:
 
 
 @dataclass(frozen=True)
-class EffectBase(ABC):
-    """The base class of effects, whose own behaviour changes nothing; every kind overrides what it needs.
+class EffectBase:
+    """The base of all effects, which changes nothing; a kind declares itself and overrides what it does.
 
     Attributes
     ----------
-    kind, location : str
-    definitions : tuple of Quantity
-        Definitions at this location, in the order of `parameters`.
+    definitions : tuple of ParameterDefinition
+        Those of `parameters`, at this location.
     parameters : Parameters
-        Named `kind@location.quantity`.
+        Named `kind@location.parameter`.
     internal_coordinates : mapping of str to casadi.SX
-        Internal coordinates, named `kind@location.joint`.
+        Named `kind@location.joint`.
     arm_joints : tuple of str
         Names of the arm's joints where `location` is an arm.
     equation : str
@@ -125,6 +130,12 @@ class EffectBase(ABC):
         Sensors without which the effect is not observable.
     is_local : bool
         Whether its presence at one location says nothing about others, as for a mass; not so for friction.
+    possible_locations : callable of System
+        Names of all places where the effect can act, as a function of this module gives them.
+    candidate_locations : callable of System, optional
+        Names of the places that a diagnosis tries; `possible_locations` where it is absent.
+    declared_parameters : tuple of ParameterDefinition
+        What `parameter_definitions` puts at a location.
     """
 
     kind: str
@@ -138,30 +149,18 @@ class EffectBase(ABC):
     required_excitation: ClassVar[str] = ""
     required_sensors: ClassVar[frozenset[str]] = frozenset()
     is_local: ClassVar[bool] = False
+    possible_locations: ClassVar[Callable[[System], Collection[str]]]
+    candidate_locations: ClassVar[Callable[[System], Collection[str]] | None] = None
+    declared_parameters: ClassVar[tuple[ParameterDefinition, ...]] = ()
 
     @classmethod
-    @abstractmethod
-    def possible_locations(cls, system: System) -> tuple[str, ...]:
-        """Names of all places in the system where the effect can act."""
-
-    @classmethod
-    def candidate_locations(cls, system: System) -> tuple[str, ...]:
-        """Names of the places that a diagnosis tries; by default all of `possible_locations`."""
-        return cls.possible_locations(system)
-
-    @classmethod
-    @abstractmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definitions of the effect's parameters; bounds and ranges may depend on the location."""
+        """Definitions of the effect's parameters with the bounds and ranges of the location."""
+        return tuple(definition.at_location(system, location) for definition in cls.declared_parameters)
 
     @classmethod
     def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
         """Names of the effect's internal coordinates, such as the joint that each belongs to; none by default."""
-        return ()
-
-    @classmethod
-    def arm_joints_at_location(cls, location: str, system: System) -> tuple[str, ...]:
-        """Names of the joints that an arm's location stands for, where the effect needs them; none by default."""
         return ()
 
     @property
@@ -173,8 +172,8 @@ class EffectBase(ABC):
         """Values of a second starting point for a search that starts at `start`; None where one start is enough."""
         return None
 
-    def __getitem__(self, quantity: str) -> ca.SX:
-        return self.parameters[f"{self.kind}@{self.location}.{quantity}"].symbol
+    def __getitem__(self, parameter: str) -> ca.SX:
+        return self.parameters[f"{self.label}.{parameter}"].symbol
 
     @property
     def label(self) -> str:
@@ -204,30 +203,24 @@ class EffectBase(ABC):
     def reported_parameters(
         self, values: Mapping[str, float] | None = None, stds: Mapping[str, float] | None = None
     ) -> dict[str, ReportedParameter]:
-        """The parameters as reported to users; a compliance is reported as stiffness.
+        """The parameters as reported to users, by reported name; a compliance is reported as stiffness.
 
         The standard deviation of C^(-1/p) is C^(-1/p) std(C)/(p C) (delta method).
 
         Parameters
         ----------
-        values : mapping of parameter name to value, optional
-            Nominal where absent; entries of other effects are skipped.
-        stds : mapping of parameter name to standard deviation, optional
-            NaN where absent.
-
-        Returns
-        -------
-        dict of quantity name to Reported
+        values, stds : mapping of parameter name to float, optional
+            Nominal and NaN where absent; entries of other effects are skipped.
         """
         result = {}
-        for quantity, entry in zip(self.definitions, self.parameters, strict=True):
+        for definition, entry in zip(self.definitions, self.parameters, strict=True):
             value = float((values or {}).get(entry.name, entry.value))
             std = float((stds or {}).get(entry.name, math.nan))
-            name, unit = quantity.reported_name_and_unit
-            if quantity.reported_reciprocal:
-                known = bool(value)
-                turned = quantity.to_reported(value) if known else math.inf
-                value, std = turned, abs(turned * std / (quantity.reciprocal_power * value)) if known else math.nan
+            name, unit = definition.reported_name_and_unit
+            if definition.reported_reciprocal:
+                reported = definition.to_reported(value) if value else math.inf
+                std = abs(reported * std / (definition.reciprocal_power * value)) if value else math.nan
+                value = reported
             result[name] = ReportedParameter(value, std, unit)
         return result
 
@@ -263,32 +256,32 @@ class EffectBase(ABC):
 EFFECTS: Registry[type[EffectBase]] = Registry("effect")
 
 
-def build_effect(kind: str, location: str, system: System, values: Mapping[str, float] | None = None) -> EffectBase:
+def build_effect(kind: str, location: str, system: System, values: Mapping[str, float]) -> EffectBase:
     """An effect of a registered kind at a valid location; `make_effect` also checks the location."""
-    cls = EFFECTS[kind]
-    label = f"{kind}@{location}"
-    quantities = cls.parameter_definitions(location, system)
-    names = {q.name: q for q in quantities} | {q.reported_name_and_unit[0]: q for q in quantities}
+    cls, label = EFFECTS[kind], f"{kind}@{location}"
+    definitions = cls.parameter_definitions(location, system)
+    names = {q.name: q for q in definitions} | {q.reported_name_and_unit[0]: q for q in definitions}
     given: dict[str, float] = {}
-    for name, value in (values or {}).items():
+    for name, value in values.items():
         if name not in names:
             raise ConfigError(f"{kind} has no quantity '{name}'", where=label, hint=nearest_name_hint(name, names))
-        quantity = names[name]
-        if name != quantity.name:
-            signed = quantity.lower < 0
+        definition = names[name]
+        if name != definition.name:
+            signed = definition.lower < 0
             if not (value > 0 or (signed and value < 0)):
                 allowed = f"{'a number other than zero' if signed else 'a positive number'} "
-                allowed += quantity.reported_name_and_unit[1]
+                allowed += definition.reported_name_and_unit[1]
                 raise ConfigError(f"{name} = {value}", where=label, allowed=allowed)
-            value = quantity.to_internal(value)
-        given[quantity.name] = float(value)
+            value = definition.to_internal(value)
+        given[definition.name] = float(value)
     entries = (
         Parameter(f"{label}.{q.name}", given.get(q.name, q.neutral_value), q.unit, q.lower, q.upper, q.description)
-        for q in quantities
+        for q in definitions
     )
     inner = (f"{label}.{name}" for name in cls.internal_coordinate_names(location, system))
     internal = {name: ca.SX.sym(name) for name in inner}
-    return cls(kind, location, quantities, Parameters(entries), internal, cls.arm_joints_at_location(location, system))
+    joints = joints_by_arm(system).get(location, ())
+    return cls(kind, location, definitions, Parameters(entries), internal, joints)
 
 
 # -- where effects can sit --------------------------------------------------------------------------------------------
@@ -304,18 +297,17 @@ def object_joints(system: System) -> tuple[str, ...]:
     return tuple(joint for segment in system.segment_layouts for link in segment.link_joints for joint in link)
 
 
-def _clamp_names(system: System) -> tuple[str, ...]:
+def clamp_names(system: System) -> tuple[str, ...]:
     """Names of floating clamps, each with six joints NAME_x ... NAME_rz."""
     names = set(system.mechanism.joint_names)
     found = [name.removesuffix("_rz") for name in system.mechanism.joint_names if name.endswith("_rz")]
-    return tuple(c for c in found if all(f"{c}_{part}" in names for part in ("x", "y", "z", "rx", "ry")))
+    return tuple(clamp for clamp in found if all(f"{clamp}_{axis}" in names for axis in _CLAMP_AXES))
 
 
 def robot_joints(system: System) -> tuple[str, ...]:
     """Names of the arms' joints: all but those of the object, of clamps and of compliant mounts."""
-    other = set(object_joints(system)) | set(system.joint_compliances)
-    for clamp in _clamp_names(system):
-        other |= {f"{clamp}_{part}" for part in ("x", "y", "z", "rx", "ry", "rz")}
+    clamps = {f"{clamp}_{axis}" for clamp in clamp_names(system) for axis in _CLAMP_AXES}
+    other = {*object_joints(system), *system.joint_compliances, *clamps}
     return tuple(name for name in system.mechanism.joint_names if name not in other)
 
 
@@ -326,8 +318,7 @@ def grasp_names(system: System) -> tuple[str, ...]:
 
 def joints_by_arm(system: System) -> dict[str, tuple[str, ...]]:
     """Joint names of every arm, by the arm's name: its grasp, else the prefix left or right, else `gripper`."""
-    joints = robot_joints(system)
-    tree = system.mechanism
+    joints, tree = robot_joints(system), system.mechanism
     found: dict[str, tuple[str, ...]] = {}
     for grasp in system.grasps:
         chain = {tree.joints[i].name for i in tree.ancestor_joints(tree.frame(grasp.holder_frame).joint_index)}
@@ -365,54 +356,20 @@ def relative_effort_limit(system: System, joint: str) -> float:
     return max(1.0, limit / _BAXTER_EFFORT_LIMIT) if limit < UNLIMITED_EFFORT else 1.0
 
 
-@dataclass(frozen=True)
-class CarriedBody:
-    """Nominal mass, centre of mass and second moment of a joint's child bodies, in the joint's frame.
-
-    Attributes
-    ----------
-    mass : float
-        [kg]
-    center_of_mass : ndarray, shape (3,)
-        Centre of mass [m]; the joint's origin where it carries none.
-    second_moment : ndarray, shape (3, 3)
-        Second moment of mass, the integral of r r' dm about the centre of mass [kg m^2].
-    """
-
-    mass: float
-    center_of_mass: np.ndarray
-    second_moment: np.ndarray
-
-
-def carried_body(system: System, joint: int) -> CarriedBody:
-    """Nominal mass properties of one joint's child bodies, up to the next joints."""
-    bodies = [replace(body, gravity_fraction=None) for body in system.mechanism.joints[joint].bodies]
-    whole = merge_bodies(bodies)
-    if whole is None:
-        return CarriedBody(0.0, np.zeros(3), np.zeros((3, 3)))
-    parameters = system.parameters
-    function = ca.Function("carried", [parameters.symbols], [whole.mass, whole.center_of_mass, whole.inertia_about_com])
-    mass, com, tensor = (np.array(ca.densify(x)) for x in function(parameters.vector()))
-    return CarriedBody(float(mass[0, 0]), com.ravel(), np.trace(tensor) / 2 * np.eye(3) - tensor)
-
-
 def link_end_frames(system: System) -> tuple[str, ...]:
     """Names of frames at the ends of the arms' links: at the next joint or at the tip, each point once.
 
     A point on an axis that no other joint moves is left out.
     """
     tree = system.mechanism
-    if not robot_joints(system):
-        return ()
     own = {tree.joint_index(name) for name in robot_joints(system)}
+    if not own:
+        return ()
     # a link's own frame is where the link before it ends
-    first: dict[int, str] = {}
-    for name, frame in tree.frames.items():
-        if frame.joint_index in own:
-            first.setdefault(frame.joint_index, name)
+    first = {f.joint_index: name for name, f in list(tree.frames.items())[::-1] if f.joint_index in own}
     names = (*_arm_tip_frames(system), *(first[joint] for joint in sorted(first)))
     held = [end for grasp in system.grasps for end in (grasp.holder_frame, grasp.held_frame)]
-    paths = _paths(system, tree, (*names, *held))
+    paths = _paths(system, (*names, *held))
     known = [path for name, path in paths.items() if name in held]
     found = []
     for name in dict.fromkeys(names):
@@ -443,46 +400,15 @@ def link_frames(system: System) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _paths(system: System, tree: Mechanism, names: Sequence[str]) -> dict[str, np.ndarray]:
+def _paths(system: System, names: Sequence[str]) -> dict[str, np.ndarray]:
     """Positions of frames in some random configurations, shape (configurations, 3) each [m]."""
-    if not names:
-        return {}
-    q = ca.SX.sym("q", len(tree.joints))
-    kinematics = forward_kinematics(tree, q)
+    q = ca.SX.sym("q", system.n_coordinates)
+    kinematics = forward_kinematics(system.mechanism, q)
     places = ca.horzcat(*(kinematics.frame_position(name) for name in names))
     function = ca.Function("places", [q, system.parameters.symbols], [places])
     rng, theta = np.random.default_rng(0), system.parameters.vector()
-    at = [np.array(ca.densify(function(rng.uniform(-1.0, 1.0, len(tree.joints)), theta))) for _ in range(3)]
+    at = [np.array(ca.densify(function(rng.uniform(-1.0, 1.0, system.n_coordinates), theta))) for _ in range(3)]
     return {name: np.stack([place[:, i] for place in at]) for i, name in enumerate(names)}
-
-
-def root_joints_by_base(system: System) -> dict[str, tuple[str, ...]]:
-    """First joints of all segments without a parent, by what carries them: a clamp's name, else `base`."""
-    tree, clamps = system.mechanism, _clamp_names(system)
-    found: dict[str, tuple[str, ...]] = {}
-    for segment in system.segment_layouts:
-        if segment.parent_segment is not None:
-            continue
-        first = segment.link_joints[0][0]
-        below = {tree.joints[i].name for i in tree.ancestor_joints(tree.joints[tree.joint_index(first)].parent_index)}
-        place = next((clamp for clamp in clamps if f"{clamp}_rz" in below), "base")
-        found[place] = (*found.get(place, ()), first)
-    return found
-
-
-def branch_joints_by_junction(system: System) -> dict[str, tuple[str, ...]]:
-    """First joints of the branches at every junction: `w_PARENT` at a parent's tip, else `junction_BRANCH`."""
-    tree = system.mechanism
-    found: dict[str, tuple[str, ...]] = {}
-    for segment in system.segment_layouts:
-        if segment.parent_segment is None:
-            continue
-        first = segment.link_joints[0][0]
-        tip = tree.frame(f"w_{segment.parent_segment}").joint_index
-        at_tip = tip in tree.ancestor_joints(tree.joint_index(first))
-        place = f"w_{segment.parent_segment}" if at_tip else f"junction_{segment.name}"
-        found[place] = (*found.get(place, ()), first)
-    return found
 
 
 def segment_of_frame(system: System, frame: str) -> str | None:
@@ -502,20 +428,16 @@ def segment_springs(system: System, segment: str) -> tuple[ElasticJoint, ...]:
     return tuple(spring for spring in system.elastic_joints if spring.segment_name == segment)
 
 
-def with_elastic_joints(system: System, changed: Mapping[str, ElasticJoint]) -> System:
-    """The system with some elastic joints replaced, by joint name."""
-    return replace(system, elastic_joints=tuple(changed.get(s.joint_name, s) for s in system.elastic_joints))
+def joint_parameter(name: str, unit: str, upper: float, expected: float, description: str) -> ParameterDefinition:
+    """A parameter of an arm joint from zero, which is neutral, up to a size that grows with the effort limit."""
+    prior, scale = (0.0, expected), relative_effort_limit
+    return ParameterDefinition(name, unit, 0.0, 0.0, upper, prior, description, range_scale=scale)
 
 
-def mean_bending_stiffness(system: System, segment: str) -> float:
-    """Mean nominal bending stiffness of a segment's joints, at least 1e-6 [N m/rad]."""
-    springs = segment_springs(system, segment)
-    chosen = [s.stiffness for s in springs if s.deformation == "bend"] or [s.stiffness for s in springs]
-    if not chosen:
-        return 1.0
-    parameters = system.parameters
-    function = ca.Function("stiffness", [parameters.symbols], [ca.vertcat(*chosen)])
-    return max(float(np.mean(np.array(function(parameters.vector())))), 1e-6)
+def compliance(unit: str, upper: float, prior: tuple[float, float], place: str, reported: str) -> ParameterDefinition:
+    """The compliance of a place, neutral at zero, that is reported as a stiffness in another unit."""
+    text, said = f"compliance of the {place}", f"stiffness {reported}"
+    return ParameterDefinition("compliance", unit, 0.0, 0.0, upper, prior, text, reported_reciprocal=said)
 
 
 def force_on_joint(system: System, joint: str, value: ca.SX) -> ca.SX:
@@ -525,25 +447,10 @@ def force_on_joint(system: System, joint: str, value: ca.SX) -> ca.SX:
     return force
 
 
-def with_bodies(system: System, changed: Mapping[str, Sequence[Inertia]]) -> System:
-    """The system with the bodies of some joints replaced, by joint name."""
+def with_bodies(
+    system: System, joints: Collection[str], change: Callable[[tuple[Inertia, ...]], Iterable[Inertia]]
+) -> System:
+    """The system with the bodies of some joints changed."""
     tree = system.mechanism
-    joints = tuple(replace(j, bodies=tuple(changed[j.name])) if j.name in changed else j for j in tree.joints)
-    return replace(system, mechanism=replace(tree, joints=joints))
-
-
-def with_grasp(system: System, changed: Grasp) -> System:
-    """The system with one grasp replaced, by its name."""
-    return replace(system, grasps=tuple(changed if g.name == changed.name else g for g in system.grasps))
-
-
-def substitute_symbols(system: System, old: Collection[ca.SX], new: Collection[ca.SX]) -> System:
-    """The system with symbols substituted in all its expressions."""
-    before, after = ca.vertcat(*old), ca.vertcat(*new)
-    return system.map_expressions(lambda expression: ca.substitute(expression, before, after))
-
-
-def inverse_placement(placement: Placement) -> Placement:
-    """The inverse of a rigid transform."""
-    back = placement.rotation.T
-    return Placement(back, -(back @ placement.translation))
+    changed = tuple(replace(j, bodies=tuple(change(j.bodies))) if j.name in joints else j for j in tree.joints)
+    return replace(system, mechanism=replace(tree, joints=changed))

@@ -1,110 +1,80 @@
-"""Friction in the joints of arms."""
+"""Friction and springs in the joints of arms."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Mapping
 
 import casadi as ca
 
 from yid_ocp.effects.base import (
     EFFECTS,
-    SIGN_SMOOTHING_SPEED,
     EffectBase,
     ParameterDefinition,
     force_on_joint,
-    relative_effort_limit,
+    joint_parameter,
     robot_joints,
 )
 from yid_ocp.model.system import MidpointState, StepTerms, System
 
+_SIGN_SMOOTHING_SPEED = 0.02
+"""Smoothing speed v_s in sgn(v) = tanh(v/v_s) [rad/s]."""
 _ABS_SMOOTHING_ANGLE = 1e-7
 """Angle turned in a step below which |d| in Dahl's law is smoothed [rad]."""
 _SERIES_MAX_ANGLE_RATIO = 1e-2
 """Ratio of step angle to yield angle below which a power series replaces the exponential, which loses digits there."""
 
 
+class _JointFriction(EffectBase):
+    """Friction of an arm joint as a function of its speed."""
+
+    required_excitation = "how fast it moves"
+    possible_locations = robot_joints
+
+    def _friction(self, v: ca.SX) -> ca.SX:
+        """The torque that works against the speed v."""
+        raise NotImplementedError
+
+    def step_terms(self, state: MidpointState) -> StepTerms:
+        """The friction of the joint."""
+        v = state.v[state.system.mechanism.joint_index(self.location)]
+        return StepTerms(dissipative_force=force_on_joint(state.system, self.location, -self._friction(v)))
+
+
 @EFFECTS.register("joint_viscous")
-class JointViscous(EffectBase):
+class JointViscous(_JointFriction):
     """Viscous friction F = -b v in addition to the model's damping."""
 
     equation = "F = -b v"
-    required_excitation = "how fast it moves"
+    declared_parameters = (joint_parameter("b", "N m s/rad", 10.0, 2.0, "viscous friction"),)
 
-    @classmethod
-    def possible_locations(cls, system: System) -> tuple[str, ...]:
-        """Names of the arms' joints."""
-        return robot_joints(system)
-
-    @classmethod
-    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definition of b [N m s/rad]."""
-        size = relative_effort_limit(system, location)
-        return (ParameterDefinition("b", "N m s/rad", 0.0, 0.0, 10.0 * size, (0.0, 2.0 * size), "viscous friction"),)
-
-    def step_terms(self, state: MidpointState) -> StepTerms:
-        """The viscous friction of the joint."""
-        return _friction(self, state, lambda v: self["b"] * v)
+    def _friction(self, v: ca.SX) -> ca.SX:
+        return self["b"] * v
 
 
 @EFFECTS.register("joint_coulomb")
-class JointCoulomb(EffectBase):
-    """Coulomb friction F = -tau_c tanh(v/v_s), v_s = `SIGN_SMOOTHING_SPEED`."""
+class JointCoulomb(_JointFriction):
+    """Coulomb friction F = -tau_c tanh(v/v_s), v_s = `_SIGN_SMOOTHING_SPEED`."""
 
     equation = "F = -tau_c tanh(v/v_s)"
-    required_excitation = "how fast it moves"
+    declared_parameters = (joint_parameter("tau_c", "N m", 10.0, 2.0, "sliding friction"),)
 
-    @classmethod
-    def possible_locations(cls, system: System) -> tuple[str, ...]:
-        """Names of the arms' joints."""
-        return robot_joints(system)
-
-    @classmethod
-    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definition of tau_c [N m], expected up to a fifth of the joint's effort limit."""
-        size = relative_effort_limit(system, location)
-        return (ParameterDefinition("tau_c", "N m", 0.0, 0.0, 10.0 * size, (0.0, 2.0 * size), "sliding friction"),)
-
-    def step_terms(self, state: MidpointState) -> StepTerms:
-        """The Coulomb friction of the joint."""
-        return _friction(self, state, lambda v: self["tau_c"] * ca.tanh(v / SIGN_SMOOTHING_SPEED))
+    def _friction(self, v: ca.SX) -> ca.SX:
+        return self["tau_c"] * ca.tanh(v / _SIGN_SMOOTHING_SPEED)
 
 
 @EFFECTS.register("joint_stribeck")
-class JointStribeck(EffectBase):
+class JointStribeck(_JointFriction):
     """Stribeck friction F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s) beside Coulomb friction, v_s as there."""
 
     equation = "F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s)"
-    required_excitation = "how fast it moves"
+    declared_parameters = (
+        joint_parameter("tau_s", "N m", 10.0, 2.0, "friction at low speed beside sliding friction"),
+        ParameterDefinition("v_stribeck", "rad/s", 0.1, 5e-3, 2.0, (0.01, 0.3), "speed beyond which it is gone", True),
+    )
 
-    @classmethod
-    def possible_locations(cls, system: System) -> tuple[str, ...]:
-        """Names of the arms' joints."""
-        return robot_joints(system)
-
-    @classmethod
-    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definitions of tau_s [N m] and v_stribeck [rad/s]."""
-        size, text = relative_effort_limit(system, location), "friction at low speed beside sliding friction"
-        return (
-            ParameterDefinition("tau_s", "N m", 0.0, 0.0, 10.0 * size, (0.0, 2.0 * size), text),
-            ParameterDefinition(
-                "v_stribeck",
-                "rad/s",
-                0.1,
-                5e-3,
-                2.0,
-                (0.01, 0.3),
-                "speed beyond which it is gone",
-                is_shape_parameter=True,
-            ),
-        )
-
-    def step_terms(self, state: MidpointState) -> StepTerms:
-        """The Stribeck friction of the joint."""
-        width = self["v_stribeck"]
-        return _friction(
-            self, state, lambda v: self["tau_s"] * ca.exp(-((v / width) ** 2)) * ca.tanh(v / SIGN_SMOOTHING_SPEED)
-        )
+    def _friction(self, v: ca.SX) -> ca.SX:
+        return self["tau_s"] * ca.exp(-((v / self["v_stribeck"]) ** 2)) * ca.tanh(v / _SIGN_SMOOTHING_SPEED)
 
 
 @EFFECTS.register("joint_presliding")
@@ -129,31 +99,11 @@ class JointPresliding(EffectBase):
 
     equation = "F = -tau_c s, ds/dt = (v - |v| s) / yield_angle"
     required_excitation = "how fast it moves"
-
-    @classmethod
-    def possible_locations(cls, system: System) -> tuple[str, ...]:
-        """Names of the arms' joints."""
-        return robot_joints(system)
-
-    @classmethod
-    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definitions of tau_c [N m], expected up to a fifth of the effort limit, and yield_angle [rad]."""
-        size = relative_effort_limit(system, location)
-        return (
-            ParameterDefinition(
-                "tau_c", "N m", 0.0, 0.0, 10.0 * size, (0.0, 2.0 * size), "friction that holds and slides"
-            ),
-            ParameterDefinition(
-                "yield_angle",
-                "rad",
-                5e-3,
-                1e-5,
-                0.5,
-                (1e-4, 0.05),
-                "angle over which it yields",
-                is_shape_parameter=True,
-            ),
-        )
+    possible_locations = robot_joints
+    declared_parameters = (
+        joint_parameter("tau_c", "N m", 10.0, 2.0, "friction that holds and slides"),
+        ParameterDefinition("yield_angle", "rad", 5e-3, 1e-5, 0.5, (1e-4, 0.05), "angle over which it yields", True),
+    )
 
     @classmethod
     def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
@@ -172,10 +122,8 @@ class JointPresliding(EffectBase):
         s, rate, width = state.z[row], state.z_rate[row], self["yield_angle"]
         turned = state.h * state.v[index]
         before = s - state.h / 2 * rate
-        x, rounded = (
-            ca.fabs(turned) / width,
-            (ca.sqrt(turned**2 + _ABS_SMOOTHING_ANGLE**2) - _ABS_SMOOTHING_ANGLE) / width,
-        )
+        x = ca.fabs(turned) / width
+        rounded = (ca.sqrt(turned**2 + _ABS_SMOOTHING_ANGLE**2) - _ABS_SMOOTHING_ANGLE) / width
         # e^-x by what is left over x^2, so that nothing is lost next to zero, where an arm that rests stays
         change = turned / width * (1 - x * _left(x)) - before * rounded * (1 - rounded * _left(rounded))
         mean = turned / width * _left(x) + before * (1 - rounded * _left(rounded))
@@ -192,6 +140,19 @@ def _left(x: ca.SX) -> ca.SX:
     return ca.if_else(x < _SERIES_MAX_ANGLE_RATIO, series, (ca.exp(-far) - 1 + far) / far**2)
 
 
-def _friction(effect: EffectBase, state: MidpointState, law: Callable[[ca.SX], ca.SX]) -> StepTerms:
-    v = state.v[state.system.mechanism.joint_index(effect.location)]
-    return StepTerms(dissipative_force=force_on_joint(state.system, effect.location, -law(v)))
+@EFFECTS.register("joint_spring")
+class JointSpring(EffectBase):
+    """A spring across an arm joint: V += 1/2 stiffness (q - rest_angle)^2."""
+
+    equation = "V += 1/2 stiffness (q - rest_angle)^2"
+    required_excitation = "how far it bends"
+    possible_locations = robot_joints
+    declared_parameters = (
+        joint_parameter("stiffness", "N m/rad", 300.0, 60.0, "stiffness of the spring"),
+        ParameterDefinition("rest_angle", "rad", 0.0, -math.pi, math.pi, (-2.0, 2.0), "where it is relaxed", True),
+    )
+
+    def step_terms(self, state: MidpointState) -> StepTerms:
+        """The energy of the spring."""
+        stretch = state.q[state.system.mechanism.joint_index(self.location)] - self["rest_angle"]
+        return StepTerms(lagrangian=-self["stiffness"] / 2 * stretch**2)

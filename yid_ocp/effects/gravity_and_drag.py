@@ -8,10 +8,11 @@ import casadi as ca
 
 from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, object_joints, segment_names, with_bodies
 from yid_ocp.model.kinematics import Kinematics, cross_product, motion_cross_force_product, motion_cross_motion_product
+from yid_ocp.model.mechanism import Inertia
 from yid_ocp.model.rotations import symbolic_rotation_from_rpy
 from yid_ocp.model.system import ForceWithDerivatives, MidpointState, StepTerms, System
 
-AIR_DENSITY = 1.2
+_AIR_DENSITY = 1.2
 """Density of air [kg/m^3]."""
 _ABS_SMOOTHING_SPEED = 1e-3
 """Speed below which |v_n| in the drag is smoothed [m/s]."""
@@ -27,16 +28,8 @@ class AerodynamicDrag(EffectBase):
 
     equation = "F = -J_c' 1/2 rho_air cd 2 r l |v_n| v_n"
     required_excitation = "how fast it moves"
-
-    @classmethod
-    def possible_locations(cls, system: System) -> tuple[str, ...]:
-        """Names of the object's segments."""
-        return segment_names(system)
-
-    @classmethod
-    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definition of the drag coefficient cd [1]."""
-        return (ParameterDefinition("cd", "1", 0.0, 0.0, 20.0, (0.0, 3.0), "drag coefficient"),)
+    possible_locations = segment_names
+    declared_parameters = (ParameterDefinition("cd", "1", 0.0, 0.0, 20.0, (0.0, 3.0), "drag coefficient"),)
 
     def step_terms(self, state: MidpointState) -> StepTerms:
         """The drag force on the links with its derivatives in closed form."""
@@ -51,7 +44,7 @@ class AerodynamicDrag(EffectBase):
             v = velocity[j][3:] + cross_product(velocity[j][:3], centre)
             normal = v - along * ca.dot(along, v)
             speed = ca.sqrt(ca.dot(normal, normal) + _ABS_SMOOTHING_SPEED**2)
-            factor = self["cd"] * AIR_DENSITY * segment.radius * length
+            factor = self["cd"] * _AIR_DENSITY * segment.radius * length
             push = -factor * speed * normal
             slope = -factor * (speed * (ca.SX.eye(3) - along @ along.T) + normal @ normal.T / speed)
             wrenches[j] = ca.vertcat(cross_product(centre, push), push)
@@ -60,35 +53,34 @@ class AerodynamicDrag(EffectBase):
         return StepTerms(force_with_derivatives=_on_bodies(kinematics, velocity, wrenches, slopes))
 
 
+def _object(system: System) -> tuple[str, ...]:
+    """`object`, where there is one."""
+    return ("object",) if system.segment_layouts else ()
+
+
+def _world(system: System) -> tuple[str, ...]:
+    return ("world",)
+
+
 @EFFECTS.register("gravity_scale")
 class GravityScale(EffectBase):
     """A fraction of the object's full weight added to its weight in the model; inertia is unchanged."""
 
     equation = "V += -fraction x sum of m g.x over the object"
     required_excitation = "how it stands against gravity"
-
-    @classmethod
-    def possible_locations(cls, system: System) -> tuple[str, ...]:
-        """`object`, where there is one."""
-        return ("object",) if system.segment_layouts else ()
-
-    @classmethod
-    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definition of fraction, added weight over full weight [1]."""
-        return (ParameterDefinition("fraction", "1", 0.0, -2.0, 2.0, (-1.0, 1.0), "weight added over full weight"),)
+    possible_locations = _object
+    declared_parameters = (
+        ParameterDefinition("fraction", "1", 0.0, -2.0, 2.0, (-1.0, 1.0), "weight added over full weight"),
+    )
 
     def apply_to_system(self, system: System) -> System:
         """The system with a scaled weight of the object's bodies."""
-        tree, bodies = system.mechanism, {}
-        for joint in object_joints(system):
-            bodies[joint] = [
-                replace(
-                    body,
-                    gravity_fraction=(1 if body.gravity_fraction is None else body.gravity_fraction) + self["fraction"],
-                )
-                for body in tree.joints[tree.joint_index(joint)].bodies
-            ]
-        return with_bodies(system, bodies)
+
+        def scaled(body: Inertia) -> Inertia:
+            nominal = 1 if body.gravity_fraction is None else body.gravity_fraction
+            return replace(body, gravity_fraction=nominal + self["fraction"])
+
+        return with_bodies(system, object_joints(system), lambda bodies: map(scaled, bodies))
 
 
 @EFFECTS.register("gravity_tilt")
@@ -97,18 +89,10 @@ class GravityTilt(EffectBase):
 
     equation = "g = Ry(ry) Rx(rx) g_0"
     required_excitation = "how it stands against gravity"
-
-    @classmethod
-    def possible_locations(cls, system: System) -> tuple[str, ...]:
-        """`world`."""
-        return ("world",)
-
-    @classmethod
-    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definitions of the angles rx and ry [rad]."""
-        return tuple(
-            ParameterDefinition(f"r{axis}", "rad", 0.0, -0.5, 0.5, (-0.05, 0.05), f"turn about {axis}") for axis in "xy"
-        )
+    possible_locations = _world
+    declared_parameters = tuple(
+        ParameterDefinition(f"r{axis}", "rad", 0.0, -0.5, 0.5, (-0.05, 0.05), f"turn about {axis}") for axis in "xy"
+    )
 
     def apply_to_system(self, system: System) -> System:
         """The system with the rotated gravity vector."""
@@ -138,27 +122,20 @@ def _on_bodies(
     because turning joint i turns a body and its wrench together, up to the velocity D_i that the turn adds; hence the A
     and T of `ForceWithDerivatives`.
 
-    Parameters
-    ----------
-    kinematics : Kinematics
-    velocity : list of casadi.SX, shape (6, 1) each
-    wrenches : dict of joint index to casadi.SX, shape (6, 1)
-        About the world origin; must turn with the body and its velocity.
-    slopes : dict of joint index to casadi.SX, shape (6, 6)
-        Symmetric.
+    By joint index, `wrenches`, shape (6, 1), are about the world origin and must turn with the body and its velocity;
+    `slopes`, shape (6, 6), are symmetric.
     """
     tree = kinematics.mechanism
     n, screws = len(tree.joints), kinematics.joint_screws
     zero = ca.SX(ca.DM.zeros(6))
     force, along, turned = ca.SX(n, 1), [zero] * n, [zero] * n
-    wrenches, slopes = dict(wrenches), dict(slopes)
     for j in reversed(range(n)):
         if j not in wrenches:
             continue
         parent = tree.joints[j].parent_index
         if parent >= 0:
-            wrenches[parent] = wrenches[parent] + wrenches[j] if parent in wrenches else wrenches[j]
-            slopes[parent] = slopes[parent] + slopes[j] if parent in slopes else slopes[j]
+            for sums in (wrenches, slopes):
+                sums[parent] = sums[parent] + sums[j] if parent in sums else sums[j]
         force[j] = ca.dot(screws[j], wrenches[j])
         along[j] = slopes[j] @ screws[j]
         added = motion_cross_motion_product(velocity[parent], screws[j]) if parent >= 0 else zero

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import ClassVar
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
 
 from yid_ocp.effects.base import (
     EFFECTS,
-    CarriedBody,
     EffectBase,
     ParameterDefinition,
     ReportedParameter,
-    carried_body,
+    joint_parameter,
     link_end_frames,
     link_frames,
     object_joints,
@@ -23,10 +22,9 @@ from yid_ocp.effects.base import (
     robot_joints,
     segment_names,
     segment_of_frame,
-    substitute_symbols,
     with_bodies,
 )
-from yid_ocp.model.mechanism import Inertia
+from yid_ocp.model.mechanism import Inertia, merge_bodies
 from yid_ocp.model.system import MidpointState, StepTerms, System
 
 _MAX_PAYLOAD_DISTANCE = 0.5
@@ -45,54 +43,82 @@ _MIN_LINK_EXTENT = 1e-3
 """Smallest root mean square extent of a link [m]."""
 
 
+@dataclass(frozen=True)
+class _CarriedBody:
+    """Nominal mass [kg], centre of mass [m] and integral of r r' dm about it [kg m^2] of a joint's child bodies."""
+
+    mass: float
+    center_of_mass: np.ndarray
+    second_moment: np.ndarray
+
+
+def _carried_body(system: System, joint: int) -> _CarriedBody:
+    """Nominal mass properties of one joint's child bodies, in its frame; at its origin where it carries none."""
+    whole = merge_bodies([replace(body, gravity_fraction=None) for body in system.mechanism.joints[joint].bodies])
+    if whole is None:
+        return _CarriedBody(0.0, np.zeros(3), np.zeros((3, 3)))
+    parameters = system.parameters
+    function = ca.Function("carried", [parameters.symbols], [whole.mass, whole.center_of_mass, whole.inertia_about_com])
+    mass, com, tensor = (np.array(ca.densify(x)) for x in function(parameters.vector()))
+    return _CarriedBody(float(mass[0, 0]), com.ravel(), np.trace(tensor) / 2 * np.eye(3) - tensor)
+
+
+class _ScaledBodies(EffectBase):
+    """Masses and inertias of some bodies multiplied by a factor."""
+
+    required_excitation = "how hard it accelerates"
+
+    def _joints(self, system: System) -> tuple[str, ...]:
+        """Names of the joints that carry the bodies."""
+        raise NotImplementedError
+
+    def apply_to_system(self, system: System) -> System:
+        """The system with the scaled bodies."""
+        return with_bodies(system, self._joints(system), lambda bodies: (b.scaled_by(self["scale"]) for b in bodies))
+
+
 @EFFECTS.register("density")
-class Density(EffectBase):
+class Density(_ScaledBodies):
     """All masses and inertias of a segment multiplied by a factor."""
 
     equation = "masses and inertias times scale"
-    required_excitation = "how hard it accelerates"
+    possible_locations = segment_names
+    declared_parameters = (
+        ParameterDefinition("scale", "1", 1.0, 0.2, 3.0, (0.7, 1.3), "factor on masses and inertias"),
+    )
 
-    @classmethod
-    def possible_locations(cls, system: System) -> tuple[str, ...]:
-        """Names of the object's segments."""
-        return segment_names(system)
+    def _joints(self, system: System) -> tuple[str, ...]:
+        return tuple(joint for link in system.segment_layout(self.location).link_joints for joint in link)
 
-    @classmethod
-    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definition of scale, the factor on masses and inertias [1]."""
-        return (ParameterDefinition("scale", "1", 1.0, 0.2, 3.0, (0.7, 1.3), "factor on masses and inertias"),)
 
-    def apply_to_system(self, system: System) -> System:
-        """The system with the segment's scaled bodies."""
-        return _scaled(
-            system,
-            [joint for link in system.segment_layout(self.location).link_joints for joint in link],
-            self["scale"],
-        )
+def _joints_with_mass(system: System) -> tuple[str, ...]:
+    """Names of arm joints whose child link has mass."""
+    tree = system.mechanism
+    return tuple(name for name in robot_joints(system) if tree.joints[tree.joint_index(name)].bodies)
 
 
 @EFFECTS.register("link_mass")
-class LinkMass(EffectBase):
+class LinkMass(_ScaledBodies):
     """Mass and inertia of an arm joint's child link multiplied by a factor."""
 
     equation = "mass and inertia of the child link times scale"
-    required_excitation = "how hard it accelerates"
-    is_local: ClassVar[bool] = True
+    is_local = True
+    possible_locations = _joints_with_mass
+    declared_parameters = (ParameterDefinition("scale", "1", 1.0, 0.2, 3.0, (0.8, 1.2), "factor on mass and inertia"),)
 
-    @classmethod
-    def possible_locations(cls, system: System) -> tuple[str, ...]:
-        """Names of arm joints whose child link has mass."""
-        tree = system.mechanism
-        return tuple(name for name in robot_joints(system) if tree.joints[tree.joint_index(name)].bodies)
+    def _joints(self, system: System) -> tuple[str, ...]:
+        return (self.location,)
 
-    @classmethod
-    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definition of scale, the factor on mass and inertia [1]."""
-        return (ParameterDefinition("scale", "1", 1.0, 0.2, 3.0, (0.8, 1.2), "factor on mass and inertia"),)
 
-    def apply_to_system(self, system: System) -> System:
-        """The system with the scaled link."""
-        return _scaled(system, [self.location], self["scale"])
+def _moving_frames(system: System) -> tuple[str, ...]:
+    """Names of all frames that a joint moves."""
+    return tuple(name for name, frame in system.mechanism.frames.items() if frame.joint_index >= 0)
+
+
+def _tips_and_link_ends(system: System) -> tuple[str, ...]:
+    """Names of segment tips, junctions and ends of arm links."""
+    ends = (f"{prefix}_{s.name}" for s in system.segment_layouts for prefix in ("w", "junction"))
+    return (*(name for name in ends if name in system.mechanism.frames), *link_end_frames(system))
 
 
 @EFFECTS.register("point_mass")
@@ -101,19 +127,9 @@ class PointMass(EffectBase):
 
     equation = "T += 1/2 mass |v|^2, V -= mass g.x"
     required_excitation = "how hard it accelerates"
-    is_local: ClassVar[bool] = True
-
-    @classmethod
-    def possible_locations(cls, system: System) -> tuple[str, ...]:
-        """Names of all moving frames."""
-        return tuple(name for name, frame in system.mechanism.frames.items() if frame.joint_index >= 0)
-
-    @classmethod
-    def candidate_locations(cls, system: System) -> tuple[str, ...]:
-        """Names of segment tips, junctions and ends of arm links."""
-        tree = system.mechanism
-        ends = (f"{prefix}_{s.name}" for s in system.segment_layouts for prefix in ("w", "junction"))
-        return (*(name for name in ends if name in tree.frames), *link_end_frames(system))
+    is_local = True
+    possible_locations = _moving_frames
+    candidate_locations = _tips_and_link_ends
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
@@ -124,9 +140,9 @@ class PointMass(EffectBase):
     def apply_to_system(self, system: System) -> System:
         """The system with the added point mass."""
         frame = system.mechanism.frame(self.location)
-        joint = system.mechanism.joints[frame.joint_index]
         point = Inertia(self["mass"], frame.placement.translation, ca.SX(ca.DM.zeros(3, 3)))
-        return with_bodies(system, {joint.name: (*joint.bodies, point)})
+        joint = system.mechanism.joints[frame.joint_index].name
+        return with_bodies(system, [joint], lambda bodies: (*bodies, point))
 
 
 @EFFECTS.register("payload")
@@ -150,39 +166,23 @@ class Payload(EffectBase):
 
     equation = "a mass at (mx, my, mz)/mass, moving with the frame"
     required_excitation = "how it stands against gravity"
-    is_local: ClassVar[bool] = True
-
-    @classmethod
-    def possible_locations(cls, system: System) -> tuple[str, ...]:
-        """Names of all moving frames."""
-        return tuple(name for name, frame in system.mechanism.frames.items() if frame.joint_index >= 0)
-
-    @classmethod
-    def candidate_locations(cls, system: System) -> tuple[str, ...]:
-        """One frame per arm link: payloads at two frames of one link are equivalent."""
-        return link_frames(system)
+    is_local = True
+    possible_locations = _moving_frames
+    # payloads at two frames of one link are equivalent
+    candidate_locations = link_frames
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
         """Mass [kg], above -`_MAX_REMOVED_MASS_FRACTION` of the link's, first moments mx, my, mz [kg m]."""
         upper, expected = _bearable(system, location)
-        lower = -_MAX_REMOVED_MASS_FRACTION * carried_body(system, system.mechanism.frame(location).joint_index).mass
+        lower = -_MAX_REMOVED_MASS_FRACTION * _carried_body(system, system.mechanism.frame(location).joint_index).mass
+        far, near = (_MAX_PAYLOAD_DISTANCE * mass for mass in (upper, expected))
         moments = (
-            ParameterDefinition(
-                f"m{axis}",
-                "kg m",
-                0.0,
-                -_MAX_PAYLOAD_DISTANCE * upper,
-                _MAX_PAYLOAD_DISTANCE * upper,
-                (-_MAX_PAYLOAD_DISTANCE * expected, _MAX_PAYLOAD_DISTANCE * expected),
-                f"mass times its place along {axis}",
-            )
+            ParameterDefinition(f"m{axis}", "kg m", 0.0, -far, far, (-near, near), f"mass times its place along {axis}")
             for axis in "xyz"
         )
-        return (
-            ParameterDefinition("mass", "kg", 0.0, lower, upper, (lower, expected), "mass added to the link"),
-            *moments,
-        )
+        mass = ParameterDefinition("mass", "kg", 0.0, lower, upper, (lower, expected), "mass added to the link")
+        return (mass, *moments)
 
     def alternative_start(self, start: Mapping[str, float]) -> Mapping[str, float] | None:
         """A start with the opposite sign of mass, at the distance `_MAX_PAYLOAD_DISTANCE`; None where the mass is zero.
@@ -190,10 +190,8 @@ class Payload(EffectBase):
         Near zero mass no second moment distinguishes the two signs.
         """
         mass, *moments = (start.get(f"{self.label}.{quantity.name}", 0.0) for quantity in self.definitions)
-        own = self.definitions[0]
-        other = float(
-            np.clip(-math.copysign(np.linalg.norm(moments) / _MAX_PAYLOAD_DISTANCE, mass), own.lower, own.upper)
-        )
+        opposite = -math.copysign(np.linalg.norm(moments) / _MAX_PAYLOAD_DISTANCE, mass)
+        other = float(np.clip(opposite, self.definitions[0].lower, self.definitions[0].upper))
         return {f"{self.label}.mass": other} if other * mass < 0 else None
 
     def reported_parameters(
@@ -205,16 +203,14 @@ class Payload(EffectBase):
         own = -self.definitions[0].lower / _MAX_REMOVED_MASS_FRACTION
         kept = float(_kept(ca.SX(mass), ca.SX(ca.DM(moments)), own))
         for name in ("mx", "my", "mz"):
-            said = found[name]
-            found[name] = ReportedParameter(
-                kept * said.value, said.std if kept > _UNLIMITED_MOMENT_FRACTION else math.nan, said.unit
-            )
+            std = found[name].std if kept > _UNLIMITED_MOMENT_FRACTION else math.nan
+            found[name] = replace(found[name], value=kept * found[name].value, std=std)
         return found
 
     def apply_to_system(self, system: System) -> System:
         """The system with the payload's mass, first and second moments added to its link."""
         frame = system.mechanism.frame(self.location)
-        joint, link = system.mechanism.joints[frame.joint_index], carried_body(system, frame.joint_index)
+        joint, link = system.mechanism.joints[frame.joint_index], _carried_body(system, frame.joint_index)
         mass, centre = self["mass"], ca.SX(ca.DM(link.center_of_mass))
         moment = ca.vertcat(*(self[f"m{axis}"] for axis in "xyz"))
         first = frame.placement.rotation @ (moment * _kept(mass, moment, link.mass)) + mass * (
@@ -227,7 +223,7 @@ class Payload(EffectBase):
             Inertia(ca.SX(1), centre + first, ca.densify(tensor)),
             Inertia(mass - 1, centre, ca.SX(ca.DM.zeros(3, 3))),
         )
-        return with_bodies(system, {joint.name: (*joint.bodies, *pair)})
+        return with_bodies(system, [joint.name], lambda bodies: (*bodies, *pair))
 
 
 def _kept(mass: ca.SX, moment: ca.SX, own: float) -> ca.SX:
@@ -236,7 +232,7 @@ def _kept(mass: ca.SX, moment: ca.SX, own: float) -> ca.SX:
     return (1 + (ca.dot(moment, moment) / most) ** 4) ** (-1 / 8)
 
 
-def _spread(mass: ca.SX, first: ca.SX, link: CarriedBody) -> ca.SX:
+def _spread(mass: ca.SX, first: ca.SX, link: _CarriedBody) -> ca.SX:
     """The factor of e e' in K, 1/mass for a point; see `Payload`."""
     far = ca.dot(first, first) / _POINT_INERTIA_DISTANCE**2
     inverse = mass**3 / (mass**4 + far**2 + _POINT_INERTIA_MIN_MASS**4)
@@ -255,11 +251,22 @@ def _bearable(system: System, frame: str) -> tuple[float, float]:
     tree = system.mechanism
     joint = tree.frame(frame).joint_index
     if segment_of_frame(system, frame) is not None:
-        whole = sum(carried_body(system, tree.joint_index(name)).mass for name in object_joints(system))
+        whole = sum(_carried_body(system, tree.joint_index(name)).mass for name in object_joints(system))
         return max(0.5, whole), max(0.05, whole)
     moving = set(robot_joints(system)) & {tree.joints[i].name for i in tree.ancestor_joints(joint)}
     size = max((relative_effort_limit(system, name) for name in moving), default=1.0)
     return 10.0 * size, 3.0 * size
+
+
+def _length_names(system: System, segment: str) -> list[str]:
+    """Names of the parameters that are lengths of a segment's links."""
+    own = f"{segment}.length"
+    return [name for name in system.parameters.names if name == own or name.startswith(f"{own}_")]
+
+
+def _segments_with_length(system: System) -> tuple[str, ...]:
+    """Names of segments whose length is a parameter."""
+    return tuple(name for name in segment_names(system) if _length_names(system, name))
 
 
 @EFFECTS.register("length_scale")
@@ -268,21 +275,13 @@ class LengthScale(EffectBase):
 
     equation = "link lengths times scale"
     required_excitation = "how long it is"
-
-    @classmethod
-    def possible_locations(cls, system: System) -> tuple[str, ...]:
-        """Names of segments whose length is a parameter."""
-        return tuple(name for name in segment_names(system) if _lengths(system, name))
-
-    @classmethod
-    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definition of scale, the factor on link lengths [1]."""
-        return (ParameterDefinition("scale", "1", 1.0, 0.8, 1.2, (0.97, 1.03), "factor on link lengths"),)
+    possible_locations = _segments_with_length
+    declared_parameters = (ParameterDefinition("scale", "1", 1.0, 0.8, 1.2, (0.97, 1.03), "factor on link lengths"),)
 
     def apply_to_system(self, system: System) -> System:
         """The system with scaled link lengths."""
-        old = [system.parameters[name].symbol for name in _lengths(system, self.location)]
-        return substitute_symbols(system, old, [symbol * self["scale"] for symbol in old])
+        lengths = ca.vertcat(*(system.parameters[name].symbol for name in _length_names(system, self.location)))
+        return system.map_expressions(lambda expression: ca.substitute(expression, lengths, lengths * self["scale"]))
 
 
 @EFFECTS.register("rotor_inertia")
@@ -291,31 +290,10 @@ class RotorInertia(EffectBase):
 
     equation = "T += 1/2 armature v^2"
     required_excitation = "how hard it accelerates"
-
-    @classmethod
-    def possible_locations(cls, system: System) -> tuple[str, ...]:
-        """Names of the arms' joints."""
-        return robot_joints(system)
-
-    @classmethod
-    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definition of armature [kg m^2]."""
-        size, text = relative_effort_limit(system, location), "inertia of the rotor at the joint"
-        return (ParameterDefinition("armature", "kg m^2", 0.0, 0.0, 5.0 * size, (0.0, size), text),)
+    possible_locations = robot_joints
+    declared_parameters = (joint_parameter("armature", "kg m^2", 5.0, 1.0, "inertia of the rotor at the joint"),)
 
     def step_terms(self, state: MidpointState) -> StepTerms:
         """The kinetic energy of the rotor."""
         v = state.v[state.system.mechanism.joint_index(self.location)]
         return StepTerms(lagrangian=self["armature"] / 2 * v**2)
-
-
-def _scaled(system: System, joints: list[str], factor: ca.SX) -> System:
-    tree = system.mechanism
-    bodies = {name: tree.joints[tree.joint_index(name)].bodies for name in joints}
-    return with_bodies(system, {name: [body.scaled_by(factor) for body in entry] for name, entry in bodies.items()})
-
-
-def _lengths(system: System, segment: str) -> list[str]:
-    return [
-        name for name in system.parameters.names if name == f"{segment}.length" or name.startswith(f"{segment}.length_")
-    ]

@@ -24,15 +24,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Transition:
-    """Transition x' = (M x, f p) of the state x = (s, p); only what s becomes needs a matrix.
-
-    Attributes
-    ----------
-    state_rows : ndarray, shape (ns, nx)
-        M
-    decay : ndarray, shape (nx - ns,)
-        f, a factor for each parameter.
-    """
+    """Transition x' = (M x, f p) of the state x = (s, p), M (ns, nx) as `state_rows` and f (nx - ns,) as `decay`."""
 
     state_rows: Array
     decay: Array
@@ -53,14 +45,8 @@ class Transition:
 class KalmanStep:
     """Frozen measurement update and transition of one step.
 
-    Attributes
-    ----------
-    observation : ndarray, shape (r, nx)
-        H
-    whitening : ndarray, shape (r, r)
-        S^(-1/2)
-    projected_covariance : ndarray, shape (r, nx)
-        S^(-1/2) H P
+    They are H (r, nx) as `observation`, S^(-1/2) (r, r) as `whitening` and S^(-1/2) H P (r, nx) as
+    `projected_covariance`.
     """
 
     observation: Array
@@ -99,14 +85,8 @@ class KalmanStep:
 def kalman_step(covariance: Array, observation: Array, transition: Transition) -> tuple[KalmanStep, Array, float]:
     """Freeze one step of the filter, with the covariance after it (without process noise) and log det S.
 
-    The determinant is infinite, and S counts by its diagonal alone, where covariances differ by so many decades that
-    rounding shows.
-
-    Parameters
-    ----------
-    covariance : ndarray, shape (nx, nx)
-        P, before the measurement.
-    observation : ndarray, shape (r, nx)
+    `covariance` is P (nx, nx) before the measurement by H (r, nx). The determinant is infinite, and S counts by its
+    diagonal alone, where covariances differ by so many decades that rounding shows.
     """
     cross = observation @ covariance
     whitening, log_determinant = np.zeros((0, 0)), 0.0

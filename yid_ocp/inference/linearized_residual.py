@@ -26,16 +26,9 @@ Array = NDArray[np.float64]
 class NominalTrajectory:
     """Nominal trajectory of an episode and its measurements, about which residuals are linearized.
 
-    Attributes
-    ----------
-    theta : ndarray, shape (ntheta,)
-    measurements : sequence of Measurements
-        Shifted by their delays to the times at which they were true.
-    joint_efforts : ndarray, shape (N + 1, n)
-        Of prescribed and driven joints.
-    initial_state_by_angles, initial_state_by_torque : ndarray, shape (nx, nu)
-        Derivatives of the start by the first angles and the first torque of the driven joints, zero where it does not
-        follow from them.
+    Measurements are shifted by their delays to the times at which they were true; `joint_efforts` (N + 1, n) are those
+    of prescribed and driven joints. The derivatives of the start by the first angles and the first torque of the driven
+    joints, shape (nx, nu), are zero where it does not follow from them.
     """
 
     model_functions: ModelFunctions
@@ -53,9 +46,8 @@ def nominal_trajectory(
 ) -> NominalTrajectory:
     """Trajectory of an episode about which its residual is linearized."""
     own, rest, sizes = predictor.episode_theta(episode, theta), result.equilibrium, predictor.step.sizes
-    by_angles = by_torque = np.zeros((sizes["nx"], sizes["nu"]))
-    if rest is not None:
-        by_angles, by_torque = rest.state_by_known_coordinates[:, : sizes["nu"]], rest.state_by_torque
+    none = np.zeros((sizes["nx"], sizes["nu"]))
+    by_angles = none if rest is None else rest.state_by_known_coordinates[:, : sizes["nu"]]
     return NominalTrajectory(
         predictor.model_functions,
         own,
@@ -64,7 +56,7 @@ def nominal_trajectory(
         episode.tracking_feedback,
         predictor.joint_efforts(result.rollout),
         by_angles,
-        by_torque,
+        none if rest is None else rest.state_by_torque,
     )
 
 
@@ -72,14 +64,8 @@ def nominal_trajectory(
 class ResidualSlopes:
     """Slopes of a recording's residual, in units of the sensors' noise, at the two nodes about each of its r rows.
 
-    Attributes
-    ----------
-    node : ndarray of int, shape (r,)
-        Node before the row.
-    before, after : ndarray, shape (r, nx)
-        By the states of that node and of the next, their shares of the interpolation included.
-    by_effort_before, by_effort_after : ndarray, shape (r, nc)
-        By the efforts of prescribed joints there.
+    They are by the states (r, nx) of the node before the row and of the next, their shares of the interpolation
+    included, and by the efforts of prescribed joints there (r, nc).
     """
 
     node: NDArray[np.int64]
@@ -131,14 +117,9 @@ class ResidualSlopes:
         return ResidualSlopes(self.node[rows], *(array[rows] for array in slopes))
 
     def response(self, by_node: Array, effort: Array, first: int) -> Array:
-        """Slopes of the rows by d directions, shape (r, d).
+        """Slopes of the rows by d directions (r, d), from those of states (K, nx, d) and prescribed efforts (K, nc, d).
 
-        Parameters
-        ----------
-        by_node : ndarray, shape (K, nx, d)
-            Slopes of the states of K nodes from `first` on; a row beyond them is read at the last.
-        effort : ndarray, shape (K, nc, d)
-            Of the efforts of prescribed joints.
+        They are of K nodes from `first` on; a row beyond them is read at the last.
         """
         found = np.zeros((len(self.node), by_node.shape[2]))
         pairs = ((0, self.before, self.by_effort_before), (1, self.after, self.by_effort_after))
@@ -163,12 +144,10 @@ _MAX_RELATIVE_REDUCTION, _MAX_NOISE_UNIT_REDUCTION = 1e-3, 1e-2
 def residual_without_weak_priors(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, Array]:
     """Return the noise-scaled residual (r,) and Jacobian (r, nx) of data and stated priors, without weak priors."""
     assert evaluation.jacobian is not None
-    rows, unit = problem.residual_rows, problem.data_noise_unit
+    rows = problem.residual_rows
     residual, jacobian = evaluation.residual[rows.without_weak_priors], evaluation.jacobian[rows.without_weak_priors]
-    if unit == 1.0:
-        return residual, jacobian
     units = np.ones(len(residual))
-    units[rows.data] = unit
+    units[rows.data] = problem.data_noise_unit
     return residual / units, jacobian / units[:, None]
 
 
@@ -186,13 +165,9 @@ def bounded_least_squares_step(jacobian: Array, residual: Array, mu: float, lowe
         return plain
     low, high = np.minimum(lower, 0.0), np.maximum(upper, 0.0)
     # the bounded solver wants room between the bounds
-    closed = high - low < 1e-14
-    step = np.zeros(count)
-    if np.all(closed):
-        return step
-    free = ~closed
-    result = scipy.optimize.lsq_linear(matrix[:, free], target, bounds=(low[free], high[free]), method="bvls")
-    step[free] = result.x
+    free, step = high - low >= 1e-14, np.zeros(count)
+    if np.any(free):
+        step[free] = scipy.optimize.lsq_linear(matrix[:, free], target, (low[free], high[free]), method="bvls").x
     return step
 
 
@@ -202,14 +177,7 @@ def predicted_reduction(jacobian: Array, residual: Array, step: Array) -> float:
 
 
 def is_stationary(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> bool:
-    """Whether a point is stationary: no step up to the unknowns' size predicts a relevant cost reduction.
-
-    Parameters
-    ----------
-    x : ndarray, shape (nx,)
-    evaluation : Evaluation
-        At `x`, with its Jacobian.
-    """
+    """Whether a point (evaluated with its Jacobian) is stationary: no step promises a relevant cost reduction."""
     worth = max(_MAX_RELATIVE_REDUCTION * evaluation.cost, _MAX_NOISE_UNIT_REDUCTION * problem.data_noise_unit**2)
     return achievable_reduction(problem, x, evaluation) <= worth
 
@@ -217,8 +185,7 @@ def is_stationary(problem: EstimationProblem, x: Array, evaluation: Evaluation) 
 def achievable_reduction(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> float:
     """Cost reduction that the linear model predicts for a step up to the unknowns' size; infinite without a Jacobian.
 
-    The step is undamped and within the bounds; size is the larger of value and typical size. Parameters as of
-    `is_stationary`.
+    The step is undamped and within the bounds; size is the larger of value and typical size.
     """
     if evaluation.jacobian is None:
         return math.inf

@@ -7,6 +7,7 @@ variable with n/(1 + 2 sum rho_l^2) degrees of freedom; a free parameter takes o
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -27,16 +28,10 @@ RESIDUAL_WINDOW_LENGTH = 0.5
 
 @dataclass(frozen=True)
 class GapCriteria:
-    """Criteria for a residual that exceeds noise: significance level and size.
+    """Criteria for a residual that exceeds noise.
 
-    Attributes
-    ----------
-    significance_level : float
-        Significance below which a residual is more than noise.
-    min_excess_chi2 : float
-        chi2/n - 1 below which a significant excess is ignored.
-    noise_fraction : float
-        Fraction of the stated standard deviations that is noise; the rest represents model error.
+    It does where it is significant at the level and chi2/n - 1 is at least `min_excess_chi2`; of the stated standard
+    deviations `noise_fraction` is noise, the rest represents model error.
     """
 
     significance_level: float = 0.01
@@ -49,16 +44,9 @@ DEFAULT_GAP_CRITERIA = GapCriteria()
 
 @dataclass(frozen=True)
 class ResidualChannel:
-    """One scalar sensor output of one recording: its times, residual indices and noise autocorrelation.
+    """One scalar sensor output of one recording: times since its start (M,) [s] and indices in the residual (M,).
 
-    Attributes
-    ----------
-    t : ndarray, shape (M,)
-        Times since the start of the recording [s].
-    residual_indices : ndarray of int, shape (M,)
-        Indices in the residual.
-    noise_autocorrelation : ndarray, shape (L + 1,)
-        Autocorrelation of the noise at lags 0 to L samples.
+    The autocorrelation of its noise is at lags 0 to L samples, shape (L + 1,).
     """
 
     recording: str
@@ -72,13 +60,7 @@ class ResidualChannel:
 
 @dataclass(frozen=True)
 class ChannelNoiseLevel:
-    """Noise standard deviation that is assumed for one channel.
-
-    Attributes
-    ----------
-    noise_std : float
-        Median standard deviation of its samples, after smoothing where they are smoothed, in `unit`.
-    """
+    """Median standard deviation of the noise of one channel's samples, after smoothing where they are smoothed."""
 
     channel: str
     unit: str
@@ -88,16 +70,10 @@ class ChannelNoiseLevel:
 
 @dataclass(frozen=True)
 class _ResidualWindow:
-    """Test of one channel's residual in one time window.
+    """Test of one channel's residual in one time window [s].
 
-    Attributes
-    ----------
-    start_time, end_time : float
-        [s]
-    z_score : float
-        Excess of r'r over its expectation, in standard deviations.
-    is_flagged : bool
-        Whether it is more than chance among all windows (false-discovery rate).
+    `z_score` is the excess of r'r over its expectation, in standard deviations; it is flagged where it is more than
+    chance among all windows (false-discovery rate).
     """
 
     recording: str
@@ -110,18 +86,10 @@ class _ResidualWindow:
 
 @dataclass(frozen=True)
 class NullTestResult:
-    """Result of the null test: chi2, p-values and whiteness of a residual.
+    """Result of the null test: chi2 per degree of freedom, and the probability of one this large under noise alone.
 
-    Attributes
-    ----------
-    degrees_of_freedom : float
-        Effective, of coloured noise.
-    p_value : float
-        Probability of a residual this large under noise alone.
-    channel_chi2 : dict of channel to float
-        Mean square of its whitened residual.
-    whiteness_p_values : dict of channel to float
-        p-value of its first autocorrelations under the noise's colour (Ljung-Box; NaN for smoothed channels).
+    Degrees of freedom are effective ones, of coloured noise. By channel there are the mean square of its whitened
+    residual, and the p-value of its first autocorrelations (Ljung-Box; NaN for smoothed channels).
     """
 
     chi2_per_dof: float
@@ -157,47 +125,31 @@ def run_null_test(
     level: float = DEFAULT_GAP_CRITERIA.significance_level,
     window: float = RESIDUAL_WINDOW_LENGTH,
 ) -> NullTestResult:
-    """Test a whitened residual against the hypothesis that it is noise alone.
+    """Test a whitened residual (nr,), with a number of free parameters, against the hypothesis of noise alone.
 
-    Parameters
-    ----------
-    residual : ndarray, shape (nr,)
-        Rows that belong to no series (priors) do not count.
-    parameters : int
-        Number of free parameters.
-    level : float
-        False-discovery rate of the windows.
-    window : float
-        Their length [s].
+    Rows that belong to no series (priors) do not count. `level` is the false-discovery rate of the windows, `window`
+    their length [s].
     """
     count = sum(len(s.residual_indices) for s in series)
-    effective = max(
-        sum(len(s.residual_indices) / _variance_inflation(s.noise_autocorrelation) for s in series) - parameters, 1.0
-    )
+    degrees = sum(len(s.residual_indices) / _variance_inflation(s.noise_autocorrelation) for s in series)
+    effective = max(degrees - parameters, 1.0)
     total = float(sum(np.sum(residual[s.residual_indices] ** 2) for s in series))
     ratio = total / max(count - parameters, 1)
     p_value = float(scipy.stats.chi2.sf(ratio * effective, effective))
     channels, whiteness = {}, {}
     for channel in dict.fromkeys(s.channel for s in series):
         own = [s for s in series if s.channel == channel]
-        channels[channel] = float(np.mean(np.concatenate([residual[s.residual_indices] for s in own]) ** 2))
-        whiteness[channel] = (
-            _whiteness([residual[s.residual_indices] for s in own])
-            if len(own[0].noise_autocorrelation) == 1
-            else float("nan")
-        )
+        parts = [residual[s.residual_indices] for s in own]
+        channels[channel] = float(np.mean(np.concatenate(parts) ** 2))
+        whiteness[channel] = _whiteness(parts) if len(own[0].noise_autocorrelation) == 1 else math.nan
     return NullTestResult(ratio, effective, p_value, channels, whiteness, _windows(series, residual, level, window))
 
 
 def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
-    """Whiten a residual by its noise and by k further independent errors, (I + F F')^(-1/2) r.
+    """Whiten a residual (nr,) by its noise and by k further independent errors, (I + F F')^(-1/2) r.
 
-    Parameters
-    ----------
-    residual : ndarray, shape (nr,)
-        In units of its noise.
-    spread : ndarray, shape (nr, k)
-        F: change of the residual per standard deviation of each error; non-finite columns are ignored.
+    The `spread` F (nr, k) is the change of the residual per standard deviation of each error; non-finite columns are
+    ignored.
     """
     spread = spread[:, np.isfinite(spread).all(axis=0)]
     columns, sizes, _ = np.linalg.svd(spread, full_matrices=False)
@@ -205,13 +157,7 @@ def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
 
 
 def exceeds_noise(tests: Sequence[NullTestResult], limits: GapCriteria = DEFAULT_GAP_CRITERIA) -> bool:
-    """Whether residuals of one model exceed noise, both significantly and by a relevant size.
-
-    Parameters
-    ----------
-    tests : sequence of NullTestResult
-        Of the recordings that were fitted, of those held out, or of both.
-    """
+    """Whether residuals of one model, fitted or held out, exceed noise, both significantly and by a relevant size."""
     return (
         bonferroni_p_value(tests) < limits.significance_level
         and max(test.chi2_per_dof for test in tests) > 1 + limits.min_excess_chi2
@@ -236,13 +182,14 @@ def _whiteness(parts: Sequence[Array], lags: int = 10) -> float:
             rho = float(r[lag:] @ r[:-lag]) / power
             statistic += n * (n + 2) * rho**2 / (n - lag)
         degrees += lags
-    return float(scipy.stats.chi2.sf(statistic, degrees)) if degrees else float("nan")
+    return float(scipy.stats.chi2.sf(statistic, degrees)) if degrees else math.nan
 
 
 def _windows(
     series: Sequence[ResidualChannel], residual: Array, level: float, length: float
 ) -> tuple[_ResidualWindow, ...]:
-    raw: list[tuple[str, str, float, float, float, float]] = []
+    raw: list[tuple[str, str, float, float, float]] = []
+    p_values: list[float] = []
     merged: dict[tuple[str, str], list[ResidualChannel]] = {}
     for s in series:
         merged.setdefault((s.recording, s.channel), []).append(s)
@@ -256,33 +203,23 @@ def _windows(
                 total, count = total + float(r @ r), count + len(r)
                 degrees += len(r) / _variance_inflation(s.noise_autocorrelation)
             if count:
-                p = float(scipy.stats.chi2.sf(total / count * degrees, degrees))
-                z = (total / count - 1) * np.sqrt(degrees / 2)
-                raw.append((recording, channel, begin, min(begin + length, last), float(z), p))
-    flagged = benjamini_hochberg_mask([entry[5] for entry in raw], len(raw), level)
-    return tuple(_ResidualWindow(*entry[:5], flag) for entry, flag in zip(raw, flagged, strict=True))
+                p_values.append(float(scipy.stats.chi2.sf(total / count * degrees, degrees)))
+                z = (total / count - 1) * math.sqrt(degrees / 2)
+                raw.append((recording, channel, begin, min(begin + length, last), z))
+    flagged = benjamini_hochberg_mask(p_values, len(raw), level)
+    return tuple(_ResidualWindow(*entry, flag) for entry, flag in zip(raw, flagged, strict=True))
 
 
 def benjamini_hochberg_mask(p_values: Sequence[float], tries: float, level: float) -> list[bool]:
-    """Which of several p-values are significant at a false-discovery rate.
+    """Which of several p-values are significant at a false-discovery rate among `tries` tests, reported or not.
 
     Benjamini and Hochberg (1995), doi:10.1111/j.2517-6161.1995.tb02031.x.
-
-    Parameters
-    ----------
-    p_values : sequence of float
-        Reported p-values.
-    tries : float
-        Number of tests made, reported or not.
-    level : float
-        False-discovery rate.
     """
     order = np.argsort(p_values)
     passed = np.flatnonzero(np.sort(p_values) <= level * np.arange(1, len(order) + 1) / max(tries, 1.0))
     real = np.zeros(len(order), bool)
-    if len(passed):
-        real[order[: passed[-1] + 1]] = True
-    return [bool(r) for r in real]
+    real[order[: passed[-1] + 1 if len(passed) else 0]] = True
+    return real.tolist()
 
 
 def sample_times(episode: Episode, samples: Measurements) -> Array:

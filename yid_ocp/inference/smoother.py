@@ -48,16 +48,9 @@ _LATER_GROUP_TRIALS = 6
 
 @dataclass(frozen=True)
 class SmoothedUnknowns:
-    """Smoothed unknowns of one recording over its intervals: posterior mean and standard deviation.
+    """Smoothed unknowns of one recording over its intervals, whose edges are (J + 1,) [s].
 
-    Attributes
-    ----------
-    interval_edges : ndarray, shape (J + 1,)
-        [s]
-    reference_std : ndarray, shape (nd,)
-        [N m, N or m]
-    posterior_mean, posterior_std : ndarray, shape (J, nd)
-        In units of the reference.
+    Posterior mean and standard deviation (J, nd) are in units of the reference (nd,) [N m, N or m].
     """
 
     recording: str
@@ -131,24 +124,6 @@ class SmootherResult:
 
 
 @dataclass(frozen=True)
-class _Pass:
-    """Filter and disturbance smoother over one recording.
-
-    `products` (1 + ntheta, 1 + ntheta) holds V' S^-1 V, `score` (J, nd, 1 + ntheta) and `information` (J, nd) the
-    disturbances' scores and their variances, both by disturbances of unit variance before they are scaled, `mean`
-    (J, nd, 1 + ntheta) the smoothed unknowns, `covariance` (J, nd) their variances, `left` the smoothed residuals.
-    """
-
-    products: Array
-    log_determinant: float
-    score: Array
-    information: Array
-    mean: Array
-    covariance: Array
-    left: tuple[Array, ...]
-
-
-@dataclass(frozen=True)
 class _Update:
     """One interval of the filter, as its backward pass needs it: prediction `mean`, covariance `p` and innovations."""
 
@@ -159,11 +134,12 @@ class _Update:
 
 
 @dataclass(frozen=True)
-class _ForwardPass:
-    """The filter of one recording at given variances: see `_Pass`; its updates where they are kept.
+class _Filtered:
+    """The filter of one recording at given variances; its updates where they are kept.
 
-    The determinant is infinite where variances are so large that rounding shows: they are never the best. `begin`
-    (ns + nd, nd) says how state and unknowns of the first interval follow the first disturbances.
+    `products` (1 + ntheta, 1 + ntheta) holds V' S^-1 V. The determinant is infinite where variances are so large that
+    rounding shows: they are never the best. `begin` (ns + nd, nd) says how state and unknowns of the first interval
+    follow the first disturbances.
     """
 
     model: LinearResidualModel
@@ -173,16 +149,23 @@ class _ForwardPass:
     updates: Sequence[_Update]
 
 
-def _filter(model: LinearResidualModel, variance: Array, smooth: bool) -> _Pass:
-    """Run through one recording with given variances of the unknowns, shape (nd,)."""
-    done = _forwards(model, variance, smooth)
-    if not smooth or math.isinf(done.log_determinant):
-        empty = np.zeros(0)
-        return _Pass(done.products, done.log_determinant, empty, empty, empty, empty, ())
-    return _Pass(done.products, done.log_determinant, *_backwards(done))
+@dataclass(frozen=True)
+class _Smoothed:
+    """The disturbance smoother over one recording.
+
+    `score` (J, nd, 1 + ntheta) and `information` (J, nd) are the disturbances' scores and their variances, both by
+    disturbances of unit variance before they are scaled, `mean` (J, nd, 1 + ntheta) the smoothed unknowns, `covariance`
+    (J, nd) their variances, `left` the smoothed residuals.
+    """
+
+    score: Array
+    information: Array
+    mean: Array
+    covariance: Array
+    left: tuple[Array, ...]
 
 
-def _forwards(model: LinearResidualModel, variance: Array, keep: bool) -> _ForwardPass:
+def _forwards(model: LinearResidualModel, variance: Array, keep: bool) -> _Filtered:
     """Filter one recording with given variances of the unknowns, shape (nd,)."""
     # nobody asks for the scores of unknowns that are known to be zero
     used = np.arange(len(variance)) if keep else np.flatnonzero(variance > 0)
@@ -202,7 +185,7 @@ def _forwards(model: LinearResidualModel, variance: Array, keep: bool) -> _Forwa
         move = np.hstack([interval.state_transition, interval.unknown_input_matrix[:, used]])
         step, later, own = kalman_step(p, design, Transition(move, np.full(nd, model.interval_correlation)))
         if math.isinf(own):
-            return _ForwardPass(model, begin, products, math.inf, ())
+            return _Filtered(model, begin, products, math.inf, ())
         white, after = step.update(mean, interval.negative_residual_jacobian)
         products += white.T @ white
         log_determinant += own
@@ -210,11 +193,11 @@ def _forwards(model: LinearResidualModel, variance: Array, keep: bool) -> _Forwa
             updates.append(_Update(step, mean, p, white))
         mean, p = after, later + fresh
         p = (p + p.T) / 2
-    return _ForwardPass(model, begin, products, log_determinant, updates)
+    return _Filtered(model, begin, products, log_determinant, updates)
 
 
-def _backwards(done: _ForwardPass) -> tuple[Array, Array, Array, Array, tuple[Array, ...]]:
-    """Scores, their variances, smoothed unknowns, their variances and smoothed residuals; see `_Pass`."""
+def _backwards(done: _Filtered) -> _Smoothed:
+    """The smoother behind a filter whose updates were kept."""
     model, begin, updates = done.model, done.begin, done.updates
     ns, gain = len(model.initial_state_std), math.sqrt(1 - model.interval_correlation**2)
     count, (size, columns) = len(updates), updates[0].mean.shape
@@ -233,7 +216,7 @@ def _backwards(done: _ForwardPass) -> tuple[Array, Array, Array, Array, tuple[Ar
         own = update.p[ns:]
         covariance[j] = np.diag(update.p)[ns:] - np.sum((own @ n) * own, axis=1)
     score[0], information[0] = begin.T @ r, np.sum(begin * (n @ begin), axis=0)
-    return score, information, smoothed, covariance, tuple(reversed(left))
+    return _Smoothed(score, information, smoothed, covariance, tuple(reversed(left)))
 
 
 # -- evidence and the choice of groups --------------------------------------------------------------------------------
@@ -243,23 +226,27 @@ def _backwards(done: _ForwardPass) -> tuple[Array, Array, Array, Array, tuple[Ar
 class _State:
     """All recordings at given variances.
 
-    `passes` of the recordings, `shift` (ntheta,) of the free parameters in units of their scales, its covariance
-    `spread` (ntheta, ntheta), and the `log_evidence`.
+    `shift` (ntheta,) is that of the free parameters in units of their scales, `spread` (ntheta, ntheta) its covariance.
     """
 
-    passes: tuple[_Pass, ...]
+    recordings: tuple[_Smoothed, ...]
     shift: Array
     spread: Array
     log_evidence: float
 
 
 def _run(models: Sequence[LinearResidualModel], variance: Mapping[UnknownGroup, float], smooth: bool = True) -> _State:
-    """All recordings at given variances: the parameters' step, its covariance, and the log evidence."""
+    """All recordings at given variances; their unknowns where they are to be smoothed."""
 
-    passes = tuple(map_in_threads(lambda model: _filter(model, model.unknown_variance(variance), smooth), models))
-    products = np.sum([p.products for p in passes], axis=0)
-    evidence, shift, information = _judged(products, sum(p.log_determinant for p in passes))
-    return _State(passes, shift, scipy.linalg.cho_solve(information, np.eye(len(shift))), evidence)
+    def run(model: LinearResidualModel) -> tuple[_Filtered, _Smoothed | None]:
+        done = _forwards(model, model.unknown_variance(variance), smooth)
+        return done, _backwards(done) if done.updates else None
+
+    filtered, smoothed = zip(*map_in_threads(run, models), strict=True)
+    products = np.sum([done.products for done in filtered], axis=0)
+    evidence, shift, information = _judged(products, sum(done.log_determinant for done in filtered))
+    known = tuple(done for done in smoothed if done is not None)
+    return _State(known, shift, scipy.linalg.cho_solve(information, np.eye(len(shift))), evidence)
 
 
 def _judged(products: Array, log_determinant: float) -> tuple[float, Array, tuple[Array, bool]]:
@@ -275,16 +262,15 @@ def _judged(products: Array, log_determinant: float) -> tuple[float, Array, tupl
 
 def _scores(models: Sequence[LinearResidualModel], state: _State) -> dict[UnknownGroup, tuple[float, float]]:
     """|score|^2 of every group's unknowns and its expectation, whatever their variance is."""
-    up: dict[UnknownGroup, float] = {}
-    down: dict[UnknownGroup, float] = {}
-    for model, done in zip(models, state.passes, strict=True):
+    found: dict[UnknownGroup, tuple[float, float]] = {}
+    for model, done in zip(models, state.recordings, strict=True):
         by_theta = done.score[:, :, 1:]
         score = done.score[:, :, 0] - by_theta @ state.shift
         information = np.maximum(done.information - np.sum((by_theta @ state.spread) * by_theta, axis=2), 0.0)
-        for i, source in enumerate(model.unknown_groups):
-            up[source] = up.get(source, 0.0) + float(np.sum(score[:, i] ** 2))
-            down[source] = down.get(source, 0.0) + float(np.sum(information[:, i]))
-    return {source: (up[source], down[source]) for source in up}
+        for source, up, down in zip(model.unknown_groups, np.sum(score**2, 0), np.sum(information, 0), strict=True):
+            before = found.get(source, (0.0, 0.0))
+            found[source] = before[0] + float(up), before[1] + float(down)
+    return found
 
 
 def _refined(
@@ -293,13 +279,8 @@ def _refined(
     """Variances of the groups at work by MacKay's fixed point: s^2 <- s^2 |score|^2 / its expectation."""
     state = _run(models, variance)
     for _ in range(_MAX_ITERATIONS):
-        found = _scores(models, state)
-        trial = {
-            s: float(np.clip(v * np.clip(found[s][0] / max(found[s][1], 1e-300), 0.05, 20.0), *_VARIANCE_BOUNDS))
-            if v
-            else 0.0
-            for s, v in variance.items()
-        }
+        ratio = {s: np.clip(up / max(down, 1e-300), 0.05, 20.0) for s, (up, down) in _scores(models, state).items()}
+        trial = {s: float(np.clip(v * ratio[s], *_VARIANCE_BOUNDS)) if v else 0.0 for s, v in variance.items()}
         after = _run(models, trial)
         if not after.log_evidence > state.log_evidence + 0.05:
             break
@@ -322,27 +303,27 @@ def _selected(
         if any(variance.values()):
             promising = promising[:_LATER_GROUP_TRIALS]
 
-        bases = _bases(models, variance) if promising else ()
-
-        def tried(source: UnknownGroup, bases: Sequence[_ForwardPass] = bases) -> tuple[float, float]:
-            return _largest_evidence(bases, source)
-
-        outcomes = map_in_threads(tried, promising)
+        outcomes = list(zip(_largest_evidences(models, variance, promising), promising, strict=True))
         if not outcomes:
             return variance, state
-        (evidence, size), source = max(zip(outcomes, promising, strict=True), key=lambda pair: pair[0][0])
+        (evidence, size), source = max(outcomes, key=lambda pair: pair[0][0])
         if not evidence > state.log_evidence + limits.min_log_bayes_factor:
             return variance, state
         variance, state = _refined(models, variance | {source: size})
     return variance, state
 
 
-def _bases(models: Sequence[LinearResidualModel], variance: Mapping[UnknownGroup, float]) -> tuple[_ForwardPass, ...]:
-    """The filters of all recordings at variances to which one group's is to be added."""
-    return tuple(map_in_threads(lambda model: _forwards(model, model.unknown_variance(variance), True), models))
+def _largest_evidences(
+    models: Sequence[LinearResidualModel], variance: Mapping[UnknownGroup, float], sources: Sequence[UnknownGroup]
+) -> list[tuple[float, float]]:
+    """`_largest_evidence` of several groups, each on top of the same variances."""
+    if not sources:
+        return []
+    bases = map_in_threads(lambda model: _forwards(model, model.unknown_variance(variance), True), models)
+    return map_in_threads(lambda source: _largest_evidence(bases, source), sources)
 
 
-def _responses(base: _ForwardPass, chosen: NDArray[np.int64]) -> Array:
+def _responses(base: _Filtered, chosen: NDArray[np.int64]) -> Array:
     """Innovations by disturbances of unit variance of some unknowns, shape (rows of all intervals, u J).
 
     The filter follows a disturbance as far as its own unknowns let it; those without variance stay at zero.
@@ -358,19 +339,17 @@ def _responses(base: _ForwardPass, chosen: NDArray[np.int64]) -> Array:
         unknown[:, :k] *= model.interval_correlation
         unknown[:, k] = math.sqrt(1 - model.interval_correlation**2) if k else 1.0
         left = behind.reshape(len(kept), u * count)
-        shaped = update.step.normalized_observation
-        half = update.step.projected_covariance
-        move = update.step.transition
+        shaped, move = update.step.normalized_observation, update.step.transition
         rows = shaped[:, kept] @ left
         rows += (shaped[:, ns + chosen][:, :, None] * unknown).reshape(rows.shape)
         found.append(rows)
         follow = Transition(move.state_rows[:, kept], move.decay[kept[ns:] - ns])
-        behind = follow.forward(left - half[:, kept].T @ rows).reshape(behind.shape)
+        behind = follow.forward(left - update.step.projected_covariance[:, kept].T @ rows).reshape(behind.shape)
         behind[:ns] += move.state_rows[:, ns + chosen][:, :, None] * unknown
     return np.vstack(found)
 
 
-def _largest_evidence(bases: Sequence[_ForwardPass], source: UnknownGroup) -> tuple[float, float]:
+def _largest_evidence(bases: Sequence[_Filtered], source: UnknownGroup) -> tuple[float, float]:
     """The largest log evidence over the variance that one group gets on top, and that variance.
 
     With W the innovations by its disturbances, those of the base have the covariance I + s^2 W W', whose inverse and
@@ -404,16 +383,9 @@ def run_smoother(
     evaluation: Evaluation,
     limits: SmootherThresholds = DEFAULT_SMOOTHER_THRESHOLDS,
 ) -> SmootherResult:
-    """Run the smoother: choose the groups of unknowns with the largest evidence and estimate them.
+    """Choose the groups of unknowns with the largest evidence at a whitened problem's fit `x` and estimate them.
 
-    Parameters
-    ----------
-    problem : EstimationProblem
-        Whitened.
-    x : ndarray, shape (nx,)
-        Its fit.
-    evaluation : Evaluation
-        At `x`, with its Jacobian.
+    The evaluation is that at `x`, with its Jacobian.
     """
     # matrices of this size are multiplied faster by one thread
     with threadpoolctl.threadpool_limits(1):
@@ -421,25 +393,20 @@ def run_smoother(
         sources = tuple(dict.fromkeys(source for model in models for source in model.unknown_groups))
         none = dict.fromkeys(sources, 0.0)
         nothing = _run(models, none)
-        sides = {
-            "both": sources,
-            "plant": tuple(s for s in sources if s.kind != "bias"),
-            "sensor": tuple(s for s in sources if s.kind == "bias"),
-        }
+        sides = {"both": sources, "plant": tuple(s for s in sources if s.kind != "bias")}
+        sides["sensor"] = tuple(s for s in sources if s.kind == "bias")
         found: dict[str, tuple[dict[UnknownGroup, float], _State]] = {}
         for side, own in sides.items():
             done = [entry for entry in found.values() if {s for s, v in entry[0].items() if v} <= set(own)]
             found[side] = done[0] if done else _selected(models, own, none, nothing, limits)
-        evidence = {"none": 0.0} | {
-            side: state.log_evidence - nothing.log_evidence for side, (_, state) in found.items()
-        }
+        gain = {side: state.log_evidence - nothing.log_evidence for side, (_, state) in found.items()}
         # what is chosen greedily among all may end behind a choice among fewer
         variance, state = max(found.values(), key=lambda entry: entry[1].log_evidence)
         before, after, taken, samples = _explained(models, variance, nothing, state)
         degrees = max(float(samples) - len(nothing.shift), 1.0)
         weight = _weights(models, variance, state)
         return SmootherResult(
-            tuple(_trace(model, done, state) for model, done in zip(models, state.passes, strict=True)),
+            tuple(_trace(model, done, state) for model, done in zip(models, state.recordings, strict=True)),
             variance,
             weight,
             # what unknowns of the reference size add to r'r on average is the variance of their scores
@@ -448,7 +415,7 @@ def run_smoother(
             after,
             degrees,
             max(degrees - taken, 1.0),
-            evidence,
+            {"none": 0.0} | gain,
             limits.min_log_bayes_factor,
             _instead(models, variance, state.log_evidence, weight, limits),
         )
@@ -457,21 +424,10 @@ def run_smoother(
 def force_likelihood_terms(
     model: LinearResidualModel, variance: Mapping[UnknownGroup, float], unknown: int
 ) -> tuple[Array, Array]:
-    """Return g and L of the log likelihood g'f - f'L f / 2 of one unknown f over the intervals of a recording.
+    """Return g (J,) and L (J, J) of the log likelihood g'f - f'L f / 2 of one unknown f over a recording's intervals.
 
-    Parameters
-    ----------
-    variance : mapping of UnknownGroup to float
-        Of all groups of unknowns beside it, squared reference.
-    unknown : int
-        Place among the model's unknowns.
-
-    Returns
-    -------
-    score : ndarray, shape (J,)
-        g, f in units of the unknown's reference.
-    information : ndarray, shape (J, J)
-        L; free parameters, states and all other unknowns are integrated out.
+    f is in units of the unknown's reference; free parameters, states and all other unknowns, whose groups have these
+    variances [squared reference], are integrated out.
     """
     count, parameters = len(model.intervals), model.intervals[0].negative_residual_jacobian.shape[1] - 1
     moved = np.zeros((len(model.initial_state_std), count))
@@ -481,14 +437,9 @@ def force_likelihood_terms(
         seen[:, j] += interval.unknown_jacobian[:, unknown]
         moved = interval.state_transition @ moved
         moved[:, j] += interval.unknown_input_matrix[:, unknown]
+        jacobian = np.hstack([interval.negative_residual_jacobian, seen])
         rest = np.pad(interval.unreachable_products, (0, count))
-        intervals.append(
-            replace(
-                interval,
-                negative_residual_jacobian=np.hstack([interval.negative_residual_jacobian, seen]),
-                unreachable_products=rest,
-            )
-        )
+        intervals.append(replace(interval, negative_residual_jacobian=jacobian, unreachable_products=rest))
     products = _forwards(replace(model, intervals=tuple(intervals)), model.unknown_variance(variance), False).products
     split = 1 + parameters
     free = products[1:split, 1:split] + np.eye(parameters) / 9.0
@@ -500,21 +451,13 @@ def force_likelihood_terms(
 # -- what it says -----------------------------------------------------------------------------------------------------
 
 
-def _trace(model: LinearResidualModel, done: _Pass, state: _State) -> SmoothedUnknowns:
+def _trace(model: LinearResidualModel, done: _Smoothed, state: _State) -> SmoothedUnknowns:
     """The unknowns of one recording, with the free parameters' own uncertainty."""
     by_theta = done.mean[:, :, 1:]
     smoothed = done.mean[:, :, 0] - by_theta @ state.shift
     spread = done.covariance + np.sum((by_theta @ state.spread) * by_theta, axis=2)
-    std = np.sqrt(np.maximum(spread, 0.0))
-    return SmoothedUnknowns(
-        model.recording,
-        model.interval_edges,
-        model.unknown_names,
-        model.unknown_groups,
-        model.reference_std,
-        smoothed,
-        std,
-    )
+    named = model.unknown_names, model.unknown_groups, model.reference_std
+    return SmoothedUnknowns(model.recording, model.interval_edges, *named, smoothed, np.sqrt(np.maximum(spread, 0.0)))
 
 
 def _explained(
@@ -524,7 +467,7 @@ def _explained(
     before = after = taken = 0.0
     samples = 0
     bare, full = np.append(1.0, -plain.shift), np.append(1.0, -state.shift)
-    for model, done in zip(models, state.passes, strict=True):
+    for model, done in zip(models, state.recordings, strict=True):
         own = np.array([variance[s] for s in model.unknown_groups])
         taken += float(np.sum((own * done.information)[:, own > 0]))
         for interval, smoothed in zip(model.intervals, done.left, strict=True):
@@ -560,12 +503,7 @@ def _instead(
         scores = _scores(models, _run(models, less))
         # promise at no variance says little of how far a group gets: all of them are asked
         asked = [s for s, v in variance.items() if not v and scores[s][0] > scores[s][1]]
-        bases = _bases(models, less) if asked else ()
-
-        def tried(other: UnknownGroup, bases: Sequence[_ForwardPass] = bases) -> float:
-            return _largest_evidence(bases, other)[0]
-
         lost = max(limits.min_log_bayes_factor, (1 - limits.location_tie) * weight[source])
-        reached = zip(asked, map_in_threads(tried, asked), strict=True)
-        found[source] = tuple(other for other, reach in reached if reach >= evidence - lost)
+        reached = zip(asked, _largest_evidences(models, less, asked), strict=True)
+        found[source] = tuple(other for other, (reach, _) in reached if reach >= evidence - lost)
     return found

@@ -25,7 +25,7 @@ import scipy.sparse
 from annotated_types import Ge, Gt, Le
 from numpy.typing import NDArray
 
-from yid_ocp.effects.base import grasp_names, robot_joints
+from yid_ocp.effects.base import robot_joints
 from yid_ocp.inference.linearized_residual import NominalTrajectory, ResidualSlopes, nominal_trajectory
 from yid_ocp.integrator.rollout import AdditionalLoads, active_state_mask, applied_joint_torque, linearized_steps
 from yid_ocp.model.kinematics import forward_kinematics
@@ -51,25 +51,7 @@ _FORCE_POINT = "75%"
 
 @dataclass(frozen=True)
 class SmootherThresholds:
-    """How large unknowns may be, and what counts as evidence for a group of them.
-
-    Attributes
-    ----------
-    min_log_bayes_factor : float
-        Smallest log Bayes factor for adding a group of unknowns; 5 means odds of 150 to 1.
-    max_unknown_groups : int
-        Maximum number of groups of unknowns.
-    detectable_chi2 : float
-        Rise of r'r at which unknowns of the reference size below are detectable.
-    force_prior_std : float
-        Prior standard deviation of an unknown force, relative to the load at its location.
-    grasp_offset_prior_std : float
-        Prior standard deviation of a grasp's unknown offset [m].
-    bias_prior_std : float
-        Prior standard deviation of a sensor's unknown bias, relative to its noise.
-    location_tie : float
-        Fraction of a location's log evidence that another must reach to be indistinguishable from it.
-    """
+    """How large unknowns may be, and what counts as evidence for a group of them (5 is odds of 150 to 1)."""
 
     min_log_bayes_factor: Annotated[
         float, Gt(0), OptionInfo("rise of the log evidence that a group of unknowns must bring")
@@ -85,17 +67,14 @@ class SmootherThresholds:
 
 
 DEFAULT_SMOOTHER_THRESHOLDS = SmootherThresholds()
-"""Default thresholds of the smoother."""
 
 
 @dataclass(frozen=True)
 class UnknownGroup:
     """Group of unknowns that share a location and a standard deviation.
 
-    Attributes
-    ----------
-    is_confounded_with_bias : bool
-        Whether a bias of an effort sensor would be the same: a force at a prescribed joint whose effort is measured.
+    `is_confounded_with_bias`: a bias of an effort sensor would be the same, as for a force at a prescribed joint whose
+    effort is measured.
     """
 
     location: str
@@ -119,21 +98,10 @@ class _LinearizedEpisode:
 
 @dataclass(frozen=True)
 class _SmootherUnknowns:
-    """What gets an unknown, and how large it may be.
+    """What gets an unknown, and how large it may be: first forces, then offsets, pushes and biases.
 
-    Attributes
-    ----------
-    names : tuple of str, length nd
-        Coordinate, grasp, segment or channel, and axis: first forces, then offsets, pushes and biases.
-    reference : ndarray, shape (nd,)
-    forced : ndarray of int
-        Coordinates with an unknown force.
-    grasped : ndarray of int
-        Constraint rows with an unknown offset.
-    pushed : tuple of str
-        Segments with an unknown push.
-    biased : tuple of (int, int)
-        Group of samples and column with an unknown bias.
+    These are at coordinates (`forced`), constraint rows (`grasped`), segments (`pushed`), and groups of samples with
+    their columns (`biased`).
     """
 
     names: tuple[str, ...]
@@ -159,15 +127,14 @@ def _smoother_unknowns(course: _LinearizedEpisode, limits: SmootherThresholds) -
     """Unknowns of one recording, with their groups and reference sizes."""
     names, sources, reference, forced = _unknown_forces(course, limits.force_prior_std)
     grasped, row = [], 0
-    for grasp, name in zip(course.system.grasps, grasp_names(course.system), strict=True):
+    for grasp in course.system.grasps:
         grasped += [row, row + 1, row + 2]
-        names += [f"{name}.{axis}" for axis in "xyz"]
-        sources += [UnknownGroup(name, "offset")] * 3
+        names += [f"{grasp.name}.{axis}" for axis in "xyz"]
+        sources += [UnknownGroup(grasp.name, "offset")] * 3
         reference += [limits.grasp_offset_prior_std] * 3
         row += grasp.n_equations
-    pushed = []
-    for segment, weight in _segment_weights(course.system, course.nominal.theta).items():
-        pushed.append(segment)
+    pushed = _segment_weights(course.system, course.nominal.theta)
+    for segment, weight in pushed.items():
         names += [f"{segment}.push_{axis}" for axis in "xyz"]
         sources += [UnknownGroup(segment, "push")] * 3
         reference += [limits.force_prior_std * weight] * 3
@@ -185,10 +152,8 @@ def _smoother_unknowns(course: _LinearizedEpisode, limits: SmootherThresholds) -
             names.append(f"{channel}{axis}")
             sources.append(UnknownGroup(sensor_bias_location(course.system, sensor, frame), "bias"))
             reference.append(limits.bias_prior_std * float(np.nanmedian(samples.std[:, column])))
-    held = np.array(grasped, int)
-    return _SmootherUnknowns(
-        tuple(names), tuple(sources), np.array(reference), forced, held, tuple(pushed), tuple(biased)
-    )
+    held, biases = np.array(grasped, int), tuple(biased)
+    return _SmootherUnknowns(tuple(names), tuple(sources), np.array(reference), forced, held, tuple(pushed), biases)
 
 
 def _unknown_forces(
@@ -268,18 +233,14 @@ def _generalized_forces_per_newton(system: System, theta: Array, q: Array, segme
 
 @dataclass(frozen=True)
 class IntervalModel:
-    """Linear model of one interval: residual, state transition and input of the unknowns.
+    """Linear model of one interval: residual, transition of the state at its beginning, input of the unknowns.
 
     Attributes
     ----------
     negative_residual_jacobian : ndarray, shape (r, 1 + ntheta)
         Whitened residual with the opposite sign, then its derivative by the free parameters, with that sign too.
-    state_jacobian : ndarray, shape (r, ns)
-        Its derivative by the state at the interval's beginning.
-    unknown_jacobian : ndarray, shape (r, nd)
-    state_transition : ndarray, shape (ns, ns)
-        State at the end by that at the beginning.
-    unknown_input_matrix : ndarray, shape (ns, nd)
+    state_jacobian, unknown_jacobian : ndarray, shape (r, ns), (r, nd)
+    state_transition, unknown_input_matrix : ndarray, shape (ns, ns), (ns, nd)
     unreachable_products : ndarray, shape (1 + ntheta, 1 + ntheta)
         Products of what no state or unknown can reach.
     sample_count : int
@@ -303,10 +264,8 @@ class LinearResidualModel:
     ----------
     interval_edges : ndarray, shape (J + 1,)
         Beginnings of the intervals and the end [s].
-    unknown_names : tuple of str
-        Coordinate, grasp or channel of each of the nd unknowns.
-    unknown_groups : tuple of UnknownGroup
-        That each of the nd unknowns belongs to.
+    unknown_names, unknown_groups : tuple, length nd
+        Coordinate, grasp or channel of each unknown, and its group.
     reference_std : ndarray, shape (nd,)
         Reference standard deviation of each; the matrices are by unknowns in this unit.
     initial_state_jacobian : ndarray, shape (ns, nd)
@@ -344,15 +303,7 @@ def linear_residual_models(
 ) -> tuple[LinearResidualModel, ...]:
     """Return the linear model of every recording about its rollout at `x`, with unknown forces, offsets and biases.
 
-    Parameters
-    ----------
-    x : ndarray, shape (nx,)
-    evaluation : Evaluation
-        At `x`, with its Jacobian.
-    limits : SmootherThresholds
-        For the reference size of unknowns.
-    interval : float
-        Shortest time over which unknowns are constant [s].
+    The evaluation is that at `x`, with its Jacobian; unknowns are constant over `interval` [s] at the least.
     """
     assert evaluation.jacobian is not None
     columns = -np.column_stack([evaluation.residual, evaluation.jacobian * problem.unknown_scales])
@@ -361,10 +312,11 @@ def linear_residual_models(
         groups = problem.residual_rows.measurements[i]
         observed = columns[groups[0].start : groups[-1].stop]
         nominal = nominal_trajectory(problem.predictor, episode, result, problem.split(x, i)[0])
-        factor = [
-            samples.residual_block(predicted, threshold=problem.options.huber_threshold).robust_factor
-            for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True)
-        ]
+        pairs, threshold = (
+            zip(episode.measurements, result.predicted_outputs, strict=True),
+            problem.options.huber_threshold,
+        )
+        factor = [samples.residual_block(y, threshold=threshold).robust_factor for samples, y in pairs]
         course = _LinearizedEpisode(problem, episode, nominal)
         found.append(_recording(course, np.concatenate(factor), observed, limits, interval))
     prior = columns[problem.residual_rows.stated_priors]
@@ -397,18 +349,11 @@ def _steps(
 ) -> tuple[Array, Array, Array]:
     """A_k (steps, ns, ns), E_k (steps, ns, nd') and the effort's slopes (steps, nc, ns + nd') of some steps.
 
-    `force_pulses` (N + 1, forces, np) says what forces pushes amount to.
+    `pushes` (N + 1, forces, np) says what forces they amount to.
     """
     a, e, effort = [], [], []
-    feedback = course.episode.tracking_feedback
-    followed = (
-        np.zeros((0, 0))
-        if feedback is None
-        else np.vstack([0 * loads.next_momentum, loads.next_momentum])[feedback.state_indices]
-    )
-    found = linearized_steps(
-        course.problem.step, course.nominal.theta, course.nominal.rollout, loads, slice(first, last)
-    )
+    feedback, nominal, forces = course.episode.tracking_feedback, course.nominal, pushes.shape[1]
+    found = linearized_steps(course.problem.step, nominal.theta, nominal.rollout, loads, slice(first, last))
     for k, one in enumerate(found, first):
         by_state, effort_by_state = one.state_by_state, one.effort_by_state
         by_load, effort_by_load = one.state_by_load, one.effort_by_load
@@ -418,12 +363,10 @@ def _steps(
             effort_by_state[:, feedback.state_indices] -= one.effort_by_torque @ feedback.gain[k]
             # the momentum of the motion that was measured has half the impulse of an unknown force in it (of the step
             # before; this step's stands for it)
+            followed = np.vstack([0 * loads.next_momentum, loads.next_momentum])[feedback.state_indices]
             unknown = feedback.gain[k] @ followed
-            by_load, effort_by_load = (
-                by_load + one.state_by_torque @ unknown,
-                effort_by_load + one.effort_by_torque @ unknown,
-            )
-        forces = pushes.shape[1]
+            by_load = by_load + one.state_by_torque @ unknown
+            effort_by_load = effort_by_load + one.effort_by_torque @ unknown
         a.append(by_state[np.ix_(moving, moving)])
         e.append(np.hstack([by_load[moving], by_load[moving, :forces] @ pushes[k]]))
         pushed = effort_by_load[:, :forces] @ pushes[k]
@@ -444,9 +387,8 @@ def _recording(
     unknowns = _smoother_unknowns(course, limits)
     loads, forces = _loads_of(course, unknowns), len(unknowns.forced)
     nodes = course.nominal.rollout.state[:, : course.system.n_coordinates]
-    pushes = _generalized_forces_per_newton(course.system, course.nominal.theta, nodes, unknowns.pushed)[
-        :, unknowns.forced
-    ]
+    pushes = _generalized_forces_per_newton(course.system, course.nominal.theta, nodes, unknowns.pushed)
+    pushes = pushes[:, unknowns.forced]
     pushes *= unknowns.reference[unknowns.loading : unknowns.driving] / unknowns.reference[:forces, None]
     linear = partial(linearized_steps, course.problem.step, course.nominal.theta, course.nominal.rollout, loads)
     ends = [*linear(slice(0, 1)), *linear(slice(steps - 1, steps))]
@@ -476,9 +418,7 @@ def _recording(
         course.episode.name,
         tuple(intervals),
         h * edges,
-        unknowns.names,
-        unknowns.sources,
-        unknowns.reference,
+        *(unknowns.names, unknowns.sources, unknowns.reference),
         at_rest,
         np.zeros(ns) if rests else _loose_start(course)[moving],
         decay,
@@ -540,13 +480,10 @@ def _interval_response(
 def _bias_slopes(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> Array:
     """Slopes of all rows by the biases, in units of their reference, shape (r, nb)."""
     reference, found = unknowns.reference[unknowns.driving :], []
+    group, output = np.array(unknowns.biased, int).reshape(-1, 2).T
     for k, samples in enumerate(course.episode.measurements):
         sample, column = np.nonzero(samples.is_used)
-        size = [
-            r * (column == c) if group == k else np.zeros(len(column))
-            for r, (group, c) in zip(reference, unknowns.biased, strict=True)
-        ]
-        own = np.array(size).reshape(len(size), len(column)).T
+        own = reference * ((group == k) & (output == column[:, None]))
         found.append(samples.decorrelate(samples.weight[sample, column][:, None] * own))
     return np.concatenate(found)
 

@@ -46,16 +46,9 @@ _MAX_CHECKED_PARAMETERS = 12
 class GoodnessOfFit:
     """Whether the model explains the recordings on which it was fitted.
 
-    Attributes
-    ----------
-    chi2_per_dof : float
-        Mean square of the residual in standard deviations of the noise; NaN where there is none.
-    p_value : float
-        Probability of a residual this large under noise alone.
-    explains : bool
-        By the null test of a diagnosis, at its level and relevance; see `exceeds_noise`.
-    believed : bool
-        Whether the data have no grave quality issue; see `ProblemOptions.data_issues`.
+    `chi2_per_dof` is the mean square of the residual in standard deviations of the noise, NaN where there is none, and
+    `p_value` the probability of one this large under noise alone; `explains` is by the null test of a diagnosis
+    (`exceeds_noise`). Data are `believed` without a grave quality issue (`ProblemOptions.data_issues`).
     """
 
     chi2_per_dof: float
@@ -64,23 +57,13 @@ class GoodnessOfFit:
     believed: bool = True
 
 
-_UNKNOWN_FIT = GoodnessOfFit(math.nan, math.nan, False)
-"""Goodness of fit of a run without a result."""
-
-
 @dataclass(frozen=True)
 class ParameterEstimate:
     """Estimate of one parameter with standard deviation, bounds and verdict.
 
-    Attributes
-    ----------
-    value, std : float
-        In `unit`; `std` is infinite where the data do not inform the parameter.
-    verdict : str
-        See `verdict`; `fixed` where it was not free.
-    interval : (float or None, float or None), or None
-        95 % interval where a standard deviation does not tell it: one-sided at a bound, by profile likelihood where the
-        cost is no parabola; None for an open end.
+    `std` is infinite where the data do not inform the parameter; the verdict is `parameter_verdict` or `fixed`.
+    The 95 % `interval` is stated where a standard deviation does not tell it: one-sided at a bound, by profile
+    likelihood where the cost is no parabola; None is an open end.
     """
 
     value: float
@@ -110,7 +93,7 @@ def assess_goodness_of_fit(
 ) -> GoodnessOfFit:
     """Null test of a fit on its own recordings, with residuals in noise units whatever the weighting."""
     if not evaluation.ok:
-        return _UNKNOWN_FIT
+        return GoodnessOfFit(math.nan, math.nan, False)
     residual = evaluation.residual
     if problem.options.weighting == "paper":
         parts = [
@@ -120,9 +103,8 @@ def assess_goodness_of_fit(
         ]
         residual = np.concatenate(parts) if parts else np.zeros(0)
     found = run_null_test(residual_channels(problem), residual / limits.noise_fraction, len(problem.unknown_names))
-    return GoodnessOfFit(
-        found.chi2_per_dof, found.p_value, not exceeds_noise((found,), limits), problem.options.has_trusted_data
-    )
+    explains = not exceeds_noise((found,), limits)
+    return GoodnessOfFit(found.chi2_per_dof, found.p_value, explains, problem.options.has_trusted_data)
 
 
 # -- how sure ---------------------------------------------------------------------------------------------------------
@@ -147,10 +129,10 @@ def noise_covariance_factor(problem: EstimationProblem, evaluation: Evaluation) 
     count, scale = len(problem.initial_unknowns), problem.unknown_scales
     _, jacobian = residual_without_weak_priors(problem, evaluation)
     _, singular, vectors = np.linalg.svd(jacobian * scale, full_matrices=False)
-    inverse = np.zeros(count)
-    inverse[: len(singular)] = singular
-    basis = np.eye(count) if len(vectors) == 0 else _completed(vectors, count)
-    return scale[:, None] * basis.T / np.maximum(inverse, 1e-8)
+    if len(vectors) < count:
+        rest = np.linalg.svd(np.eye(count) - vectors.T @ vectors)[0][:, : count - len(vectors)]
+        vectors, singular = np.vstack([vectors, rest.T]), np.pad(singular, (0, count - len(singular)))
+    return scale[:, None] * vectors.T / np.maximum(singular, 1e-8)
 
 
 def _chi2_per_dof(problem: EstimationProblem, evaluation: Evaluation) -> float:
@@ -158,13 +140,6 @@ def _chi2_per_dof(problem: EstimationProblem, evaluation: Evaluation) -> float:
     residual, _ = residual_without_weak_priors(problem, evaluation)
     data = residual[problem.residual_rows.data]
     return float(data @ data) / max(len(residual) - len(problem.initial_unknowns), 1)
-
-
-def _completed(vectors: Array, count: int) -> Array:
-    if len(vectors) == count:
-        return vectors
-    rest = np.linalg.svd(np.eye(count) - vectors.T @ vectors)[0][:, : count - len(vectors)]
-    return np.vstack([vectors, rest.T])
 
 
 def _misfit_sandwich_covariance(problem: EstimationProblem, evaluation: Evaluation, covariance: Array) -> Array:
@@ -242,14 +217,10 @@ def _cost_checked_std(problem: EstimationProblem, x: Array, evaluation: Evaluati
     for name in parameters if len(parameters) <= _MAX_CHECKED_PARAMETERS else ():
         i = problem.unknown_names.index(name)
         size = max(abs(float(x[i])), float(problem.unknown_scales[i]))
-        if (
-            not math.isfinite(spread[i])
-            or not MAX_IDENTIFIABLE_RELATIVE_STD * abs(x[i]) < spread[i] < MIN_UNINFORMED_RELATIVE_STD * size
-        ):
+        if not MAX_IDENTIFIABLE_RELATIVE_STD * abs(x[i]) < spread[i] < MIN_UNINFORMED_RELATIVE_STD * size:
             continue
         heights = []
-        for sign in (-1.0, 1.0):
-            room = float(upper[i] - x[i]) if sign > 0 else float(x[i] - lower[i])
+        for sign, room in ((-1.0, float(x[i] - lower[i])), (1.0, float(upper[i] - x[i]))):
             # farther than this off its typical size a parabola has nothing to say
             step = min(math.sqrt(CHI2_95_TWO_SIDED) * spread[i], room, 10 * size)
             if step < MAX_IDENTIFIABLE_RELATIVE_STD * spread[i]:
@@ -279,16 +250,12 @@ def std_from_covariance(covariance: Array, x: Array) -> Array:
 
 
 def covariance_to_dict(names: Sequence[str], matrix: Array, std: Sequence[float]) -> dict[str, Any]:
-    """Names and covariance of parameters for result.json: correlations of a matrix, scaled to given deviations.
+    """Names and covariance of parameters for result.json: correlations of a matrix (n, n), scaled to given deviations.
 
-    Parameters
-    ----------
-    matrix : ndarray, shape (n, n)
-    std : sequence of float, length n
-        Those that are not finite and positive are left out: nothing is known of their parameters.
+    Those that are not finite and positive are left out: nothing is known of their parameters.
     """
     at = [i for i, value in enumerate(std) if math.isfinite(value) and value > 0 and matrix[i, i] > 0]
-    factor = np.array([std[i] for i in at]) / np.sqrt(np.array([matrix[i, i] for i in at]))
+    factor = np.asarray(std, float)[at] / np.sqrt(np.diag(matrix)[at])
     kept = matrix[np.ix_(at, at)] * np.outer(factor, factor)
     return {"names": [names[i] for i in at], "matrix": kept.tolist()}
 
@@ -318,15 +285,9 @@ def parameter_verdict(
     weak                anything else
     ==================  ================================================================================================
 
-    The first that holds is returned. A value that may be zero is judged by `scale` as well: identifiable where value
-    and two standard deviations stay below a tenth of it, weak where they stay below all of it.
-
-    Parameters
-    ----------
-    value, std : float
-        In the same unit.
-    scale : float
-        Plausible size of the parameter, zero where unknown.
+    The first that holds is returned. A value that may be zero is judged by `scale` as well, the parameter's plausible
+    size, zero where unknown: identifiable where value and two standard deviations stay below a tenth of it, weak where
+    they stay below all of it.
     """
     found = verdict_by_relative_std(value, std, scale)
     if found == "not_identifiable":
@@ -352,14 +313,8 @@ def with_profile_interval(entry: ParameterEstimate, interval: ConfidenceInterval
 
     Open on both sides it is not_identifiable, on one side at best weak and without a ±. An end that is not met before
     a bound within `scale` is that bound. Else the wider side is two standard deviations (`verdict_by_relative_std`),
-    and is the ± where a parabola's would be less than half of it.
-
-    Parameters
-    ----------
-    interval : (float or None, float or None)
-        95 %.
-    scale : float
-        See `parameter_verdict`.
+    and is the ± where a parabola's would be less than half of it. The interval is that of 95 %, the scale that of
+    `parameter_verdict`.
     """
     low, high = interval
     if low is None and entry.value - entry.lower <= scale:
@@ -391,25 +346,24 @@ def typical_parameter_sizes(problem: EstimationProblem, x: Array) -> Mapping[str
     A prior counts with its standard deviation, finite bounds with half of what lies between them, the others of the
     same kind (`bend`, say, or else of the same unit) with the median of their sizes.
     """
-    theta, _ = problem.split(x, 0)
-    entries = list(problem.system.parameters)
-    scales = {
-        name.split("[")[0]: float(scale)
-        for name, scale in zip(problem.unknown_names, problem.unknown_scales, strict=True)
-    }
+
+    def kind(name: str) -> str:
+        return name.rpartition(".")[2]
+
+    (theta, _), entries = problem.split(x, 0), list(problem.system.parameters)
+    pairs = zip(problem.unknown_names, problem.unknown_scales, strict=True)
+    scales = {name.split("[")[0]: float(scale) for name, scale in pairs}
     sizes = dict(zip((entry.name for entry in entries), np.abs(theta), strict=True))
     joint = problem.options.multivariate_prior
-    known = {
-        **problem.options.prior_stds,
-        **dict(zip(joint.parameter_names, np.sqrt(np.diag(joint.covariance)), strict=True)),
-    }
+    known = dict(problem.options.prior_stds)
+    known |= dict(zip(joint.parameter_names, np.sqrt(np.diag(joint.covariance)), strict=True))
     found = {}
     for entry in entries:
         if entry.name not in (*problem.shared_parameters, *problem.local_parameters):
             continue
         width = entry.upper - entry.lower
         alike = [o for o in entries if o.name != entry.name and o.unit == entry.unit and "@" not in o.name]
-        own = [o for o in alike if _kind(o.name) == _kind(entry.name)]
+        own = [o for o in alike if kind(o.name) == kind(entry.name)]
         others = [float(sizes[o.name]) for o in own or alike if sizes[o.name] > 0]
         if entry.name in known:
             found[entry.name] = float(known[entry.name])
@@ -420,23 +374,12 @@ def typical_parameter_sizes(problem: EstimationProblem, x: Array) -> Mapping[str
     return found
 
 
-def _kind(name: str) -> str:
-    return name.rpartition(".")[2]
-
-
 def parameter_estimates(
     problem: EstimationProblem, x: Array, evaluation: Evaluation, covariance: Array, fit: GoodnessOfFit | None
 ) -> dict[str, ParameterEstimate]:
-    """Estimates of all parameters, local ones by recording, with value, standard deviation and verdict.
+    """Estimates of all parameters, local ones by recording, from the covariance (nx, nx) and the evaluation at `x`.
 
-    Parameters
-    ----------
-    x : ndarray, shape (nx,)
-    evaluation : Evaluation
-        At `x`, with its Jacobian.
-    covariance : ndarray, shape (nx, nx)
-    fit : GoodnessOfFit, optional
-        None where the point is not a fit; misfit and bounds are then ignored.
+    Where the point is not a fit, which None stands for, misfit and bounds are ignored.
     """
     known = fit is not None and evaluation.ok and evaluation.jacobian is not None
     spread = _cost_checked_std(problem, x, evaluation, covariance) if known else std_from_covariance(covariance, x)
@@ -444,18 +387,16 @@ def parameter_estimates(
     scales, (lower, upper) = problem.unknown_scales, problem.bounds
     result: dict[str, ParameterEstimate] = {}
     free = {name: problem.unknown_names.index(name) for name in parameter_unknown_names(problem)}
-    for i, entry in enumerate(problem.system.parameters):
+    for entry, value, initial in zip(problem.system.parameters, theta, problem.theta, strict=True):
         if entry.name not in problem.local_parameters:
-            value, bounds = float(theta[i]), (entry.lower, entry.upper)
-            result[entry.name] = ParameterEstimate(
-                value, 0.0, entry.unit, float(problem.theta[i]), *bounds, False, "fixed"
-            )
+            told = entry.unit, float(initial), entry.lower, entry.upper
+            result[entry.name] = ParameterEstimate(float(value), 0.0, *told, False, "fixed")
     for name, at in free.items():
         entry = problem.system.parameters[name.split("[")[0]]
-        value, initial = float(x[at]), float(problem.initial_unknowns[at])
-        std = float(spread[at])
-        std = std if std < MIN_UNINFORMED_RELATIVE_STD * max(abs(value), float(scales[at])) else math.inf
-        side = _bound_side(value, float(lower[at]), float(upper[at]), float(scales[at])) if known else 0
+        value, std, low, high, scale = (float(v[at]) for v in (x, spread, lower, upper, scales))
+        std = std if std < MIN_UNINFORMED_RELATIVE_STD * max(abs(value), scale) else math.inf
+        near = _AT_BOUND_FRACTION * scale
+        side = (-1 if value - low <= near else 1 if high - value <= near else 0) if known else 0
         explains = fit is None or (fit.explains and fit.believed)
         said = parameter_verdict(value, std, scale=sizes[entry.name], explains=explains, at_bound=side != 0)
         interval = None
@@ -463,8 +404,8 @@ def parameter_estimates(
             std = math.inf
         elif side:
             interval = _one_sided_interval(value, std, side, _pull(problem, evaluation, at))
-        bounds = (float(lower[at]), float(upper[at]))
-        result[name] = ParameterEstimate(value, std, entry.unit, initial, *bounds, True, said, interval)
+        initial = float(problem.initial_unknowns[at])
+        result[name] = ParameterEstimate(value, std, entry.unit, initial, low, high, True, said, interval)
     return result
 
 
@@ -474,12 +415,6 @@ def mark_not_trusted(known: Mapping[str, ParameterEstimate]) -> dict[str, Parame
         name: replace(entry, verdict="not_trusted") if entry.free and entry.verdict != "not_identifiable" else entry
         for name, entry in known.items()
     }
-
-
-def _bound_side(value: float, lower: float, upper: float, size: float) -> int:
-    """-1 where a value lies at its lower bound, 1 at its upper one, 0 elsewhere."""
-    near = _AT_BOUND_FRACTION * size
-    return -1 if value - lower <= near else 1 if upper - value <= near else 0
 
 
 def _one_sided_interval(value: float, std: float, side: int, slope: float) -> ConfidenceInterval:

@@ -62,10 +62,7 @@ _TORQUE_BIAS_TOLERANCE = 0.05
 
 @dataclass(frozen=True)
 class _FilterStep:
-    """One step of a frozen filter of (d, w, b): rows of the residual, the filter, and the rows' slopes by a torque.
-
-    `by_torque` (r, nu) is by a known correction of the torque over the step.
-    """
+    """One step of a frozen filter of (d, w, b): rows of the residual, and their slopes by a known torque (r, nu)."""
 
     rows: _RowIndices
     kalman: KalmanStep
@@ -88,16 +85,9 @@ class _FilterStep:
 
 @dataclass(frozen=True)
 class _SmoothedInputErrors:
-    """Smoothed torque errors and state errors of a recording, from all its measurements.
+    """Smoothed b (nu,) and w (N, nu) [N m], and the rollout's state less the true one (N + 1, nx).
 
-    Attributes
-    ----------
-    torque_bias : ndarray, shape (nu,)
-        b [N m]
-    torque_noise : ndarray, shape (N, nu)
-        w in every step [N m].
-    state_error : ndarray, shape (N + 1, nx)
-        State of the rollout less the true one; where encoders are measurements.
+    The last is known where encoders are measurements.
     """
 
     torque_bias: Array
@@ -111,14 +101,14 @@ class WhiteningFilter:
 
     Attributes
     ----------
-    filter_steps : tuple of _FilterStep
+    filter_steps : tuple
         One for every node.
     input_errors : InputErrors
         With the values of b and w about which it is linearised.
     initial_covariance : ndarray, shape (na, na)
-        Covariance of (d, w, b) before all measurements.
+        Of (d, w, b) before all measurements.
     state_mask : ndarray of bool, shape (nx,)
-        Those that d is made up of.
+        States that d is made up of.
     torque_bias_std : ndarray, shape (nu,)
         Standard deviation of b after all measurements [N m].
     """
@@ -130,7 +120,7 @@ class WhiteningFilter:
     torque_bias_std: Array
 
     def whiten(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
-        """Whiten a residual and its derivatives: normalized innovations of the Kalman filter.
+        """Normalized innovations (r, c) of the Kalman filter, and the estimate of b from all rows (nu, c) [N m].
 
         Parameters
         ----------
@@ -138,12 +128,6 @@ class WhiteningFilter:
             A residual in units of the sensors' noise, then columns of its derivative.
         push : ndarray, shape (N, nu, c), or None
             The tracking filter's correction of the torque, and its derivative [N m].
-
-        Returns
-        -------
-        innovations : ndarray, shape (r, c)
-        bias : ndarray, shape (nu, c)
-            Estimate of b from all rows [N m], and its derivative.
         """
         result, mean = np.empty_like(rows), self._expected(rows.shape[1])
         for k, step in enumerate(self.filter_steps):
@@ -153,15 +137,7 @@ class WhiteningFilter:
         return result, bias
 
     def smooth(self, rows: Array, push: Array | None) -> _SmoothedInputErrors:
-        """Smooth torque and state errors from all measurements (Bryson and Frazier 1963).
-
-        Parameters
-        ----------
-        rows : ndarray, shape (r,)
-            A residual in units of the sensors' noise.
-        push : ndarray, shape (N, nu, 1), or None
-            As in `whiten`.
-        """
+        """Smooth torque and state errors from all measurements; arguments as in `whiten` (Bryson and Frazier 1963)."""
         errors, last = self.input_errors, len(self.filter_steps) - 1
         nu, ns = len(errors.torque_bias), int(np.count_nonzero(self.state_mask))
         torque = slice(ns, ns + nu)
@@ -190,10 +166,9 @@ class WhiteningFilter:
 
     def _expected(self, columns: int) -> Array:
         """Mean of (d, w, b) before all measurements; no derivative in further columns, shape (na, columns)."""
+        known = np.concatenate([self.input_errors.torque_noise[0], self.input_errors.torque_bias])
         mean = np.zeros((len(self.initial_covariance), columns))
-        mean[len(mean) - 2 * len(self.input_errors.torque_bias) :, 0] = -np.concatenate(
-            [self.input_errors.torque_noise[0], self.input_errors.torque_bias]
-        )
+        mean[len(mean) - len(known) :, 0] = -known
         return mean
 
     def _updated(self, k: int, mean: Array, own: Array, push: Array | None) -> tuple[Array, Array]:
@@ -224,22 +199,21 @@ def _build_whitening_filter(course: NominalTrajectory, errors: InputErrors) -> W
     made, steps, momentum = [], linear(), course.model_functions.momentum_shift.momentum_by_torque(course.theta)
     for k in range(count + 1):
         fresh = k + 1 < count and errors.sample_of_step[k + 1] != errors.sample_of_step[k]
-        here = next(steps, None)
-        turn = (
-            _Turn(_transition(np.eye(len(kept), len(kept) + 2 * nu), nu, fresh), None, None)
-            if here is None
-            else _turn(here, kept, course.tracking_feedback, momentum, errors, k, fresh)
-        )
-        rows, move = rows_of_node[k], turn.transition.state_rows
+        here, rows = next(steps, None), rows_of_node[k]
+        move, effort, shaken = np.eye(len(kept), len(kept) + 2 * nu), None, None
+        if here is not None:
+            move, effort, shaken = _error_step(here, kept, course.tracking_feedback, momentum, errors, k)
         observe = slopes.after[rows] @ move
         by_torque = observe[:, len(kept) : len(kept) + nu].copy()
         observe[:, : len(kept)] += slopes.before[rows]
-        if turn.effort is not None:
-            observe += (slopes.by_effort_before[rows] + slopes.by_effort_after[rows]) @ turn.effort
-        kalman, covariance, _ = kalman_step(covariance, observe, turn.transition)
+        if effort is not None:
+            observe += (slopes.by_effort_before[rows] + slopes.by_effort_after[rows]) @ effort
+        # another w where it is fresh, and the same b
+        transition = Transition(move, np.repeat([0.0 if fresh else 1.0, 1.0], nu))
+        kalman, covariance, _ = kalman_step(covariance, observe, transition)
         made.append(_FilterStep(rows, kalman, by_torque))
-        if turn.shaken is not None:
-            covariance[: len(kept), : len(kept)] += turn.shaken @ turn.shaken.T
+        if shaken is not None:
+            covariance[: len(kept), : len(kept)] += shaken @ shaken.T
         if fresh:
             torque = np.arange(len(kept), len(kept) + nu)
             covariance[torque, torque] += errors.torque_std**2
@@ -248,34 +222,19 @@ def _build_whitening_filter(course: NominalTrajectory, errors: InputErrors) -> W
     return WhiteningFilter(tuple(made), errors, first, live, spread)
 
 
-@dataclass(frozen=True)
-class _Turn:
-    """How (d, w, b) comes through one step.
-
-    `shaken` (ns, s) is by unit noises of its own that come to d; `effort` (nc, na) is that of prescribed coordinates at
-    the node before, None after the last step and where there are none.
-    """
-
-    transition: Transition
-    shaken: Array | None
-    effort: Array | None
-
-
-def _transition(move: Array, nu: int, fresh: bool) -> Transition:
-    """d after the step by (d, w, b), with another w where it is `fresh`, and the same b."""
-    return Transition(move, np.repeat([0.0 if fresh else 1.0, 1.0], nu))
-
-
-def _turn(
+def _error_step(
     here: LinearizedStep,
     kept: _RowIndices,
     feedback: TrackingFeedback | None,
     momentum: Array,
     errors: InputErrors,
     k: int,
-    fresh: bool,
-) -> _Turn:
-    """Step k; `momentum` (nu, nu) is what torques of the step before add to the momenta that the filter follows."""
+) -> tuple[Array, Array | None, Array | None]:
+    """How (d, w, b) comes through step k: d after it (ns, na), prescribed efforts at the node before it, noise of d.
+
+    The efforts (nc, na) are None where there are none, as is what unit noises of their own add to d (ns, s). `momentum`
+    (nu, nu) is what torques of the step before add to the momenta that the filter follows.
+    """
     by_state, effort_by_state, shaken = here.state_by_state, here.effort_by_state, None
     by_error, effort_by_error = here.state_by_torque[kept], here.effort_by_torque
     if feedback is not None and not errors.has_encoder_measurements:
@@ -288,11 +247,8 @@ def _turn(
         # that as half the impulse of the step before does not
         known = torque_error_feedthrough(feedback.gain[k], momentum)
         by_error, effort_by_error = by_error @ known, effort_by_error @ known
-    effort = None
-    if len(effort_by_state):
-        effort = np.hstack([effort_by_state[:, kept], effort_by_error, effort_by_error])
-    move = np.hstack([by_state[np.ix_(kept, kept)], by_error, by_error])
-    return _Turn(_transition(move, by_error.shape[1], fresh), shaken, effort)
+    effort = np.hstack([effort_by_state[:, kept], effort_by_error, effort_by_error]) if len(effort_by_state) else None
+    return np.hstack([by_state[np.ix_(kept, kept)], by_error, by_error]), effort, shaken
 
 
 # -- about an episode -------------------------------------------------------------------------------------------------
@@ -379,15 +335,8 @@ def whitened_at(
     """The same problem with residuals whitened by sensor and process noise, linearized at `x`.
 
     Returns the problem itself without process noise, or where the rollout fails at `x`. Where it is whitened
-    already, the new filter is linearized about the smoothed motion and torques of the old one.
-
-    Parameters
-    ----------
-    x : array_like, shape (nx,)
-    equilibrium_guesses : EquilibriumGuesses, optional
-        As in `EstimationProblem.evaluate`.
-    rounds : int
-        Number of relinearizations; 2 at a fit.
+    already, the new filter is linearized about the smoothed motion and torques of the old one. `rounds` is the number
+    of relinearizations; 2 at a fit.
     """
     x = np.asarray(x, float)
     guesses = equilibrium_guesses or (None,) * len(problem.episodes)
@@ -425,8 +374,7 @@ def relinearized_at_torque_bias(problem: EstimationProblem, x: Array, frozen: Ar
     Their weights are unchanged.
     """
     at = [(e, *problem.split(x, i), problem.split(frozen, i)[0]) for i, e in enumerate(problem.episodes)]
-    made = _relinearized_filters(problem.predictor, problem.whitening_filters, at)
-    episodes = _with_filter_errors(problem.episodes, made)
+    episodes, made = _relinearized(problem.predictor, problem.episodes, problem.whitening_filters, at)
     return problem.with_episodes(episodes, problem.held_out, made, problem.held_out_whitening_filters)
 
 
@@ -434,8 +382,7 @@ def held_out_relinearized_at_torque_bias(problem: EstimationProblem, x: Array, f
     """The same problem with held-out filters relinearized from the torque offsets at `frozen` to those at `x`."""
     before = problem.held_out_theta(frozen)
     at = [(*own, before) for own in problem.held_out_evaluation_points(x)]
-    made = _relinearized_filters(problem.predictor, problem.held_out_whitening_filters, at)
-    held_out = _with_filter_errors(problem.held_out, made)
+    held_out, made = _relinearized(problem.predictor, problem.held_out, problem.held_out_whitening_filters, at)
     return problem.with_episodes(problem.episodes, held_out, problem.whitening_filters, made)
 
 
@@ -479,20 +426,20 @@ def _own_filter(whitening: ResidualWhitener | None) -> WhiteningFilter | None:
     return whitening
 
 
-def _relinearized_filters(
+def _relinearized(
     predictor: EpisodePredictor,
+    episodes: Sequence[Episode],
     known: Sequence[ResidualWhitener | None],
     at: Sequence[tuple[Episode, Array, Array, Array]],
-) -> tuple[WhiteningFilter | None, ...]:
-    """Filters about the torque offsets estimated at (episode, theta, offset), linearized at another theta so far."""
+) -> tuple[tuple[Episode, ...], tuple[WhiteningFilter | None, ...]]:
+    """Filters about the torque offsets estimated at (episode, theta, offset), linearized at another theta so far.
+
+    They come with the episodes, which have the input errors about which their filters are linearized.
+    """
     pairs = zip(map(_own_filter, known), at, strict=True)
-    return tuple(own and _settled(predictor, own, *told) for own, told in pairs)
-
-
-def _with_filter_errors(episodes: Sequence[Episode], known: Sequence[WhiteningFilter | None]) -> tuple[Episode, ...]:
-    """Episodes with the input errors about which their filters are linearized."""
-    pairs = zip(episodes, known, strict=True)
-    return tuple(episode if own is None else replace(episode, input_errors=own.input_errors) for episode, own in pairs)
+    made = tuple(own and _settled(predictor, own, *told) for own, told in pairs)
+    both = zip(episodes, made, strict=True)
+    return tuple(e if own is None else replace(e, input_errors=own.input_errors) for e, own in both), made
 
 
 def _settled(
@@ -502,14 +449,17 @@ def _settled(
     now, before = (
         predictor.corrected_inputs(episode, predictor.episode_theta(episode, t), ()).torque for t in (theta, frozen)
     )
-    made = trial = _about(whitening, whitening.input_errors.torque_bias + np.mean(now - before, axis=0))
+
+    def about(offset: Array) -> WhiteningFilter:
+        return replace(whitening, input_errors=replace(whitening.input_errors, torque_bias=offset))
+
+    made = trial = about(whitening.input_errors.torque_bias + np.mean(now - before, axis=0))
     for _ in range(_MAX_ROLLOUTS if np.any(whitening.input_errors.torque_bias_std > 0) else 0):
         own = replace(episode, input_errors=trial.input_errors)
         result = predictor.predict_episode(own, theta, start, False)
         if isinstance(result, str):
             break
-        made, offset = trial, estimate_torque_bias(own, result, trial)
-        trial = _about(made, offset)
+        made, trial = trial, about(estimate_torque_bias(own, result, trial))
         if _apart(trial, made) < _TORQUE_BIAS_TOLERANCE:
             break
     return made
@@ -525,7 +475,3 @@ def _apart(one: ResidualWhitener, other: ResidualWhitener) -> float:
     stated = one.input_errors.torque_bias_std > 0
     apart = np.abs(one.input_errors.torque_bias - other.input_errors.torque_bias)
     return float(np.max(apart[stated] / one.input_errors.torque_bias_std[stated], initial=0.0))
-
-
-def _about(whitening: WhiteningFilter, offset: Array) -> WhiteningFilter:
-    return replace(whitening, input_errors=replace(whitening.input_errors, torque_bias=offset))

@@ -58,19 +58,8 @@ class Status(str, Enum):
 class Iterate:
     """One accepted iterate of a solver.
 
-    Attributes
-    ----------
-    iteration : int
-    cost : float
-    x : ndarray, shape (nx,)
-    gradient_norm : float
-        Largest scaled component of the projected gradient.
-    n_evaluations : int
-        Rollouts of all recordings so far.
-    seconds : float
-        Wall time so far.
-    note : str
-        Anything out of the ordinary, such as a shortened horizon.
+    `gradient_norm` is the largest scaled component of the projected gradient; rollouts of all recordings and wall time
+    [s] are counted from the start; `note` says anything out of the ordinary, such as a shortened horizon.
     """
 
     iteration: int
@@ -88,27 +77,21 @@ class Solution(ReprMixin):
 
     Attributes
     ----------
-    status : Status
     message : str
         Why it ended, and what to try where it did not converge.
     unknown_names : tuple of str
-        Unknowns, in the order of `x`.
-    x : ndarray, shape (nx,)
-        Unknown vector of lowest cost.
+        In the order of `x`, the unknown vector of lowest cost, shape (nx,).
     covariance : ndarray, shape (nx, nx)
         From the data and stated priors (the weak prior excluded), scaled by chi2 per degree of freedom above one, and
-        counting the misfit where the model does not explain the data (`judgement._misfit_sandwich_covariance`).
-    parameters : dict of str to Estimate
+        counting the misfit where the model does not explain the data (`uncertainty.covariance_of_fit`).
+    parameters : dict of str to ParameterEstimate
         Free parameters shared by all recordings, and the fixed ones that the problem's model has.
-    cost : float
-    goodness_of_fit : Fit
+    goodness_of_fit : GoodnessOfFit
         Whether the model explains the recordings.
-    history : tuple of Iterate
-    n_iterations, n_evaluations : int
     wall_time : float
+        [s]
     evaluation : Evaluation or None
         At `x`.
-    solver_name : str
     problem : EstimationProblem, optional
         Problem as solved, whitened at `x`.
     """
@@ -122,7 +105,6 @@ class Solution(ReprMixin):
     cost: float
     goodness_of_fit: GoodnessOfFit
     history: tuple[Iterate, ...]
-    n_iterations: int
     n_evaluations: int
     wall_time: float
     evaluation: Evaluation | None
@@ -141,16 +123,18 @@ class Solution(ReprMixin):
         return ReprSummary(", ".join(filter(None, (how, *told, more, fit))), rows)
 
     @property
+    def n_iterations(self) -> int:
+        """Number of accepted steps."""
+        return max(len(self.history) - 1, 0)
+
+    @property
     def std(self) -> dict[str, float]:
         """Standard deviation of every shared free parameter."""
         return {name: entry.std for name, entry in self.parameters.items() if entry.free}
 
     @cached_property
     def episode_predictions(self) -> tuple[EpisodePrediction | str, ...]:
-        """Prediction of each recording from its recorded torques minus their offsets; empty without a result.
-
-        A recording whose rollout fails under these torques has the error message in place of a prediction.
-        """
+        """Prediction of each recording from its recorded torques minus their offsets, or why its rollout fails."""
         if self.evaluation is None or self.problem is None or not self.problem.has_process_noise:
             return () if self.evaluation is None else self.evaluation.episode_predictions
         problem = whitened_by_sensor_noise(self.problem)
@@ -194,10 +178,9 @@ IterationCallback = Callable[[Iterate], None]
 
 @dataclass(frozen=True)
 class SolverResult:
-    """Raw result of a solver: best unknown vector, termination status, message and history.
+    """Raw result of a solver: its best unknown vector, and the equilibria there where they are known.
 
-    `equilibrium_guesses` are those at the best point, where known. `stopped_at_noise_level`: the search ended because
-    many steps reduced the cost negligibly compared with the noise.
+    `stopped_at_noise_level`: the search ended because many steps reduced the cost negligibly compared with the noise.
     """
 
     status: Status
@@ -211,7 +194,12 @@ class SolverResult:
 
 @runtime_checkable
 class Solver(Protocol):
-    """Interface of a solver: a frozen dataclass of settings, registered under its name."""
+    """Interface of a solver: a frozen dataclass of settings, registered under its name.
+
+    It may say besides whether it needs a rollout from its start (`needs_rollout`, True), whether it can whiten
+    residuals by process noise (`uses_process_noise_covariance`, False) or has the errors of torques as unknowns
+    (`estimates_torque_errors`, False).
+    """
 
     @property
     def name(self) -> str:
@@ -227,7 +215,6 @@ class Solver(Protocol):
 
 SOLVERS: Registry[type[Solver]] = Registry("solver")
 _DEFAULT_SOLVER = "gauss_newton"
-"""Name of the default solver."""
 
 
 @dataclass
@@ -242,10 +229,9 @@ class IterationRecorder:
     def record_iterate(self, cost: float, x: Array, gradient: float, note: str = "") -> None:
         """Record an accepted iterate."""
         seconds = time.perf_counter() - self.start_time
-        entry = Iterate(len(self.history), cost, x.copy(), gradient, self.n_evaluations, seconds, note)
-        self.history.append(entry)
+        self.history.append(Iterate(len(self.history), cost, x.copy(), gradient, self.n_evaluations, seconds, note))
         if self.callback is not None:
-            self.callback(entry)
+            self.callback(self.history[-1])
 
     def result(
         self, status: Status, message: str, x: Array, equilibrium_guesses: EquilibriumGuesses | None = None
@@ -294,14 +280,13 @@ def solve(
 
     Parameters
     ----------
-    problem : EstimationProblem
     solver : Solver, optional
         `GaussNewton()` when absent.
     initial_unknowns : sequence of float, optional
-        Initial unknown vector; the problem's when absent.
+        The problem's when absent.
     callback : callable, optional
         Called with every `Iterate`.
-    limits : GapCriteria, optional
+    limits : GapCriteria
         Criteria for a residual that exceeds noise.
     restarts : bool
         Whether a poor fit is started again from other initial values.
@@ -345,15 +330,14 @@ class _MultiStartSearch:
 
     def restart(self, first: Array, limits: GapCriteria) -> None:
         """Try other starts as far as the best fit so far gives reason to."""
-        problem, noisy = self._problem, self._problem.has_process_noise
+        noisy, most = self._problem.has_process_noise, 1 + len(RESTART_FACTORS)
         for factor in RESTART_FACTORS:
-            if _good_fit(problem, self._best.evaluation):
+            if _good_fit(self._problem, self._best.evaluation):
                 break
-            self._try(self._multiple(first, factor), f"initial values x {factor:g}", 1 + len(RESTART_FACTORS))
+            self._try(self._multiple(first, factor), f"initial values x {factor:g}", most)
         once = self._n_fits == 1 and noisy and _accounts_for_process_noise(self._solver)
         if once and np.any(_doubtful(self._best, first)):
-            factor = RESTART_FACTORS[0]
-            self._try(self._multiple(first, factor), f"initial values x {factor:g}", 2)
+            self._try(self._multiple(first, RESTART_FACTORS[0]), f"initial values x {RESTART_FACTORS[0]:g}", 2)
         if not uses_process_noise_covariance(self._solver):
             return
         most = self._n_starts + len(_NEARBY_START_FACTORS)
@@ -401,7 +385,6 @@ class _MultiStartSearch:
             finish.cost,
             fit,
             tuple(self._history),
-            max(len(self._history) - 1, 0),
             self._n_evaluations,
             time.perf_counter() - self._begun,
             finish if finish.ok else None,

@@ -16,8 +16,6 @@ VERDICT_PREDICATES: Mapping[str, str] = {
 """Sentence predicate for a parameter of each verdict."""
 VERDICT_WORDS: Mapping[str, str] = {verdict: text.removeprefix("is ") for verdict, text in VERDICT_PREDICATES.items()}
 """Table text of each verdict."""
-_DIAGNOSE_HINT = "run `yid-ocp diagnose`"
-"""Advice where the model does not explain the recordings."""
 
 
 def fit_message(chi2_per_dof: float | None, explains: bool) -> str:
@@ -28,20 +26,11 @@ def fit_message(chi2_per_dof: float | None, explains: bool) -> str:
     if explains:
         return f"the model explains the recordings to within their noise ({size})"
     said = f"the model does not explain the recordings ({size}, 1 is noise alone)"
-    return f"{said}: no number is to be trusted; {_DIAGNOSE_HINT}"
+    return f"{said}: no number is to be trusted; run `yid-ocp diagnose`"
 
 
 def parameter_text(value: float, std: float | None, interval: tuple[float | None, float | None] | None) -> str:
-    """Format a value with its 95 % interval, or else its standard deviation where it has one.
-
-    Parameters
-    ----------
-    value : float
-    std : float, optional
-        None where the data do not inform the value.
-    interval : (float or None, float or None), optional
-        95 %.
-    """
+    """Format a value with its 95 % interval, or else its standard deviation where the data inform it."""
     if interval is not None and interval != (None, None):
         return f"{value:.4g} ({interval_text(*interval)})"
     return f"{value:.4g}" if std is None else f"{value:.4g} ± {std:.2g}"

@@ -6,8 +6,6 @@ import itertools
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +13,6 @@ from numpy.typing import NDArray
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference.linearized_residual import bounded_least_squares_step, predicted_reduction
 from yid_ocp.integrator.rollout import generalized_momentum, simulate
-from yid_ocp.integrator.step_model import Rollout, TrackingFeedback
 from yid_ocp.integrator.tracking_feedback import lqr_feedback
 from yid_ocp.problem.episodes import Episode, InitialState
 from yid_ocp.problem.estimation_problem import EstimationProblem
@@ -27,12 +24,8 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 
-class _MisfitFunction(Protocol):
-    """Mean square whitened residual of recording `i` with given node states, at unknowns `x` of the problem."""
-
-    def __call__(self, i: int, nodes: Array, x: Array) -> float: ...
-
-
+_MisfitFunction = Callable[[int, Array, Array], float]
+"""Mean square whitened residual of a recording, by its number, with given node states, at unknowns of the problem."""
 # Values tried of every shape parameter, across its range.
 _N_SHAPE_VALUES = 4
 # Part of an amplitude's range at which an effect begins that has no slope at its neutral value, and at the least.
@@ -49,16 +42,9 @@ _EQUILIBRIUM_SPACING = 0.1
 
 @dataclass(frozen=True)
 class NodeStateGuess:
-    """Initial guess of parameters, node states and multipliers.
+    """Initial guess of the unknowns x, and of every recording's initial state at x, nodes and multipliers.
 
-    Attributes
-    ----------
-    x : ndarray, shape (nx,)
-        Unknowns of the problem.
-    initial_states : tuple of Start
-        Initial states of all recordings at `x`.
-    node_states, multipliers : tuple of ndarray
-        Of every recording, (K + 1, nx) at the nodes and (K, m) or (N, m).
+    Node states have the shape (K + 1, nx), multipliers (K, m) or (N, m).
     """
 
     x: Array
@@ -74,15 +60,7 @@ def guess_node_states(
 
     A recording's states are the rollout under the tracking filter, which has no defects, or, where that fails or strays
     from what was measured, every node at rest at the posture that the arms had then, which has defects but follows the
-    data.
-
-    Parameters
-    ----------
-    problem : EstimationProblem
-    nodes : sequence of ndarray of int, shape (K + 1,)
-        Of every recording.
-    x : ndarray, shape (nx,)
-    misfit : callable
+    data. `nodes`, of every recording, have the shape (K + 1,).
     """
     lower, upper = problem.bounds
     best: tuple[float, NodeStateGuess] | None = None
@@ -92,12 +70,17 @@ def guess_node_states(
         for i, episode in enumerate(problem.episodes):
             theta = problem.predictor.episode_theta(episode, problem.split(moved, i)[0])
             begins.append(problem.initial_state(episode, theta))
-
-            judged = partial(misfit, i, x=moved)
-            size, state, pull = _node_states(problem, episode, nodes[i], theta, begins[-1], judged)
+            found: list[tuple[Array, Array]] = []
+            if not begins[-1].failure_message:
+                found += _tracked(problem, episode, nodes[i], theta, begins[-1].state)
+            sizes = [misfit(i, state, moved) for state, _ in found]
+            if not found or sizes[0] > _POOR_GUESS_CHI2:
+                found.append(_resting(problem, episode, nodes[i], theta, begins[-1].state))
+                sizes.append(misfit(i, found[-1][0], moved))
+            state, pull = found[int(np.argmin(sizes))]
             states.append(state)
             multipliers.append(pull)
-            total += size / len(problem.episodes)
+            total += min(sizes) / len(problem.episodes)
         if best is None or total < best[0]:
             best = total, NodeStateGuess(moved, tuple(begins), tuple(states), tuple(multipliers))
         if best[0] <= _POOR_GUESS_CHI2 or not np.any(problem.is_positive):
@@ -117,37 +100,18 @@ def mean_square_residual(problem: EstimationProblem, i: int, trajectory: Array, 
     return float(np.mean(np.concatenate(parts) ** 2))
 
 
-def _node_states(
-    problem: EstimationProblem,
-    episode: Episode,
-    nodes: NDArray[np.int64],
-    theta: Array,
-    begin: InitialState,
-    misfit: Callable[[Array], float],
-) -> tuple[float, Array, Array]:
-    """Misfit, node states and multipliers of one recording."""
-    found: list[tuple[float, Array, Array]] = []
-    rollout = None if begin.failure_message else _tracked(problem, episode, theta, begin.state)
-    if rollout is not None and rollout.status.is_converged:
-        state = rollout.state[nodes]
-        found.append((misfit(state), state, rollout.multipliers))
-    if not found or found[0][0] > _POOR_GUESS_CHI2:
-        state, pull = _resting(problem, episode, nodes, theta, begin.state)
-        found.append((misfit(state), state, pull))
-    return min(found, key=lambda entry: entry[0])
-
-
-def _tracked(problem: EstimationProblem, episode: Episode, theta: Array, start: Array) -> Rollout:
-    feedback = _tracking(problem, episode, theta)
-    return simulate(problem.step, theta, start, episode.grid.steps, episode.torque, episode.prescribed_path, feedback)
-
-
-def _tracking(problem: EstimationProblem, episode: Episode, theta: Array) -> TrackingFeedback | None:
+def _tracked(
+    problem: EstimationProblem, episode: Episode, nodes: NDArray[np.int64], theta: Array, start: Array
+) -> list[tuple[Array, Array]]:
+    """Node states and multipliers of the rollout under the tracking filter; none where it fails."""
     feedback = episode.tracking_feedback
     if feedback is None and problem.system.driven and not problem.system.servos:
         smooth = LowPassFilter(problem.options.path_cutoff)(episode.grid.node_times, episode.measured_driven_angles)
-        return lqr_feedback(problem.step, smooth, episode.torque, theta, arms=problem.model_functions.arms_only_step)
-    return feedback
+        arms = problem.model_functions.arms_only_step
+        feedback = lqr_feedback(problem.step, smooth, episode.torque, theta, arms=arms)
+    inputs = episode.grid.steps, episode.torque, episode.prescribed_path, feedback
+    rollout = simulate(problem.step, theta, start, *inputs)
+    return [(rollout.state[nodes], rollout.multipliers)] if rollout.status.is_converged else []
 
 
 def _resting(
@@ -172,34 +136,28 @@ def _resting(
         else:
             state[j], pull[j] = state[max(j - 1, 0)], pull[max(j - 1, 0)]
     times = nodes * h
-    for column in range(state.shape[1]):
-        state[:, column] = np.interp(times, times[chosen], state[chosen, column])
-    force = np.zeros((len(times), m))
-    for column in range(m):
-        force[:, column] = np.interp(times, times[chosen], pull[chosen, column])
+    for table in (state, pull):
+        for column in range(table.shape[1]):
+            table[:, column] = np.interp(times, times[chosen], table[chosen, column])
     driven = list(problem.system.driven_indices)
     state[:, driven] = episode.measured_driven_angles[nodes]
     velocity = np.gradient(state[:, :n], times, axis=0)
     state[:, n : 2 * n] += generalized_momentum(step, state[:, :n], velocity, theta)
-    return state, force[:-1] * h
+    return state, pull[:-1] * h
 
 
 # -- free effects ------------------------------------------------------------------------------------------------------
 
 
 def initialize_free_effects(problem: EstimationProblem, x: Array) -> Array:
-    """Return an initial unknown vector at which every free effect is slightly active.
+    """An initial unknown vector at which every free effect is slightly active, shape (nx,).
 
     At its neutral value an effect's shape (where a spring is relaxed, how fast a branch creeps) moves nothing, and the
     slope by its amplitude is that of whatever shape the settings name: a spring that would have to push from there
     stays at its bound of zero. So each free effect that starts neutral, one after the other, is tried with several
     shapes; the linear model at the best of them gives its amplitude, within the range that one would expect. Without a
-    shape the neutral value is kept, unless nothing is seen of the amplitude there.
-
-    Returns
-    -------
-    ndarray, shape (nx,)
-        `x` itself where no free effect starts neutral, or where nothing else can be rolled out.
+    shape the neutral value is kept, unless nothing is seen of the amplitude there. It is `x` itself where no free
+    effect starts neutral, or where nothing else can be rolled out.
     """
     place = {name: i for i, name in enumerate(problem.unknown_names)}
     for effect in problem.system.effects:
@@ -246,12 +204,10 @@ def _with_effect_begun(problem: EstimationProblem, x: Array, effect: EffectBase,
         return None
     for at in amplitudes:
         low, high = expected[at]
-        width = high - low
+        width, least = high - low, _MIN_AMPLITUDE_FRACTION * (high - low)
         moved = float(np.clip(best[at] - x[at], -width, width))
-        if abs(moved) < _MIN_AMPLITUDE_FRACTION * width:
-            lower = problem.bounds[0][at]
-            least = _MIN_AMPLITUDE_FRACTION * width
-            moved = -least if moved < 0 and x[at] - least >= lower else least
+        if abs(moved) < least:
+            moved = -least if moved < 0 and x[at] - least >= problem.bounds[0][at] else least
         best[at] = x[at] + moved
     return np.clip(best, *problem.bounds)
 

@@ -41,7 +41,6 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 _MEMORY_WARNING_BYTES = 2e9
-_IPOPT_SUCCESS = {"Solve_Succeeded", "Solved_To_Acceptable_Level"}
 _CONDENSING_NODE_INTERVAL = 20
 
 # Condensing. Largest factor by which one iteration changes an unknown that is positive by nature.
@@ -125,33 +124,24 @@ class MultipleShooting:
     # -- IPOPT --------------------------------------------------------------------------------------------------------
 
     def _check_ipopt_settings(self) -> None:
+        told: tuple[str, ...] = ()
         if self.hessian not in ("gauss_newton", "exact"):
-            raise SolverError(
-                f"hessian = '{self.hessian}'",
-                where="solver.hessian",
-                allowed="gauss_newton, exact",
-                hint="limited-memory updates cannot learn thousands of node states in a few dozen iterations",
-            )
-        if str(self.ipopt.get("hessian_approximation", "exact")) != "exact":
-            raise SolverError(
-                "limited-memory Hessians are refused",
-                where="solver.ipopt.hessian_approximation",
-                allowed="exact",
-                hint="the node states number in the thousands; use hessian: gauss_newton",
-            )
-        if self.node_interval not in (None, 1):
-            raise SolverError(
-                f"node_interval = {self.node_interval} without condensing",
-                where="solver.node_interval",
-                allowed="1",
-                hint="condensing: true eliminates the steps between nodes",
-            )
+            hint = "limited-memory updates cannot learn thousands of node states in a few dozen iterations"
+            told = f"hessian = '{self.hessian}'", "hessian", "gauss_newton, exact", hint
+        elif str(self.ipopt.get("hessian_approximation", "exact")) != "exact":
+            hint = "the node states number in the thousands; use hessian: gauss_newton"
+            told = "limited-memory Hessians are refused", "ipopt.hessian_approximation", "exact", hint
+        elif self.node_interval not in (None, 1):
+            hint = "condensing: true eliminates the steps between nodes"
+            told = f"node_interval = {self.node_interval} without condensing", "node_interval", "1", hint
+        if told:
+            raise SolverError(told[0], where=f"solver.{told[1]}", allowed=told[2], hint=told[3])
 
     def _by_ipopt(self, problem: EstimationProblem, start: Array, recorder: IterationRecorder) -> SolverResult:
         program = transcribe(problem, start)
         assert program.ridge is not None
-        ridge = _AdaptiveRidge(program.ridge.scale)
-        program = replace(program, ridge=replace(program.ridge, factor=_RidgeFactor(ridge, program.w.numel())))
+        ridge = _AdaptiveRidge(program.ridge.scale, program.w.numel())
+        program = replace(program, ridge=replace(program.ridge, factor=ridge))
         needed, free = program.estimated_memory(self.hessian), available_memory()
         size = f"{program.w.numel()} unknowns, {program.g.numel()} equations, about {needed / 1e9:.2g} GB of memory"
         log.log(logging.WARNING if needed > _MEMORY_WARNING_BYTES else logging.INFO, "IPOPT on %s", size)
@@ -200,12 +190,13 @@ class MultipleShooting:
         return {**QUIET_OPTIONS, "no_nlp_grad": True, "ipopt": {**ipopt, **self.ipopt}}
 
     def _ipopt_status(self, returned: str, defect: float) -> tuple[Status, str]:
-        if returned in _IPOPT_SUCCESS:
-            return Status.CONVERGED, f"IPOPT: {returned}, largest defect {defect:.1e}"
+        closed = f"largest defect {defect:.1e}"
+        if returned in ("Solve_Succeeded", "Solved_To_Acceptable_Level"):
+            return Status.CONVERGED, f"IPOPT: {returned}, {closed}"
         if returned == "Maximum_Iterations_Exceeded":
-            limit = f"IPOPT stopped after {self.max_iterations} iterations, largest defect {defect:.1e}"
+            limit = f"IPOPT stopped after {self.max_iterations} iterations, {closed}"
             return Status.ITERATION_LIMIT, f"{limit}; raise solver.max_iterations"
-        return Status.STALLED, f"IPOPT: {returned}, largest defect {defect:.1e}; start nearer, or use gauss_newton"
+        return Status.STALLED, f"IPOPT: {returned}, {closed}; start nearer, or use gauss_newton"
 
     # -- condensing ---------------------------------------------------------------------------------------------------
 
@@ -256,12 +247,21 @@ class MultipleShooting:
         return ended(Status.ITERATION_LIMIT, limit)
 
 
-class _AdaptiveRidge:
+class _AdaptiveRidge(ca.Callback):
     """Factor of a ridge that rises where parameters swing to and fro, and falls where they keep going."""
 
-    def __init__(self, scale: Array) -> None:
+    def __init__(self, scale: Array, size: int) -> None:
+        ca.Callback.__init__(self)
         self.factor = MIN_RIDGE_FACTOR
-        self._scale, self._change = scale, np.zeros(len(scale))
+        self._scale, self._change, self._size = scale, np.zeros(len(scale)), size
+        self.construct("factor", {})
+
+    def get_sparsity_in(self, _: int) -> ca.Sparsity:
+        return ca.Sparsity.dense(self._size, 1)
+
+    def eval(self, _: Sequence[ca.DM]) -> list[float]:
+        """The factor, whatever the point is."""
+        return [self.factor]
 
     def update(self, before: Array, after: Array) -> None:
         """Take note of an iterate."""
@@ -269,22 +269,6 @@ class _AdaptiveRidge:
         turned = float(change @ self._change) < 0
         self.factor = 4.0 * self.factor if turned else max(0.5 * self.factor, MIN_RIDGE_FACTOR)
         self._change = change
-
-
-class _RidgeFactor(ca.Callback):
-    """The factor of a ridge, as CasADi asks for it."""
-
-    def __init__(self, ridge: _AdaptiveRidge, size: int) -> None:
-        ca.Callback.__init__(self)
-        self._ridge, self._size = ridge, size
-        self.construct("factor", {})
-
-    def get_sparsity_in(self, _: int) -> ca.Sparsity:
-        return ca.Sparsity.dense(self._size, 1)
-
-    def eval(self, _: Sequence[ca.DM]) -> list[float]:
-        """Whatever the point is."""
-        return [self._ridge.factor]
 
 
 class _Watch(ca.Callback):
@@ -303,21 +287,12 @@ class _Watch(ca.Callback):
         self._problem, self._program, self._functions = problem, program, functions
         cost = float(functions(program.initial_guess, program.parameter_values)[0])
         self.unit = max(cost, 0.5 * program.residual.numel() * problem.data_noise_unit**2)
-        self._sizes = {"x": program.w.numel(), "f": 1, "g": program.g.numel(), "lam_x": program.w.numel()}
-        self._sizes |= {"lam_g": program.g.numel(), "lam_p": program.p.numel()}
+        nw, ng = program.w.numel(), program.g.numel()
+        self._sizes = {"x": nw, "f": 1, "g": ng, "lam_x": nw, "lam_g": ng, "lam_p": program.p.numel()}
         self.construct("watch", {})
 
     def get_n_in(self) -> int:
         return ca.nlpsol_n_out()
-
-    def get_n_out(self) -> int:
-        return 1
-
-    def get_name_in(self, i: int) -> str:
-        return str(ca.nlpsol_out(i))
-
-    def get_name_out(self, _: int) -> str:
-        return "stop"
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
         return ca.Sparsity.dense(self._sizes[ca.nlpsol_out(i)], 1)
@@ -475,11 +450,7 @@ class _ShootingIntervals:
     def _condensed(
         self, i: int, theta: Array, start: InitialState, nodes: Array
     ) -> tuple[Array, Array, Array, Array, float] | str:
-        """Trajectory and node states' derivatives by (free parameters and start, closing of defects); largest defect.
-
-        Returns the trajectory (N + 1, nx), its derivatives (N + 1, nx, width + 1), those of the nodes by the unknowns
-        and by closing the defects, and the largest defect.
-        """
+        """Trajectory (N + 1, nx), its and the nodes' derivatives by unknowns and closing of defects; largest defect."""
         wanted, by_start = self.problem.unknowns.free_parameters, start.state_sensitivity
         nx, width = by_start.shape
         steps = self.problem.episodes[i].grid.steps

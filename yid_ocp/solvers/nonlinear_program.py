@@ -23,6 +23,7 @@ from yid_ocp.errors import SolverError, nearest_name_hint
 from yid_ocp.parallel import CASADI_LOCK
 from yid_ocp.solvers.program_terms import (
     IndexArray,
+    MadeOnce,
     ProgramTerm,
     ResidualTerm,
     RidgeRegularization,
@@ -45,20 +46,43 @@ _SIZE_DEPENDENT_OPTIONS = ("iteration_callback", "discrete", "equality", "struct
 
 @dataclass(frozen=True)
 class VectorBlock:
-    """Named block of a program's variables or parameters.
-
-    Attributes
-    ----------
-    index : ndarray of int, shape (rows, columns)
-        Indices in the vector.
-    row_names : tuple of str
-        Name of every row.
-    unit : str
-    """
+    """Named block of a program's variables or parameters: indices in the vector, shape (rows, columns), rows' names."""
 
     index: IndexArray
     row_names: tuple[str, ...]
     unit: str = ""
+
+
+@dataclass
+class VectorLayout:
+    """A vector of blocks that are laid one after the other, with values and bounds."""
+
+    size: int = 0
+    blocks: dict[str, VectorBlock] = field(default_factory=dict)
+    values: list[Array] = field(default_factory=list)
+    lower: list[Array] = field(default_factory=list)
+    upper: list[Array] = field(default_factory=list)
+
+    def extend(self, values: Array, lower: float | Array = -math.inf, upper: float | Array = math.inf) -> IndexArray:
+        """Lay values down; their places."""
+        self.values.append(values)
+        self.lower.append(np.broadcast_to(lower, values.shape).astype(float))
+        self.upper.append(np.broadcast_to(upper, values.shape).astype(float))
+        self.size += len(values)
+        return np.arange(self.size - len(values), self.size)
+
+    def name(self, name: str, index: IndexArray, rows: Sequence[str], unit: str = "") -> None:
+        """Name places, unless there are none."""
+        if index.size:
+            self.blocks[name] = VectorBlock(index, tuple(rows), unit)
+
+    def add(self, name: str, values: Array, rows: Sequence[str], unit: str = "") -> IndexArray:
+        """Lay a block down, column by column; its places, (rows, columns)."""
+        table = np.asarray(values, float)
+        table = table[:, None] if table.ndim == 1 else table
+        index = self.extend(table.ravel(order="F")).reshape(table.shape, order="F")
+        self.name(name, index, rows, unit)
+        return index
 
 
 @dataclass(frozen=True)
@@ -88,22 +112,17 @@ class NonlinearProgram(ReprMixin):
 
     Attributes
     ----------
-    variables, parameters : mapping of str to Block
-        What `w` and `p` are made of.
-    constraint_terms : tuple of Term
+    variables, parameters : mapping of str to VectorBlock
+        What the columns `w` of unknowns and `p` of parameters are made of.
+    constraint_terms : tuple of ProgramTerm
         Equalities, one below the other in `g`.
-    residual_terms : tuple of Residual
+    residual_terms : tuple of ResidualTerm
         Their losses make the objective.
-    lower, upper : ndarray, shape (nw,)
-        Bounds of `w`.
-    initial_guess : ndarray, shape (nw,)
-        Guess of `w`.
+    lower, upper, initial_guess : ndarray, shape (nw,)
+        Of `w`.
     parameter_values : ndarray, shape (np,)
         Of `p`.
-    ridge : Ridge or None
-    w, p : casadi.MX
-        Unknowns and parameters, columns.
-    user_terms : tuple of Extra
+    user_terms : tuple
         What `with_user_terms` added.
     """
 
@@ -119,7 +138,6 @@ class NonlinearProgram(ReprMixin):
     w: ca.MX
     p: ca.MX
     user_terms: tuple[_UserTerms, ...] = ()
-    _kept: dict[str, Any] = field(default_factory=dict, repr=False)
 
     def _summary(self) -> ReprSummary:
         rows = [("block", "entries"), *((name, str(block.index.size)) for name, block in self.variables.items())]
@@ -171,22 +189,17 @@ class NonlinearProgram(ReprMixin):
         ]
         return (*terms, *(f"added.{i}" for i in range(sum(len(extra.lower) for extra in self.user_terms))))
 
-    @property
+    @MadeOnce
     def f(self) -> ca.MX:
         """Objective."""
-        return self._once(
-            "f", lambda: sum((self._loss(i) for i in range(len(self.residual_terms))), ca.MX(0)) + self._own()
-        )
+        own = sum((extra.objective for extra in self.user_terms), ca.MX(0))
+        return sum(self._losses, ca.MX(0)) + own
 
-    @property
+    @MadeOnce
     def g(self) -> ca.MX:
         """Constraints, shape (ng, 1)."""
-
-        def made() -> ca.MX:
-            terms = (term.values(self.w, self.p) for term in self.constraint_terms)
-            return ca.vertcat(ca.MX(0, 1), *terms, *(extra.constraints for extra in self.user_terms))
-
-        return self._once("g", made)
+        terms = (term.values(self.w, self.p) for term in self.constraint_terms)
+        return ca.vertcat(ca.MX(0, 1), *terms, *(extra.constraints for extra in self.user_terms))
 
     @property
     def nlp(self) -> dict[str, ca.MX]:
@@ -203,123 +216,112 @@ class NonlinearProgram(ReprMixin):
 
     # -- derivatives --------------------------------------------------------------------------------------------------
 
+    @MadeOnce
+    def _residuals(self) -> list[ca.MX]:
+        return [term.values(self.w, self.p) for term in self.residual_terms]
+
+    @MadeOnce
+    def _slopes(self) -> list[ca.MX]:
+        return [term.jacobian(self.w, self.p) for term in self.residual_terms]
+
     @property
+    def _losses(self) -> list[ca.MX]:
+        return [term.evaluate_loss(r) for term, r in zip(self.residual_terms, self._residuals, strict=True)]
+
+    @MadeOnce
     def residual(self) -> ca.MX:
         """All residuals, shape (nr, 1)."""
-        parts = (self._residual(i) for i in range(len(self.residual_terms)))
-        return self._once("r", lambda: ca.vertcat(ca.MX(0, 1), *parts))
+        return ca.vertcat(ca.MX(0, 1), *self._residuals)
 
-    @property
+    @MadeOnce
     def jac_r(self) -> ca.MX:
         """dr/dw, sparse."""
-        parts = (self._slope(i) for i in range(len(self.residual_terms)))
-        return self._once("jac_r", lambda: ca.vertcat(ca.MX(0, self.w.numel()), *parts))
+        return ca.vertcat(ca.MX(0, self.w.numel()), *self._slopes)
 
-    @property
+    @MadeOnce
     def jac_g(self) -> ca.MX:
         """dg/dw, sparse."""
-        return self._once("jac_g", self._jacobian)
-
-    @property
-    def grad_f(self) -> ca.MX:
-        """df/dw, shape (nw, 1)."""
-        return self._once("grad_f", self._gradient)
-
-    @property
-    def lam_f(self) -> ca.MX:
-        """Factor on the objective in the Lagrangian, of which `hessian` is an expression."""
-        return self._once("lam_f", lambda: ca.MX.sym("lam_f"))
-
-    @property
-    def lam_g(self) -> ca.MX:
-        """Multipliers of the constraints in the Lagrangian, shape (ng, 1)."""
-        return self._once("lam_g", lambda: ca.MX.sym("lam_g", self.g.numel()))
-
-    def hessian(self, kind: HessianKind = "gauss_newton") -> ca.MX:
-        """Hessian of lam_f f + lam_g . g, exact or Gauss-Newton, sparse and symmetric.
-
-        Gauss-Newton leaves out the curvature of residuals and of `constraint_terms`, not of what was added.
-        """
-        return self._once(kind, lambda: self._data_curvature(kind) + self._other_curvature(kind))
-
-    def _data_curvature(self, kind: HessianKind) -> ca.MX:
-        size = self.w.numel()
-        total = ca.MX(size, size)
-        for i, residual in enumerate(self.residual_terms):
-            r, slope = self._residual(i), self._slope(i)
-            weight = residual.hessian_weight(r, kind == "exact")
-            weighted = slope if weight is None else ca.mtimes(ca.diag(weight), slope)
-            total += self.lam_f * ca.mtimes(slope.T, weighted)
-            if kind == "exact":
-                matrix, pull = residual.jacobian_by_values(self.p), residual.loss_gradient(r)
-                pull = pull if matrix is None else ca.mtimes(matrix.T, pull)
-                curved = residual.term.hessian_entries(self.w, self.p, self.lam_f * pull)
-                total += 0 if curved is None else sum_duplicate_entries(*curved, size)
-        return total
-
-    def _other_curvature(self, kind: HessianKind) -> ca.MX:
-        size, at = self.w.numel(), 0
-        total = ca.MX(size, size)
-        if kind == "gauss_newton" and self.ridge is not None:
-            total += self.lam_f * self._ridge(self.ridge)
-        for term in self.constraint_terms:
-            weight = self.lam_g[at : at + term.n_values]
-            at += term.n_values
-            curved = term.hessian_entries(self.w, self.p, weight) if kind == "exact" else None
-            total += 0 if curved is None else sum_duplicate_entries(*curved, size)
-        for extra in self.user_terms:
-            weight = self.lam_g[at : at + len(extra.lower)]
-            at += len(extra.lower)
-            total += ca.hessian(self.lam_f * extra.objective + ca.dot(weight, extra.constraints), self.w)[0]
-        return total
-
-    def _once(self, name: str, make: Any) -> Any:
-        with CASADI_LOCK:
-            if name not in self._kept:
-                self._kept[name] = make()
-            return self._kept[name]
-
-    def _own(self) -> ca.MX:
-        return sum((extra.objective for extra in self.user_terms), ca.MX(0))
-
-    def _residual(self, i: int) -> ca.MX:
-        return self._once(f"r{i}", lambda: self.residual_terms[i].values(self.w, self.p))
-
-    def _slope(self, i: int) -> ca.MX:
-        return self._once(f"jac_r{i}", lambda: self.residual_terms[i].jacobian(self.w, self.p))
-
-    def _loss(self, i: int) -> ca.MX:
-        return self.residual_terms[i].evaluate_loss(self._residual(i))
-
-    def _jacobian(self) -> ca.MX:
-        entries, rows, columns, at = [], [], [], 0
+        entries, rows, columns, at = [ca.MX(0, 1)], [np.zeros(0, int)], [np.zeros(0, int)], 0
         for term in self.constraint_terms:
             row, column = term.jacobian_indices()
             entries.append(term.jacobian_entries(self.w, self.p))
             rows.append(at + row)
             columns.append(column)
             at += term.n_values
-        if not entries:
-            placed = ca.MX(0, self.w.numel())
-        else:
-            where = np.concatenate(rows), np.concatenate(columns)
-            placed = assemble_sparse(ca.vertcat(*entries), *where, (at, self.w.numel()))
+        where = np.concatenate(rows), np.concatenate(columns)
+        placed = assemble_sparse(ca.vertcat(*entries), *where, (at, self.w.numel()))
         return ca.vertcat(placed, *(ca.jacobian(extra.constraints, self.w) for extra in self.user_terms))
 
-    def _gradient(self) -> ca.MX:
-        total = ca.gradient(self._own(), self.w) if self.user_terms else ca.MX.zeros(self.w.numel(), 1)
-        for i, residual in enumerate(self.residual_terms):
-            total += ca.mtimes(self._slope(i).T, residual.loss_gradient(self._residual(i)))
+    @MadeOnce
+    def grad_f(self) -> ca.MX:
+        """df/dw, shape (nw, 1)."""
+        own = sum((extra.objective for extra in self.user_terms), ca.MX(0))
+        total = ca.gradient(own, self.w) if self.user_terms else ca.MX.zeros(self.w.numel(), 1)
+        for term, r, slope in zip(self.residual_terms, self._residuals, self._slopes, strict=True):
+            total += ca.mtimes(slope.T, term.loss_gradient(r))
         return total
+
+    @MadeOnce
+    def lam_f(self) -> ca.MX:
+        """Factor on the objective in the Lagrangian, of which `hessian` is an expression."""
+        return ca.MX.sym("lam_f")
+
+    @MadeOnce
+    def lam_g(self) -> ca.MX:
+        """Multipliers of the constraints in the Lagrangian, shape (ng, 1)."""
+        return ca.MX.sym("lam_g", self.g.numel())
+
+    @MadeOnce
+    def _hessians(self) -> dict[HessianKind, ca.MX]:
+        return {}
+
+    def hessian(self, kind: HessianKind = "gauss_newton") -> ca.MX:
+        """Hessian of lam_f f + lam_g . g, exact or Gauss-Newton, sparse and symmetric.
+
+        Gauss-Newton leaves out the curvature of residuals and of `constraint_terms`, not of what was added.
+        """
+        with CASADI_LOCK:
+            if kind not in self._hessians:
+                self._hessians[kind] = self._data_curvature(kind == "exact") + self._other_curvature(kind == "exact")
+            return self._hessians[kind]
+
+    def _data_curvature(self, exact: bool) -> ca.MX:
+        total = ca.MX(self.w.numel(), self.w.numel())
+        for residual, r, slope in zip(self.residual_terms, self._residuals, self._slopes, strict=True):
+            weight = residual.hessian_weight(r, exact)
+            weighted = slope if weight is None else ca.mtimes(ca.diag(weight), slope)
+            total += self.lam_f * ca.mtimes(slope.T, weighted)
+            if exact:
+                matrix, pull = residual.jacobian_by_values(self.p), residual.loss_gradient(r)
+                pull = pull if matrix is None else ca.mtimes(matrix.T, pull)
+                total += self._curvature(residual.term, self.lam_f * pull)
+        return total
+
+    def _other_curvature(self, exact: bool) -> ca.MX:
+        total, at = ca.MX(self.w.numel(), self.w.numel()), 0
+        if not exact and self.ridge is not None:
+            total += self.lam_f * self._ridge(self.ridge)
+        for term in self.constraint_terms:
+            total += self._curvature(term, self.lam_g[at : at + term.n_values]) if exact else 0
+            at += term.n_values
+        for extra in self.user_terms:
+            weight = self.lam_g[at : at + len(extra.lower)]
+            at += len(extra.lower)
+            total += ca.hessian(self.lam_f * extra.objective + ca.dot(weight, extra.constraints), self.w)[0]
+        return total
+
+    def _curvature(self, term: ProgramTerm, weight: ca.MX) -> ca.MX | int:
+        """Hessian of weight . values of a term."""
+        curved = term.hessian_entries(self.w, self.p, weight)
+        return 0 if curved is None else sum_duplicate_entries(*curved, self.w.numel())
 
     def _ridge(self, ridge: RidgeRegularization) -> ca.MX:
         count = sum(residual.n_residuals for residual in self.residual_terms)
-        cost = sum((self._loss(i) for i in range(len(self.residual_terms))), ca.MX(0))
         at = ridge.index.tolist()
         size = ca.fmax(ca.fabs(self.w[at]), ca.DM(ridge.scale))
         pattern = ca.Sparsity.triplet(self.w.numel(), self.w.numel(), at, at)
         factor = ridge.factor(self.w) if isinstance(ridge.factor, ca.Function) else ridge.factor
-        return ca.MX(pattern, factor * 2 * cost / count / size**2)
+        return ca.MX(pattern, factor * 2 * sum(self._losses, ca.MX(0)) / count / size**2)
 
     def estimated_memory(self, hessian: HessianKind = "gauss_newton") -> float:
         """Estimated additional memory of an interior-point method with a direct linear solver [bytes]."""
@@ -334,16 +336,9 @@ class NonlinearProgram(ReprMixin):
         lower: ArrayLike = 0.0,
         upper: ArrayLike = 0.0,
     ) -> NonlinearProgram:
-        """The program with a further objective term and further constraint rows.
+        """The program with a further scalar objective term and further constraint rows, expressions of `w` and `p`.
 
-        Parameters
-        ----------
-        objective : casadi.MX
-            Scalar expression of `w` and `p`.
-        constraints : casadi.MX or sequence of them
-            Expressions of `w` and `p`.
-        lower, upper : array_like
-            Bounds of these rows; equalities to zero when absent.
+        Rows without bounds are equalities to zero.
 
         Raises
         ------
@@ -370,23 +365,12 @@ class NonlinearProgram(ReprMixin):
                     allowed=f"one for all, or {column.numel()}",
                 )
             bounds.append(np.broadcast_to(given, (column.numel(),)).copy())
-        return replace(self, user_terms=(*self.user_terms, _UserTerms(scalar, column, *bounds)), _kept={})
+        return replace(self, user_terms=(*self.user_terms, _UserTerms(scalar, column, *bounds)))
 
     def make_solver(self, plugin: str = "ipopt", hessian: HessianKind = "gauss_newton", **options: Any) -> ca.Function:
-        """Make a `casadi.nlpsol` solver of the program that uses its assembled derivatives.
+        """Make a `casadi.nlpsol` solver with the program's assembled derivatives, to be called with `solver_arguments`.
 
-        Parameters
-        ----------
-        plugin : str
-            Any of CasADi's.
-        hessian : "gauss_newton" or "exact"
-        **options
-            Of `casadi.nlpsol`.
-
-        Returns
-        -------
-        casadi.Function
-            To be called with `solver_arguments`.
+        `plugin` is any of CasADi's, `options` those of `casadi.nlpsol`.
 
         Raises
         ------

@@ -8,32 +8,34 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.integrator.compiler import compiled_function
-from yid_ocp.parallel import LockedCache
+from yid_ocp.parallel import CASADI_LOCK
 
 Array = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 
 
-class LocalFunction:
-    """Function y(v; d, s) of local variables v, data d and shared data s, with its derivatives.
+class MadeOnce(cached_property[Any]):
+    """A property that is made once, by one thread at a time."""
 
-    Parameters
-    ----------
-    name : str
-    inputs : sequence of casadi.SX
-        (v, d, s), columns.
-    value : casadi.SX, shape (ny, 1)
-    jacobian : casadi.SX, shape (ny, nv), optional
-        dy/dv; differentiated from the value when absent.
-    use_compiler : bool
-        Whether the derivatives are compiled where that is possible; the value stays CasADi's own, so that whoever
-        builds upon it can differentiate it.
+    def __get__(self, instance: Any, owner: type[Any] | None = None) -> Any:
+        with CASADI_LOCK:
+            return super().__get__(instance, owner)
+
+
+class LocalFunction:
+    """Function y(v; d, s) of the columns v (local variables), d (data) and s (shared data), with its derivatives.
+
+    The `jacobian` dy/dv, shape (ny, nv), is differentiated from the value where it is not given. With `use_compiler`
+    the derivatives are compiled where that is possible; the value stays CasADi's own, so that whoever builds upon it
+    can differentiate it.
     """
 
     def __init__(
@@ -48,18 +50,14 @@ class LocalFunction:
         self.value = ca.Function(name, self._inputs, [value])
         slopes = ca.jacobian(value, inputs[0]) if jacobian is None else jacobian
         self.jacobian = self._compiled(ca.Function(f"{name}_slope", self._inputs, ca.cse([ca.sparsify(slopes)])))
-        self._curvature: LockedCache[None, ca.Function | None] = LockedCache(lambda _: self._curved())
-
-    @property
-    def curvature(self) -> ca.Function | None:
-        """Second derivative of weight . y by v at (v, d, s, weight), sparse; None where y is linear."""
-        return self._curvature(None)
 
     def _compiled(self, function: ca.Function) -> ca.Function:
         return compiled_function(function) if self._use_compiler else function
 
-    def _curved(self) -> ca.Function | None:
-        """One product with a direction, for each colour of the pattern: the whole would be millions of operations."""
+    @MadeOnce
+    def curvature(self) -> ca.Function | None:
+        """Second derivative of weight . y by v at (v, d, s, weight), sparse; None where y is linear."""
+        # one product with a direction, for each colour of the pattern: the whole would be millions of operations
         v, weight = self._inputs[0], ca.SX.sym("weight", self._expression.numel())
         gradient = ca.gradient(ca.dot(weight, self._expression), v)
         pattern = ca.jacobian_sparsity(gradient, v)
@@ -86,10 +84,8 @@ class ProgramTerm:
 
     Attributes
     ----------
-    name : str
     row_names : tuple of str
         Names of the ny outputs.
-    local_function : Local
     variable_indices : ndarray of int, shape (K, nv)
         Indices of each place's local variables among the unknowns; none twice in a row.
     data_indices : ndarray of int, shape (K, nd)
@@ -110,27 +106,21 @@ class ProgramTerm:
         """Number of values at all places."""
         return len(self.row_names) * len(self.variable_indices)
 
-    def gather_arguments(self, w: ca.MX, p: ca.MX) -> tuple[ca.MX, ca.MX, ca.MX]:
-        """Gather local variables (nv, K), data (nd, K) and shared data (ns, 1)."""
-
-        def gathered(vector: ca.MX, index: IndexArray) -> ca.MX:
-            return ca.reshape(vector[index.ravel().tolist()], index.shape[1], index.shape[0])
-
-        return gathered(w, self.variable_indices), gathered(p, self.data_indices), p[self.shared_data_indices.tolist()]
-
-    def map_over_places(self, function: ca.Function, *arguments: ca.MX) -> ca.MX:
+    def _map_over_places(self, function: ca.Function, w: ca.MX, p: ca.MX, *more: ca.MX) -> ca.MX:
         """Map a local function over all places, its results side by side."""
-        return function.map(
-            f"{function.name()}_{len(self.variable_indices)}", "serial", len(self.variable_indices), [2], []
-        )(*arguments)
+        count = len(self.variable_indices)
+        pairs = ((w, self.variable_indices), (p, self.data_indices))
+        local = (ca.reshape(vector[at.ravel().tolist()], at.shape[1], count) for vector, at in pairs)
+        mapped = function.map(f"{function.name()}_{count}", "serial", count, [2], [])
+        return mapped(*local, p[self.shared_data_indices.tolist()], *more)
 
     def values(self, w: ca.MX, p: ca.MX) -> ca.MX:
         """Values place by place, shape (ny K, 1)."""
-        return ca.vec(self.map_over_places(self.local_function.value, *self.gather_arguments(w, p)))
+        return ca.vec(self._map_over_places(self.local_function.value, w, p))
 
     def jacobian_entries(self, w: ca.MX, p: ca.MX) -> ca.MX:
         """Nonzero entries of the Jacobian, in the order of `jacobian_indices`."""
-        return _nonzero_values(self.map_over_places(self.local_function.jacobian, *self.gather_arguments(w, p)))
+        return _nonzero_values(self._map_over_places(self.local_function.jacobian, w, p))
 
     def jacobian_indices(self) -> tuple[IndexArray, IndexArray]:
         """Row and column indices of the Jacobian's entries."""
@@ -144,7 +134,7 @@ class ProgramTerm:
         if function is None:
             return None
         weights = ca.reshape(weight, len(self.row_names), len(self.variable_indices))
-        entries = _nonzero_values(self.map_over_places(function, *self.gather_arguments(w, p), weights))
+        entries = _nonzero_values(self._map_over_places(function, w, p, weights))
         row, column = (np.array(x, np.int64) for x in function.sparsity_out(0).get_triplet())
         return entries, self.variable_indices[:, row].ravel(), self.variable_indices[:, column].ravel()
 
@@ -155,7 +145,6 @@ class ResidualTerm:
 
     Attributes
     ----------
-    term : Term
     combination : casadi.DM, shape (nr, ny K), or None
         None takes the values as they are.
     weight_indices, target_indices : ndarray of int, shape (nr,), or None
@@ -197,9 +186,8 @@ class ResidualTerm:
 
     def jacobian(self, w: ca.MX, p: ca.MX) -> ca.MX:
         """dr/dw, shape (nr, nw), sparse."""
-        placed = assemble_sparse(
-            self.term.jacobian_entries(w, p), *self.term.jacobian_indices(), (self.term.n_values, w.numel())
-        )
+        entries, shape = self.term.jacobian_entries(w, p), (self.term.n_values, w.numel())
+        placed = assemble_sparse(entries, *self.term.jacobian_indices(), shape)
         matrix = self.jacobian_by_values(p)
         return placed if matrix is None else ca.mtimes(matrix, placed)
 
@@ -212,9 +200,8 @@ class ResidualTerm:
 
     def loss_gradient(self, r: ca.MX) -> ca.MX:
         """Gradient of the loss by r."""
-        return (
-            r if math.isinf(self.huber_threshold) else ca.fmax(ca.fmin(r, self.huber_threshold), -self.huber_threshold)
-        )
+        limit = self.huber_threshold
+        return r if math.isinf(limit) else ca.fmax(ca.fmin(r, limit), -limit)
 
     def hessian_weight(self, r: ca.MX, exact: bool) -> ca.MX | None:
         """Weight of each residual in the Hessian of the loss; None for ones.

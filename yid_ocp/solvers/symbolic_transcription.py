@@ -14,9 +14,8 @@ the states of their recording, with their standard deviations as priors: at the 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -24,7 +23,7 @@ import scipy.sparse
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import SolverError
-from yid_ocp.integrator.nlp_stage import nlp_stage
+from yid_ocp.integrator.nlp_stage import NlpStage, nlp_stage
 from yid_ocp.integrator.statics import holding_spring_stiffness
 from yid_ocp.parallel import CASADI_LOCK
 from yid_ocp.problem.episodes import Episode
@@ -32,9 +31,8 @@ from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.unknown_vector import MIN_LOG_RATIO
 from yid_ocp.sensors import Sensor, sensor_function
-from yid_ocp.solvers.driven_stage import DrivenStage, FreeParameterSymbols, make_driven_stage
 from yid_ocp.solvers.initial_guess import NodeStateGuess, guess_node_states, mean_square_residual
-from yid_ocp.solvers.nonlinear_program import NonlinearProgram, VectorBlock
+from yid_ocp.solvers.nonlinear_program import NonlinearProgram, VectorLayout
 from yid_ocp.solvers.program_terms import IndexArray, LocalFunction, ProgramTerm, ResidualTerm, RidgeRegularization
 
 Array = NDArray[np.float64]
@@ -50,9 +48,8 @@ def transcribe(
 
     Parameters
     ----------
-    problem : EstimationProblem
     initial_unknowns : array_like, optional, shape (nx,)
-        Unknown vector of the problem near which the guess of the program's unknowns is made; the problem's when absent.
+        Unknown vector near which the guess of the program's unknowns is made; the problem's when absent.
     use_compiler : bool, optional
         Whether the derivatives of a stage are compiled where that is possible; as the problem's step when absent.
 
@@ -76,24 +73,18 @@ def transcribe(
     problem = _about_zero(problem)
     _check_transcribable(problem, "transcribe")
     compiled = problem.step.is_compiled if use_compiler is None else use_compiler
+    start = problem.initial_unknowns if initial_unknowns is None else np.asarray(initial_unknowns, float)
     with CASADI_LOCK:
-        return _Maker(problem, compiled).program(
-            problem.initial_unknowns if initial_unknowns is None else np.asarray(initial_unknowns, float)
-        )
+        return _Maker(problem, compiled).program(start)
 
 
 def _about_zero(problem: EstimationProblem) -> EstimationProblem:
     """The problem with torques as recorded: no offset of theirs is known yet, as it is an unknown."""
-    if not any(
-        episode.input_errors is not None and np.any(episode.input_errors.torque_bias) for episode in problem.episodes
-    ):
+    known = [episode.input_errors for episode in problem.episodes]
+    if not any(e is not None and np.any(e.torque_bias) for e in known):
         return problem
-    episodes = [
-        episode
-        if (e := episode.input_errors) is None
-        else replace(episode, input_errors=replace(e, torque_bias=0.0 * e.torque_bias))
-        for episode in problem.episodes
-    ]
+    zero = [e and replace(e, torque_bias=0.0 * e.torque_bias) for e in known]
+    episodes = [replace(episode, input_errors=e) for episode, e in zip(problem.episodes, zero, strict=True)]
     return problem.with_episodes(episodes, problem.held_out)
 
 
@@ -120,15 +111,10 @@ def _check_transcribable(problem: EstimationProblem, where: str) -> None:
             hint="rename one of the files: blocks have their names",
         )
     for episode in problem.episodes:
-        known = {
-            **episode.known_parameters,
-            **({} if episode.fixed_initial_state is None else episode.fixed_initial_state.fitted_parameters),
-        }
-        both = [name for name in problem.free if name in known]
-        if both:
-            raise SolverError(
-                f"{both[0]} is free and has a known value in a recording", where=f"{where}: {episode.name}"
-            )
+        start = episode.fixed_initial_state
+        known = {*episode.known_parameters, *(() if start is None else start.fitted_parameters)}
+        for name in (name for name in problem.free if name in known):
+            raise SolverError(f"{name} is free and has a known value in a recording", where=f"{where}: {episode.name}")
 
 
 def unknowns_from_program(problem: EstimationProblem, program: NonlinearProgram, w: Array) -> Array:
@@ -149,43 +135,11 @@ def unknowns_from_program(problem: EstimationProblem, program: NonlinearProgram,
     return x
 
 
-@dataclass
-class _Vector:
-    """Blocks laid one after the other, with values and bounds."""
-
-    size: int = 0
-    blocks: dict[str, VectorBlock] = field(default_factory=dict)
-    values: list[Array] = field(default_factory=list)
-    lower: list[Array] = field(default_factory=list)
-    upper: list[Array] = field(default_factory=list)
-
-    def extend(self, values: Array, lower: float | Array = -math.inf, upper: float | Array = math.inf) -> IndexArray:
-        """Lay values down; their places."""
-        self.values.append(values)
-        self.lower.append(np.broadcast_to(lower, values.shape).astype(float))
-        self.upper.append(np.broadcast_to(upper, values.shape).astype(float))
-        self.size += len(values)
-        return np.arange(self.size - len(values), self.size)
-
-    def name(self, name: str, index: IndexArray, rows: Sequence[str], unit: str = "") -> None:
-        """Name places, unless there are none."""
-        if index.size:
-            self.blocks[name] = VectorBlock(index, tuple(rows), unit)
-
-    def add(self, name: str, values: Array, rows: Sequence[str], unit: str = "") -> IndexArray:
-        """Lay a block down, column by column; its places, (rows, columns)."""
-        table = np.asarray(values, float)
-        table = table[:, None] if table.ndim == 1 else table
-        index = self.extend(table.ravel(order="F")).reshape(table.shape, order="F")
-        self.name(name, index, rows, unit)
-        return index
-
-
 @dataclass(frozen=True)
 class _Places:
     """Where the unknowns of one recording stand, and the parameters that drive it.
 
-    `errors` are those of the torque of every step, (N, ne), `first` those of the first angles, as `DrivenStage` wants.
+    `errors` are those of the torque of every step, (N, ne), `first` those of the first angles, as `_DrivenStage` wants.
     """
 
     free: IndexArray
@@ -210,6 +164,79 @@ class _Places:
         return np.hstack([self.torque.T, self.gain.T, self.reference.T])
 
 
+@dataclass(frozen=True, eq=False)
+class _FreeParameterSymbols:
+    """Symbols of the parameters theta: of free ones, nominal values of all, and theta, free symbols where free."""
+
+    names: tuple[str, ...]
+    free: ca.SX
+    nominal: ca.SX
+    theta: ca.SX
+
+
+@dataclass(frozen=True, eq=False)
+class _DrivenStage:
+    """One stage as a function of local variables v = (free, x_k, x_{k+1}, lam_k, errors) and data (ubar, K, xbar).
+
+    `function` gives the stage's rows; `effort` of prescribed joints and `torque` of driven ones have their slopes by v.
+    """
+
+    function: LocalFunction
+    v: ca.SX
+    data: ca.SX
+    state_before: ca.SX
+    state_after: ca.SX
+    effort: tuple[ca.SX, ca.SX]
+    torque: tuple[ca.SX, ca.SX]
+
+
+def _driven_stage(
+    stage: NlpStage,
+    freed: _FreeParameterSymbols,
+    followed: Sequence[int],
+    momentum: Array,
+    noisy: bool,
+    use_compiler: bool,
+) -> _DrivenStage:
+    """The stage with its tracking filter and torque errors, where it has them.
+
+    The torque that acts is u_k = ubar_k - w_k - b - K_k (x_k[followed] - xbar_k) - K_k v_k, without K_k where encoders
+    are measurements, and without the errors where torques are taken as true: the two forms of `inference.whitening`,
+    with the errors themselves in the place of their covariance, so that nothing is linearised. `momentum` (nu, nu) is
+    what torques of the step before add to the momenta that the filter follows.
+    """
+    nx, nu, m, index = stage.x0.numel(), stage.u.numel(), stage.lam.numel(), list(followed)
+    before, after, lam = ca.SX.sym("x0", nx), ca.SX.sym("x1", nx), ca.SX.sym("lam", m)
+    nominal, gain = ca.SX.sym("torque", nu), ca.SX.sym("gain", nu * len(index))
+    reference = ca.SX.sym("reference", len(index))
+    matrix = ca.reshape(gain, len(index), nu).T
+    by_errors = ca.SX(nu, 0)
+    if noisy:
+        # the momentum that was measured has half the impulse of the step before in it: its w is taken for this step's
+        late = ca.mtimes(matrix[:, nu:], momentum) if len(index) > nu else 0.0
+        by_errors = ca.horzcat(*([-ca.SX.eye(nu) - late] * 2), *([-matrix[:, :nu]] if index else []))
+    errors = ca.SX.sym("errors", by_errors.shape[1])
+    by_before = ca.SX(nu, nx)
+    torque = nominal + ca.mtimes(by_errors, errors)
+    if index:
+        torque -= ca.mtimes(matrix, before[index] - reference)
+        by_before[:, index] = -matrix
+    symbols = [stage.x0, stage.x1, stage.lam, stage.u, stage.theta]
+    values = (stage.residual, stage.prescribed_effort)
+    by_free, slopes = stage.parameter_jacobians(freed.names), (stage.residual_jacobians, stage.effort_jacobians)
+    made = []
+    for value, own, by in zip(values, by_free, slopes, strict=True):
+        parts = [value, own, *(by[name] for name in ("x0", "x1", "lam", "u"))]
+        value, own, first, second, pull, by_u = ca.substitute(parts, symbols, [before, after, lam, torque, freed.theta])
+        driven = ca.mtimes(by_u, by_before), ca.mtimes(by_u, by_errors)
+        made.append((value, ca.horzcat(own, first + driven[0], second, pull, driven[1])))
+    (rows, by_v), effort = made
+    by_torque = ca.horzcat(ca.SX(nu, len(freed.names)), by_before, ca.SX(nu, nx + m), by_errors)
+    v, data = ca.vertcat(freed.free, before, after, lam, errors), ca.vertcat(nominal, gain, reference)
+    function = LocalFunction("step", [v, data, freed.nominal], rows, by_v, use_compiler)
+    return _DrivenStage(function, v, data, before, after, effort, (torque, by_torque))
+
+
 class _Maker:
     """Lays out unknowns and parameters of a problem, and makes the terms about them."""
 
@@ -217,15 +244,15 @@ class _Maker:
         self._problem, self._compiled = problem, compiled
         self._step, self._sizes = problem.step, problem.step.sizes
         self._names = problem.unknowns.free_parameters
-        self._w, self._p = _Vector(), _Vector()
+        self._w, self._p = VectorLayout(), VectorLayout()
         system = problem.system
         free, fixed = ca.SX.sym("free", len(self._names)), ca.SX.sym("theta", len(system.parameters))
         theta = ca.SX(fixed)
         for k, name in enumerate(self._names):
             theta[system.parameters.index(name)] = free[k]
-        self._freed = FreeParameterSymbols(self._names, free, fixed, theta)
+        self._freed = _FreeParameterSymbols(self._names, free, fixed, theta)
         self._stage = nlp_stage(self._step.equations, self._step.time_step)
-        self._stages: dict[tuple[bool, bool], DrivenStage] = {}
+        self._stages: dict[tuple[bool, bool], _DrivenStage] = {}
         self._sensors: dict[tuple[Sensor, bool, bool], tuple[LocalFunction, bool]] = {}
 
     def program(self, x: Array) -> NonlinearProgram:
@@ -276,26 +303,17 @@ class _Maker:
     def _laid_out(self, i: int, found: NodeStateGuess, free: IndexArray) -> tuple[_Places, list[ResidualTerm]]:
         """The unknowns of a recording at their guess and what drives it; priors of errors."""
         problem, episode = self._problem, self._problem.episodes[i]
-        system, name, n, nx, m = problem.system, episode.name, *(self._sizes[key] for key in ("n", "nx", "m"))
+        system, name, (n, nx, m) = problem.system, episode.name, (self._sizes[key] for key in ("n", "nx", "m"))
         begin, state, pull = found.initial_states[i], found.node_states[i], found.multipliers[i]
         theta = problem.predictor.episode_theta(episode, problem.split(found.x, i)[0])
         rest = np.zeros(0)
-        if begin.equilibrium is not None:
-            sought = list(problem.model_functions.equilibrium_solver.free_coordinates)
-            rest = np.concatenate(
-                [
-                    begin.equilibrium.state[sought],
-                    begin.equilibrium.state[2 * n :],
-                    begin.equilibrium.constraint_reactions,
-                ]
-            )
+        sought = list(problem.model_functions.equilibrium_solver.free_coordinates)
+        if (found_rest := begin.equilibrium) is not None:
+            parts = found_rest.state[sought], found_rest.state[2 * n :], found_rest.constraint_reactions
+            rest = np.concatenate(parts)
         joints = system.mechanism.joint_names
         grasped = [name for grasp in system.grasps for name in grasp.equation_names]
-        at_rest = [
-            *(joints[k] for k in problem.model_functions.equilibrium_solver.free_coordinates),
-            *system.internal_coordinates,
-            *grasped,
-        ]
+        at_rest = [*(joints[k] for k in sought), *system.internal_coordinates, *grasped]
         rest_at = self._w.extend(rest)
         self._w.name(f"rest[{name}]", rest_at[:, None], at_rest if len(rest) else ())
         table = np.zeros((3, len(state), nx + m))
@@ -321,7 +339,7 @@ class _Maker:
         """Gains (row by row) and reference of the tracking filter at every step."""
         feedback, steps = episode.tracking_feedback, episode.grid.steps
         if feedback is None or not _kind(episode)[0]:
-            return np.zeros((0, steps), np.int64), np.zeros((0, steps), np.int64)
+            return (np.zeros((0, steps), np.int64),) * 2
         driven, joints, n = self._problem.system.driven, self._problem.system.mechanism.joint_names, self._sizes["n"]
         followed = [f"{'q' if row < n else 'p'}.{joints[row % n]}" for row in feedback.state_indices]
         pairs = [f"{joint}, {other}" for joint in driven for other in followed]
@@ -332,15 +350,15 @@ class _Maker:
         theta = self._problem.predictor.episode_theta(self._problem.episodes[i], self._problem.split(x, i)[0])
         return mean_square_residual(self._problem, i, nodes, theta)
 
-    def _driven(self, episode: Episode) -> DrivenStage:
+    def _driven(self, episode: Episode) -> _DrivenStage:
         """The stage as a recording drives it."""
-        key = _kind(episode)
+        key = is_followed, is_noisy = _kind(episode)
         if key not in self._stages:
-            followed = (
-                episode.tracking_feedback.state_indices if key[0] and episode.tracking_feedback is not None else None
-            )
+            feedback = episode.tracking_feedback
+            followed = feedback.state_indices.tolist() if is_followed and feedback is not None else []
             momentum = self._problem.model_functions.momentum_shift.momentum_by_torque(self._problem.theta)
-            self._stages[key] = make_driven_stage(self._stage, self._freed, followed, momentum, key[1], self._compiled)
+            made = _driven_stage(self._stage, self._freed, followed, momentum, is_noisy, self._compiled)
+            self._stages[key] = made
         return self._stages[key]
 
     def _erring(self, episode: Episode) -> tuple[IndexArray, IndexArray, list[ResidualTerm]]:
@@ -362,9 +380,8 @@ class _Maker:
             places[label] = at.reshape(count, nu)
             self._w.name(f"{label}[{name}]", places[label].T, driven)
             weight = self._p.add(f"weight.{label}[{name}]", 1.0 / np.where(std > 0, std, 1.0), driven)
-            term = ProgramTerm(
-                f"{label}[{name}]", driven, _itself(nu), places[label], np.zeros((count, 0), np.int64), weight[:0, 0]
-            )
+            data = np.zeros((count, 0), np.int64)
+            term = ProgramTerm(f"{label}[{name}]", driven, _itself(nu), places[label], data, weight[:0, 0])
             priors.append(ResidualTerm(term, ca.DM.eye(nu * count), np.tile(weight[:, 0], count)))
         offset = np.broadcast_to(places["torque_offset"], (steps, nu))
         per_step = [places["torque_error"][of_step.ravel()], offset]
@@ -376,10 +393,8 @@ class _Maker:
 
     def _moved(self, episode: Episode, places: _Places) -> ProgramTerm:
         """Every step's equations."""
-        local = self._driven(episode).stage_function
-        return ProgramTerm(
-            f"step[{episode.name}]", self._stage.residual_names, local, places.stages(), places.inputs(), places.theta
-        )
+        at = places.stages(), places.inputs(), places.theta
+        return ProgramTerm(f"step[{episode.name}]", self._stage.residual_names, self._driven(episode).function, *at)
 
     def _begun(self, episode: Episode, places: _Places) -> tuple[ProgramTerm, list[ResidualTerm]]:
         """What fixes the first state, and the prior of what is free of it."""
@@ -387,11 +402,7 @@ class _Maker:
         loose = list(problem.predictor.estimated_state_indices)
         fixed = [k for k in range(nx) if k not in {*problem.system.prescribed_indices, *loose}]
         joints = problem.system.mechanism.joint_names
-        rows = [
-            *(f"q.{joint}" for joint in joints),
-            *(f"p.{joint}" for joint in joints),
-            *problem.system.internal_coordinates,
-        ]
+        rows = [*(f"{part}.{joint}" for part in "qp" for joint in joints), *problem.system.internal_coordinates]
         first = ca.SX.sym("x0", nx)
         if episode.fixed_initial_state is not None:
             given = self._p.add(f"start[{name}]", episode.fixed_initial_state.state, rows)
@@ -403,9 +414,8 @@ class _Maker:
             rest = statics.equations
             sought, held = rest.inputs[0], rest.inputs[2]
             stiffness = holding_spring_stiffness(problem.system, bool(problem.system.driven))
-            symbols = rest.inputs[3:]
             values = [ca.SX(stiffness), self._freed.theta, ca.SX(self._step.time_step)]
-            balance, state = ca.substitute([rest.residual, rest.state], symbols, values)
+            balance, state = ca.substitute([rest.residual, rest.state], rest.inputs[3:], values)
             posture, nu = rest.inputs[1], held.numel()
             errors = ca.SX.sym("errors", 3 * len(places.first))
             if len(places.first):
@@ -413,11 +423,8 @@ class _Maker:
                 moved = posture - ca.vertcat(errors[:nu], ca.SX(ca.DM.zeros(posture.numel() - nu)))
                 true = held - errors[nu : 2 * nu] - errors[2 * nu :]
                 balance, state = ca.substitute([balance, state], [posture, held], [moved, true])
-            inputs = [
-                ca.vertcat(self._freed.free_symbols, sought, first, errors),
-                ca.vertcat(posture, held),
-                self._freed.nominal_symbols,
-            ]
+            v = ca.vertcat(self._freed.free, sought, first, errors)
+            inputs = [v, ca.vertcat(posture, held), self._freed.nominal]
             known = [problem.system.mechanism.joint_names[k] for k in statics.known_coordinates]
             given = self._p.add(f"posture[{name}]", episode.initial_known_coordinates, known)
             wrong = [places.first, places.errors[0, : 2 * nu]] if len(places.first) else []
@@ -444,9 +451,8 @@ class _Maker:
         if loaded:
             # after the last step the effort is that of this step
             step = np.minimum(nodes, len(places.multipliers) - 1)
-            ends = self._p.add(
-                f"last.{sensor.group_name}[{episode.name}]", (nodes > step).astype(float)[None, :], ["last"]
-            )
+            is_last = (nodes > step).astype(float)[None, :]
+            ends = self._p.add(f"last.{sensor.group_name}[{episode.name}]", is_last, ["last"])
             at, data = places.stages()[step], np.hstack([places.inputs()[step], ends.T])
         else:
             free = np.broadcast_to(places.free, (len(nodes), len(places.free)))
@@ -473,20 +479,20 @@ class _Maker:
         """What a sensor reads at a node, and whether it depends on efforts, that is, on the step from there."""
         key = (sensor, *_kind(episode))
         if key not in self._sensors:
-            n, nz = self._sizes["n"], self._sizes["nz"]
             function = sensor_function(self._problem.system, sensor, self._names)
             loaded = function.nnz_out(3) > 0
-            made = self._loaded(function, self._driven(episode)) if loaded else self._unloaded(function, n, nz)
+            made = self._loaded(function, self._driven(episode)) if loaded else self._unloaded(function)
             self._sensors[key] = made, loaded
         return self._sensors[key]
 
-    def _unloaded(self, function: ca.Function, n: int, nz: int) -> LocalFunction:
-        q, z = ca.SX.sym("q", n), ca.SX.sym("z", nz)
+    def _unloaded(self, function: ca.Function) -> LocalFunction:
+        n = self._sizes["n"]
+        q, z = ca.SX.sym("q", n), ca.SX.sym("z", self._sizes["nz"])
         y, by_q, by_z, _, by_free = function(q, z, ca.SX(ca.DM.zeros(n)), self._freed.theta)
-        inputs = [ca.vertcat(self._freed.free_symbols, q, z), ca.SX(0, 1), self._freed.nominal_symbols]
+        inputs = [ca.vertcat(self._freed.free, q, z), ca.SX(0, 1), self._freed.nominal]
         return LocalFunction("reading", inputs, y, ca.horzcat(by_free, by_q, by_z))
 
-    def _loaded(self, function: ca.Function, step: DrivenStage) -> LocalFunction:
+    def _loaded(self, function: ca.Function, step: _DrivenStage) -> LocalFunction:
         system, n, nx = self._problem.system, self._sizes["n"], self._sizes["nx"]
         last, size = ca.SX.sym("last"), step.v.numel()
         node = (1 - last) * step.state_before + last * step.state_after
@@ -499,9 +505,8 @@ class _Maker:
         at_node = ca.horzcat(by_q, ca.SX(y.numel(), n), by_z)
         rest = ca.SX(y.numel(), size - len(self._names) - 2 * nx)
         slopes = ca.mtimes(by_load, by_v) + ca.horzcat(by_free, (1 - last) * at_node, last * at_node, rest)
-        return LocalFunction(
-            "reading_under_load", [step.v, ca.vertcat(step.data, last), self._freed.nominal_symbols], y, slopes
-        )
+        inputs = [step.v, ca.vertcat(step.data, last), self._freed.nominal]
+        return LocalFunction("reading_under_load", inputs, y, slopes)
 
     def _priors(self, columns: dict[int, int]) -> list[ResidualTerm]:
         """Stated priors of parameters, and the weak ones."""
@@ -539,10 +544,8 @@ class _Maker:
 
 def _kind(episode: Episode) -> tuple[bool, bool]:
     """Whether a recording's stage is under the tracking filter, and whether errors of torques are unknowns."""
-    errors = episode.input_errors
-    return episode.tracking_feedback is not None and (
-        errors is None or not errors.has_encoder_measurements
-    ), errors is not None
+    feedback, errors = episode.tracking_feedback, episode.input_errors
+    return feedback is not None and not (errors and errors.has_encoder_measurements), errors is not None
 
 
 def _itself(size: int) -> LocalFunction:

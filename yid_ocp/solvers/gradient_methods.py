@@ -1,4 +1,4 @@
-"""The source paper's solver: steepest descent projected on the bounds, with Armijo's rule."""
+"""First-order methods on the adjoint's gradient: SciPy's L-BFGS-B, and the source paper's steepest descent."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
+import scipy.optimize
 from annotated_types import Ge, Gt, Lt
 from numpy.typing import NDArray
 
@@ -21,6 +22,70 @@ from yid_ocp.solvers.base import (
 )
 
 Array = NDArray[np.float64]
+
+
+@SOLVERS.register("single_shooting")
+@dataclass(frozen=True)
+class SingleShooting:
+    """Minimise the cost by SciPy's L-BFGS-B on unknowns scaled to order one.
+
+    References
+    ----------
+    Zhu, Byrd, Lu, Nocedal (1997), ACM Trans. Math. Softw. 23(4):550, doi:10.1145/279232.279236.
+    """
+
+    max_iterations: Annotated[int, Ge(1), OptionInfo("limit on iterations")] = 200
+    cost_tolerance: Annotated[
+        float, Gt(0), OptionInfo("converged when the cost falls by less than this fraction in an iteration")
+    ] = 1e-9
+    name: ClassVar[str] = "single_shooting"
+
+    def __post_init__(self) -> None:
+        check_option_bounds(self, f"solver {self.name}")
+
+    def minimize_cost(
+        self, problem: EstimationProblem, start: Array, callback: IterationCallback | None
+    ) -> SolverResult:
+        """Minimize the problem's cost from `start` by L-BFGS-B."""
+        (lower, upper), scale = problem.bounds, problem.unknown_scales
+        recorder = IterationRecorder(callback)
+        cost, gradient, first = problem.cost_and_gradient(start)
+        recorder.n_evaluations += 1
+        if not first.ok:
+            return recorder.result(Status.FAILED, first.message, start)
+        unit, warm = max(cost, 1e-300), first.equilibrium_guesses
+        seen: dict[bytes, tuple[float, Array]] = {start.tobytes(): (cost, gradient)}
+
+        def function(scaled: Array) -> tuple[float, Array]:
+            x = scaled * scale
+            key = x.tobytes()
+            if key not in seen:
+                cost, gradient, evaluation = problem.cost_and_gradient(x, equilibrium_guesses=warm)
+                recorder.n_evaluations += 1
+                # a failed rollout is a wall: the line search steps back from it
+                seen[key] = (cost, gradient) if evaluation.ok else (1e3 * unit, np.zeros_like(x))
+            cost, gradient = seen[key]
+            return cost / unit, gradient * scale / unit
+
+        def accepted(intermediate_result: scipy.optimize.OptimizeResult) -> None:
+            x = intermediate_result.x * scale
+            cost, gradient = seen.get(x.tobytes(), (np.nan, np.zeros_like(x)))
+            recorder.record_iterate(cost, x, projected_gradient_norm(x, gradient, lower, upper, scale))
+
+        accepted(scipy.optimize.OptimizeResult(x=start / scale))
+        result = scipy.optimize.minimize(
+            function,
+            start / scale,
+            jac=True,
+            method="L-BFGS-B",
+            bounds=scipy.optimize.Bounds(lower / scale, upper / scale),
+            callback=accepted,
+            options={"maxiter": self.max_iterations, "ftol": self.cost_tolerance, "gtol": 1e-9}
+            | {"maxls": 40, "maxcor": 20},
+        )
+        best = min(recorder.history, key=lambda entry: entry.cost if np.isfinite(entry.cost) else np.inf)
+        status = {0: Status.CONVERGED, 1: Status.ITERATION_LIMIT}.get(result.status, Status.STALLED)
+        return recorder.result(status, str(result.message).lower(), best.x, warm)
 
 
 @SOLVERS.register("steepest_descent")
@@ -64,9 +129,7 @@ class SteepestDescent:
         self, problem: EstimationProblem, start: Array, callback: IterationCallback | None
     ) -> SolverResult:
         """Minimize the problem's cost from `start` by projected steepest descent."""
-        lower, upper = problem.bounds
-        recorder = IterationRecorder(callback)
-        x = start.copy()
+        (lower, upper), recorder, x = problem.bounds, IterationRecorder(callback), start.copy()
         cost, gradient, evaluation = problem.cost_and_gradient(x)
         recorder.n_evaluations += 1
         if not evaluation.ok:
@@ -95,11 +158,10 @@ class SteepestDescent:
                 length *= self.backtracking_factor
                 if np.max(np.abs(length * gradient) / size) < 1e-12:
                     return ended(Status.STALLED, "no step along the gradient lowers the cost")
-            before, slope_before = x, gradient
-            x = trial
+            moved, before, x = trial - x, gradient, trial
             cost, gradient, evaluation = problem.cost_and_gradient(x, attempt)
             length /= self.backtracking_factor
-            moved, turned = x - before, gradient - slope_before
+            turned = gradient - before
             if self.first_trial_step == "spectral" and float(moved @ turned) > 0:
                 length = float(moved @ moved) / float(moved @ turned)
         size = np.maximum(np.abs(x), problem.unknown_scales)

@@ -1,0 +1,235 @@
+"""Material of the object's segments: losses, stress relaxation, hysteresis, and errors of the nominal springs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+
+from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, segment_names, segment_springs
+from yid_ocp.model.flexible import ElasticJoint
+from yid_ocp.model.system import MidpointState, StepTerms, System
+
+_ABS_SMOOTHING_SPEED = 1e-3
+"""Speed below which |v| in Dahl's law is smoothed [rad/s]."""
+_REFERENCE_ANGLE = 0.5
+"""Default for the largest angle in the data, on which the range of k3 depends [rad]."""
+_MIN_LARGEST_ANGLE = 0.02
+"""Lower limit of the largest angle from which the range of k3 is computed [rad]."""
+
+
+def _bending_stiffness(system: System, segment: str) -> float:
+    """Mean nominal bending stiffness of a segment's joints, at least 1e-6 [N m/rad]."""
+    springs = segment_springs(system, segment)
+    chosen = [s.stiffness for s in springs if s.deformation == "bend"] or [s.stiffness for s in springs]
+    if not chosen:
+        return 1.0
+    function = ca.Function("stiffness", [system.parameters.symbols], [ca.vertcat(*chosen)])
+    return max(float(np.mean(np.array(function(system.parameters.vector())))), 1e-6)
+
+
+def _reference_cubic_stiffness(system: System, segment: str) -> float:
+    """Bending stiffness over the squared reference angle [N m/rad^3]."""
+    return _bending_stiffness(system, segment) / _REFERENCE_ANGLE**2
+
+
+class _SegmentEffect(EffectBase):
+    """An effect on every elastic joint of a segment."""
+
+    possible_locations = segment_names
+
+    def _springs(self, state: MidpointState) -> list[tuple[ElasticJoint, int]]:
+        """The segment's elastic joints with their indices."""
+        index = state.system.mechanism.joint_index
+        return [(spring, index(spring.joint_name)) for spring in segment_springs(state.system, self.location)]
+
+
+class _SegmentMemory(_SegmentEffect):
+    """An effect with an internal coordinate beside every elastic joint of a segment."""
+
+    required_excitation = "how long it is held"
+
+    @classmethod
+    def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
+        """Names of the segment's elastic joints."""
+        return tuple(spring.joint_name for spring in segment_springs(system, location))
+
+
+class _SpringChange(_SegmentEffect):
+    """An effect that changes the segment's springs."""
+
+    required_excitation = "how far it bends"
+
+    def _changed(self, spring: ElasticJoint) -> ElasticJoint:
+        raise NotImplementedError
+
+    def apply_to_system(self, system: System) -> System:
+        """The system with the segment's changed springs."""
+        springs = (self._changed(s) if s.segment_name == self.location else s for s in system.elastic_joints)
+        return replace(system, elastic_joints=tuple(springs))
+
+
+@EFFECTS.register("kelvin_voigt")
+class KelvinVoigt(_SegmentEffect):
+    """Damping in proportion to stiffness: F = -tau kappa v on all joints of a segment, beside the model's damping."""
+
+    equation = "F = -tau kappa v"
+    required_excitation = "how fast it moves"
+    declared_parameters = (ParameterDefinition("tau", "s", 0.0, 0.0, 1.0, (0.005, 0.2), "damping over stiffness"),)
+
+    def step_terms(self, state: MidpointState) -> StepTerms:
+        """The damping force -tau kappa v on the segment's elastic joints."""
+        force = ca.SX(state.system.n_coordinates, 1)
+        for spring, index in self._springs(state):
+            force[index] = -self["tau"] * spring.stiffness * state.v[index]
+        return StepTerms(dissipative_force=force)
+
+
+@EFFECTS.register("standard_linear_solid")
+class StandardLinearSolid(_SegmentMemory):
+    """A spring and a damper in series, parallel to every spring of a segment (bend and twist).
+
+    V += 1/2 ratio kappa (q - z)^2 with the massless z creeping after q: (q - z) = relaxation_time dz/dt.
+    """
+
+    equation = "V += 1/2 ratio kappa (q - z)^2, q - z = relaxation_time dz/dt"
+    declared_parameters = (
+        ParameterDefinition(
+            "ratio", "1", 0.0, 0.0, 5.0, (0.05, 1.0), "stiffness of the branch over that of the spring"
+        ),
+        ParameterDefinition("relaxation_time", "s", 0.5, 1e-3, 100.0, (0.05, 10.0), "of the branch", True),
+    )
+
+    def step_terms(self, state: MidpointState) -> StepTerms:
+        """The energy of the additional springs and the relaxation equations of their internal coordinates."""
+        energy, equations = ca.SX(0), {}
+        for spring, index in self._springs(state):
+            name = f"{self.label}.{spring.joint_name}"
+            row = state.internal_rows[name]
+            stretch = state.q[index] - state.z[row]
+            energy += self["ratio"] * spring.stiffness * stretch**2 / 2
+            equations[name] = stretch - self["relaxation_time"] * state.z_rate[row]
+        return StepTerms(lagrangian=-energy, internal_equations=equations)
+
+
+@EFFECTS.register("hysteresis")
+class Hysteresis(_SegmentMemory):
+    """A Dahl friction element parallel to every spring of a segment (bend and twist).
+
+    F = -stiffness z, dz/dt = v - |v| z / yield_angle, with |v| rounded off below `_ABS_SMOOTHING_SPEED`. At the start
+    of a recording z = 0: what came before is not known.
+
+    References
+    ----------
+    Dahl (1968), A solid friction model, Aerospace Corporation TOR-158(3107-18).
+    """
+
+    equation = "F = -stiffness z, dz/dt = v - |v| z / yield_angle"
+    declared_parameters = (
+        ParameterDefinition(
+            "stiffness",
+            "N m/rad",
+            0.0,
+            0.0,
+            50.0,
+            (0.05, 1.0),
+            "stiffness of the element before it yields",
+            range_scale=_bending_stiffness,
+        ),
+        ParameterDefinition("yield_angle", "rad", 0.15, 5e-3, 5.0, (0.05, 0.5), "angle over which it yields", True),
+    )
+
+    def step_terms(self, state: MidpointState) -> StepTerms:
+        """The forces of the Dahl elements and the equations of their internal coordinates."""
+        force, equations, start = ca.SX(state.system.n_coordinates, 1), {}, {}
+        for spring, index in self._springs(state):
+            name = f"{self.label}.{spring.joint_name}"
+            row = state.internal_rows[name]
+            v, z = state.v[index], state.z[row]
+            speed = ca.sqrt(v**2 + _ABS_SMOOTHING_SPEED**2) - _ABS_SMOOTHING_SPEED
+            force[index] = -self["stiffness"] * z
+            equations[name] = state.z_rate[row] - v + speed * z / self["yield_angle"]
+            start[name] = z
+        return StepTerms(generalized_force=force, internal_equations=equations, static_equations=start)
+
+
+@EFFECTS.register("cubic_stiffness")
+class CubicStiffness(_SegmentEffect):
+    """Springs of a segment that stiffen (k3 > 0) or soften (k3 < 0) with angle: V += 1/4 k3 q^4 on every joint.
+
+    k3 is expected within -0.5 to 1 times stiffness over the squared largest angle, which is `_REFERENCE_ANGLE` until
+    `with_expected_ranges` is given the one in the data.
+    """
+
+    equation = "V += 1/4 k3 q^4"
+    required_excitation = "how far it bends"
+    declared_parameters = (
+        ParameterDefinition(
+            "k3",
+            "N m/rad^3",
+            0.0,
+            -10.0,
+            50.0,
+            (-0.5, 1.0),
+            "cubic stiffness of every joint",
+            range_scale=_reference_cubic_stiffness,
+        ),
+    )
+
+    def with_expected_ranges(self, largest: Mapping[str, float]) -> CubicStiffness:
+        """The effect with the expected range of k3 scaled to the segment's largest angle in the data."""
+        if self.location not in largest:
+            return self
+        factor = (_REFERENCE_ANGLE / max(largest[self.location], _MIN_LARGEST_ANGLE)) ** 2
+        [k3] = self.definitions
+        low, high = k3.prior_range
+        return replace(self, definitions=(replace(k3, prior_range=(factor * low, factor * high)),))
+
+    def step_terms(self, state: MidpointState) -> StepTerms:
+        """The energy of the cubic springs."""
+        return StepTerms(lagrangian=-self["k3"] / 4 * sum((state.q[i] ** 4 for _, i in self._springs(state)), ca.SX(0)))
+
+
+@EFFECTS.register("rest_curvature")
+class RestCurvature(_SpringChange):
+    """A segment that is bent at rest: V = 1/2 kappa (q - q_rest)^2 with equal rest angles at all its joints."""
+
+    equation = "V = 1/2 kappa (q - q_rest)^2"
+
+    @classmethod
+    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
+        """Definitions of the rest angles qx and qy [rad] that are added at every joint that bends about x or y."""
+        axes = {spring.axis for spring in segment_springs(system, location)}
+        text = "rest angle of every joint about"
+        return tuple(
+            ParameterDefinition(f"q{axis}", "rad", 0.0, -1.0, 1.0, (-0.3, 0.3), f"{text} {axis}")
+            for axis in "xy"
+            if axis in axes
+        )
+
+    def _changed(self, spring: ElasticJoint) -> ElasticJoint:
+        if spring.deformation != "bend":
+            return spring
+        return replace(spring, rest_angle=spring.rest_angle + self[f"q{spring.axis}"])
+
+
+def _doubly_bending_segments(system: System) -> tuple[str, ...]:
+    """Names of segments that bend about both x and y."""
+    bent = {(spring.segment_name, spring.axis) for spring in system.elastic_joints}
+    return tuple(name for name in segment_names(system) if {(name, "x"), (name, "y")} <= bent)
+
+
+@EFFECTS.register("bend_anisotropy")
+class BendAnisotropy(_SpringChange):
+    """A segment whose bending stiffness differs between x and y: kappa_y = kappa_x (1 + ratio)."""
+
+    equation = "kappa_y = kappa_x (1 + ratio)"
+    possible_locations = _doubly_bending_segments
+    declared_parameters = (
+        ParameterDefinition("ratio", "1", 0.0, -0.9, 3.0, (-0.3, 0.3), "excess of the bending stiffness about y"),
+    )
+
+    def _changed(self, spring: ElasticJoint) -> ElasticJoint:
+        return replace(spring, stiffness=spring.stiffness * (1 + self["ratio"])) if spring.axis == "y" else spring

@@ -1,0 +1,195 @@
+"""How the object is held: springs at its foot and its junctions; grasps that are displaced, compliant or slipping."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+
+from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, clamp_names, compliance, grasp_names
+from yid_ocp.model.flexible import UNIT_AXES
+from yid_ocp.model.mechanism import Joint, Placement
+from yid_ocp.model.system import Grasp, MidpointState, StepTerms, System
+
+_SPRING_RELAXATION_TIME = 5e-3
+"""Relaxation time of mount and junction springs [s]: too short to damp any visible motion."""
+
+
+def _root_joints_by_base(system: System) -> dict[str, tuple[str, ...]]:
+    """First joints of all segments without a parent, by what carries them: a clamp's name, else `base`."""
+    tree, clamps = system.mechanism, clamp_names(system)
+    found: dict[str, tuple[str, ...]] = {}
+    for first in (s.link_joints[0][0] for s in system.segment_layouts if s.parent_segment is None):
+        below = {tree.joints[i].name for i in tree.ancestor_joints(tree.joints[tree.joint_index(first)].parent_index)}
+        place = next((clamp for clamp in clamps if f"{clamp}_rz" in below), "base")
+        found[place] = (*found.get(place, ()), first)
+    return found
+
+
+def _branch_joints_by_junction(system: System) -> dict[str, tuple[str, ...]]:
+    """First joints of the branches at every junction: `w_PARENT` at a parent's tip, else `junction_BRANCH`."""
+    tree = system.mechanism
+    found: dict[str, tuple[str, ...]] = {}
+    for segment in (s for s in system.segment_layouts if s.parent_segment is not None):
+        first, tip = segment.link_joints[0][0], f"w_{segment.parent_segment}"
+        at_tip = tree.frame(tip).joint_index in tree.ancestor_joints(tree.joint_index(first))
+        place = tip if at_tip else f"junction_{segment.name}"
+        found[place] = (*found.get(place, ()), first)
+    return found
+
+
+class _JointInsertion(EffectBase):
+    """A massless two-axis rotational spring in what is rigid in the model."""
+
+    required_excitation = "how hard it pulls at its ends"
+    declared_parameters = (compliance("rad/(N m)", 1.0, (1 / 500, 1 / 5), "two-axis spring", "N m/rad"),)
+
+    def _sprung(self, system: System, hung: tuple[str, ...], at: Placement | None, label: str) -> System:
+        """The system with two massless joints `LABEL_x`, `LABEL_y` between some joints and what they hang on.
+
+        They sit at the placement `at` of the carrier, at that of the only joint hung where there is none.
+        """
+        tree = system.mechanism
+        first = min(tree.joint_index(joint) for joint in hung)
+        carrier = tree.joints[first].parent_index
+        place, inverse = tree.joints[first].placement, Placement.identity()
+        if at is not None:
+            place, inverse = at, Placement(at.rotation.T, -(at.rotation.T @ at.translation))
+        chain = [
+            Joint(f"{label}_x", "revolute", carrier, place, UNIT_AXES["x"]),
+            Joint(f"{label}_y", "revolute", carrier, Placement.identity(), UNIT_AXES["y"]),
+        ]
+        tree = tree.with_inserted_joints(first, chain)
+        joints = list(tree.joints)
+        for index in (tree.joint_index(name) for name in hung):
+            rest = Placement.identity() if at is None else inverse @ joints[index].placement
+            joints[index] = replace(joints[index], parent_index=first + 1, placement=rest)
+        names = [joint.name for joint in chain]
+        return replace(
+            system,
+            mechanism=replace(tree, joints=tuple(joints)),
+            joint_compliances={**system.joint_compliances, **dict.fromkeys(names, self["compliance"])},
+            joint_relaxation_times={**system.joint_relaxation_times, **dict.fromkeys(names, _SPRING_RELAXATION_TIME)},
+        )
+
+
+@EFFECTS.register("mount_compliance")
+class MountCompliance(_JointInsertion):
+    """A massless two-axis rotational spring under the object's foot or clamp, about x and y of the first link.
+
+    It has the relaxation time `_SPRING_RELAXATION_TIME`.
+    """
+
+    equation = "two joints with V = 1/2 stiffness q^2 before the first link"
+    possible_locations = _root_joints_by_base
+
+    def apply_to_system(self, system: System) -> System:
+        """The system with two compliant joints before the object's first link."""
+        for number, first in enumerate(_root_joints_by_base(system)[self.location]):
+            system = self._sprung(system, (first,), None, f"{self.label}_{number}" if number else self.label)
+        return system
+
+
+@EFFECTS.register("junction_compliance")
+class JunctionCompliance(_JointInsertion):
+    """A massless two-axis rotational spring between a segment and the branches that leave it at one junction.
+
+    At `w_PARENT` all branches turn together about x and y of the parent's last link, at `junction_BRANCH` one turns
+    about its own. It has the relaxation time `_SPRING_RELAXATION_TIME`.
+    """
+
+    equation = "two joints with V = 1/2 stiffness q^2 before the branches"
+    possible_locations = _branch_joints_by_junction
+
+    def apply_to_system(self, system: System) -> System:
+        """The system with two compliant joints before the junction's branches."""
+        at = system.mechanism.frame(self.location).placement if self.location.startswith("w_") else None
+        return self._sprung(system, _branch_joints_by_junction(system)[self.location], at, self.label)
+
+
+class _GraspChange(EffectBase):
+    """An effect that changes one grasp."""
+
+    required_excitation = "how hard it pulls at its ends"
+    possible_locations = grasp_names
+
+    def _changes(self, grasp: Grasp) -> dict[str, Any]:
+        """The fields of the grasp that the effect changes."""
+        raise NotImplementedError
+
+    def apply_to_system(self, system: System) -> System:
+        """The system with the changed grasp."""
+        changed = (replace(g, **self._changes(g)) if g.name == self.location else g for g in system.grasps)
+        return replace(system, grasps=tuple(changed))
+
+
+@EFFECTS.register("grasp_offset")
+class GraspOffset(_GraspChange):
+    """The grasped point displaced by (dx, dy, dz) from its nominal position, in the gripper's frame."""
+
+    equation = "phi = (holder + R (dx, dy, dz)) - held"
+    declared_parameters = tuple(
+        ParameterDefinition(f"d{axis}", "m", 0.0, -0.1, 0.1, (-0.02, 0.02), f"shift along the gripper's {axis}")
+        for axis in "xyz"
+    )
+
+    def _changes(self, grasp: Grasp) -> dict[str, Any]:
+        return {"holder_offset": grasp.holder_offset + ca.vertcat(self["dx"], self["dy"], self["dz"])}
+
+
+@EFFECTS.register("grasp_compliance")
+class GraspCompliance(_GraspChange):
+    """A spring-damper in place of the rigid constraint: f = phi/C + damping dphi/dt, phi = gripper - object.
+
+    In a step: phi(q_{k+1}) + C damping (phi(q_{k+1}) - phi(q_k))/h = C lam_k/h, regular at C = 0, where it is the rigid
+    grasp. The stretch is taken at the end of the step, which by itself damps what is fast against it. Every row of the
+    grasp has the same C; in rows of orientation it counts in rad/(N m).
+    """
+
+    equation = "phi + C damping dphi/dt = C force"
+    declared_parameters = (
+        compliance("m/N", 0.1, (1e-4, 1e-2), "grasp", "N/m"),
+        ParameterDefinition("damping", "N s/m", 0.0, 0.0, 100.0, (0.1, 20.0), "damping of the grasp", True),
+    )
+
+    def _changes(self, grasp: Grasp) -> dict[str, Any]:
+        own = self["compliance"] * self["damping"]
+        relaxation = own if grasp.relaxation_time is None else grasp.relaxation_time + own
+        return {"compliance": grasp.compliance + self["compliance"], "relaxation_time": relaxation}
+
+
+@EFFECTS.register("grasp_slip")
+class GraspSlip(_GraspChange):
+    """The grasped point creeps along the tube in the direction in which the gripper pulls.
+
+    d(offset)/dt = slip_per_load x axial load, both along the object's z axis; `Grasp.axial_slip` counts the other way.
+    At the start of a recording nothing has slipped.
+    """
+
+    equation = "d(offset)/dt = slip_per_load x axial load"
+    required_excitation = "how long it is held"
+    declared_parameters = (
+        ParameterDefinition("slip_per_load", "m/(N s)", 0.0, 0.0, 0.1, (0.0, 0.01), "creep rate per axial load"),
+    )
+
+    @classmethod
+    def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
+        """`offset`, the slipped distance along the tube."""
+        return ("offset",)
+
+    def _changes(self, grasp: Grasp) -> dict[str, Any]:
+        return {"axial_slip": grasp.axial_slip - self.internal_coordinates[f"{self.label}.offset"]}
+
+    def step_terms(self, state: MidpointState) -> StepTerms:
+        """The creep equation of the slipped distance."""
+        [name] = self.internal_coordinates
+        row, grasps = state.internal_rows[name], state.system.grasps
+        at = grasp_names(state.system).index(self.location)
+        first = sum(grasp.n_equations for grasp in grasps[:at])
+        axis = state.kinematics.frame_pose(grasps[at].held_frame).rotation[:, 2]
+        load = ca.dot(axis, state.constraint_force[first : first + 3])
+        return StepTerms(
+            internal_equations={name: state.z_rate[row] - self["slip_per_load"] * load},
+            static_equations={name: state.z[row]},
+        )
