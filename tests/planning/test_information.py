@@ -18,6 +18,7 @@ from yid_ocp.planning.plan_shooting import ValueWithJacobian
 from yid_ocp.planning.planned_experiment import PlannedExperiment
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 
+PAIR = ("joint_coulomb@shoulder", "joint_viscous@shoulder")
 FREE = ("elbow.stiffness", "elbow.damping")
 OPTIONS = PlanOptions(
     goal="information",
@@ -57,9 +58,6 @@ def values_of(problem):
 
 def some_motion(experiment, seed=0, size=0.1):
     return size * np.random.default_rng(seed).normal(size=experiment.zero_coefficients.shape)
-
-
-# -- what would be recorded -------------------------------------------------------------------------------------------
 
 
 def test_sensors_tell_as_much_in_a_second_as_in_the_recording(driven_problem):
@@ -113,8 +111,6 @@ def test_driven_arms_tell_about_what_the_innovations_say(driven_problem):
         np.testing.assert_allclose(np.log(std[0]), np.log(std[1]), atol=0.5)
 
 
-# -- criteria ---------------------------------------------------------------------------------------------------------
-
 ROWS = np.random.default_rng(4).normal(size=(30, 7))
 CRITERIA = {
     "all": DOptimality((0, 1, 2), (0, 1, 2)),
@@ -153,59 +149,50 @@ def test_distances_are_what_others_cannot_explain():
     assert criterion.effect_distances(rows)[0, 1] == pytest.approx(14.0, rel=1e-3)
 
 
-# -- the search -------------------------------------------------------------------------------------------------------
+def line(w):
+    """Readings of a straight line at two places: its height and its slope are sought."""
+    return 1e3 * np.column_stack([np.ones(2), w.ravel()])
 
 
-def made_up(rows, limits, size, low, high):
-    """A search over numbers of which sensitivities and limits are known functions."""
+def searched(limits, rounds=50):
+    """A search, and what it found, over two places from -1 to 1.5 at which a line is read, within values and bounds."""
 
     def slopes(w, here):
-        return np.array([(rows(w + 1e-6 * e.reshape(w.shape)) - here) / 1e-6 for e in np.eye(size)])
+        return np.array([(line(w + 1e-6 * e.reshape(w.shape)) - here) / 1e-6 for e in np.eye(2)])
 
-    bounds = np.full((size, 1), low), np.full((size, 1), high)
-    simulator = SimpleNamespace(coefficient_bounds=lambda: bounds, simulate_path=lambda w, slopes=False: w)
-    experiment = SimpleNamespace(simulator=simulator, search_sensitivities=rows, sensitivity_derivatives=slopes)
     values, upper = limits
+    bounds = np.full((2, 1), -1.0), np.full((2, 1), 1.5)
+    simulator = SimpleNamespace(coefficient_bounds=lambda: bounds, simulate_path=lambda w, slopes=False: w)
+    experiment = SimpleNamespace(simulator=simulator, search_sensitivities=line, sensitivity_derivatives=slopes)
     bounded = [SimpleNamespace(unit=np.ones(len(upper)), lower=-np.inf * np.ones(len(upper)), upper=np.array(upper))]
     kept = SimpleNamespace(limit_rows=bounded, limit_values=lambda rolled, w: ValueWithJacobian(*values(w.ravel())))
-    return InformativeMotionSearch(experiment, kept, DOptimality((0, 1), (0, 1)))
+    search = InformativeMotionSearch(experiment, kept, DOptimality((0, 1), (0, 1)))
+    return search, search.improve_motion(np.array([[0.1], [-0.05]]), rounds)
 
 
 def straight(matrix):
     return lambda w: (np.array(matrix) @ w, np.array(matrix))
 
 
-def line(w):
-    """Readings of a straight line at two places: its height and its slope are sought."""
-    return 1e3 * np.column_stack([np.ones(2), w.ravel()])
-
-
 def test_a_straight_line_is_read_at_the_ends_of_its_range():
-    search = made_up(line, (straight([[0.0, 0.0]]), [1.0]), 2, -1.0, 1.5)
-    found = search.improve_motion(np.array([[0.1], [-0.05]]), 50)
+    _, found = searched((straight([[0.0, 0.0]]), [1.0]))
     assert found.is_converged
     np.testing.assert_allclose(np.sort(found.w.ravel()), [-1.0, 1.5], atol=1e-6)
     assert found.final_criterion > found.initial_criterion
 
 
-def test_a_limit_is_kept_and_used_up():
-    # the places are no more than 0.8 apart
-    search = made_up(line, (straight([[1.0, -1.0], [-1.0, 1.0]]), [0.8, 0.8]), 2, -1.0, 1.5)
-    found = search.improve_motion(np.array([[0.1], [-0.05]]), 50)
-    assert abs(float(np.diff(found.w.ravel())[0])) == pytest.approx(0.8, abs=5e-3)
-    assert search.max_limit_violation(found.w) <= 0.0
-
-
-def test_a_curved_limit_is_kept_on_the_way_and_in_the_end():
-    # the places lie in a circle of radius 0.6
-    search = made_up(line, (lambda w: (np.array([w @ w]), 2 * w[None, :]), [0.36]), 2, -1.0, 1.5)
+@pytest.mark.parametrize(
+    ("limits", "apart"),
+    [
+        ((straight([[1.0, -1.0], [-1.0, 1.0]]), [0.8, 0.8]), 0.8),  # the places are no more than 0.8 apart
+        ((lambda w: (np.array([w @ w]), 2 * w[None, :]), [0.36]), 2 * 0.6 / 2**0.5),  # in a circle of radius 0.6
+    ],
+)
+def test_a_limit_is_kept_on_the_way_and_used_up_in_the_end(limits, apart):
     for rounds in (1, 2, 50):
-        found = search.improve_motion(np.array([[0.1], [-0.05]]), rounds)
+        search, found = searched(limits, rounds)
         assert search.max_limit_violation(found.w) <= 0.0
-    assert abs(float(np.diff(found.w.ravel())[0])) == pytest.approx(2 * 0.6 / 2**0.5, abs=5e-3)
-
-
-# -- plans ------------------------------------------------------------------------------------------------------------
+    assert abs(float(np.diff(found.w.ravel())[0])) == pytest.approx(apart, abs=5e-3)
 
 
 def test_the_motion_tells_more_than_those_it_came_from(told, moved_problem):
@@ -217,10 +204,8 @@ def test_the_motion_tells_more_than_those_it_came_from(told, moved_problem):
     for name, known in told.parameter_precisions.items():
         assert known.std_recorded == pytest.approx(before.parameters[name].std_relative)
         assert known.std_combined <= min(known.std_recorded, known.std_planned)
-    assert (
-        told.parameter_precisions["elbow.stiffness"].std_planned
-        < told.parameter_precisions["elbow.stiffness"].std_recorded
-    )
+    stiffness = told.parameter_precisions["elbow.stiffness"]
+    assert stiffness.std_planned < stiffness.std_recorded
 
 
 def test_it_starts_and_ends_at_rest_within_limits(told):
@@ -238,34 +223,31 @@ def test_it_starts_and_ends_at_rest_within_limits(told):
 
 def test_one_parameter_is_told_better_where_it_alone_counts(moved_problem, told):
     alone = plan_informative_motion(moved_problem, replace(OPTIONS, identify=("elbow.damping",)))
-    assert (
-        alone.parameter_precisions["elbow.damping"].std_planned
-        <= 1.02 * told.parameter_precisions["elbow.damping"].std_planned
-    )
+    own, both = (plan.parameter_precisions["elbow.damping"].std_planned for plan in (alone, told))
+    assert own <= 1.02 * both
 
 
 def test_the_same_seed_gives_the_same_motion(moved_problem):
-    options = replace(OPTIONS, n_random_starts=1, max_iterations=2)
-    first, again, other = (plan_informative_motion(moved_problem, replace(options, seed=seed)) for seed in (0, 0, 1))
-    np.testing.assert_array_equal(first.spline_coefficients, again.spline_coefficients)
-    assert not np.allclose(first.spline_coefficients, other.spline_coefficients)
+    options = replace(OPTIONS, n_random_starts=1, max_iterations=1)
+    first, again, other = (
+        plan_informative_motion(moved_problem, replace(options, seed=seed)).spline_coefficients for seed in (0, 0, 1)
+    )
+    np.testing.assert_array_equal(first, again)
+    assert not np.allclose(first, other)
 
 
 def test_two_effects_are_moved_apart(driven_problem):
-    pair = ("joint_coulomb@shoulder", "joint_viscous@shoulder")
-    options = replace(OPTIONS, discriminate=pair, n_random_starts=2)
-    found = plan_informative_motion(driven_problem, options)
-    assert set(found.effect_distances) == {pair, pair[::-1]}
+    found = plan_informative_motion(driven_problem, replace(OPTIONS, discriminate=PAIR, n_random_starts=1))
+    assert set(found.effect_distances) == {PAIR, PAIR[::-1]}
     for before, after in found.effect_distances.values():
         assert after > 1.5 * before
 
 
 def test_effects_of_twice_the_size_lie_twice_as_far_apart(driven_problem):
-    pair = ("joint_coulomb@shoulder", "joint_viscous@shoulder")
-    quick = replace(OPTIONS, n_random_starts=1, max_iterations=1, discriminate=pair)
+    quick = replace(OPTIONS, n_random_starts=1, max_iterations=1, n_spline_coefficients=2, discriminate=PAIR)
     told = []
     for factor in (1.0, 2.0):
-        sizes = {pair[0]: {"tau_c": 0.2 * factor}, pair[1]: {"b": 0.05 * factor}}
+        sizes = {PAIR[0]: {"tau_c": 0.2 * factor}, PAIR[1]: {"b": 0.05 * factor}}
         told.append(plan_informative_motion(driven_problem, quick, None, sizes).effect_distances)
     for key in told[0]:
         assert told[1][key][0] == pytest.approx(2 * told[0][key][0], rel=1e-3)
@@ -277,8 +259,8 @@ def test_a_parameter_that_nothing_sees_is_named_and_the_others_are_told(limited_
     blind = problem.with_options(replace(problem.options, sensors=sensors))
     found = plan_informative_motion(blind, replace(OPTIONS, n_random_starts=1, max_iterations=3))
     assert set(found.unobservable_parameters) == {"shoulder.damping"}
-    assert found.parameter_precisions["shoulder.damping"].std_planned == np.inf
-    assert found.parameter_precisions["shoulder.damping"].std_combined == np.inf
+    damping = found.parameter_precisions["shoulder.damping"]
+    assert damping.std_planned == damping.std_combined == np.inf
     assert found.parameter_precisions["elbow.stiffness"].std_planned < 1.0
     with pytest.raises(ConfigError) as caught:
         plan_informative_motion(blind, replace(OPTIONS, identify=("shoulder.damping",)))

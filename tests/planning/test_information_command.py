@@ -107,15 +107,12 @@ def test_a_diagnosis_hands_over_its_parameters_and_effects(config, tmp_path):
     ("settings", "words"),
     [
         (["plan.identify=[elbow.stifness]"], ("no parameter 'elbow.stifness'", "did you mean", "pendulum.yaml")),
-        (["plan.discriminate=[joint_viscous@shoulder]"], ("two effects or more",)),
-        (["parameters.elbow.stiffness.free=false", "parameters.elbow.damping.free=false"],
-         ("no parameter is free",)),
+        (["parameters.elbow.stiffness.free=false", "parameters.elbow.damping.free=false"], ("no parameter is free",)),
         (["recordings.estimate=[]"], ("no recording to estimate on",)),
         (["plan.parameter_run=nowhere"], ("no finished run of `solve` or `diagnose`", "plan.parameter_run")),
-        (["plan.limits.effort_fraction=0.0001"], ("pass their limits before they move", "plan.limits")),
         (["plan.duration=0.1", "plan.hold_duration=0.1"], ("too short", "plan.duration")),
     ],
-)  # fmt: skip
+)
 def test_wrong_input_leaves_nothing(config, refused, settings, words):
     refused(config, settings, words)
 

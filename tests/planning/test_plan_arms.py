@@ -63,15 +63,9 @@ def test_the_middle_of_a_cable_stays_below_a_lid(repository, tmp_path):
 
 
 def test_a_path_of_the_free_tip_is_followed_as_far_as_it_says(repository, tmp_path):
-    path = (
-        "plan.goal=path",
-        "plan.waypoint_offsets=[[-0.01, 0.01, 0.02]]",
-        "plan.duration=1.6",
-        "plan.n_spline_coefficients=8",
-    )
-    run, outcome = planned(
-        repository, tmp_path, "plan_place", *COARSE["plan_place"], *path, "plan.position_tolerance=0.004"
-    )
+    path = "goal=path", "waypoint_offsets=[[-0.01, 0.01, 0.02]]", "duration=1.6", "n_spline_coefficients=8"
+    more = (f"plan.{entry}" for entry in (*path, "position_tolerance=0.004"))
+    run, outcome = planned(repository, tmp_path, "plan_place", *COARSE["plan_place"], *more)
     assert outcome.is_successful, outcome.result["message"]
     tip, t = outcome.plan.point_trajectories["w_T3"], outcome.plan.t
     halfway = tip[int(np.argmin(np.abs(t - 0.8)))] - tip[0]
@@ -97,13 +91,10 @@ def test_two_arms_bring_the_junction_to_a_place_and_keep_hold_of_it(repository, 
     np.testing.assert_allclose(found.joint_positions[0], first, atol=5e-3)
     travel = dict(zip(found.joint_names, np.ptp(found.joint_positions, axis=0), strict=True))
     assert min(max(v for k, v in travel.items() if k.startswith(side)) for side in ("left", "right")) > 0.01
-    system, theta = found.simulator.step.system, found.simulator.theta
+    system = found.simulator.step.system
     names = [end for grasp in system.grasps for end in (grasp.holder_frame, grasp.held_frame)]
-    at = (
-        FramePositions(system, names)
-        .positions_and_jacobian(found.rollout.state[:, : system.n_coordinates], theta)[0]
-        .reshape(len(found.t), -1, 2, 3)
-    )
+    at = found.simulator.trajectories(FramePositions(system, names), found.rollout.state)
+    at = at.reshape(len(found.t), -1, 2, 3)
     assert np.abs(at[:, :, 0] - at[:, :, 1]).max() < 1e-8
 
 
@@ -115,18 +106,13 @@ def test_an_arm_that_holds_nothing_cannot_move_the_object(repository, tmp_path):
 @pytest.mark.parametrize(
     ("limit", "words"),
     [
-        (
-            "effort_fraction=0.4",
-            ("left_s1 at rest where the motion begins", "beyond its limit", "plan.limits.effort_fraction"),
-        ),
-        ("max_spring_angle=0.001", ("at rest", "rad", "plan.limits.max_spring_angle")),
+        ("effort_fraction=0.4", r"(?s)left_s1 at rest where the motion begins.*beyond its limit.*effort_fraction"),
+        ("max_spring_angle=0.001", r"(?s)at rest.*rad.*plan\.limits\.max_spring_angle"),
     ],
 )
 def test_limits_that_rest_itself_passes_are_refused(repository, tmp_path, limit, words):
-    with pytest.raises(ConfigError) as caught:
+    with pytest.raises(ConfigError, match=words):
         planned(repository, tmp_path, "plan_place", *COARSE["plan_place"], f"plan.limits.{limit}")
-    for word in words:
-        assert word in str(caught.value)
 
 
 def test_a_real_cable_in_two_clamps_is_at_rest_before_it_is_moved(repository, tmp_path):

@@ -86,12 +86,9 @@ def test_parameters_and_their_uncertainty_come_from_a_run_of_solve(config, tmp_p
     assert source["parameters"] == {"elbow.stiffness": 4.0}
     outcome = run_plan(run, tmp_path / "out")
     assert max(outcome.result["std"]) > 1e-4
-
-
-def test_what_is_not_known_is_not_counted_and_said(config, tmp_path):
-    folder = solved(tmp_path / "solved", 4.0, np.inf)
-    run = load_config(config, [f"plan.parameter_run={folder}"])
-    _, known, source = identified_parameters(run, compile_planning_step(run))
+    # what is not known is not counted, and said
+    run = load_config(config, [f"plan.parameter_run={solved(tmp_path / 'unsure', 4.0, np.inf)}"])
+    _, known, source = identified_parameters(run, step)
     assert known.parameter_names == ()
     assert source["uncertainty_unknown"] == ["elbow.stiffness"]
 
@@ -107,11 +104,10 @@ def test_a_plan_that_fails_says_so(config, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        (["plan.target_offset=[0, 3, 0]"], ("out of reach", "mm off", "pendulum.yaml")),
         (["plan.parameter_run=nowhere"], ("no finished run of `solve`", "plan.parameter_run")),
         (["plan.goal=throw"], ("plan.goal", "place, path, box")),
         (["plan.limits.velocity_fraction=2"], ("plan.limits.velocity_fraction", "up to 1")),
-        (["plan.point=tup"], ("no frame 'tup'", "did you mean 'tip'?")),
+        (["plan.point=tup"], ("no frame 'tup'", "did you mean 'tip'?", "pendulum.yaml")),
     ],
 )
 def test_wrong_input_leaves_nothing(config, refused, settings, words):

@@ -14,6 +14,8 @@ import pytest
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.errors import DataError
+from yid_ocp.model.objects.foam_y import y_object
+from yid_ocp.model.system import System
 from yid_ocp.vision import (
     CameraScene,
     DepthCamera,
@@ -50,6 +52,12 @@ def truth():
 @pytest.fixture(scope="session")
 def system(single_arm):
     return single_arm
+
+
+@pytest.fixture(scope="session")
+def alone():
+    """The Y without a robot."""
+    return System.build(objects=[(y_object(), None, None)])
 
 
 @pytest.fixture(scope="session")
@@ -91,14 +99,14 @@ COARSE = DepthCamera(
 def tracked(system, run, recording, shape):
     """tracked(options, **camera and timing): frames, their track, the errors of all points in the good ones [m]."""
 
-    def make(options=None, outliers=0.0, seed=0, frames=None, stages=(), **timing):
+    def make(options=None, outliers=0.0, seed=0, frames=None, **timing):
         when = FrameTiming(**{"mean_rate": 4.0, "latency": LATENCY, **timing})
         scene = CameraScene(system, "package:baxter")
         camera = VirtualCamera(POSE, replace(COARSE, outlier_probability=outliers), when, seed=seed)
         made = render_virtual_frames(scene, run.t, run.q, camera)
         seen = made.sequence if frames is None else made.sequence.select_frames(frames)
         chosen = replace(options or TrackOptions(), tracked_points=system.point_frames)
-        found = track_object(scene, recording, seen, chosen, stages=stages)
+        found = track_object(scene, recording, seen, chosen)
         were = np.array([shape.points_at(made.true_configuration_at(t)) for t in found.t])
         errors = np.linalg.norm(found.position - were, axis=2)
         return SimpleNamespace(made=made, track=found, latency=when.latency, errors=errors)
@@ -108,7 +116,7 @@ def tracked(system, run, recording, shape):
 
 @pytest.fixture(scope="session")
 def clean(tracked):
-    return tracked(stages=[3])
+    return tracked()
 
 
 @pytest.fixture(scope="session")

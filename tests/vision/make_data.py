@@ -26,7 +26,7 @@ from yid_ocp.vision import (
     write_frame_folder,
 )
 from yid_ocp.vision.fit import ShapeFitter
-from yid_ocp.vision.point_cloud import ObjectRegion, is_not_outlier, is_not_robot, voxel_averages
+from yid_ocp.vision.point_cloud import ObjectRegion, is_not_outlier, voxel_averages
 from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, load_robot_meshes, numeric_mechanism
 
 FOLDER = Path(__file__).parent / "data"
@@ -52,7 +52,7 @@ def main() -> None:
         points = made.sequence.load_world_cloud(i)
         cloud = voxel_averages(points[region.bounds_at(q, pose[:3, 3]).contains(points)], VOXEL)
         cloud = cloud.select(is_not_outlier(cloud, 12, 4.0))
-        cloud = cloud.select(is_not_robot(cloud, robot, q, 0.03))
+        cloud = cloud.select(~robot.is_within_distance(cloud.points, q, 0.03))
         clouds.append((cloud.points - pose[:3, 3]) @ pose[:3, :3])
     write_frame_folder(FrameSequence.from_clouds(made.capture_times, clouds, pose), FOLDER / "frames")
     names = system.driven

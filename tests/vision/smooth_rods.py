@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from yid_ocp.vision import CameraIntrinsics, FrameSequence, look_at_pose
+from yid_ocp.model.rotations import homogeneous_transform
+from yid_ocp.vision import CameraIntrinsics, CameraScene, FrameSequence, TrackOptions, look_at_pose, track_object
 from yid_ocp.vision.frames import import_open3d
 from yid_ocp.vision.surface_meshes import TriangleMesh
 
@@ -54,16 +55,12 @@ def swept(line, tangents, radius, facets=24):
 
 def box(centre, size):
     """A box with its middle somewhere."""
-    place = np.eye(4)
-    place[:3, 3] = centre
-    return TriangleMesh.box(size).transformed(place)
+    return TriangleMesh.box(size).transformed(homogeneous_transform(np.eye(3), centre))
 
 
 def pole(foot, length, radius):
     """An upright cylinder."""
-    place = np.eye(4)
-    place[:3, 3] = foot
-    return TriangleMesh.cylinder(radius, 0.0, length).transformed(place)
+    return TriangleMesh.cylinder(radius, 0.0, length).transformed(homogeneous_transform(np.eye(3), foot))
 
 
 @dataclass
@@ -102,9 +99,8 @@ def seen(meshes: Sequence[TriangleMesh], seed, *, pose=None, pinhole=PINHOLE, no
     camera = look_at_pose(EYE, TARGET) if pose is None else pose
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)
     mesh = TriangleMesh.concatenate(list(meshes))
-    scene.add_triangles(
-        o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32))
-    )
+    corners, faces = mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32)
+    scene.add_triangles(o3d.core.Tensor(corners), o3d.core.Tensor(faces))
     rays = pinhole.pixel_rays
     directions = rays @ camera[:3, :3].T
     packed = np.concatenate([np.broadcast_to(camera[:3, 3], directions.shape), directions], axis=-1)
@@ -133,3 +129,12 @@ def filmed(object_: SmoothY, frames, things=lambda k: [], *, seed=0, rate=4.0, b
         clouds.append(seen([*meshes, *around, *things(k)], [seed, k]))
         truth.append([tips[name] for name in ("w_T1", "w_T2", "w_T3")])
     return FrameSequence.from_clouds(np.arange(frames) / rate, clouds, pose), np.array(truth)
+
+
+def measured(alone, sequence, truth, extra=(), empty=None, **options):
+    """A track of a filmed sequence, and its errors [m]."""
+    chosen = TrackOptions(tracked_points=alone.point_frames, **options)
+    found = track_object(CameraScene(alone, extra_meshes=extra), None, sequence, chosen, empty=empty)
+    good = [frame.index for frame in found.frame_reports if frame.is_good]
+    order = [("w_T1", "w_T2", "w_T3").index(name) for name in found.point_names]
+    return found, found.position - truth[good][:, order]

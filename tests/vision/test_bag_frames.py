@@ -24,6 +24,7 @@ LENS = CameraIntrinsics(8, 6, 10.0, 11.0, 3.5, 2.5, "plumb_bob", (-0.2, 0.05, 1e
 STAMPS = (0.3, 0.1, 0.2)
 """Since the first joint states [s]; messages come out of order."""
 KINDS = ("ros1", "ros2", "mcap")
+UNSTAMPED = object()
 
 
 class Bag:
@@ -44,36 +45,28 @@ class Bag:
     def __exit__(self, *error):
         self.writer.close()
 
-    def make(self, kind, **fields):
-        return self.store.types[kind](**fields)
-
-    def header(self, stamp):
-        time = self.make("builtin_interfaces/msg/Time", sec=int(stamp // 10**9), nanosec=int(stamp % 10**9))
-        seq = {"seq": 0} if self.kind == "ros1" else {}
-        return self.make("std_msgs/msg/Header", stamp=time, frame_id="camera_depth_optical_frame", **seq)
-
-    def put(self, topic, message):
-        kind = message.__msgtype__
+    def put(self, topic, kind, seconds=None, **fields):
+        """Write a message, with a header where a time is given."""
+        if seconds is not None:
+            stamp = self.of(
+                "builtin_interfaces/msg/Time",
+                *divmod(0 if seconds is UNSTAMPED else START + round(1e9 * seconds), 10**9),
+            )
+            sequence = (0,) if self.kind == "ros1" else ()
+            fields["header"] = self.of("std_msgs/msg/Header", *sequence, stamp=stamp, frame_id="camera")
         if topic not in self.connections:
             self.connections[topic] = self.writer.add_connection(topic, kind, typestore=self.store)
         pack = self.store.serialize_ros1 if self.kind == "ros1" else self.store.serialize_cdr
         self.log += 10**6
-        self.writer.write(self.connections[topic], self.log, bytes(pack(message, kind)))
+        self.writer.write(self.connections[topic], self.log, bytes(pack(self.of(kind, **fields), kind)))
+
+    def of(self, kind, *values, **fields):
+        return self.store.types[kind](*values, **fields)
 
     def joints(self, seconds):
-        stamp = START + round(1e9 * seconds)
         empty = np.zeros(0)
-        self.put(
-            "/joint_states",
-            self.make(
-                "sensor_msgs/msg/JointState",
-                header=self.header(stamp),
-                name=["a"],
-                position=np.zeros(1),
-                velocity=empty,
-                effort=empty,
-            ),
-        )
+        fields = {"name": ["a"], "position": np.zeros(1), "velocity": empty, "effort": empty}
+        self.put("/joint_states", "sensor_msgs/msg/JointState", seconds, **fields)
 
     def cloud(self, seconds, points, colours=None, topic="/camera/points", names="xyz"):
         order = ">" if self.big else "<"
@@ -85,41 +78,21 @@ class Bag:
         if colours is not None:
             wide = colours.astype(np.uint32)
             rows["rgb"] = (wide[:, 0] << 16) | (wide[:, 1] << 8) | wide[:, 2]
-        kind = "sensor_msgs/msg/PointField"
-        fields = [
-            self.make(kind, name=name, offset=rows.dtype.fields[name][1], datatype=7, count=1)
-            for name, _ in columns
-            if name != "gap"
-        ]
-        message = self.make(
-            "sensor_msgs/msg/PointCloud2",
-            header=self.header(START + round(1e9 * seconds)),
-            height=1,
-            width=len(rows),
-            fields=fields,
-            is_bigendian=self.big,
-            point_step=rows.dtype.itemsize,
-            row_step=rows.dtype.itemsize * len(rows),
-            data=np.frombuffer(rows.tobytes(), np.uint8),
-            is_dense=False,
-        )
-        self.put(topic, message)
+        places = {name: rows.dtype.fields[name][1] for name, _ in columns if name != "gap"}
+        field, size = "sensor_msgs/msg/PointField", rows.dtype.itemsize
+        fields = [self.of(field, name=name, offset=at, datatype=7, count=1) for name, at in places.items()]
+        layout = {"height": 1, "width": len(rows), "point_step": size, "row_step": size * len(rows), "is_dense": False}
+        data = np.frombuffer(rows.tobytes(), np.uint8)
+        kind = "sensor_msgs/msg/PointCloud2"
+        self.put(topic, kind, seconds, **layout, fields=fields, is_bigendian=self.big, data=data)
 
     def image(self, seconds, image, encoding, topic="/camera/depth/image_raw"):
         padded = np.zeros((image.shape[0], image.shape[1] + 1), image.dtype)  # rows may be longer than the picture
         padded[:, :-1] = image
         packed = padded.astype(padded.dtype.newbyteorder(">" if self.big else "<"))
-        message = self.make(
-            "sensor_msgs/msg/Image",
-            header=self.header(0 if seconds is None else START + round(1e9 * seconds)),
-            height=image.shape[0],
-            width=image.shape[1],
-            encoding=encoding,
-            is_bigendian=int(self.big),
-            step=packed.strides[0],
-            data=np.frombuffer(packed.tobytes(), np.uint8),
-        )
-        self.put(topic, message)
+        layout = {"height": image.shape[0], "width": image.shape[1], "step": packed.strides[0], "encoding": encoding}
+        data = np.frombuffer(packed.tobytes(), np.uint8)
+        self.put(topic, "sensor_msgs/msg/Image", seconds, **layout, is_bigendian=int(self.big), data=data)
 
     def info(self, lens=LENS, topic="/camera/depth/camera_info", model=None):
         matrix = np.array([lens.fx, 0, lens.cx, 0, lens.fy, lens.cy, 0, 0, 1])
@@ -127,21 +100,11 @@ class Bag:
         names = {"k": matrix, "d": np.array(lens.coefficients), "r": np.eye(3).ravel(), "p": own}
         if self.kind == "ros1":
             names = {key.upper(): value for key, value in names.items()}
-        region = self.make(
-            "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
-        )
-        message = self.make(
-            "sensor_msgs/msg/CameraInfo",
-            header=self.header(START),
-            height=lens.height,
-            width=lens.width,
-            distortion_model=model or lens.model,
-            **names,
-            binning_x=0,
-            binning_y=0,
-            roi=region,
-        )
-        self.put(topic, message)
+        nothing = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
+        region = self.of("sensor_msgs/msg/RegionOfInterest", **nothing)
+        more = {"height": lens.height, "width": lens.width, "binning_x": 0, "binning_y": 0, "roi": region}
+        kind = "sensor_msgs/msg/CameraInfo"
+        self.put(topic, kind, 0.0, distortion_model=model or lens.model, **names, **more)
 
 
 @pytest.mark.parametrize("big", [False, True])
@@ -191,7 +154,7 @@ def test_a_file_of_a_realsense_camera(tmp_path):
     with Bag(tmp_path, "ros1") as bag:
         bag.info(topic=f"{sensor}/Depth_0/info/camera_info")
         bag.info(CameraIntrinsics(8, 6, 1.0, 1.0, 0.0, 0.0), topic="/device_0/sensor_1/Color_0/info/camera_info")
-        bag.put(f"{sensor}/option/Depth_Units/value", bag.make("std_msgs/msg/Float32", data=1e-4))
+        bag.put(f"{sensor}/option/Depth_Units/value", "std_msgs/msg/Float32", data=1e-4)
         bag.image(0.0, DEPTH, "mono16", topic=f"{sensor}/Depth_0/image/data")
         bag.image(0.0, DEPTH.astype(np.uint8), "rgb8", topic="/device_0/sensor_1/Color_0/image/data")
     sequence = read_frames(bag.path, pose=POSE)
@@ -202,7 +165,7 @@ def test_messages_without_stamps_have_the_time_of_recording(tmp_path):
     with Bag(tmp_path, "ros2") as bag:
         bag.info()
         bag.image(0.7, DEPTH, "16UC1")
-        bag.image(None, DEPTH, "16UC1")
+        bag.image(UNSTAMPED, DEPTH, "16UC1")
     assert np.allclose(read_frames(bag.path, pose=POSE).stamps, [0.0, 1e-3], atol=1e-9)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from yid_ocp.errors import DataError
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.vision import CameraCalibrationOptions, CameraClockOptions, CameraIntrinsics, look_at_pose
 from yid_ocp.vision.calibration import (
-    _find_on_time_frames,
     calibrate_camera,
     calibration_as_given,
     estimate_stamp_delay,
@@ -28,7 +26,6 @@ from yid_ocp.vision.camera_registration import (
     ArmSurface,
     CalibrationFrame,
     CameraState,
-    _at_least,
     _CalibrationEquations,
     evaluate_robust_cost,
 )
@@ -112,6 +109,12 @@ def found_of(robot, seed, *, turn=0.0, shift=0.0, scale=1.0, latency=0.0, drift=
     return found, CameraState(POSE, 1 / scale, 0.0, latency + drift * (about - latency), drift, about)
 
 
+@pytest.fixture(scope="module")
+def clean(robot):
+    """A calibration from a right pose and clock."""
+    return found_of(robot, 3)
+
+
 def displaced(found, true):
     """By how much, and in how many standard deviations, points of the world are off, shape (N, 3)."""
     error = found.camera_state.to_world(true.to_measured(POINTS)) - POINTS
@@ -119,9 +122,6 @@ def displaced(found, true):
     return error, error / found.shared_point_std(
         POINTS, nothing, np.full(len(POINTS), found.camera_state.clock_reference_stamp)
     )
-
-
-# -- the state --------------------------------------------------------------------------------------------------------
 
 
 def test_slopes_of_the_state_are_derivatives():
@@ -148,14 +148,8 @@ def test_slopes_of_the_rows_are_derivatives(robot):
     points = state.to_world(cloud)
     glimpse = CalibrationFrame(1.7, cloud[arm.is_near_surface(points, 1.7, 0.02)][::7])
     rows = arm.calibration_equations(state, glimpse, 0.1, along=True)
-    for k, step in (
-        (TRANSLATION_SLICE.start, 1e-4),
-        (TRANSLATION_SLICE.start + 2, 1e-4),
-        (0, 1e-4),
-        (DEPTH_SCALE_INDEX, 1e-4),
-        (CLOCK_OFFSET_INDEX, 1e-3),
-        (CLOCK_DRIFT_INDEX, 1e-3),
-    ):
+    moved = {TRANSLATION_SLICE.start: 1e-4, TRANSLATION_SLICE.start + 2: 1e-4, 0: 1e-4, DEPTH_SCALE_INDEX: 1e-4}
+    for k, step in {**moved, CLOCK_OFFSET_INDEX: 1e-3, CLOCK_DRIFT_INDEX: 1e-3}.items():
         change = np.zeros(STATE_SIZE)
         change[k] = step
         ahead, behind = (
@@ -168,20 +162,9 @@ def test_slopes_of_the_rows_are_derivatives(robot):
             assert np.median(off) < 0.05 * np.abs(rows.jacobian[:, k]).max() + 1e-4
 
 
-# -- what it finds ----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {},
-        {"turn": 4.0, "shift": 0.04},
-        {"scale": 0.96, "latency": 0.4},
-        {"turn": 3.0, "shift": 0.03, "scale": 1.03, "latency": -0.3},
-    ],
-)
-def test_pose_depth_and_clock_are_found(robot, wrong):
-    found, true = found_of(robot, 3, **wrong)
+@pytest.mark.parametrize("wrong", [{}, {"turn": 4.0, "shift": 0.04, "latency": -0.3}, {"scale": 0.96, "latency": 0.4}])
+def test_pose_depth_and_clock_are_found(robot, clean, wrong):
+    found, true = found_of(robot, 3, frames=6, **wrong) if wrong else clean
     error, relative = displaced(found, true)
     assert np.abs(error).max() < 0.01
     assert np.abs(relative).max() < 4
@@ -195,8 +178,8 @@ def test_pose_depth_and_clock_are_found(robot, wrong):
 def test_standard_deviations_are_honest(robot):
     """Normalised errors of many clocks and places are of size one: neither three times as large nor a third."""
     z = []
-    for seed in range(6):
-        found, true = found_of(robot, 10 + seed, turn=1.0, shift=0.01, latency=0.05, frames=6)
+    for seed in range(5):
+        found, true = found_of(robot, 10 + seed, turn=1.0, shift=0.01, latency=0.05, frames=4)
         error = found.camera_state.difference_from(true) / np.sqrt(np.diag(found.state_covariance))
         z.append([error[CLOCK_OFFSET_INDEX], *displaced(found, true)[1].ravel()])
     size = np.sqrt(np.mean(np.square(z), axis=0))
@@ -245,27 +228,15 @@ def test_one_frame_at_its_minimum_has_the_errors_of_its_patches():
     assert found.score_covariance[0, 0] / found.hessian[0, 0] == pytest.approx(0.41, rel=0.3)
 
 
-def test_a_matrix_at_least_another_one_in_every_direction():
-    least = np.array([[2.0, 1.0, 0.0], [1.0, 3.0, 0.0], [0.0, 0.0, 0.0]])
-    above = least + np.array([[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
-    np.testing.assert_allclose(_at_least(least, above), above, atol=1e-9)
-    np.testing.assert_allclose(_at_least(least, np.zeros((3, 3))), least, atol=1e-9)
-    # as much as asked for along one direction only: that one is raised, the other one stays
-    mixed = _at_least(np.eye(2), np.array([[2.5, 2.0], [2.0, 2.5]]))
-    np.testing.assert_allclose(mixed, [[2.75, 1.75], [1.75, 2.75]], atol=1e-9)
-
-
-def test_drift_is_found_where_the_recording_is_long(robot):
-    found, _ = found_of(robot, 5, drift=1e-3, duration=60.0, frames=12, latency=0.05)
+def test_drift_is_found_where_the_recording_is_long(robot, clean):
+    found, _ = found_of(robot, 5, drift=1e-3, duration=60.0, frames=8, latency=0.05)
     std = math.sqrt(found.state_covariance[CLOCK_DRIFT_INDEX, CLOCK_DRIFT_INDEX])
     assert std < 2.5e-4
     assert abs(found.camera_state.clock_drift - 1e-3) < 4 * std
     assert "drift" in found.message
     assert np.abs(found.camera_state.to_joint_time(61.0 + 0.05 + 0.061) - 61.0) < 0.02
-    short, _ = found_of(robot, 5)
-    assert math.sqrt(short.state_covariance[CLOCK_DRIFT_INDEX, CLOCK_DRIFT_INDEX]) > 2 * std, (
-        "four seconds tell little of it"
-    )
+    short, _ = clean  # four seconds tell little of it
+    assert math.sqrt(short.state_covariance[CLOCK_DRIFT_INDEX, CLOCK_DRIFT_INDEX]) > 2 * std
     assert "drift" not in short.message
 
 
@@ -280,26 +251,16 @@ def test_frames_stamped_late_do_not_pull(robot):
     [cloud] = clouds(robot, [2.6], rng)
     for by, expected in ((0.0, False), (0.15, True)):
         stamp = 2.6 + found.camera_state.clock_offset + by
-        own = estimate_stamp_delay(
-            arm_of(robot),
-            found.camera_state,
-            stamp,
-            found.camera_state.to_world(cloud),
-            rng,
-            found.on_time_frames.median_square_distance,
-        )
+        points = found.camera_state.to_world(cloud)
+        own = estimate_stamp_delay(arm_of(robot), found.camera_state, stamp, points, rng, found.usual_square_distance)
         assert own.delay == pytest.approx(by, abs=max(4 * own.std, 0.01))
         assert is_stamped_late(own, CameraClockOptions()) is expected
-    assert _find_on_time_frames([None]).frame_indices == ()
-
-
-# -- a pose that is kept ----------------------------------------------------------------------------------------------
 
 
 def test_a_kept_pose_that_the_arm_contradicts_is_said_and_counted(robot):
     before = np.zeros(3)
     for shift, turn in ((0.0, 0.0), (0.03, 2.0)):
-        found, true = found_of(robot, 7, shift=shift, turn=turn, fix_pose=True)
+        found, true = found_of(robot, 7, shift=shift, turn=turn, fix_pose=True, frames=5)
         assert np.array_equal(found.camera_state.pose, found.prior_state.pose)
         assert found.camera_state.depth_scale == 1.0
         assert ("contradicts" in found.message) == (shift > 0)
@@ -310,8 +271,8 @@ def test_a_kept_pose_that_the_arm_contradicts_is_said_and_counted(robot):
         assert abs(found.camera_state.clock_offset - true.clock_offset) < 0.02, "the clock is found all the same"
 
 
-def test_speed_and_time_enter_the_standard_deviation(robot):
-    found, _ = found_of(robot, 8)
+def test_speed_and_time_enter_the_standard_deviation(clean):
+    found, _ = clean
     about = found.camera_state.clock_reference_stamp
     rest, fast = (found.shared_point_std(POINTS, np.full((3, 3), v), np.full(3, about)) for v in (0.0, 2.0))
     clock = math.sqrt(found.state_covariance[CLOCK_OFFSET_INDEX, CLOCK_OFFSET_INDEX])
@@ -323,16 +284,12 @@ def test_speed_and_time_enter_the_standard_deviation(robot):
     assert nothing.camera_state.to_joint_time(1.0) == pytest.approx(0.9)
 
 
-# -- refused ----------------------------------------------------------------------------------------------------------
-
-
 def test_refused_where_the_arm_does_not_tell(robot):
     with pytest.raises(DataError, match="moves too little") as caught:
-        found_of(robot, 9, motion=still)
+        found_of(robot, 9, motion=still, frames=4)
     assert "search_half_width: 0" in caught.value.hint
-    found, true = found_of(
-        robot, 9, motion=still, clock=CameraClockOptions(search_half_width=0.0), turn=2.0, shift=0.02
-    )
+    known = CameraClockOptions(search_half_width=0.0)
+    found, true = found_of(robot, 9, motion=still, clock=known, turn=2.0, shift=0.02, frames=5)
     assert np.abs(displaced(found, true)[1]).max() < 4
     assert "as given" in found.message
     away = look_at_pose([1.9, 0.6, 0.8], [4.0, 0.6, 0.8])
@@ -340,10 +297,10 @@ def test_refused_where_the_arm_does_not_tell(robot):
     nothing = [
         CalibrationFrame(t, c) for t, c in zip((1.0, 2.0, 3.0), clouds(robot, [1.0, 2.0, 3.0], rng), strict=True)
     ]
-    options, clock = CameraCalibrationOptions(fix_pose=True), CameraClockOptions(search_half_width=0.0)
+    options = CameraCalibrationOptions(fix_pose=True)
     with pytest.raises(DataError, match="in view in 0 frames"):
-        calibrate_camera(arm_of(robot), nothing, away, rng, CameraCalibrationOptions(), clock, "there")
-    kept = calibrate_camera(arm_of(robot), nothing, away, rng, options, clock)
+        calibrate_camera(arm_of(robot), nothing, away, rng, CameraCalibrationOptions(), known, "there")
+    kept = calibrate_camera(arm_of(robot), nothing, away, rng, options, known)
     assert kept.n_frames == 0
     assert "as given: it is in view in 0 frames" in kept.message
 
@@ -351,13 +308,10 @@ def test_refused_where_the_arm_does_not_tell(robot):
 def test_refused_where_the_camera_sees_through_the_arm(robot):
     """Another motion than the recorded one: nowhere does the arm lie on the clouds."""
     rng = np.random.default_rng(0)
-    times = np.linspace(1.0, 4.0, 6)
+    times = np.linspace(1.0, 4.0, 4)
     other = [
         CalibrationFrame(t, c)
         for t, c in zip(times, clouds(robot, times, rng, lambda t: lively(1.7 * t + 9)), strict=True)
     ]
     with pytest.raises(DataError, match="cannot be calibrated"):
         calibrate_camera(arm_of(robot), other, POSE, rng, CameraCalibrationOptions(), CameraClockOptions())
-    empty = [replace(g, points=g.points[g.points[:, 2] > 3.0]) for g in other]
-    with pytest.raises(DataError, match="cannot be calibrated"):
-        calibrate_camera(arm_of(robot), empty, POSE, rng, CameraCalibrationOptions(), CameraClockOptions())

@@ -4,54 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from smooth_rods import EYE, TARGET, SmoothY, box, filmed, floor_and_wall, pole, seen
+from smooth_rods import EYE, TARGET, SmoothY, box, filmed, floor_and_wall, measured, pole, seen
 
 from yid_ocp.errors import ConfigError, DataError, ModelError
-from yid_ocp.model.objects.foam_y import y_object
-from yid_ocp.model.system import System
 from yid_ocp.vision import (
-    CameraScene,
     CloudFilterOptions,
     ExtraMesh,
     FrameSequence,
-    TrackOptions,
     look_at_pose,
-    track_object,
 )
 from yid_ocp.vision.point_cloud import has_any_colour
-from yid_ocp.vision.sequence_calibration import BackgroundPoints, extra_meshes_by_joint, group_foreign_objects
+from yid_ocp.vision.sequence_calibration import BackgroundPoints, group_foreign_objects
 from yid_ocp.vision.shape_evidence import ForeignCluster, TubeLinks
-from yid_ocp.vision.surface_meshes import numeric_mechanism
+from yid_ocp.vision.surface_meshes import extra_meshes_by_joint, numeric_mechanism
 
 FRAMES = 2
-NAMES = ["w_T1", "w_T2", "w_T3"]
 TABLE = [0.6, 0.5, -0.2], [0.6, 0.8, 0.04]
-
-
-@pytest.fixture(scope="module")
-def alone():
-    """The Y without a robot."""
-    return System.build(objects=[(y_object(), None, None)])
-
-
-def measured(alone, sequence, truth, extra=(), empty=None, **options):
-    found = track_object(
-        CameraScene(alone, extra_meshes=extra),
-        None,
-        sequence,
-        TrackOptions(tracked_points=alone.point_frames, **options),
-        empty=empty,
-    )
-    good = [frame.index for frame in found.frame_reports if frame.is_good]
-    order = [NAMES.index(name) for name in found.point_names]
-    return found, found.position - truth[good][:, order]
-
-
-def emptied(things):
-    """The scene without the object."""
-    pose = look_at_pose(EYE, TARGET)
-    clouds = [seen([*floor_and_wall(), *things(k)], [9, k]) for k in range(2)]
-    return FrameSequence.from_clouds([0.0, 1.0], clouds, pose)
 
 
 @pytest.mark.parametrize(
@@ -71,9 +39,14 @@ def test_things_in_reach_neither_drop_frames_nor_mislead(alone, things, junction
     assert np.mean(relative < 2) > 0.9
 
 
-def test_messages_name_the_thing_and_what_helps(alone):
-    sequence, truth = filmed(SmoothY(), FRAMES, lambda k: [box(*TABLE)])
-    found, _ = measured(alone, sequence, truth)
+@pytest.fixture(scope="module")
+def table():
+    """The Y behind a table."""
+    return filmed(SmoothY(), FRAMES, lambda k: [box(*TABLE)])
+
+
+def test_messages_name_the_thing_and_what_helps(alone, table):
+    found, _ = measured(alone, *table)
     thing = found.foreign_objects[0]
     assert thing.centre == pytest.approx([0.7, 0.5, -0.18], abs=0.15)
     assert thing.size[1] == pytest.approx(0.8, abs=0.1)
@@ -83,13 +56,13 @@ def test_messages_name_the_thing_and_what_helps(alone):
     assert thing.text in found.notes
 
 
-def test_every_remedy_takes_the_table_away(alone):
+def test_every_remedy_takes_the_table_away(alone, table):
     """A background of frames or of an empty scene, and its mesh."""
-    sequence, truth = filmed(SmoothY(), FRAMES, lambda k: [box(*TABLE)])
-    empty = emptied(lambda k: [box(*TABLE)])
+    clouds = [seen([*floor_and_wall(), box(*TABLE)], [9, k]) for k in range(2)]
+    empty = FrameSequence.from_clouds([0.0, 1.0], clouds, look_at_pose(EYE, TARGET))
     mesh = ExtraMesh(box=TABLE[1], xyz=TABLE[0])
     for how in ({"background_estimation": "frames"}, {"extra": [mesh]}, {"empty": empty}):
-        found, error = measured(alone, sequence, truth, **how)
+        found, error = measured(alone, *table, **how)
         assert np.nanmax(np.linalg.norm(error, axis=2)) < 0.02
         assert all(np.linalg.norm(thing.size) < 0.6 for thing in found.foreign_objects)
 
@@ -97,7 +70,7 @@ def test_every_remedy_takes_the_table_away(alone):
 def test_an_empty_scene_is_a_background():
     rng = np.random.default_rng(0)
     wall = np.column_stack([rng.uniform(0, 1, (20000, 2)), 0.003 * rng.standard_normal(20000)])
-    background = BackgroundPoints.from_empty_scene([wall[::2], wall[1::2]], 0.008, 0.006)
+    background = BackgroundPoints.from_static_points([wall[::2], wall[1::2]], 0.008, 0.006)
     asked = np.array([[0.5, 0.5, 0.01], [0.5, 0.5, 0.06], [2.0, 0.5, 0.0]])
     assert background.contains(asked).tolist() == [True, False, False]
     assert background.contains(asked, 0.05).tolist() == [True, True, False]
@@ -111,7 +84,7 @@ def test_what_stands_still_is_a_background_but_for_the_object():
     elsewhere = [np.array([0.0, 1.0 + k, 0.0]) + rng.uniform(-0.05, 0.05, (3000, 3)) for k in range(4)]
     clouds = [np.concatenate([heap, rod, other]) for other in elsewhere]
     shape = TubeLinks(np.array([[[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]]]), np.array([0.02]), (0,), np.array([0.3]))
-    background = BackgroundPoints.from_static_points(clouds, [shape] * 4, 0.016, 0.006, 0.045)
+    background = BackgroundPoints.from_static_points(clouds, 0.016, 0.006, [shape] * 4, 0.045)
     assert background.contains(heap).mean() > 0.95
     assert not background.contains(rod).any()
     assert not background.contains(elsewhere[0]).any()
@@ -131,31 +104,31 @@ def test_what_moves_with_a_link_is_told_from_what_moves_by_itself():
         (lambda t: [0.5, 0.3 * t, 0.5], True, "", "take it out of view"),
         (lambda t: [3.0, 0.3 * t, 0.5], True, "", "box_lower and box_upper"),
     ):
-        [thing] = group_foreign_objects(looked(place), 6, 0.006, box_, links.__getitem__, False)
+        [thing] = group_foreign_objects(looked(place), 0.006, box_, links.__getitem__, False)
         assert (thing.moving, thing.link, thing.frames) == (moving, link, 6)
         assert help_ in thing.text
-    [thing] = group_foreign_objects(looked(lambda t: [0.5, 0.3 * t, 0.5]), 6, 0.006, box_, links.__getitem__, True)
+    [thing] = group_foreign_objects(looked(lambda t: [0.5, 0.3 * t, 0.5]), 0.006, box_, links.__getitem__, True)
     assert "colour" in thing.text
     still = looked(lambda t: [0.5, 0.5, 0.5])
     for left_out in (False, True):  # what is done already is no advice
-        [thing] = group_foreign_objects(still, 6, 0.006, box_, links.__getitem__, False, left_out)
+        [thing] = group_foreign_objects(still, 0.006, box_, links.__getitem__, False, left_out)
         assert ("background_estimation: frames" in thing.text) != left_out
         assert "film the scene without object and robot" in thing.text
 
 
 def test_extra_meshes_hang_on_links(system):
     tree = numeric_mechanism(system)
-    made = extra_meshes_by_joint(
-        [ExtraMesh(parent_frame="left_gripper", box=(0.1, 0.1, 0.1)), ExtraMesh(sphere=0.2, xyz=(1, 2, 3))], tree
-    )
+    extra = [ExtraMesh(parent_frame="left_gripper", box=(0.1, 0.1, 0.1)), ExtraMesh(sphere=0.2, xyz=(1, 2, 3))]
+    made = extra_meshes_by_joint(extra, tree)
     assert set(made) == {-1, tree.frames["left_gripper"].joint_index}
     assert made[-1][0].vertices.mean(axis=0) == pytest.approx([1, 2, 3], abs=0.01)
-    with pytest.raises(ConfigError, match="no link 'left_griper'"):
-        extra_meshes_by_joint([ExtraMesh(parent_frame="left_griper", sphere=0.1)], tree)
-    with pytest.raises(ConfigError, match="box and sphere"):
-        extra_meshes_by_joint([ExtraMesh(box=(1, 1, 1), sphere=0.1)], tree)
-    with pytest.raises(ModelError, match="no mesh"):
-        extra_meshes_by_joint([ExtraMesh(mesh="nowhere.stl")], tree)
+    for wrong, error, message in (
+        (ExtraMesh(parent_frame="left_griper", sphere=0.1), ConfigError, "no link 'left_griper'"),
+        (ExtraMesh(box=(1, 1, 1), sphere=0.1), ConfigError, "box and sphere"),
+        (ExtraMesh(mesh="nowhere.stl"), ModelError, "no mesh"),
+    ):
+        with pytest.raises(error, match=message):
+            extra_meshes_by_joint([wrong], tree)
 
 
 def test_colours_in_light_and_shade():
@@ -166,6 +139,6 @@ def test_colours_in_light_and_shade():
 
 
 def test_a_colour_mask_needs_colours(alone):
-    sequence, truth = filmed(SmoothY(), 1)
+    red = CloudFilterOptions(object_colours=((200.0, 40.0, 30.0),))
     with pytest.raises(DataError, match="no colours"):
-        measured(alone, sequence, truth, filters=CloudFilterOptions(object_colours=((200.0, 40.0, 30.0),)))
+        measured(alone, *filmed(SmoothY(), 1), filters=red)

@@ -2,52 +2,43 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
-from smooth_rods import Y_LENGTHS, Y_RADII, SmoothY, filmed
+from smooth_rods import Y_LENGTHS, Y_RADII, SmoothY, filmed, measured
 
 from yid_ocp.errors import DataError
-from yid_ocp.model.objects.foam_y import y_object
-from yid_ocp.model.system import System
-from yid_ocp.vision import CameraScene, CloudFilterOptions, TrackOptions, track_object
+from yid_ocp.vision import CloudFilterOptions
 from yid_ocp.vision.sequence_calibration import DimensionCheck
 
-FRAMES = 5
-NAMES = ["w_T1", "w_T2", "w_T3"]
+FRAMES = 4
 
 
 @pytest.fixture(scope="module")
-def alone():
-    """The Y without a robot."""
-    return System.build(objects=[(y_object(), None, None)])
+def track(alone):
+    """track(lengths, radii, **options): a track of smooth rods of other sizes, and its errors [m]."""
 
+    @cache
+    def film(lengths, radii, frames):
+        return filmed(SmoothY(Y_LENGTHS | dict(lengths), Y_RADII | dict(radii)), frames)
 
-@pytest.fixture(scope="module")
-def measured(alone):
-    """measured(lengths, radii, **options): a track of smooth rods of other sizes, and its errors [m]."""
-    kept = {}
+    @cache
+    def make(lengths, radii, frames, options):
+        return measured(alone, *film(lengths, radii, frames), **dict(options))
 
-    def make(lengths=None, radii=None, frames=FRAMES, **options):
-        key = str((lengths, radii, frames, options))
-        if key not in kept:
-            sequence, truth = filmed(SmoothY(Y_LENGTHS | (lengths or {}), Y_RADII | (radii or {})), frames)
-            found = track_object(
-                CameraScene(alone), None, sequence, TrackOptions(tracked_points=alone.point_frames, **options)
-            )
-            good = [frame.index for frame in found.frame_reports if frame.is_good]
-            order = [NAMES.index(name) for name in found.point_names]
-            kept[key] = found, found.position - truth[good][:, order]
-        return kept[key]
+    def by_name(lengths=(), radii=(), frames=FRAMES, **options):
+        return make(tuple(dict(lengths).items()), tuple(dict(radii).items()), frames, tuple(options.items()))
 
-    return make
+    return by_name
 
 
 def ratio(found, name):
     return np.exp(found.dimensions.log_ratio[found.dimensions.names.index(name)])
 
 
-def test_right_sizes_are_not_doubted(measured):
-    found, error = measured()
+def test_right_sizes_are_not_doubted(track):
+    found, error = track()
     assert found.dimensions.n_frames == FRAMES
     assert not found.dimensions.is_contradicted.any()
     assert not found.dimensions.messages
@@ -56,8 +47,8 @@ def test_right_sizes_are_not_doubted(measured):
 
 
 @pytest.mark.parametrize(("factor", "value"), [(1.1, "811 mm"), (0.9, "663 mm")])
-def test_a_wrong_length_is_said_and_its_point_is_not_written(measured, factor, value):
-    found, error = measured({"T3": factor * Y_LENGTHS["T3"]})
+def test_a_wrong_length_is_said_and_its_point_is_not_written(track, factor, value):
+    found, error = track({"T3": factor * Y_LENGTHS["T3"]})
     assert found.dimensions.is_contradicted.tolist() == [False, False, True, False, False, False]
     assert ratio(found, "T3.length") == pytest.approx(factor, abs=0.02)
     [message] = found.dimensions.messages
@@ -71,39 +62,39 @@ def test_a_wrong_length_is_said_and_its_point_is_not_written(measured, factor, v
     assert np.nanmax(np.abs(error)) < 0.006
 
 
-def test_a_wrong_length_further_up_moves_everything_and_is_found(measured):
-    found, error = measured({"T1": 1.1 * Y_LENGTHS["T1"]}, frames=3, estimated_dimensions=("length",))
+def test_a_wrong_length_further_up_moves_everything_and_is_found(track):
+    found, error = track({"T1": 1.1 * Y_LENGTHS["T1"]}, frames=3, estimated_dimensions=("length",))
     assert ratio(found, "T1.length") == pytest.approx(1.1, abs=0.02)
     assert np.nanmax(np.linalg.norm(error, axis=2)) < 0.012
     assert "T1.length is estimated: " in found.dimensions.messages[0]
     with pytest.raises(DataError, match=r"no point is known|not one frame") as caught:
-        measured({"T1": 1.1 * Y_LENGTHS["T1"]}, frames=3)
+        track({"T1": 1.1 * Y_LENGTHS["T1"]}, frames=3)
     assert caught.value.what.startswith("the object seems to be other than the model says (T1.length")
     assert "T1.length seems to be wrong" in caught.value.hint
 
 
-def test_radii_wrong_by_a_third_are_said_and_enter_the_standard_deviation(measured):
-    found, error = measured(radii={name: 1.3 * radius for name, radius in Y_RADII.items()})
+def test_radii_wrong_by_a_third_are_said_and_enter_the_standard_deviation(track):
+    found, error = track(radii={name: 1.3 * radius for name, radius in Y_RADII.items()})
     sizes = found.dimensions
     assert sizes.is_contradicted.tolist() == [False, False, False, True, True, True]
     assert np.exp(sizes.log_ratio[3:]) == pytest.approx(1.3, abs=0.1)
     # the camera's side of a thicker tube is nearer to it: all points are off by that, and say so
     assert np.nanmean((error / found.std) ** 2) < 1.5
-    plain, _ = measured()
+    plain, _ = track()
     assert np.nanmedian(found.std) > 1.5 * np.nanmedian(plain.std)
 
 
-def test_estimated_radii_are_used(measured):
-    found, error = measured(
+def test_estimated_radii_are_used(track):
+    found, error = track(
         radii={name: 0.7 * radius for name, radius in Y_RADII.items()}, estimated_dimensions=("radius",)
     )
     assert np.exp(found.dimensions.log_ratio[3:]) == pytest.approx(0.7, abs=0.06)
     assert np.nanmax(np.linalg.norm(error, axis=2)) < 0.012
 
 
-def test_an_end_outside_of_the_filters_box_tells_nothing_of_a_length(measured, alone):
+def test_an_end_outside_of_the_filters_box_tells_nothing_of_a_length(track):
     """What was cut off by a filter is no missing end."""
-    found, _ = measured(filters=CloudFilterOptions(box_lower=(0.0, -0.45, -2.0), box_upper=(2.0, 2.0, 2.0)))
+    found, _ = track(filters=CloudFilterOptions(box_lower=(0.0, -0.45, -2.0), box_upper=(2.0, 2.0, 2.0)))
     i = found.dimensions.names.index("T3.length")
     assert not found.dimensions.is_contradicted[i]
     assert all(np.isnan(frame.shape_fit.end_offsets[1]) for frame in found.frame_reports if frame.shape_fit is not None)

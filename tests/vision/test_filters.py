@@ -7,9 +7,7 @@ from yid_ocp.errors import ConfigError
 from yid_ocp.vision import CloudFilterOptions
 from yid_ocp.vision.point_cloud import (
     ObjectRegion,
-    WeightedCloud,
     is_not_outlier,
-    is_not_robot,
     voxel_averages,
     weighted_median,
 )
@@ -56,11 +54,10 @@ def test_the_robot_goes_with_its_padding(system, run):
     for q in (run.q[0], run.q[-1]):
         pose = robot.part_poses_at(q)[robot.part_joints.index(wrist)]
         surface = meshes[wrist].transformed(pose).vertices[::20]
-        assert not is_not_robot(WeightedCloud(surface, np.ones(len(surface))), robot, q, 0.01).any()
-        away = surface + np.array([0.0, 0.0, 3.0])
-        assert is_not_robot(WeightedCloud(away, np.ones(len(away))), robot, q, 0.01).all()
+        assert robot.is_within_distance(surface, q, 0.01).all()
+        assert not robot.is_within_distance(surface + np.array([0.0, 0.0, 3.0]), q, 0.01).any()
     tip = run.point_positions[0][system.point_frames.index("w_T1")][None]
-    assert is_not_robot(WeightedCloud(tip, np.ones(1)), robot, run.q[0], 0.03).all()
+    assert not robot.is_within_distance(tip, run.q[0], 0.03).any()
 
 
 def test_where_the_object_can_be(system, run):

@@ -38,12 +38,14 @@ def test_distances_follow_the_joints(ball):
         directions = np.random.default_rng(0).standard_normal((50, 3))
         directions /= np.linalg.norm(directions, axis=1)[:, None]
         radii = np.linspace(0.05, 0.3, 50)
-        found = ball.distance_to_surface(middle + radii[:, None] * directions, q, 0.15)
-        expected = np.abs(radii - 0.1)
+        points, expected = middle + radii[:, None] * directions, np.abs(radii - 0.1)
+        found = ball.nearest_moving_surface(points, q, 0.15)[0]
         assert np.allclose(found[expected < 0.145], expected[expected < 0.145], atol=6e-4)
         assert np.isinf(found[expected > 0.155]).all()
-    assert np.isfinite(ball.distance_to_surface(np.array([[0.0, 5.0, 0.6]]), [0, 0], 0.2)).all()
-    assert np.isinf(ball.distance_to_surface(np.array([[0.0, 5.0, 0.6]]), [0, 0], 0.2, moving_only=True)).all()
+        assert np.array_equal(ball.is_within_distance(points, q, 0.15, moving_only=True), np.isfinite(found))
+    beside = np.array([[0.0, 5.0, 0.6]])
+    assert ball.is_within_distance(beside, [0, 0], 0.2).all()
+    assert not ball.is_within_distance(beside, [0, 0], 0.2, moving_only=True).any()
 
 
 def test_closest_points_give_the_way_out(ball):

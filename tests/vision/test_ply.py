@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.errors import DataError
-from yid_ocp.vision.frame_folder import _read_ply_points
+from yid_ocp.vision import FrameSequence, read_frames, write_frame_folder
 
 CLOUD = np.random.default_rng(0).normal(size=(7, 3))
 COLUMNS = [("red", "u1"), ("x", "f4"), ("nx", "f8"), ("y", "f4"), ("z", "f4")]
@@ -43,10 +43,23 @@ SOUND = {
 }
 
 
+@pytest.fixture(scope="module")
+def read(tmp_path_factory):
+    """The points of a file with some bytes."""
+    folder = tmp_path_factory.mktemp("frames")
+    write_frame_folder(FrameSequence.from_clouds([0.0], [CLOUD], np.eye(4)), folder)
+    sequence = read_frames(folder)
+
+    def points(data):
+        (folder / sequence.frame_names[0]).write_bytes(data)
+        return sequence.load_cloud(0)
+
+    return points
+
+
 @pytest.mark.parametrize("kind", SOUND)
-def test_points_are_read(tmp_path, kind):
-    (tmp_path / "a.ply").write_bytes(SOUND[kind])
-    assert np.allclose(_read_ply_points(tmp_path / "a.ply"), CLOUD, atol=1e-6)
+def test_points_are_read(read, kind):
+    assert np.allclose(read(SOUND[kind]), CLOUD, atol=1e-6)
 
 
 WRONG = {
@@ -69,20 +82,18 @@ WRONG = {
 
 
 @pytest.mark.parametrize("kind", WRONG)
-def test_damage_is_said(tmp_path, kind):
+def test_damage_is_said(read, kind):
     data, message = WRONG[kind]
-    (tmp_path / "a.ply").write_bytes(data)
     with pytest.raises(DataError, match=message):
-        _read_ply_points(tmp_path / "a.ply")
+        read(data)
 
 
-def test_whatever_is_damaged_is_read_or_refused(tmp_path):
-    rng, path = np.random.default_rng(1), tmp_path / "a.ply"
+def test_whatever_is_damaged_is_read_or_refused(read):
+    rng = np.random.default_rng(1)
     for data in SOUND.values():
         for _ in range(100):
             made = bytearray(data)
             for at in rng.integers(len(made), size=3):
                 made[at] = int(rng.integers(256))
-            path.write_bytes(bytes(made))
             with contextlib.suppress(DataError):
-                assert _read_ply_points(path).shape[1] == 3
+                assert read(bytes(made)).shape[1] == 3

@@ -5,7 +5,7 @@ import pytest
 
 from yid_ocp.errors import ConfigError
 from yid_ocp.vision import SkeletonOptions
-from yid_ocp.vision.point_cloud import WeightedCloud, _spanning_forest, _thin_to_nodes, extract_skeleton
+from yid_ocp.vision.point_cloud import WeightedCloud, extract_skeleton
 
 FOOT, FORK = np.zeros(3), np.array([0.0, 0.0, 0.8])
 ENDS = (np.array([0.0, 0.4, 1.2]), np.array([0.0, -0.5, 1.3]))
@@ -33,11 +33,12 @@ def from_bones(points):
 
 def test_nodes_lie_on_the_centre_lines():
     cloud = letter()
-    nodes, size, label = _thin_to_nodes(cloud, np.random.default_rng(0))
+    found = extract_skeleton(cloud, np.random.default_rng(0))
+    nodes, label = found.nodes, found.node_of_point
     assert np.median(from_bones(nodes)) < 0.005
     assert from_bones(nodes).max() < 0.02
-    assert size.sum() == (label >= 0).sum()
-    assert (label >= 0).mean() > 0.9
+    assert found.node_weights.sum() == found.has_node.sum()
+    assert found.has_node.mean() > 0.9
     for i in range(len(nodes)):
         mine = cloud.points[label == i]
         assert len(mine) <= 50
@@ -46,14 +47,14 @@ def test_nodes_lie_on_the_centre_lines():
 
 def test_the_walk_begins_at_the_lowest_point():
     for down, end in (((0, 0, -1), FOOT), ((0, 0, 1), ENDS[1]), ((0, 1, 0), ENDS[0])):
-        nodes, _, _ = _thin_to_nodes(letter(), np.random.default_rng(0), down=down)
+        nodes = extract_skeleton(letter(), np.random.default_rng(0), down=down).nodes
         assert np.linalg.norm(nodes[0] - end) < 0.05
         # from there it goes on to neighbours
         assert np.linalg.norm(np.diff(nodes[:6], axis=0), axis=1).max() < 0.1
 
 
 def test_the_same_seed_gives_the_same_nodes_and_another_hardly_others():
-    one, two, other = (_thin_to_nodes(letter(), np.random.default_rng(seed))[0] for seed in (1, 1, 2))
+    one, two, other = (extract_skeleton(letter(), np.random.default_rng(seed)).nodes for seed in (1, 1, 2))
     assert np.array_equal(one, two)
     assert abs(len(other) - len(one)) < 0.15 * len(one)
 
@@ -83,20 +84,18 @@ def test_too_little_gives_nothing():
     assert len(extract_skeleton(few, np.random.default_rng(0)).nodes) == 0
     empty = extract_skeleton(WeightedCloud(np.empty((0, 3)), np.empty(0)), np.random.default_rng(0))
     assert len(empty.nodes) == len(empty.edges) == len(empty.node_of_point) == 0
-    assert _spanning_forest(np.zeros((1, 3)))[1].tolist() == [0]
 
 
 def test_points_at_one_place_do_not_hang_it():
     cloud = WeightedCloud(np.zeros((500, 3)), np.ones(500))
-    nodes, _, label = _thin_to_nodes(cloud, np.random.default_rng(0))
-    assert len(nodes) == 10
-    assert (label >= 0).all()
-    ring = 0.069 * np.column_stack([np.cos(np.arange(40)), np.sin(np.arange(40)), np.zeros(40)])
-    _thin_to_nodes(
-        WeightedCloud(ring, np.ones(40)),
-        np.random.default_rng(0),
-        SkeletonOptions(neighbour_radius=0.01, min_segment_points=1),
+    found = extract_skeleton(cloud, np.random.default_rng(0))
+    assert len(found.nodes) == 10
+    assert found.has_node.all()
+    ring = WeightedCloud(
+        0.069 * np.column_stack([np.cos(np.arange(40)), np.sin(np.arange(40)), np.zeros(40)]), np.ones(40)
     )
+    lonely = SkeletonOptions(neighbour_radius=0.01, min_segment_points=1)
+    assert len(extract_skeleton(ring, np.random.default_rng(0), lonely).nodes)
 
 
 def test_options_are_checked():

@@ -1,10 +1,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from matplotlib.image import imread
 from scipy.spatial.transform import Rotation
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
@@ -20,12 +20,20 @@ from yid_ocp.vision import (
     track_object,
 )
 from yid_ocp.vision.camera_registration import CLOCK_OFFSET_INDEX, CameraState
-from yid_ocp.vision.track_result import _STAGE_NAMES, draw_frame_stages, draw_track
+from yid_ocp.vision.track import FrameTracker
 
 MILLIMETRE = 1e-3
 
 
-# -- the figures that it must reach -----------------------------------------------------------------------------------
+@pytest.fixture(scope="module")
+def plain(system, small):
+    """The small sequence tracked without the robot's meshes, all points, and what was told meanwhile."""
+    calls = []
+    options = TrackOptions(tracked_points=system.point_frames)
+    found = track_object(
+        CameraScene(system), small.recording, small.sequence, options, progress=lambda *told: calls.append(told)
+    )
+    return SimpleNamespace(track=found, calls=calls)
 
 
 def test_points_at_two_metres(clean, system):
@@ -51,30 +59,20 @@ def test_errors_are_within_the_stated_standard_deviations(clean, system):
     assert clean.track.std.max() < 20 * MILLIMETRE
 
 
-def test_the_seed_hardly_matters(system, recording, clean):
+def test_the_seed_hardly_matters(system, small, plain):
     """The same frame sequence, other random points in the walk: within the noise."""
-    chosen = clean.made.sequence.select_frames([2, 6])
-    clouds = [chosen.load_cloud(i) for i in range(2)]
-    seen = replace(chosen, load_cloud=clouds.__getitem__)
-    known = TrackOptions(
-        clock=CameraClockOptions(initial_offset=clean.latency, search_half_width=0.0),
-        calibration=CameraCalibrationOptions(fix_pose=True),
-        tracked_points=system.point_frames,
+    options = TrackOptions(tracked_points=system.point_frames)
+    again, other = (
+        track_object(CameraScene(system), small.recording, small.sequence, replace(options, seed=seed)).position
+        for seed in (0, 1)
     )
-    scene = CameraScene(system, "package:baxter")
-    first, other, again = (
-        track_object(scene, recording, seen, replace(known, seed=seed)).position for seed in (1, 2, 1)
-    )
-    assert np.abs(first - other).max() < 2 * MILLIMETRE
-    assert np.array_equal(again, first)
+    assert np.abs(plain.track.position - other).max() < 2 * MILLIMETRE
+    assert np.array_equal(plain.track.position, again)
 
 
 def test_frames_that_were_fitted_say_how_long_it_took(clean):
     for frame in clean.track.frame_reports:
         assert (frame.cpu_seconds > 0) == (frame.shape_fit is not None)
-
-
-# -- the clock --------------------------------------------------------------------------------------------------------
 
 
 def test_the_camera_and_its_clock_are_found(clean):
@@ -109,23 +107,14 @@ def test_a_displaced_camera_is_put_right_or_said(system, recording, clean):
     pose = sequence.camera_pose.copy()
     pose[:3, 3] += [0.03, -0.025, 0.02]
     pose[:3, :3] = Rotation.from_rotvec([0.02, -0.01, 0.03]).as_matrix() @ pose[:3, :3]
-    stds = []
-    for options in (
-        TrackOptions(),
-        TrackOptions(calibration=CameraCalibrationOptions(fix_pose=True), max_point_std=0.2),
-    ):
-        options = replace(
-            options,
-            max_distance_in_radii=4.0,
-            max_distance_ratio=20.0,
-            max_grasp_gap_change=0.2,
-            min_visible_coverage=0.0,
-        )
-        found = track_object(
-            CameraScene(system, "package:baxter"), recording, replace(sequence, camera_pose=pose), options
-        )
-        assert "sees the arm" in found.camera_calibration.message or "contradicts" in found.camera_calibration.message
-        truth = np.array([found._place(clean.made.true_configuration_at(t)) for t in found.t])[:, [0, 2]]
+    loose = {"max_distance_in_radii": 4.0, "max_distance_ratio": 20.0, "max_grasp_gap_change": 0.2}
+    kept = {"calibration": CameraCalibrationOptions(fix_pose=True), "max_point_std": 0.2}
+    scene, stds = CameraScene(system, "package:baxter"), []
+    for more, word in (({}, "sees the arm"), (kept, "contradicts")):
+        options = TrackOptions(**loose, min_visible_coverage=0.0, **more)
+        found = track_object(scene, recording, replace(sequence, camera_pose=pose), options)
+        assert word in found.camera_calibration.message
+        truth = np.array([found._place(clean.made.true_configuration_at(t)) for t in found.t])
         errors = found.position - truth
         assert np.nanmean((errors / found.std) ** 2) < 1.5
         if not stds:
@@ -142,9 +131,6 @@ def test_without_motion_the_clock_has_to_be_given(system, clean, small):
     sequence = clean.made.sequence.select_frames([0, 1, 2])
     with pytest.raises(DataError, match="cannot be calibrated by the arm"):
         track_object(CameraScene(system, "package:baxter"), still, sequence)
-
-
-# -- what it leaves ---------------------------------------------------------------------------------------------------
 
 
 def test_a_recording_that_solve_reads(tmp_path, clean, recording, system):
@@ -173,17 +159,15 @@ def test_positions_of_a_straight_object_stay_with_their_points(clean, recording)
         assert (clean.track.to_recording(before).marker_reference_pose is not None) is kept
     assert clean.track.to_recording(recording).marker_reference_pose is None
     mocap = replace(groups["points_arm"], name="points_mocap")
-    assert (
-        clean.track.to_recording(
-            replace(recording, points=(mocap,), marker_reference_pose=straight)
-        ).marker_reference_pose
-        is None
-    )
+    before = replace(recording, points=(mocap,), marker_reference_pose=straight)
+    assert clean.track.to_recording(before).marker_reference_pose is None
 
 
 def test_the_points_are_those_that_no_arm_holds(system, small):
-    found = track_object(CameraScene(system), small.recording, small.sequence)
-    assert found.point_names == ("w_T1", "w_T3")
+    assert FrameTracker(CameraScene(system), small.recording, small.sequence, TrackOptions()).point_names == (
+        "w_T1",
+        "w_T3",
+    )
     with pytest.raises(ConfigError, match="no point 'w_T9'"):
         track_object(CameraScene(system), small.recording, small.sequence, TrackOptions(tracked_points=("w_T9",)))
 
@@ -198,150 +182,98 @@ def test_the_spline_passes_through_the_good_frames(clean, system):
     assert np.array_equal(found.configuration_at(found.t[-1] + 5.0), found.configuration_at(found.t[-1]))
 
 
-def test_pictures_of_every_stage(clean, tmp_path):
-    [stages] = clean.track.frame_stages
-    assert stages.frame_name == "frame 3"
-    files = draw_frame_stages(stages, tmp_path / "pictures")
-    assert [file.stem.rpartition("_")[2] for file in files] == list(_STAGE_NAMES)
-    draw_track(clean.track, tmp_path / "track.png")
-    for file in (*files, tmp_path / "track.png"):
-        image = imread(file)
-        assert image.shape[0] > 400
-        assert image[..., :3].std() > 0.01
-
-
-def test_progress_is_reported(system, small):
-    calls = []
-    track_object(
-        CameraScene(system),
-        small.recording,
-        small.sequence,
-        progress=lambda done, total, text: calls.append((done, total, text)),
-    )
-    assert [done for done, _, _ in calls] == sorted(done for done, _, _ in calls)
-    assert calls[-1] == (3, 3, "done")
-    assert calls[0][2] == "comparing the object's sizes"
-    assert calls[1][2] == "fitting 000000.ply"
-
-
-def test_a_small_sequence_from_disk(system, small):
-    found = track_object(
-        CameraScene(system), small.recording, small.sequence, TrackOptions(tracked_points=system.point_frames)
-    )
-    errors = np.linalg.norm(found.position - small.truth, axis=2)
+def test_a_small_sequence_from_disk(small, plain):
+    errors = np.linalg.norm(plain.track.position - small.truth, axis=2)
     assert errors.max() < 8 * MILLIMETRE
-    assert [frame.n_raw_points for frame in found.frame_reports] == [len(cloud) for cloud in small.clouds]
+    assert [frame.n_raw_points for frame in plain.track.frame_reports] == [len(cloud) for cloud in small.clouds]
+    done = [done for done, _, _ in plain.calls]
+    assert done == sorted(done)
+    assert plain.calls[-1] == (3, 3, "done")
+    assert [text for _, _, text in plain.calls[:2]] == ["comparing the object's sizes", "fitting 000000.ply"]
 
 
-# -- bad input: a clear error, or a dropped frame with the reason -----------------------------------------------------
+def unreadable():
+    raise DataError("the cloud is empty or cannot be read")
 
 
-def spoilt(small, **changes):
-    """The small frame sequence with some clouds or stamps replaced."""
-    clouds = [changes.get(f"cloud{i}", cloud) for i, cloud in enumerate(small.clouds)]
-    return FrameSequence.from_clouds(changes.get("t", small.sequence.stamps), clouds, small.sequence.camera_pose)
+DUST = np.random.default_rng(0)
+BAD = {
+    "the cloud is empty": lambda points: points[:0],
+    "the cloud is empty:": lambda points: np.full_like(points, np.nan),
+    "not in metres": lambda points: 1000 * points,
+    "no point lies where the object can be": lambda points: points + np.array([30.0, 0.0, 0.0]),
+    "too few points of the object": lambda points: points[:60],
+    "an end is not where its gripper is": lambda points: points * [1.0, 1.0, 1.05],
+    "the cloud is empty or cannot be read": lambda points: unreadable(),
+    "": lambda points: points + DUST.uniform(-0.3, 0.3, points.shape),  # random points are no object
+}
+
+
+def test_bad_frames_are_dropped_with_the_reason_and_do_not_stop_the_rest(system, small):
+    """Clouds that are bad, stamps that are out of order, duplicated or missing, and a time without joint angles."""
+    bad, t = list(BAD.values()), small.sequence.stamps
+    stamps = [t[2], t[0], t[1], *(t[1] + 1e-3 * (1 + np.arange(len(bad)))), t[0], np.nan, 99.0]
+
+    def load(index):
+        if 3 <= index < 3 + len(bad):
+            return bad[index - 3](small.clouds[1])
+        return small.clouds[[2, 0, 1][index]] if index < 3 else small.clouds[0]
+
+    sequence = replace(small.sequence, stamps=np.array(stamps), frame_names=tuple(map(str, stamps)), load_cloud=load)
+    found = track_object(CameraScene(system), small.recording, sequence)
+    assert np.array_equal(found.t, t)
+    reports = {frame.index: frame.drop_reason for frame in found.frame_reports}
+    assert list(reports)[:2] == [1, 3 + len(bad)]
+    for index, reason in enumerate(BAD, start=3):
+        assert reports[index]
+        assert reason.rstrip(":") in reports[index]
+    duplicate, missing, late = (reports[3 + len(bad) + k] for k in range(3))
+    assert "a duplicate" in duplicate
+    assert "not a number" in missing
+    assert late == "there are no joint angles at its time"
+    assert sum(found.drop_reason_counts.values()) == len(bad) + 3
+
+
+def spoilt(small, clouds=None, t=None):
+    """The small frame sequence with other clouds or stamps."""
+    return FrameSequence.from_clouds(
+        small.sequence.stamps if t is None else t,
+        small.clouds if clouds is None else clouds,
+        small.sequence.camera_pose,
+    )
 
 
 @pytest.mark.parametrize(
-    ("cloud", "reason"),
+    ("change", "options", "message"),
     [
-        (lambda points: points[:0], "the cloud is empty"),
-        (lambda points: np.full_like(points, np.nan), "the cloud is empty"),
-        (lambda points: 1000 * points, "not in metres"),
-        (lambda points: points + np.array([30.0, 0.0, 0.0]), "no point lies where the object can be"),
-        (lambda points: points[:60], "too few points of the object"),
-        (lambda points: points * [1.0, 1.0, 1.05], "an end is not where its gripper is"),
+        (lambda points: 1000 * points, TrackOptions(), "metres"),
+        (lambda points: points, TrackOptions(filters=CloudFilterOptions(box_lower=(0.0, 0.0, 5.0))), "camera's pose"),
     ],
 )
-def test_one_bad_cloud_does_not_stop_the_rest(system, small, cloud, reason):
-    found = track_object(CameraScene(system), small.recording, spoilt(small, cloud1=cloud(small.clouds[1])))
-    assert [frame.is_good for frame in found.frame_reports] == [True, False, True]
-    assert reason in found.frame_reports[1].drop_reason
-    assert len(found.t) == 2
-    assert sum(found.drop_reason_counts.values()) == 1
-
-
-def test_random_points_are_no_object(system, small):
-    rng = np.random.default_rng(0)
-    dust = small.clouds[1] + rng.uniform(-0.3, 0.3, small.clouds[1].shape)
-    found = track_object(CameraScene(system), small.recording, spoilt(small, cloud1=dust))
-    assert not found.frame_reports[1].is_good
-
-
-@pytest.mark.parametrize(
-    ("cloud", "message"),
-    [
-        (lambda points: points[:0], "the cloud is empty"),
-        (lambda points: 1000 * points, "metres"),
-        (lambda points: points + np.array([30.0, 0.0, 0.0]), "camera's pose"),
-    ],
-)
-def test_nothing_but_bad_clouds_is_an_error(system, small, cloud, message):
-    clouds = {f"cloud{i}": cloud(points) for i, points in enumerate(small.clouds)}
+def test_nothing_but_bad_clouds_is_an_error(system, small, change, options, message):
+    sequence = spoilt(small, [change(points) for points in small.clouds])
     with pytest.raises(DataError, match="not one frame could be used") as caught:
-        track_object(CameraScene(system), small.recording, spoilt(small, **clouds))
+        track_object(CameraScene(system), small.recording, sequence, options)
     assert message in caught.value.what
     assert caught.value.what.endswith(f"({len(small.clouds)} of {len(small.clouds)})")  # all for one reason
     assert "other than the model says" not in caught.value.what
     assert caught.value.hint
 
 
-def test_all_points_filtered(system, small):
-    options = TrackOptions(filters=CloudFilterOptions(box_lower=(0.0, 0.0, 5.0)))
-    with pytest.raises(DataError, match="no point lies where the object can be"):
-        track_object(CameraScene(system), small.recording, small.sequence, options)
-
-
-def test_stamps_out_of_order_duplicated_or_missing(system, small):
-    t = small.sequence.stamps
-    clouds = [*small.clouds, small.clouds[0], small.clouds[0]]
-    sequence = FrameSequence.from_clouds(
-        [t[2], t[0], t[1], t[0], np.nan], [clouds[2], *clouds[:2], *clouds[3:]], small.sequence.camera_pose
-    )
-    found = track_object(CameraScene(system), small.recording, sequence)
-    assert np.array_equal(found.t, t)
-    assert [frame.index for frame in found.frame_reports] == [1, 3, 2, 0, 4]
-    assert "a duplicate" in found.frame_reports[1].drop_reason
-    assert "not a number" in found.frame_reports[4].drop_reason
-    straight = track_object(CameraScene(system), small.recording, small.sequence)
-    assert np.abs(found.position - straight.position).max() < 2 * MILLIMETRE
-
-
 def test_the_time_of_another_clock(system, small):
+    later = spoilt(small, t=small.sequence.stamps + 1.7e9)
     with pytest.raises(DataError, match="their clocks are not the same") as caught:
-        track_object(CameraScene(system), small.recording, spoilt(small, t=small.sequence.stamps + 1.7e9))
+        track_object(CameraScene(system), small.recording, later)
     assert "give the clock offset" in caught.value.hint
     options = TrackOptions(clock=CameraClockOptions(initial_offset=1.7e9))
-    assert (
-        len(
-            track_object(
-                CameraScene(system), small.recording, spoilt(small, t=small.sequence.stamps + 1.7e9), options
-            ).t
-        )
-        == 3
-    )
-    late = track_object(CameraScene(system), small.recording, spoilt(small, t=[*small.sequence.stamps[:2], 99.0]))
-    assert late.frame_reports[2].drop_reason == "there are no joint angles at its time"
-
-
-def test_a_file_that_cannot_be_read(system, small):
-    def load(index):
-        if index == 1:
-            raise DataError("the cloud is empty or cannot be read")
-        return small.clouds[index]
-
-    found = track_object(CameraScene(system), small.recording, replace(small.sequence, load_cloud=load))
-    assert found.frame_reports[1].drop_reason == "the cloud is empty or cannot be read"
+    assert len(track_object(CameraScene(system), small.recording, later, options).t) == 3
 
 
 def test_a_recording_that_does_not_fit(system, small, urdf_folder):
     joints = small.recording.joints
+    points = PointGroup("points", ("a",), [0.0], np.zeros((1, 1, 3)))
     with pytest.raises(DataError, match="no joint angles"):
-        track_object(
-            CameraScene(system),
-            Recording(points=(PointGroup("points", ("a",), [0.0], np.zeros((1, 1, 3))),)),
-            small.sequence,
-        )
+        track_object(CameraScene(system), Recording(points=(points,)), small.sequence)
     names = ("left_s9", *joints.names[1:])
     with pytest.raises(DataError, match="joint 'left_s0' of the model is not recorded"):
         track_object(CameraScene(system), Recording(JointGroup(names, joints.t, joints.position)), small.sequence)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,32 +33,11 @@ from yid_ocp.progress import NULL_PROGRESS, Progress
 Array = NDArray[np.float64]
 
 _UNOBSERVABLE_STDS = 1e-2  # stds by which no reading moves when a parameter changes by its whole value: nothing sees it
-_RANDOM_COEFFICIENT_STD = (
-    0.3  # of the random motions from which a search begins, before limits make them smaller [rad or m]
-)
+_RANDOM_COEFFICIENT_STD = 0.3  # of random motions from which a search begins, before limits shrink them [rad or m]
 _MAX_RELATIVE_SENSITIVITY_CHANGE = 0.05  # of a sensitivity with a ten-thousandth of the motion, or the object snaps
 _ACTIVE_LIMIT_FRACTION = 0.98  # part of a limit from which it counts as reached
 _PROBE_AMPLITUDE = 0.05  # largest unknown of a motion that asks what else could see a parameter [rad or m]
 _MIN_VISIBLE_MOTION = 1e-4  # of a point that a camera may see, for a change of a parameter by its whole value [m]
-
-
-@dataclass(frozen=True)
-class SearchStartResult:
-    """Result of the search from one random initial motion.
-
-    Attributes
-    ----------
-    initial_criterion, final_criterion : float
-        Search criterion of the initial and of the final motion [nat].
-    configured_criterion : float
-        Criterion of the final motion in the configured problem [nat]; minus infinity where it cannot be simulated.
-    """
-
-    initial_criterion: float
-    final_criterion: float
-    configured_criterion: float
-    is_converged: bool
-    n_iterations: int
 
 
 @dataclass(frozen=True)
@@ -83,7 +62,7 @@ class InformativeMotionPlan(PlannedMotion):
     effect_distances : mapping of (str, str) to (float, float)
         For each pair of effects, distance of the change by the first from what the second and all free unknowns can
         imitate, in standard deviations of the data: in the recordings and in the plan. Empty without effects.
-    start_results : tuple of SearchStartResult
+    start_results : tuple of MotionSearchResult
         Results of the random initial motions, in the order drawn.
     active_limits : mapping of str to tuple of str
         Names of the joints, springs or frames that reach a limit, by kind of limit.
@@ -95,7 +74,7 @@ class InformativeMotionPlan(PlannedMotion):
 
     parameter_precisions: Mapping[str, ParameterPrecision]
     effect_distances: Mapping[tuple[str, str], tuple[float, float]]
-    start_results: tuple[SearchStartResult, ...]
+    start_results: tuple[MotionSearchResult, ...]
     best_start_index: int
     active_limits: Mapping[str, tuple[str, ...]]
     unobservable_parameters: Mapping[str, str]
@@ -134,7 +113,12 @@ def plan_informative_motion(
     known = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True)) | dict(values or {})
     progress.begin_stage("building the experiment")
     chosen, rivals = _chosen(problem, options, effects or {})
-    composed = problem if not rivals else _composed(problem, rivals, known)
+    composed = problem
+    if rivals:  # the problem of the system with all effects, neutral
+        system = problem.system.with_effects([make_effect(e.kind, e.location, problem.system) for e in rivals])
+        recordings = [episode.recording for episode in problem.episodes]
+        extra, step = [name for e in rivals for name in e.parameters.names], compile_step_like(problem.step, system)
+        composed = EstimationProblem(step, recordings, problem.free, problem.options, known, (), extra)
     names = (*problem.free, *(name for effect in rivals for name in effect.amplitude_names))
     shapes = {entry.name: entry.value for e in rivals for entry in e.parameters if entry.name in e.shape_names}
     experiment = PlannedExperiment.from_options(composed, known | shapes, options, names)
@@ -159,17 +143,13 @@ def plan_informative_motion(
     return _plan(experiment, limits, search, criterion, found, rivals, unseen)
 
 
-# -- what is asked ----------------------------------------------------------------------------------------------------
-
-
 def _chosen(
     problem: EstimationProblem, options: PlanOptions, sizes: Mapping[str, Mapping[str, float]]
 ) -> tuple[tuple[str, ...], tuple[EffectBase, ...]]:
     """Parameters that are to be told, or effects that are to be separated."""
     if options.identify is not None and options.discriminate is not None:
-        raise ConfigError(
-            "parameters are to be told and effects to be separated", where="plan.discriminate", allowed="one of the two"
-        )
+        what = "parameters are to be told and effects to be separated"
+        raise ConfigError(what, where="plan.discriminate", allowed="one of the two")
     if options.discriminate is not None:
         return (), _effects(problem, options.discriminate, sizes)
     wanted = problem.free if options.identify is None else options.identify
@@ -177,57 +157,35 @@ def _chosen(
         raise ConfigError("no parameter is to be told", where="plan.identify", allowed=", ".join(problem.free))
     for name in wanted:
         if name not in problem.system.parameters:
-            raise ConfigError(
-                f"there is no parameter '{name}'",
-                where="plan.identify",
-                hint=nearest_name_hint(name, problem.system.parameters.names),
-            )
+            hint = nearest_name_hint(name, problem.system.parameters.names)
+            raise ConfigError(f"there is no parameter '{name}'", where="plan.identify", hint=hint)
         if name not in problem.free:
-            raise ConfigError(
+            what, hint = (
                 f"'{name}' is not free: a recording would say nothing of it",
-                where="plan.identify",
-                allowed=", ".join(problem.free),
-                hint=f"set parameters.{name}.free: true",
+                f"set parameters.{name}.free: true",
             )
+            raise ConfigError(what, where="plan.identify", allowed=", ".join(problem.free), hint=hint)
     return wanted, ()
 
 
 def _effects(
     problem: EstimationProblem, labels: Sequence[str], sizes: Mapping[str, Mapping[str, float]]
 ) -> tuple[EffectBase, ...]:
+    where = "plan.discriminate"
     if len(set(labels)) < 2:
-        raise ConfigError(
-            f"{len(set(labels))} effect is to be separated from others" if labels else "no effect is to be separated",
-            where="plan.discriminate",
-            allowed="two effects or more, kind@location each",
-        )
+        what = f"{len(set(labels))} effect is to be separated from others" if labels else "no effect is to be separated"
+        raise ConfigError(what, where=where, allowed="two effects or more, kind@location each")
     there = {f"{effect.kind}@{effect.location}" for effect in problem.system.effects}
     found = []
     for label in dict.fromkeys(labels):
         kind, _, place = label.partition("@")
         if not place:
-            raise ConfigError(
-                f"'{label}' says nothing of where the effect is",
-                where="plan.discriminate",
-                allowed=f"kind@location, such as {label}@PLACE",
-            )
+            allowed = f"kind@location, such as {label}@PLACE"
+            raise ConfigError(f"'{label}' says nothing of where the effect is", where=where, allowed=allowed)
         if label in there:
-            raise ConfigError(
-                f"{label} is part of the model", where="plan.discriminate", hint="free its parameters instead"
-            )
+            raise ConfigError(f"{label} is part of the model", where=where, hint="free its parameters instead")
         found.append(make_effect(kind, place, problem.system, sizes.get(label)))
     return tuple(found)
-
-
-def _composed(
-    problem: EstimationProblem, effects: Sequence[EffectBase], values: Mapping[str, float]
-) -> EstimationProblem:
-    """The problem of the system with all effects, neutral."""
-    system = problem.system.with_effects([make_effect(e.kind, e.location, problem.system) for e in effects])
-    recordings = [episode.recording for episode in problem.episodes]
-    extra = [name for effect in effects for name in effect.parameters.names]
-    step = compile_step_like(problem.step, system)
-    return EstimationProblem(step, recordings, problem.free, problem.options, values, (), extra)
 
 
 def _criterion(
@@ -255,28 +213,20 @@ def _size(effect: EffectBase) -> Array:
     return np.diag(half)
 
 
-# -- within which limits ----------------------------------------------------------------------------------------------
-
-
 def _check_room(search: InformativeMotionSearch, limits: PlanResidualsAndLimits) -> None:
     """Refuse limits that the arms pass where they begin."""
     mover, still = search.experiment.simulator, search.experiment.zero_coefficients
     for name, low, high in zip(mover.step.system.prescribed, search.lower, search.upper, strict=False):
         if not low <= 0.0 <= high:
-            raise ConfigError(
-                f"{name} begins {max(low, -high):.3g} beyond the limit of the joint",
-                where="plan.start_joint_positions",
-                hint="give a plan.start_joint_positions within the limits",
-            )
+            what = f"{name} begins {max(low, -high):.3g} beyond the limit of the joint"
+            hint = "give a plan.start_joint_positions within the limits"
+            raise ConfigError(what, where="plan.start_joint_positions", hint=hint)
     broken = limits.violated_limits(limits.limit_values(mover.simulate_path(still), still).value)
     if broken:
         parts = ((what, *passed) for what, passed in broken.items())
         said = "; ".join(f"{name}: {x:.4g} where {bound:.4g} is allowed, {what}" for what, name, x, bound in parts)
-        raise ConfigError(
-            f"the arms pass their limits before they move: {said}",
-            where="plan.limits",
-            hint="widen plan.limits where the machine allows it, or give another plan.start_joint_positions",
-        )
+        hint = "widen plan.limits where the machine allows it, or give another plan.start_joint_positions"
+        raise ConfigError(f"the arms pass their limits before they move: {said}", where="plan.limits", hint=hint)
 
 
 def _random(experiment: PlannedExperiment, seed: int) -> Array:
@@ -295,9 +245,6 @@ def _smooth(experiment: PlannedExperiment, w: Array) -> Array:
             return w
         w = 0.5 * w
     return w
-
-
-# -- what nothing sees ------------------------------------------------------------------------------------------------
 
 
 def _unseen(experiment: PlannedExperiment, motions: Sequence[Array]) -> dict[str, float]:
@@ -330,11 +277,8 @@ def _check_seen(
         )
     for effect in rivals:
         if all(name in unseen for name in effect.amplitude_names):
-            raise ConfigError(
-                f"no motion tells {effect.label} from anything: no sensor sees it to first order",
-                where="plan.discriminate",
-                hint="add a sensor that sees it",
-            )
+            what = f"no motion tells {effect.label} from anything: no sensor sees it to first order"
+            raise ConfigError(what, where="plan.discriminate", hint="add a sensor that sees it")
 
 
 def _would_see(experiment: PlannedExperiment, name: str, w: Array) -> str:
@@ -361,9 +305,6 @@ def _would_see(experiment: PlannedExperiment, name: str, w: Array) -> str:
     )
 
 
-# -- what was found ---------------------------------------------------------------------------------------------------
-
-
 def _plan(
     experiment: PlannedExperiment,
     limits: PlanResidualsAndLimits,
@@ -373,33 +314,34 @@ def _plan(
     rivals: Sequence[EffectBase],
     unseen: Mapping[str, float],
 ) -> InformativeMotionPlan:
-    judged = [_judged(experiment, criterion, one) for one in found]
-    best = int(np.argmax(judged))
-    if not np.isfinite(judged[best]):
-        raise SolverError(
-            "no motion that was found can be followed by its torques",
-            where="plan",
-            hint="lower plan.limits.max_acceleration",
-        )
-    w = found[best].w
-    starts = tuple(
-        SearchStartResult(one.initial_criterion, one.final_criterion, value, one.is_converged, one.n_iterations)
-        for one, value in zip(found, judged, strict=True)
-    )
-    parameters, open_words = _parameters(experiment, w)
-    distances = {} if not isinstance(criterion, EffectDiscrimination) else _distances(experiment, criterion, rivals, w)
-    message = "the motion was found"
-    if found[best].final_criterion == found[best].initial_criterion and not found[best].is_converged:
-        message = (
-            "the motions are too rough to be improved; lower plan.limits, or give another plan.start_joint_positions"
-        )
-    elif not found[best].is_converged:
-        message = f"the search was stopped after {found[best].n_iterations} rounds; raise plan.max_iterations"
+    judged = [replace(one, configured_criterion=_judged(experiment, criterion, one)) for one in found]
+    best = int(np.argmax([one.configured_criterion for one in judged]))
+    chosen = judged[best]
+    if not np.isfinite(chosen.configured_criterion):
+        hint = "lower plan.limits.max_acceleration"
+        raise SolverError("no motion that was found can be followed by its torques", where="plan", hint=hint)
+    w, message = chosen.w, "the motion was found"
+    if chosen.final_criterion == chosen.initial_criterion and not chosen.is_converged:
+        way = "lower plan.limits, or give another plan.start_joint_positions"
+        message = f"the motions are too rough to be improved; {way}"
+    elif not chosen.is_converged:
+        message = f"the search was stopped after {chosen.n_iterations} rounds; raise plan.max_iterations"
+    precisions, unidentifiable = _parameters(experiment, w)
     lost = {name: _would_see(experiment, name, w) for name in unseen if name in experiment.configured_problem.free}
     return InformativeMotionPlan(
-        experiment.simulator, w, experiment.simulator.simulate_path(w), found[best].is_converged, message, parameters,
-        distances, starts, best, _active(search, limits, w), lost, open_words,
-    )  # fmt: skip
+        experiment.simulator,
+        w,
+        experiment.simulator.simulate_path(w),
+        chosen.is_converged,
+        message,
+        parameter_precisions=precisions,
+        effect_distances=_distances(experiment, criterion, rivals, w) if rivals else {},
+        start_results=tuple(judged),
+        best_start_index=best,
+        active_limits=_active(search, limits, w),
+        unobservable_parameters=lost,
+        unidentifiable_directions=unidentifiable,
+    )
 
 
 def _judged(experiment: PlannedExperiment, criterion: OptimalityCriterion, found: MotionSearchResult) -> float:
@@ -428,13 +370,12 @@ def _parameters(experiment: PlannedExperiment, w: Array) -> tuple[dict[str, Para
 
 
 def _distances(
-    experiment: PlannedExperiment, criterion: EffectDiscrimination, rivals: Sequence[EffectBase], w: Array
+    experiment: PlannedExperiment, criterion: OptimalityCriterion, rivals: Sequence[EffectBase], w: Array
 ) -> dict[tuple[str, str], tuple[float, float]]:
     """Distances of effects in the recordings that there are, and in the planned one."""
-    before, after = (
-        criterion.effect_distances(rows)
-        for rows in (experiment.recorded_sensitivities, experiment.configured_sensitivities(w))
-    )
+    assert isinstance(criterion, EffectDiscrimination)
+    recorded, planned = experiment.recorded_sensitivities, experiment.configured_sensitivities(w)
+    before, after = criterion.effect_distances(recorded), criterion.effect_distances(planned)
     labels = [effect.label for effect in rivals]
     pairs = itertools.permutations(range(len(labels)), 2)
     return {(labels[i], labels[j]): (float(before[i, j]), float(after[i, j])) for i, j in pairs}
@@ -442,19 +383,15 @@ def _distances(
 
 def _active(search: InformativeMotionSearch, limits: PlanResidualsAndLimits, w: Array) -> dict[str, tuple[str, ...]]:
     """Limits that a motion reaches."""
-    mover = search.experiment.simulator
-    value, at = limits.limit_values(mover.simulate_path(w), w).value, 0
-    found: dict[str, tuple[str, ...]] = {}
-    for rows in limits.limit_rows:
-        own = value[at : at + len(rows.row_names)]
-        at += len(rows.row_names)
+    mover, found = search.experiment.simulator, {}
+
+    def reached(names: Sequence[str], is_near: NDArray[np.bool_]) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(name for name, near in zip(names, is_near, strict=True) if near))
+
+    for rows, own in limits.limits_with_values(limits.limit_values(mover.simulate_path(w), w).value):
         near = (own > _ACTIVE_LIMIT_FRACTION * rows.upper) | (own < _ACTIVE_LIMIT_FRACTION * rows.lower)
-        found[rows.description] = tuple(
-            dict.fromkeys(name for name, one in zip(rows.row_names, near, strict=True) if one)
-        )
+        found[rows.description] = reached(rows.row_names, near)
     flat = w.ravel()
     room = np.minimum(search.upper - flat, flat - search.lower).reshape(w.shape).min(0)
-    found["position [rad or m]"] = tuple(
-        name for name, left in zip(mover.step.system.prescribed, room, strict=True) if left < 1e-3
-    )
+    found["position [rad or m]"] = reached(mover.step.system.prescribed, room < 1e-3)
     return {what: names for what, names in found.items() if names}

@@ -1,9 +1,8 @@
 """Search for the most informative motion within limits, and the optimality criteria that it maximises.
 
-Sensitivities J(w) of a motion w are nearly linear in it, since springs and small motions are; the criterion of J is
-not. In every round J and the limits are linearised and the criterion of the linear J is maximised within a trust
-region. All iterates keep the limits. Every parameter has a prior standard deviation of 400 % of its value
-(`MAX_WEAK_RELATIVE_STD`), so that a criterion stays finite where no measurement informs one.
+In every round sensitivities J(w) and limits are linearised and the criterion of the linear J is maximised within a
+trust region. All iterates keep the limits. Every parameter has a prior standard deviation of `MAX_WEAK_RELATIVE_STD` of
+its value, so that a criterion stays finite where no measurement informs one.
 
 References
 ----------
@@ -16,7 +15,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import scipy.linalg
@@ -24,19 +22,11 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD
-from yid_ocp.planning.plan_shooting import PlanResidualsAndLimits
+from yid_ocp.planning.plan_shooting import PlanResidualsAndLimits, scaled_bounds
 from yid_ocp.planning.planned_experiment import PlannedExperiment
 from yid_ocp.progress import NULL_PROGRESS, Progress
 
 Array = NDArray[np.float64]
-
-
-class OptimalityCriterion(Protocol):
-    """A criterion to maximise [nat], with its gradient by the sensitivities (nr, columns)."""
-
-    def value_and_gradient(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
-        """Criterion and gradient at sensitivities (nr, columns) to relative changes; the gradient may be left empty."""
-        ...
 
 
 def _prior(columns: int, bounded: Sequence[int]) -> Array:
@@ -67,7 +57,7 @@ class DOptimality:
         return np.asarray(scipy.linalg.inv(information))
 
     def value_and_gradient(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
-        """In nat, and by the rows."""
+        """Criterion [nat] at sensitivities (nr, columns) to relative changes, and its gradient by them if asked for."""
         whole, chosen = self.column_covariance(rows), list(self.chosen_columns)
         own = whole[np.ix_(chosen, chosen)]
         found = -0.5 * float(np.linalg.slogdet(own)[1])
@@ -84,20 +74,12 @@ class EffectDiscrimination:
 
     d_ij^2 = min_b |J_i a - J_j b|^2, over what j and the nuisances can do; the smaller distances count most:
     -1/2 log sum_ij 1 / (1 + d_ij^2).
-
-    Attributes
-    ----------
-    amplitude_columns : tuple of tuple of int
-        Columns of every effect's amplitudes.
-    amplitude_cases : tuple of ndarray, shape (amplitudes, cases)
-        Of the amplitudes, in units of the columns: one case where they are known, else one for each.
-    parameter_columns : tuple of int
-        Columns with a prior: of the nominal parameters and of the effects.
     """
 
-    amplitude_columns: tuple[tuple[int, ...], ...]
+    amplitude_columns: tuple[tuple[int, ...], ...]  # of every effect
+    # of the amplitudes, in units of the columns, (amplitudes, cases): one case where they are known, else one for each
     amplitude_cases: tuple[Array, ...]
-    parameter_columns: tuple[int, ...]
+    parameter_columns: tuple[int, ...]  # with a prior: of the nominal parameters and of the effects
 
     def effect_distances(self, rows: Array) -> Array:
         """d_ij in standard deviations of the data, from i (row) to j; the diagonal is infinite."""
@@ -107,7 +89,7 @@ class EffectDiscrimination:
         return found
 
     def value_and_gradient(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
-        """In nat, and by the rows."""
+        """As `DOptimality.value_and_gradient`."""
         total, by_rows = 0.0, np.zeros_like(rows)
         for i, j in itertools.permutations(range(len(self.amplitude_columns)), 2):
             square, rest, others, used = self._apart(rows, i, j)
@@ -131,6 +113,8 @@ class EffectDiscrimination:
         return square, rest, others, used
 
 
+OptimalityCriterion = DOptimality | EffectDiscrimination
+
 _INITIAL_TRUST_RADIUS, _MAX_TRUST_RADIUS = 0.05, 0.4  # of the trust region, for every unknown of the motion [rad or m]
 _MIN_TRUST_RADIUS = 1e-3
 _MIN_STEP = 1e-9  # step in the linear picture that counts as none [rad or m]
@@ -149,6 +133,7 @@ class MotionSearchResult:
     final_criterion: float
     is_converged: bool
     n_iterations: int
+    configured_criterion: float = -np.inf  # in the configured problem; minus infinity where that cannot be simulated
 
 
 class InformativeMotionSearch:
@@ -159,8 +144,7 @@ class InformativeMotionSearch:
     ) -> None:
         self.experiment, self.limits, self.criterion = experiment, limits, criterion
         self.lower, self.upper = (bound.ravel() for bound in experiment.simulator.coefficient_bounds())
-        parts = [np.concatenate([getattr(b, k) for b in limits.limit_rows]) for k in ("unit", "lower", "upper")]
-        self._unit, self._low, self._high = parts[0], parts[1] / parts[0], parts[2] / parts[0]
+        self._unit, self._low, self._high = scaled_bounds(limits.limit_rows)
 
     def max_limit_violation(self, w: Array) -> float:
         """Largest limit violation of a motion, relative to the limits; infinite where it cannot be simulated."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Annotated, Literal
@@ -126,9 +126,8 @@ class FramePositions:
     def __init__(self, system: System, names: Sequence[str]) -> None:
         for name in names:
             if not system.mechanism.has_frame(name):
-                raise ConfigError(
-                    f"there is no frame '{name}'", where="plan", hint=nearest_name_hint(name, system.point_frames)
-                )
+                hint = nearest_name_hint(name, system.point_frames)
+                raise ConfigError(f"there is no frame '{name}'", where="plan", hint=hint)
         self.names = tuple(names)
         with CASADI_LOCK:
             q, theta = ca.SX.sym("q", system.n_coordinates), ca.vertcat(*(entry.symbol for entry in system.parameters))
@@ -153,17 +152,10 @@ class SplinePath:
 
     A spline of degree 5 with clamped ends lies within the hull of its control points, and so do its derivatives:
     limits on these hold at all times, not at nodes alone.
-
-    Attributes
-    ----------
-    duration : float
-        [s]
-    n_coefficients : int
-        K, coefficients of each joint; the last one is its displacement at the end.
     """
 
-    duration: float
-    n_coefficients: int
+    duration: float  # [s]
+    n_coefficients: int  # K, coefficients of each joint; the last one is its displacement at the end
 
     @property
     def knots(self) -> Array:
@@ -207,22 +199,13 @@ class SplinePath:
 
 @dataclass(frozen=True, eq=False)
 class PathSimulator:
-    """Simulator of a system, initially at rest, whose prescribed joints follow a spline path.
+    """Simulator of a system, initially at rest, whose prescribed joints follow a spline path."""
 
-    Attributes
-    ----------
-    step : Step
-        Every joint that moves is prescribed; nothing is driven.
-    theta : ndarray, shape (ntheta,)
-    hold_duration : float
-        Time for which the joints stand still at the end [s].
-    """
-
-    step: Step
-    theta: Array
+    step: Step  # every joint that moves is prescribed; nothing is driven
+    theta: Array  # (ntheta,)
     start_equilibrium: Equilibrium
     path: SplinePath
-    hold_duration: float
+    hold_duration: float  # time for which the joints stand still at the end [s]
 
     @property
     def joint_indices(self) -> list[int]:
@@ -237,7 +220,7 @@ class PathSimulator:
     def coefficient_bounds(self) -> tuple[Array, Array]:
         """Lowest and highest coefficients that keep the joints' position limits, shape (K, nc) each."""
         shape = (self.path.n_coefficients, 1)
-        lower, upper = (np.tile(side - self.start_positions, shape) for side in joint_position_limits(self.step.system))
+        lower, upper = (np.tile(side - self.start_positions, shape) for side in _position_limits(self.step.system))
         return lower, upper
 
     @cached_property
@@ -296,19 +279,12 @@ REACHED_TOLERANCE_FACTOR = 1.5  # of that unit: beyond it a place is out of reac
 
 @dataclass(frozen=True, eq=False)
 class PlannedMotion:
-    """A planned motion of the arms and its rollout.
-
-    Attributes
-    ----------
-    spline_coefficients : ndarray, shape (K, nc)
-    is_successful : bool
-        Whether a motion within the limits reaches the goal, or the search for the best one converged.
-    """
+    """A planned motion of the arms and its rollout."""
 
     simulator: PathSimulator
-    spline_coefficients: Array
+    spline_coefficients: Array  # (K, nc)
     rollout: Rollout
-    is_successful: bool
+    is_successful: bool  # whether a motion within the limits reaches the goal, or the search for the best one converged
     message: str
 
     @property
@@ -355,25 +331,15 @@ class PlannedMotion:
 
 @dataclass(frozen=True)
 class EndEquilibrium:
-    """An equilibrium at which the point rests near its target.
+    """An equilibrium at which the point rests near its target."""
 
-    Attributes
-    ----------
-    joint_positions : ndarray, shape (nc,)
-        Moved joints [rad or m].
-    target_distance : float
-        Distance of the point from its target [m].
-    joints_at_limit : tuple of str
-        Joints that stand at a limit of theirs.
-    """
-
-    joint_positions: Array
+    joint_positions: Array  # (nc,), moved joints [rad or m]
     equilibrium: Equilibrium
-    target_distance: float
+    target_distance: float  # distance of the point from its target [m]
     joints_at_limit: tuple[str, ...]
 
 
-def joint_position_limits(system: System) -> tuple[Array, Array]:
+def _position_limits(system: System) -> tuple[Array, Array]:
     """Lower and upper limits of the moved joints, shape (nc,) each."""
     joints = [system.mechanism.joints[i] for i in system.prescribed_indices]
     return np.array([joint.lower_limit for joint in joints]), np.array([joint.upper_limit for joint in joints])
@@ -384,30 +350,22 @@ def ordered_start_positions(system: System, posture: Mapping[str, float]) -> Arr
 
     Raises `ConfigError` where a joint is missing, does not exist, or stands outside its range.
     """
+    where = "plan.start_joint_positions"
     for name in posture:
         if name not in system.prescribed:
-            raise ConfigError(
-                f"'{name}' is no joint that moves",
-                where="plan.start_joint_positions",
-                hint=nearest_name_hint(name, system.prescribed),
-            )
+            hint = nearest_name_hint(name, system.prescribed)
+            raise ConfigError(f"'{name}' is no joint that moves", where=where, hint=hint)
     missing = [name for name in system.prescribed if name not in posture]
     if missing:
-        raise ConfigError(
-            f"the posture says nothing of {', '.join(missing)}",
-            where="plan.start_joint_positions",
-            allowed="every joint that moves",
-            hint="leave plan.start_joint_positions out to begin where the arms first grasp the undeformed object",
-        )
+        what, allowed = f"the posture says nothing of {', '.join(missing)}", "every joint that moves"
+        hint = f"leave {where} out to begin where the arms first grasp the undeformed object"
+        raise ConfigError(what, where=where, allowed=allowed, hint=hint)
     chosen = np.array([float(posture[name]) for name in system.prescribed])
-    for name, value, low, high in zip(system.prescribed, chosen, *joint_position_limits(system), strict=True):
+    for name, value, low, high in zip(system.prescribed, chosen, *_position_limits(system), strict=True):
         if not low - 1e-9 <= value <= high + 1e-9:
             over = low - value if value < low else value - high
-            raise ConfigError(
-                f"{name} starts at {value:.4g}, {over:.3g} beyond its limit",
-                where="plan.start_joint_positions",
-                allowed=f"{low:.4g} to {high:.4g}",
-            )
+            what = f"{name} starts at {value:.4g}, {over:.3g} beyond its limit"
+            raise ConfigError(what, where=where, allowed=f"{low:.4g} to {high:.4g}")
     return chosen
 
 
@@ -430,20 +388,18 @@ def solve_start_equilibrium(step: Step, theta: Array, posture: Array, guess: Arr
 
 def check_standstill_limits(step: Step, theta: Array, rest: Equilibrium, limits: PlanLimits, when: str) -> None:
     """Raise `ConfigError` where efforts or spring angles exceed their limits although the arms stand still."""
-    system = step.system
-    effort = simulate(step, theta, rest.state, 1).effort[0]
-    joints = [system.mechanism.joints[i] for i in system.prescribed_indices]
+    system, joints = step.system, step.system.mechanism.joints
+    efforts = zip(system.prescribed_indices, simulate(step, theta, rest.state, 1).effort[0], strict=True)
     springs = sorted({system.mechanism.joint_index(spring.joint_name) for spring in system.elastic_joints})
     largest = np.inf if limits.max_spring_angle is None else limits.max_spring_angle
-    able, names = limits.effort_fraction, system.mechanism.joint_names
-    rows = [
-        (j.name, "effort_fraction", "N m or N", u, able * j.effort_limit) for j, u in zip(joints, effort, strict=True)
-    ]
-    rows += [(names[i], "max_spring_angle", "rad", rest.state[i], largest) for i in springs]
-    for name, which, unit, value, limit in rows:
+    able = limits.effort_fraction
+    rows = [(i, "effort_fraction", "N m or N", effort, able * joints[i].effort_limit) for i, effort in efforts]
+    rows += [(i, "max_spring_angle", "rad", rest.state[i], largest) for i in springs]
+    for i, which, unit, value, limit in rows:
         if not abs(value) <= limit * (1 + 1e-9):
+            over = f"{value:.4g} {unit}, {abs(value) - limit:.3g} beyond its limit"
             raise ConfigError(
-                f"{name} at rest {when} takes {value:.4g} {unit}, {abs(value) - limit:.3g} beyond its limit",
+                f"{joints[i].name} at rest {when} takes {over}",
                 where=f"plan.limits.{which}",
                 allowed=f"up to {limit:.4g} {unit}",
                 hint=f"raise plan.limits.{which} where the machine allows it, or take another posture or place",
@@ -458,46 +414,49 @@ def solve_end_equilibrium(
     Raises `ConfigError` where no joint moves the point.
     """
     statics, system = EquilibriumSolver(step), step.system
-    joints, n = list(system.prescribed_indices), system.n_coordinates
-    first = start.state[joints]
+    n, first = system.n_coordinates, start.state[list(system.prescribed_indices)]
+
+    def point_and_slope(rest: Equilibrium) -> tuple[Array, Array]:
+        where, by_q = point.positions_and_jacobian(rest.state[None, :n], theta)
+        return where[0, :3], by_q[0, :3] @ rest.state_by_known_coordinates[:n]
+
+    if np.abs(point_and_slope(start)[1]).max(initial=0.0) < _MIN_POINT_MOBILITY:
+        what, allowed = f"no arm moves '{point.names[0]}'", "a point of what an arm holds or carries"
+        raise ConfigError(what, where="plan.point", allowed=allowed, hint="set model.grasp, or name another point")
     guess = [start.state[:n]]
-    last: list[tuple[Array, tuple[Array, Array]]] = []
 
-    def at(x: Array) -> tuple[Array, Array]:
-        # the search asks for residual and slope of a point one after the other
-        if not last or not np.array_equal(last[-1][0], x):
-            last[:] = [(np.array(x), rows(x))]
-        return last[-1][1]
-
+    @_last_kept
     def rows(x: Array) -> tuple[Array, Array]:
         rest = statics.solve(x, theta, guess=guess[0])
         if not rest.is_converged:
             return np.full(3 + len(x), 1e3), np.zeros((3 + len(x), len(x)))
         guess[0] = rest.state[:n]
-        where, by_q = point.positions_and_jacobian(rest.state[None, :n], theta)
-        slope = by_q[0, :3] @ rest.state_by_known_coordinates[:n]
-        value = np.concatenate([(where[0, :3] - place) / tolerance, _TRAVEL_WEIGHT * (x - first)])
+        where, slope = point_and_slope(rest)
+        value = np.concatenate([(where - place) / tolerance, _TRAVEL_WEIGHT * (x - first)])
         return value, np.vstack([slope / tolerance, _TRAVEL_WEIGHT * np.eye(len(x))])
 
-    reach = point.positions_and_jacobian(start.state[None, :n], theta)[1][0, :3]
-    if np.abs(reach @ start.state_by_known_coordinates[:n]).max(initial=0.0) < _MIN_POINT_MOBILITY:
-        raise ConfigError(
-            f"no arm moves '{point.names[0]}'",
-            where="plan.point",
-            allowed="a point of what an arm holds or carries",
-            hint="set model.grasp, or name another point",
-        )
-    lower, upper = joint_position_limits(system)
+    lower, upper = _position_limits(system)
     begin = np.clip(first, lower + 1e-6, upper - 1e-6)
     found = least_squares(
-        lambda x: at(x)[0], begin, jac=lambda x: at(x)[1], bounds=(lower, upper), x_scale=1.0, max_nfev=100
+        lambda x: rows(x)[0], begin, jac=lambda x: rows(x)[1], bounds=(lower, upper), x_scale=1.0, max_nfev=100
     )
     rest = statics.solve(found.x, theta, guess=guess[0])
-    where, _ = point.positions_and_jacobian(rest.state[None, :n], theta)
-    distance = float(np.linalg.norm(where[0, :3] - place)) if rest.is_converged else np.inf
+    distance = float(np.linalg.norm(point_and_slope(rest)[0] - place)) if rest.is_converged else np.inf
     near = (found.x - lower < 1e-3) | (upper - found.x < 1e-3)
     limits = tuple(name for name, one in zip(system.prescribed, near, strict=True) if one)
     return EndEquilibrium(found.x, rest, distance, limits)
+
+
+def _last_kept(function: Callable[[Array], tuple[Array, Array]]) -> Callable[[Array], tuple[Array, Array]]:
+    """The function with its last value kept: searches ask for residual and slope of a point one after the other."""
+    last: list[tuple[Array, tuple[Array, Array]]] = []
+
+    def at(x: Array) -> tuple[Array, Array]:
+        if not last or not np.array_equal(last[-1][0], x):
+            last[:] = [(np.array(x), function(x))]
+        return last[-1][1]
+
+    return at
 
 
 def check_target_reachable(end: EndEquilibrium, name: str, place: Array, tolerance: float) -> None:

@@ -11,13 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.errors import ConfigError, nearest_name_hint
-from yid_ocp.integrator.statics import Equilibrium
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model.system import System
 from yid_ocp.options import check_option_bounds
 from yid_ocp.planning.joint_paths import (
     REACHED_TOLERANCE_FACTOR,
-    EndEquilibrium,
     FramePositions,
     PathSimulator,
     PlannedMotion,
@@ -51,28 +49,15 @@ class ParameterCovariance:
 class MotionPlan(PlannedMotion):
     """A planned motion that brings a point to a target, with its predicted errors.
 
-    Attributes
-    ----------
-    target_position : ndarray, shape (3,)
-        [m]
-    max_position_error : float
-        Largest distance of the point from its target while the arms stand still at the end [m].
-    max_residual_speed : float
-        Largest speed of a point of the object in that time [m/s].
-    max_path_deviation : float or None
-        Largest distance of the point from its reference path at the same time [m]; None without a path.
-    end_position_std : ndarray, shape (3,), or None
-        Of the point's final position, from the parameters' covariance [m]; None without one.
-    simulator : PathSimulator
-        Its step may be a shorter one than that the plan began with.
+    Its simulator's step may be a shorter one than that the plan began with.
     """
 
     target_point: str
-    target_position: Array
-    max_position_error: float
-    max_residual_speed: float
-    max_path_deviation: float | None
-    end_position_std: Array | None
+    target_position: Array  # (3,) [m]
+    max_position_error: float  # largest distance of the point from its target while the arms stand still at the end [m]
+    max_residual_speed: float  # largest speed of a point of the object in that time [m/s]
+    max_path_deviation: float | None  # largest distance from its reference path at the same time [m]; None without one
+    end_position_std: Array | None  # (3,), of the final position, from the parameters' covariance [m]; None without one
     n_evaluations: int
 
     @property
@@ -111,29 +96,28 @@ def plan_motion(
     check_option_bounds(options, "plan")
     system = step.system
     if system.driven or not system.prescribed:
-        raise ConfigError(
-            "no joint is prescribed",
-            where="plan",
-            allowed="a robot whose arms move",
-            hint="set model.robot and model.arms",
-        )
+        allowed, hint = "a robot whose arms move", "set model.robot and model.arms"
+        raise ConfigError("no joint is prescribed", where="plan", allowed=allowed, hint=hint)
     known = ParameterCovariance() if known is None else known
     values = system.parameters.vector() if theta is None else np.asarray(theta, float)
     progress.begin_stage("finding where the motion begins and ends")
-    posture = _posture(system, options, values)
-    start = solve_start_equilibrium(step, values, posture)
-    point, inside = _points(step, options)
-    n = system.n_coordinates
-    begin = point.positions_and_jacobian(start.state[None, :n], values)[0][0, :3]
-    place = _place(options, begin)
-    _check_box(options, inside, start, n, values, place)
+    start = solve_start_equilibrium(step, values, _posture(system, options, values))
+    path = SplinePath(options.duration, options.n_spline_coefficients)
+    mover = PathSimulator(step, values, start, path, options.hold_duration)
+    point, inside = _points(system, options)
+    place = _place(options, mover.trajectories(point, start.state[None])[0, 0])
+    if inside is not None:
+        _check_box(options, inside, mover.trajectories(inside, start.state[None])[0], place)
     check_standstill_limits(step, values, start, options.limits, "where the motion begins")
     end = solve_end_equilibrium(step, values, start, point, place, options.position_tolerance)
     check_target_reachable(end, point.names[0], place, options.position_tolerance)
     check_standstill_limits(step, values, end.equilibrium, options.limits, "where it ends")
 
     def attempt(duration: float) -> MotionPlan:
-        return _attempt(step, replace(options, duration=duration), values, known, (start, end), (point, inside), place)
+        own = replace(mover, path=replace(path, duration=duration))
+        straight = own.path.straight_line_coefficients(end.joint_positions - own.start_positions)
+        rows = PlanResidualsAndLimits(own, replace(options, duration=duration), point, place, straight, inside)
+        return _attempt(rows, known)
 
     progress.begin_stage(f"searching the motion in {options.duration:g} s")
     found = attempt(options.duration)
@@ -146,26 +130,18 @@ def _posture(system: System, options: PlanOptions, theta: Array) -> Array:
     if options.start_joint_positions is not None:
         return ordered_start_positions(system, options.start_joint_positions)
     if not system.grasps:
-        raise ConfigError(
-            "nothing says where the motion begins",
-            where="plan.start_joint_positions",
-            allowed="every joint that moves",
-            hint="only where a gripper holds the object do the angles follow from that",
-        )
+        what, where = "nothing says where the motion begins", "plan.start_joint_positions"
+        hint = "only where a gripper holds the object do the angles follow from that"
+        raise ConfigError(what, where=where, allowed="every joint that moves", hint=hint)
     by_name = dict(zip(system.parameters.names, map(float, theta), strict=True))
     angles = grasping_joint_angles(system, by_name)
     return ordered_start_positions(system, {name: angles[name] for name in angles if name in system.prescribed})
 
 
-def _points(step: Step, options: PlanOptions) -> tuple[FramePositions, FramePositions | None]:
-    system = step.system
+def _points(system: System, options: PlanOptions) -> tuple[FramePositions, FramePositions | None]:
     if options.point is None:
-        raise ConfigError(
-            "no point is named",
-            where="plan.point",
-            allowed="a frame of the model",
-            hint=nearest_name_hint("", system.point_frames),
-        )
+        hint = nearest_name_hint("", system.point_frames)
+        raise ConfigError("no point is named", where="plan.point", allowed="a frame of the model", hint=hint)
     calm = [name for name in system.point_frames if name != options.point]
     boxed = options.frames_in_box or system.point_frames
     inside = FramePositions(system, boxed) if options.goal == "box" else None
@@ -180,35 +156,26 @@ def _place(options: PlanOptions, begin: Array) -> Array:
         allowed, where = "one of place and shift", "plan.target_position"
         raise ConfigError(f"{said} where the point is to arrive", where=where, allowed=allowed, hint=hint)
     if options.goal == "path" and not options.waypoint_offsets:
-        raise ConfigError(
-            "the path has no places on the way", where="plan.waypoint_offsets", allowed="one or more shifts [m]"
-        )
+        what, where = "the path has no places on the way", "plan.waypoint_offsets"
+        raise ConfigError(what, where=where, allowed="one or more shifts [m]")
     if options.target_position is not None:
         return np.array(options.target_position, float)
     return begin + np.array(options.target_offset, float)
 
 
-def _check_box(
-    options: PlanOptions, inside: FramePositions | None, start: Equilibrium, n: int, theta: Array, place: Array
-) -> None:
-    if inside is None:
-        return
+def _check_box(options: PlanOptions, inside: FramePositions, at: Array, place: Array) -> None:
+    """Refuse a box that frames begin outside of at places (frames, 3) [m], or that the point leaves."""
     if options.box is None:
         raise ConfigError("there is no box", where="plan.box", allowed="two corners [m]", hint="goal: place needs none")
     low, high = np.array(options.box)
     if np.any(low >= high):
         worst = int(np.argmin(high - low))
-        axis = "xyz"[worst]
-        raise ConfigError(
-            f"the box is empty along {axis}: it goes from {low[worst]:.4g} up to {high[worst]:.4g} m",
-            where="plan.box",
-            allowed="lowest corner first",
-        )
-    at = inside.positions_and_jacobian(start.state[None, :n], theta)[0].reshape(-1, 3)
-    for name, where, when in [*((name, x, "starts") for name, x in zip(inside.names, at, strict=True)),
-                              (str(options.point), place, "is to arrive")]:  # fmt: skip
-        if when == "is to arrive" and name not in inside.names:
-            continue
+        what = f"the box is empty along {'xyz'[worst]}: it goes from {low[worst]:.4g} up to {high[worst]:.4g} m"
+        raise ConfigError(what, where="plan.box", allowed="lowest corner first")
+    places = [(name, x, "starts") for name, x in zip(inside.names, at, strict=True)]
+    if options.point in inside.names:
+        places.append((str(options.point), place, "is to arrive"))
+    for name, where, when in places:
         over = np.maximum(low - where, where - high)
         if np.any(over > 0):
             row = int(np.argmax(over))
@@ -220,47 +187,35 @@ def _check_box(
             )
 
 
-def _attempt(
-    step: Step,
-    options: PlanOptions,
-    theta: Array,
-    known: ParameterCovariance,
-    ends: tuple[Equilibrium, EndEquilibrium],
-    points: tuple[FramePositions, FramePositions | None],
-    place: Array,
-) -> MotionPlan:
+def _attempt(rows: PlanResidualsAndLimits, known: ParameterCovariance) -> MotionPlan:
     """The best motion of one duration: found with the step's time step, sharpened with shorter ones.
 
     What swings in the end is a small difference of large motions: a step that is fine enough for them leaves out part
     of it.
     """
-    start, end = ends
-    path = SplinePath(options.duration, options.n_spline_coefficients)
-    mover = PathSimulator(step, theta, start, path, options.hold_duration)
-    guess = straight = path.straight_line_coefficients(end.joint_positions - mover.start_positions)
+    options, mover, guess, evaluations = rows.options, rows.simulator, rows.quasi_static_coefficients, 0
     lower, upper = mover.coefficient_bounds()
-    evaluations = 0
     for halved in range(_MAX_STEP_HALVINGS + 1):
-        rows = PlanResidualsAndLimits(mover, options, points[0], place, straight, points[1])
         cases = [rows, *_scenarios(rows, known)] if options.minimize_parameter_sensitivity else [rows]
-        shot = PlanShooting(cases, straight.shape).solve(guess, lower, upper, options.max_iterations)
+        shot = PlanShooting(cases, guess.shape).solve(guess, lower, upper, options.max_iterations)
         evaluations += shot.n_evaluations
         if not shot.is_converged or halved == _MAX_STEP_HALVINGS:
             break
-        finer = _finer(mover)
+        step = rows.simulator.step
+        numerics = step.force_split, step.constraint_force
+        half = compile_step(step.system, step.time_step / 2, *numerics, use_compiler=step.is_compiled)
+        finer = _at_rest(rows.simulator, half, rows.simulator.theta)
         if _steady(rows, finer, shot.w):
             break
-        mover, guess = finer, shot.w
+        guess, goal = shot.w, (rows.target, rows.quasi_static_coefficients, rows.inside)
+        rows = PlanResidualsAndLimits(finer, options, rows.point, *goal)
     return _outcome(rows, replace(shot, n_evaluations=evaluations), known)
 
 
-def _finer(mover: PathSimulator) -> PathSimulator:
-    """The same with half the time step."""
-    step = mover.step
-    numerics = step.force_split, step.constraint_force
-    half = compile_step(step.system, step.time_step / 2, *numerics, use_compiler=step.is_compiled)
-    rest = solve_start_equilibrium(half, mover.theta, mover.start_positions, mover.start_configuration)
-    return replace(mover, step=half, start_equilibrium=rest)
+def _at_rest(mover: PathSimulator, step: Step, theta: Array) -> PathSimulator:
+    """The same motion from rest with another step or other parameters."""
+    rest = solve_start_equilibrium(step, theta, mover.start_positions, mover.start_configuration)
+    return replace(mover, step=step, theta=theta, start_equilibrium=rest)
 
 
 def _steady(rows: PlanResidualsAndLimits, finer: PathSimulator, w: Array) -> bool:
@@ -280,11 +235,8 @@ def _scenarios(rows: PlanResidualsAndLimits, known: ParameterCovariance) -> list
     """The same motion with parameters a standard deviation off, along the axes that move the point's rest most."""
     mover, system = rows.simulator, rows.simulator.step.system
     if not len(known.parameter_names):
-        raise ConfigError(
-            "the parameters' uncertainty is not known",
-            where="plan.minimize_parameter_sensitivity",
-            allowed="plan.parameter_run: FOLDER of `solve`",
-        )
+        what, where = "the parameters' uncertainty is not known", "plan.minimize_parameter_sensitivity"
+        raise ConfigError(what, where=where, allowed="plan.parameter_run: FOLDER of `solve`")
     values, vectors = np.linalg.eigh(known.covariance)
     axes = vectors * np.sqrt(np.maximum(values, 0.0))
     slope = _point_slopes(rows, rows.quasi_static_coefficients, known)
@@ -298,10 +250,8 @@ def _scenarios(rows: PlanResidualsAndLimits, known: ParameterCovariance) -> list
                 entry = system.parameters[name]
                 floor = max(entry.lower, 0.2 * theta[i]) if theta[i] > 0 else entry.lower
                 theta[i] = np.clip(theta[i] + change, floor, entry.upper)
-            rest = solve_start_equilibrium(mover.step, theta, mover.start_positions, mover.start_configuration)
-            own = replace(mover, theta=theta, start_equilibrium=rest)
             goal = rows.options, rows.point, rows.target, rows.quasi_static_coefficients
-            found.append(PlanResidualsAndLimits(own, *goal))
+            found.append(PlanResidualsAndLimits(_at_rest(mover, mover.step, theta), *goal))
     return found
 
 
@@ -338,10 +288,8 @@ def _outcome(rows: PlanResidualsAndLimits, shot: PlanShootingResult, known: Para
     doubt = float(np.linalg.norm(std)) if std is not None and rows.options.minimize_parameter_sensitivity else 0.0
     far = not error <= REACHED_TOLERANCE_FACTOR * max(rows.options.position_tolerance, doubt)
     if shot.is_converged and far:
-        message = (
-            f"the best motion within the limits leaves the point {1e3 * error:.3g} mm from its place; take a longer "
-            "plan.duration or a nearer place"
-        )
+        message = f"the best motion within the limits leaves the point {1e3 * error:.3g} mm from its place"
+        message += "; take a longer plan.duration or a nearer place"
     reached = shot.is_converged and not broken and not far
     errors = error, swing, off_path, std, shot.n_evaluations
     return MotionPlan(mover, shot.w, rollout, reached, message, rows.point.names[0], rows.target, *errors)

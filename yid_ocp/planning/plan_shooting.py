@@ -7,7 +7,7 @@ rho/2 max(0, g - u + lam/rho)^2 to the cost, and lam is raised until no row is p
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,25 +35,22 @@ class ValueWithJacobian:
 
 @dataclass(frozen=True, eq=False)
 class LimitRows:
-    """Bounds of limit rows of one kind; `description` is the limited quantity, with its unit.
+    """Bounds of limit rows of one kind."""
 
-    Attributes
-    ----------
-    lower, upper : ndarray, shape (rows,)
-    unit : ndarray, shape (rows,)
-        Divisor that scales each row to order one.
-    row_names : tuple of str
-        Joint, spring or frame of each row.
-    """
-
-    description: str
-    lower: Array
-    upper: Array
-    unit: Array
-    row_names: tuple[str, ...]
+    description: str  # the limited quantity, with its unit
+    lower: Array  # (rows,)
+    upper: Array  # (rows,)
+    unit: Array  # (rows,), divisor that scales each row to order one
+    row_names: tuple[str, ...]  # joint, spring or frame of each row
 
 
-def stack_values(parts: list[ValueWithJacobian]) -> ValueWithJacobian:
+def scaled_bounds(limits: Sequence[LimitRows]) -> tuple[Array, Array, Array]:
+    """Units of all limit rows, and their lower and upper bounds in these units, shape (rows,) each."""
+    unit, lower, upper = (np.concatenate([getattr(rows, k) for rows in limits]) for k in ("unit", "lower", "upper"))
+    return unit, lower / unit, upper / unit
+
+
+def _stacked(parts: list[ValueWithJacobian]) -> ValueWithJacobian:
     """Vectors and Jacobians stacked one below the other."""
     slopes = [part.jacobian for part in parts]
     known = [slope for slope in slopes if slope is not None]
@@ -64,16 +61,8 @@ def stack_values(parts: list[ValueWithJacobian]) -> ValueWithJacobian:
 class PlanResidualsAndLimits:
     """Residuals and limit rows of a planned motion, for one set of parameters.
 
-    Parameters
-    ----------
-    point : FramePositions
-        Of the frame that is to arrive, and of all frames that are to rest.
-    target : ndarray, shape (3,)
-        Where it is to arrive [m].
-    simple : ndarray, shape (K, nc)
-        Unknowns of the quasi-static motion; of motions that do equally well, the one nearest to it is wanted.
-    inside : FramePositions, optional
-        Frames that stay in the box.
+    `point` is the frame that is to arrive at `target` (3,) [m], and all frames that are to rest; `inside` those that
+    stay in the box. Of motions that do equally well, the one nearest to the quasi-static unknowns (K, nc) is wanted.
     """
 
     def __init__(
@@ -93,8 +82,6 @@ class PlanResidualsAndLimits:
             {mover.step.system.mechanism.joint_index(spring.joint_name) for spring in mover.step.system.elastic_joints}
         )
         self.limit_rows = self._bounded()
-
-    # -- what is wanted -----------------------------------------------------------------------------------------------
 
     @property
     def reference_path(self) -> Array | None:
@@ -133,9 +120,7 @@ class PlanResidualsAndLimits:
             if by_effort is not None:
                 by_effort = by_effort / unit[:, None]
             parts.append(_rows(rollout.effort[:, finite] / unit, by_effort, 1.0))
-        return stack_values(parts)
-
-    # -- what is kept within ------------------------------------------------------------------------------------------
+        return _stacked(parts)
 
     def limit_values(self, rollout: Rollout, w: Array) -> ValueWithJacobian:
         """Values of the limit rows of `limit_rows` along a motion, in their own units."""
@@ -153,7 +138,7 @@ class PlanResidualsAndLimits:
             at, by_q = self.inside.positions_and_jacobian(rollout.state[every, :n], mover.theta)
             slope = None if moved is None else np.einsum("tiq,tqd->tid", by_q, moved[every, :n, -size:])
             parts.append(ValueWithJacobian(at.ravel(), None if slope is None else slope.reshape(-1, size)))
-        return stack_values(parts)
+        return _stacked(parts)
 
     def _bounded(self) -> list[LimitRows]:
         mover, limits = self.simulator, self.options.limits
@@ -177,17 +162,18 @@ class PlanResidualsAndLimits:
             found.append(LimitRows("place [m]", low, high, np.full(len(low), 0.1), axes * nodes))
         return found
 
+    def limits_with_values(self, value: Array) -> Iterator[tuple[LimitRows, Array]]:
+        """Every kind of limit with its rows of `limit_values`."""
+        ends = np.cumsum([len(rows.row_names) for rows in self.limit_rows])
+        return zip(self.limit_rows, np.split(value, ends[:-1]), strict=True)
+
     def violated_limits(self, value: Array) -> dict[str, tuple[str, float, float]]:
         """The worst violated row of each kind of limit: its name, value and bound."""
-        found, at = {}, 0
-        for rows in self.limit_rows:
-            own = value[at : at + len(rows.row_names)]
-            at += len(rows.row_names)
-            if not len(own):
-                continue
+        found = {}
+        for rows, own in self.limits_with_values(value):
             over = np.maximum(own - rows.upper, rows.lower - own) / rows.unit
-            worst = int(np.argmax(over))
-            if over[worst] > 1e-4:
+            worst = int(np.argmax(over)) if len(own) else 0
+            if len(own) and over[worst] > 1e-4:
                 bound = rows.upper[worst] if own[worst] > rows.upper[worst] else rows.lower[worst]
                 found[rows.description] = (rows.row_names[worst], float(own[worst]), float(bound))
         return found
@@ -232,9 +218,7 @@ class PlanShooting:
     def __init__(self, cases: Sequence[PlanResidualsAndLimits], shape: tuple[int, int]) -> None:
         self._cases, self._shape = list(cases), shape
         self._last: tuple[Array, tuple[ValueWithJacobian, ValueWithJacobian]] | None = None
-        rows = self._cases[0].limit_rows
-        self._unit, lower, upper = (np.concatenate([getattr(b, k) for b in rows]) for k in ("unit", "lower", "upper"))
-        self._lower, self._upper = lower / self._unit, upper / self._unit
+        self._unit, self._lower, self._upper = scaled_bounds(self._cases[0].limit_rows)
         self.evaluations = 0
 
     def residual_and_limits(self, x: Array) -> tuple[ValueWithJacobian, ValueWithJacobian]:
@@ -244,7 +228,7 @@ class PlanShooting:
             w = x.reshape(self._shape)
             rollouts = [case.simulator.simulate_path(w, True) for case in self._cases]
             parts = [case.goal_residual(rollout, w) for case, rollout in zip(self._cases, rollouts, strict=True)]
-            whole, scale = stack_values(parts), 1.0 / np.sqrt(len(self._cases))
+            whole, scale = _stacked(parts), 1.0 / np.sqrt(len(self._cases))
             limits = self._cases[0].limit_values(rollouts[0], w)
             assert whole.jacobian is not None
             assert limits.jacobian is not None
@@ -281,11 +265,8 @@ class PlanShooting:
             before = passed
         residual = self.residual_and_limits(x)[0].value
         finished = bool(ended and passed <= _LIMIT_TOLERANCE)
-        if finished:
-            message = "the motion was found"
-        elif passed > _LIMIT_TOLERANCE:
-            message = "no motion within the limits was found"
-        else:
+        message = "the motion was found" if finished else "no motion within the limits was found"
+        if not ended and not passed > _LIMIT_TOLERANCE:
             message = f"the search was stopped after {iterations} evaluations; raise plan.max_iterations"
         cost = 0.5 * float(residual @ residual)
         return PlanShootingResult(x.reshape(self._shape), cost, finished, message, self.evaluations)

@@ -1,13 +1,9 @@
 """Predicted recording and sensitivities of a planned motion of the arms with the configured sensors.
 
-Two forms of one experiment. In the first the arms are moved and the torques that this needs are measured, with a
-constant error each: one rollout tells all, so that it serves to search. Where arms are driven their motion is known as
-far as sensors tell of it only; what an error of the motion does to all readings is taken at rest, once, and eliminated
-(Golub and Pereyra 1973, doi:10.1137/0710036). The second form is the estimation problem as it is configured, driven by
-these torques; it judges what was found.
-
-A camera's frames come when they come. What is counted is the information of its mean rate over the recording, spread
-evenly over the motion, so that no plan relies on a frame at a certain moment.
+To search, the arms are moved and the torques that this needs are measured, with a constant error each; what errors of a
+driven arm's motion do to all readings is taken at rest, once, and eliminated (Golub and Pereyra 1973,
+doi:10.1137/0710036). To judge what was found, the estimation problem as it is configured is driven by these torques. Of
+a camera the information of its mean rate over the recording is spread evenly over the motion.
 """
 
 from __future__ import annotations
@@ -54,46 +50,23 @@ _SPLINE_DIFFERENCE_STEP = 1e-5  # of an unknown of the motion [rad or m]
 
 @dataclass(frozen=True, eq=False)
 class PlannedExperiment:
-    """A planned experiment: predicted recording and parameter sensitivities as functions of spline coefficients.
+    """A planned experiment: predicted recording and parameter sensitivities as functions of spline coefficients."""
 
-    Attributes
-    ----------
-    configured_problem : EstimationProblem
-        The problem of the settings; its first recording defines sensors, noise and rates.
-    parameter_values : mapping of str to float
-        Parameters at which the sensitivities are taken.
-    simulator : PathSimulator
-        Of the same system with its arms prescribed.
-    free_parameters : tuple of str
-        Those of the problem, and amplitudes of effects that are to be discriminated.
-    """
-
-    configured_problem: EstimationProblem
-    parameter_values: Mapping[str, float]
-    simulator: PathSimulator
-    free_parameters: tuple[str, ...]
+    configured_problem: EstimationProblem  # of the settings; its first recording defines sensors, noise and rates
+    parameter_values: Mapping[str, float]  # at which the sensitivities are taken
+    simulator: PathSimulator  # of the same system with its arms prescribed
+    free_parameters: tuple[str, ...]  # of the problem, and amplitudes of effects that are to be discriminated
 
     @staticmethod
     def from_options(
         problem: EstimationProblem, values: Mapping[str, float], options: PlanOptions, names: Sequence[str] = ()
     ) -> PlannedExperiment:
-        """The experiment described by a plan's options.
-
-        Parameters
-        ----------
-        values : mapping of str to float
-            Of any parameters; the others as the problem has them.
-        options : PlanOptions
-            Duration, spline, posture at the start: the first of the recording when absent.
-        names : sequence of str
-            Parameters that are free; those of the problem when empty.
+        """The experiment described by a plan's options, at values of some parameters, with some of them free.
 
         Raises
         ------
-        ConfigError
-            No joint moves, or clamps follow measured points.
-        ModelError
-            There is no rest to begin from.
+        ConfigError, ModelError
+            No joint moves, or clamps follow measured points; there is no rest to begin from.
         """
         system, episode = problem.system, problem.episodes[0]
         if problem.options.clamp_paths or not (system.driven or system.prescribed):
@@ -102,12 +75,9 @@ class PlannedExperiment:
                 said = "the ends of a cable follow measured points: there is no joint whose motion could be planned"
             raise ConfigError(said, where="plan", allowed=allowed, hint="set model.robot and model.arms")
         if system.servos:
-            raise ConfigError(
-                "motions are not planned for arms of servos, whose commands are not their motion",
-                where="model.arms.mode",
-                allowed="driven, prescribed",
-                hint="set model.arms.mode: prescribed for the plan",
-            )
+            what = "motions are not planned for arms of servos, whose commands are not their motion"
+            hint = "set model.arms.mode: prescribed for the plan"
+            raise ConfigError(what, where="model.arms.mode", allowed="driven, prescribed", hint=hint)
         moved = replace(system, driven=(), prescribed=(*system.driven, *system.prescribed))
         step = problem.step if not system.driven else compile_step_like(problem.step, moved)
         known = dict(zip(system.parameters.names, map(float, problem.theta), strict=True)) | dict(values)
@@ -119,8 +89,6 @@ class PlannedExperiment:
         mover = PathSimulator(step, theta, solve_start_equilibrium(step, theta, first), path, options.hold_duration)
         _check_long_enough(problem, float(mover.node_times[-1]))
         return PlannedExperiment(problem, known, mover, tuple(names) or problem.free)
-
-    # -- what the sensors would record --------------------------------------------------------------------------------
 
     def noise_free_recording(self, w: Array, fastest: float = np.inf) -> Recording:
         """Noise-free predicted recording of a motion (K, nc); it states the standard deviations of its sensors.
@@ -219,10 +187,7 @@ class PlannedExperiment:
     def configured_sensitivities(self, w: Array) -> Array:
         """Sensitivities of the planned recording in the configured problem, without columns of torque offsets.
 
-        Raises
-        ------
-        SolverError
-            The motion cannot be followed by its torques.
+        `SolverError` where the motion cannot be followed by its torques.
         """
         return self._weighted(self.estimation_problem(w))
 
@@ -248,8 +213,6 @@ class PlannedExperiment:
         own = np.array([name.split("[")[0] in self.free_parameters for name in problem.unknown_names])
         jacobian[problem.residual_rows.stated_priors] *= ~own
         return jacobian
-
-    # -- sensitivities with a known motion ----------------------------------------------------------------------------
 
     @cached_property
     def _known(self) -> EstimationProblem:
@@ -374,12 +337,10 @@ def _check_long_enough(problem: EstimationProblem, duration: float) -> None:
     step = problem.step.time_step
     least = 2.0 * low_pass.settling_time + low_pass.decorrelation_stride(step) * step
     if joints is not None and joints.effort is not None and duration <= least:
-        raise ConfigError(
-            f"{duration:g} s are too short to measure efforts that are smoothed at {low_pass.cutoff:g} Hz",
-            where="plan.duration",
-            allowed=f"more than {least:.2g} s together with plan.hold_duration",
-            hint="take a longer plan.duration, or raise problem.path_cutoff",
-        )
+        what = f"{duration:g} s are too short to measure efforts that are smoothed at {low_pass.cutoff:g} Hz"
+        allowed = f"more than {least:.2g} s together with plan.hold_duration"
+        hint = "take a longer plan.duration, or raise problem.path_cutoff"
+        raise ConfigError(what, where="plan.duration", allowed=allowed, hint=hint)
 
 
 def _sizes(problem: EstimationProblem) -> Array:

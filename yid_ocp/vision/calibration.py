@@ -1,13 +1,8 @@
-"""Calibration of the camera of a sequence: pose, depth scale and offset, and clock.
+"""Calibration of the camera of a sequence from the arm that it sees: pose, depth and clock, and frames stamped late.
 
-The robot is the calibration target: all ten numbers are estimated together from the arm in a sample of the frames
-(`registration`), from starts that are looked for about what is told. Priors about that are wide; they decide where the
-arm's motion informs of nothing. What stays uncertain is an error common to all frames, and enters the standard
-deviation of every point.
-
-The common offset of the two clocks and its drift are part of the calibration. Here a frame is taken by itself: its own
-offset is where the robot's surface lies best on its points, and a frame whose own offset is another than the common one
-was stamped late. Clock offset and latency cannot be told apart and come as one number, stamp minus joint time.
+What stays uncertain is an error common to all frames, and enters the standard deviation of every point. A frame whose
+own clock offset is another than the common one was stamped late. Offset and latency are one number, stamp minus joint
+time.
 """
 
 from __future__ import annotations
@@ -15,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Annotated
 
 import numpy as np
@@ -34,12 +30,11 @@ from yid_ocp.vision.camera_registration import (
     ArmSurface,
     CalibrationFrame,
     CameraState,
-    CloudSearchTrees,
     RobustCost,
     SurfaceVisibility,
     evaluate_robust_cost,
-    gauss_newton_step,
     initial_camera_states,
+    surface_visibility,
 )
 from yid_ocp.vision.point_cloud import weighted_median
 
@@ -101,22 +96,10 @@ class _StampDelay:
 def estimate_stamp_delay(
     arm: ArmSurface, state: CameraState, stamp: float, points: Array, rng: np.random.Generator, usual: float = 0.0
 ) -> _StampDelay | None:
-    """Estimate the delay of one frame's time stamp beyond the common offset.
+    """Delay of one frame's stamp [s] beyond the common offset, from world points (N, 3), the robot's among them [m].
 
-    Parameters
-    ----------
-    state : CameraState
-        Of the sequence.
-    stamp : float [s]
-    points : ndarray, shape (N, 3)
-        Of the frame in the world, the robot's among them [m].
-    usual : float
-        Misfit of other frames [m^2]; where this one's is not much larger, its offset is looked for nearby only.
-
-    Returns
-    -------
-    OwnOffset or None
-        None where the arm is not in view.
+    None where the arm is not in view. Where the misfit is not much larger than the `usual` one of other frames [m^2],
+    the offset is looked for nearby only.
     """
     t, origin = float(state.to_joint_time(stamp)), state.pose[:3, 3]
     points = points[rng.permutation(len(points))[:_THIN]]
@@ -128,7 +111,8 @@ def estimate_stamp_delay(
         steps = round(_FURTHEST / _COARSE)
         grid = _COARSE * np.arange(-steps, steps + 1)
         few = chosen[:_FEW_POINTS]
-        start = float(grid[int(np.argmin([_misfit(arm, origin, t - delay, few) for delay in grid]))])
+        met = [arm.match_points(few, origin, t - delay, _OFF_ARM_DISTANCE, along=True) for delay in grid]
+        start = float(grid[int(np.argmin([_mean_square(one.normal_distance, len(few)) for one in met]))])
         if abs(start) > _LEAST_LATE:
             other = _nearby(arm, origin, t, chosen, start)
             trial = other if other.mean_square_distance < _CLEARLY * trial.mean_square_distance else trial
@@ -157,33 +141,21 @@ def _nearby(arm: ArmSurface, origin: Array, t: float, points: Array, start: floa
     return _StampDelay(float(x[0]), std, _mean_square(error, len(points)))
 
 
-def _misfit(arm: ArmSurface, origin: Array, t: float, points: Array) -> float:
-    return _mean_square(arm.match_points(points, origin, t, _OFF_ARM_DISTANCE, along=True).normal_distance, len(points))
-
-
 def _mean_square(error: Array, count: int) -> float:
     """Mean square of errors, those of the other points being beyond the reach."""
     return float((error @ error + (count - len(error)) * _OFF_ARM_DISTANCE**2) / count)
 
 
-@dataclass(frozen=True, eq=False)
-class _OnTimeFrames:
-    """Frames that agree on one clock offset, and their median misfit."""
-
-    frame_indices: tuple[int, ...]
-    median_square_distance: float
-
-
-def _find_on_time_frames(own: Sequence[_StampDelay | None]) -> _OnTimeFrames:
-    """Frames whose delays agree, so that frames stamped late do not bias the others."""
+def _find_on_time_frames(own: Sequence[_StampDelay | None]) -> tuple[list[int], float]:
+    """Frames whose delays agree, so that frames stamped late do not bias the others, and the usual misfit [m^2]."""
     known = [(i, entry) for i, entry in enumerate(own) if entry is not None and math.isfinite(entry.std)]
     if not known:
-        return _OnTimeFrames((), 0.0)
+        return [], 0.0
     delay, std = (np.array([getattr(entry, name) for _, entry in known]) for name in ("delay", "std"))
     apart = np.abs(delay - weighted_median(delay, std**-2))
     near = apart < np.maximum(_LEAST_LATE, _LATE * std)
-    on_time = tuple(i for (i, _), good in zip(known, near, strict=True) if good)
-    return _OnTimeFrames(on_time, float(np.median([entry.mean_square_distance for _, entry in known])))
+    usual = float(np.median([entry.mean_square_distance for _, entry in known]))
+    return [i for (i, _), good in zip(known, near, strict=True) if good], usual
 
 
 def is_stamped_late(own: _StampDelay, options: CameraClockOptions) -> bool:
@@ -242,14 +214,6 @@ class CameraCalibrationOptions:
     def __post_init__(self) -> None:
         check_option_bounds(self, "calibration options")
 
-    def prior_precision(self, clock: CameraClockOptions) -> Array:
-        """Inverse covariance of the prior, shape (10, 10)."""
-        pose = [*[self.rotation_prior_std] * 3, *[self.translation_prior_std] * 3]
-        # a uniform distribution over what is searched; taken as it is where nothing is
-        offset = max(clock.search_half_width / math.sqrt(3.0), 1e-6)
-        std = [*pose, self.depth_scale_prior_std, self.depth_offset_prior_std, offset, clock.drift_prior_std]
-        return np.diag(np.array(std) ** -2)
-
 
 @dataclass(frozen=True, eq=False)
 class CameraCalibration:
@@ -257,7 +221,7 @@ class CameraCalibration:
 
     camera_state: CameraState  # what is used: pose, depth, clock
     prior_state: CameraState
-    on_time_frames: _OnTimeFrames | None  # of frames by themselves; None where the clock was not compared
+    usual_square_distance: float | None  # misfit of frames by themselves [m^2]; None where no clock was compared
     # (10, 10), of `camera_state`, in the order of `CameraState.difference_from`; zero where nothing was estimated
     state_covariance: Array
     estimate_minus_used: Array  # (10,), what the arm says less what is used: of a pose that was to be kept
@@ -271,19 +235,9 @@ class CameraCalibration:
         return self.camera_state.pose[:3, 3]
 
     def shared_point_std(self, points: Array, velocity: Array, stamps: Array) -> Array:
-        """Standard deviations of points due to uncertainty of the camera's pose, depth and clock.
+        """Standard deviations of points (N, 3) by the uncertain pose, depth and clock of the camera, (N, 3) [m].
 
-        Parameters
-        ----------
-        points : ndarray, shape (N, 3)
-            In the world [m].
-        velocity : ndarray, shape (N, 3) [m/s]
-        stamps : ndarray, shape (N,) [s]
-
-        Returns
-        -------
-        ndarray, shape (N, 3)
-            [m]; the same error for all of them, as far as they stand at one place.
+        The same error for all of them, as far as they stand at one place; `velocity` (N, 3) [m/s], `stamps` (N,) [s].
         """
         slopes = np.empty((len(points), 3, STATE_SIZE))
         slopes[:, :, :CLOCK_OFFSET_INDEX] = self.camera_state.point_jacobian(points)
@@ -314,16 +268,9 @@ def calibrate_camera(
     clock: CameraClockOptions,
     source: str = "sequence",
 ) -> CameraCalibration:
-    """Calibrate the camera of a sequence from some of its frames.
+    """Calibrate the camera of a sequence, told to stand at a pose (4, 4), from some of its frames.
 
-    Parameters
-    ----------
-    glimpses : sequence of Glimpse
-        Thinned, the robot and what is about it among the points.
-    pose : ndarray, shape (4, 4)
-        Camera in the world, as far as known.
-    source : str
-        Where the frames come from, for messages.
+    The frames are thinned, the robot and what is about it among the points; `source` says where they come from.
 
     Raises
     ------
@@ -333,7 +280,7 @@ def calibrate_camera(
     about = float(np.mean([g.stamp for g in glimpses])) if glimpses else 0.0
     told = CameraState(pose, clock_offset=clock.initial_offset, clock_reference_stamp=about)
     try:
-        return _Calibrator(arm, glimpses, told, rng, options, clock).run()
+        return _Calibrator(arm, told, rng, options, clock).run(glimpses)
     except _UntoldError as reason:
         if options.fix_pose and clock.search_half_width == 0:
             return calibration_as_given(pose, clock, str(reason))
@@ -350,38 +297,50 @@ class _UntoldError(Exception):
         self.hint = hint
 
 
+@dataclass
 class _Calibrator:
     """What one call of `calibrate_camera` needs."""
 
-    def __init__(
-        self,
-        arm: ArmSurface,
-        glimpses: Sequence[CalibrationFrame],
-        told: CameraState,
-        rng: np.random.Generator,
-        options: CameraCalibrationOptions,
-        clock: CameraClockOptions,
-    ) -> None:
-        self.arm, self.told, self.rng, self.options, self.clock = arm, told, rng, options, clock
-        self.precision = options.prior_precision(clock)
-        self.glimpses = [g for g in (self._about_the_arm(g) for g in glimpses) if g is not None]
+    arm: ArmSurface
+    told: CameraState
+    rng: np.random.Generator
+    options: CameraCalibrationOptions
+    clock: CameraClockOptions
 
-    def run(self) -> CameraCalibration:
-        if len(self.glimpses) < _LEAST_FRAMES:
+    @cached_property
+    def precision(self) -> Array:
+        """Inverse covariance of the prior, shape (10, 10)."""
+        own = self.options
+        pose = [*[own.rotation_prior_std] * 3, *[own.translation_prior_std] * 3]
+        # a uniform distribution over what is searched; taken as it is where nothing is
+        offset = max(self.clock.search_half_width / math.sqrt(3.0), 1e-6)
+        std = [*pose, own.depth_scale_prior_std, own.depth_offset_prior_std, offset, self.clock.drift_prior_std]
+        return np.diag(np.array(std) ** -2)
+
+    def run(self, frames: Sequence[CalibrationFrame]) -> CameraCalibration:
+        glimpses = [g for g in map(self._about_the_arm, frames) if g is not None]
+        if len(glimpses) < _LEAST_FRAMES:
             raise _UntoldError(
-                f"it is in view in {len(self.glimpses)} frames, {_LEAST_FRAMES} are needed",
+                f"it is in view in {len(glimpses)} frames, {_LEAST_FRAMES} are needed",
                 "turn the camera so that it sees the arm, or record for longer",
             )
-        state, chosen = self._start(), self.glimpses
+        state, chosen = self._start(glimpses), glimpses
         for _ in range(2):  # once more without the frames that were stamped late
-            state, found, used = self._settled(state, chosen)
+            state = self._rounds(state, chosen, _WIDE[-1], True, _FEW, _ROUNDS)[0]
+            state, found, used = self._rounds(state, chosen, _REACH, True, _MANY, _LAST_ROUNDS)
             own = [estimate_stamp_delay(self.arm, state, g.stamp, state.to_world(g.points), self.rng) for g in used]
-            usual = _find_on_time_frames(own)
-            chosen = [used[i] for i in usual.frame_indices]
+            on_time, usual = _find_on_time_frames(own)
+            chosen = [used[i] for i in on_time]
             if len(chosen) < _LEAST_FRAMES:
                 raise _UntoldError("its frames do not agree on one time", "check the time stamps")
-        presence = CloudSearchTrees(chosen).surface_visibility(self.arm, state, _REACH)
-        self._check_presence(presence)
+        presence = surface_visibility(self.arm, chosen, state, _REACH)
+        free = presence.there + presence.through
+        if not presence.there >= self.options.min_visible_fraction * free:
+            raise _UntoldError(
+                f"the camera sees through {100 * presence.through / max(free, 1e-9):.0f} % of its surface, wherever"
+                " camera and clock are put",
+                "check the told pose, the robot's description and which recording belongs to the frames",
+            )
         covariance = found.state_covariance(self.precision)
         std = math.sqrt(covariance[CLOCK_OFFSET_INDEX, CLOCK_OFFSET_INDEX])
         if self.clock.search_half_width > 0 and not std < self.clock.max_offset_std:
@@ -394,8 +353,9 @@ class _Calibrator:
         if self.options.fix_pose:
             used_state = replace(self.told, clock_offset=state.clock_offset, clock_drift=state.clock_drift)
             beside = state.difference_from(used_state)
-        text = _message(state, used_state, self.told, covariance, presence, self.arm, chosen, self.clock)
-        return CameraCalibration(used_state, self.told, usual, covariance, beside, presence, len(chosen), text)
+        words = self._message(state, covariance, chosen[len(chosen) // 2].stamp)
+        words += f"; from {len(chosen)} frames, with {100 * presence.there:.0f} % of the arm's surface in the clouds"
+        return CameraCalibration(used_state, self.told, usual, covariance, beside, presence, len(chosen), words)
 
     def _about_the_arm(self, glimpse: CalibrationFrame) -> CalibrationFrame | None:
         """The points in the directions where the arm is, as far as told; None where it is out of view."""
@@ -411,28 +371,23 @@ class _Calibrator:
         count = len(glimpse.points)
         return replace(glimpse, points=glimpse.points[self.rng.choice(count, min(count, _THIN), replace=False)])
 
-    def _start(self) -> CameraState:
+    def _start(self, glimpses: Sequence[CalibrationFrame]) -> CameraState:
         """The state near which most of the arm is where the camera sees something."""
-        few = [self._thinned(glimpse) for glimpse in _some(self.glimpses, _START_FRAMES)]
+        some = np.linspace(0, len(glimpses) - 1, min(len(glimpses), _START_FRAMES)).round()
+        few = [self._thinned(glimpses[int(k)]) for k in some]
         tried = initial_camera_states(self.arm, few, self.told, self.clock.search_half_width, _STARTS)
         if not tried:
             raise _UntoldError("it is hardly in view", "turn the camera so that it sees more of the arm")
-        clouds, best, most = CloudSearchTrees(few), tried[0], -1.0
+        best, most = tried[0], -1.0
         for trial in tried:
             for reach in _WIDE:
                 trial = self._rounds(trial, few, reach, False, _FEW, _ROUNDS)[0]
-            presence = clouds.surface_visibility(self.arm, trial, 0.5 * _REACH)
+            presence = surface_visibility(self.arm, few, trial, 0.5 * _REACH)
             if presence.there - presence.through > most:
                 best, most = trial, presence.there - presence.through
             if most > _ENOUGH:
                 break
         return best
-
-    def _settled(
-        self, state: CameraState, glimpses: Sequence[CalibrationFrame]
-    ) -> tuple[CameraState, RobustCost, list[CalibrationFrame]]:
-        state = self._rounds(state, glimpses, _WIDE[-1], True, _FEW, _ROUNDS)[0]
-        return self._rounds(state, glimpses, _REACH, True, _MANY, _LAST_ROUNDS)
 
     def _rounds(
         self,
@@ -462,67 +417,40 @@ class _Calibrator:
             return evaluate_robust_cost(rows, reach)
 
         for _ in range(rounds):
-            state, step = gauss_newton_step(state, cost(state), self.told, self.precision)
+            hessian, gradient, _ = cost(state).weighted_normal_equations(self.precision)
+            pull = gradient + self.precision @ state.difference_from(self.told)
+            step = np.asarray(-np.linalg.solve(hessian + self.precision, pull), float)
+            state = state.with_change(step)
             if np.abs(step).max() < _SETTLED:
                 break
         return state, cost(state), chosen
 
-    def _check_presence(self, presence: SurfaceVisibility) -> None:
-        free = presence.there + presence.through
-        if not presence.there >= self.options.min_visible_fraction * free:
-            raise _UntoldError(
-                f"the camera sees through {100 * presence.through / max(free, 1e-9):.0f} % of its surface, wherever"
-                " camera and clock are put",
-                "check the told pose, the robot's description and which recording belongs to the frames",
-            )
-
-
-def _message(
-    state: CameraState,
-    used: CameraState,
-    told: CameraState,
-    covariance: Array,
-    presence: SurfaceVisibility,
-    arm: ArmSurface,
-    glimpses: Sequence[CalibrationFrame],
-    clock: CameraClockOptions,
-) -> str:
-    """What the arm says, in words."""
-    words = []
-    std = math.sqrt(covariance[CLOCK_OFFSET_INDEX, CLOCK_OFFSET_INDEX])
-    if clock.search_half_width > 0:
-        words.append(f"clock offset {1e3 * state.clock_offset:.1f} ms ± {1e3 * std:.1f} ms (stamp minus joint time)")
-    else:
-        words.append(f"clock offset {1e3 * state.clock_offset:.1f} ms as given")
-    drift = math.sqrt(covariance[CLOCK_DRIFT_INDEX, CLOCK_DRIFT_INDEX])
-    if abs(state.clock_drift) > 2 * drift:
-        words.append(f"its drift {1e3 * state.clock_drift:.2f} ms in a second ± {1e3 * drift:.2f}")
-    middle = glimpses[len(glimpses) // 2]
-    points = arm.visible_points(state, middle.stamp)[0].mean(axis=0, keepdims=True)
-    away = np.linalg.norm(state.to_world(told.to_measured(points)) - points)
-    change = state.difference_from(told)
-    turn = math.degrees(float(np.linalg.norm(change[ROTATION_SLICE])))
-    shift = float(np.linalg.norm(change[TRANSLATION_SLICE]))
-    if used is not state:
-        slopes = state.point_jacobian(points)[0]
-        spread = slopes @ covariance[:CLOCK_OFFSET_INDEX, :CLOCK_OFFSET_INDEX] @ slopes.T
-        gap = slopes @ change[:CLOCK_OFFSET_INDEX]
-        size = float(gap @ np.linalg.solve(spread + 1e-6 * np.eye(3), gap))
-        if size > _CONTRADICTED**2 * 3 and away > _NOTED:
+    def _message(self, state: CameraState, covariance: Array, stamp: float) -> str:
+        """What the arm says of camera and clock in the middle of the recording, in words."""
+        words = [f"clock offset {1e3 * state.clock_offset:.1f} ms as given"]
+        if self.clock.search_half_width > 0:
+            std = math.sqrt(covariance[CLOCK_OFFSET_INDEX, CLOCK_OFFSET_INDEX])
+            words = [f"clock offset {1e3 * state.clock_offset:.1f} ms ± {1e3 * std:.1f} ms (stamp minus joint time)"]
+        drift = math.sqrt(covariance[CLOCK_DRIFT_INDEX, CLOCK_DRIFT_INDEX])
+        if abs(state.clock_drift) > 2 * drift:
+            words.append(f"its drift {1e3 * state.clock_drift:.2f} ms in a second ± {1e3 * drift:.2f}")
+        points = self.arm.visible_points(state, stamp)[0].mean(axis=0, keepdims=True)
+        away = np.linalg.norm(state.to_world(self.told.to_measured(points)) - points)
+        change = state.difference_from(self.told)
+        if away > _NOTED and self.options.fix_pose:
+            slopes = state.point_jacobian(points)[0]
+            spread = slopes @ covariance[:CLOCK_OFFSET_INDEX, :CLOCK_OFFSET_INDEX] @ slopes.T
+            gap = slopes @ change[:CLOCK_OFFSET_INDEX]
+            if float(gap @ np.linalg.solve(spread + 1e-6 * np.eye(3), gap)) > _CONTRADICTED**2 * 3:
+                words.append(
+                    f"the arm contradicts the pose that is kept: it is seen {1e3 * away:.0f} mm from where the joints "
+                    "have it, which the standard deviations count"
+                )
+        elif away > _NOTED:
+            turn = math.degrees(float(np.linalg.norm(change[ROTATION_SLICE])))
+            shift = float(np.linalg.norm(change[TRANSLATION_SLICE]))
             words.append(
-                f"the arm contradicts the pose that is kept: it is seen {1e3 * away:.0f} mm from where the joints have"
-                " it, which the standard deviations count"
+                f"the told camera sees the arm {1e3 * away:.0f} mm from where the joints have it: turned by {turn:.1f}"
+                f" degrees, shifted by {1e3 * shift:.0f} mm, depth scaled by {math.exp(-change[DEPTH_SCALE_INDEX]):.3f}"
             )
-    elif away > _NOTED:
-        words.append(
-            f"the told camera sees the arm {1e3 * away:.0f} mm from where the joints have it: turned by {turn:.1f}"
-            f" degrees, shifted by {1e3 * shift:.0f} mm, depth scaled by {math.exp(-change[DEPTH_SCALE_INDEX]):.3f}"
-        )
-    words.append(f"from {len(glimpses)} frames, with {100 * presence.there:.0f} % of the arm's surface in the clouds")
-    return "; ".join(words)
-
-
-def _some(glimpses: Sequence[CalibrationFrame], most: int) -> list[CalibrationFrame]:
-    if len(glimpses) <= most:
-        return list(glimpses)
-    return [glimpses[int(k)] for k in np.linspace(0, len(glimpses) - 1, most).round()]
+        return "; ".join(words)

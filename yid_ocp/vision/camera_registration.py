@@ -5,15 +5,13 @@ A point p that the camera measured at its time s should lie on the robot's surfa
     P = t + R (g + o/z) p,      e = n . (P - surface(q(s - tau0 - beta (s - s0)))),
 
 with the camera's pose (R, t), a factor g and an offset o on its depth z along the ray, and its clock, ahead by tau0 and
-by beta in every second. The surface's point is where the camera's ray through P meets the robot, so that depth's noise,
-which is along the ray, leaves e without bias; the nearest point of the surface instead (noise of 6 mm: 1 mm too near on
-Baxter's links) leads from further away. Steps are those of Gauss and Newton on a robust sum (Geman and McClure) of e,
-with what is told as the mean of a normal prior.
+by beta in every second. The surface's point is where the camera's ray through P meets the robot, or the nearest one,
+which leads from further away. Steps are those of Gauss and Newton on a robust sum (Geman and McClure) of e, with what
+is told as the mean of a normal prior.
 
-The points' errors are alike, from pixel to pixel of a frame and, where a mesh is not quite the robot's surface, from
-frame to frame at one place of a link. The covariance is therefore the sandwich H^-1 B H^-1 with B summed over frames
-and over patches of the links as wholes, less what each patch has in each frame, which both hold, and not over points;
-data weigh against the prior by how much larger B is than H.
+Errors are alike from pixel to pixel of a frame, and from frame to frame at one place of a link. The covariance is the
+sandwich H^-1 B H^-1 with B summed over frames and over patches of the links as wholes, less what each patch has in each
+frame; data weigh against the prior by how much larger B is than H.
 
 References
 ----------
@@ -27,6 +25,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -138,6 +137,11 @@ class CalibrationFrame:
     stamp: float
     points: Array
 
+    @cached_property
+    def _trees(self) -> tuple[cKDTree, cKDTree]:
+        """Search trees of the points and of their directions."""
+        return cKDTree(self.points), cKDTree(self.points[:, :2] / self.points[:, 2:])
+
 
 @dataclass(frozen=True, eq=False)
 class _CalibrationEquations:
@@ -148,30 +152,19 @@ class _CalibrationEquations:
     patch_indices: Integers
 
 
+@dataclass(frozen=True, eq=False)
 class ArmSurface:
-    """Surface of the robot along its recorded motion.
+    """Surface of the robot along its recorded motion."""
 
-    Parameters
-    ----------
-    configuration_at : callable
-        From a time on the joints' clock to a configuration.
-    grasp_positions_at : callable
-        From a configuration to where the grippers hold the object, shape (G, 3) [m]: points near there may be the
-        object's.
-    grasp_exclusion_radius : float
-        How near [m].
-    """
+    robot_surfaces: ArticulatedSurfaces
+    configuration_at: Callable[[float], Array]  # from a time on the joints' clock
+    # from a configuration to where the grippers hold the object, shape (G, 3) [m], and how near points may be its [m]
+    grasp_positions_at: Callable[[Array], Array]
+    grasp_exclusion_radius: float
 
-    def __init__(
-        self,
-        robot: ArticulatedSurfaces,
-        posture: Callable[[float], Array],
-        grasps: Callable[[Array], Array],
-        around: float,
-    ) -> None:
-        self.robot_surfaces, self.configuration_at = robot, posture
-        self.grasp_positions_at, self.grasp_exclusion_radius = grasps, around
-        self._moving = np.array([joint >= 0 for joint in robot.part_joints])
+    @cached_property
+    def _moving(self) -> Mask:
+        return np.array([joint >= 0 for joint in self.robot_surfaces.part_joints])
 
     def part_poses_at(self, t: float) -> Array:
         """Poses of the parts, shape (parts, 4, 4)."""
@@ -188,7 +181,7 @@ class ArmSurface:
     def is_near_surface(self, points: Array, t: float, within: float) -> Mask:
         """Whether world points are near a moving surface and not near a grasp."""
         q = self.configuration_at(t)
-        result = np.isfinite(self.robot_surfaces.distance_to_surface(points, q, within, moving_only=True))
+        result = self.robot_surfaces.is_within_distance(points, q, within, moving_only=True)
         for held in self.grasp_positions_at(q):
             result &= np.linalg.norm(points - held, axis=1) > self.grasp_exclusion_radius
         return np.asarray(result)
@@ -254,8 +247,6 @@ class RobustCost:
     # (10, 10), outer products of gradients summed over frames and over patches, less those of each patch in each
     # frame, which both have, and no less than these (two-way clusters of Cameron, Gelbach and Miller 2011)
     score_covariance: Array
-    point_error_std: float  # standard deviation of a point's error [m]
-    n_points: int
 
     def weighted_normal_equations(self, precision: Array) -> tuple[Array, Array, float]:
         """Weighted Hessian and gradient of the data, and the weight; `precision`: inverse covariance of the prior."""
@@ -300,7 +291,7 @@ def evaluate_robust_cost(rows: Sequence[_CalibrationEquations], reach: float) ->
         both = summed(frame * (patch.max() + 1) + patch)
         blocks = _at_least(both, summed(frame) + summed(patch) - both)
     curvature = max(bent / max(straight, 1e-12), _LEAST_CURVATURE)
-    return RobustCost(gradient, hessian, curvature, blocks, sigma, len(size))
+    return RobustCost(gradient, hessian, curvature, blocks)
 
 
 def _at_least(least: Array, matrix: Array) -> Array:
@@ -311,26 +302,12 @@ def _at_least(least: Array, matrix: Array) -> Array:
     return np.asarray(back.T @ (np.maximum(values, 1.0)[:, None] * back))
 
 
-def gauss_newton_step(
-    state: CameraState, found: RobustCost, told: CameraState, precision: Array
-) -> tuple[CameraState, Array]:
-    """Camera state after one Gauss-Newton step, and the step; `precision`: of the prior, shape (10, 10)."""
-    hessian, gradient, _ = found.weighted_normal_equations(precision)
-    step = np.asarray(-np.linalg.solve(hessian + precision, gradient + precision @ state.difference_from(told)), float)
-    return state.with_change(step), step
-
-
 def initial_camera_states(
     arm: ArmSurface, glimpses: Sequence[CalibrationFrame], told: CameraState, search: float, most: int
 ) -> list[CameraState]:
     """Candidate camera states at which the arm's visible surface lies on the clouds, best first.
 
-    Parameters
-    ----------
-    search : float
-        How far from its offset others are tried [s].
-    most : int
-        Of starts, at least `_APART` from one another, best first.
+    So many at most, at least `_APART` from one another, with clock offsets up to `search` [s] from the told one.
     """
     steps = math.ceil(search / _CLOCK_STEP) if search > 0 else 0
     delays = np.linspace(-search, search, 2 * steps + 1) if steps else np.zeros(1)
@@ -338,11 +315,7 @@ def initial_camera_states(
     cells = np.stack(np.meshgrid(sides, sides, ahead, indexing="ij"), axis=-1).reshape(-1, 3)
     total = np.zeros((len(delays), len(cells)))
     for glimpse in glimpses:
-        field = _Field.of(arm, glimpse, told)
-        if field is None:
-            continue
-        for k, delay in enumerate(delays):
-            total[k] += field.costs(arm, told, glimpse.stamp, delay, cells)
+        _add_costs(total, arm, told, glimpse, delays, cells)
     result: list[CameraState] = []
     for index in np.argsort(total, axis=None):
         delay, cell = np.unravel_index(index, total.shape)
@@ -360,62 +333,49 @@ def initial_camera_states(
     return result
 
 
-@dataclass(frozen=True, eq=False)
-class _Field:
-    """Cost of a surface's point by its place in the camera's frame, and the arm's visible points."""
+def _add_costs(
+    total: Array, arm: ArmSurface, told: CameraState, glimpse: CalibrationFrame, delays: Array, cells: Integers
+) -> None:
+    """Mean costs of the arm's visible points as they were `delays` [s] earlier, shifted by cells of the camera's frame.
 
-    cost: NDArray[np.float32]
-    low: Array
-    shape: tuple[int, ...]
-    points: Array
-    part: Integers
-
-    @staticmethod
-    def of(arm: ArmSurface, glimpse: CalibrationFrame, told: CameraState) -> _Field | None:
-        """The field about one frame; None where the camera would see too little of the arm."""
-        points, part = arm.visible_points(told, glimpse.stamp)
-        own = told.to_measured(points)
-        at = glimpse.points[:, :2] / glimpse.points[:, 2:]
-        view = np.array([at.min(axis=0), at.max(axis=0)])
-        towards = own[:, :2] / own[:, 2:]
-        seen = ((towards >= view[0]) & (towards <= view[1])).all(axis=1)
-        if np.count_nonzero(seen) < MIN_ARM_POINTS:
-            return None
-        chosen = np.flatnonzero(seen)
-        chosen = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), _SAMPLES)).astype(np.int64)]
-        points, part, own = points[chosen], part[chosen], own[chosen]
-        # room for the shifts, and for the arm's own way
-        margin = _CELL * (np.array([_SIDEWAYS, _SIDEWAYS, _AHEAD]) + 2) + 0.2
-        low = own.min(axis=0) - margin
-        shape = np.ceil((own.max(axis=0) + margin - low) / _CELL).astype(int) + 1
-        cell = np.floor((glimpse.points - low) / _CELL).astype(int)
-        cell = cell[((cell >= 0) & (cell < shape)).all(axis=1)]
-        empty = np.ones(shape, bool)
-        empty[tuple(cell.T)] = False
-        if empty.all():
-            return None
-        distance = distance_transform_edt(empty, sampling=_CELL)
-        centre = [low[axis] + _CELL * (np.arange(shape[axis]) + 0.5) for axis in range(3)]
-        outside = np.zeros(shape, bool)
-        for axis in (0, 1):
-            at = centre[axis][:, None] / np.maximum(centre[2], _CELL)
-            beyond = (at < view[0, axis]) | (at > view[1, axis])
-            outside |= beyond[:, None] if axis == 0 else beyond
-        cost = np.where(outside, _HIDDEN, (np.minimum(distance, _CAPTURE) / _CAPTURE) ** 2)
-        return _Field(cost.astype(np.float32).ravel(), low, tuple(int(n) for n in shape), points, part)
-
-    def costs(self, arm: ArmSurface, told: CameraState, stamp: float, delay: float, cells: Integers) -> Array:
-        """Mean cost of the arm as it was `delay` [s] earlier, shifted by cells of the camera's frame."""
-        t = float(told.to_joint_time(stamp))
-        before, after = arm.part_poses_at(t)[self.part], arm.part_poses_at(t - delay)[self.part]
-        local = np.einsum("nji,nj->ni", before[:, :3, :3], self.points - before[:, :3, 3])
-        own = told.to_measured(np.einsum("nij,nj->ni", after[:, :3, :3], local) + after[:, :3, 3])
-        index = np.floor((own - self.low) / _CELL).astype(np.int64)
-        limit = np.array(self.shape)
-        index = np.clip(index, [_SIDEWAYS, _SIDEWAYS, _AHEAD], limit - 1 - [_SIDEWAYS, _SIDEWAYS, _AHEAD])
-        strides = np.array([self.shape[1] * self.shape[2], self.shape[2], 1])
-        cost = self.cost[(index @ strides)[None, :] + (cells @ strides)[:, None]]
-        return np.asarray(cost.mean(axis=1), float)
+    Added to `total` (delays, cells); nothing where the camera would see too little of the arm.
+    """
+    points, part = arm.visible_points(told, glimpse.stamp)
+    own = told.to_measured(points)
+    at = glimpse.points[:, :2] / glimpse.points[:, 2:]
+    view = np.array([at.min(axis=0), at.max(axis=0)])
+    towards = own[:, :2] / own[:, 2:]
+    chosen = np.flatnonzero(((towards >= view[0]) & (towards <= view[1])).all(axis=1))
+    if len(chosen) < MIN_ARM_POINTS:
+        return
+    chosen = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), _SAMPLES)).astype(np.int64)]
+    points, part, own = points[chosen], part[chosen], own[chosen]
+    # a field of distances with room for the shifts, and for the arm's own way
+    margin = _CELL * (np.array([_SIDEWAYS, _SIDEWAYS, _AHEAD]) + 2) + 0.2
+    low = own.min(axis=0) - margin
+    shape = np.ceil((own.max(axis=0) + margin - low) / _CELL).astype(int) + 1
+    cell = np.floor((glimpse.points - low) / _CELL).astype(int)
+    cell = cell[((cell >= 0) & (cell < shape)).all(axis=1)]
+    if not len(cell):
+        return
+    empty = np.ones(shape, bool)
+    empty[tuple(cell.T)] = False
+    x, y, z = (low[axis] + _CELL * (np.arange(shape[axis]) + 0.5) for axis in range(3))
+    depth = np.maximum(z, _CELL)
+    u, v = x[:, None, None] / depth, y[:, None] / depth
+    outside = (u < view[0, 0]) | (u > view[1, 0]) | (v < view[0, 1]) | (v > view[1, 1])
+    distance = distance_transform_edt(empty, sampling=_CELL)
+    cost = np.where(outside, _HIDDEN, (np.minimum(distance, _CAPTURE) / _CAPTURE) ** 2)
+    flat = cost.astype(np.float32).ravel()
+    t = float(told.to_joint_time(glimpse.stamp))
+    before = arm.part_poses_at(t)[part]
+    local = np.einsum("nji,nj->ni", before[:, :3, :3], points - before[:, :3, 3])
+    edge, strides = np.array([_SIDEWAYS, _SIDEWAYS, _AHEAD]), np.array([shape[1] * shape[2], shape[2], 1])
+    for row, delay in zip(total, delays, strict=True):
+        then = arm.part_poses_at(t - delay)[part]
+        own = told.to_measured(np.einsum("nij,nj->ni", then[:, :3, :3], local) + then[:, :3, 3])
+        index = np.clip(np.floor((own - low) / _CELL).astype(np.int64), edge, shape - 1 - edge)
+        row += flat[(index @ strides)[None, :] + (cells @ strides)[:, None]].mean(axis=1)
 
 
 @dataclass(frozen=True)
@@ -430,29 +390,21 @@ class SurfaceVisibility:
     samples: int
 
 
-class CloudSearchTrees:
-    """Search trees of some frames, to measure how much of the arm they show."""
-
-    def __init__(self, glimpses: Sequence[CalibrationFrame]) -> None:
-        self._glimpses = glimpses
-        self._places = [cKDTree(g.points) for g in glimpses]
-        self._rays = [cKDTree(g.points[:, :2] / g.points[:, 2:]) for g in glimpses]
-
-    def surface_visibility(self, arm: ArmSurface, state: CameraState, within: float) -> SurfaceVisibility:
-        """Fractions of the arm's visible surface that have a point within a distance [m], or have none."""
-        counts = np.zeros(4)
-        for glimpse, places, rays in zip(self._glimpses, self._places, self._rays, strict=True):
-            points, _ = arm.visible_points(state, glimpse.stamp)
-            own = state.to_measured(points)
-            away, _ = places.query(own, distance_upper_bound=within)
-            # as wide as the gaps between points of a cloud that was thinned
-            apart, index = rays.query(own[:, :2] / own[:, 2:], distance_upper_bound=0.015)
-            near = np.isfinite(away)
-            known = np.isfinite(apart)
-            depth = glimpse.points[np.minimum(index, len(glimpse.points) - 1), 2]
-            through = known & ~near & (depth > own[:, 2] + within)
-            covered = known & ~near & (depth < own[:, 2] - within)
-            counts += [np.count_nonzero(x) for x in (near, covered, through, known | near)]
-        samples = max(int(counts[3]), 1)
-        there, covered, through = (float(share) for share in counts[:3] / samples)
-        return SurfaceVisibility(there, covered, through, int(counts[3]))
+def surface_visibility(
+    arm: ArmSurface, glimpses: Sequence[CalibrationFrame], state: CameraState, within: float
+) -> SurfaceVisibility:
+    """Fractions of the arm's visible surface that have a point of the frames within a distance [m], or have none."""
+    counts = np.zeros(4)
+    for glimpse in glimpses:
+        points, _ = arm.visible_points(state, glimpse.stamp)
+        own, (places, rays) = state.to_measured(points), glimpse._trees
+        away, _ = places.query(own, distance_upper_bound=within)
+        # as wide as the gaps between points of a cloud that was thinned
+        apart, index = rays.query(own[:, :2] / own[:, 2:], distance_upper_bound=0.015)
+        near, known = np.isfinite(away), np.isfinite(apart)
+        depth = glimpse.points[np.minimum(index, len(glimpse.points) - 1), 2]
+        through = known & ~near & (depth > own[:, 2] + within)
+        covered = known & ~near & (depth < own[:, 2] - within)
+        counts += [np.count_nonzero(x) for x in (near, covered, through, known | near)]
+    there, covered, through = (float(share) for share in counts[:3] / max(counts[3], 1.0))
+    return SurfaceVisibility(there, covered, through, int(counts[3]))

@@ -2,19 +2,17 @@
 
     q_o = argmin sum_i w_i rho(e_i) + |g(q)/s_g|^2 + |b(q)|^2,      e_i = |p_i - c_i(q)| - f r_i
 
-p_i: point of the cloud, or node of its skeleton; c_i: nearest point of the model's line segments, with r_i the radius
-of its tube. A camera sees surfaces: points lie at the radius (f = 1) from the centre line, on the camera's side; a
-node, the mean of the visible half of a tube, lies at f = pi/4. rho is Geman and McClure's loss. g: distance of held
-frames from the grippers, known from the joint angles. b: bends, in proportion to the square root of their stiffness, so
-that of all shapes through the points it is the one of least elastic energy. Twists about the tubes' axes move no centre
-line (the two bends at the next joint reach every direction) and stay at rest.
+p_i: point of the cloud (f = 1), or node of its skeleton, the mean of the visible half of a tube (f = pi/4); c_i:
+nearest point of the model's line segments, r_i the radius of its tube. rho is Geman and McClure's loss. g: distance of
+held frames from the grippers. b: bends, in proportion to the square root of their stiffness. Twists about the tubes'
+axes move no centre line and stay at rest.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from typing import Annotated
 
@@ -26,7 +24,6 @@ from numpy.typing import ArrayLike, NDArray
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.least_squares import LocalQuadraticModel, minimize_by_damped_newton
 from yid_ocp.model.kinematics import Kinematics, forward_kinematics
-from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System
 from yid_ocp.options import Fraction, OptionInfo, PositiveFloat, check_option_bounds
 from yid_ocp.vision.initial_shapes import EndAnchor, InitialShapeFinder
@@ -35,6 +32,7 @@ from yid_ocp.vision.shape_evidence import (
     DimensionEquations,
     FrameShapeFit,
     ShapeEvidence,
+    ShapeQuality,
     TubeLinks,
     assess_shape,
     line_of_sight_residuals,
@@ -42,11 +40,15 @@ from yid_ocp.vision.shape_evidence import (
     nearest_surface_residuals,
     tube_like_nodes_and_points,
 )
-from yid_ocp.vision.surface_meshes import numeric_mechanism
+from yid_ocp.vision.surface_meshes import numeric_mechanism, tube_sizes
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
+Mask = NDArray[np.bool_]
+_Left = tuple[Mask, Mask]
+"""Which of a frame's nodes and points count."""
+_GRASP_FRAMES = ("holder_frame", "held_frame")
 _NODE_RADIUS_FRACTION = math.pi / 4
 """Distance of the mean of a tube's visible half from its axis, as a fraction of its radius."""
 
@@ -108,19 +110,10 @@ class ShapeFitOptions:
 
 
 class ShapeFitter:
-    """Fitter of the shape of a system's object to a camera's points.
+    """Fitter of the shape of a system's object to a camera's points, at parameter values; nominal where absent.
 
-    Parameters
-    ----------
-    values : mapping of str to float, optional
-        Parameter values (lengths, radii, stiffnesses for the prior); nominal where absent.
-    loose : sequence of str
-        Joints beside the bends that are sought as well, with next to no prior: see `initial_shapes.with_free_root`.
-
-    Raises
-    ------
-    DataError
-        The system has no object with bends.
+    Beside the bends, `loose` joints are sought with next to no prior: see `initial_shapes.with_free_root`. `DataError`
+    for a system without an object.
     """
 
     def __init__(
@@ -134,80 +127,69 @@ class ShapeFitter:
         self.options = options or ShapeFitOptions()
         if not system.segment_layouts:
             raise DataError("the model has no object whose shape could be fitted", hint="give it segments")
-        tree = numeric_mechanism(system, values)
-        self._tree = tree
+        tree = self._tree = numeric_mechanism(system, values)
         symbols, theta = system.parameters.symbols, system.parameters.vector(values)
 
-        def number(expression: ca.SX) -> Array:
-            return np.array(ca.densify(ca.Function("number", [symbols], [expression])(theta))).ravel()
+        def number(expression: ca.SX) -> float:
+            return float(np.array(ca.densify(ca.Function("number", [symbols], [expression])(theta))).ravel()[0])
 
         bends = [entry for entry in system.elastic_joints if entry.deformation == "bend" and entry.axis]
         self.bend_joints = tuple(tree.joint_index(entry.joint_name) for entry in bends)
         self.free_joints = (*self.bend_joints, *(tree.joint_index(name) for name in loose))
-        self.free_joint_segments = (*(_owner(system, entry.joint_name) for entry in bends), *[""] * len(loose))
+        owner = {joint: s.name for s in system.segment_layouts for names in s.link_joints for joint in names}
+        self._free_joint_segments = (*(owner.get(entry.joint_name, "") for entry in bends), *[""] * len(loose))
         self.rest_configuration = np.zeros(system.n_coordinates)
         for entry in system.elastic_joints:
-            self.rest_configuration[tree.joint_index(entry.joint_name)] = number(entry.rest_angle)[0]
-        stiffness = np.array([number(entry.stiffness)[0] for entry in bends])
+            self.rest_configuration[tree.joint_index(entry.joint_name)] = number(entry.rest_angle)
+        stiffness = np.array([number(entry.stiffness) for entry in bends])
         typical = stiffness.mean() if stiffness.max() > 0 else 1.0
-        self._prior = np.sqrt(np.maximum(stiffness / typical, _LEAST_STIFFNESS)) / self.options.bend_prior_std
-        self._prior = np.concatenate([self._prior, np.full(len(loose), _LOOSE)])
+        held_by = np.sqrt(np.maximum(stiffness / typical, _LEAST_STIFFNESS)) / self.options.bend_prior_std
+        self._prior = np.concatenate([held_by, np.full(len(loose), _LOOSE)])
         sought = {*(entry.joint_name for entry in system.elastic_joints), *loose}
         self.recorded_joint_names = tuple(name for name in tree.joint_names if name not in sought)
 
-        radii, owners = [], []
-        for segment in system.segment_layouts:
-            radii += [number(segment.radius)[0]] * len(segment.link_joints)
-            owners += [segment.name] * len(segment.link_joints)
-        self.link_radii, self.link_segments = np.array(radii), tuple(owners)
-        q, columns = ca.SX.sym("q", system.n_coordinates), list(self.free_joints)
-        corners, seen, held, gap = _expressions(system, forward_kinematics(tree, q), self.options)
-        held, gap = (ca.substitute(entry, symbols, ca.SX(ca.DM(theta))) for entry in (held, gap))
-        self._corners = ca.Function("corners", [q], ca.cse([corners, ca.densify(ca.jacobian(corners, q)[:, columns])]))
-        self._seen = ca.Function("seen", [q], ca.cse([seen, ca.densify(ca.jacobian(seen, q)[:, columns])]))
-        holders = [forward_kinematics(tree, q).frame_position(grasp.holder_frame) for grasp in system.grasps]
-        self._holders = ca.Function("holders", [q], [ca.densify(ca.vertcat(ca.SX(0, 1), *holders))])
-        self._gap = ca.Function("gap", [q], [ca.densify(gap)])
-        self._held = ca.Function("held", [q], ca.cse([held, ca.densify(ca.jacobian(held, q)[:, columns])]))
+        sizes = tube_sizes(system, values)
+        self.link_radii = np.concatenate([np.full(len(lengths), radius) for lengths, radius in sizes.values()])
+        self.link_segments = tuple(name for name, (lengths, _) in sizes.items() for _ in lengths)
+        q, numbers = ca.SX.sym("q", system.n_coordinates), ca.SX(ca.DM(theta))
+        kinematics = forward_kinematics(tree, q)
+        corners, seen, held, gap = _expressions(system, kinematics, self.options)
+        held, gap = (ca.substitute(entry, symbols, numbers) for entry in (held, gap))
+
+        def with_slope(entry: ca.SX) -> ca.Function:
+            slope = ca.densify(ca.jacobian(entry, q)[:, list(self.free_joints)])
+            return ca.Function("places", [q], ca.cse([entry, slope]))
+
+        self._corners, self._seen, self._held = with_slope(corners), with_slope(seen), with_slope(held)
+        ends = [[kinematics.frame_position(getattr(g, name)) for g in system.grasps] for name in _GRASP_FRAMES]
+        grippers, taken = (ca.densify(ca.vertcat(ca.SX(0, 1), *places)) for places in ends)
+        self._holders, self._gap = ca.Function("holders", [q], [grippers]), ca.Function("gap", [q], [ca.densify(gap)])
         # how all this moves as the tubes grow
         full = _expressions(system, forward_kinematics(system.mechanism, q), self.options)[:3]
         growth = np.zeros((len(theta), len(system.segment_layouts)))
         for k, segment in enumerate(system.segment_layouts):
-            for name in ca.symvar(ca.vertcat(*segment.link_lengths)):
-                index = system.parameters.names.index(name.name())
+            for symbol in ca.symvar(ca.vertcat(*segment.link_lengths)):
+                index = system.parameters.names.index(symbol.name())
                 growth[index, k] = theta[index]
         grown = [ca.densify(ca.mtimes(ca.jacobian(entry, symbols), ca.DM(growth))) for entry in full]
-        self._grown = ca.Function("grown", [q], ca.cse(ca.substitute(grown, [symbols], [ca.SX(ca.DM(theta))])))
-        at_rest = self._corners(self.rest_configuration)[0]
-        self._lengths = np.linalg.norm(np.diff(np.array(at_rest).reshape(-1, 2, 3), axis=1)[:, 0], axis=1)
-        self.tube_lengths, self.free_end_links = self._ends(np.array(at_rest).reshape(-1, 2, 3), tree)
+        self._grown = ca.Function("grown", [q], ca.cse(ca.substitute(grown, [symbols], [numbers])))
+        at_rest = self._links_at(self.rest_configuration)
+        self._lengths = np.linalg.norm(at_rest[:, 1] - at_rest[:, 0], axis=1)
+        self._tube_lengths = np.array([self._lengths[self._links_of({name})].sum() for name in self.link_segments])
+        # links after which nothing comes
+        places = np.array(ca.Function("held", [q], [taken])(self.rest_configuration)).reshape(-1, 3)
+        apart = np.linalg.norm(at_rest[:, 1][:, None] - np.concatenate([at_rest[:, 0], places]), axis=2).min(axis=1)
+        self.free_end_links = tuple(int(k) for k in np.flatnonzero(apart > _TOUCHING))
 
-    def _ends(self, corners: Array, tree: Mechanism) -> tuple[Array, tuple[int, ...]]:
-        """Length of the tube that each link belongs to, and the links after which nothing comes."""
-        reach = np.array([self._lengths[self._links_of({name})].sum() for name in self.link_segments])
-        q = ca.SX.sym("q", self.system.n_coordinates)
-        kinematics = forward_kinematics(tree, q)
-        held = [kinematics.frame_position(grasp.held_frame) for grasp in self.system.grasps]
-        places = np.array(ca.Function("held", [q], [ca.horzcat(ca.SX(3, 0), *held)])(self.rest_configuration)).T
-        taken = np.concatenate([corners[:, 0], places])
-        apart = np.linalg.norm(corners[:, 1][:, None] - taken, axis=2).min(axis=1)
-        return reach, tuple(int(k) for k in np.flatnonzero(apart > _TOUCHING))
+    def _links_at(self, q: Array) -> Array:
+        """Start and end of every link, shape (K, 2, 3) [m]."""
+        return np.array(self._corners(q)[0]).reshape(-1, 2, 3)
 
     def fit_frame(self, sight: CloudObservation, q_known: Array, starts: Sequence[Array] = ()) -> FrameShapeFit:
-        """Fit the shape in one frame.
+        """Fit the shape in one frame, with the robot's part of a configuration (n,) and from starts of the object's.
 
-        Parameters
-        ----------
-        q_known : ndarray, shape (n,)
-            Configuration whose robot part is right; the object's part is not used.
-        starts : sequence of ndarray, each (n,)
-            Where the search for the object's part begins; at rest where absent. The passes on the nodes, which cost
-            little, run from all of them, the others from the best that was found.
-
-        Raises
-        ------
-        DataError
-            There is no point.
+        The passes on the nodes, which cost little, run from all starts (rest where absent), the others from the best
+        that was found. `DataError` where there is no point.
         """
         if not len(sight.points) or not len(sight.skeleton_nodes):
             raise DataError("there is no point to fit to", where="fit")
@@ -215,110 +197,99 @@ class ShapeFitter:
         q = self.rest_configuration.copy()
         known = [self.system.mechanism.joint_index(name) for name in self.recorded_joint_names]
         q[known] = q_known[known]
-        begun = []
-        for start in starts or (self.rest_configuration,):
-            trial = q.copy()
+        begun = [q.copy() for _ in starts or "r"]
+        for trial, start in zip(begun, starts or (self.rest_configuration,), strict=True):
             trial[free] = start[free]
-            begun.append(trial)
-        everything = _Left(np.ones(len(sight.skeleton_nodes), bool), np.ones(len(sight.points), bool))
-        thin = _Left(*tube_like_nodes_and_points(sight, float(self.link_radii.max())))
-        best = self._attempt(sight, begun, thin if thin.nodes.any() and thin.points.any() else everything)
-        for left in (self._without(best, sight, self._links_of(self._failed(best.evidence))), everything):
-            failed = self._failed(best.evidence)
+        everything = np.ones(len(sight.skeleton_nodes), bool), np.ones(len(sight.points), bool)
+        thin = tube_like_nodes_and_points(sight, float(self.link_radii.max()))
+        best, evidence = self._attempt(sight, begun, thin if thin[0].any() and thin[1].any() else everything)
+        for left in (self._without(best, evidence, sight, self._links_of(self._failed(evidence))), everything):
+            failed = self._failed(evidence)
             if not failed:
                 break
             # a part of the object is not where this has it: something like it stood nearer to where the search began
-            if left.nodes.any() and left.points.any():
-                other = self._attempt(sight, [self._rested(best.minimum.q, failed), *begun], left)
-                best = max(best, other, key=lambda attempt: self._covered(attempt.evidence))
-        return self._judged(best, self._rivals(best, sight), sight)
+            if left[0].any() and left[1].any():
+                other = self._attempt(sight, [self._rested(best.q, failed), *begun], left)
+                best, evidence = max((best, evidence), other, key=lambda found: found[1].coverage(self._lengths))
+        return self._judged(best, evidence, self._rivals(best, evidence, sight), sight)
 
     def _rested(self, q: Array, tubes: Collection[str]) -> Array:
         """A configuration with some tubes as at rest."""
         trial = q.copy()
-        owners = zip(self.free_joints, self.free_joint_segments, strict=True)
-        again = [index for index, owner in owners if owner in tubes]
+        again = [j for j, owner in zip(self.free_joints, self._free_joint_segments, strict=True) if owner in tubes]
         trial[again] = self.rest_configuration[again]
         return trial
 
-    def _links_of(self, tubes: Collection[str]) -> NDArray[np.bool_]:
+    def _links_of(self, tubes: Collection[str]) -> Mask:
         return np.array([owner in tubes for owner in self.link_segments])
 
-    def _rivals(self, best: _Attempt, sight: CloudObservation) -> list[Array]:
+    def _rivals(self, best: _Minimum, evidence: ShapeEvidence, sight: CloudObservation) -> list[Array]:
         """Other shapes that the cloud speaks for as much, where a thing touches a tube."""
-        if not best.evidence.is_contested.any() or not self.options.surface_loss_scales:
+        if not evidence.is_contested.any() or not self.options.surface_loss_scales:
             return []
-        tubes = self.tubes_at(best.minimum.q)
-        touched = nearest_on_tubes(tubes.link_ends, tubes.radius, sight.points[best.evidence.is_contested])[0]
+        tubes = self.tubes_at(best.q)
+        touched = nearest_on_tubes(tubes.link_ends, tubes.radius, sight.points[evidence.is_contested])[0]
         found = []
         for name in dict.fromkeys(self.link_segments[k] for k in sorted(set(touched.tolist()))):
             mine = self._links_of({name})
             onward = mine & (np.arange(len(mine)) >= min(k for k in touched if mine[k]))
-            left = self._without(best, sight, onward)
-            if left.nodes.any() and left.points.any():
-                rival = self._attempt(sight, [self._rested(best.minimum.q, {name}), best.minimum.q], left)
-                if not self._failed(rival.evidence):
-                    found.append(rival.minimum.q)
+            left = self._without(best, evidence, sight, onward)
+            if left[0].any() and left[1].any():
+                rival, its = self._attempt(sight, [self._rested(best.q, {name}), best.q], left)
+                if not self._failed(its):
+                    found.append(rival.q)
         return found
-
-    def _covered(self, evidence: ShapeEvidence) -> float:
-        """Share of the visible length that has points of its own."""
-        filled = float(self._lengths @ evidence.covered_fraction)
-        empty = float(self._lengths @ evidence.visibly_empty_fraction)
-        return filled / max(filled + empty, 1e-12)
 
     def _failed(self, evidence: ShapeEvidence) -> set[str]:
         """Tubes of which too much is seen to be empty."""
         failed = set()
         for name in dict.fromkeys(self.link_segments):
             mine = self._lengths * self._links_of({name})
-            filled, empty = float(mine @ evidence.covered_fraction), float(mine @ evidence.visibly_empty_fraction)
-            if empty > 0 and filled < self.options.min_tube_coverage * (filled + empty):
+            empty = float(mine @ evidence.visibly_empty_fraction) > 0
+            if empty and evidence.coverage(mine) < self.options.min_tube_coverage:
                 failed.add(name)
         return failed
 
-    def _without(self, attempt: _Attempt, sight: CloudObservation, links: NDArray[np.bool_]) -> _Left:
+    def _without(self, best: _Minimum, evidence: ShapeEvidence, sight: CloudObservation, links: Mask) -> _Left:
         """All nodes and points but those on which some links lie."""
-        tubes = self.tubes_at(attempt.minimum.q)
+        tubes, nodes = self.tubes_at(best.q), sight.skeleton_nodes
         link = nearest_on_tubes(tubes.link_ends, tubes.radius, sight.points)[0]
-        wrong = links[link] & (attempt.evidence.is_own | attempt.evidence.is_contested)
-        nodes = sight.skeleton_nodes
+        wrong = links[link] & (evidence.is_own | evidence.is_contested)
         node_link, _, _, distance = nearest_on_tubes(tubes.link_ends, tubes.radius, nodes, _NODE_RADIUS_FRACTION)
-        return _Left(~(links[node_link] & (distance < 2 * tubes.radius[node_link])), ~wrong)
+        return ~(links[node_link] & (distance < 2 * tubes.radius[node_link])), ~wrong
 
-    def _attempt(self, sight: CloudObservation, starts: Sequence[Array], left: _Left) -> _Attempt:
+    def _attempt(self, sight: CloudObservation, starts: Sequence[Array], left: _Left) -> tuple[_Minimum, ShapeEvidence]:
         """The best shape through some of the nodes and points, then through those that are surely its own."""
-        on_nodes, on_points = self._tasks(sight, left)
+        on_nodes, on_points = self._tasks(sight, *left)
         unit = np.eye(len(self.free_joints))
         tried = [self._minimise(_Minimum(start, unit, math.inf, 0), on_nodes) for start in starts]
         best = min(tried, key=lambda minimum: minimum.cost)
         last = self._minimise(best, on_points)
         iterations = sum(minimum.iterations for minimum in tried) + last.iterations - best.iterations
         evidence = assess_shape(self.tubes_at(last.q), sight, self.max_informative_distance)
-        if on_points:
-            keep = ~(evidence.is_contested | evidence.is_foreign)
-            if keep.any():
-                last = self._minimise(last, self._tasks(sight, _Left(left.nodes, keep))[1])
-                evidence = assess_shape(self.tubes_at(last.q), sight, self.max_informative_distance)
-        return _Attempt(replace(last, iterations=iterations + last.iterations), evidence)
+        keep = ~(evidence.is_contested | evidence.is_foreign)
+        if on_points and keep.any():
+            last = self._minimise(last, self._tasks(sight, left[0], keep)[1])
+            evidence = assess_shape(self.tubes_at(last.q), sight, self.max_informative_distance)
+        return replace(last, iterations=iterations + last.iterations), evidence
 
     @property
     def max_informative_distance(self) -> float:
         """Distance from the surface beyond which a point says nothing of the shape [m]."""
         return (self.options.surface_loss_scales or self.options.node_loss_scales)[-1] * _NEAR
 
-    def _tasks(self, sight: CloudObservation, left: _Left) -> tuple[list[_Task], list[_Task]]:
+    def _tasks(self, sight: CloudObservation, at_nodes: Mask, at_points: Mask) -> tuple[list[_Task], list[_Task]]:
         """The passes on the nodes and those on the points."""
         options, camera = self.options, sight.camera_position
         factor = 1.0 / (options.correlated_points * options.surface_noise_std**2)
-        weight = np.minimum(sight.point_weights, options.max_point_weight)[left.points]
-        nodes, points = sight.skeleton_nodes[left.nodes], sight.points[left.points]
+        weight = np.minimum(sight.point_weights, options.max_point_weight)[at_points]
+        nodes, points = sight.skeleton_nodes[at_nodes], sight.points[at_points]
         # nodes weigh together as much as the points, which share their errors
         node_weight = np.full(len(nodes), weight.sum() / max(len(nodes), 1)) * factor
         anchors = sight.end_anchors
-        at_nodes, on_surface = (nodes, node_weight, _NODE_RADIUS_FRACTION), (points, weight * factor, 1.0)
+        on_nodes, on_surface = (nodes, node_weight, _NODE_RADIUS_FRACTION), (points, weight * factor, 1.0)
         return (
-            [_Task(*at_nodes, scale, camera, anchors) for scale in options.node_loss_scales],
+            [_Task(*on_nodes, scale, camera, anchors) for scale in options.node_loss_scales],
             [_Task(*on_surface, scale, camera, anchors) for scale in options.surface_loss_scales],
         )
 
@@ -344,47 +315,52 @@ class ShapeFitter:
             end = _Minimum(q, found.final_model.hessian, found.final_model.cost, end.iterations + found.n_iterations)
         return end
 
-    def _judged(self, attempt: _Attempt, rivals: Sequence[Array], sight: CloudObservation) -> FrameShapeFit:
+    def _judged(
+        self, best: _Minimum, evidence: ShapeEvidence, rivals: Sequence[Array], sight: CloudObservation
+    ) -> FrameShapeFit:
         """The shape with its standard deviations, and what speaks for and against it."""
-        minimum, evidence = attempt.minimum, attempt.evidence
-        q, on_shape = minimum.q, evidence.is_own | evidence.is_contested
+        q, on_shape = best.q, evidence.is_own | evidence.is_contested
         points, jacobian = (np.array(x) for x in self._seen(q))
-        spread = jacobian @ np.linalg.solve(minimum.hessian, jacobian.T)
         places = points.reshape(-1, 3)
-        own, every = (
-            self._tasks(sight, _Left(np.zeros(len(sight.skeleton_nodes), bool), mask))[1][-1:]
-            for mask in (~(evidence.is_contested | evidence.is_foreign), ~evidence.is_foreign)
-        )
+        spread = np.diag(jacobian @ np.linalg.solve(best.hessian, jacobian.T)).reshape(-1, 3)
+        none = np.zeros(len(sight.skeleton_nodes), bool)
+        own = self._tasks(sight, none, ~(evidence.is_contested | evidence.is_foreign))[1][-1:]
         moved = np.zeros(places.shape)
-        if every and evidence.is_contested.any():
+        if own and evidence.is_contested.any():
             # how far the contested points would take the shape, if they counted
-            moved = (jacobian @ self._quadratic(q, every[0]).damped_step(0.0)).reshape(-1, 3)
+            every = self._tasks(sight, none, ~evidence.is_foreign)[1][-1]
+            moved = (jacobian @ self._quadratic(q, every).damped_step(0.0)).reshape(-1, 3)
         for rival in rivals:
             moved = np.maximum(np.abs(moved), np.abs(self.points_at(rival) - places))
-        corners = self.tubes_at(q).link_ends
-        swath = self._swath_std(corners, places, evidence, sight.camera_position)
+        corners = self._links_at(q)
+        touching = np.linalg.norm(corners[:, :, None] - places, axis=3).min(axis=1) < _TOUCHING
+        # the spread across the links about each point
+        across = np.cross(corners[:, 1] - corners[:, 0], corners.mean(axis=1) - sight.camera_position)
+        across /= np.maximum(np.linalg.norm(across, axis=1), 1e-12)[:, None]
+        wide = np.sqrt(evidence.excess_variance)[:, None] * np.abs(across)
+        swath = np.max(np.where(touching[..., None], wide[:, None], 0.0), axis=0)
         off_end = np.zeros(places.shape)
         for k, offset in zip(self.free_end_links, evidence.end_offsets, strict=True):
             if abs(offset) > _SIGMAS * max(self.options.surface_noise_std, evidence.noise_std):
                 at_end = np.linalg.norm(places - corners[k, 1], axis=1) < _TOUCHING
                 axis = (corners[k, 1] - corners[k, 0]) / np.linalg.norm(corners[k, 1] - corners[k, 0])
                 off_end[at_end] = offset * axis
+        # a point is seen where a link that begins or ends there is, of a tube that is where it should be
+        sure = evidence.covered_fraction >= self.options.min_link_coverage
+        sure &= ~self._links_of(self._failed(evidence))
+        held = {grasp.held_frame for grasp in self.system.grasps}
+        seen = (touching & sure[:, None]).any(axis=0) | np.array([name in held for name in self.system.point_frames])
         return FrameShapeFit(
-            q,
-            places,
-            np.sqrt(np.maximum(np.diag(spread), 0.0).reshape(-1, 3) + moved**2 + swath**2 + off_end**2),
-            evidence.mean_distance,
-            evidence.noise_std,
-            evidence.covered_fraction,
-            evidence.visibly_empty_fraction,
-            self._seen_points(corners, places, evidence),
-            np.array(self._gap(q)).reshape(-1, 3),
-            evidence.end_offsets,
-            float(evidence.is_contested.sum() / max(on_shape.sum(), 1)),
-            evidence.foreign_clusters,
-            self._size_rows(q, own[0] if own else None, evidence),
-            minimum.iterations,
-            corners,
+            **{entry.name: getattr(evidence, entry.name) for entry in fields(ShapeQuality)},
+            q=q,
+            point_positions=places,
+            point_std=np.sqrt(np.maximum(spread, 0.0) + moved**2 + swath**2 + off_end**2),
+            is_point_seen=np.asarray(seen),
+            grasp_gaps=np.array(self._gap(q)).reshape(-1, 3),
+            contested_fraction=float(evidence.is_contested.sum() / max(on_shape.sum(), 1)),
+            dimension_equations=self._size_rows(q, own[0] if own else None, evidence),
+            n_iterations=best.iterations,
+            link_ends=corners,
         )
 
     def _quadratic(self, q: Array, task: _Task) -> LocalQuadraticModel:
@@ -423,28 +399,10 @@ class ShapeFitter:
         hessian += by_held.T @ by_held + np.diag(self._prior**2)
         return LocalQuadraticModel(cost, gradient, hessian)
 
-    def _seen_points(self, corners: Array, places: Array, evidence: ShapeEvidence) -> NDArray[np.bool_]:
-        """A point is seen where a link that begins or ends there is, of a tube that is where it should be."""
-        apart = np.linalg.norm(corners[:, :, None] - places, axis=3).min(axis=1)
-        failed = self._failed(evidence)
-        sure = evidence.covered_fraction >= self.options.min_link_coverage
-        sure &= ~self._links_of(failed)
-        covered = (apart < _TOUCHING) & sure[:, None]
-        held = {grasp.held_frame for grasp in self.system.grasps}
-        return np.asarray(covered.any(axis=0) | np.array([name in held for name in self.system.point_frames]))
-
     def initial_shape_finder(self) -> InitialShapeFinder:
         """Finder of initial shapes for a system with a free root (`initial_shapes.with_free_root`)."""
         by_owner = {name: self._lengths[self._links_of({name})] for name in dict.fromkeys(self.link_segments)}
         return InitialShapeFinder(self.system, self._tree, self.rest_configuration, self.bend_joints, by_owner)
-
-    def _swath_std(self, corners: Array, places: Array, evidence: ShapeEvidence, camera: Array) -> Array:
-        """Standard deviation of each point, shape (np, 3), that the spread across the links about it leaves [m]."""
-        apart = np.linalg.norm(corners[:, :, None] - places, axis=3).min(axis=1)
-        across = np.cross(corners[:, 1] - corners[:, 0], corners.mean(axis=1) - camera)
-        across /= np.maximum(np.linalg.norm(across, axis=1), 1e-12)[:, None]
-        spread = np.sqrt(evidence.excess_variance)[:, None] * np.abs(across)
-        return np.asarray(np.max(np.where((apart < _TOUCHING)[..., None], spread[:, None], 0.0), axis=0))
 
     def _size_rows(self, q: Array, task: _Task | None, evidence: ShapeEvidence) -> DimensionEquations:
         """What a frame's points say of lengths and radii at its shape."""
@@ -494,8 +452,7 @@ class ShapeFitter:
 
     def tubes_at(self, q: Array) -> TubeLinks:
         """Tube links in the world at a configuration."""
-        corners = np.array(self._corners(q)[0]).reshape(-1, 2, 3)
-        return TubeLinks(corners, self.link_radii, self.free_end_links, self.tube_lengths)
+        return TubeLinks(self._links_at(q), self.link_radii, self.free_end_links, self._tube_lengths)
 
     def gripper_positions_at(self, q: ArrayLike) -> Array:
         """Gripper positions at a configuration, shape (grasps, 3) [m]."""
@@ -517,22 +474,6 @@ class _Minimum:
 
 
 @dataclass(frozen=True, eq=False)
-class _Left:
-    """Which of a frame's nodes and points count."""
-
-    nodes: NDArray[np.bool_]
-    points: NDArray[np.bool_]
-
-
-@dataclass(frozen=True, eq=False)
-class _Attempt:
-    """A shape and what the whole cloud says of it."""
-
-    minimum: _Minimum
-    evidence: ShapeEvidence
-
-
-@dataclass(frozen=True, eq=False)
 class _Task:
     """One pass: points, their weights, where they lie on the tubes, the scale of the loss, the camera, seen ends."""
 
@@ -542,11 +483,6 @@ class _Task:
     scale: float
     camera: Array
     anchors: Sequence[EndAnchor]
-
-
-def _owner(system: System, joint: str) -> str:
-    """Segment to which an elastic joint belongs."""
-    return next((s.name for s in system.segment_layouts if any(joint in names for names in s.link_joints)), "")
 
 
 def _expressions(system: System, kinematics: Kinematics, options: ShapeFitOptions) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:

@@ -13,7 +13,7 @@ import re
 import warnings
 import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import DataError, OutputError, unknown_name_details
-from yid_ocp.files import atomic_write, is_file
+from yid_ocp.files import atomic_write, is_file, write_text
 from yid_ocp.vision.frames import CameraIntrinsics, Colours, FrameSequence, import_open3d, validated_pose
 
 Array = NDArray[np.float64]
@@ -37,30 +37,14 @@ _LARGEST_DEPTH = 65.535  # [m]; what sixteen bits of millimetres hold
 _AGAIN = "copy or record it again"
 
 
-def _read_cloud(path: Path) -> Array:
-    """Points of a cloud, shape (N, 3), in the file's unit."""
-    return _read_ply_points(_there(path)) if path.suffix.lower() == ".ply" else _read(path)[0]
-
-
-def _read_colours(path: Path) -> Colours | None:
-    """Red, green and blue of the points that `_read_cloud` gives, shape (N, 3), None where the file has none."""
-    return _read_ply_colours(_there(path)) if path.suffix.lower() == ".ply" else _read(path)[1]
-
-
-def _there(path: Path) -> Path:
+def _read_cloud(path: Path, coloured: bool = False) -> tuple[Array, Colours | None]:
+    """Points of a cloud in the file's unit, and their red, green and blue where asked for and there, both (N, 3)."""
     if not is_file(path):
         raise DataError("the file of the cloud is missing", where=str(path))
-    return path
-
-
-def _read(path: Path) -> tuple[Array, Colours | None]:
-    match _there(path).suffix.lower():
-        case ".npz":
-            points, colours = _read_npz(path)
-        case ".xyz":
-            points, colours = _read_xyz(path)
-        case _:
-            points, colours = _read_pcd(path)
+    if path.suffix.lower() == ".ply":
+        return _read_ply(path, coloured)
+    readers = {".npz": _read_npz, ".xyz": _read_xyz, ".pcd": _read_pcd}
+    points, colours = readers[path.suffix.lower()](path)
     if not len(points):
         raise DataError("the cloud is empty or cannot be read", where=str(path))
     return points, colours
@@ -114,16 +98,6 @@ def _read_pcd(path: Path) -> tuple[Array, Colours | None]:
     return np.asarray(cloud.points, dtype=np.float64), colours
 
 
-def _write_cloud(path: Path, points: Array) -> None:
-    """Write a binary PLY file; `OutputError` where that cannot be."""
-    o3d = import_open3d()
-    # float32 keeps 0.2 um at 2 m in half the space
-    cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(np.ascontiguousarray(points, dtype=np.float32)))
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        if not o3d.t.io.write_point_cloud(str(path), cloud):
-            raise OutputError("the cloud cannot be written", where=str(path))
-
-
 def _read_depth_image(path: Path) -> Array:
     """A depth image in the file's unit, shape (height, width); `DataError` where it is no grey PNG of 16 bits."""
     o3d = import_open3d()
@@ -137,15 +111,6 @@ def _read_depth_image(path: Path) -> Array:
     return image.astype(np.float64)
 
 
-def _write_depth_image(path: Path, depth: Array) -> None:
-    """Write a depth image [m] as millimetres; `OutputError` where that cannot be."""
-    o3d = import_open3d()
-    good = np.isfinite(depth) & (depth > 0) & (depth < _LARGEST_DEPTH)
-    image = np.where(good, np.rint(1e3 * np.where(good, depth, 0.0)), 0.0).astype(np.uint16)
-    if not o3d.io.write_image(str(path), o3d.geometry.Image(np.ascontiguousarray(image))):
-        raise OutputError("the depth image cannot be written", where=str(path))
-
-
 _MAX_HEADER_BYTES = 100_000
 """A longer head is none [bytes]."""
 _TYPES = {
@@ -157,28 +122,12 @@ _AXIS_PROPERTIES, _COLOUR_PROPERTIES = ("x", "y", "z"), ("red", "green", "blue")
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
-@dataclass(frozen=True)
-class _Element:
-    """A table of a PLY file: its name, its number of rows, its columns with NumPy's names of their types."""
-
-    name: str
-    count: int
-    columns: tuple[tuple[str, str], ...]
+_Element = tuple[str, int, list[tuple[str, str]]]
+"""A table of a PLY file: its name, its number of rows, its columns with NumPy's names of their types, "" for lists."""
 
 
-def _read_ply_points(path: Path) -> Array:
-    """Positions of the vertices, shape (N, 3), in the file's unit; other properties and later elements are left out."""
-    return _columns(path, _AXIS_PROPERTIES)
-
-
-def _read_ply_colours(path: Path) -> NDArray[np.uint8] | None:
-    """Red, green and blue of the vertices, shape (N, 3), None where they have none; errors as `_read_ply_points`."""
-    colours = _columns(path, _COLOUR_PROPERTIES)
-    return colours.astype(np.uint8) if colours.shape[1] else None
-
-
-def _columns(path: Path, wanted: Sequence[str]) -> Array:
-    """Columns of the vertices, shape (N, number of them), or (N, 0) where the file does not have all of them."""
+def _read_ply(path: Path, coloured: bool) -> tuple[Array, Colours | None]:
+    """Positions and colours of the vertices; other properties and later elements are left out."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -188,10 +137,15 @@ def _columns(path: Path, wanted: Sequence[str]) -> Array:
     if not end or len(head) > _MAX_HEADER_BYTES or line.strip() or not head.startswith(b"ply"):
         raise _damaged(path, "it has no head")
     order, elements = _head(path, head.decode("latin-1"))
-    for element in elements:
-        if element.name == "vertex":
-            return _vertices(path, element, order, body, wanted)
-        body = _rest(path, element, order, body)
+    for name, count, columns in elements:
+        if name == "vertex":
+            return _vertices(path, count, columns, order, body, coloured)
+        if any(not kind for _, kind in columns):  # there is no telling how far they go
+            raise _damaged(path, f"lists of '{name}' stand before the vertices")
+        if order:
+            body = body[count * sum(np.dtype(kind).itemsize for _, kind in columns) :]
+        else:
+            body = b"\n".join(body.split(b"\n")[min(count, len(body)) :])
     raise _damaged(path, "it has no vertices")
 
 
@@ -210,11 +164,11 @@ def _head(path: Path, text: str) -> tuple[str, list[_Element]]:
             case ["format", name, _] if name in _ORDERS:
                 order = _ORDERS[name]
             case ["element", name, count] if count.isascii() and count.isdigit() and len(count) <= 18:
-                found.append(_Element(name, int(count), ()))
+                found.append((name, int(count), []))
             case ["property", "list", _, _, name] if found:
-                found[-1] = _Element(found[-1].name, found[-1].count, (*found[-1].columns, (name, "")))
+                found[-1][2].append((name, ""))
             case ["property", kind, name] if found and kind in _TYPES:
-                found[-1] = _Element(found[-1].name, found[-1].count, (*found[-1].columns, (name, _TYPES[kind])))
+                found[-1][2].append((name, _TYPES[kind]))
             case _:
                 raise _damaged(path, f"its head says {line[:60]!r}")
     if order is None:
@@ -222,39 +176,31 @@ def _head(path: Path, text: str) -> tuple[str, list[_Element]]:
     return order, found
 
 
-def _rest(path: Path, element: _Element, order: str, body: bytes) -> bytes:
-    """What follows an element; in a list's rows there is no telling how far they go."""
-    if any(not kind for _, kind in element.columns):
-        raise _damaged(path, f"lists of '{element.name}' stand before the vertices")
-    if order:
-        return body[element.count * sum(np.dtype(kind).itemsize for _, kind in element.columns) :]
-    return b"\n".join(body.split(b"\n")[min(element.count, len(body)) :])
-
-
-def _vertices(path: Path, element: _Element, order: str, body: bytes, wanted: Sequence[str]) -> Array:
-    names = [name for name, _ in element.columns]
-    kinds = [kind for _, kind in element.columns]
+def _vertices(
+    path: Path, count: int, columns: Sequence[tuple[str, str]], order: str, body: bytes, coloured: bool
+) -> tuple[Array, Colours | None]:
+    names, kinds = [name for name, _ in columns], [kind for _, kind in columns]
     if len(set(names)) < len(names) or not set(_AXIS_PROPERTIES) <= set(names) or "" in kinds:
         raise _damaged(path, "its vertices have no x, y and z, or lists")
     size = sum(np.dtype(kind).itemsize for kind in kinds) if order else 2 * len(names)
-    if element.count * size > len(body) + (not order):  # the last line of a text may end without a newline
-        what = f"the cloud is damaged: it declares {element.count:.3g} points in {len(body)} bytes"
+    if count * size > len(body) + (not order):  # the last line of a text may end without a newline
+        what = f"the cloud is damaged: it declares {count:.3g} points in {len(body)} bytes"
         raise DataError(what, where=str(path), hint=_AGAIN)
-    if not element.count:
+    if not count:
         raise _damaged(path, "it has no vertices")
-    if not set(wanted) <= set(names):
-        return np.empty((element.count, 0))
+    wanted = [*_AXIS_PROPERTIES, *(_COLOUR_PROPERTIES if coloured and set(_COLOUR_PROPERTIES) <= set(names) else ())]
     if order:
-        rows = np.frombuffer(body, [(n, order + k) for n, k in element.columns], element.count)
-        return np.stack([rows[name].astype(np.float64) for name in wanted], axis=1)
-    try:
-        lines = [line.split() for line in body.split(b"\n", element.count)[: element.count]]
-        values = np.array([[float(row[names.index(name)]) for name in wanted] for row in lines])
-    except (ValueError, IndexError) as error:
-        raise _damaged(path, f"a vertex is not what its head says ({error})") from error
-    if len(values) < element.count:
+        rows = np.frombuffer(body, [(n, order + k) for n, k in columns], count)
+        values = np.stack([rows[name].astype(np.float64) for name in wanted], axis=1)
+    else:
+        try:
+            lines = [line.split() for line in body.split(b"\n", count)[:count]]
+            values = np.array([[float(row[names.index(name)]) for name in wanted] for row in lines])
+        except (ValueError, IndexError) as error:
+            raise _damaged(path, f"a vertex is not what its head says ({error})") from error
+    if len(values) < count:
         raise _damaged(path, "vertices are missing")
-    return values
+    return values[:, :3], values[:, 3:].astype(np.uint8) if len(wanted) > 3 else None
 
 
 _FRAMES_FORMAT = "yid-frames/1"
@@ -273,14 +219,7 @@ def read_frame_folder(
     The folder holds `camera.json` (`yid-frames/1`: `pose` 4x4, `frame` "camera" or "world" of the clouds, `unit` "m" or
     "mm" of the clouds, `intrinsics` and `depth_unit` [m] of depth images), `timestamps.csv` (columns `file`, `t` [s])
     and the files that it names: PLY, PCD, NPZ or XYZ clouds, or 16-bit PNG depth images, in any order. They are read
-    when they are needed.
-
-    Parameters
-    ----------
-    pose : array_like, shape (4, 4), optional
-        Camera in the world, instead of the folder's.
-    unit : str, optional
-        Unit of the clouds, instead of the folder's.
+    when they are needed. A `pose`, shape (4, 4), or a `unit` that is given replaces the folder's.
 
     Raises
     ------
@@ -309,13 +248,11 @@ def read_frame_folder(
         if file.suffix.lower() == _DEPTH_IMAGE_SUFFIX:
             assert intrinsics is not None
             return intrinsics.points_from_depth(_read_depth_image(file) * depth_unit)
-        points = _read_cloud(file) * METRES_PER_UNIT[given]
-        if frame == "world":
-            points = (points - camera[:3, 3]) @ camera[:3, :3]
-        return points
+        points = _read_cloud(file)[0] * METRES_PER_UNIT[given]
+        return (points - camera[:3, 3]) @ camera[:3, :3] if frame == "world" else points
 
     def colours(index: int) -> Colours | None:
-        return None if names[index].lower().endswith(_DEPTH_IMAGE_SUFFIX) else _read_colours(path / names[index])
+        return None if names[index].lower().endswith(_DEPTH_IMAGE_SUFFIX) else _read_cloud(path / names[index], True)[1]
 
     return FrameSequence(times, names, camera, load, intrinsics, str(path), colours)
 
@@ -325,12 +262,7 @@ def write_frame_folder(
 ) -> None:
     """Write a frame sequence as a folder for `read_frame_folder`: binary PLY clouds, or depth images in millimetres.
 
-    Parameters
-    ----------
-    folder : path-like
-        Made where it does not exist.
-    depth : sequence of array_like, each (height, width), optional
-        Depth images [m] to write instead of clouds; the frame sequence must have intrinsics.
+    Instead of clouds depth images, each (height, width) [m], where given; the sequence must have intrinsics then.
 
     Raises
     ------
@@ -344,19 +276,26 @@ def write_frame_folder(
         raise OutputError(f"the folder cannot be made: {error.strerror}", where=str(path)) from error
     if depth is not None and sequence.intrinsics is None:
         raise OutputError("depth images need the camera's intrinsics", where=str(path))
-    ending = _CLOUD_SUFFIXES[0] if depth is None else _DEPTH_IMAGE_SUFFIX
+    o3d, ending = import_open3d(), _CLOUD_SUFFIXES[0] if depth is None else _DEPTH_IMAGE_SUFFIX
     names = [f"{i:06d}{ending}" for i in range(len(sequence))]
     for i, name in enumerate(names):
-        if depth is None:
-            _write_cloud(path / name, sequence.load_cloud(i))
-        else:
-            _write_depth_image(path / name, np.asarray(depth[i], float))
+        with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+            if depth is None:  # float32 keeps 0.2 um at 2 m in half the space
+                points = np.ascontiguousarray(sequence.load_cloud(i), dtype=np.float32)
+                made = o3d.t.io.write_point_cloud(str(path / name), o3d.t.geometry.PointCloud(o3d.core.Tensor(points)))
+            else:
+                image = np.asarray(depth[i], float)
+                image = np.where(np.isfinite(image) & (image > 0) & (image < _LARGEST_DEPTH), image, 0.0)
+                image = np.ascontiguousarray(np.rint(1e3 * image).astype(np.uint16))
+                made = o3d.io.write_image(str(path / name), o3d.geometry.Image(image))
+        if not made:
+            kind = "cloud" if depth is None else "depth image"
+            raise OutputError(f"the {kind} cannot be written", where=str(path / name))
     pose = sequence.camera_pose.tolist()
     head: dict[str, Any] = {"format": _FRAMES_FORMAT, "pose": pose, "frame": "camera", "unit": "m"}
     if sequence.intrinsics is not None:
         head |= {"intrinsics": asdict(sequence.intrinsics), "depth_unit": 1e-3}
-    with atomic_write(path / _CAMERA_FILE) as temporary:
-        temporary.write_text(json.dumps(head, indent=1) + "\n", encoding="utf-8")
+    write_text(path / _CAMERA_FILE, json.dumps(head, indent=1) + "\n")
     with atomic_write(path / STAMP_FILE) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["file", "t"])

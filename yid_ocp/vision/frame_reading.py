@@ -145,7 +145,9 @@ def _lens(bag: OpenBag, topic: str) -> CameraIntrinsics:
         hint = f"record {topic.rpartition('/')[0]}/camera_info as well"
         raise DataError(what, where=str(bag.path), allowed=allowed, hint=hint)
     info = _first(bag, nearest[0])
-    matrix, projection, bent = (_field(info, name) for name in ("k", "p", "d"))
+    # ROS 1 spells them with a capital
+    fields = (getattr(info, name, getattr(info, name.upper(), ())) for name in ("k", "p", "d"))
+    matrix, projection, bent = ([float(value) for value in entry] for entry in fields)
     if "rect" in topic and projection[0] > 0:
         fx, _, cx, _, _, fy, cy = projection[:7]
         return CameraIntrinsics(int(info.width), int(info.height), fx, fy, cx, cy)
@@ -156,11 +158,6 @@ def _lens(bag: OpenBag, topic: str) -> CameraIntrinsics:
     model = "equidistant" if model == "fisheye" else model
     fx, _, cx, _, fy, cy = matrix[:6]
     return CameraIntrinsics(int(info.width), int(info.height), fx, fy, cx, cy, model, tuple(bent))
-
-
-def _field(info: Any, name: str) -> list[float]:
-    """A field of CameraInfo, which ROS 1 spells with a capital."""
-    return [float(value) for value in getattr(info, name, getattr(info, name.upper(), ()))]
 
 
 def _depth(content: Any, per_metre: float, where: str) -> Array:
@@ -262,9 +259,11 @@ _FILM_HINT = "write its depth images as 16-bit PNG into a folder with camera.jso
 class _Film:
     """An Azure Kinect's film, whose frames are found by going through it: the last one that was read is kept."""
 
+    _kind: Any
+    reader: Any = None
+
     def __init__(self, path: Path) -> None:
         self.path, self._kind = path, getattr(import_open3d().io, "AzureKinectMKVReader", None)
-        self.reader: Any = None
         what = "this build of Open3D cannot read the films of Azure Kinects"
         if self._kind is None:
             raise DataError(what, where=str(path), hint=_FILM_HINT)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,31 +53,19 @@ def reject_outlying_frames(frames: Sequence[FrameReport], options: TrackOptions)
         return list(frames)
     usual = float(np.median([fit.mean_distance for fit in fits]))
     gap = np.median([fit.grasp_gaps for fit in fits], axis=0)
-    return [_compared(frame, usual, gap, options) for frame in frames]
-
-
-def _compared(frame: FrameReport, usual: float, gap: Array, options: TrackOptions) -> FrameReport:
-    if not frame.is_good or frame.shape_fit is None:
-        return frame
-    if frame.shape_fit.mean_distance > options.max_distance_ratio * usual:
-        off = f"{1e3 * frame.shape_fit.mean_distance:.1f} mm off on average, {1e3 * usual:.1f} mm are usual"
-        return replace(frame, drop_reason=f"the shape fits worse than in other frames: {off}")
-    apart = float(np.linalg.norm(frame.shape_fit.grasp_gaps - gap, axis=1).max(initial=0.0))
-    if apart > options.max_grasp_gap_change:
-        off = f"{1e3 * apart:.0f} mm more than usual (a late stamp?)"
-        return replace(frame, drop_reason=f"{_END_ELSEWHERE}: {off}")
-    return frame
-
-
-@dataclass(frozen=True, eq=False)
-class _TrackedPoints:
-    """Tracked points of the good frames."""
-
-    t: Array
-    q: Array
-    position: Array
-    std: Array
-    shared_std: Array
+    made = list(frames)
+    for k, frame in enumerate(frames):
+        fit, reason = frame.shape_fit, ""
+        if not frame.is_good or fit is None:
+            continue
+        apart = float(np.linalg.norm(fit.grasp_gaps - gap, axis=1).max(initial=0.0))
+        if fit.mean_distance > options.max_distance_ratio * usual:
+            off = f"{1e3 * fit.mean_distance:.1f} mm off on average, {1e3 * usual:.1f} mm are usual"
+            reason = f"the shape fits worse than in other frames: {off}"
+        elif apart > options.max_grasp_gap_change:
+            reason = f"{_END_ELSEWHERE}: {1e3 * apart:.0f} mm more than usual (a late stamp?)"
+        made[k] = replace(frame, drop_reason=reason)
+    return made
 
 
 def tracked_points(
@@ -87,24 +75,11 @@ def tracked_points(
     things: Sequence[ForeignObject],
     options: TrackOptions,
     source: str,
-) -> _TrackedPoints:
-    """Tracked points of the good frames with standard deviations.
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Times, configurations, positions, their standard deviations and the shared part of these, as in `TrackResult`.
 
-    Parameters
-    ----------
-    frames : sequence of FrameReport
-        All of them, judged.
-    columns : sequence of int
-        Of the system's points, those that are wanted.
-    things : sequence of Foreign
-        That stood about the object.
-    source : str
-        Where the frames come from.
-
-    Raises
-    ------
-    DataError
-        No good frame, or no point that is known well enough in any.
+    Of the points in `columns` of the system's in the good frames. `DataError` without a good frame, or where no point
+    is known well enough in any.
     """
     good = [frame for frame in frames if frame.is_good]
     if not good:
@@ -136,7 +111,8 @@ def tracked_points(
         raise DataError(what, where=source, hint=_hint(sizes, things, check))
     hidden = unseen[..., None]
     q = np.array([fit.q for fit in fits])
-    return _TrackedPoints(t, q, *(np.where(hidden, np.nan, entry) for entry in (position, std, shared)))
+    position, std, shared = (np.where(hidden, np.nan, entry) for entry in (position, std, shared))
+    return t, q, position, std, shared
 
 
 def _none_good(
@@ -195,11 +171,11 @@ def choose_root_ends(frames: Sequence[FrameReport], options: TrackOptions) -> tu
         if other_fit is not None and last is not None and _apart(other_fit, last) < _apart(made[k].shape_fit, last):
             made[k] = _exchanged(made[k])
         last = made[k].shape_fit
-    roots, tips = _ends([frame.shape_fit for frame in (made[k] for k in two)])
+    roots, tips = _ends(made[k].shape_fit for k in two)
     moving = [float(np.median(np.linalg.norm(ends - np.median(ends, axis=0), axis=1))) for ends in (roots, tips)]
     above = float(np.median(roots[:, 2] - tips[:, 2]))
     between = float(np.median(np.linalg.norm(roots - tips, axis=1)))
-    own = float(np.median(np.linalg.norm(roots - _ends([made[k].alternative_fit for k in two])[0], axis=1)))
+    own = float(np.median(np.linalg.norm(roots - _ends(made[k].alternative_fit for k in two)[0], axis=1)))
     if own < _SAME * between:
         other, said = False, "branches that are alike were followed from frame to frame, which is which is not known"
     elif options.root_placement == "fixed" and max(moving) > _CLEARLY * min(moving):
@@ -225,38 +201,27 @@ def _apart(one: FrameShapeFit | None, other: FrameShapeFit | None) -> float:
     return float(np.linalg.norm(one.link_ends - other.link_ends, axis=2).mean())
 
 
-def _ends(fits: Sequence[FrameShapeFit | None]) -> tuple[Array, Array]:
+def _ends(fits: Iterable[FrameShapeFit | None]) -> tuple[Array, Array]:
+    """Where roots and tips are."""
     lines = np.array([fit.link_ends for fit in fits if fit is not None])
     return lines[:, 0, 0], lines[:, -1, 1]
 
 
 def _fixed(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameReport]:
     """Drop frames whose root is not where it is in the others, where it is fixed."""
-    good = [frame.shape_fit for frame in frames if frame.is_good and frame.shape_fit is not None]
-    if options.root_placement != "fixed" or not good:
-        return list(frames)
-    usual = np.median(_ends(good)[0], axis=0)
-    made = []
-    for frame in frames:
-        if frame.is_good and frame.shape_fit is not None:
-            away = float(np.linalg.norm(frame.shape_fit.link_ends[0, 0] - usual))
+    good = [k for k, frame in enumerate(frames) if frame.is_good and frame.shape_fit is not None]
+    made = list(frames)
+    if options.root_placement == "fixed" and good:
+        roots = _ends(frames[k].shape_fit for k in good)[0]
+        for k, away in zip(good, np.linalg.norm(roots - np.median(roots, axis=0), axis=1), strict=True):
             if away > options.max_grasp_gap_change + 2 * options.max_point_std:
                 reason = f"its root is not where it is in other frames: {1e3 * away:.0f} mm away"
-                made.append(replace(frame, drop_reason=reason))
-                continue
-        made.append(frame)
+                made[k] = replace(frames[k], drop_reason=reason)
     return made
 
 
 def is_self_touching(centre_line: Array, radius: Array) -> bool:
-    """Whether a shape touches itself at parts that are far apart along it.
-
-    Parameters
-    ----------
-    centre_line : ndarray, shape (K, 2, 3)
-        Start and end of every link [m].
-    radius : ndarray, shape (K,) [m]
-    """
+    """Whether a shape of links (K, 2, 3) and radii (K,) [m] touches itself at parts that are far apart along it."""
     corners = centre_line.reshape(-1, 3)
     near = np.linalg.norm(corners[:, None] - corners, axis=2)
     edges = np.where(near < _TOUCHING, 1e-6, np.inf)  # zero would be no way

@@ -39,22 +39,9 @@ _CLOSE = 1e-3  # [pixels]
 
 @dataclass(frozen=True)
 class CameraIntrinsics:
-    """Intrinsics of a camera (x right, y down, z ahead).
+    """Intrinsics of a camera (x right, y down, z ahead); `DataError` for a lens's distortion that is not known.
 
-    Attributes
-    ----------
-    width, height : int [pixels]
-    fx, fy, cx, cy : float
-        Focal lengths and principal point [pixels]:  u = fx x/z + cx,  v = fy y/z + cy  without distortion.
-    model : str
-        Of the lens's distortion, one of `_DISTORTION_COEFFICIENT_COUNTS`.
-    coefficients : tuple of float
-        Empty for a lens without distortion.
-
-    Raises
-    ------
-    DataError
-        A model that is not known, or coefficients of another number than it has.
+    Focal lengths and principal point [pixels] of  u = fx x/z + cx,  v = fy y/z + cy  without distortion.
     """
 
     width: int
@@ -63,8 +50,8 @@ class CameraIntrinsics:
     fy: float
     cx: float
     cy: float
-    model: str = "plumb_bob"
-    coefficients: tuple[float, ...] = ()
+    model: str = "plumb_bob"  # of the lens's distortion, one of `_DISTORTION_COEFFICIENT_COUNTS`
+    coefficients: tuple[float, ...] = ()  # empty for a lens without distortion
 
     def __post_init__(self) -> None:
         if not any(self.coefficients):
@@ -100,22 +87,9 @@ class CameraIntrinsics:
         return np.stack([self.fx * x + self.cx, self.fy * y + self.cy], axis=1)
 
     def points_from_depth(self, depth: ArrayLike) -> Array:
-        """Points of a depth image in the camera's frame.
+        """Points (N, 3) in the camera's frame, row by row, of a depth image (height, width) along the optical axis [m].
 
-        Parameters
-        ----------
-        depth : array_like, shape (height, width)
-            Distance along the optical axis [m]; zero or NaN where nothing was measured.
-
-        Returns
-        -------
-        ndarray, shape (N, 3)
-            [m], row by row.
-
-        Raises
-        ------
-        DataError
-            An image of another size.
+        Zero or NaN is where nothing was measured; errors as `is_measured`.
         """
         image = np.asarray(depth, float)
         seen = np.flatnonzero(self.is_measured(image))
@@ -162,31 +136,23 @@ def _rays(lens: CameraIntrinsics) -> Array:
 
 def _straightened(lens: CameraIntrinsics, aim_x: Array, aim_y: Array) -> tuple[Array, Array]:
     """Where  distort(x, y) = aim, by Newton's method; NaN where the lens's formula does not reach."""
-    x, y = aim_x, aim_y
+    x, y, h = aim_x, aim_y, 1e-6
     if lens.model == "equidistant":  # the aim is an angle, which is nearer to the answer as one
         bent = np.maximum(np.hypot(aim_x, aim_y), 1e-9)
         x, y = (aim * np.tan(np.minimum(bent, 1.5)) / bent for aim in (aim_x, aim_y))
     with np.errstate(all="ignore"):
         for _ in range(_STEPS):
-            change_x, change_y, turn = _newton(lens, x, y, aim_x, aim_y)
-            x, y = x + change_x, y + change_y
+            at_x, at_y = lens._distort(x, y)
+            right_x, right_y = lens._distort(x + h, y)
+            down_x, down_y = lens._distort(x, y + h)
+            a, b, c, d = (right_x - at_x) / h, (down_x - at_x) / h, (right_y - at_y) / h, (down_y - at_y) / h
+            error_x, error_y, turn = aim_x - at_x, aim_y - at_y, a * d - b * c
+            x, y = x + (d * error_x - b * error_y) / turn, y + (a * error_y - c * error_x) / turn
         seen_x, seen_y = lens._distort(x, y)
         off = np.hypot((seen_x - aim_x) * lens.fx, (seen_y - aim_y) * lens.fy)
         # beyond where a formula turns back, its other solutions are behind the edge or mirrored
         good = (off < _CLOSE) & (turn > 0) & (x * aim_x + y * aim_y >= 0)
     return np.where(good, x, np.nan), np.where(good, y, np.nan)
-
-
-def _newton(lens: CameraIntrinsics, x: Array, y: Array, aim_x: Array, aim_y: Array) -> tuple[Array, Array, Array]:
-    """A step, and the determinant of the derivatives, by differences."""
-    h = 1e-6
-    at_x, at_y = lens._distort(x, y)
-    right_x, right_y = lens._distort(x + h, y)
-    down_x, down_y = lens._distort(x, y + h)
-    a, b, c, d = (right_x - at_x) / h, (down_x - at_x) / h, (right_y - at_y) / h, (down_y - at_y) / h
-    error_x, error_y = aim_x - at_x, aim_y - at_y
-    turn = a * d - b * c
-    return (d * error_x - b * error_y) / turn, (a * error_y - c * error_x) / turn, turn
 
 
 XTION_INTRINSICS = CameraIntrinsics.from_field_of_view(640, 480, math.radians(58.0))
@@ -249,16 +215,7 @@ class FrameSequence:
     def from_clouds(
         t: ArrayLike, clouds: Sequence[ArrayLike], pose: ArrayLike, *, source: str = "sequence"
     ) -> FrameSequence:
-        """A frame sequence of clouds that are in memory.
-
-        Parameters
-        ----------
-        t : array_like, shape (M,) [s]
-        clouds : sequence of array_like, each (N, 3)
-            In the camera's frame [m].
-        pose : array_like, shape (4, 4)
-            Camera in the world.
-        """
+        """A frame sequence of clouds in memory, each (N, 3) in the camera's frame [m], at stamps `t` (M,) [s]."""
         arrays = [np.asarray(cloud, float).reshape(-1, 3) for cloud in clouds]
         names = tuple(f"frame {i}" for i in range(len(arrays)))
         camera = validated_pose(pose, source)
@@ -319,21 +276,10 @@ class OcclusionMap:
     _kept: list[tuple[Array, Array, float, cKDTree, Array]] = field(default_factory=list, repr=False)
 
     def is_hidden(self, places: Array, radius: Array, margin: float) -> Mask:
-        """Whether places are hidden from the camera.
+        """Whether something nearer stands before world places (S, 3) or throws its shadow on them, or the picture ends.
 
-        Parameters
-        ----------
-        places : ndarray, shape (S, 3)
-            In the world [m].
-        radius : ndarray, shape (S,)
-            How far about its line of sight each place reaches [m].
-        margin : float
-            What is nearer to the camera than a place by more than its radius and this stands before it [m].
-
-        Returns
-        -------
-        ndarray, shape (S,)
-            True where something nearer stands before it, throws its shadow on it, or where the picture ends.
+        What is nearer to the camera than a place by more than its radius (S,), by which it reaches about its line of
+        sight, and a margin stands before it, all in [m].
         """
         seen, depth = _picture(places, self.camera_pose)
         asked, wide = seen.T, radius / np.maximum(depth, _LEAST_DEPTH)
@@ -364,31 +310,27 @@ class OcclusionMap:
         return (seen, depth) if ahead.all() else (seen[:, ahead], depth[ahead])
 
     @cached_property
-    def _borders(self) -> tuple[Array, Array]:
-        """Where the picture ends, as far as points along all of a side show it; infinite at other sides."""
+    def _borders(self) -> Array:
+        """Where the picture ends, lowest and highest, as far as points along all of a side show it; else infinite."""
         borders = np.array([[-np.inf, -np.inf], [np.inf, np.inf]])
         seen, _ = self._all
         if seen.size:
             low, high = seen.min(1), seen.max(1)
             for axis in range(2 if (high - low > _NARROWEST).all() else 0):
+                other = 1 - axis
                 for end, value in enumerate((low[axis], high[axis])):
                     strip = np.abs(seen[axis] - value) <= _STRIP * (high[axis] - low[axis])
-                    other = 1 - axis
                     along = (seen[other, strip] - low[other]) / max(high[other] - low[other], 1e-12)
-                    filled = np.bincount(np.minimum((along * _PIECES).astype(np.int64), _PIECES - 1), minlength=_PIECES)
-                    if np.mean(filled > 0) > _HALF:
+                    pieces = np.unique(np.minimum((along * _PIECES).astype(np.int64), _PIECES - 1))
+                    if len(pieces) / _PIECES > _HALF:
                         borders[end, axis] = value
-        return borders[0], borders[1]
-
-    @cached_property
-    def _shadow(self) -> float:
-        """How far beside its place in the picture the shadow of the nearest point can fall, as x/z."""
-        _, depth = self._all
-        return _BASELINE / float(depth.min()) if len(depth) else 0.0
+        return borders
 
     def _about(self, asked: Array, wide: Array) -> tuple[cKDTree, Array]:
         """Points of the picture round about the places: where in the picture, and how deep."""
-        reach, narrow = max(float(wide.max()), self._shadow), float(wide.min())
+        nearest = float(self._all[1].min()) if len(self._all[1]) else np.inf
+        # a shadow of the nearest point falls so far beside its place in the picture
+        reach, narrow = max(float(wide.max()), _BASELINE / nearest), float(wide.min())
         low, high = asked.min(0) - reach, asked.max(0) + reach
         for lower, upper, least, tree, depth in self._kept:
             if (lower <= low).all() and (upper >= high).all() and narrow >= least:

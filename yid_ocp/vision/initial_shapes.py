@@ -1,9 +1,8 @@
 """Initial shapes for the shape fit, from the centerline of the object in the cloud.
 
-The graph of a cloud's nearest points is cut into slices of equal distance along it from one end. Connected parts of
-neighbouring slices that touch make a graph of their own (Reeb's), in which a branch is a chain, a branching a vertex of
-three, and a loop that the object closes by touching or crossing itself a cycle. The ends of this centerline are given
-to the root and the tips of the object in every way in which their distances agree; each way is a start.
+The graph of a cloud's nearest points is cut into slices of equal distance along it from one end; touching parts of
+neighbouring slices make a graph of their own (Reeb's), whose cycles are loops of the object. Its ends are given to the
+root and the tips of the object in every way in which their distances agree; each way is a start.
 
 References
 ----------
@@ -12,7 +11,7 @@ Verroust & Lazarus (2000), Extracting skeletal curves from 3D scattered data, do
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
 
@@ -87,23 +86,9 @@ class _Centerline:
 
 
 def trace_centerline(cloud: WeightedCloud, diameter: float, gap: float, rng: np.random.Generator) -> _Centerline:
-    """Trace the centerline of an object in a cloud.
+    """Trace the centerline of an object in a cloud; without nodes where the cloud has too few points.
 
-    Parameters
-    ----------
-    cloud : Cloud
-        The object's points.
-    diameter : float
-        Of its thickest tube [m].
-    gap : float
-        Parts further apart do not hang together [m].
-    rng : Generator
-        For the choice among many points.
-
-    Returns
-    -------
-    Trace
-        Without nodes where the cloud has too few points.
+    `diameter` is that of its thickest tube [m]; parts further apart than `gap` [m] do not hang together.
     """
     points = cloud.points
     if len(points) > _MOST:
@@ -139,33 +124,22 @@ def _connected(points: Array, gap: float) -> tuple[Array, csr_matrix]:
     _, part = connected_components(_graph(points, edges), directed=False)
     size = np.bincount(part)
     large = np.flatnonzero(size >= _LEAST_SHARE * len(points))
-    bridges = []
-    joined, rest = [int(large[np.argmax(size[large])])], [int(k) for k in large]
-    rest.remove(joined[0])
-    while rest:
+    bridges, joined = [], [int(large[np.argmax(size[large])])]
+    while len(joined) < len(large):
         own = np.flatnonzero(np.isin(part, joined))
-        tree = cKDTree(points[own])
-        best = min(((*_closest(tree, points, part, k), k) for k in rest), key=lambda found: found[0])
-        if best[0] > gap:
+        other = np.flatnonzero(np.isin(part, np.setdiff1d(large, joined)))
+        apart, nearest = cKDTree(points[own]).query(points[other])
+        k = int(np.argmin(apart))
+        if apart[k] > gap:
             break
-        bridges.append((int(own[best[1]]), best[2]))
-        joined.append(best[3])
-        rest.remove(best[3])
+        bridges.append((int(own[nearest[k]]), int(other[k])))
+        joined.append(int(part[other[k]]))
     kept = np.flatnonzero(np.isin(part, joined))
     renamed = np.full(len(points), -1)
     renamed[kept] = np.arange(len(kept))
-    every = np.concatenate([edges, np.array(bridges, dtype=np.int64).reshape(-1, 2)])
-    every = renamed[every]
+    every = renamed[np.concatenate([edges, np.array(bridges, dtype=np.int64).reshape(-1, 2)])]
     both = np.unique(np.sort(every[(every >= 0).all(axis=1)], axis=1), axis=0)
     return points[kept], _graph(points[kept], both)
-
-
-def _closest(tree: cKDTree, points: Array, part: Integers, number: int) -> tuple[float, int, int]:
-    """Distance from a part to the points of a tree, and the two points."""
-    mine = np.flatnonzero(part == number)
-    distance, other = tree.query(points[mine])
-    k = int(np.argmin(distance))
-    return float(distance[k]), int(other[k]), int(mine[k])
 
 
 def _slices(points: Array, graph: csr_matrix, slices: Integers) -> tuple[Array, Integers]:
@@ -185,18 +159,12 @@ def _tree(nodes: Array, edges: Integers, loop: float) -> tuple[Integers, Array]:
     """Shortest edges that join all nodes, and where an edge left out closes a longer way than `loop` [m]."""
     if not len(edges):
         return edges, np.empty((0, 3))
-    graph = _graph(nodes, edges)
-    forest = minimum_spanning_tree(graph).tocoo()
+    forest = minimum_spanning_tree(_graph(nodes, edges)).tocoo()
     tree = np.column_stack([forest.row, forest.col]).astype(np.int64)
-    kept = {(int(min(a, b)), int(max(a, b))) for a, b in tree}
-    left = [(int(a), int(b)) for a, b in edges if (int(a), int(b)) not in kept]
-    if not left:
-        return tree, np.empty((0, 3))
-    starts = sorted({a for a, _ in left})
-    far = dijkstra(_graph(nodes, tree), directed=False, indices=starts)
-    closing = [(a, b) for a, b in left if far[starts.index(a), b] > loop]
-    places = [0.5 * (nodes[a] + nodes[b]) for a, b in closing]
-    return tree, np.array(places).reshape(-1, 3)
+    one, other = edges.T
+    along = np.asarray(dijkstra(_graph(nodes, tree), directed=False))[one, other]
+    across = np.linalg.norm(nodes[one] - nodes[other], axis=1)  # of an edge of the tree as long as the way along it
+    return tree, (0.5 * (nodes[one] + nodes[other]))[along > np.maximum(loop, 1.001 * across)]
 
 
 def _pruned(trace: _Centerline, twig: float) -> _Centerline:
@@ -255,17 +223,9 @@ class _InitialShape:
 
 
 def with_free_root(system: System, values: Mapping[str, float] | None = None) -> tuple[System, tuple[str, ...]]:
-    """System with its object on six additional free joints, without grasps.
+    """System with its object on six additional free joints, without grasps, and the names of these joints.
 
-    Parameters
-    ----------
-    values : mapping of str to float, optional
-        Parameter values; nominal where absent.
-
-    Returns
-    -------
-    tuple of str
-        The six joints: the root's place [m], then its turns about x, y and z [rad].
+    They are the root's place [m], then its turns about x, y and z [rad].
     """
     tree = numeric_mechanism(system, values)
     q = ca.SX.sym("q", system.n_coordinates)
@@ -289,18 +249,9 @@ class _Link:
 
 
 class InitialShapeFinder:
-    """Finder of initial shapes for an object.
+    """Finder of initial shapes for an object of a numeric mechanism, which may bend some joints from rest (n,).
 
-    Parameters
-    ----------
-    tree : Mechanism
-        The system's, with numbers in place of its parameters.
-    rest : ndarray, shape (n,)
-        Configuration at rest.
-    bends : sequence of int
-        Joints that a shape may bend.
-    lengths : mapping of str to sequence of float
-        Of the links of every segment [m].
+    `lengths` are those of the links of every segment [m].
     """
 
     def __init__(
@@ -322,75 +273,63 @@ class InitialShapeFinder:
                 ends[indices[-1]] = begin + float(length)
                 found.append((segment.name, i, indices, begin, begin + float(length)))
         carrying = {self._parent[indices[0]] for _, _, indices, _, _ in found}
-        tips = [indices[-1] for _, _, indices, _, _ in found if indices[-1] not in carrying]
-        self._corners = [0, *(2 * [indices[-1] for _, _, indices, _, _ in found].index(tip) + 1 for tip in tips)]
-        ways = {tip: self._way(tip) for tip in tips}
-        self.links = [
+        lasts = [indices[-1] for _, _, indices, _, _ in found]
+        tips = [last for last in lasts if last not in carrying]
+        self._corners = [0, *(2 * lasts.index(tip) + 1 for tip in tips)]
+        ways = {tip: set(self._way(tip)) for tip in tips}
+        self._links = [
             _Link(indices, begin, end, next(k for k, tip in enumerate(tips) if indices[-1] in ways[tip]))
             for _, _, indices, begin, end in found
         ]
-        self.root_to_tip_lengths = np.array([ends[tip] for tip in tips])
+        self._root_to_tip_lengths = np.array([ends[tip] for tip in tips])
         shared = [[max((ends[j] for j in ways[a] & ways[b] if j in ends), default=0.0) for b in tips] for a in tips]
-        count = len(tips) + 1
-        self.end_distances = np.zeros((count, count))
-        self.end_distances[0, 1:] = self.end_distances[1:, 0] = self.root_to_tip_lengths
-        self.end_distances[1:, 1:] = self.root_to_tip_lengths[:, None] + self.root_to_tip_lengths - 2 * np.array(shared)
-        np.fill_diagonal(self.end_distances, 0.0)
+        to_tips = np.array([0.0, *self._root_to_tip_lengths])
+        self._end_distances = to_tips[:, None] + to_tips - 2 * np.pad(np.array(shared), ((1, 0), (1, 0)))
+        np.fill_diagonal(self._end_distances, 0.0)
 
-    @property
-    def n_ends(self) -> int:
-        """Number of ends of the object, including its root."""
-        return len(self.end_distances)
-
-    def _way(self, joint: int) -> set[int]:
-        way = set()
+    def _way(self, joint: int) -> Iterator[int]:
         while joint >= 0:
-            way.add(joint)
+            yield joint
             joint = self._parent[joint]
-        return way
 
     def find_initial_shapes(self, trace: _Centerline) -> list[_InitialShape]:
         """Initial shapes that follow a centerline whose ends are as far apart as the object's.
 
-        Raises
-        ------
-        DataError
-            The course has other ends than the object, or is not as long: part of the object is hidden, or something
-            else hangs together with it.
+        `DataError` where it has other ends than the object, or is not as long: part of the object is hidden, or
+        something else hangs together with it.
         """
-        leaves = trace.end_nodes
-        if not self.n_ends <= len(leaves) <= _MOST_ENDS:
-            counts = f"the cloud has {len(leaves)} ends, the object {self.n_ends}"
+        leaves, n_ends = trace.end_nodes, len(self._end_distances)
+        if not n_ends <= len(leaves) <= _MOST_ENDS:
+            counts = f"the cloud has {len(leaves)} ends, the object {n_ends}"
             raise DataError(f"the object cannot be followed from end to end: {counts}")
         # the middles of the last slices are half a slice from the ends
         along = np.array([trace.path_lengths_from(int(leaf))[0][leaves] for leaf in leaves]) + trace.slice_width
         np.fill_diagonal(along, 0.0)
         ways = []
-        for chosen in permutations(range(len(leaves)), self.n_ends):
-            off = np.abs(along[np.ix_(chosen, chosen)] - self.end_distances)
+        for chosen in permutations(range(len(leaves)), n_ends):
+            off = np.abs(along[np.ix_(chosen, chosen)] - self._end_distances)
             ways.append((float(off.max()), chosen))
         best, nearest = min(ways)
-        if best > max(_WHOLE * float(self.root_to_tip_lengths.max()), trace.slice_width):
-            own = self.end_distances[0, 1]
+        if best > max(_WHOLE * float(self._root_to_tip_lengths.max()), trace.slice_width):
+            own = self._end_distances[0, 1]
             lengths = f"{along[nearest[0], nearest[1]]:.2f} m from end to end, the object has {own:.2f} m"
             raise DataError(f"the object cannot be followed from end to end: the cloud has {lengths}")
         limit = max(_ALIKE * best, trace.slice_width)
-        kept = [chosen for off, chosen in sorted(ways) if off <= limit][: 2 * self.n_ends]
+        kept = [chosen for off, chosen in sorted(ways) if off <= limit][: 2 * n_ends]
         return [self._along(trace, [int(leaves[k]) for k in chosen]) for chosen in kept]
 
     def _along(self, trace: _Centerline, ends: Sequence[int]) -> _InitialShape:
         """The start whose root and tips lie at some nodes of the course."""
-        reaches = zip(ends[1:], self.root_to_tip_lengths, strict=True)
+        reaches = zip(ends[1:], self._root_to_tip_lengths, strict=True)
         courses = [_Course(trace.path_between(ends[0], end), reach) for end, reach in reaches]
         q = self._rest.copy()
-        first = self.links[0]
+        first = self._links[0]
         turned = self._rotations(q)
         aim = courses[first.tip].direction(first.begin, first.end)
-        carry = _turn(turned[first.joints[-1]][:, 2], aim)
-        for link in self.links[1:]:
+        carry = Rotation.align_vectors(aim, turned[first.joints[-1]][:, 2])[0].as_matrix()
+        for link in self._links[1:]:
             aim = carry.T @ courses[link.tip].direction(link.begin, link.end)
-            carrier = self._parent[link.joints[0]]
-            self._bend(q, link.joints, turned[carrier] if carrier >= 0 else np.eye(3), aim, turned)
+            self._bend(q, link.joints, aim, turned)
         place = courses[first.tip].at(0.0)
         q[self._root[:3]] = place
         q[self._root[3:]] = Rotation.from_matrix(carry).as_euler("XYZ")
@@ -413,10 +352,10 @@ class InitialShapeFinder:
             return self._placed[joint]
         return np.asarray(self._placed[joint] @ Rotation.from_rotvec(value * self._axis[joint]).as_matrix())
 
-    def _bend(self, q: Array, joints: Sequence[int], carrier: Array, aim: Array, turned: list[Array]) -> None:
+    def _bend(self, q: Array, joints: Sequence[int], aim: Array, turned: list[Array]) -> None:
         """Set the bends of a link so that its z axis, by which it is long, looks where it should."""
-        bends = [j for j in joints if j in self._bends]
-        base, ahead = carrier, np.array([0.0, 0.0, 1.0])
+        bends, carrier = [j for j in joints if j in self._bends], self._parent[joints[0]]
+        base, ahead = turned[carrier] if carrier >= 0 else np.eye(3), np.array([0.0, 0.0, 1.0])
         for j in joints:
             if bends and j == bends[0]:
                 local = (base @ self._placed[j]).T @ aim
@@ -448,16 +387,3 @@ class _Course:
         """Unit vector from one place to another."""
         way = self.at(end) - self.at(begin)
         return np.asarray(way / max(float(np.linalg.norm(way)), 1e-9))
-
-
-def _turn(one: Array, other: Array) -> Array:
-    """The least rotation from one direction to another, shape (3, 3)."""
-    axis = np.cross(one, other)
-    sine, cosine = float(np.linalg.norm(axis)), float(one @ other)
-    if sine < 1e-9:
-        if cosine > 0:
-            return np.eye(3)
-        axis = np.cross(one, np.eye(3)[int(np.argmin(np.abs(one)))])
-        sine, cosine = float(np.linalg.norm(axis)), -1.0
-        return np.asarray(Rotation.from_rotvec(np.pi * axis / sine).as_matrix())
-    return np.asarray(Rotation.from_rotvec(np.arctan2(sine, cosine) * axis / sine).as_matrix())

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.options import Fraction, OptionInfo, PositiveFloat, check_option_bounds
-from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, numeric_mechanism
+from yid_ocp.vision.surface_meshes import numeric_mechanism, tube_sizes
 
 Array = NDArray[np.float64]
 Coordinates = tuple[float, float, float]
@@ -144,12 +144,7 @@ class _RegionBounds:
 class ObjectRegion:
     """Region that the object can reach, from the length of its branches and the floor.
 
-    Parameters
-    ----------
-    values : mapping of str to float, optional
-        Parameter values; nominal where absent.
-    anywhere : bool
-        Whether its root may be anywhere; only the box and the floor of the options bound it then.
+    Where its root may be `anywhere`, only the box and the floor of the options bound it.
     """
 
     def __init__(
@@ -160,25 +155,19 @@ class ObjectRegion:
         *,
         anywhere: bool = False,
     ) -> None:
-        tree = numeric_mechanism(system, values)
-        symbols, theta = system.parameters.symbols, system.parameters.vector(values)
-
-        def number(expression: ca.SX) -> float:
-            return float(ca.Function("number", [symbols], [expression])(theta))
-
-        lengths = {s.name: float(sum(number(length) for length in s.link_lengths)) for s in system.segment_layouts}
-        radius = max(number(s.radius) for s in system.segment_layouts)
+        tree, sizes = numeric_mechanism(system, values), tube_sizes(system, values)
         reach: dict[str, float] = {}
         for segment in system.segment_layouts:
             before = reach[segment.parent_segment] if segment.parent_segment else 0.0
-            reach[segment.name] = lengths[segment.name] + before
+            reach[segment.name] = float(sizes[segment.name][0].sum()) + before
+        radius = max(own for _, own in sizes.values())
         first = next(s for s in system.segment_layouts if s.parent_segment is None)
         self._radius = np.inf if anywhere else max(reach.values()) + radius + options.reach_margin
         base = tree.joint_index(first.link_joints[0][0])
         q = ca.SX.sym("q", system.n_coordinates)
         kinematics = forward_kinematics(tree, q)
         self._root = ca.Function("root", [q], [kinematics.joint_origins[base]])
-        tips = [kinematics.frame_position(f"w_{name}") for name in lengths if f"w_{name}" in tree.frames]
+        tips = [kinematics.frame_position(f"w_{name}") for name in sizes if f"w_{name}" in tree.frames]
         low = -np.inf if options.floor_height is None else options.floor_height
         if options.floor_height is None and tree.joints[base].parent_index < 0 and tips and not anywhere:
             rest = np.zeros(system.n_coordinates)
@@ -208,19 +197,7 @@ class ObjectRegion:
 
 
 def voxel_averages(points: Array, size: float) -> WeightedCloud:
-    """Mean of the points in every cube of a grid.
-
-    Parameters
-    ----------
-    points : ndarray, shape (N, 3) [m]
-    size : float
-        Edge of the cubes [m].
-
-    Returns
-    -------
-    Cloud
-        One point for every cube that is not empty, weighted by how many were in it.
-    """
+    """Mean of the points (N, 3) in every cube of a grid of edge `size` [m], weighted by how many are in it."""
     if not len(points):
         return WeightedCloud(np.empty((0, 3)), np.empty(0))
     cell = np.floor((points - points.min(0)) / size).astype(np.int64)
@@ -231,29 +208,12 @@ def voxel_averages(points: Array, size: float) -> WeightedCloud:
     return WeightedCloud(total / count[:, None], count.astype(np.float64))
 
 
-def is_not_robot(cloud: WeightedCloud, robot: ArticulatedSurfaces, q: ArrayLike, padding: float) -> Mask:
-    """Whether points are further than `robot_padding` [m] from the robot's surface, shape (N,)."""
-    return ~robot.is_within_distance(cloud.points, q, padding)
-
-
 def is_not_outlier(cloud: WeightedCloud, neighbours: int, ratio: float, asked: Mask | None = None) -> Mask:
-    """Whether points are inliers of statistical outlier removal.
+    """Whether points are inliers of statistical outlier removal, shape (N,); False for those that are not asked.
 
     A point stays where the mean distance d to its nearest neighbours satisfies  d <= median(d) + ratio s,  with s the
     median absolute deviation turned into a standard deviation. Both are weighted, so that wrong points, each alone in
-    its voxel, count for little; unlike mean and standard deviation themselves they hardly move with the outliers.
-
-    Parameters
-    ----------
-    neighbours : int
-        Of every point.
-    asked : ndarray, shape (N,), optional
-        Points to judge; all when absent. What is usual is told by points all over the cloud, whichever are asked.
-
-    Returns
-    -------
-    ndarray, shape (N,)
-        True for points that stay; False for those that are not asked.
+    its voxel, count for little, and are of points all over the cloud, whichever are asked.
     """
     if len(cloud) <= neighbours:
         return np.zeros(len(cloud), bool)
@@ -273,19 +233,10 @@ def is_not_outlier(cloud: WeightedCloud, neighbours: int, ratio: float, asked: M
 
 
 def has_any_colour(colours: ArrayLike, wanted: ArrayLike, angle: float) -> Mask:
-    """Whether points have one of the given colours.
+    """Whether points have one of the wanted colours, shape (N,).
 
-    Parameters
-    ----------
-    colours : array_like, shape (N, 3)
-        Red, green and blue, 0 to 255 (sRGB).
-    wanted : array_like, shape (C, 3)
-    angle : float
-        Largest angle between two colours as directions of linear light, which brightness does not change [rad].
-
-    Returns
-    -------
-    ndarray, shape (N,)
+    Colours are red, green and blue, 0 to 255 (sRGB), shapes (N, 3) and (C, 3). `angle` is the largest between two of
+    them as directions of linear light, which brightness does not change [rad].
     """
     seen, asked = (_light(np.asarray(entry, float)) for entry in (colours, wanted))
     return np.asarray((seen @ asked.T).max(axis=1) >= math.cos(angle))
@@ -344,27 +295,21 @@ class CloudSkeleton:
 
 
 def _thin_to_nodes(
-    cloud: WeightedCloud,
-    rng: np.random.Generator,
-    options: SkeletonOptions | None = None,
-    down: ArrayLike = (0.0, 0.0, -1.0),
+    cloud: WeightedCloud, rng: np.random.Generator, options: SkeletonOptions, down: ArrayLike
 ) -> tuple[Array, Array, Integers]:
-    """Thin a cloud to nodes, segment by segment."""
-    chosen = options or SkeletonOptions()
-    label = np.full(len(cloud), -1)
-    alive = np.arange(len(cloud))
+    """Thin a cloud to nodes, segment by segment: nodes, their weights, and the node of each point."""
+    label, alive = np.full(len(cloud), -1), np.arange(len(cloud))
     points, weight = cloud.points, cloud.point_weights
-    nodes: list[Array] = []
-    size: list[float] = []
+    nodes, size = list[Array](), list[float]()
     seed = points[int(np.argmax(points @ np.asarray(down, float)))] if len(points) else np.zeros(3)
 
     while len(alive):
-        first = _near(points, seed, chosen)
-        centred = _near(points, np.average(points[first], axis=0, weights=weight[first]), chosen)
+        first = _near(points, seed, options)
+        centred = _near(points, np.average(points[first], axis=0, weights=weight[first]), options)
         if not len(centred):  # a ring about its own centre: take the segment itself, or the walk would not go on
             centred = first
         centre = np.average(points[centred], axis=0, weights=weight[centred])
-        if len(centred) >= chosen.min_segment_points:
+        if len(centred) >= options.min_segment_points:
             label[alive[centred]] = len(nodes)
             nodes.append(centre)
             size.append(float(weight[centred].sum()))
@@ -376,7 +321,7 @@ def _thin_to_nodes(
         away = points - centre
         square = np.einsum("ij,ij->i", away, away)
         following = int(np.argmin(square))
-        if square[following] > chosen.neighbour_radius**2:
+        if square[following] > options.neighbour_radius**2:
             following = int(rng.integers(len(alive)))
         seed = points[following]
     return np.array(nodes).reshape(-1, 3), np.array(size), label
@@ -393,14 +338,13 @@ def _near(points: Array, centre: Array, options: SkeletonOptions) -> Integers:
     return np.flatnonzero(square <= within)
 
 
-def _spanning_forest(nodes: Array, options: SkeletonOptions | None = None) -> tuple[Integers, Integers]:
-    """Join nodes to their nearest neighbours and keep the shortest edges that connect them."""
-    chosen = options or SkeletonOptions()
+def _spanning_forest(nodes: Array, options: SkeletonOptions) -> tuple[Integers, Integers]:
+    """The shortest edges that connect nodes to their nearest neighbours, and the connected part of each node."""
     count = len(nodes)
     if count < 2:
         return np.empty((0, 2), dtype=np.int64), np.zeros(count, dtype=np.int64)
-    k = min(chosen.node_neighbours + 1, count)
-    distance, index = cKDTree(nodes).query(nodes, k=k, distance_upper_bound=chosen.max_edge_length)
+    k = min(options.node_neighbours + 1, count)
+    distance, index = cKDTree(nodes).query(nodes, k=k, distance_upper_bound=options.max_edge_length)
     rows = np.repeat(np.arange(count), k)
     columns, lengths = index.ravel(), distance.ravel()
     good = np.isfinite(lengths) & (columns != rows)
@@ -411,34 +355,24 @@ def _spanning_forest(nodes: Array, options: SkeletonOptions | None = None) -> tu
     return np.column_stack([forest.row, forest.col]).astype(np.int64), part.astype(np.int64)
 
 
+_DEFAULTS = SkeletonOptions()
+
+
 def extract_skeleton(
     cloud: WeightedCloud,
     rng: np.random.Generator,
-    options: SkeletonOptions | None = None,
+    options: SkeletonOptions = _DEFAULTS,
     down: ArrayLike = (0.0, 0.0, -1.0),
 ) -> CloudSkeleton:
-    """Skeleton of a cloud, without connected parts that hold too few points.
-
-    Parameters
-    ----------
-    down : array_like, shape (3,)
-
-    Returns
-    -------
-    Skeleton
-        Without nodes where the cloud has nowhere enough points.
-    """
-    chosen = options or SkeletonOptions()
-    nodes, size, label = _thin_to_nodes(cloud, rng, chosen, down)
-    _, part = _spanning_forest(nodes, chosen)
+    """Skeleton of a cloud without connected parts that hold too few points, begun at the point furthest `down` (3,)."""
+    nodes, size, label = _thin_to_nodes(cloud, rng, options, down)
+    _, part = _spanning_forest(nodes, options)
     if not len(nodes):
         return CloudSkeleton(nodes, size, label, np.empty((0, 2), dtype=np.int64), part)
     held = np.bincount(part, size)
-    order = np.argsort(-held, kind="stable")
-    rank = np.empty(len(order), dtype=np.int64)
-    rank[order] = np.arange(len(order))
-    keep = held[part] >= chosen.min_component_fraction * size.sum()
+    rank = np.argsort(np.argsort(-held, kind="stable"))
+    keep = held[part] >= options.min_component_fraction * size.sum()
     renamed = np.full(len(nodes) + 1, -1)
     renamed[:-1][keep] = np.arange(int(keep.sum()))
-    edges, _ = _spanning_forest(nodes[keep], chosen)
+    edges, _ = _spanning_forest(nodes[keep], options)
     return CloudSkeleton(nodes[keep], size[keep], renamed[label], edges, rank[part[keep]])

@@ -1,15 +1,12 @@
-"""Calibration shared by all frames of a sequence: camera, the object's dimensions, and background.
+"""Calibration shared by all frames of a sequence: the camera, background, foreign objects and the object's dimensions.
 
-Dimensions:
-Every frame has a least cost about the sizes x (logarithms of lengths and radii, relative to the model's), the bends
-following: g_f'x + x'S_f x/2 (`DimensionEquations`). Together, with a wide prior P,
+Of every frame the least cost about the sizes x (logarithms of lengths and radii over the model's), the bends following,
+is g_f'x + x'S_f x/2 (`DimensionEquations`). Together, with a wide prior P, the frames fitted anew at every x,
 
     x = -(S + P)^-1 g,    cov x = (S + P)^-1 + (S + P)^-1 (sum_f r_f r_f') (S + P)^-1 + diag(b^2),    r_f = g_f + S_f x
 
-found by Gauss and Newton's method, the frames fitted anew at every x. The second term is the scatter between frames,
-however alike the errors within one are. b is what all frames share: an end is seen no better than a point is and stands
-where the camera's pose has it; noise along the sight makes a tube thinner or thicker by as much as its square over the
-radius.
+The second term is the scatter between frames. b is what all frames share: the error of an end's place with the camera's
+pose, and noise along the sight, which changes a radius by as much as its square over it.
 """
 
 from __future__ import annotations
@@ -18,7 +15,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import Literal
 
 import casadi as ca
@@ -26,14 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from yid_ocp.errors import ConfigError, ModelError, nearest_name_hint
-from yid_ocp.files import is_file
-from yid_ocp.model.mechanism import Mechanism
-from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.system import System
 from yid_ocp.vision.calibration import CameraCalibration
 from yid_ocp.vision.shape_evidence import ForeignCluster, FrameShapeFit, TubeLinks, nearest_on_tubes
-from yid_ocp.vision.surface_meshes import ExtraMesh, TriangleMesh, load_mesh_file
+from yid_ocp.vision.surface_meshes import tube_sizes
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -59,94 +51,37 @@ class BackgroundPoints:
         return cKDTree(self.points)
 
     def contains(self, points: Array, beyond: float = 0.0) -> Mask:
-        """Whether points, shape (N, 3), lie within `within + beyond` [m] of the background, shape (N,)."""
+        """Whether points, shape (N, 3), lie within `match_distance + beyond` [m] of the background, shape (N,)."""
         if not len(self.points) or not len(points):
             return np.zeros(len(points), bool)
         reach = self.match_distance + beyond
         return np.asarray(np.isfinite(self._tree.query(points, distance_upper_bound=reach)[0]))
 
-    @staticmethod
-    def from_empty_scene(clouds: Sequence[Array], voxel: float, noise: float) -> BackgroundPoints:
-        """Background from clouds of the scene without robot and object, in the world [m]."""
-        if not clouds:
-            return BackgroundPoints()
-        cells = np.unique(np.floor(np.concatenate(clouds) / voxel).astype(np.int64), axis=0)
-        return BackgroundPoints(np.asarray((cells + 0.5) * voxel), _NOISE_STDS * noise + 0.5 * math.sqrt(3.0) * voxel)
+    def joined(self, other: BackgroundPoints) -> BackgroundPoints:
+        """This background and another one."""
+        points = np.concatenate([self.points, other.points])
+        return BackgroundPoints(points, max(self.match_distance, other.match_distance))
 
     @staticmethod
     def from_static_points(
-        clouds: Sequence[Array], shapes: Sequence[TubeLinks], voxel: float, noise: float, near: float
+        clouds: Sequence[Array], voxel: float, noise: float, shapes: Sequence[TubeLinks] | None = None, near: float = 0
     ) -> BackgroundPoints:
-        """Background from points that stay in most frames away from every fitted shape.
+        """Background from world points (N, 3) of an empty scene, or that stay in most frames away from fitted shapes.
 
-        Parameters
-        ----------
-        clouds : sequence of ndarray, each (N, 3)
-            In the world, without the robot [m].
-        shapes : sequence of Tubes
-            All that were fitted.
-        voxel : float
-            Edge of the cubes that are counted [m].
-        noise : float
-            Standard deviation of a point [m].
-        near : float
-            From the tubes' surface; what ever was so near may be the object's [m].
+        Counted in cubes of an edge `voxel`, with points of standard deviation `noise`; what ever was nearer than `near`
+        to the surface of a tube may be the object's, all in [m].
         """
-        if not clouds or not shapes:
+        if not clouds or (shapes is not None and not shapes):
             return BackgroundPoints()
         cells = [np.unique(np.floor(cloud / voxel).astype(np.int64), axis=0) for cloud in clouds]
         place, count = np.unique(np.concatenate(cells), axis=0, return_counts=True)
-        points: Array = np.asarray((place[count >= max(2.0, _MOST * len(clouds))] + 0.5) * voxel)
-        for tubes in shapes:
+        often = 1.0 if shapes is None else max(2.0, _MOST * len(clouds))
+        points: Array = np.asarray((place[count >= often] + 0.5) * voxel)
+        for tubes in shapes or ():
             if len(points):
                 link, _, _, distance = nearest_on_tubes(tubes.link_ends, tubes.radius, points)
                 points = points[distance > tubes.radius[link] + near]
         return BackgroundPoints(points, _NOISE_STDS * noise + 0.5 * math.sqrt(3.0) * voxel)
-
-
-def extra_meshes_by_joint(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> dict[int, list[TriangleMesh]]:
-    """Meshes that the URDF does not have, by the index of the joint that carries them, -1 for the world.
-
-    Raises
-    ------
-    ConfigError
-        No such link, or not exactly one shape.
-    ModelError
-        A file that cannot be read.
-    """
-    made: dict[int, list[TriangleMesh]] = {}
-    for number, entry in enumerate(extra):
-        where = f"model: extra_meshes: {number}"
-        mesh = _shape(entry, where)
-        pose = homogeneous_transform(rotation_from_rpy(*entry.rpy), entry.xyz)
-        joint = -1
-        if entry.parent_frame is not None:
-            if entry.parent_frame not in mechanism.frames:
-                hint = nearest_name_hint(entry.parent_frame, list(mechanism.frames))
-                raise ConfigError(f"there is no link '{entry.parent_frame}'", where=where, hint=hint)
-            frame = mechanism.frames[entry.parent_frame]
-            joint, pose = frame.joint_index, np.array(ca.DM(frame.placement.homogeneous_matrix())) @ pose
-        made.setdefault(joint, []).append(mesh.transformed(pose))
-    return made
-
-
-def _shape(entry: ExtraMesh, where: str) -> TriangleMesh:
-    given = [kind for kind in ("mesh", "box", "cylinder", "sphere") if getattr(entry, kind) is not None]
-    if len(given) != 1:
-        found = " and ".join(given) or "no shape"
-        raise ConfigError(f"there is {found}", where=where, allowed="one of mesh, box, cylinder, sphere")
-    if entry.box is not None:
-        return TriangleMesh.box(entry.box)
-    if entry.cylinder is not None:
-        radius, length = entry.cylinder
-        return TriangleMesh.cylinder(radius, -0.5 * length, 0.5 * length)
-    if entry.sphere is not None:
-        return TriangleMesh.sphere(entry.sphere)
-    path = Path(str(entry.mesh))
-    if not is_file(path):
-        hint = "give a file that trimesh reads: STL, OBJ, DAE"
-        raise ModelError(f"there is no mesh '{path}'", where=where, hint=hint)
-    return load_mesh_file(path)
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,31 +98,16 @@ class ForeignObject:
 
 def group_foreign_objects(
     things: Sequence[tuple[float, Sequence[ForeignCluster]]],
-    total: int,
     noise: float,
     box: tuple[Array, Array],
     links: Callable[[float], Mapping[str, Array]],
     coloured: bool,
     background: bool = False,
 ) -> tuple[ForeignObject, ...]:
-    """Group the foreign clusters of all frames into foreign objects, each with advice.
+    """Group the foreign clusters of all frames, each with its time [s], into foreign objects with advice.
 
-    Parameters
-    ----------
-    things : sequence of (float, sequence of Thing)
-        Of each frame: its time on the joints' clock [s] and what it saw.
-    total : int
-        Number of frames.
-    noise : float
-        Standard deviation of a point [m].
-    box : (ndarray, ndarray), each (3,)
-        In which the object ever was: lower and upper corner [m].
-    links : callable
-        From a time to the poses of the robot's links in the world, shape (4, 4) each.
-    coloured : bool
-        Whether clouds have colours.
-    background : bool
-        Whether what stands still in the frames is left out already.
+    `noise` is a point's standard deviation, `box` the corners (3,) in which the object ever was [m]; `links` gives the
+    poses (4, 4) of the robot's links at a time; `background` says that what stands still is left out already.
     """
     groups: list[list[tuple[float, ForeignCluster]]] = []
     for t, seen in things:
@@ -197,9 +117,37 @@ def group_foreign_objects(
                 home.append((t, thing))
             else:
                 groups.append([(t, thing)])
-    groups = [group for group in groups if len(group) >= min(_FEWEST, total)]
+    groups = [group for group in groups if len(group) >= min(_FEWEST, len(things))]
     groups.sort(key=lambda group: -sum(thing.n_points for _, thing in group))
-    return tuple(_named(group, total, noise, box, links, coloured, background) for group in groups)
+    found = []
+    for group in groups:
+        places, extents = np.array([thing.centre for _, thing in group]), [thing.extent for _, thing in group]
+        centre, size = np.median(places, axis=0), np.median(extents, axis=0)
+        # as arm and object hide parts of a still thing, the middle of the rest wanders within it
+        still = np.maximum(2 * _NOISE_STDS * noise, _STILL * np.max(extents, axis=0))
+        moving = bool((np.ptp(places, axis=0) > still).any())
+        poses = [links(t) for t, _ in group]
+        link = _carrying_link(places, poses) if moving else ""
+        low, high = places.min(axis=0) - 0.5 * size, places.max(axis=0) + 0.5 * size
+        beside = bool(((low > box[1]) | (high < box[0])).any())
+        how = f"moving with {link}" if link else "moving" if moving else "still"
+        big, where = (mark.join(f"{x:.2f}" for x in of) for mark, of in ((" x ", size), (", ", centre)))
+        text = (
+            f"something of {big} m at ({where}) m is not the object, {how}, in {len(group)} of {len(things)} frames: "
+        )
+        boxed = "leave it out with track.options.filters.box_lower and box_upper"
+        if link:
+            text += f"give its shape under model.extra_meshes with parent_frame: {link}"
+        elif moving:
+            text += boxed if beside else "take it out of view"
+            text += ", or give the object's colour under track.options.filters.object_colours" if coloured else ""
+        else:
+            text += "" if background else "set track.options.background_estimation: frames, or "
+            text += "film the scene without object and robot for track.background_frames"
+            text += f"; or {boxed}" if beside else ""
+            text += "; if it is another arm, lock its joints (model.arms.locked_joints)" if poses[0] else ""
+        found.append(ForeignObject(centre, size, len(group), moving, link, text))
+    return tuple(found)
 
 
 def _apart(one: ForeignCluster, other: ForeignCluster) -> float:
@@ -208,53 +156,20 @@ def _apart(one: ForeignCluster, other: ForeignCluster) -> float:
     return float(np.linalg.norm(one.centre - other.centre)) / (_ALIKE * size)
 
 
-def _wandering(places: Array) -> float:
-    return _TO_SIGMA * float(np.median(np.linalg.norm(places - np.median(places, axis=0), axis=1)))
-
-
 def _carrying_link(places: Array, poses: Sequence[Mapping[str, Array]]) -> str:
     """Link within which places wander much less than in the world; empty for none."""
-    inside = {}
-    for name in poses[0]:
-        own = [(p - at[name][:3, 3]) @ at[name][:3, :3] for p, at in zip(places, poses, strict=True)]
-        inside[name] = _wandering(np.array(own))
+
+    def wandering(own: Array) -> float:
+        return _TO_SIGMA * float(np.median(np.linalg.norm(own - np.median(own, axis=0), axis=1)))
+
+    inside = {
+        name: wandering(
+            np.array([(p - at[name][:3, 3]) @ at[name][:3, :3] for p, at in zip(places, poses, strict=True)])
+        )
+        for name in poses[0]
+    }
     best = min(inside, key=lambda name: inside[name], default="")
-    return best if best and inside[best] < _FOLLOWS * _wandering(places) else ""
-
-
-def _named(
-    group: Sequence[tuple[float, ForeignCluster]],
-    total: int,
-    noise: float,
-    box: tuple[Array, Array],
-    links: Callable[[float], Mapping[str, Array]],
-    coloured: bool,
-    background: bool,
-) -> ForeignObject:
-    places, extents = np.array([thing.centre for _, thing in group]), [thing.extent for _, thing in group]
-    centre, size = np.median(places, axis=0), np.median(extents, axis=0)
-    # as arm and object hide parts of a still thing, the middle of the rest wanders within it
-    still = np.maximum(2 * _NOISE_STDS * noise, _STILL * np.max(extents, axis=0))
-    moving = bool((np.ptp(places, axis=0) > still).any())
-    link = _carrying_link(places, [links(t) for t, _ in group]) if moving else ""
-    low, high = places.min(axis=0) - 0.5 * size, places.max(axis=0) + 0.5 * size
-    beside = bool(((low > box[1]) | (high < box[0])).any())
-    where = ", ".join(f"{value:.2f}" for value in centre)
-    big = " x ".join(f"{value:.2f}" for value in size)
-    how = f"moving with {link}" if link else "moving" if moving else "still"
-    text = f"something of {big} m at ({where}) m is not the object, {how}, in {len(group)} of {total} frames: "
-    if link:
-        text += f"give its shape under model.extra_meshes with parent_frame: {link}"
-    elif moving:
-        boxed = "leave it out with track.options.filters.box_lower and box_upper"
-        text += boxed if beside else "take it out of view"
-        text += ", or give the object's colour under track.options.filters.object_colours" if coloured else ""
-    else:
-        text += "" if background else "set track.options.background_estimation: frames, or "
-        text += "film the scene without object and robot for track.background_frames"
-        text += "; or leave it out with track.options.filters.box_lower and box_upper" if beside else ""
-        text += "; if it is another arm, lock its joints (model.arms.locked_joints)" if links(group[0][0]) else ""
-    return ForeignObject(centre, size, len(group), moving, link, text)
+    return best if best and inside[best] < _FOLLOWS * wandering(places) else ""
 
 
 DimensionKind = Literal["length", "radius"]
@@ -286,12 +201,12 @@ class DimensionCheck:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @property
-    def is_determined(self) -> NDArray[np.bool_]:
+    def is_determined(self) -> Mask:
         """Which dimensions the frames determine, shape (2 s,)."""
         return np.asarray((self.log_ratio_std < _KNOWN) & (self.n_frames > 0))
 
     @property
-    def is_contradicted(self) -> NDArray[np.bool_]:
+    def is_contradicted(self) -> Mask:
         """Which of the model's values contradict the frames, shape (2 s,)."""
         return np.asarray(self.is_determined & (np.abs(self.log_ratio) > _SIGMAS * self.log_ratio_std))
 
@@ -322,18 +237,9 @@ class DimensionCheck:
         return tuple(lines)
 
     def point_std(self, points: Array) -> Array:
-        """Standard deviations of points due to wrong and uncertain dimensions.
+        """Standard deviations of points (np, 3) by wrong and uncertain sizes, of slopes (np, 3, 2 s) [m].
 
-        Parameters
-        ----------
-        points : ndarray, shape (np, 3, 2 s)
-            How they move with the sizes (`DimensionEquations`) [m].
-
-        Returns
-        -------
-        ndarray, shape (np, 3)
-            Standard deviations [m]: the whole displacement of what is doubted and yet used, and what remains uncertain
-            of what is estimated.
+        The whole displacement of what is doubted and yet used, and what remains uncertain of what is estimated.
         """
         used = np.array(self.is_estimated)
         wrong = np.where(self.is_contradicted & ~used, self.log_ratio, 0.0)
@@ -355,20 +261,11 @@ def check_dimensions(
 ) -> DimensionCheck:
     """Estimate the tubes' dimensions from some frames and compare them with the model.
 
-    Parameters
-    ----------
-    given : mapping of str to float, optional
-        Parameter values; nominal where absent.
-    estimate : sequence of "length" and "radius"
-        What the fit is to use in place of the model's values, where the frames tell it.
-    std : (float, float)
-        Standard deviations of a point's distance from the surface, and of the error of places that all frames share
-        with the camera's pose [m].
-    fitted : callable
-        From parameter values and the configurations of the round before, empty in the first, to the fits of the frames
-        that can be used.
+    `std` are the standard deviations of a point's distance from the surface, and of the places' error that all frames
+    share [m]; `fitted` makes the fits of the frames from parameter values and the configurations of the round before.
     """
-    told = _told(system, given)
+    sizes = tube_sizes(system, given).values()
+    told = np.array([*(lengths.sum() for lengths, _ in sizes), *(radius for _, radius in sizes)])
     count, many = len(told), len(told) // 2
     names = tuple(f"{s.name}.{kind}" for kind in _DIMENSION_KINDS for s in system.segment_layouts)
     prior = np.diag(np.repeat(1.0 / np.square(_PRIOR), many))
@@ -415,24 +312,14 @@ def _believed(fits: Sequence[FrameShapeFit]) -> list[FrameShapeFit]:
     return [fit for fit, good in zip(fits, keep, strict=True) if good]
 
 
-def _symbols(system: System) -> list[list[str]]:
-    """Parameters that each size is made of."""
-    found = [[x.name() for x in ca.symvar(ca.vertcat(*s.link_lengths))] for s in system.segment_layouts]
-    return found + [[x.name() for x in ca.symvar(s.radius)] for s in system.segment_layouts]
-
-
-def _told(system: System, given: Mapping[str, float] | None) -> Array:
-    symbols, theta = system.parameters.symbols, system.parameters.vector(given)
-    sums = [ca.sum1(ca.vertcat(*s.link_lengths)) for s in system.segment_layouts]
-    sums += [s.radius for s in system.segment_layouts]
-    return np.array(ca.Function("told", [symbols], [ca.densify(ca.vertcat(*sums))])(theta)).ravel()
-
-
 def _changed(system: System, given: Mapping[str, float] | None, change: Array) -> dict[str, float]:
+    """Parameter values with the sizes changed by logarithms (2 s,)."""
     values = dict(zip(system.parameters.names, system.parameters.vector(given).tolist(), strict=True))
-    for i, names in enumerate(_symbols(system)):
-        for name in names:
-            values[name] *= math.exp(float(change[i]))
+    made_of = [ca.vertcat(*s.link_lengths) for s in system.segment_layouts]
+    made_of += [s.radius for s in system.segment_layouts]
+    for entry, by in zip(made_of, change, strict=True):
+        for symbol in ca.symvar(entry):
+            values[symbol.name()] *= math.exp(float(by))
     return values
 
 

@@ -1,9 +1,8 @@
 """Assessment of a shape by a frame's cloud: own points, foreign points, and links without points.
 
-Points within three standard deviations of the tubes' surface lie on the shape. Of the others, those that hang together
-and are as many as a piece of tube as long as it is wide would have are a thing. Where a thing's surface goes on from
-the shape's, nobody can tell whose the points are: within two tubes' reach of there they are contested and say nothing.
-A station of a tube that no own point lies on is hidden, or it is empty although the camera sees it.
+Of the points that are not near the tubes' surface, those that hang together and are as many as a piece of tube as long
+as it is wide would have are a thing. Where a thing's surface goes on from the shape's, points within two tubes' reach
+are contested and say nothing. A station of a tube that no own point lies on is hidden, or visibly empty.
 """
 
 from __future__ import annotations
@@ -59,26 +58,10 @@ class TubeLinks:
 def nearest_on_tubes(
     corners: Array, radius: Array, points: Array, share: float = 1.0
 ) -> tuple[Integers, Array, Array, Array]:
-    """Nearest place on tubes for each point.
+    """Nearest place on tubes of links (K, 2, 3) and radii (K,) for points (N, 3) that lie at a share of the radius [m].
 
-    Parameters
-    ----------
-    corners : ndarray, shape (K, 2, 3)
-        Start and end of every link [m].
-    radius : ndarray, shape (K,) [m]
-    points : ndarray, shape (N, 3) [m]
-    share : float
-        Of the radius, at which points lie from the centre line.
-
-    Returns
-    -------
-    link : ndarray of int, shape (N,)
-    along : ndarray, shape (N,)
-        From the link's start, 0, to its end, 1.
-    normal : ndarray, shape (N, 3)
-        Unit vector from the centre line to the point.
-    distance : ndarray, shape (N,)
-        From the centre line [m].
+    Index of the link and place along it from 0 to 1, both (N,), unit vectors (N, 3) from the centre line to the points,
+    and distances (N,) from it [m].
     """
     start, edge = corners[:, 0], corners[:, 1] - corners[:, 0]
     square = np.einsum("ij,ij->i", edge, edge)
@@ -108,15 +91,11 @@ class ForeignCluster:
     n_points: int
 
 
-@dataclass(frozen=True, eq=False)
-class ShapeEvidence:
-    """Classification of a frame's points by a shape, and how much of the shape they cover."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ShapeQuality:
+    """How well a shape suits a frame's points, and how much of the shape they cover."""
 
-    # (N,), points on the shape that are surely its own; points there that may be a thing's; points of things
-    is_own: Mask
-    is_contested: Mask
-    is_foreign: Mask
-    noise_std: float  # standard deviation of their distances from the surface [m]
+    noise_std: float  # standard deviation of the points on the shape from its surface [m]
     mean_distance: float  # mean distance from the surface of points near it that are no thing's [m]
     # (K,), share of each link's length on which there are own points, and on which the camera sees that there are
     # none
@@ -125,14 +104,23 @@ class ShapeEvidence:
     # (E,), by how much each free tube's end lies further along than the shape has it, NaN where that cannot be seen
     # [m]
     end_offsets: Array
-    excess_variance: Array  # (K,), variance across each link beyond that of its tube [m^2]
-    foreign_clusters: tuple[ForeignCluster, ...]  # the largest first
+    foreign_clusters: tuple[ForeignCluster, ...]  # things beside the shape, the largest first
 
-    @property
-    def visible_coverage(self) -> Array:
-        """Share of each link's visible length that has own points, shape (K,); 0 where nothing of it is visible."""
-        visible = self.covered_fraction + self.visibly_empty_fraction
-        return np.asarray(self.covered_fraction / np.maximum(visible, 1e-12))
+    def coverage(self, lengths: Array) -> float:
+        """Share of the visible length of links, of lengths (K,) [m], that has own points; 0 where none is visible."""
+        filled, empty = float(lengths @ self.covered_fraction), float(lengths @ self.visibly_empty_fraction)
+        return filled / max(filled + empty, 1e-12)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ShapeEvidence(ShapeQuality):
+    """Classification of a frame's points by a shape, and how much of the shape they cover."""
+
+    # (N,), points on the shape that are surely its own; points there that may be a thing's; points of things
+    is_own: Mask
+    is_contested: Mask
+    is_foreign: Mask
+    excess_variance: Array  # (K,), variance across each link beyond that of its tube [m^2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,17 +158,10 @@ class CloudObservation:
 
 
 def assess_shape(tubes: TubeLinks, seen: CloudObservation, near: float) -> ShapeEvidence:
-    """Assess a shape by a frame's points.
-
-    Parameters
-    ----------
-    near : float
-        Distance from the surface beyond which a point says nothing of the shape [m].
-    """
+    """Assess a shape by a frame's points, of which those further than `near` [m] from the surface say nothing."""
     link, along, normal, distance = nearest_on_tubes(tubes.link_ends, tubes.radius, seen.points)
     away = _faces_away_from_camera(normal, seen.points - seen.camera_position)
-    error = np.where(away, -distance, distance) - tubes.radius[link]
-    size = np.abs(error)
+    size = np.abs(np.where(away, -distance, distance) - tubes.radius[link])
     close = size < near
     tree, spacing = seen.point_tree, seen.point_spacing
     noise = _TO_SIGMA * weighted_median(size[close], seen.point_weights[close]) if close.any() else near / _SIGMAS
@@ -188,50 +169,49 @@ def assess_shape(tubes: TubeLinks, seen: CloudObservation, near: float) -> Shape
     noise = max(noise, spacing / math.sqrt(12.0))
     gate = min(_SIGMAS * noise, near)
     on_shape = size < gate
-    slices = [_Slices.of(tubes, k, spacing) for k in tubes.free_end_links]
     beyond = np.zeros(len(on_shape), bool)
-    ends = np.full(len(slices), np.nan)
-    for i, cut in enumerate(slices):
-        ends[i] = cut.end(seen, gate)
-        if ends[i] > 0:
-            beyond |= cut.within(seen.points, gate, 0.0, ends[i])
-    part = _parts(tree, ~on_shape & ~beyond, _LINKED * spacing)
-    part = _large(part, 4 * float(tubes.radius.min()) ** 2 / spacing**2)
+    ends = np.full(len(tubes.free_end_links), np.nan)
+    for i, k in enumerate(tubes.free_end_links):
+        ends[i], behind_tip = _end_offset(tubes, k, seen, gate)
+        beyond |= behind_tip
+    part = _things(tree, ~on_shape & ~beyond, _LINKED * spacing, 4 * float(tubes.radius.min()) ** 2 / spacing**2)
     foreign = part >= 0
     contact = _contacts(tree, seen, on_shape | beyond, foreign, _LINKED * spacing)
-    widest = 2 * (tubes.radius[link] + gate)
     contested = np.zeros(len(on_shape), bool)
     if contact.any():
         touching = cKDTree(seen.points[contact])
-        contested = (on_shape | beyond) & (touching.query(seen.points)[0] < widest)
-        for i, cut in enumerate(slices):
+        contested = (on_shape | beyond) & (touching.query(seen.points)[0] < 2 * (tubes.radius[link] + gate))
+        for i, k in enumerate(tubes.free_end_links):
             # whose the points at the end are is not known, so neither is where it is
-            if np.isfinite(ends[i]) and touching.query(cut.place(ends[i]))[0] < 2 * (cut.radius + gate):
-                ends[i] = np.nan
+            if np.isfinite(ends[i]):
+                start, tip = tubes.link_ends[k]
+                end = tip + ends[i] * (tip - start) / np.linalg.norm(tip - start)
+                if touching.query(end)[0] < 2 * (tubes.radius[k] + gate):
+                    ends[i] = np.nan
     own = on_shape & ~contested
     filled, empty = _coverage(tubes, seen, own, link, along, gate)
     counted = close & ~foreign
     mean = float(np.average(size[counted], weights=seen.point_weights[counted])) if counted.any() else math.inf
-    swath, things = _swath(tubes, seen, counted & ~contested, link, normal * distance[:, None]), _things(part, seen)
-    return ShapeEvidence(own, contested, foreign, noise, mean, filled, empty, ends, swath, things)
+    clusters = [seen.points[part == number] for number in range(min(_MOST_THINGS, int(part.max(initial=-1)) + 1))]
+    return ShapeEvidence(
+        is_own=own,
+        is_contested=contested,
+        is_foreign=foreign,
+        noise_std=noise,
+        mean_distance=mean,
+        covered_fraction=filled,
+        visibly_empty_fraction=empty,
+        end_offsets=ends,
+        excess_variance=_swath(tubes, seen, counted & ~contested, link, normal * distance[:, None]),
+        foreign_clusters=tuple(ForeignCluster(np.median(x, axis=0), np.ptp(x, axis=0), len(x)) for x in clusters),
+    )
 
 
 def tube_like_nodes_and_points(sight: CloudObservation, radius: float) -> tuple[Mask, Mask]:
-    """Whether nodes and points lie where the surface is as narrow as a tube.
+    """Which nodes (K,), and points (N,) nearest to them, lie where the surface is as narrow as a tube of a radius [m].
 
     About a tube points spread by its length in one direction and by r/sqrt(3) across; on a table, a wall or a body they
     spread as far in two.
-
-    Parameters
-    ----------
-    radius : float
-        Of the thickest tube [m].
-
-    Returns
-    -------
-    nodes : ndarray of bool, shape (K,)
-    points : ndarray of bool, shape (N,)
-        Those whose nearest node is among them.
     """
     within = _SURROUNDINGS * radius
     thin = np.zeros(len(sight.skeleton_nodes), bool)
@@ -244,28 +224,21 @@ def tube_like_nodes_and_points(sight: CloudObservation, radius: float) -> tuple[
     return thin, thin[cKDTree(sight.skeleton_nodes).query(sight.points)[1]]
 
 
-def _parts(tree: cKDTree, chosen: Mask, within: float) -> Integers:
-    """Connected parts of some of the points, -1 for the others."""
-    part = np.full(len(chosen), -1)
-    index = np.flatnonzero(chosen)
+def _things(tree: cKDTree, chosen: Mask, within: float, least: float) -> Integers:
+    """Connected parts of some of the points that are large enough, the largest 0; -1 for all other points."""
+    part, index = np.full(len(chosen), -1), np.flatnonzero(chosen)
     if not len(index):
         return part
     pairs = cKDTree(tree.data[index]).query_pairs(within, output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(index),) * 2)
-    part[index] = connected_components(graph, directed=False)[1]
-    return part
-
-
-def _large(part: Integers, least: float) -> Integers:
-    """Parts with so many points, numbered by their size, the largest first; -1 for the others."""
-    if (part < 0).all():
-        return part
-    count = np.bincount(part[part >= 0])
+    owner = connected_components(graph, directed=False)[1]
+    count = np.bincount(owner)
     order = np.argsort(-count, kind="stable")
     number = np.full(len(count), -1)
     kept = order[count[order] >= max(least, _FEWEST)]
     number[kept] = np.arange(len(kept))
-    return np.where(part >= 0, number[np.maximum(part, 0)], -1)
+    part[index] = number[owner]
+    return part
 
 
 def _contacts(tree: cKDTree, seen: CloudObservation, shape: Mask, foreign: Mask, within: float) -> Mask:
@@ -313,61 +286,33 @@ def _swath(tubes: TubeLinks, seen: CloudObservation, counted: Mask, link: Intege
     return np.maximum(total / np.maximum(weight, 1e-12) - tubes.radius**2 / 3, 0.0)
 
 
-def _things(part: Integers, seen: CloudObservation) -> tuple[ForeignCluster, ...]:
-    found = []
-    for number in range(min(_MOST_THINGS, int(part.max(initial=-1)) + 1)):
-        mine = part == number
-        points = seen.points[mine]
-        found.append(ForeignCluster(np.median(points, axis=0), np.ptp(points, axis=0), int(mine.sum())))
-    return tuple(found)
+def _end_offset(tubes: TubeLinks, link: int, seen: CloudObservation, gate: float) -> tuple[float, Mask]:
+    """Where points end along the axis of a tube's last link, from its tip [m], NaN where that cannot be seen.
 
-
-@dataclass(frozen=True, eq=False)
-class _Slices:
-    """A free tube's last link and where it would go on, cut across."""
-
-    tip: Array
-    axis: Array
-    radius: float
-    edges: Array
-
-    @staticmethod
-    def of(tubes: TubeLinks, link: int, spacing: float) -> _Slices:
-        start, tip = tubes.link_ends[link]
-        length = float(np.linalg.norm(tip - start))
-        thick = max(float(tubes.radius[link]), 2 * spacing)
-        behind, ahead = max(3, int(length / thick)), max(3, int(_AHEAD * tubes.tube_lengths[link] / thick))
-        return _Slices(tip, (tip - start) / length, float(tubes.radius[link]), thick * np.arange(-behind, ahead + 1.0))
-
-    def place(self, along: float) -> Array:
-        return np.asarray(self.tip + along * self.axis)
-
-    def within(self, points: Array, gate: float, low: float, high: float) -> Mask:
-        """Points about the axis, between two places along it from the tip."""
-        away = points - self.tip
-        along = away @ self.axis
-        across = np.einsum("ij,ij->i", away, away) - along**2
-        return np.asarray((along > low) & (along <= high) & (across < (self.radius + gate) ** 2))
-
-    def end(self, seen: CloudObservation, gate: float) -> float:
-        """Where the points end along the axis, from the tip [m]; NaN where that cannot be seen."""
-        edges = self.edges
-        mine = self.within(seen.points, gate, edges[0], edges[-1])
-        along = (seen.points[mine] - self.tip) @ self.axis
-        count, _ = np.histogram(along, edges, weights=seen.point_weights[mine])
-        behind = count[edges[1:] <= 0]
-        usual = float(np.median(count[count > 0])) if (behind > 0).any() else 0.0
-        if not usual:
-            return math.nan
-        filled = count > _FILLED * usual
-        middles = self.tip + 0.5 * (edges[1:] + edges[:-1])[:, None] * self.axis
-        hidden = seen.is_hidden(middles, np.full(len(middles), self.radius), gate) & ~filled
-        score = np.concatenate([[0.0], np.cumsum(np.where(hidden, 0.0, np.where(filled, 0.5, -0.5)))])
-        last = int(np.argmax(score))
-        if last == 0 or last == len(count) or hidden[last]:
-            return math.nan
-        inside = along[(along > edges[last - 1]) & (along <= edges[last])]
-        return float(inside.max()) if len(inside) else float(edges[last])
+    And which points lie about the axis between the tip and there.
+    """
+    (start, tip), radius = tubes.link_ends[link], float(tubes.radius[link])
+    length, thick = float(np.linalg.norm(tip - start)), max(radius, 2 * seen.point_spacing)
+    axis, behind = (tip - start) / length, max(3, int(length / thick))
+    edges = thick * np.arange(-behind, max(3, int(_AHEAD * tubes.tube_lengths[link] / thick)) + 1.0)
+    away = seen.points - tip
+    along = away @ axis
+    about = np.einsum("ij,ij->i", away, away) - along**2 < (radius + gate) ** 2
+    mine = about & (along > edges[0]) & (along <= edges[-1])
+    count, _ = np.histogram(along[mine], edges, weights=seen.point_weights[mine])
+    nothing = math.nan, np.zeros(len(along), bool)
+    if not (count[edges[1:] <= 0] > 0).any():
+        return nothing
+    filled = count > _FILLED * float(np.median(count[count > 0]))
+    middles = tip + 0.5 * (edges[1:] + edges[:-1])[:, None] * axis
+    hidden = seen.is_hidden(middles, np.full(len(middles), radius), gate) & ~filled
+    score = np.concatenate([[0.0], np.cumsum(np.where(hidden, 0.0, np.where(filled, 0.5, -0.5)))])
+    last = int(np.argmax(score))
+    if last == 0 or last == len(count) or hidden[last]:
+        return nothing
+    inside = along[mine & (along > edges[last - 1]) & (along <= edges[last])]
+    end = float(inside.max()) if len(inside) else float(edges[last])
+    return end, about & (along > 0.0) & (along <= end)
 
 
 _RIM = 0.85  # of the radius to either side, within which a tube's depth is compared
@@ -387,17 +332,10 @@ class _SurfaceResiduals:
 def nearest_surface_residuals(
     corners: Array, radius: Array, points: Array, camera: Array, share: float = 1.0
 ) -> _SurfaceResiduals:
-    """Residuals along the nearest way to the surface,  e = |p - c| - f r.
+    """Residuals along the nearest way to the surface,  e = |p - c| - f r, of points (N, 3) that lie at a share f.
 
-    Parameters
-    ----------
-    corners : ndarray, shape (K, 2, 3) [m]
-    radius : ndarray, shape (K,) [m]
-    points : ndarray, shape (N, 3) [m]
-    camera : ndarray, shape (3,)
-        [m]; a point that only the far side of a tube is near to counts from the near side.
-    share : float
-        f, of the radius, at which points lie.
+    Links are (K, 2, 3), radii (K,), the camera (3,) [m]. A point that only the far side of a tube is near to counts
+    from the near side.
     """
     link, along, normal, distance = nearest_on_tubes(corners, radius, points, share)
     sign = np.where(_faces_away_from_camera(normal, points - camera), -1.0, 1.0)
@@ -446,26 +384,18 @@ class DimensionEquations:
     point_jacobian: Array  # (np, 3, 2 s), how the system's points move with them [m]
 
 
-@dataclass(frozen=True, eq=False)
-class FrameShapeFit:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FrameShapeFit(ShapeQuality):
     """Fitted shape of one frame with its uncertainty and quality."""
 
     q: Array  # (n,), configuration, twists at rest
     point_positions: Array  # (np, 3), the system's points there [m]
     point_std: Array  # (np, 3), standard deviation of each coordinate by the curvature of the cost [m]
-    mean_distance: float  # mean of |e_i| over the points near the shape that belong to no other thing [m]
-    noise_std: float  # standard deviation of e_i of the points on the shape [m]
-    # (K,), share of each link's length on which there are points, and on which the camera sees that there are none
-    covered_fraction: Array
-    visibly_empty_fraction: Array
     # (np,), whether there are points enough about each of the system's points, or a gripper that holds it
-    is_point_seen: NDArray[np.bool_]
+    is_point_seen: Mask
     grasp_gaps: Array  # (grasps, 3), from what each gripper holds to the gripper [m]
-    # (E,), by how much each free tube's end lies further along than the shape has it, NaN where that is not seen [m]
-    end_offsets: Array
     # share of the points on the shape that may belong to a thing which touches it; they are left out
     contested_fraction: float
-    foreign_clusters: tuple[ForeignCluster, ...]  # what else there is
     dimension_equations: DimensionEquations  # what the frame says of lengths and radii
     n_iterations: int
     link_ends: Array  # (K, 2, 3), start and end of every link [m]
@@ -473,6 +403,4 @@ class FrameShapeFit:
     @property
     def visible_coverage(self) -> float:
         """Fraction of the shape's visible length that has points."""
-        lengths = np.linalg.norm(self.link_ends[:, 1] - self.link_ends[:, 0], axis=1)
-        there, bare = float(lengths @ self.covered_fraction), float(lengths @ self.visibly_empty_fraction)
-        return there / max(there + bare, 1e-12)
+        return self.coverage(np.linalg.norm(self.link_ends[:, 1] - self.link_ends[:, 0], axis=1))

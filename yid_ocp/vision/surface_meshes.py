@@ -1,15 +1,12 @@
-"""Surfaces of the robot and of the tubes, each fixed to a joint's moving frame, and queries against them.
-
-Every joint keeps one scene in its own frame: rays and points are brought there, so that nothing is rebuilt as the robot
-moves.
-"""
+"""Surfaces of the robot, of the tubes and of what stands about, each in a joint's moving frame, and their queries."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -18,16 +15,19 @@ import numpy as np
 from annotated_types import Gt
 from numpy.typing import ArrayLike, NDArray
 
-from yid_ocp.errors import DataError, ModelError
+from yid_ocp.errors import ConfigError, DataError, ModelError, nearest_name_hint
 from yid_ocp.files import is_file
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Mechanism
+from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import resolve_urdf_path
 from yid_ocp.options import OptionInfo, PositiveFloat
 from yid_ocp.vision.frames import CameraIntrinsics, import_open3d
 
 Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 MeshKind = Literal["visual", "collision"]
 _Triple = tuple[float, float, float]
 
@@ -74,7 +74,7 @@ class TriangleMesh:
     """Triangles: `vertices` (V, 3) [m], `faces` (F, 3) indices."""
 
     vertices: Array
-    faces: NDArray[np.int64]
+    faces: Integers
 
     def transformed(self, pose: ArrayLike) -> TriangleMesh:
         """Mesh transformed by a pose, shape (4, 4)."""
@@ -91,42 +91,31 @@ class TriangleMesh:
     @staticmethod
     def box(size: ArrayLike) -> TriangleMesh:
         """A box about the origin; `size` (3,) [m]."""
-        corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-        sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-        faces = [triangle for a, b, c, d in sides for triangle in ((a, b, c), (a, c, d))]
-        return TriangleMesh(corners * np.asarray(size, float), np.array(faces))
+        from trimesh import creation
+
+        return TriangleMesh._of(creation.box(np.asarray(size, float)))
 
     @staticmethod
     def cylinder(radius: float, low: float, high: float) -> TriangleMesh:
         """A closed cylinder about z from `low` to `high` [m]."""
-        angle = 2 * np.pi * np.arange(_FACETS) / _FACETS
-        ring = np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
-        levels = [np.column_stack([ring, np.full(_FACETS, z)]) for z in (low, high)]
-        vertices = np.concatenate([*levels, [[0, 0, low], [0, 0, high]]])
-        i, j = np.arange(_FACETS), (np.arange(_FACETS) + 1) % _FACETS
-        sides = [np.column_stack([i, j, j + _FACETS]), np.column_stack([i, j + _FACETS, i + _FACETS])]
-        caps = [np.column_stack([j, i, np.full(_FACETS, 2 * _FACETS)])]
-        caps += [np.column_stack([i + _FACETS, j + _FACETS, np.full(_FACETS, 2 * _FACETS + 1)])]
-        return TriangleMesh(vertices, np.concatenate([*sides, *caps]))
+        from trimesh import creation
+
+        middle = homogeneous_transform(np.eye(3), (0.0, 0.0, 0.5 * (low + high)))
+        return TriangleMesh._of(creation.cylinder(radius, high - low, _FACETS, transform=middle))
+
+    @staticmethod
+    def _of(found: Any) -> TriangleMesh:
+        return TriangleMesh(np.asarray(found.vertices, float), np.asarray(found.faces, np.int64))
 
     @staticmethod
     def sphere(radius: float) -> TriangleMesh:
         """A sphere about the origin."""
-        rings = _FACETS // 2
-        polar = np.pi * np.arange(1, rings) / rings
-        angle = 2 * np.pi * np.arange(_FACETS) / _FACETS
-        around = np.column_stack([np.cos(angle), np.sin(angle)])
-        shell = [np.column_stack([np.sin(p) * around, np.full(_FACETS, np.cos(p))]) for p in polar]
-        vertices = radius * np.concatenate([*shell, [[0, 0, 1.0], [0, 0, -1.0]]])
-        top, bottom = len(vertices) - 2, len(vertices) - 1
-        i, j = np.arange(_FACETS), (np.arange(_FACETS) + 1) % _FACETS
-        faces = [np.column_stack([i, j, np.full(_FACETS, top)])]
-        for k in range(rings - 2):
-            a, b = k * _FACETS, (k + 1) * _FACETS
-            faces += [np.column_stack([i + a, i + b, j + b]), np.column_stack([i + a, j + b, j + a])]
-        last = (rings - 2) * _FACETS
-        faces.append(np.column_stack([j + last, i + last, np.full(_FACETS, bottom)]))
-        return TriangleMesh(vertices, np.concatenate(faces))
+        from trimesh import creation
+
+        polar = np.linspace(0.0, np.pi, _FACETS // 2 + 1)
+        outline = radius * np.column_stack([np.sin(polar), np.cos(polar)])
+        outline[[0, -1], 0] = 0.0
+        return TriangleMesh._of(creation.revolve(outline, sections=_FACETS))
 
 
 class _Cells:
@@ -138,10 +127,9 @@ class _Cells:
 
     def distance(self, points: Array) -> Array:
         """Distance of points of the part's frame to its surface, shape (N,) [m]."""
-        query = import_open3d().core.Tensor(np.ascontiguousarray(points, dtype=np.float32))
-        return np.asarray(self._scene.compute_distance(query, nthreads=1).numpy().astype(np.float64))
+        return np.asarray(self._scene.compute_distance(_tensor(points), nthreads=1).numpy().astype(np.float64))
 
-    def within(self, points: Array, reach: float) -> NDArray[np.bool_]:
+    def within(self, points: Array, reach: float) -> Mask:
         """Which points are no further than `reach` [m], shape (N,)."""
         cell = np.floor((points - self._origin) / _CELL).astype(np.int64) + _CELLS // 2
         key = (cell[:, 0] * _CELLS + cell[:, 1]) * _CELLS + cell[:, 2]
@@ -162,32 +150,22 @@ class _Cells:
 
 
 class ArticulatedSurfaces:
-    """Meshes on the joints of a mechanism, with ray and distance queries.
+    """Meshes by joint (-1: the world), in the joints' frames, of a numeric mechanism, with ray and distance queries.
 
-    Parameters
-    ----------
-    mechanism : Mechanism
-        With numbers in place of its parameters (`Mechanism.with_numeric_values`).
-    meshes : mapping of int to Mesh
-        By joint index (-1: fixed to the world), in the joint's moving frame.
+    Every joint keeps one scene in its own frame, to which rays and points are brought: nothing is rebuilt as it moves.
     """
 
     def __init__(self, mechanism: Mechanism, meshes: Mapping[int, TriangleMesh]) -> None:
         o3d = import_open3d()
-        self.mechanism = mechanism
         self.part_joints = tuple(sorted(meshes))
-        self._scenes: list[Any] = []
-        self._low, self._high = [], []
-        self._cells: list[_Cells] = []
-        for joint in self.part_joints:
-            mesh = meshes[joint]
+        self._scenes, self._cells, self._boxes = list[Any](), list[_Cells](), list[Array]()
+        for mesh in (meshes[joint] for joint in self.part_joints):
             scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-            vertices = o3d.core.Tensor(np.ascontiguousarray(mesh.vertices, dtype=np.float32))
-            scene.add_triangles(vertices, o3d.core.Tensor(np.ascontiguousarray(mesh.faces, dtype=np.uint32)))
+            faces = o3d.core.Tensor(np.ascontiguousarray(mesh.faces, dtype=np.uint32))
+            scene.add_triangles(_tensor(mesh.vertices), faces)
             self._scenes.append(scene)
-            self._low.append(mesh.vertices.min(0))
-            self._high.append(mesh.vertices.max(0))
-            self._cells.append(_Cells(scene, self._low[-1]))
+            self._boxes.append(np.array([mesh.vertices.min(0), mesh.vertices.max(0)]))
+            self._cells.append(_Cells(scene, self._boxes[-1][0]))
         q = ca.SX.sym("q", len(mechanism.joints))
         kinematics = forward_kinematics(mechanism, q)
         poses, last = [], ca.SX(ca.DM([[0.0, 0.0, 0.0, 1.0]]))
@@ -197,103 +175,47 @@ class ArticulatedSurfaces:
         self._poses = ca.Function("poses", [q], [ca.densify(ca.horzcat(*poses))])
 
     def part_poses_at(self, q: ArrayLike) -> Array:
-        """Pose of every part in the world at a configuration, shape (len(joints), 4, 4)."""
+        """Pose of every part in the world at a configuration, shape (parts, 4, 4)."""
         stacked = np.array(self._poses(np.asarray(q, float)))
         return np.asarray(stacked.reshape(4, len(self.part_joints), 4).transpose(1, 0, 2))
 
-    def distance_to_surface(self, points: Array, q: ArrayLike, within: float, *, moving_only: bool = False) -> Array:
-        """Distance of points to the nearest surface.
-
-        Parameters
-        ----------
-        points : ndarray, shape (N, 3)
-            In the world [m].
-        q : array_like, shape (n,)
-            Configuration of the mechanism.
-        within : float
-            Distances beyond this one are not worked out [m].
-        moving_only : bool
-            Whether what is fixed to the world is left out.
-
-        Returns
-        -------
-        ndarray, shape (N,)
-            Unsigned [m]; infinite beyond `is_within_distance`.
-        """
-        result = np.full(len(points), np.inf)
-        for part, _, near, local in self._near_parts(points, q, within, moving_only):
-            result[near] = np.minimum(result[near], self._cells[part].distance(local))
-        return np.where(result <= within, result, np.inf)
-
-    def _near_parts(
-        self, points: Array, q: ArrayLike, within: float, moving_only: bool
-    ) -> Iterator[tuple[int, Array, NDArray[np.int64], Array]]:
-        """Parts with points near their boxes: part, pose, indices of these points, and they in the part's frame."""
-        for part, pose in enumerate(self.part_poses_at(q)):
-            if moving_only and self.part_joints[part] < 0:
-                continue
-            local = (points - pose[:3, 3]) @ pose[:3, :3]
-            near = np.flatnonzero(self._inside(local, part, within))
-            if len(near):
-                yield part, pose, near, local[near]
-
-    def _inside(self, local: Array, part: int, margin: float) -> NDArray[np.bool_]:
-        """Which points of a part's frame lie in its box, widened by a margin [m], shape (N,)."""
-        inside = np.ones(len(local), bool)
+    def _near(self, points: Array, part: int, pose: Array, margin: float) -> tuple[Integers, Array]:
+        """Points of the world in a part's box, widened by a margin [m]: their indices, and they in the part's frame."""
+        local = (points - pose[:3, 3]) @ pose[:3, :3]
+        (low, high), inside = self._boxes[part], np.ones(len(local), bool)
         for axis in range(3):  # column by column, which is quicker than whole rows
-            inside &= local[:, axis] > self._low[part][axis] - margin
-            inside &= local[:, axis] < self._high[part][axis] + margin
-        return inside
+            inside &= (local[:, axis] > low[axis] - margin) & (local[:, axis] < high[axis] + margin)
+        near = np.flatnonzero(inside)
+        return near, local[near]
 
-    def is_within_distance(self, points: Array, q: ArrayLike, reach: float) -> NDArray[np.bool_]:
-        """Whether points lie within `reach` [m] of a surface, shape (N,); faster than `distance_to_surface`.
+    def is_within_distance(self, points: Array, q: ArrayLike, reach: float, *, moving_only: bool = False) -> Mask:
+        """Whether world points (N, 3) lie within `reach` [m] of a surface at a configuration (n,), shape (N,).
 
         No distance differs from that of a place by more than the way there: the cell in which a point lies, whose
-        centre's distance is kept, mostly tells.
-
-        Parameters
-        ----------
-        points : ndarray, shape (N, 3)
-            In the world [m].
-        q : array_like, shape (n,)
+        centre's distance is kept, mostly tells. `moving_only` leaves out what is fixed to the world.
         """
         result = np.zeros(len(points), bool)
         for part, pose in enumerate(self.part_poses_at(q)):
-            asked = np.flatnonzero(~result)
-            local = (points[asked] - pose[:3, 3]) @ pose[:3, :3]
-            near = np.flatnonzero(self._inside(local, part, reach))
-            if len(near):
-                result[asked[near]] = self._cells[part].within(local[near], reach)
+            if not (moving_only and self.part_joints[part] < 0):
+                asked = np.flatnonzero(~result)
+                near, local = self._near(points[asked], part, pose, reach)
+                if len(near):
+                    result[asked[near]] = self._cells[part].within(local, reach)
         return result
 
-    def nearest_moving_surface(
-        self, points: Array, q: ArrayLike, within: float
-    ) -> tuple[Array, Array, NDArray[np.int64]]:
-        """Distance, normal and part of the nearest moving surface for each point.
+    def nearest_moving_surface(self, points: Array, q: ArrayLike, within: float) -> tuple[Array, Array, Integers]:
+        """Nearest moving surface of world points: distance (N,) [m], unit normal (N, 3) towards the point, part (N,).
 
-        Parameters
-        ----------
-        points : ndarray, shape (N, 3)
-            In the world [m].
-        q : array_like, shape (n,)
-        within : float
-            Surfaces further away are not looked for [m].
-
-        Returns
-        -------
-        distance : ndarray, shape (N,)
-            Infinite beyond `is_within_distance` [m].
-        normal : ndarray, shape (N, 3)
-            Unit vector from the surface to the point; zero beyond `is_within_distance`.
-        part : ndarray of int, shape (N,)
-            Index into `part_joints`, -1 beyond `is_within_distance`.
+        Beyond `within` [m] they are infinite, zero and -1.
         """
-        o3d = import_open3d()
         distance, normal = np.full(len(points), np.inf), np.zeros((len(points), 3))
         owner = np.full(len(points), -1)
-        for part, pose, near, local in self._near_parts(points, q, within, True):
+        for part, pose in enumerate(self.part_poses_at(q)):
+            near, local = self._near(points, part, pose, within)
+            if self.part_joints[part] < 0 or not len(near):
+                continue
             query = np.ascontiguousarray(local, dtype=np.float32)
-            answer = self._scenes[part].compute_closest_points(o3d.core.Tensor(query), nthreads=1)
+            answer = self._scenes[part].compute_closest_points(_tensor(query), nthreads=1)
             away = query - answer["points"].numpy()
             length = np.linalg.norm(away, axis=1).astype(np.float64)
             # the way to a surface that is all but touched is rounding: its own normal is better
@@ -308,23 +230,10 @@ class ArticulatedSurfaces:
 
     def render_depth_image(
         self, pinhole: CameraIntrinsics, pose: ArrayLike, q: ArrayLike
-    ) -> tuple[Array, Array, NDArray[np.int64]]:
-        """Noise-free depth image, cosine of incidence and surface part of each pixel.
+    ) -> tuple[Array, Array, Integers]:
+        """Noise-free depth along the optical axis [m], cosine of incidence and surface part of each pixel.
 
-        Parameters
-        ----------
-        pose : array_like, shape (4, 4)
-            Camera in the world.
-        q : array_like, shape (n,)
-
-        Returns
-        -------
-        depth : ndarray, shape (height, width)
-            Along the optical axis [m]; infinite where there is nothing.
-        cosine : ndarray, shape (height, width)
-            Of the angle between ray and surface normal.
-        part : ndarray of int, shape (height, width)
-            Index into `part_joints`, -1 where there is nothing.
+        All have shape (height, width): infinite, 0 and -1 where there is nothing. `pose` (4, 4) is in the world.
         """
         rays, camera = pinhole.pixel_rays, np.asarray(pose, float)
         size = rays.shape[:2]
@@ -335,40 +244,24 @@ class ArticulatedSurfaces:
             window = self._window(pinhole, rotation, origin, part)
             if window is None:
                 continue
-            rows, columns = window
-            directions = rays[rows, columns] @ rotation.T
+            directions = rays[window] @ rotation.T
             hit, normals = self._cast(part, origin, directions)
             square = np.abs((normals * directions).sum(-1)) / np.linalg.norm(directions, axis=-1)
-            nearer = hit < depth[rows, columns]
-            depth[rows, columns] = np.where(nearer, hit, depth[rows, columns])
-            cosine[rows, columns] = np.where(nearer, square, cosine[rows, columns])
-            owner[rows, columns] = np.where(nearer, part, owner[rows, columns])
+            nearer = hit < depth[window]
+            for image, own in ((depth, hit), (cosine, square), (owner, part)):
+                image[window] = np.where(nearer, own, image[window])
         return depth, cosine, owner
 
-    def intersect_rays(self, origin: Array, directions: Array, q: ArrayLike) -> tuple[Array, Array, NDArray[np.int64]]:
-        """First intersection of rays with moving or fixed surfaces.
+    def intersect_rays(self, origin: Array, directions: Array, q: ArrayLike) -> tuple[Array, Array, Integers]:
+        """First intersection of rays from one place (3,) in the world along directions (N, 3) with any surface.
 
-        Parameters
-        ----------
-        origin : ndarray, shape (3,)
-            Of all rays, in the world [m].
-        directions : ndarray, shape (N, 3)
-        q : array_like, shape (n,)
-
-        Returns
-        -------
-        distance : ndarray, shape (N,)
-            In lengths of the directions; infinite for rays that meet nothing.
-        normal : ndarray, shape (N, 3)
-            Unit vector of the surface, towards the origin.
-        part : ndarray of int, shape (N,)
-            Index into `part_joints`, -1 for nothing.
+        Distances (N,) in lengths of the directions, unit normals (N, 3) towards the origin, and parts (N,); infinite,
+        zero and -1 for rays that meet nothing.
         """
         distance, normal = np.full(len(directions), np.inf), np.zeros((len(directions), 3))
         owner = np.full(len(directions), -1)
         for part, pose in enumerate(self.part_poses_at(q)):
-            local = directions @ pose[:3, :3]
-            hit, normals = self._cast(part, (origin - pose[:3, 3]) @ pose[:3, :3], local)
+            hit, normals = self._cast(part, (origin - pose[:3, 3]) @ pose[:3, :3], directions @ pose[:3, :3])
             nearer = hit < distance
             distance[nearer], owner[nearer] = hit[nearer], part
             normal[nearer] = normals[nearer] @ pose[:3, :3].T
@@ -378,16 +271,14 @@ class ArticulatedSurfaces:
     def _cast(self, part: int, origin: Array, directions: Array) -> tuple[Array, Array]:
         """Distances in lengths of the directions, and normals, where rays of a part's frame meet it."""
         packed = np.concatenate([np.broadcast_to(origin, directions.shape), directions], axis=-1)
-        rays = import_open3d().core.Tensor(np.ascontiguousarray(packed, dtype=np.float32))
-        answer = self._scenes[part].cast_rays(rays, nthreads=1)
+        answer = self._scenes[part].cast_rays(_tensor(packed), nthreads=1)
         return answer["t_hit"].numpy().astype(np.float64), answer["primitive_normals"].numpy()
 
     def _window(
         self, pinhole: CameraIntrinsics, rotation: Array, origin: Array, part: int
     ) -> tuple[slice, slice] | None:
-        low, high = self._low[part], self._high[part]
-        corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
-        seen = (corners - origin) @ rotation
+        """Rows and columns of the image in which a part may be seen."""
+        seen = (np.array(list(product(*self._boxes[part].T))) - origin) @ rotation
         if (seen[:, 2] < _NEAR).all():
             return None
         if (seen[:, 2] < _NEAR).any() or pinhole.has_distortion:
@@ -399,8 +290,12 @@ class ArticulatedSurfaces:
         return (slice(top, bottom), slice(left, right)) if left < right and top < bottom else None
 
 
+def _tensor(values: NDArray[Any]) -> Any:
+    return import_open3d().core.Tensor(np.ascontiguousarray(values, dtype=np.float32))
+
+
 def load_robot_meshes(urdf: str | Path, mechanism: Mechanism, kind: MeshKind = "visual") -> dict[int, TriangleMesh]:
-    """Meshes of a robot's links by the joint that carries them.
+    """Meshes of a robot's links by the joint that carries them, -1 for what does not move, in the joint's frame.
 
     Parameters
     ----------
@@ -408,11 +303,6 @@ def load_robot_meshes(urdf: str | Path, mechanism: Mechanism, kind: MeshKind = "
         The URDF file, or `package:baxter`.
     mechanism : Mechanism
         That was read from it, alone or joined with others; numeric.
-
-    Returns
-    -------
-    dict of int to Mesh
-        In the frame of the joint, -1 for what does not move.
 
     Raises
     ------
@@ -430,43 +320,78 @@ def load_robot_meshes(urdf: str | Path, mechanism: Mechanism, kind: MeshKind = "
         raise ModelError(f"the URDF cannot be read: {error}", where=str(path)) from error
     parts: dict[int, list[TriangleMesh]] = {}
     for link in robot.robot.links:
-        if link.name not in mechanism.frames:
-            continue
-        frame = mechanism.frames[link.name]
-        placement = np.array(ca.DM(frame.placement.homogeneous_matrix()))
-        for shape in link.visuals if kind == "visual" else link.collisions:
-            origin = np.eye(4) if shape.origin is None else np.asarray(shape.origin, float)
-            mesh = _shape_mesh(shape.geometry, path)
+        for shape in (link.visuals if kind == "visual" else link.collisions) if link.name in mechanism.frames else ():
+            geometry, origin = shape.geometry, np.eye(4) if shape.origin is None else np.asarray(shape.origin, float)
+            tube = geometry.cylinder and (geometry.cylinder.radius, geometry.cylinder.length)
+            mesh = _solid(geometry.box and geometry.box.size, tube, geometry.sphere and geometry.sphere.radius)
+            if mesh is None and geometry.mesh is not None:
+                mesh = _load_mesh_file(_resolve_mesh_path(geometry.mesh.filename, path))
+                if geometry.mesh.scale is not None:
+                    mesh = replace(mesh, vertices=mesh.vertices * np.asarray(geometry.mesh.scale, float))
             if mesh is not None:
-                parts.setdefault(frame.joint_index, []).append(mesh.transformed(placement @ origin))
+                joint, placement = _carrier(mechanism, link.name)
+                parts.setdefault(joint, []).append(mesh.transformed(placement @ origin))
     if not parts:
         raise ModelError(f"the URDF has no {kind} meshes", where=str(path), hint="choose the other kind")
     return {joint: TriangleMesh.concatenate(entries) for joint, entries in parts.items()}
 
 
-def _shape_mesh(geometry: Any, urdf: Path) -> TriangleMesh | None:
-    if geometry.box is not None:
-        return TriangleMesh.box(geometry.box.size)
-    if geometry.cylinder is not None:
-        half = 0.5 * geometry.cylinder.length
-        return TriangleMesh.cylinder(geometry.cylinder.radius, -half, half)
-    if geometry.sphere is not None:
-        return TriangleMesh.sphere(geometry.sphere.radius)
-    if geometry.mesh is None:
-        return None
-    scale = np.ones(3) if geometry.mesh.scale is None else np.asarray(geometry.mesh.scale, float)
-    loaded = load_mesh_file(_resolve_mesh_path(geometry.mesh.filename, urdf))
-    return replace(loaded, vertices=loaded.vertices * scale)
+def _carrier(mechanism: Mechanism, frame: str) -> tuple[int, Array]:
+    """Joint that carries a frame, and the frame's pose in it."""
+    found = mechanism.frames[frame]
+    return found.joint_index, np.array(ca.DM(found.placement.homogeneous_matrix()))
+
+
+def _solid(box: ArrayLike | None, cylinder: tuple[float, float] | None, sphere: float | None) -> TriangleMesh | None:
+    """A box of a size, a cylinder of radius and length, or a sphere of a radius about the origin; None for none."""
+    if box is not None:
+        return TriangleMesh.box(box)
+    if cylinder is not None:
+        radius, length = cylinder
+        return TriangleMesh.cylinder(radius, -0.5 * length, 0.5 * length)
+    return None if sphere is None else TriangleMesh.sphere(sphere)
+
+
+def extra_meshes_by_joint(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> dict[int, list[TriangleMesh]]:
+    """Meshes that the URDF does not have, by the index of the joint that carries them, -1 for the world.
+
+    Raises
+    ------
+    ConfigError
+        No such link, or not exactly one shape.
+    ModelError
+        A file that cannot be read.
+    """
+    made: dict[int, list[TriangleMesh]] = {}
+    for number, entry in enumerate(extra):
+        where = f"model: extra_meshes: {number}"
+        given = [kind for kind in ("mesh", "box", "cylinder", "sphere") if getattr(entry, kind) is not None]
+        if len(given) != 1:
+            found = " and ".join(given) or "no shape"
+            raise ConfigError(f"there is {found}", where=where, allowed="one of mesh, box, cylinder, sphere")
+        mesh = _solid(entry.box, entry.cylinder, entry.sphere)
+        if mesh is None:
+            if not is_file(Path(str(entry.mesh))):
+                hint = "give a file that trimesh reads: STL, OBJ, DAE"
+                raise ModelError(f"there is no mesh '{entry.mesh}'", where=where, hint=hint)
+            mesh = _load_mesh_file(Path(str(entry.mesh)))
+        joint, placement = -1, np.eye(4)
+        if entry.parent_frame is not None:
+            if entry.parent_frame not in mechanism.frames:
+                hint = nearest_name_hint(entry.parent_frame, list(mechanism.frames))
+                raise ConfigError(f"there is no link '{entry.parent_frame}'", where=where, hint=hint)
+            joint, placement = _carrier(mechanism, entry.parent_frame)
+        pose = placement @ homogeneous_transform(rotation_from_rpy(*entry.rpy), entry.xyz)
+        made.setdefault(joint, []).append(mesh.transformed(pose))
+    return made
 
 
 @lru_cache(maxsize=64)
-def load_mesh_file(file: Path) -> TriangleMesh:
-    """Triangles of a file; `ModelError` where it cannot be read."""
+def _load_mesh_file(file: Path) -> TriangleMesh:
     import trimesh
 
     try:
-        loaded: Any = trimesh.load(file, force="mesh")
-        return TriangleMesh(np.asarray(loaded.vertices, float), np.asarray(loaded.faces, np.int64))
+        return TriangleMesh._of(trimesh.load(file, force="mesh"))
     except Exception as error:  # trimesh's readers raise many kinds
         raise ModelError(f"the mesh cannot be read: {error}", where=str(file)) from error
 
@@ -480,24 +405,24 @@ def _resolve_mesh_path(name: str, urdf: Path) -> Path:
         # the package's folder is the URDF's own or one above it, whether or not it still has its name
         parts = Path(package).parts
         candidates = [above / Path(*rest) for above in urdf.parents for rest in (parts, parts[1:]) if rest]
-    for candidate in candidates:
-        if candidate.is_file():
-            return candidate
-    raise ModelError(f"the mesh '{name}' is not there", where=str(urdf), hint="keep meshes beside the URDF's package")
+    found = next((candidate for candidate in candidates if candidate.is_file()), None)
+    if found is None:
+        hint = "keep meshes beside the URDF's package"
+        raise ModelError(f"the mesh '{name}' is not there", where=str(urdf), hint=hint)
+    return found
+
+
+def tube_sizes(system: System, values: Mapping[str, float] | None = None) -> dict[str, tuple[Array, float]]:
+    """Lengths of the links and radius of every tube, by segment [m]."""
+    symbols, theta = system.parameters.symbols, system.parameters.vector(values)
+    sizes = [ca.densify(ca.vertcat(*s.link_lengths, s.radius)) for s in system.segment_layouts]
+    numbers = [np.array(entry).ravel() for entry in ca.Function("sizes", [symbols], sizes).call([theta])]
+    names = [segment.name for segment in system.segment_layouts]
+    return {name: (entry[:-1], float(entry[-1])) for name, entry in zip(names, numbers, strict=True)}
 
 
 def tube_meshes_by_joint(system: System, values: Mapping[str, float] | None = None) -> dict[int, TriangleMesh]:
-    """Cylinders along the links of the object's tubes, with balls at the joints between them.
-
-    Parameters
-    ----------
-    values : mapping of str to float, optional
-        Parameter values (lengths, radii); nominal where absent.
-
-    Returns
-    -------
-    dict of int to Mesh
-        By joint index, in the joint's frame.
+    """Cylinders along the links of the object's tubes, with balls at the joints between them, in the joints' frames.
 
     Raises
     ------
@@ -506,16 +431,10 @@ def tube_meshes_by_joint(system: System, values: Mapping[str, float] | None = No
     """
     if not system.segment_layouts:
         raise DataError("the model has no object to see", hint="give it segments")
-    symbols, theta = system.parameters.symbols, system.parameters.vector(values)
-
-    def number(expression: ca.SX) -> float:
-        return float(ca.Function("number", [symbols], [expression])(theta))
-
     meshes: dict[int, TriangleMesh] = {}
-    for segment in system.segment_layouts:
-        radius = number(segment.radius)
-        for i, (names, length) in enumerate(zip(segment.link_joints, segment.link_lengths, strict=True)):
-            parts = [TriangleMesh.cylinder(radius, 0.0, number(length))]
+    for segment, (lengths, radius) in zip(system.segment_layouts, tube_sizes(system, values).values(), strict=True):
+        for i, (names, length) in enumerate(zip(segment.link_joints, lengths, strict=True)):
+            parts = [TriangleMesh.cylinder(radius, 0.0, float(length))]
             if i or segment.parent_segment is not None:
                 parts.append(TriangleMesh.sphere(radius))
             meshes[system.mechanism.joint_index(names[-1])] = TriangleMesh.concatenate(parts)

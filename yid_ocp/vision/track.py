@@ -1,8 +1,7 @@
 """Tracking of an object's points in a frame sequence: filter, skeleton, shape fit and selection of frames.
 
-A first pass over some frames finds what is common to the sequence (`calibration`). A second one takes frame by frame
-and keeps no cloud; every frame ends as a fitted shape or with the reason why it was dropped, and nothing in one frame
-stops the sequence. What is left is small and judged in the end (`judgement`).
+A first pass over some frames finds what is common to the sequence. A second one takes frame by frame and keeps no
+cloud; every frame ends as a fitted shape or with the reason why it was dropped.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +45,6 @@ from yid_ocp.vision.point_cloud import (
     extract_skeleton,
     has_any_colour,
     is_not_outlier,
-    is_not_robot,
     voxel_averages,
 )
 from yid_ocp.vision.sequence_calibration import (
@@ -54,7 +53,6 @@ from yid_ocp.vision.sequence_calibration import (
     ForeignObject,
     SequenceCalibration,
     check_dimensions,
-    extra_meshes_by_joint,
     group_foreign_objects,
 )
 from yid_ocp.vision.shape_evidence import CloudObservation, FrameShapeFit
@@ -62,6 +60,7 @@ from yid_ocp.vision.surface_meshes import (
     ArticulatedSurfaces,
     CameraScene,
     TriangleMesh,
+    extra_meshes_by_joint,
     load_robot_meshes,
     numeric_mechanism,
 )
@@ -86,7 +85,6 @@ def track_object(
     sequence: FrameSequence,
     options: TrackOptions | None = None,
     *,
-    stages: Sequence[int] = (),
     empty: FrameSequence | None = None,
     progress: _ProgressCallback | None = None,
 ) -> TrackResult:
@@ -94,13 +92,11 @@ def track_object(
 
     Parameters
     ----------
-    scene : Scene
+    scene : CameraScene
         Robot and object; joints that are not elastic must be in the recording. Without a URDF file there is no
         self-filter and no clock offset.
     recording : Recording or None
         Joint angles, for the self-filter, the grasps and the clock; None where the model has no robot.
-    stages : sequence of int
-        Frames of the frame sequence of which all stages are kept for pictures, as far as they can be read.
     empty : FrameSequence, optional
         Frames of the scene without robot and object, by the same camera: a background.
     progress : callable, optional
@@ -124,9 +120,7 @@ def track_object(
         told(done, total, f"fitting {sequence.frame_names[i]}")
         frames.append(tracker.track_frame(i, common))
     told(total, total, "done")
-    found = tracker.to_track_result(*tracker.reject_outlying_frames(frames), common)
-    drawn = (tracker.frame_stages(frame, common) for frame in found.frame_reports if frame.index in stages)
-    return replace(found, frame_stages=tuple(entry for entry in drawn if entry is not None))
+    return tracker.to_track_result(*tracker.reject_outlying_frames(frames), common)
 
 
 @dataclass(eq=False)
@@ -137,14 +131,18 @@ class _Work:
     filtered: WeightedCloud | None = None
     skeleton: CloudSkeleton | None = None
 
+    def say(self, **changes: Any) -> None:
+        """Fill in fields of the report."""
+        self.report = replace(self.report, **changes)
+
 
 @dataclass(frozen=True, eq=False)
 class _Look:
     """What a frame shows, once for every way in which it may, the robot's configuration, and where searches begin."""
 
-    sights: tuple[CloudObservation, ...]
+    sights: Sequence[CloudObservation]
     q: Array
-    starts: tuple[tuple[Array, ...], ...]
+    starts: Sequence[Sequence[Array]]
 
 
 class FrameTracker:
@@ -199,9 +197,12 @@ class FrameTracker:
             meshes[joint] = TriangleMesh.concatenate([*([meshes[joint]] if joint in meshes else []), *extra])
         self.robot_surfaces = ArticulatedSurfaces(tree, meshes) if meshes else None
         self.arm_surface: ArmSurface | None = None
+        self._widest = float(self.shape_fitter.link_radii.max())
         if self.robot_surfaces is not None and self.joint_time_span is not None and scene.robot_urdf is not None:
-            grip, held_at = float(self.shape_fitter.link_radii.max()) + _GRIP, self.shape_fitter.gripper_positions_at
-            self.arm_surface = ArmSurface(self.robot_surfaces, self.configuration_at_rest, held_at, grip)
+            held_at = self.shape_fitter.gripper_positions_at
+            self.arm_surface = ArmSurface(
+                self.robot_surfaces, self.configuration_at_rest, held_at, self._widest + _GRIP
+            )
         self.frame_order, self._reasons = _by_stamp(sequence.stamps)
         usable = [i for i in self.frame_order if i not in self._reasons]
         self._check_clock(usable)
@@ -210,7 +211,7 @@ class FrameTracker:
             raise DataError("the clouds have no colours", where=sequence.source, hint=hint)
         self._asked = _spread(usable, _ASKED)
         self._shapes: dict[tuple[float, ...], ShapeFitter] = {(): self.shape_fitter}
-        self.calibration_frames = _spread(usable, options.calibration.n_frames) if self.arm_surface is not None else []
+        self.calibration_frames = _spread(usable, options.calibration.n_frames) if self.arm_surface is not None else ()
 
     def configuration_at_rest(self, t: float) -> Array:
         """Configuration at a time on the joints' clock with the object at rest; constant beyond the recording."""
@@ -229,7 +230,7 @@ class FrameTracker:
         if self.empty_scene is not None:
             seen = (self._finite(self.empty_scene, i)[0] for i in range(len(self.empty_scene)))
             clouds = [calibration.camera_state.to_world(points) for points in seen]
-            background = BackgroundPoints.from_empty_scene(clouds, filters.voxel_size, noise)
+            background = BackgroundPoints.from_static_points(clouds, filters.voxel_size, noise)
         looks = [look for i in self._asked if (look := self._look(i, calibration, background)[1]) is not None]
         last: list[tuple[ShapeFitter, FrameShapeFit]] = []
 
@@ -251,11 +252,9 @@ class FrameTracker:
         if self.options.background_estimation == "frames":
             shapes = [shape.tubes_at(fit.q) for shape, fit in last if not rejection_reason(fit, shape, self.options)]
             clouds = [look.sights[0].points for look in looks]
-            found = BackgroundPoints.from_static_points(
-                clouds, shapes, 2 * filters.voxel_size, noise, self.shape_fitter.max_informative_distance
-            )
-            points = np.concatenate([found.points, background.points])
-            background = BackgroundPoints(points, max(found.match_distance, background.match_distance))
+            near = self.shape_fitter.max_informative_distance
+            found = BackgroundPoints.from_static_points(clouds, 2 * filters.voxel_size, noise, shapes, near)
+            background = found.joined(background)
         return SequenceCalibration(calibration, sizes, background)
 
     def _calibration(self, progress: Callable[[int, str], None]) -> CameraCalibration:
@@ -302,17 +301,14 @@ class FrameTracker:
         self, q: Array, calibration: CameraCalibration, background: BackgroundPoints
     ) -> Callable[[Array], Mask]:
         """Which places the filters leave no points of, the robot at a configuration."""
-        region, padding = (
-            self.object_region.bounds_at(q, calibration.camera_position),
-            self.options.filters.robot_padding,
-        )
-        within = padding + float(self.shape_fitter.link_radii.max())
+        region = self.object_region.bounds_at(q, calibration.camera_position)
+        within = self.options.filters.robot_padding + self._widest
 
         def removed(places: Array) -> Mask:
-            gone = ~region.contains(places)
+            gone = ~region.contains(places) | background.contains(places, self._widest)
             if self.robot_surfaces is not None:
                 gone |= self.robot_surfaces.is_within_distance(places, q, within)
-            return gone | background.contains(places, float(self.shape_fitter.link_radii.max()))
+            return gone
 
         return removed
 
@@ -377,15 +373,18 @@ class FrameTracker:
         """Tracking result of the frames; `DataError` if none is good."""
         columns = [self.system.point_frames.index(name) for name in self.point_names]
         things = self.foreign_objects(frames)
-        points = tracked_points(frames, columns, common, things, self.options, self.sequence.source)
-        measured = points.t, points.q, points.position, points.std, points.shared_std
-        camera, dimensions, place = (
-            common.camera_calibration,
-            common.dimensions,
-            self._shape(common.dimensions).points_at,
+        measured = tracked_points(frames, columns, common, things, self.options, self.sequence.source)
+        place = self._shape(common.dimensions).points_at
+        return TrackResult(
+            self.point_names,
+            *measured,
+            frame_reports=tuple(frames),
+            camera_calibration=common.camera_calibration,
+            dimensions=common.dimensions,
+            foreign_objects=things,
+            root_note=note,
+            _place=lambda q: place(q)[columns],
         )
-        shown, names, seen = (), self.point_names, self.system.point_frames
-        return TrackResult(names, *measured, tuple(frames), camera, dimensions, things, note, shown, seen, place)
 
     def foreign_objects(self, frames: Sequence[FrameReport]) -> tuple[ForeignObject, ...]:
         """Foreign objects seen in the fitted frames."""
@@ -393,19 +392,22 @@ class FrameTracker:
         if not fitted:
             return ()
         corners = np.concatenate([fit.link_ends.reshape(-1, 3) for _, fit in fitted])
-        radius = float(self.shape_fitter.link_radii.max())
-        box = corners.min(axis=0) - radius, corners.max(axis=0) + radius
+        box = corners.min(axis=0) - self._widest, corners.max(axis=0) + self._widest
         seen, noise = [(t, fit.foreign_clusters) for t, fit in fitted], self.options.shape_fit.surface_noise_std
         coloured, still = self.sequence.load_colours is not None, self.options.background_estimation == "frames"
-        return group_foreign_objects(seen, len(fitted), noise, box, self._links, coloured, still)
+        return group_foreign_objects(seen, noise, box, self._links, coloured, still)
 
     def _links(self, t: float) -> dict[str, Array]:
-        """Poses of what moves with the robot at a time, by the names of the joints."""
+        """Poses of what moves with the robot at a time, by the names of the links."""
         if self.robot_surfaces is None:
             return {}
         poses = self.robot_surfaces.part_poses_at(self.configuration_at_rest(t))
-        names, joints = self.system.mechanism.joint_names, self.robot_surfaces.part_joints
-        return {_link_of(self.system, names[j]): pose for j, pose in zip(joints, poses, strict=True) if j >= 0}
+        tree, found = self.system.mechanism, {}
+        for joint, pose in zip(self.robot_surfaces.part_joints, poses, strict=True):
+            if joint >= 0:  # a frame beside the joint's moving side has its link's name, as far as the model has it
+                frames = (name for name, frame in tree.frames.items() if frame.joint_index == joint)
+                found[next(frames, tree.joint_names[joint])] = pose
+        return found
 
     def _work(self, index: int, common: SequenceCalibration) -> _Work:
         work, look = self._look(index, common.camera_calibration, common.background)
@@ -421,8 +423,7 @@ class FrameTracker:
             reason = "the object crosses or touches itself"
         other = fits[1] if len(fits) > 1 and fits[1].mean_distance < _AS_GOOD * fits[0].mean_distance else None
         spent = work.report.cpu_seconds + time.process_time() - begun
-        work.report = replace(work.report, shape_fit=fits[0], alternative_fit=other, cpu_seconds=spent)
-        work.report = replace(work.report, drop_reason=reason)
+        work.say(shape_fit=fits[0], alternative_fit=other, cpu_seconds=spent, drop_reason=reason)
         return work
 
     def _look(
@@ -433,38 +434,39 @@ class FrameTracker:
         try:
             return work, None if work.report.drop_reason else self._prepared(work, calibration, background)
         except DataError as error:
-            work.report = replace(work.report, drop_reason=error.what)
+            work.say(drop_reason=error.what)
             return work, None
 
     def _prepared(self, work: _Work, calibration: CameraCalibration, background: BackgroundPoints) -> _Look:
         """What a frame shows of the object; `DataError` with the reason why it is dropped."""
         options, index, stamp, t = self.options, work.report.index, work.report.stamp, work.report.joint_time
         cloud, raw = self._read(index, calibration)
-        work.report = replace(work.report, n_raw_points=len(raw))
+        work.say(n_raw_points=len(raw))
         if self.joint_time_span is not None and not self.joint_time_span[0] <= t <= self.joint_time_span[1]:
             raise DataError("there are no joint angles at its time")
         rng = np.random.default_rng([options.seed, index])
-        usual = calibration.on_time_frames
-        if self.arm_surface is not None and usual is not None:
-            state, typical = calibration.camera_state, usual.median_square_distance
+        typical = calibration.usual_square_distance
+        if self.arm_surface is not None and typical is not None:
+            state = calibration.camera_state
             own = estimate_stamp_delay(self.arm_surface, state, stamp, cloud.points, rng, typical)
             if own is not None and math.isfinite(own.std):
-                work.report = replace(work.report, stamp_delay=own.delay)
+                work.say(stamp_delay=own.delay)
                 if is_stamped_late(own, options.clock):
                     raise DataError(f"its stamp is late: by {1e3 * own.delay:.0f} ms")
         q = self.configuration_at_rest(t)
         filters, kept = options.filters, np.ones(len(cloud), bool)
         if self.robot_surfaces is not None:
-            kept = is_not_robot(cloud, self.robot_surfaces, q, filters.robot_padding)
+            kept = ~self.robot_surfaces.is_within_distance(cloud.points, q, filters.robot_padding)
         kept[kept] = ~background.contains(cloud.points[kept])
         # beside the robot's points: among all surfaces, wrong points are few
         cloud = cloud.select(is_not_outlier(cloud, filters.outlier_neighbours, filters.outlier_z_max, kept))
-        work.filtered, work.report = cloud, replace(work.report, n_filtered_points=len(cloud))
+        work.filtered = cloud
+        work.say(n_filtered_points=len(cloud))
         if len(cloud) < filters.min_points:
             raise DataError(f"too few points of the object: {len(cloud)} left")
         if len(cloud) > filters.max_points:
             cloud = cloud.select(np.sort(rng.choice(len(cloud), filters.max_points, replace=False)))
-            work.report = replace(work.report, n_filtered_points=len(cloud))
+            work.say(n_filtered_points=len(cloud))
         begun = time.process_time()
         view = OcclusionMap(raw, calibration.camera_state.pose, self.sequence.intrinsics, cloud.points)
         given = calibration.camera_position, view, self._removed(q, calibration, background)
@@ -472,13 +474,14 @@ class FrameTracker:
             look = self._held(work, cloud, q, rng, given)
         else:
             look = self._anywhere(self.initial_shape_finder, work, cloud, rng, given)
-        work.report = replace(work.report, cpu_seconds=time.process_time() - begun)
+        work.say(cpu_seconds=time.process_time() - begun)
         return look
 
     def _held(self, work: _Work, cloud: WeightedCloud, q: Array, rng: np.random.Generator, given: _Given) -> _Look:
         """What is seen of an object whose root is where the model has it."""
         found = extract_skeleton(cloud, rng, self.options.skeleton)
-        work.skeleton, work.report = found, replace(work.report, n_skeleton_nodes=len(found.nodes))
+        work.skeleton = found
+        work.say(n_skeleton_nodes=len(found.nodes))
         if not len(found.nodes):
             raise DataError("no part of the cloud is dense enough for a skeleton")
         work.filtered = rest = cloud.select(found.has_node)
@@ -488,9 +491,10 @@ class FrameTracker:
         self, starts: InitialShapeFinder, work: _Work, cloud: WeightedCloud, rng: np.random.Generator, given: _Given
     ) -> _Look:
         """What is seen of an object whose root is sought, with the ends that it may have where."""
-        diameter, options = 2.0 * float(self.shape_fitter.link_radii.max()), self.options
+        diameter, options = 2.0 * self._widest, self.options
         course = trace_centerline(cloud, diameter, options.skeleton.max_edge_length, rng)
-        work.skeleton, work.report = course.to_skeleton, replace(work.report, n_skeleton_nodes=len(course.nodes))
+        work.skeleton = course.to_skeleton
+        work.say(n_skeleton_nodes=len(course.nodes))
         if len(course.loop_positions):
             raise DataError("the object crosses or touches itself: its cloud closes a loop")
         found = starts.find_initial_shapes(course)
@@ -500,17 +504,9 @@ class FrameTracker:
             found = [start for start in found if np.array_equal(start.root_position, near)]
         own = cKDTree(course.nodes).query(cloud.points)[0] < 2.0 * diameter
         work.filtered = rest = cloud.select(own)
-        sights = tuple(
-            CloudObservation(rest.points, rest.point_weights, course.nodes, *given, end_anchors=start.end_anchors)
-            for start in found
-        )
-        return _Look(sights, self.shape_fitter.rest_configuration, tuple((start.q,) for start in found))
-
-
-def _link_of(system: System, joint: str) -> str:
-    """Name of a frame that stands still beside a joint's moving side: its link, as far as the model has it."""
-    index = system.mechanism.joint_index(joint)
-    return next((name for name, frame in system.mechanism.frames.items() if frame.joint_index == index), joint)
+        seen = rest.points, rest.point_weights, course.nodes, *given
+        sights = [CloudObservation(*seen, start.end_anchors) for start in found]
+        return _Look(sights, self.shape_fitter.rest_configuration, [(start.q,) for start in found])
 
 
 def _chosen_points(system: System, wanted: tuple[str, ...] | None) -> tuple[str, ...]:
@@ -542,15 +538,7 @@ def _joint_angles(
             where, hint = f"{recording.name}: joints", nearest_name_hint(name, joints.names)
             raise DataError(f"joint '{name}' of the model is not recorded", where=where, hint=hint)
     t, position = joints.t, joints.position[:, [joints.names.index(name) for name in known]]
-
-    def angles(at: float) -> Array:
-        if len(t) == 1:
-            return np.array(position[0])
-        after = int(np.clip(np.searchsorted(t, at), 1, len(t) - 1))
-        share = float(np.clip((at - t[after - 1]) / (t[after] - t[after - 1]), 0.0, 1.0))
-        return np.asarray((1 - share) * position[after - 1] + share * position[after])
-
-    return (float(t[0]), float(t[-1])), angles
+    return (float(t[0]), float(t[-1])), lambda at: np.array([np.interp(at, t, column) for column in position.T])
 
 
 def _by_stamp(stamps: Array) -> tuple[tuple[int, ...], dict[int, str]]:

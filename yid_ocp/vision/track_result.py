@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -88,9 +88,7 @@ class TrackResult:
     dimensions: DimensionCheck  # what the frames say of the object's lengths and radii
     foreign_objects: tuple[ForeignObject, ...]  # what stood about the object
     root_note: str  # how the root was told from other ends; empty where the model says where it is
-    frame_stages: tuple[FrameStages, ...]  # of the frames that were asked for and turned out well
-    _system_points: tuple[str, ...]
-    _place: Callable[[Array], Array]
+    _place: Callable[[Array], Array]  # from a configuration to the points
 
     def configuration_at(self, t: float) -> Array:
         """Configuration at any time between the good frames, by a cubic spline through theirs, shape (n,).
@@ -104,7 +102,7 @@ class TrackResult:
 
     def points_at(self, t: float) -> Array:
         """Positions of the tracked points at any time, by the kinematics of `configuration_at`, shape (np, 3) [m]."""
-        return self._place(self.configuration_at(t))[[self._system_points.index(name) for name in self.point_names]]
+        return self._place(self.configuration_at(t))
 
     @property
     def drop_reason_counts(self) -> dict[str, int]:
@@ -141,22 +139,15 @@ class TrackResult:
 
 _MOST = 12000  # points in one picture: more hide each other
 _GREY, _BLUE, _ORANGE, _GREEN = "#9a9a9a", "#1f5fa8", "#e07a1f", "#2a8f4f"
-_STAGE_NAMES = ("cloud", "filtered", "skeleton", "graph", "fit")
-"""The pictures of one frame, in order."""
+_Picture = tuple[str, str, Sequence[tuple[Array, str, float]], Sequence[Array], str]
+"""Name and title of a picture, points with colour and size, lines (2, 3) and their colour."""
 
 
 def draw_frame_stages(stages: FrameStages, folder: str | os.PathLike[str]) -> list[Path]:
     """Write one picture for every stage that a frame came to: cloud, filtered, skeleton, graph, fit.
 
-    Parameters
-    ----------
-    folder : path-like
-        Made where it does not exist.
-
-    Returns
-    -------
-    list of Path
-        `NAME_1_cloud.png` to `NAME_5_fit.png`; the title of the last one says why the frame was dropped.
+    They are `NAME_1_cloud.png` to `NAME_5_fit.png` in the folder, which is made; the title of the last one says why the
+    frame was dropped.
 
     Raises
     ------
@@ -172,68 +163,65 @@ def draw_frame_stages(stages: FrameStages, folder: str | os.PathLike[str]) -> li
     parts += [] if stages.shape_fit is None else [stages.shape_fit.link_ends.reshape(-1, 3)]
     near = np.concatenate([np.empty((0, 3)), *parts])
     stem = "".join(letter if letter.isalnum() else "_" for letter in Path(stages.frame_name).stem)
-    written = []
-    drawings = _drawings(stages)
-    for number, (name, (title, draw)) in enumerate(zip(_STAGE_NAMES, drawings, strict=False), start=1):
+    written, pictures = [], _pictures(stages)
+    for number, picture in enumerate(pictures, start=1):
+        name, title = picture[:2]
         target = path / f"{stem}_{number}_{name}.png"
         frame = stages.raw_points if name == "cloud" or not len(near) else near
-        ended = f"\n{stages.drop_reason}" if number == len(drawings) and stages.drop_reason else ""
-        _write(target, f"{stages.frame_name}: {title}{ended}", frame, stages.camera_position, draw)
+        ended = f"\n{stages.drop_reason}" if number == len(pictures) and stages.drop_reason else ""
+        _write(target, f"{stages.frame_name}: {title}{ended}", frame, stages.camera_position, picture)
         written.append(target)
     return written
 
 
-def _drawings(stages: FrameStages) -> list[tuple[str, Callable[[Any], None]]]:
-    """Title and drawing of every stage that the frame came to, in the order of `_STAGE_NAMES`."""
-    rng = np.random.default_rng(0)
-    near, skeleton, fit = stages.filtered_points, stages.skeleton, stages.shape_fit
-
-    def cloud(axes: Any) -> None:
-        _scatter(axes, _some(stages.raw_points, rng), _GREY, 0.4)
-
-    made: list[tuple[str, Callable[[Any], None]]] = [(f"{len(stages.raw_points)} points of the camera", cloud)]
+def _pictures(stages: FrameStages) -> list[_Picture]:
+    """The pictures of every stage that the frame came to, in order."""
+    raw, near, skeleton, fit = stages.raw_points, stages.filtered_points, stages.skeleton, stages.shape_fit
+    made: list[_Picture] = [("cloud", f"{len(raw)} points of the camera", [(raw, _GREY, 0.4)], [], "")]
     if near is None:
         return made
-
-    def filtered(axes: Any) -> None:
-        _scatter(axes, _some(near, rng), _BLUE, 1.5)
-
-    made.append((f"{len(near)} points of the object", filtered))
+    made.append(("filtered", f"{len(near)} points of the object", [(near, _BLUE, 1.5)], [], ""))
     if skeleton is None:
         return made
-
-    def nodes(axes: Any) -> None:
-        _scatter(axes, _some(near, rng), _GREY, 0.4)
-        _scatter(axes, skeleton.nodes, _ORANGE, 14)
-
-    def graph(axes: Any) -> None:
-        _scatter(axes, skeleton.nodes, _ORANGE, 14)
-        for a, b in skeleton.edges:
-            axes.plot(*skeleton.nodes[[a, b]].T, color=_BLUE, linewidth=1.2)
-
-    made.append((f"{len(skeleton.nodes)} nodes of the walk", nodes))
-    parts = len(set(skeleton.component_of_node.tolist()))
-    made.append((f"{len(skeleton.edges)} edges, {parts} connected parts", graph))
+    faint, nodes, edges = (near, _GREY, 0.4), (skeleton.nodes, _ORANGE, 14.0), skeleton.nodes[skeleton.edges]
+    made.append(("skeleton", f"{len(skeleton.nodes)} nodes of the walk", [faint, nodes], [], ""))
+    title = f"{len(edges)} edges, {len(set(skeleton.component_of_node.tolist()))} connected parts"
+    made.append(("graph", title, [nodes], list(edges), _BLUE))
     if fit is None:
         return made
+    title = f"fitted shape, {1e3 * fit.mean_distance:.1f} mm off on average"
+    places = [faint, (fit.link_ends.reshape(-1, 3), _GREEN, 18.0), (fit.point_positions, _ORANGE, 40.0)]
+    return [*made, ("fit", title, places, list(fit.link_ends), _GREEN)]
 
-    def shape(axes: Any) -> None:
-        _scatter(axes, _some(near, rng), _GREY, 0.4)
-        for link in fit.link_ends:
-            axes.plot(*link.T, color=_GREEN, linewidth=2.5)
-        _scatter(axes, fit.link_ends.reshape(-1, 3), _GREEN, 18)
-        _scatter(axes, fit.point_positions, _ORANGE, 40)
 
-    return [*made, (f"fitted shape, {1e3 * fit.mean_distance:.1f} mm off on average", shape)]
+def _write(path: Path, title: str, frame: Array, camera: Array, picture: _Picture) -> None:
+    figure = Figure(figsize=(6.4, 6.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes: Any = figure.add_subplot(projection="3d")
+    _, _, places, lines, line_colour = picture
+    rng = np.random.default_rng(0)
+    for points, colour, size in places:
+        shown = points if len(points) <= _MOST else points[rng.choice(len(points), _MOST, replace=False)]
+        axes.scatter(*shown.T, s=size, c=colour, linewidths=0, depthshade=False)
+    for line in lines:
+        axes.plot(*line.T, color=line_colour, linewidth=1.2 if line_colour == _BLUE else 2.5)
+    low, high = np.percentile(frame, 0.5, axis=0) - 0.02, np.percentile(frame, 99.5, axis=0) + 0.02
+    middle, half = 0.5 * (low + high), 0.5 * float((high - low).max())
+    limits = np.column_stack([middle - half, middle + half])
+    axes.set(xlim=limits[0], ylim=limits[1], zlim=limits[2], xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+    axes.set_box_aspect((1, 1, 1))
+    away = camera - middle
+    # beside the camera's own view, where depth shows
+    axes.view_init(elev=18, azim=float(np.degrees(np.arctan2(away[1], away[0]))) + 35)
+    axes.set_title(title, fontsize=10)
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=110)
 
 
 def draw_track(track: TrackResult, file: str | os.PathLike[str]) -> None:
     """Write a picture of the points over time: the good frames with two standard deviations, and the spline between.
 
-    Raises
-    ------
-    OutputError
-        The file cannot be written.
+    `OutputError` where the file cannot be written.
     """
     figure = Figure(figsize=(9, 2.2 * len(track.point_names) + 0.8), layout="constrained")
     FigureCanvasAgg(figure)
@@ -256,30 +244,4 @@ def draw_track(track: TrackResult, file: str | os.PathLike[str]) -> None:
     axes[0].set_title(f"{said}\n{track.camera_calibration.message}", fontsize=9)
     axes[-1].set_xlabel("t [s]")
     with atomic_write(Path(file)) as temporary:
-        figure.savefig(temporary, format="png", dpi=110)
-
-
-def _some(points: Array, rng: np.random.Generator) -> Array:
-    return points if len(points) <= _MOST else points[rng.choice(len(points), _MOST, replace=False)]
-
-
-def _scatter(axes: Any, points: Array, colour: str, size: float) -> None:
-    axes.scatter(*points.T, s=size, c=colour, linewidths=0, depthshade=False)
-
-
-def _write(path: Path, title: str, frame: Array, camera: Array, draw: Callable[[Any], None]) -> None:
-    figure = Figure(figsize=(6.4, 6.4), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot(projection="3d")
-    draw(axes)
-    low, high = np.percentile(frame, 0.5, axis=0) - 0.02, np.percentile(frame, 99.5, axis=0) + 0.02
-    middle, half = 0.5 * (low + high), 0.5 * float((high - low).max())
-    limits = np.column_stack([middle - half, middle + half])
-    axes.set(xlim=limits[0], ylim=limits[1], zlim=limits[2], xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
-    axes.set_box_aspect((1, 1, 1))
-    away = camera - middle
-    # beside the camera's own view, where depth shows
-    axes.view_init(elev=18, azim=float(np.degrees(np.arctan2(away[1], away[0]))) + 35)
-    axes.set_title(title, fontsize=10)
-    with atomic_write(path) as temporary:
         figure.savefig(temporary, format="png", dpi=110)

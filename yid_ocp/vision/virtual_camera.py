@@ -1,8 +1,6 @@
 """A virtual depth camera: clouds of a robot and its object as a structured-light sensor would see them.
 
-The pattern's shift is a disparity d = f b / z [pixels]. Its noise and its steps are even in d, so that in depth both
-grow with the square of the distance: dz = z^2/(f b) dd. Pixels are lost where the surface is seen at a grazing angle,
-at edges, and where the projector's light does not reach; some at edges mix front and back.
+Noise and steps are even in the pattern's disparity d = f b / z [pixels]; in depth they are dz = z^2/(f b) dd.
 
 References
 ----------
@@ -59,24 +57,10 @@ class DepthCamera:
     outlier_probability: float = 0.0
     outlier_depth_range: float = 0.4  # [m], to either side of the true depth
 
-    def depth_std(self, depth: ArrayLike) -> Array:
-        """Standard deviation of a measured depth, noise and steps together [m]:  z^2/(f b) sqrt(std^2 + step^2/12)."""
-        z = np.asarray(depth, float)
-        spread = math.hypot(self.disparity_std, self.disparity_step / math.sqrt(12.0))
-        return np.asarray(z**2 / (self.intrinsics.fx * self.baseline) * spread)
-
     def simulate_depth_image(self, depth: Array, cosine: Array, rng: np.random.Generator) -> Array:
-        """Simulated measurement of a depth image, with noise and lost pixels.
+        """Measured depth image [m], NaN where nothing was measured.
 
-        Parameters
-        ----------
-        depth, cosine : ndarray, shape (height, width)
-            True depth [m], infinite where there is nothing; cosine of ray and normal.
-
-        Returns
-        -------
-        ndarray, shape (height, width)
-            [m]; NaN where nothing was measured.
+        From the true one [m], infinite where there is nothing, and the cosine of ray and normal, all (height, width).
         """
         scale = self.intrinsics.fx * self.baseline
         shape = depth.shape
@@ -164,39 +148,34 @@ class FloorAndWall:
     floor_height: float | None = -0.93
     wall_position: float | None = -0.6
 
-    def to_mesh(self) -> TriangleMesh | None:
-        """Mesh of floor and wall as thin boxes; None if there is neither."""
-        boxes = []
-        if self.floor_height is not None:
-            boxes.append(([8.0, 8.0, 0.02], [1.0, 0.0, self.floor_height - 0.01]))
-        if self.wall_position is not None:
-            boxes.append(([0.02, 8.0, 3.0], [self.wall_position - 0.01, 0.0, 0.5]))
-        parts = [TriangleMesh.box(size).transformed(homogeneous_transform(np.eye(3), at)) for size, at in boxes]
-        return TriangleMesh.concatenate(parts) if parts else None
+    def _meshes(self) -> list[TriangleMesh]:
+        """Thin boxes."""
+        floor, wall = self.floor_height, self.wall_position
+        boxes = [] if floor is None else [([8.0, 8.0, 0.02], [1.0, 0.0, floor - 0.01])]
+        boxes += [] if wall is None else [([0.02, 8.0, 3.0], [wall - 0.01, 0.0, 0.5])]
+        return [TriangleMesh.box(size).transformed(homogeneous_transform(np.eye(3), at)) for size, at in boxes]
 
 
 @dataclass(eq=False)
 class _Images(Sequence[Array]):
-    """Depth images, each rendered from its own seed when it is asked for; the last one is kept."""
+    """Depth images at some configurations, each made from its own seed when asked for; the last one is kept."""
 
     surfaces: ArticulatedSurfaces
     camera: DepthCamera
     pose: Array
     q: Array
     seed: int
-    _kept: dict[int, Array] = field(default_factory=dict)
+    _kept: tuple[int | None, Array] = (None, np.empty(0))
 
     def __len__(self) -> int:
         return len(self.q)
 
     def __getitem__(self, index):  # type: ignore[no-untyped-def]
-        number = int(index)
-        if number not in self._kept:
-            self._kept.clear()
-            depth, cosine, _ = self.surfaces.render_depth_image(self.camera.intrinsics, self.pose, self.q[number])
-            rng = np.random.default_rng([self.seed, number])
-            self._kept[number] = self.camera.simulate_depth_image(depth, cosine, rng)
-        return self._kept[number]
+        if self._kept[0] != index:
+            depth, cosine, _ = self.surfaces.render_depth_image(self.camera.intrinsics, self.pose, self.q[index])
+            rng = np.random.default_rng([self.seed, index])
+            self._kept = index, self.camera.simulate_depth_image(depth, cosine, rng)
+        return self._kept[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,20 +191,9 @@ class VirtualCamera:
 
 
 def render_virtual_frames(scene: CameraScene, t: ArrayLike, q: ArrayLike, camera: VirtualCamera) -> VirtualFrames:
-    """Render the frames that a virtual camera takes of a motion.
+    """Render the frames that a virtual camera takes of a motion, when they are loaded and the same every time.
 
-    Parameters
-    ----------
-    scene : Scene
-        The object, and the robot whose meshes are seen where a URDF is given.
-    t : array_like, shape (N,) [s]
-    q : array_like, shape (N, n)
-        Configurations at these times, from whatever simulator; interpolated by a cubic spline in between.
-
-    Returns
-    -------
-    VirtualFrames
-        Frames are rendered when they are loaded, the same every time.
+    Configurations (N, n) at times (N,) [s] come from whatever simulator; between them a cubic spline interpolates.
 
     Raises
     ------
@@ -237,24 +205,13 @@ def render_virtual_frames(scene: CameraScene, t: ArrayLike, q: ArrayLike, camera
     taken, stamps = camera.timing.sample_times_and_stamps(float(times[0]), float(times[-1]), rng)
     course = CubicSpline(times, path, axis=0)
     configuration = np.asarray(course(taken))
-    surfaces = _surfaces(scene, camera.background)
+    of = scene.system, scene.parameter_values
+    tree, meshes = numeric_mechanism(*of), tube_meshes_by_joint(*of)
+    robot = load_robot_meshes(scene.robot_urdf, tree) if scene.robot_urdf is not None else {}
+    around = camera.background or (FloorAndWall() if robot else FloorAndWall(None, None))
+    still = [*around._meshes(), *([robot.pop(-1)] if -1 in robot else [])]
+    surfaces = ArticulatedSurfaces(tree, meshes | robot | ({-1: TriangleMesh.concatenate(still)} if still else {}))
     images = _Images(surfaces, camera.depth_camera, pose, configuration, camera.seed)
     names = tuple(f"frame {i}" for i in range(len(taken)))
     made = FrameSequence(stamps, names, pose, lambda i: lens.points_from_depth(images[i]), lens, "virtual camera")
     return VirtualFrames(made, taken, configuration, images, lambda at: np.asarray(course(at)))
-
-
-def _surfaces(scene: CameraScene, background: FloorAndWall | None) -> ArticulatedSurfaces:
-    """Object, robot and what stands around them."""
-    tree = numeric_mechanism(scene.system, scene.parameter_values)
-    meshes = tube_meshes_by_joint(scene.system, scene.parameter_values)
-    fixed = [] if background is None and scene.robot_urdf is None else [(background or FloorAndWall()).to_mesh()]
-    for joint, mesh in (load_robot_meshes(scene.robot_urdf, tree) if scene.robot_urdf is not None else {}).items():
-        if joint < 0:
-            fixed.append(mesh)
-        else:
-            meshes[joint] = mesh
-    still = [mesh for mesh in fixed if mesh is not None]
-    if still:
-        meshes[-1] = TriangleMesh.concatenate(still)
-    return ArticulatedSurfaces(tree, meshes)

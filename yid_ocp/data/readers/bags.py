@@ -462,29 +462,19 @@ def _named_places(bag: _Contents, points: Mapping[str, str] | None, where: str) 
 
 def _with_axes(entries: Iterable[tuple[str, BagMessage]], distance: float | None) -> Iterator[tuple[str, BagMessage]]:
     """The points, and of poses three more along the axes where a distance is given."""
+    from scipy.spatial.transform import Rotation
+
     for name, message in entries:
         yield name, message
         turn = message.content.axes
         if turn is None or distance is None:
             continue
-        for axis, direction in zip("xyz", _matrix(turn).T, strict=True):
+        # a quaternion of no length says nothing
+        rotation = Rotation.from_quat(turn).as_matrix() if any(turn) else np.full((3, 3), np.nan)
+        for axis, direction in zip("xyz", rotation.T, strict=True):
             place = tuple(np.array(message.content.point) + distance * direction)
-            yield (
-                f"{name}_{axis}",
-                replace(message, content=SimpleNamespace(**{**vars(message.content), "point": place})),
-            )
-
-
-def _matrix(quaternion: Sequence[float]) -> Array:
-    """Rotation of a quaternion (x, y, z, w); NaN for one of no length."""
-    x, y, z, w = np.array(quaternion) / (float(np.linalg.norm(quaternion)) or np.nan)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+            content = SimpleNamespace(**{**vars(message.content), "point": place})
+            yield f"{name}_{axis}", replace(message, content=content)
 
 
 def _positions(
