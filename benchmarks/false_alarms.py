@@ -128,7 +128,7 @@ def diagnose_twin(config: Path, estimate: Path, held_out: Path, settings: Sequen
     ]
     with tempfile.TemporaryDirectory() as folder:
         made = load_config(config, [*given, "output.write_report=false", *settings], DEFAULT_DIAGNOSIS_CONFIG)
-        finding = run_diagnose(made, Path(folder) / "run").diagnosis
+        finding = run_diagnose(made, Path(folder) / "run").output
     detectable = {
         f"{entry.effect.label}.{name}": value
         for entry in finding.detectability

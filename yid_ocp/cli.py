@@ -130,7 +130,8 @@ def _batch(parser: argparse.ArgumentParser) -> None:
 def _track(parser: argparse.ArgumentParser) -> None:
     _doubting(parser)
     text = "keep the told pose and depth of the camera, as of a hand-eye calibration; the arm then checks them"
-    parser.add_argument("--fix-pose", action="store_true", help=text)
+    fixed = "track.options.calibration.fix_pose=true"
+    parser.add_argument("--fix-pose", action="append_const", const=fixed, dest="overrides", help=text)
     _working(parser, "this process alone")
 
 
@@ -275,10 +276,10 @@ COMMANDS: tuple[CliCommand, ...] = (
     CliCommand(
         "completion",
         "print what makes a shell complete commands, options, files and settings",
-        "completion",
+        "editor_support",
         _completion,
     ),
-    CliCommand("schema", "print the JSON Schema of configuration files, for editors", "schema", _schema),
+    CliCommand("schema", "print the JSON Schema of configuration files, for editors", "editor_support", _schema),
 )
 
 
@@ -372,7 +373,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         printed as `yid-error/1` as well: kind, what, where, allowed, hint and exit_code.
     """
     if "_ARGCOMPLETE" in os.environ:
-        import_module("yid_ocp.workflow.completion").complete_arguments(build_argument_parser())
+        import_module("yid_ocp.workflow.editor_support").complete_arguments(build_argument_parser())
     as_json = "--json" in (sys.argv[1:] if argv is None else argv)
     try:
         arguments = build_argument_parser().parse_args(argv)

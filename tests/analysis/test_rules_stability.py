@@ -28,8 +28,8 @@ from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, Status, solve
-from yid_ocp.workflow import discretisation_check
-from yid_ocp.workflow.discretisation_check import with_stability_check
+from yid_ocp.workflow import solve as solve_command
+from yid_ocp.workflow.solve import with_stability_check
 
 H = 0.01
 
@@ -270,7 +270,7 @@ def test_a_fit_that_walked_away_from_an_unstable_truth_has_not_converged(light, 
 )
 def test_a_search_may_begin_but_not_end_where_the_step_is_not_stable(monkeypatch, before, start, estimate, after):
     grown = {0.0: StepErrorGrowth("run", start, 1.3, 0.1, H), 1.0: StepErrorGrowth("run", estimate, 1.3, 0.1, H)}
-    monkeypatch.setattr(discretisation_check, "largest_error_growth", lambda problem, x: grown[float(x[0])])
+    monkeypatch.setattr(solve_command, "largest_error_growth", lambda problem, x: grown[float(x[0])])
     found = replace(solution(status=before, a=estimated(1.0)), message="done")
     judged, said = with_stability_check(SimpleNamespace(initial_unknowns=np.zeros(1)), found)
     assert judged.status == after
@@ -278,7 +278,7 @@ def test_a_search_may_begin_but_not_end_where_the_step_is_not_stable(monkeypatch
     named = "at the estimate run" if estimate else "at the start run" if start and before == Status.FAILED else "done"
     assert judged.message.startswith(named)
     assert "done" in judged.message
-    monkeypatch.setattr(discretisation_check, "largest_error_growth", lambda problem, x: None)
+    monkeypatch.setattr(solve_command, "largest_error_growth", lambda problem, x: None)
     assert with_stability_check(SimpleNamespace(initial_unknowns=np.zeros(1)), found) == (
         found,
         {"start": None, "estimate": None},

@@ -77,7 +77,7 @@ def diagnosed(beam, recording, out):
 
 def test_a_load_is_what_differs_and_taking_it_away_predicts_the_first_day(beam, tmp_path):
     outcome = diagnosed(beam, "loaded", tmp_path / "new")
-    finding, result = outcome.diagnosis, outcome.result
+    finding, result = outcome.output, outcome.result
     assert [effect.label for effect in finding.accepted_effects] == ["point_mass@w_beam"]
     mass = finding.final_model.values["point_mass@w_beam.mass"]
     assert abs(mass - LOAD) < 4 * finding.final_model.std["point_mass@w_beam.mass"]

@@ -49,7 +49,7 @@ def test_the_load_is_named_and_taking_it_away_predicts_the_bare_run(repository, 
     for i, (recording, mass) in enumerate(loads(folder)):
         said = (f"recordings.estimate=[{recording}]", f"diagnosis.baseline=[{bare.folder}]")
         run = load_config(repository / "configs" / "soft_beam.yaml", (*QUIET, *said))
-        finding = run_diagnose(run, tmp_path / f"load{i}").diagnosis
+        finding = run_diagnose(run, tmp_path / f"load{i}").output
         assert finding.accepted_effects[0].label == "point_mass@w_beam"
         found = finding.final_model.values["point_mass@w_beam.mass"]
         assert found == pytest.approx(mass, rel=0.1)

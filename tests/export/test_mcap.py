@@ -13,7 +13,6 @@ from mcap_ros2.decoder import DecoderFactory
 from yid_ocp.data import JointGroup, PointGroup, Recording, read_any
 from yid_ocp.errors import OutputError
 from yid_ocp.export.signals import TopicSignal, export_mcap, signals_from_recording
-from yid_ocp.workflow.export import export_run_signals
 
 
 def read(path) -> dict[str, list]:
@@ -122,7 +121,7 @@ def test_a_solve_says_what_it_measured_and_predicted(pendulum, cli, tmp_path):
     assert cli("export", "run", "--format", "csv", "--out", "x").code == 2
 
 
-def test_a_diagnosis_says_what_it_could_not_explain(tmp_path):
+def test_a_diagnosis_says_what_it_could_not_explain(tmp_path, cli):
     """From made-up trajectories: every kind of unknown, an event, points before and after."""
     rng, run = np.random.default_rng(0), tmp_path / "run"
     run.mkdir()
@@ -144,9 +143,10 @@ def test_a_diagnosis_says_what_it_could_not_explain(tmp_path):
             points[key] = values
         event = file.create_group("events/b/elbow")
         event["t"], event["value"] = np.arange(3.0), np.array([0.0, 2.0, 0.0])
-    files, notes = export_run_signals(run, tmp_path / "out")
-    assert sorted(path.name for path in files) == ["a.mcap", "b.mcap"]
-    assert notes == []
+    done = cli("export", run, "--format", "mcap", "--out", tmp_path / "out", "--json")
+    told = json.loads(done.out)
+    assert {path.rpartition("/")[2] for path in told["file"]} == {"a.mcap", "b.mcap"}
+    assert told["notes"] == []
     found = read(tmp_path / "out" / "a.mcap")
     held = np.vstack([mean, mean[-1:]])
     topics = {"/unknown/joint_states", "/unknown/push/T1", "/unknown/offset/left", "/unknown/bias/camera/w_T1"}

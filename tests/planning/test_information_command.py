@@ -73,11 +73,11 @@ def test_the_run_folder_says_what_is_told_and_what_limits_it(config, tmp_path):
     assert result["goal"] == "information"
     assert {"recording.h5", "csv", "trajectory.json", "report.html"} <= {p.name for p in (tmp_path / "out").iterdir()}
     planned = read_recording(tmp_path / "out" / "recording.h5")
-    np.testing.assert_allclose(planned.joints.position, outcome.plan.joint_positions)
+    np.testing.assert_allclose(planned.joints.position, outcome.output.joint_positions)
     page = (tmp_path / "out" / "report.html").read_text()
     assert '<section id="information">' in page
     words = "\n".join(terminal_lines(plan_summary(result)))
-    for name, known in outcome.plan.parameter_precisions.items():
+    for name, known in outcome.output.parameter_precisions.items():
         assert result["parameters"][name]["std_relative_after"] == pytest.approx(known.std_planned)
         assert f"± {100 * known.std_planned:.2g} %" in words
     assert "tells most" in words

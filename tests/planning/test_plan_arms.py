@@ -53,8 +53,8 @@ def test_a_plan_that_ships_arrives_within_its_limits(repository, tmp_path, name)
 def test_the_middle_of_a_cable_stays_below_a_lid(repository, tmp_path):
     quick = (*COARSE["plan_cable"], "plan.duration=0.6")
     _, free = planned(repository, tmp_path / "free", "plan_cable", *quick, "plan.goal=place")
-    height = free.plan.point_trajectories["cable:50%"][:, 2]
-    lid = 0.5 * (height.max() + free.plan.target_position[2])
+    height = free.output.point_trajectories["cable:50%"][:, 2]
+    lid = 0.5 * (height.max() + free.output.target_position[2])
     assert height.max() > lid + 1e-3, "the free motion must pass the lid for this to be a test"
     box = f"plan.box=[[0.0, -1.0, -0.6], [1.5, 1.0, {lid}]]"
     _, kept = planned(repository, tmp_path / "kept", "plan_cable", *quick, box, "plan.frames_in_box=['cable:50%']")
@@ -67,12 +67,12 @@ def test_a_path_of_the_free_tip_is_followed_as_far_as_it_says(repository, tmp_pa
     more = (f"plan.{entry}" for entry in (*path, "position_tolerance=0.004"))
     run, outcome = planned(repository, tmp_path, "plan_place", *COARSE["plan_place"], *more)
     assert outcome.is_successful, outcome.result["message"]
-    tip, t = outcome.plan.point_trajectories["w_T3"], outcome.plan.t
+    tip, t = outcome.output.point_trajectories["w_T3"], outcome.output.t
     halfway = tip[int(np.argmin(np.abs(t - 0.8)))] - tip[0]
     off = np.linalg.norm(halfway - run.plan.waypoint_offsets[0])
     assert off <= outcome.result["off_path"] + 1e-9
     assert outcome.result["off_path"] < 0.01
-    direct = 0.5 * (outcome.plan.target_position - tip[0])
+    direct = 0.5 * (outcome.output.target_position - tip[0])
     assert np.linalg.norm(np.array(run.plan.waypoint_offsets[0]) - direct) > 0.01, (
         "the way there must not lead there by itself"
     )
@@ -84,7 +84,7 @@ def test_two_arms_bring_the_junction_to_a_place_and_keep_hold_of_it(repository, 
     run, outcome = planned(repository, tmp_path, name, "model.object.links=2", STIFF, way)
     assert outcome.is_successful, outcome.result["message"]
     assert outcome.result["swing"] < run.plan.rest_speed_tolerance
-    found = outcome.plan
+    found = outcome.output
     # it begins where the recording does, and both arms take part
     recorded = read_recording(recording_path(run.recordings.estimate[0])).joints
     first = recorded.position[0, [recorded.names.index(name) for name in found.joint_names]]
@@ -123,9 +123,9 @@ def test_a_real_cable_in_two_clamps_is_at_rest_before_it_is_moved(repository, tm
     way = "plan={point: p6, target_offset: [0.02, 0.02, 0.0], duration: 1.0, n_spline_coefficients: 4}"
     run, outcome = planned(repository, tmp_path, "deft_bdlo1", way)
     assert outcome.is_successful, outcome.result["message"]
-    first = outcome.plan.rollout.state[0]
-    held = simulate(outcome.plan.simulator.step, outcome.plan.simulator.theta, first, 20).state[-1]
+    first = outcome.output.rollout.state[0]
+    held = simulate(outcome.output.simulator.step, outcome.output.simulator.theta, first, 20).state[-1]
     np.testing.assert_allclose(held, first, atol=1e-7)
     np.testing.assert_allclose(
-        outcome.plan.point_trajectories["p6"][-1], outcome.result["place"], atol=run.plan.position_tolerance
+        outcome.output.point_trajectories["p6"][-1], outcome.result["place"], atol=run.plan.position_tolerance
     )

@@ -63,16 +63,17 @@ def test_the_run_folder_is_what_simulate_and_robots_read(config, tmp_path):
     assert "of how uncertain that is" in page
     message = json.loads((outcome.folder / "trajectory.json").read_text())
     assert message["joint_names"] == ["shoulder"]
-    assert [p["positions"][0] for p in message["points"]] == pytest.approx(outcome.plan.joint_positions[:, 0].tolist())
+    planned = outcome.output.joint_positions[:, 0]
+    assert [p["positions"][0] for p in message["points"]] == pytest.approx(planned.tolist())
     times = [p["time_from_start"]["sec"] + 1e-9 * p["time_from_start"]["nanosec"] for p in message["points"]]
-    assert times == pytest.approx(outcome.plan.t.tolist())
+    assert times == pytest.approx(outcome.output.t.tolist())
 
     file = outcome.folder / "recording.h5"
     planned = read_recording(file)
     again = load_config(config, [f"recordings.estimate=[{file}]"])
     done = run_simulate(again, tmp_path / "again")
     assert done.is_successful, done.result["message"]
-    np.testing.assert_allclose(done.recording.points[0].position, planned.points[0].position, atol=1e-6)
+    np.testing.assert_allclose(done.output.points[0].position, planned.points[0].position, atol=1e-6)
 
 
 def test_parameters_and_their_uncertainty_come_from_a_run_of_solve(config, tmp_path):

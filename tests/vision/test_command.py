@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from yid_ocp.cli import main
+from yid_ocp.cli import build_argument_parser, main
+from yid_ocp.config.reader import load_config
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.vision.track import FrameTracker
-from yid_ocp.workflow import track as command
 
 CONFIG = """\
 model:
@@ -178,10 +178,8 @@ def test_the_examples_run(cli, repository, tmp_path, name):
     assert len(list((tmp_path / "run" / "frames").glob("*.ply"))) == len(result["frames"])
 
 
-def test_a_flag_keeps_the_told_pose(repository, monkeypatch):
-    asked = []
-    monkeypatch.setattr(command, "run_track", lambda run, *rest: asked.append(run.track.options.calibration.fix_pose))
-    monkeypatch.setattr(command, "run_and_print", lambda arguments, work, *rest: work(None) or 0)
+def test_a_flag_keeps_the_told_pose(repository):
     config = str(repository / "configs" / "track_single_arm.yaml")
-    assert main(["track", config]) == main(["track", config, "--fix-pose"]) == 0
-    assert asked == [False, True]
+    asked = [build_argument_parser().parse_args(["track", config, *flags]) for flags in ([], ["--fix-pose"])]
+    runs = [load_config(config, arguments.overrides) for arguments in asked]
+    assert [run.track.options.calibration.fix_pose for run in runs] == [False, True]

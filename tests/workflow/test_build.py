@@ -11,11 +11,22 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import dump_config
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model import forward_kinematics
-from yid_ocp.model.objects.foam_y import FoamY
-from yid_ocp.model.objects.segmented import SegmentedObject
 from yid_ocp.workflow.build import arms_are_estimated_states, build_system, load_system
 from yid_ocp.workflow.build_problem import build_problem, load_problem, problem_options
 from yid_ocp.workflow.run_inputs import read_recordings
+
+
+@pytest.fixture
+def built(written):
+    """built(text, link_division): the system that settings describe."""
+    return lambda text, link_division=1: build_system(load_config(written(text)), link_division)
+
+
+def place(system, frame):
+    """Where a frame is with all coordinates at zero."""
+    q = ca.SX(ca.DM(np.zeros(system.n_coordinates)))
+    position = forward_kinematics(system.mechanism.with_numeric_values(), q).frame_position(frame)
+    return np.array(ca.DM(position)).ravel()
 
 
 @pytest.mark.parametrize(("name", "size", "constraints"), [("single_arm_vision", 43, 3), ("dual_arm_vision", 50, 6)])
@@ -43,79 +54,57 @@ def test_parameters_of_a_run(written):
     assert [system.parameters[f"T{i}.bend"].value for i in (1, 2, 3)] == [5, 7, 5]
     assert system.parameters["T3.bend"].upper == 50
     assert system.parameters["T1.mass"].value == 0.07
-    options = problem_options(run, system)
-    assert options.prior_stds == {"T2.bend": 2.0}
+    assert problem_options(run, system).prior_stds == {"T2.bend": 2.0}
 
 
-def test_an_object_of_segments_on_a_robots_hand(written):
-    run = load_config(
-        written(
-            "model:\n"
-            "  robot: package:panda\n"
-            "  arms:\n"
-            f"    joints: [{', '.join(f'panda_joint{i}' for i in range(1, 8))}]\n"
-            "    mode: prescribed\n"
-            "  object:\n"
-            "    kind: segments\n"
-            "    mount: {parent_frame: panda_hand, xyz: [0, 0, 0.1], rpy: [0, 1.5708, 0]}\n"
-            "    segments:\n"
-            "      beam: {length: 0.5, mass: 0.3, radius: 0.01, links: 5, "
-            "stiffness_per_curvature: true, clamped_at_base: true}\n"
-            "      tip: {link_lengths: [0.1, 0.05], mass: 0.01, radius: 0.01, parent: beam}\n"
-            "parameters: {beam.bend: {initial: 1.3}, tip.damping: {initial: 0.001}}\n"
-        )
+def test_an_object_of_segments_on_a_robots_hand(built):
+    text = (
+        "model:\n"
+        "  robot: package:panda\n"
+        "  arms:\n"
+        f"    joints: [{', '.join(f'panda_joint{i}' for i in range(1, 8))}]\n"
+        "    mode: prescribed\n"
+        "  object:\n"
+        "    kind: segments\n"
+        "    mount: {parent_frame: panda_hand, xyz: [0, 0, 0.1], rpy: [0, 1.5708, 0]}\n"
+        "    segments:\n"
+        "      beam: {length: 0.5, mass: 0.3, radius: 0.01, links: 5, "
+        "stiffness_per_curvature: true, clamped_at_base: true}\n"
+        "      tip: {link_lengths: [0.1, 0.05], mass: 0.01, radius: 0.01, parent: beam}\n"
+        "parameters: {beam.bend: {initial: 1.3}, tip.damping: {initial: 0.001}}\n"
     )
-    assert isinstance(run.model.object, SegmentedObject)
-    system = build_system(run)
-    assert system.n_coordinates == 7 + 15 + 6
+    system, finer = built(text), built(text, 2)
+    assert (system.n_coordinates, finer.n_coordinates) == (7 + 15 + 6, 7 + 30 + 12)
     assert len(system.prescribed) == 7
     assert system.parameters["beam.bend"].unit == "N m^2"
-    assert system.parameters["tip.damping"].value == 0.001
-    finer = build_system(run, link_division=2)
-    assert finer.n_coordinates == 7 + 30 + 12
-    assert finer.parameters["beam.bend"].value == 1.3
-    assert finer.parameters["tip.bend"].value == 6.0
-    assert finer.parameters["tip.damping"].value == 0.002
-    kinematics = forward_kinematics(finer.mechanism.with_numeric_values(), ca.SX(ca.DM(np.zeros(finer.n_coordinates))))
-    same = forward_kinematics(system.mechanism.with_numeric_values(), ca.SX(ca.DM(np.zeros(system.n_coordinates))))
+    for name, coarse, fine in (("tip.damping", 0.001, 0.002), ("beam.bend", 1.3, 1.3), ("tip.bend", 3.0, 6.0)):
+        assert (system.parameters[name].value, finer.parameters[name].value) == (coarse, fine)
     for fine, coarse in (("tip_1_tip", "tip_0_tip"), ("w_tip", "w_tip"), ("beam_5_tip", "beam_2_tip")):
-        assert np.allclose(
-            np.array(ca.DM(kinematics.frame_position(fine))), np.array(ca.DM(same.frame_position(coarse)))
-        )
+        assert np.allclose(place(finer, fine), place(system, coarse))
 
 
-def test_a_branch_stays_at_its_place_of_a_finer_parent(written):
+@pytest.mark.parametrize("finer", [1, 2, 3])
+def test_a_branch_stays_at_its_place_of_a_finer_parent(built, finer):
     text = (
         "model:\n  object:\n    kind: segments\n    segments:\n"
         "      a: {length: 0.4, mass: 0.1, radius: 0.01, links: 4}\n"
         "      b: {length: 0.1, mass: 0.1, radius: 0.01, links: 1, parent: a, parent_link_index: 0}\n"
     )
-    for finer in (1, 2, 3):
-        system = build_system(load_config(written(text)), finer)
-        kinematics = forward_kinematics(
-            system.mechanism.with_numeric_values(), ca.SX(ca.DM(np.zeros(system.n_coordinates)))
-        )
-        assert np.allclose(np.array(ca.DM(kinematics.frame_position("b:0%"))).ravel(), [0, 0, 0.1])
+    assert np.allclose(place(built(text, finer), "b:0%"), [0, 0, 0.1])
 
 
-def test_more_links_keep_the_stiffness_of_a_tube(written):
-    run = load_config(written("model: {object: {kind: foam_y, mount: {xyz: [0, 0, 1]}}, damping: 0.02}\n"))
-    assert isinstance(run.model.object, FoamY)
-    finer = build_system(run, link_division=2)
-    assert finer.parameters["T1.bend"].value == 6.0
-    assert finer.parameters["T1.damping"].value == 0.04
+def test_more_links_keep_the_stiffness_of_a_tube(built):
+    finer = built("model: {object: {kind: foam_y, mount: {xyz: [0, 0, 1]}}, damping: 0.02}\n", 2)
+    assert (finer.parameters["T1.bend"].value, finer.parameters["T1.damping"].value) == (6.0, 0.04)
     assert finer.n_coordinates == 72
 
 
-def test_springs_on_joints(written, urdf_folder):
-    run = load_config(
-        written(
-            f"model:\n  robot: {urdf_folder / 'mixed_joints.urdf'}\n  arms: {{mode: passive}}\n"
-            "  springs:\n    hinge: {stiffness: 2.0, rest_position: 0.1, damping: 0.3}\n    slide: {stiffness: 50.0}\n"
-            "  damping: {spin: 0.2}\n"
-        )
+def test_springs_on_joints(built, urdf_folder):
+    system = built(
+        f"model:\n  robot: {urdf_folder / 'mixed_joints.urdf'}\n  arms: {{mode: passive}}\n"
+        "  springs:\n    hinge: {stiffness: 2.0, rest_position: 0.1, damping: 0.3}\n    slide: {stiffness: 50.0}\n"
+        "  damping: {spin: 0.2}\n"
     )
-    system = build_system(run)
     parameters = system.parameters
     assert (parameters["hinge.stiffness"].unit, parameters["hinge.rest"].value) == ("N m/rad", 0.1)
     assert (parameters["slide.stiffness"].unit, parameters["slide.rest"].unit) == ("N/m", "m")
@@ -123,61 +112,53 @@ def test_springs_on_joints(written, urdf_folder):
     assert (system.driven, system.prescribed) == ((), ())
 
 
+EFFECTS = (
+    "model:\n"
+    "  object: {kind: foam_y}\n"
+    "  effects:\n"
+    "    - {kind: kelvin_voigt, location: T3}\n"
+    "    - {kind: density, location: T2, values: {scale: 1.1}}\n"
+    "parameters:\n"
+    "  kelvin_voigt@T3.tau: {free: true, initial: 0.02}\n"
+)
+
+
 def test_effects_bring_their_parameters(written):
-    text = (
-        "model:\n"
-        "  object: {kind: foam_y}\n"
-        "  effects:\n"
-        "    - {kind: kelvin_voigt, location: T3}\n"
-        "    - {kind: density, location: T2, values: {scale: 1.1}}\n"
-        "parameters:\n"
-        "  kelvin_voigt@T3.tau: {free: true, initial: 0.02}\n"
-    )
-    run = load_config(written(text))
+    run = load_config(written(EFFECTS))
     system = build_system(run)
     assert [(effect.kind, effect.location) for effect in system.effects] == [("kelvin_voigt", "T3"), ("density", "T2")]
     assert system.parameters["kelvin_voigt@T3.tau"].value == 0.02
     assert system.parameters["density@T2.scale"].value == 1.1
     assert load_config(written(dump_config(run))) == run
-    for old, new, message in (
-        ("kelvin_voigt, loc", "kelvin_voight, loc", "line 4: model.effects.0"),
-        ("location: T2", "location: T9", "line 5: model.effects.1"),
-        ("location: T3", "locaton: T3", "did you mean 'location'?"),
-        ("scale: 1.1", "scale: much", "model.effects.1.values"),
-    ):
-        with pytest.raises((ConfigError, ModelError)) as caught:
-            load_system(written(text.replace(old, new)))
-        assert message in str(caught.value)
 
 
-def test_errors_of_the_model_name_the_setting(written):
-    for text, message in (
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (EFFECTS.replace("kelvin_voigt, loc", "kelvin_voight, loc"), "line 4: model.effects.0"),
+        (EFFECTS.replace("location: T2", "location: T9"), "line 5: model.effects.1"),
+        (EFFECTS.replace("location: T3", "locaton: T3"), "did you mean 'location'?"),
+        (EFFECTS.replace("scale: 1.1", "scale: much"), "model.effects.1.values"),
         ("model:\n  robot: package:baxterr\n", "line 2: model.robot"),
         ("model:\n  robot: package:baxter\n  damping: {left_s9: 1}\n", "line 3: model.damping.left_s9"),
         ("model:\n  object: {kind: segments, segments: {a: {mass: 1, radius: 0.1}}}\n", "line 2: model.object"),
         ("model:\n  object: {kind: foam_y}\n  points: [w_T9]\n", "line 1: model"),
-    ):
-        with pytest.raises((ConfigError, ModelError)) as caught:
-            load_system(written(text))
-        assert message in str(caught.value)
+    ],
+)
+def test_errors_of_the_model_name_the_setting(written, text, message):
+    with pytest.raises((ConfigError, ModelError)) as caught:
+        load_system(written(text))
+    assert message in str(caught.value)
 
 
 def test_a_problem_from_a_file(repository):
-    problem = load_problem(
-        repository / "configs" / "single_arm_vision.yaml",
-        [
-            "model.object.links=1",
-            "problem.use_compiler=false",
-            "problem.duration=0.3",
-            "sensors.points_camera.use=false",
-        ],
-    )
+    file = repository / "configs" / "single_arm_vision.yaml"
+    quick = ["model.object.links=1", "problem.use_compiler=false", "problem.duration=0.3"]
+    problem = load_problem(file, [*quick, "sensors.points_camera.use=false"])
     assert problem.free == tuple(f"T{i}.{kind}" for i in (1, 2, 3) for kind in ("bend", "twist"))
     assert [s.sensor.group_name for s in problem.episodes[0].measurements] == ["points_arm"]
     assert len(problem.held_out) == 1
-    assert (
-        build_problem(load_config(repository / "configs" / "single_arm_vision.yaml"), problem.step).free == problem.free
-    )
+    assert build_problem(load_config(file), problem.step).free == problem.free
 
 
 SEGMENTED = (
@@ -189,34 +170,31 @@ SEGMENTED = (
 )
 
 
-def test_a_stiffness_stands_under_parameters_alone(written):
+def test_a_stiffness_stands_under_parameters_alone(written, built):
     for key in ("bend", "twist", "damping"):
         with pytest.raises(ConfigError, match=f"there is no key '{key}'"):
             load_config(written(SEGMENTED.replace("links: 2,", f"links: 2, {key}: 1,")))
-    parameters = build_system(load_config(written(SEGMENTED))).parameters
+    parameters = built(SEGMENTED).parameters
     assert [parameters[name].value for name in ("a.bend", "b.bend", "a.twist", "b.twist")] == [5, 5, 2, 3]
     assert [parameters[name].value for name in ("a.damping", "b.damping", "b.twist_damping")] == [0.05, 0.3, 0.05]
     assert "a.twist_damping" not in parameters
 
 
-def test_more_links_scale_what_is_said_of_a_stiffness_per_joint(written):
-    finer = build_system(load_config(written(SEGMENTED)), link_division=3).parameters
+def test_more_links_scale_what_is_said_of_a_stiffness_per_joint(built):
+    finer = built(SEGMENTED, 3).parameters
     assert [finer[name].value for name in ("a.bend", "a.twist", "b.bend", "b.damping")] == [15, 6, 5, 0.3]
     assert finer["a.damping"].value == pytest.approx(0.15)
     assert (finer["a.bend"].lower, finer["a.bend"].upper) == (3, 24)
     assert (finer["b.bend"].lower, finer["b.bend"].upper) == (1, 8)
-    finer = build_system(load_config(written(SEGMENTED.split("parameters:")[0])), link_division=3).parameters
+    finer = built(SEGMENTED.split("parameters:")[0], 3).parameters
     assert [finer[name].value for name in ("a.bend", "a.twist", "b.bend")] == [9, 9, 3]
-    foam = load_config(written("model: {object: {kind: foam_y}}\nparameters: {T1.bend: {initial: 10}}\n"))
-    finer = build_system(foam, link_division=2).parameters
+    finer = built("model: {object: {kind: foam_y}}\nparameters: {T1.bend: {initial: 10}}\n", 2).parameters
     assert [finer[name].value for name in ("T1.bend", "T2.bend")] == [20, 6]
 
 
-def test_link_lengths_as_parameters(written):
-    names = build_system(load_config(written(SEGMENTED))).parameters.names
-    assert "a.length" in names
-    run = load_config(written(SEGMENTED.replace("links: 2}", "links: 2, link_length_parameters: true}")))
-    names = build_system(run).parameters.names
+def test_link_lengths_as_parameters(built):
+    assert "a.length" in built(SEGMENTED).parameters.names
+    names = built(SEGMENTED.replace("links: 2}", "links: 2, link_length_parameters: true}")).parameters.names
     assert {"a.length_0", "a.length_1", "b.length"} <= set(names)
     assert "a.length" not in names
 
@@ -226,19 +204,18 @@ BY_JOINT = (
 )
 
 
-def test_damping_by_joint_says_that_of_the_object_too(written, urdf_folder):
+def test_damping_by_joint_says_that_of_the_object_too(built, urdf_folder):
     urdf = urdf_folder / "mixed_joints.urdf"
-    system = build_system(load_config(written(BY_JOINT.format(urdf=urdf, more=", object: 0.01"))))
-    assert [system.parameters[f"{name}.damping"].value for name in ("hinge", "slide")] == [0.2, 0.05]
-    assert [system.parameters[f"T{i}.damping"].value for i in (1, 2, 3)] == [0.01] * 3
+    parameters = built(BY_JOINT.format(urdf=urdf, more=", object: 0.01")).parameters
+    assert [parameters[f"{name}.damping"].value for name in ("hinge", "slide")] == [0.2, 0.05]
+    assert [parameters[f"T{i}.damping"].value for i in (1, 2, 3)] == [0.01] * 3
     with pytest.raises(ConfigError, match="not that of the object") as caught:
-        load_system(written(BY_JOINT.format(urdf=urdf, more="")))
+        built(BY_JOINT.format(urdf=urdf, more=""))
     assert "line 5: model.damping" in caught.value.where
     assert "`object`" in caught.value.allowed
+    alone = BY_JOINT.format(urdf=urdf, more=", object: 1").replace("object: {kind: foam_y}", "points: []")
     with pytest.raises(ConfigError, match="there is no joint 'object'"):
-        load_system(
-            written(BY_JOINT.format(urdf=urdf, more=", object: 1").replace("object: {kind: foam_y}", "points: []"))
-        )
+        built(alone)
 
 
 def test_a_problem_has_the_options_of_its_section(written):
@@ -252,11 +229,8 @@ def test_a_problem_has_the_options_of_its_section(written):
     )
     options = problem_options(run, build_system(run))
     assert (options.weighting, options.huber_threshold, options.duration) == ("paper", 3.0, 2.0)
-    assert (options.start_fit_parameters, options.local_parameters, options.prior_stds) == (
-        ("T1.mass",),
-        ("T1.bend",),
-        {"T1.bend": 2.0},
-    )
+    assert (options.start_fit_parameters, options.local_parameters) == (("T1.mass",), ("T1.bend",))
+    assert options.prior_stds == {"T1.bend": 2.0}
     assert options.sensors["points"].std == 0.1
     wrong = load_config(written("model: {object: {kind: foam_y}}\nproblem: {start_fit_parameters: [T1.mas]}\n"))
     with pytest.raises(ConfigError, match=r"there is no parameter 'T1.mas'") as caught:
@@ -278,13 +252,12 @@ def test_a_problem_has_the_options_of_its_section(written):
 def test_prescribed_arms_that_hold_an_object_are_states(repository, file, overrides, expected):
     run = load_config(repository / "configs" / f"{file}.yaml", overrides)
     assert arms_are_estimated_states(run) is expected
-    system = build_system(run)
-    assert bool(system.driven) == (expected or run.model.arms.mode == "driven")
+    assert bool(build_system(run).driven) == (expected or run.model.arms.mode == "driven")
 
 
 def test_their_encoders_are_measurements_and_the_points_of_the_arm_are_not(repository):
     file = repository / "configs" / "dual_arm_vision.yaml"
     run = load_config(file, ["model.arms.mode=prescribed", "recordings.held_out=[]", "problem.use_compiler=false"])
-    options = problem_options(run, build_system(run), read_recordings(run, "estimate"))
+    options = problem_options(run, build_system(run), read_recordings(run))
     used = {group: said.use for group, said in options.sensors.items()}
     assert used == {"joints.position": True, "points_arm": False}

@@ -21,7 +21,6 @@ from yid_ocp.workflow.run_history import (
     baseline_estimates,
     load_reference_recordings,
     read_estimates,
-    run_report,
     with_baseline_effects,
 )
 from yid_ocp.workflow.run_inputs import read_recordings
@@ -117,7 +116,7 @@ def test_a_moved_clamp_carries_the_object_and_stands_in_what_is_simulated(tmp_pa
     run = settings(tmp_path, recording, (clamp, "model.frames={}", *mount, "problem.initial_state=equilibrium"))
     problem = build_problem(run)
     assert problem.system.prescribed == tuple(f"jaw_{part}" for part in ("x", "y", "z", "rx", "ry", "rz"))
-    made = run_simulate(run, tmp_path / "made").recording
+    made = run_simulate(run, tmp_path / "made").output
     assert made is not None
     group = made.points[0]
     assert set(group.names) == {"a", "b", "w_beam"}
@@ -213,20 +212,19 @@ def test_recordings_of_the_baseline_are_those_without_what_is_looked_for(tmp_pat
     assert found.sha256 == read_recordings(run, "estimate")[0].sha256
 
 
-def test_report_says_what_drifted_and_writes_the_history(tmp_path):
+def test_report_says_what_drifted_and_writes_the_history(tmp_path, cli):
     folders = [folder_of(tmp_path / f"day{i}", values=(0.02 if i < 3 else 0.025, 5e-5)) for i in range(4)]
-    outcome = run_report(folders, tmp_path / "history")
+    done = cli("report", *folders, "--out", tmp_path / "history", "--json")
     written = json.loads((tmp_path / "history" / "history.json").read_text(encoding="utf-8"))
     assert written["format"] == "yid-history/1"
-    assert outcome.result == written
+    assert json.loads(done.out) == written
     assert [name for name, entry in written["parameters"].items() if entry["drifted"]] == ["beam.bend"]
     assert [entry["name"] for entry in written["runs"] if entry["distrusted"]] == [str(folders[3])]
     assert "beam.bend is not the same in all runs" in (tmp_path / "history" / "report.html").read_text(encoding="utf-8")
     later = folder_of(tmp_path / "later", baseline={"runs": [str(folders[0])]})
-    with pytest.raises(ConfigError, match="would count twice"):
-        run_report([folders[0], later], tmp_path / "other")
-    with pytest.raises(ConfigError, match="one run has no history"):
-        run_report(folders[:1], tmp_path / "other")
+    for runs, message in (([folders[0], later], "would count twice"), (folders[:1], "one run has no history")):
+        refused = cli("report", *runs, "--out", tmp_path / "other")
+        assert (refused.code, message in refused.err) == (2, True)
 
 
 @pytest.mark.slow

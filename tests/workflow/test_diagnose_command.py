@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from importlib import import_module
 from types import SimpleNamespace
@@ -23,7 +24,7 @@ from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.workflow.diagnose import JsonRefitStore, _with_noise_only_stds, run_diagnose
-from yid_ocp.workflow.run_folder import _reproducing_command, new_run_folder
+from yid_ocp.workflow.run_folder import new_run_folder
 
 
 def without_times(folder) -> dict:
@@ -128,14 +129,12 @@ def test_the_result_says_how_sure_a_closure_is_and_where_the_unknown_forces_are(
 def test_the_command_that_gives_a_result_again(rubbing, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     changed = load_config(rubbing, ["diagnosis.significance_level=0.02"])
-    assert (
-        _reproducing_command(changed, tmp_path / "runs" / "a b", "diagnose")
-        == "yid-ocp diagnose 'runs/a b/config.yaml'"
-    )
-    assert (
-        _reproducing_command(load_config(None, (), DEFAULT_DIAGNOSIS_CONFIG), tmp_path, "diagnose")
-        == "yid-ocp diagnose"
-    )
+    embedded = load_config(None, (), DEFAULT_DIAGNOSIS_CONFIG)
+    for settings, command in ((changed, "yid-ocp diagnose 'runs/a b/config.yaml'"), (embedded, "yid-ocp diagnose")):
+        with new_run_folder(settings, tmp_path / "runs" / "a b") as folder:
+            folder.begin_run(settings, "diagnose")
+            assert folder.write_result({})["command"] == command
+        shutil.rmtree(folder.path)
 
 
 @pytest.mark.parametrize("spoil", ["nothing", "inputs", "version", "half a file", "other text"])
@@ -162,71 +161,57 @@ def test_kept_refits_count_only_for_what_they_were_made_from(spoil, rubbing, tmp
 
 
 SHARE = 0.25
-SENSORS = {
+STATED = {
     "points": SensorOptions(std=0.02),
-    "joints.effort": SensorOptions(std={"shoulder": 0.3}),
+    "joints.effort": SensorOptions(std={"shoulder": 0.3}, bias_std=0.4),
     "joints.position": SensorOptions(std=1e-3),
 }
 
-
-@pytest.fixture(scope="module")
-def step(urdf_folder):
-    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    springs = {"elbow": RobotJointSpring(3.0, 0.1)}
-    system = System.build(robot, prescribed=["shoulder"], springs=springs, damping=0.1, point_frames=["tip"])
-    return compile_step(system, 0.01, use_compiler=False)
-
-
-def problem_of(step, position_std=None, **changed):
-    t = 0.01 * np.arange(21)
-    effort = 1.0 + 0.1 * np.sin(20 * t[:, None])
-    joints = JointGroup(("shoulder",), t, 0.1 * np.sin(9 * t[:, None]), effort=effort, position_std=position_std)
-    tip = np.tile([0.0, 0.1, 0.4], (21, 1, 1)) + 0.02 * np.random.default_rng(1).standard_normal((21, 1, 3))
-    options = {
-        "sensors": SENSORS,
-        "path_cutoff": float("inf"),
-        "initial_state": "estimated",
-        "prior_stds": {"elbow.rest": 0.05},
-        "weak_prior_factor": 7.0,
-        "huber_threshold": 1.5,
-    }
-    recording = Recording(joints, (PointGroup("points", ("tip",), t, tip),), name="made")
-    free = ("elbow.stiffness", "elbow.rest")
-    return EstimationProblem(step, [recording], free, ProblemOptions(**options | changed))
-
-
-@pytest.fixture(scope="module")
-def driven(urdf_folder):
-    """A shoulder whose recorded torques are wrong, seen by the tip or by its own encoder."""
-    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    springs = {"elbow": RobotJointSpring(3.0, 0.1)}
-    system = System.build(robot, driven=["shoulder"], springs=springs, damping=0.1, point_frames=["tip"])
-    step = compile_step(system, 0.01, use_compiler=False)
-
-    def problem(**sensors):
-        t = 0.01 * np.arange(41)
-        noise = {"effort_std": 0.05, "effort_bias_std": 0.1, "position_std": 1e-3}
-        angle, torque = 0.1 * np.sin(9 * t[:, None]), 1.0 + 0.3 * np.sin(9 * t[:, None])
-        joints = JointGroup(("shoulder",), t, angle, effort=torque, **noise)
-        tip = np.tile([0.0, 0.1, 0.4], (41, 1, 1)) + 0.02 * np.random.default_rng(1).standard_normal((41, 1, 3))
-        recording = Recording(joints, (PointGroup("points", ("tip",), t, tip),), name="made")
-        options = ProblemOptions(sensors=sensors, prior_stds={"elbow.rest": 0.05})
-        return EstimationProblem(step, [recording], ("elbow.stiffness", "elbow.rest"), options)
-
-    return problem
-
-
-STATED = {
-    "joints.effort": SensorOptions(std=0.2, bias_std={"shoulder": 0.4}),
-    "joints.position": SensorOptions(std=2e-3),
-    "points": SensorOptions(std=0.02),
+PRESCRIBED = {
+    "path_cutoff": float("inf"),
+    "initial_state": "estimated",
+    "weak_prior_factor": 7.0,
+    "huber_threshold": 1.5,
 }
 
 
+@pytest.fixture(scope="module")
+def problem_of(urdf_folder):
+    """problem_of(role, sensors, ...): a pendulum whose shoulder is driven or prescribed, seen by its tip."""
+    robot, springs = read_urdf(urdf_folder / "double_pendulum.urdf"), {"elbow": RobotJointSpring(3.0, 0.1)}
+    more = {"springs": springs, "damping": 0.1, "point_frames": ["tip"]}
+    systems = {role: System.build(robot, **{role: ["shoulder"]}, **more) for role in ("driven", "prescribed")}
+    steps = {role: compile_step(system, 0.01, use_compiler=False) for role, system in systems.items()}
+
+    def build(role, sensors=STATED, position_std=1e-3, **changed):
+        t = 0.01 * np.arange(41)
+        noise = {"effort_std": 0.05, "position_std": position_std}
+        if role == "driven":
+            noise["effort_bias_std"] = 0.1
+        else:
+            sensors = {name: replace(entry, bias_std=None) for name, entry in sensors.items()}
+        angle, torque = 0.1 * np.sin(9 * t[:, None]), 1.0 + 0.3 * np.sin(9 * t[:, None])
+        joints = JointGroup(("shoulder",), t, angle, effort=torque, **noise)
+        tip = np.tile([0.0, 0.1, 0.4], (41, 1, 1)) + 0.02 * np.random.default_rng(1).standard_normal((41, 1, 3))
+        recording = Recording(joints, (PointGroup("points", ("tip",), t, tip, 0.01),), name="made")
+        own = {"sensors": sensors, "prior_stds": {"elbow.rest": 0.05}} | (PRESCRIBED if role == "prescribed" else {})
+        options = ProblemOptions(**own | changed)
+        return EstimationProblem(steps[role], [recording], ("elbow.stiffness", "elbow.rest"), options)
+
+    return build
+
+
+def settings(share=SHARE):
+    def refuse(what, *where, **more):
+        return ConfigError(what, where=".".join(where), **more)
+
+    return SimpleNamespace(diagnosis=SimpleNamespace(noise_fraction=share), config_error=refuse)
+
+
 @pytest.mark.parametrize("encoders", [False, True])
-def test_errors_of_torques_shrink_like_all_other_noise(driven, encoders):
-    use = {True: {"joints.position": replace(STATED["joints.position"], use=True)}, False: {}}[encoders]
-    problem = driven(**STATED | use)
+def test_errors_of_torques_shrink_like_all_other_noise(problem_of, encoders):
+    position = replace(STATED["joints.position"], use=True if encoders else None)
+    problem = problem_of("driven", STATED | {"joints.position": position})
     shrunk = _with_noise_only_stds(problem, settings())
     x = problem.initial_unknowns * 1.1
     one, other = (whitened_at(made, x, rounds=2) for made in (problem, shrunk))
@@ -240,44 +225,23 @@ def test_errors_of_torques_shrink_like_all_other_noise(driven, encoders):
     np.testing.assert_allclose(smaller_std, SHARE * std, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("group", "entry", "words"),
-    [
-        ("joints.effort", SensorOptions(bias_std=0.4), "noise in the std of 'joints.effort'"),
-        ("joints.effort", SensorOptions(std=0.2), "noise in the bias_std of 'joints.effort'"),
-        ("joints.position", SensorOptions(), "noise in the std of 'joints.position'"),
-    ],
-)
-def test_a_fraction_of_an_unstated_error_of_torques_is_refused(driven, group, entry, words):
-    with pytest.raises(ConfigError, match=words):
-        _with_noise_only_stds(driven(**STATED | {group: entry}), settings())
-
-
-def settings(share=SHARE):
-    def refuse(what, *where, **more):
-        return ConfigError(what, where=".".join(where), **more)
-
-    return SimpleNamespace(diagnosis=SimpleNamespace(noise_fraction=share), config_error=refuse)
-
-
-def test_every_row_is_so_many_times_larger_and_the_fit_the_same(step):
-    problem = problem_of(step)
+def test_every_row_is_so_many_times_larger_and_the_fit_the_same(problem_of):
+    problem = problem_of("prescribed")
     shrunk = _with_noise_only_stds(problem, settings())
-    assert shrunk.residual_rows == problem.residual_rows
     rows = problem.residual_rows
+    assert shrunk.residual_rows == rows
     assert [part.stop - part.start for part in (rows.stated_priors, rows.weak_priors)] == [3, 1]
     for seed in range(3):
-        x = problem.initial_unknowns + problem.unknown_scales * np.random.default_rng(seed).uniform(
-            -0.3, 0.3, len(problem.initial_unknowns)
-        )
+        apart = np.random.default_rng(seed).uniform(-0.3, 0.3, len(problem.initial_unknowns))
+        x = problem.initial_unknowns + problem.unknown_scales * apart
         one, other = problem.evaluate(x), shrunk.evaluate(x)
         np.testing.assert_allclose(other.residual, one.residual / SHARE, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(other.jacobian, one.jacobian / SHARE, rtol=1e-9, atol=1e-9)
         assert other.cost == pytest.approx(one.cost / SHARE**2)
 
 
-def test_a_whole_fraction_and_no_weak_prior_stay_as_they_are(step):
-    problem = problem_of(step, weak_prior_factor=0.0)
+def test_a_whole_fraction_and_no_weak_prior_stay_as_they_are(problem_of):
+    problem = problem_of("prescribed", weak_prior_factor=0.0)
     assert _with_noise_only_stds(problem, settings(1.0)) is problem
     shrunk = _with_noise_only_stds(problem, settings())
     assert shrunk.options.weak_prior_factor == 0.0
@@ -285,25 +249,23 @@ def test_a_whole_fraction_and_no_weak_prior_stay_as_they_are(step):
 
 
 @pytest.mark.parametrize(
-    ("sensors", "recorded", "words"),
+    ("role", "group", "entry", "words"),
     [
-        ({"joints.effort": SENSORS["joints.effort"], "points": SensorOptions()}, None, "noise in the std of 'points'"),
-        ({"points": SENSORS["points"]}, None, "noise in the std of 'joints.effort'"),
-        ({**SENSORS, "joints.position": SensorOptions()}, 1e-3, "noise in the std of 'joints.position'"),
+        ("driven", "joints.effort", SensorOptions(bias_std=0.4), "noise in the std of 'joints.effort'"),
+        ("driven", "joints.effort", SensorOptions(std=0.2), "noise in the bias_std of 'joints.effort'"),
+        ("driven", "joints.position", SensorOptions(), "noise in the std of 'joints.position'"),
+        ("prescribed", "points", SensorOptions(), "noise in the std of 'points'"),
+        ("prescribed", "joints.effort", SensorOptions(), "noise in the std of 'joints.effort'"),
+        ("prescribed", "joints.position", SensorOptions(), "noise in the std of 'joints.position'"),
     ],
 )
-def test_a_fraction_of_what_is_not_stated_is_refused(step, sensors, recorded, words):
-    kept = {name: replace(entry, std=0.02) if entry.std is None else entry for name, entry in sensors.items()}
-    stated = {**{name: SensorOptions(std=0.3) for name in SENSORS}, **kept}
-    problem = problem_of(step, recorded, sensors=stated)
-    missing = EstimationProblem.__new__(EstimationProblem)
-    missing.__dict__.update(problem.__dict__, options=replace(problem.options, sensors=sensors))
+def test_a_fraction_of_what_is_not_stated_is_refused(problem_of, role, group, entry, words):
     with pytest.raises(ConfigError, match=words):
-        _with_noise_only_stds(missing, settings())
+        _with_noise_only_stds(problem_of(role, STATED | {group: entry}), settings())
 
 
 @pytest.mark.parametrize("recorded", [None, 0.0])
-def test_encoders_without_noise_need_none(step, recorded):
-    sensors = {"points": SENSORS["points"], "joints.effort": SensorOptions(std=0.3)}
-    shrunk = _with_noise_only_stds(problem_of(step, recorded, sensors=sensors), settings())
+def test_encoders_without_noise_need_none(problem_of, recorded):
+    sensors = {"points": STATED["points"], "joints.effort": SensorOptions(std=0.3)}
+    shrunk = _with_noise_only_stds(problem_of("prescribed", sensors, recorded), settings())
     assert shrunk.options.sensors["joints.effort"] == SensorOptions(std=0.3 * SHARE)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 from made_cross import TRUTH, configuration, record
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.report.summaries import solve_summary
-from yid_ocp.report.terminal import terminal_lines
-from yid_ocp.workflow.check import run_check
-from yid_ocp.workflow.discretisation_check import requested_refinements
 from yid_ocp.workflow.solve import run_solve
 
 pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
@@ -35,11 +33,10 @@ def judged(result, links):
     return found
 
 
-def test_too_few_links_are_told_and_counted(folder, tmp_path):
+def test_too_few_links_are_told_and_counted(folder, tmp_path, cli):
     """A branch of twelve links estimated with four: a quarter too stiff, known from the data to half a percent."""
-    run = load_config(configuration(folder, 4, ["north"], 1.5))
-    assert requested_refinements(run) == ("links", "time_step")
-    result = run_solve(run, tmp_path / "run").result
+    done = cli("solve", configuration(folder, 4, ["north"], 1.5), "--out", tmp_path / "run")
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
     error, alone, counted, entry = judged(result, 4)["north.bend"]
     assert error > 0.15
     assert alone < 0.02
@@ -49,31 +46,26 @@ def test_too_few_links_are_told_and_counted(folder, tmp_path):
     # with twice the links it is nearer to the truth by what is said
     moved = result["discretisation"]["north.bend"]["links"] / TRUTH["north.bend"]
     assert -error < moved < -0.4 * error
-    told = terminal_lines(solve_summary(result))
-    assert any(line.startswith("with twice the links these move by more than the data's") for line in told)
+    assert "with twice the links these move by more than the data's" in done.out
 
 
-def test_settings_say_what_is_refined(folder, tmp_path):
-    file = configuration(folder, 4, ["north"])
-    said = {"none": set(), "time_step": {"time_step"}, "both": {"links", "time_step"}}
-    for setting, tried in said.items():
-        run = load_config(file, [f"output.discretisation_check={setting}", "solver.max_iterations=1"])
-        assert set(requested_refinements(run)) == tried
-    result = run_solve(load_config(file, ["output.discretisation_check=none"]), tmp_path / "none").result
-    assert result["discretisation"] == {}
-    _, alone, *_ = result["parameters"]["north.bend"], result["parameters"]["north.bend"]["std"]
-    assert alone < 0.02 * TRUTH["north.bend"]
+@pytest.mark.parametrize(("setting", "tried"), [("none", set()), ("time_step", {"time_step"})])
+def test_settings_say_what_is_refined(folder, tmp_path, setting, tried):
+    overrides = [f"output.discretisation_check={setting}", "solver.max_iterations=1"]
+    result = run_solve(load_config(configuration(folder, 4, ["north"]), overrides), tmp_path / "run").result
+    moved = result["discretisation"].get("north.bend", {})
+    assert {key for key in ("links", "time_step") if moved.get(key) is not None} == tried
     assert result["parameters"]["north.bend"]["verdict"] == "not_trusted"
 
 
-def test_check_says_it_before_anything_is_solved(folder, tmp_path):
+def test_check_says_it_before_anything_is_solved(folder, tmp_path, cli):
     """At the truth the move is nearly the one at the estimate, whatever the data; a poor fit makes nothing unsure."""
-    poor, result = (
-        run_check(load_config(configuration(folder, 4, ["north"], start)), tmp_path / f"check_{start}").result
-        for start in (2.0, 1.0)
-    )
-    moved = result["discretisation"]["north.bend"]
-    assert 1 < poor["discretisation"]["north.bend"]["std"] / moved["std"] < 10
+    found = []
+    for start in (2.0, 1.0):
+        cli("check", configuration(folder, 4, ["north"], start), "--out", tmp_path / f"{start}")
+        found.append(json.loads((tmp_path / f"{start}" / "result.json").read_text())["discretisation"]["north.bend"])
+    poor, moved = found
+    assert 1 < poor["std"] / moved["std"] < 10
     assert -0.3 < moved["links"] / TRUTH["north.bend"] < -0.08
     assert abs(moved["time_step"]) < 0.02 * TRUTH["north.bend"]
     assert moved["std"] < 0.02 * TRUTH["north.bend"]

@@ -14,7 +14,6 @@ from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG, load_config
 from yid_ocp.config.settings import dump_config
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.diagnose import run_diagnose
-from yid_ocp.workflow.export import _manifest_path, export_model
 from yid_ocp.workflow.run_inputs import read_recordings
 
 mujoco = pytest.importorskip("mujoco", reason="exported models need MuJoCo: pip install 'yid-ocp[blind]'")
@@ -44,6 +43,18 @@ def found(tmp_path_factory):
     return written_run(tmp_path_factory.mktemp("found") / "run", {"kelvin_voigt@T1.tau": 0.05}, run)
 
 
+@pytest.fixture
+def exported(cli):
+    """exported(run, out, form): write a model; returns its manifest."""
+
+    def export(run, out, form="mjcf"):
+        done = cli("export", run, "--out", out, "--format", form, "--json")
+        assert done.code == 0, done.err
+        return json.loads(done.out)
+
+    return export
+
+
 def gate_holds(gate) -> None:
     assert (gate["status"], gate["which"]) == ("done", "held_out")
     assert gate["fall"] >= 0.8
@@ -59,7 +70,7 @@ def test_the_embedded_diagnosis_in_mujoco(cli, found, tmp_path) -> None:
     done = cli("export", found, "--out", out)
     assert done.code == 0, done.err
     assert "kelvin_voigt@T1  native" in done.out
-    manifest = json.loads(_manifest_path(out).read_text())
+    manifest = json.loads(out.with_name(f"{out.name}.manifest.json").read_text())
     gate_holds(manifest["gate"])
     assert manifest["effects"] == {"kelvin_voigt@T1": {"status": "native", "how": "damping of joints"}}
     entry = manifest["parameters"]["kelvin_voigt@T1.tau"]
@@ -79,16 +90,16 @@ def test_the_embedded_diagnosis_in_mujoco(cli, found, tmp_path) -> None:
 
 
 @pytest.mark.slow
-def test_what_a_diagnosis_found_in_mujoco(tmp_path) -> None:
+def test_what_a_diagnosis_found_in_mujoco(tmp_path, exported) -> None:
     run = load_config(None, default=DEFAULT_DIAGNOSIS_CONFIG)
     run_diagnose(replace(run, output=replace(run.output, write_report=False)), tmp_path / "run")
-    gate_holds(export_model(tmp_path / "run", tmp_path / "y.xml")["gate"])
+    gate_holds(exported(tmp_path / "run", tmp_path / "y.xml")["gate"])
 
 
-def test_urdf_loads_in_three_readers(found, tmp_path) -> None:
+def test_urdf_loads_in_three_readers(found, tmp_path, exported) -> None:
     pinocchio, yourdfpy = pytest.importorskip("pinocchio"), pytest.importorskip("yourdfpy")
     out = tmp_path / "y.urdf"
-    manifest = export_model(found, out, "urdf")
+    manifest = exported(found, out, "urdf")
     said = {name: entry["status"] for name, entry in manifest["parameters"].items()}
     assert said["T1.bend"] == "not representable"
     assert said["kelvin_voigt@T1.tau"] == said["T1.damping"] == said["T1.mass"] == "native"
@@ -104,9 +115,9 @@ def test_urdf_loads_in_three_readers(found, tmp_path) -> None:
     assert model.dof_damping[model.joint("T1_2_y").dofadr[0]] == pytest.approx(0.05 + 0.05 * bend)
 
 
-def test_sdf_has_springs_too(found, tmp_path) -> None:
+def test_sdf_has_springs_too(found, tmp_path, exported) -> None:
     out = tmp_path / "y.sdf"
-    manifest = export_model(found, out, "sdf")
+    manifest = exported(found, out, "sdf")
     assert manifest["parameters"]["T1.bend"]["status"] == "native"
     model = ElementTree.parse(out).getroot().find("world/model")
     assert model is not None
@@ -126,14 +137,14 @@ def test_sdf_has_springs_too(found, tmp_path) -> None:
     np.testing.assert_allclose([float(x) for x in link.text.split()], [0, 0, 0.813 / 4, 0, 0, 0], atol=1e-12)
 
 
-def test_what_cannot_be_said_is_left_out_and_listed(tmp_path) -> None:
+def test_what_cannot_be_said_is_left_out_and_listed(tmp_path, exported) -> None:
     effects = {"hysteresis@T2.stiffness": 0.4, "hysteresis@T2.yield_angle": 0.1, "kelvin_voigt@T1.tau": 0.05}
     effects |= {"junction_compliance@w_T1.compliance": 0.02, "joint_coulomb@left_e1.tau_c": 0.5}
     coarse = load_config(None, ["model.object.links=1"], DEFAULT_DIAGNOSIS_CONFIG)
     both = written_run(tmp_path / "both", effects, coarse)
     said = replace(coarse, recordings=replace(coarse.recordings, held_out=(), estimate=()))
     (both / "config.yaml").write_text(dump_config(said))
-    manifest = export_model(both, tmp_path / "both.xml")
+    manifest = exported(both, tmp_path / "both.xml")
     assert {label: entry["status"] for label, entry in manifest["effects"].items()} == {
         "hysteresis@T2": "not representable",
         "kelvin_voigt@T1": "native",
@@ -147,7 +158,7 @@ def test_what_cannot_be_said_is_left_out_and_listed(tmp_path) -> None:
     kept = {name: value for name, value in effects.items() if name.startswith(("kelvin", "joint_coulomb"))}
     less = written_run(tmp_path / "less", kept, coarse)
     (less / "config.yaml").write_text(dump_config(said))
-    export_model(less, tmp_path / "less.xml")
+    exported(less, tmp_path / "less.xml")
     assert text == (tmp_path / "less.xml").read_text()
 
 
@@ -167,8 +178,8 @@ def test_a_configuration_that_starts_at_the_estimates(cli, pendulum, tmp_path) -
             assert entry["value"] == pytest.approx(first["parameters"][name]["value"], rel=1e-5)
 
 
-def test_effects_that_were_found_come_back_free(found, tmp_path) -> None:
-    export_model(found, tmp_path / "again.yaml", "yaml")
+def test_effects_that_were_found_come_back_free(found, tmp_path, exported) -> None:
+    exported(found, tmp_path / "again.yaml", "yaml")
     run = load_config(tmp_path / "again.yaml")
     assert [(e.kind, e.location, dict(e.values)) for e in run.model.effects] == [("kelvin_voigt", "T1", {"tau": 0.05})]
     assert run.parameters["kelvin_voigt@T1.tau"].free
@@ -198,14 +209,14 @@ def test_wrong_input_leaves_nothing(cli, found, pendulum_data, tmp_path) -> None
 
 
 def test_no_model_without_its_manifest(cli, found, tmp_path) -> None:
-    _manifest_path(tmp_path / "y.urdf").mkdir()
+    (tmp_path / "y.urdf.manifest.json").mkdir()
     assert cli("export", found, "--format", "urdf", "--out", tmp_path / "y.urdf").code == 2
     assert not (tmp_path / "y.urdf").exists()
 
 
-def test_prescribed_joints_are_moved_as_recorded(cli, pendulum, tmp_path) -> None:
+def test_prescribed_joints_are_moved_as_recorded(cli, pendulum, tmp_path, exported) -> None:
     assert cli("solve", pendulum, "--out", "run", "--set", "output.write_report=false").code == 0
-    manifest = export_model("run", tmp_path / "pendulum.xml")
+    manifest = exported("run", tmp_path / "pendulum.xml")
     [(name, entry)] = manifest["gate"]["channels"].items()
     assert (name, entry["unit"]) == ("joints.effort", "N m")
     assert entry["after"] < 0.3 * entry["before"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import glob
+import itertools
 import json
 import logging
 import shlex
@@ -17,7 +18,6 @@ from typing import Any
 
 from yid_ocp.analysis.estimate_history import assess_drift
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import RunSettings
 from yid_ocp.errors import ConfigError, OutputError, YidError, nearest_name_hint
 from yid_ocp.files import file_sha256, os_error_reason, to_json_types, write_json
 from yid_ocp.parallel import LOCAL_WORKERS, Task, TaskResult, WorkerConfig, run_tasks
@@ -34,7 +34,8 @@ from yid_ocp.workflow.run_inputs import input_files
 from yid_ocp.workflow.solve import run_solve
 
 _RESULT_FORMAT = "yid-batch/1"
-_RESULT_FILE, _RUNS_FOLDER, _TASKS_FOLDER = "batch.json", "runs", "tasks"
+_RUNS_FOLDER, _TASKS_FOLDER = "runs", "tasks"
+_PARAMETER_KEYS = ("value", "std", "unit", "verdict")
 log = logging.getLogger(__name__)
 
 
@@ -54,27 +55,18 @@ class BatchRun:
     config_file: Path
     overrides: tuple[str, ...]
 
-    def load_settings(self) -> RunSettings:
-        """Load the run's settings; errors as `load_config`."""
-        return load_config(self.config_file, self.overrides)
-
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     members = list_batch_runs(arguments.configs, arguments.recordings, arguments.overrides)
     workers = workers_from_arguments(arguments) or LOCAL_WORKERS
     out = arguments.out or Path("runs") / f"batch-{time.strftime('%Y%m%d-%H%M%S')}"
-    again = _again(arguments, out)
-    return run_and_print(
-        arguments, lambda shown: run_batch(members, out, arguments.each, workers, shown, again), batch_summary
-    )
-
-
-def _again(arguments: argparse.Namespace, out: str | Path) -> str:
     words = ["yid-ocp", "batch", *map(str, arguments.configs)]
     words += ["--recordings", arguments.recordings] if arguments.recordings else []
     words += ["--command", arguments.each, *(word for said in arguments.overrides for word in ("--set", said))]
-    return shlex.join([*words, "--out", str(out)])
+    again = shlex.join([*words, "--out", str(out)])
+    asked = (members, out, arguments.each, workers)
+    return run_and_print(arguments, lambda shown: run_batch(*asked, shown, again), batch_summary)
 
 
 def list_batch_runs(
@@ -103,31 +95,28 @@ def list_batch_runs(
             raise ConfigError("there is no such configuration file", where=str(path), hint=hint)
         if path.resolve() in [other.resolve() for other in paths[:i]]:
             raise ConfigError("a configuration is given twice", where=str(path), hint="list every one once")
-    if recordings is None:
-        return _named([(path.stem, path, tuple(overrides)) for path in paths])
-    files = sorted(Path(match) for match in glob.glob(recordings, recursive=True) if Path(match).is_file())
-    if not files:
-        advice = "put the pattern in quotes, so that the shell leaves it alone, and check the folder"
-        allowed = "a pattern such as 'fleet/*.h5' or 'fleet/**/*.h5', relative to the working folder"
-        raise ConfigError("no recording matches", where=f"--recordings {recordings}", allowed=allowed, hint=advice)
-    entries = []
-    for path in paths:
-        for file in files:
-            own = (f"recordings.estimate=[{json.dumps(str(file.resolve()))}]", "recordings.held_out=[]")
-            stem = file.stem if len(paths) == 1 else f"{path.stem}-{file.stem}"
-            entries.append((stem, path, (*own, *overrides)))
-    return _named(entries)
-
-
-def _named(entries: Sequence[tuple[str, Path, tuple[str, ...]]]) -> list[BatchRun]:
-    members: list[BatchRun] = []
+    entries = [(path.stem, path, tuple(overrides)) for path in paths]
+    if recordings is not None:
+        files = sorted(Path(match) for match in glob.glob(recordings, recursive=True) if Path(match).is_file())
+        if not files:
+            advice = "put the pattern in quotes, so that the shell leaves it alone, and check the folder"
+            allowed = "a pattern such as 'fleet/*.h5' or 'fleet/**/*.h5', relative to the working folder"
+            raise ConfigError("no recording matches", where=f"--recordings {recordings}", allowed=allowed, hint=advice)
+        entries = [
+            (
+                file.stem if len(paths) == 1 else f"{path.stem}-{file.stem}",
+                path,
+                (f"recordings.estimate=[{json.dumps(str(file.resolve()))}]", "recordings.held_out=[]", *overrides),
+            )
+            for path in paths
+            for file in files
+        ]
+    members: dict[str, BatchRun] = {}
     for stem, path, settings in entries:
-        taken, name, number = {member.name for member in members}, stem, 1
-        while name in taken:
-            number += 1
-            name = f"{stem}-{number}"
-        members.append(BatchRun(name, path.resolve(), settings))
-    return members
+        names = itertools.chain([stem], (f"{stem}-{number}" for number in itertools.count(2)))
+        name = next(name for name in names if name not in members)
+        members[name] = BatchRun(name, path.resolve(), settings)
+    return list(members.values())
 
 
 def run_batch(
@@ -137,12 +126,14 @@ def run_batch(
     workers: WorkerConfig | Executor = LOCAL_WORKERS,
     progress: Progress = NULL_PROGRESS,
     command_line: str = "",
-) -> CommandResult:
+) -> CommandResult[None]:
     """Run a command for every run of a batch; finished runs in the folder are reused.
+
+    Successful where all runs were; those that failed say why.
 
     Parameters
     ----------
-    members : sequence of Member
+    members : sequence of BatchRun
         See `list_batch_runs`.
     out : str or Path
         Folder: `runs/NAME/` (a run folder each), `tasks/` (results of tasks, see `yid_ocp.parallel`), then `batch.json`
@@ -150,11 +141,6 @@ def run_batch(
     command : {'solve', 'diagnose'}
     command_line : str
         The command line that does the same, for the report.
-
-    Returns
-    -------
-    CommandResult
-        Also where runs failed: each says why.
 
     Raises
     ------
@@ -168,24 +154,18 @@ def run_batch(
     tasks = []
     for member in members:
         try:
-            run = member.load_settings()
+            run = load_config(member.config_file, member.overrides)
             # what it depends on beside its settings; their content counts, wherever they stand
-            inputs = sorted({str(path.absolute()) for path in input_files(run).values()})
+            inputs = [Path(path) for path in sorted({str(path.absolute()) for path in input_files(run).values()})]
             for path in inputs:
-                file_sha256(Path(path))
+                file_sha256(path)
         except YidError as error:
             results[member.name] = TaskResult(member.name, error=f"{type(error).__name__}: {error}")
             log.warning("%s cannot begin: %s", member.name, error.what)
             continue
-        arguments = {
-            "name": member.name,
-            "config": member.config_file,
-            "settings": list(member.overrides),
-            "inputs": [Path(path) for path in inputs],
-            "command": command,
-            "folder": str(folder / _RUNS_FOLDER),
-        }
-        tasks.append(Task(member.name, arguments))
+        own = {"name": member.name, "config": member.config_file, "settings": list(member.overrides)}
+        more = {"inputs": inputs, "command": command, "folder": str(folder / _RUNS_FOLDER)}
+        tasks.append(Task(member.name, own | more))
     progress.begin_stage(f"{command} of {len(tasks)} runs")
     done = run_tasks(run_batch_task, tasks, folder / _TASKS_FOLDER, workers, progress.report_parts_done)
     results |= {entry.name: entry for entry in done}
@@ -195,16 +175,16 @@ def run_batch(
         "command": command,
         "again": command_line,
         "runs": entries,
-        "history": _alike([folder / _RUNS_FOLDER / entry["name"] for entry in entries if entry["ok"]]),
+        "history": _history([folder / _RUNS_FOLDER / entry["name"] for entry in entries if entry["ok"]]),
         "date": local_time_text(),
         "versions": installed_versions(),
     }
     written: dict[str, Any] = to_json_types(result)
-    write_json(folder / _RESULT_FILE, written)
+    write_json(folder / "batch.json", written)
     progress.begin_stage("writing the report")
     about = f"{len(entries)} runs of {command} side by side."
     write_report(folder / "report.html", ReportData(folder.name, about, written))
-    return CommandResult(folder, written, is_successful=all(entry["ok"] for entry in entries))
+    return CommandResult(folder, written, None, all(entry["ok"] for entry in entries))
 
 
 def run_batch_task(
@@ -225,40 +205,35 @@ def run_batch_task(
         result = run_solve(run, target).result
         judged, fit = result["parameters"], result["fit"]
         status, ok, message = result["status"], result["status"] == "converged", result["message"]
-    kept = ("value", "std", "unit", "verdict")
-    found: dict[str, Any] = to_json_types({
-        "status": status,
-        "ok": ok,
-        "message": message,
-        "chi2_per_dof": fit.get("chi2_per_dof"),
-        "effects": [f"{entry['kind']}@{entry['location']}" for entry in result.get("effects", ())],
-        "parameters": {n: {key: own.get(key) for key in kept} for n, own in judged.items() if own.get("free", True)},
-        "seconds": time.perf_counter() - begun,
-    })  # fmt: skip
-    return found
+    parameters = {
+        parameter: {key: own.get(key) for key in _PARAMETER_KEYS}
+        for parameter, own in judged.items()
+        if own.get("free", True)
+    }
+    effects = [f"{entry['kind']}@{entry['location']}" for entry in result.get("effects", ())]
+    found = {"status": status, "ok": ok, "message": message, "chi2_per_dof": fit.get("chi2_per_dof")}
+    found |= {"effects": effects, "parameters": parameters, "seconds": time.perf_counter() - begun}
+    return dict(to_json_types(found))
 
 
 def _entry(result: TaskResult, folder: Path) -> dict[str, Any]:
-    own = {
-        "name": result.name,
-        "folder": f"{_RUNS_FOLDER}/{result.name}" if (folder / _RUNS_FOLDER / result.name).is_dir() else None,
-    }
-    if result.error:
-        failed = {"status": "error", "ok": False, "message": result.error, "chi2_per_dof": None, "effects": []}
-        return own | failed | {"parameters": {}, "seconds": None}
-    return own | dict(result.value)
+    place = f"{_RUNS_FOLDER}/{result.name}"
+    own = {"name": result.name, "folder": place if (folder / place).is_dir() else None}
+    if not result.error:
+        return own | dict(result.value)
+    failed = {"status": "error", "ok": False, "message": result.error, "chi2_per_dof": None}
+    return own | failed | {"effects": [], "parameters": {}, "seconds": None}
 
 
-def _alike(folders: Sequence[Path]) -> dict[str, Any] | None:
+def _history(folders: Sequence[Path]) -> dict[str, Any] | None:
     """`yid-history/1` of runs of one model, whose parameters mean the same thing; None where these are not that."""
+    if len(folders) < 2:
+        return None
     try:
-        if len(folders) < 2:
-            return None
         require_same_model(folders)
-        found: dict[str, Any] = history_result(assess_drift([read_estimates(folder) for folder in folders]))
+        return history_result(assess_drift([read_estimates(folder) for folder in folders]))
     except YidError:
         return None
-    return found
 
 
 def _folder(path: Path) -> Path:

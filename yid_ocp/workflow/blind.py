@@ -1,8 +1,12 @@
-"""The command `blind`: diagnoses synthetic cases without their labels, then opens the labels and scores."""
+"""The command `blind`: diagnoses synthetic cases without their labels, then opens the labels and scores.
+
+Experiments are variations of configurations; each has an ensemble, from which its cases are drawn.
+"""
 
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import logging
 import math
@@ -10,30 +14,19 @@ import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from yid_ocp.config.reader import DEFAULT_CONFIG, DEFAULT_DIAGNOSIS_CONFIG, load_config
 from yid_ocp.config.settings import RunSettings, dump_config
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
-from yid_ocp.diagnosis.blind import (
-    ENSEMBLE_PURPOSES,
-    BlindCase,
-    CaseLabel,
-    PlannedCase,
-    best_possible_closure,
-    calibrate_thresholds,
-    diagnose_case,
-    open_sealed_labels,
-    permissive_thresholds,
-    plan_cases,
-    score_case,
-    score_ensemble,
-    seal_labels,
-)
+from yid_ocp.diagnosis import blind
+from yid_ocp.diagnosis.blind.ensemble import MAX_CASE_DRAWS
 from yid_ocp.diagnosis.diagnosis_result import threshold_statistics
-from yid_ocp.errors import ConfigError, OutputError, YidError
+from yid_ocp.errors import ConfigError, ModelError, OutputError, YidError
 from yid_ocp.files import to_json_types, write_json, write_text
 from yid_ocp.parallel import LOCAL_WORKERS, Task, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.progress import NULL_PROGRESS, Progress
@@ -43,31 +36,18 @@ from yid_ocp.report.png_figures import draw_blind_results
 from yid_ocp.report.sections import ReportData
 from yid_ocp.report.summaries import blind_summary
 from yid_ocp.version import installed_versions, package_source_hash
-from yid_ocp.workflow.blind_experiments import (
-    EXPERIMENT_VARIATIONS,
-    BlindExperiment,
-    list_experiments,
-    require_blind_compatible,
-)
+from yid_ocp.virtual.experiment import ArmSensorNoise
+from yid_ocp.virtual.mujoco_simulation import DEFAULT_SIMULATOR_STEP, SimulationOptions
+from yid_ocp.workflow.build import build_system
+from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.command_runner import CommandResult, run_and_print, workers_from_arguments
 from yid_ocp.workflow.run_folder import local_time_text
+from yid_ocp.workflow.run_inputs import read_recordings
 
-_COMMITMENT_FILE, _LABELS_FILE, _RESULT_FILE, _TABLE_FILE = (
-    "commitment.json",
-    "sealed/labels.json",
-    "result.json",
-    "table.md",
-)
-_THRESHOLDS_FILE = "thresholds.json"
-_CONFIGS_FOLDER, _PREPARED_FOLDER, _DRAWN_FOLDER, _CASES_FOLDER, _ANSWERS_FOLDER, _BEST_FOLDER = (
-    "configs",
-    "prepared",
-    "sealed/drawn",
-    "cases",
-    "answers",
-    "best",
-)
 _MIN_TWO_ARM_CASES = 100  # cases from which the embedded proof has experiments with two arms as well
+_TORQUE_NOISE_STD, _TORQUE_OFFSET_STD = 0.1, 0.3
+"""Standard deviations of the torques' white noise and constant offsets where an experiment has any [N m]."""
+_NO_ANSWER = {"effects": [], "which": [], "where": [], "confusable": [], "gap": {"closure": None}}
 log = logging.getLogger(__name__)
 
 
@@ -78,13 +58,10 @@ def run(arguments: argparse.Namespace) -> int:
     if not arguments.configs and arguments.cases >= _MIN_TWO_ARM_CASES:
         runs.append(load_config(None, arguments.overrides, DEFAULT_CONFIG))
     workers = workers_from_arguments(arguments) or LOCAL_WORKERS
-    purpose = ENSEMBLE_PURPOSES[int(arguments.calibration)]
+    purpose = blind.ENSEMBLE_PURPOSES[int(arguments.calibration)]
     out = arguments.out or f"{runs[0].name}-blind-{'calibration-' if arguments.calibration else ''}{arguments.seed}"
-
-    def proved(shown: Progress) -> CommandResult:
-        return run_blind(runs, out, arguments.cases, arguments.seed, shown, workers, purpose)
-
-    return run_and_print(arguments, proved, blind_summary)
+    asked = (runs, out, arguments.cases, arguments.seed)
+    return run_and_print(arguments, lambda shown: run_blind(*asked, shown, workers, purpose), blind_summary)
 
 
 def run_blind(
@@ -94,15 +71,15 @@ def run_blind(
     seed: int = 1,
     progress: Progress = NULL_PROGRESS,
     workers: WorkerConfig | Executor = LOCAL_WORKERS,
-    purpose: str = ENSEMBLE_PURPOSES[0],
-) -> CommandResult:
+    purpose: str = blind.ENSEMBLE_PURPOSES[0],
+) -> CommandResult[None]:
     """Run a blind validation of the diagnosis in several processes; finished parts in the folder are reused.
 
     Parameters
     ----------
     runs : sequence of RunSettings
         Configurations: models, posture and sensors of their first recordings, `diagnosis.candidates`. Each is varied
-        (`workflow.blind_experiments.EXPERIMENT_VARIATIONS`) as far as there are cases for it.
+        (`EXPERIMENT_VARIATIONS`) as far as there are cases for it.
     out : str or Path
         Folder: `configs/`, `prepared/` (what is detectable in every experiment), `cases/` (recordings),
         `sealed/labels.json`, `commitment.json` (hash of the labels, written before the first diagnosis, and of the
@@ -120,201 +97,186 @@ def run_blind(
     OutputError
         The folder holds another ensemble.
     """
-    folder = Path(out).absolute()
     if count < 1:
         raise runs[0].config_error(f"an ensemble of {count} cases", "diagnosis", hint="give --cases from 1")
     if seed < 0:
         raise ConfigError(f"seed = {seed}", where="--seed", allowed="a whole number from 0")
     for entry in runs:
-        require_blind_compatible(entry)
+        _require_compatible(entry)
+    names = [entry.name for entry in runs]
+    twice = [name for i, name in enumerate(names) if name in names[:i]]
+    if twice:
+        what, hint = f"two configurations are called {twice[0]}", "give each a name of its own"
+        raise ConfigError(what, where="blind", hint=hint)
+    proof = _Proof(Path(out).absolute(), runs, count, seed, purpose, progress, workers)
     try:
-        cases = _made(_named(runs), folder, count, seed, progress, workers, purpose)
+        commitment, cases = proof.commit()
         progress.begin_stage(f"diagnosing {count} cases")
-        answers = _done(diagnose_case_task, cases, folder / _ANSWERS_FOLDER, workers, progress)
-        commitment = json.loads((folder / _COMMITMENT_FILE).read_text("utf-8"))
-        labels = open_sealed_labels((folder / _LABELS_FILE).read_text("utf-8"), commitment["sha256"])
+        answers = proof.done(diagnose_case_task, cases, "answers")
+        sealed = (proof.folder / "sealed/labels.json").read_text("utf-8")
+        labels = blind.open_sealed_labels(sealed, commitment["sha256"])
         progress.begin_stage("scoring")
-        best = _best(cases, labels, answers, folder, progress, workers)
+        best = proof.best_closures(cases, labels, answers)
     except KeyboardInterrupt:
-        log.warning("finished cases are in %s; the same command goes on with the others", folder)
+        log.warning("finished cases are in %s; the same command goes on with the others", proof.folder)
         raise
     marks = [
-        score_case(label, found["result"], best.get(label.case, math.nan), float(found["seconds"]))
+        blind.score_case(label, found["result"], best.get(label.case, math.nan), float(found["seconds"]))
         for label, found in zip(labels, answers, strict=True)
     ]
-    files = [folder / _CONFIGS_FOLDER / f"{entry.name}.yaml" for entry in runs]
-    flags = ["--cases", count, "--seed", seed, *(["--calibration"] if purpose == ENSEMBLE_PURPOSES[1] else [])]
-    again = shlex.join(["yid-ocp", "blind", *map(str, files), *map(str, flags)])
-    result = score_ensemble(marks) | {
+    flags = ["--cases", count, "--seed", seed, *(["--calibration"] if purpose == blind.ENSEMBLE_PURPOSES[1] else [])]
+    result = blind.score_ensemble(marks) | {
         "seed": seed,
         "purpose": purpose,
         "code": package_source_hash(),
         "code_of_cases": commitment["code"],
-        "command": again,
+        "command": shlex.join(["yid-ocp", "blind", *map(str, map(proof.config_file, names)), *map(str, flags)]),
         "date": local_time_text(),
         "versions": installed_versions(),
         "candidates": {entry.name: entry.diagnosis.candidates for entry in runs},
         "variations": {name: varied.description for name, varied in EXPERIMENT_VARIATIONS.items()},
     }
-    if purpose == ENSEMBLE_PURPOSES[1]:
-        found = calibrate_thresholds(labels, marks, answers, runs[0].diagnosis)
+    if purpose == blind.ENSEMBLE_PURPOSES[1]:
+        found = blind.calibrate_thresholds(labels, marks, answers, runs[0].diagnosis)
         result["calibration_of_thresholds"] = found
         made = {key: result[key] for key in ("cases", "seed", "code", "code_of_cases", "command", "date", "versions")}
-        write_json(folder / _THRESHOLDS_FILE, to_json_types(found | made))
-    return _write_outcome(folder, result, runs, progress)
+        write_json(proof.folder / "thresholds.json", to_json_types(found | made))
+    return _write_outcome(proof.folder, to_json_types(result), runs, progress)
 
 
 def _write_outcome(
-    folder: Path, result: Mapping[str, Any], runs: Sequence[RunSettings], progress: Progress
-) -> CommandResult:
-    written = to_json_types(result)
-    write_json(folder / _RESULT_FILE, written)
-    write_text(folder / _TABLE_FILE, "\n".join(blind_markdown(written)) + "\n")
+    folder: Path, written: dict[str, Any], runs: Sequence[RunSettings], progress: Progress
+) -> CommandResult[None]:
+    write_json(folder / "result.json", written)
+    write_text(folder / "table.md", "\n".join(blind_markdown(written)) + "\n")
     draw_blind_results(folder, written)
     if all(entry.output.write_report for entry in runs):
         progress.begin_stage("writing the report")
         said = f"{written['cases']} virtual cases whose effect was withheld, diagnosed, then opened."
         write_report(folder / "report.html", ReportData(folder.name, said, written))
-    return CommandResult(folder, written)
+    return CommandResult(folder, written, None)
 
 
 # -- the ensemble -----------------------------------------------------------------------------------------------------
 
 
-def _named(runs: Sequence[RunSettings]) -> dict[str, RunSettings]:
-    names = [entry.name for entry in runs]
-    twice = [name for i, name in enumerate(names) if name in names[:i]]
-    if twice:
-        raise ConfigError(
-            f"two configurations are called {twice[0]}", where="blind", hint="give each a name of its own"
-        )
-    return dict(zip(names, runs, strict=True))
+@dataclass(frozen=True)
+class _Proof:
+    """What a blind validation was asked for, and where and by whom it is done."""
 
+    folder: Path
+    runs: Sequence[RunSettings]
+    count: int
+    seed: int
+    purpose: str
+    progress: Progress
+    workers: WorkerConfig | Executor
 
-def _made(
-    runs: Mapping[str, RunSettings],
-    folder: Path,
-    count: int,
-    seed: int,
-    progress: Progress,
-    workers: WorkerConfig | Executor,
-    purpose: str,
-) -> list[Task]:
-    """The diagnosis of every case, of those in the folder or made now; labels are sealed before this returns."""
-    commitment = folder / _COMMITMENT_FILE
-    configs = {name: dump_config(entry) for name, entry in runs.items()}
-    if not commitment.exists():
-        _make(configs, folder, count, seed, progress, workers, purpose)
-    said = json.loads(commitment.read_text("utf-8"))
-    if (said["cases"], said["seed"], said["purpose"], said["configs"]) != (count, seed, purpose, configs):
-        what = f"'{folder}' holds another ensemble ({said['cases']} cases, seed {said['seed']}, for {said['purpose']})"
-        hint = "choose another folder, or the same configurations, --cases, --seed and --calibration"
-        raise OutputError(what, where="--out", hint=hint)
-    tasks = []
-    for entry in json.loads((folder / _CASES_FOLDER / "cases.json").read_text("utf-8")):
-        name = str(entry["name"])
-        config, _, variation = str(entry["experiment"]).rpartition(".")
-        arguments = {
-            **BlindExperiment(folder / _CONFIGS_FOLDER / f"{config}.yaml", variation, seed, purpose).task_arguments,
-            "first": folder / _PREPARED_FOLDER / f"{entry['experiment']}.h5",
-            "name": name,
-            "recordings": [folder / _CASES_FOLDER / file for file in (*entry["estimate"], entry["held_out"])],
-        }
-        tasks.append(Task(name, {**arguments, "without": entry["without"]}))
-    return tasks
+    def config_file(self, name: str) -> Path:
+        """The copy of a configuration."""
+        return self.folder / "configs" / f"{name}.yaml"
 
+    def commit(self) -> tuple[dict[str, Any], list[Task]]:
+        """The commitment to the labels and the diagnosis of every case, of those in the folder or made now."""
+        file = self.folder / "commitment.json"
+        configs = {entry.name: dump_config(entry) for entry in self.runs}
+        if not file.exists():
+            self._draw(file, configs)
+        said = json.loads(file.read_text("utf-8"))
+        asked = {"cases": self.count, "seed": self.seed, "purpose": self.purpose, "configs": configs}
+        if {key: said[key] for key in asked} != asked:
+            holds = f"{said['cases']} cases, seed {said['seed']}, for {said['purpose']}"
+            hint = "choose another folder, or the same configurations, --cases, --seed and --calibration"
+            raise OutputError(f"'{self.folder}' holds another ensemble ({holds})", where="--out", hint=hint)
+        tasks = []
+        for entry in json.loads((self.folder / "cases" / "cases.json").read_text("utf-8")):
+            config, _, variation = str(entry["experiment"]).rpartition(".")
+            experiment = BlindExperiment(self.config_file(config), variation, self.seed, self.purpose)
+            own = {
+                "experiment": vars(experiment),
+                "first": self.folder / "prepared" / f"{entry['experiment']}.h5",
+                "name": str(entry["name"]),
+                "recordings": [self.folder / "cases" / name for name in (*entry["estimate"], entry["held_out"])],
+                "without": entry["without"],
+            }
+            tasks.append(Task(own["name"], own))
+        return said, tasks
 
-def _make(
-    configs: Mapping[str, str],
-    folder: Path,
-    count: int,
-    seed: int,
-    progress: Progress,
-    workers: WorkerConfig | Executor,
-    purpose: str,
-) -> None:
-    """Draw the cases and commit to their labels."""
-    try:
-        for name in (_CONFIGS_FOLDER, _PREPARED_FOLDER, _CASES_FOLDER, _DRAWN_FOLDER):
-            (folder / name).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"the folder cannot be made: {error}", where=str(folder)) from error
-    for name, text in configs.items():
-        write_text(folder / _CONFIGS_FOLDER / f"{name}.yaml", text)
-    files = {name: folder / _CONFIGS_FOLDER / f"{name}.yaml" for name in configs}
-    experiments, chains = list_experiments(files, seed, purpose)
-    weights = {name: EXPERIMENT_VARIATIONS[entry.variation].case_fraction for name, entry in experiments.items()}
-    plan = plan_cases(count, seed, weights, chains, purpose)
-    used = [name for name in experiments if any(entry.experiment == name for entry in plan)]
-    progress.begin_stage(f"preparing {len(used)} {'experiment' if len(used) == 1 else 'experiments'}")
-    tasks = [
-        Task(name, {**experiments[name].task_arguments, "folder": str(folder / _PREPARED_FOLDER), "name": name})
-        for name in used
-    ]
-    _done(_prepare_experiment, tasks, folder / _PREPARED_FOLDER / "tasks", workers, progress)
-    progress.begin_stage(f"making {count} cases")
-    tasks = []
-    for entry in plan:
-        name = entry.experiment
-        known = {
-            "first": folder / _PREPARED_FOLDER / f"{name}.h5",
-            "detectable": folder / _PREPARED_FOLDER / f"{name}.json",
-        }
-        wanted = {"planned": asdict(entry), "folder": str(folder / _CASES_FOLDER)}
-        tasks.append(Task(f"case {entry.number}", {**experiments[name].task_arguments, **known, **wanted}))
-    made = _done(draw_case, tasks, folder / _DRAWN_FOLDER, workers, progress)
-    text, digest = seal_labels([CaseLabel.from_dict(entry["label"]) for entry in made])
-    write_text(folder / _LABELS_FILE, text)
-    write_json(folder / _CASES_FOLDER / "cases.json", [entry["case"] for entry in made])
-    said = {"sha256": digest, "cases": count, "seed": seed, "purpose": purpose, "configs": dict(configs)}
-    write_json(folder / _COMMITMENT_FILE, said | {"code": package_source_hash()})
+    def _draw(self, commitment: Path, configs: Mapping[str, str]) -> None:
+        """Draw the cases and commit to their labels."""
+        cases, prepared = self.folder / "cases", self.folder / "prepared"
+        try:
+            for part in (self.folder / "configs", prepared, cases, self.folder / "sealed/drawn"):
+                part.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"the folder cannot be made: {error}", where=str(self.folder)) from error
+        for name, text in configs.items():
+            write_text(self.config_file(name), text)
+        files = {name: self.config_file(name) for name in configs}
+        experiments, chains = list_experiments(files, self.seed, self.purpose)
+        weights = {name: EXPERIMENT_VARIATIONS[entry.variation].case_fraction for name, entry in experiments.items()}
+        plan = blind.plan_cases(self.count, self.seed, weights, chains, self.purpose)
+        used = [name for name in experiments if any(entry.experiment == name for entry in plan)]
+        self.progress.begin_stage(f"preparing {len(used)} {'experiment' if len(used) == 1 else 'experiments'}")
+        told = {name: {"experiment": vars(experiments[name])} for name in used}
+        tasks = [Task(name, {**told[name], "folder": str(prepared), "name": name}) for name in used]
+        self.done(_prepare_experiment, tasks, "prepared/tasks")
+        self.progress.begin_stage(f"making {self.count} cases")
+        tasks = []
+        for entry in plan:
+            name = entry.experiment
+            known = {"first": prepared / f"{name}.h5", "detectable": prepared / f"{name}.json"}
+            wanted = {"planned": asdict(entry), "folder": str(cases)}
+            tasks.append(Task(f"case {entry.number}", {**told[name], **known, **wanted}))
+        made = self.done(_draw_case, tasks, "sealed/drawn")
+        text, digest = blind.seal_labels([blind.CaseLabel.from_dict(entry["label"]) for entry in made])
+        write_text(self.folder / "sealed/labels.json", text)
+        write_json(cases / "cases.json", [entry["case"] for entry in made])
+        said = {"sha256": digest, "cases": self.count, "seed": self.seed, "purpose": self.purpose}
+        write_json(commitment, said | {"configs": dict(configs), "code": package_source_hash()})
+
+    def best_closures(
+        self, cases: Sequence[Task], labels: Sequence[blind.CaseLabel], answers: Sequence[Mapping[str, Any]]
+    ) -> dict[str, float]:
+        """By case, what its true effects close, where one of them or two were withheld and a gap was seen."""
+        tasks = []
+        for case, label, found in zip(cases, labels, answers, strict=True):
+            gap = found["result"]["verdict"] not in ("no_gap", "insufficient_data")
+            if gap and label.category in ("single", "pair"):
+                arguments = {key: value for key, value in case.arguments.items() if key != "without"}
+                tasks.append(Task(case.name, {**arguments, "label": label.to_dict()}))
+        best = self.done(_true_effect_closure, tasks, "best")
+        return {task.name: value for task, value in zip(tasks, best, strict=True) if value is not None}
+
+    def done(self, function: Callable[..., Any], tasks: Sequence[Task], results: str) -> list[Any]:
+        """What a function finds for each task; one experiment after the other, so that a worker builds each once."""
+        order = sorted(range(len(tasks)), key=lambda i: str(tasks[i].arguments["experiment"]))
+        folder, report = self.folder / results, self.progress.report_parts_done
+        found = run_tasks(function, [tasks[i] for i in order], folder, self.workers, report)
+        values = dict(zip(order, require_task_values(found), strict=True))
+        return [values[i] for i in range(len(tasks))]
 
 
 # -- tasks ------------------------------------------------------------------------------------------------------------
 
 
-def _done(
-    function: Callable[..., Any],
-    tasks: Sequence[Task],
-    folder: Path,
-    workers: WorkerConfig | Executor,
-    progress: Progress,
-) -> list[Any]:
-    """What a function finds for each task; one experiment after the other, so that a worker builds each once."""
-    order = sorted(range(len(tasks)), key=lambda i: [str(tasks[i].arguments[key]) for key in ("config", "variation")])
-    found = require_task_values(
-        run_tasks(function, [tasks[i] for i in order], folder, workers, progress.report_parts_done)
-    )
-    return [value for _, value in sorted(zip(order, found, strict=True), key=lambda pair: pair[0])]
-
-
-def _prepare_experiment(
-    config: Path, variation: str, seed: int, purpose: str, folder: str, name: str
-) -> dict[str, int]:
+def _prepare_experiment(experiment: Mapping[str, Any], folder: str, name: str) -> dict[str, int]:
     """Task: write an experiment's first recording and the detectable size of every candidate."""
-    experiment = BlindExperiment(config, variation, seed, purpose)
     first = Path(folder) / f"{name}.h5"
-    experiment.write_first_recording(first)
-    _, ensemble = experiment.build_ensemble(first)
+    BlindExperiment(**experiment).write_first_recording(first)
+    _, ensemble = BlindExperiment(**experiment).build_ensemble(first)
     detectable = [entry.to_dict() for entry in ensemble.detectable_effects]
     write_json(Path(folder) / f"{name}.json", detectable)
     return {"candidates": len(detectable)}
 
 
-def draw_case(
-    config: Path,
-    variation: str,
-    seed: int,
-    purpose: str,
-    first: Path,
-    detectable: Path,
-    planned: Mapping[str, Any],
-    folder: str,
+def _draw_case(
+    experiment: Mapping[str, Any], first: Path, detectable: Path, planned: Mapping[str, Any], folder: str
 ) -> dict[str, Any]:
     """Task: write the recordings of a case; returns its label and the data given to its diagnosis."""
-    _, ensemble = BlindExperiment(config, variation, seed, purpose).build_ensemble(first)
+    _, ensemble = BlindExperiment(**experiment).build_ensemble(first)
     ensemble.load_detectable_effects(json.loads(detectable.read_text("utf-8")))
-    case, label = ensemble.draw_case(PlannedCase(**planned))
+    case, label = ensemble.draw_case(blind.PlannedCase(**planned))
     for recording in (*case.estimation_recordings, case.held_out_recording):
         write_recording(recording, Path(folder) / f"{recording.name}.h5")
     told = {
@@ -329,89 +291,205 @@ def draw_case(
 
 
 def diagnose_case_task(
-    config: Path,
-    variation: str,
-    seed: int,
-    purpose: str,
-    first: Path,
-    name: str,
-    recordings: Sequence[Path],
-    without: Sequence[str],
+    experiment: Mapping[str, Any], first: Path, name: str, recordings: Sequence[Path], without: Sequence[str]
 ) -> dict[str, Any]:
     """Task: diagnose a case from its recordings, the last one held out; returns {seconds, result}.
 
     For calibration, one without a gap has `open` too: the statistics of a diagnosis that takes anything for a gap.
     """
-    run, ensemble = BlindExperiment(config, variation, seed, purpose).build_ensemble(first)
-    case = _case(name, recordings, without)
+    run, ensemble = BlindExperiment(**experiment).build_ensemble(first)
+    case, candidates = _case(name, recordings, without), run.diagnosis.candidates
     begun = time.perf_counter()
     try:
-        result = diagnose_case(ensemble, case, run.diagnosis.candidates, run.diagnosis).to_dict()
+        result = blind.diagnose_case(ensemble, case, candidates, run.diagnosis).to_dict()
     except YidError as error:
-        result = _nothing(str(error))
+        result = {"verdict": "insufficient_data", "message": str(error), **_NO_ANSWER}
     found: dict[str, Any] = to_json_types({"seconds": time.perf_counter() - begun, "result": result})
-    if purpose == ENSEMBLE_PURPOSES[1] and result["verdict"] == "no_gap":
-        anything = permissive_thresholds(run.diagnosis)
+    if experiment["purpose"] == blind.ENSEMBLE_PURPOSES[1] and result["verdict"] == "no_gap":
         try:
-            found["open"] = to_json_types(
-                threshold_statistics(diagnose_case(ensemble, case, run.diagnosis.candidates, anything))
-            )
+            anything = blind.diagnose_case(ensemble, case, candidates, blind.permissive_thresholds(run.diagnosis))
+            found["open"] = to_json_types(threshold_statistics(anything))
         except YidError as error:
             found["open"] = {"message": str(error)}
     return found
 
 
 def _true_effect_closure(
-    config: Path,
-    variation: str,
-    seed: int,
-    purpose: str,
-    first: Path,
-    name: str,
-    recordings: Sequence[Path],
-    label: Mapping[str, Any],
+    experiment: Mapping[str, Any], first: Path, name: str, recordings: Sequence[Path], label: Mapping[str, Any]
 ) -> float | None:
     """Task: fraction of a case's gap closed by its refitted true effects; None where it cannot be computed."""
-    run, ensemble = BlindExperiment(config, variation, seed, purpose).build_ensemble(first)
+    run, ensemble = BlindExperiment(**experiment).build_ensemble(first)
     case = _case(name, recordings, ())
     try:
-        best = best_possible_closure(ensemble, case, CaseLabel.from_dict(label), run.diagnosis.candidates)
+        best = blind.best_possible_closure(ensemble, case, blind.CaseLabel.from_dict(label), run.diagnosis.candidates)
     except YidError:
         return None
     return best if math.isfinite(best) else None
 
 
-def _case(name: str, recordings: Sequence[Path], without: Sequence[str]) -> BlindCase:
+def _case(name: str, recordings: Sequence[Path], without: Sequence[str]) -> blind.BlindCase:
     *estimate, held_out = map(read_recording, recordings)
-    return BlindCase(name, tuple(estimate), held_out, tuple(without))
+    return blind.BlindCase(name, tuple(estimate), held_out, tuple(without))
 
 
-def _best(
-    cases: Sequence[Task],
-    labels: Sequence[CaseLabel],
-    answers: Sequence[Mapping[str, Any]],
-    folder: Path,
-    progress: Progress,
-    workers: WorkerConfig | Executor,
-) -> dict[str, float]:
-    """By case, what its true effects close, where one of them or two were withheld and a gap was seen."""
-    tasks = []
-    for case, label, found in zip(cases, labels, answers, strict=True):
-        gap = found["result"]["verdict"] not in ("no_gap", "insufficient_data")
-        if gap and label.category in ("single", "pair"):
-            arguments = {key: value for key, value in case.arguments.items() if key != "without"}
-            tasks.append(Task(case.name, {**arguments, "label": label.to_dict()}))
-    best = _done(_true_effect_closure, tasks, folder / _BEST_FOLDER, workers, progress)
-    return {task.name: value for task, value in zip(tasks, best, strict=True) if value is not None}
+# -- experiments ------------------------------------------------------------------------------------------------------
 
 
-def _nothing(message: str) -> dict[str, Any]:
-    return {
-        "verdict": "insufficient_data",
-        "message": message,
-        "effects": [],
-        "which": [],
-        "where": [],
-        "confusable": [],
-        "gap": {"closure": None},
-    }
+@dataclass(frozen=True)
+class _ExperimentVariation:
+    """How an experiment of a blind validation differs from its configuration."""
+
+    case_fraction: float
+    description: str
+    has_torque_noise: bool = False
+    time_step_factor: float = 1.0
+    n_recordings: int = 1
+    is_without_object: bool = False
+    has_prescribed_arms: bool = False
+
+    def simulation_overrides(self) -> tuple[str, ...]:
+        """Setting overrides of the model that simulates the recordings."""
+        # what is said of the object and of what sees it means nothing without it
+        bare = ("model.object=null", "model.grasp={}", "model.points=null", "sensors={}", "parameters={}")
+        return bare if self.is_without_object else ()
+
+    def diagnosis_overrides(self, driven: Sequence[str]) -> list[str]:
+        """Setting overrides of the model that is diagnosed."""
+        own = list(self.simulation_overrides())
+        if self.is_without_object:
+            free = {f"{name}.damping": {"free": True, "bounds": [0.0, 50.0]} for name in driven}
+            own += [f"parameters={json.dumps(free)}", "diagnosis.candidates=all"]
+        return own + (["model.arms.mode=prescribed"] if self.has_prescribed_arms else [])
+
+
+_BARE = {"has_torque_noise": True, "is_without_object": True}
+EXPERIMENT_VARIATIONS: Mapping[str, _ExperimentVariation] = {
+    "as_configured": _ExperimentVariation(0.4, "as the configuration has it, torques exact"),
+    "torque_noise": _ExperimentVariation(0.2, "torques with noise and offsets", has_torque_noise=True),
+    "several_recordings": _ExperimentVariation(0.1, "three recordings to estimate on", n_recordings=3),
+    "finer_integration": _ExperimentVariation(0.1, "the other engine's step halved", time_step_factor=0.5),
+    "bare_arm": _ExperimentVariation(0.1, "the arms alone, driven", **_BARE),
+    "bare_arm_efforts": _ExperimentVariation(
+        0.1, "the arms alone, moved as measured", **_BARE, has_prescribed_arms=True
+    ),
+}
+"""By name; an experiment is `CONFIGURATION.VARIATION`."""
+
+
+@dataclass(frozen=True)
+class BlindExperiment:
+    """One experiment of an ensemble, as plain data and paths."""
+
+    config_file: Path
+    variation: str
+    seed: int
+    purpose: str
+
+    def simulation_settings(self) -> RunSettings:
+        """Settings of the model that simulates the recordings."""
+        return load_config(self.config_file, EXPERIMENT_VARIATIONS[self.variation].simulation_overrides())
+
+    def _recording_conditions(self) -> blind.RecordingConditions:
+        """Conditions under which the recordings are simulated, without the camera."""
+        varied = EXPERIMENT_VARIATIONS[self.variation]
+        noise = ArmSensorNoise()
+        if varied.has_torque_noise:
+            noise = ArmSensorNoise(effort_std=_TORQUE_NOISE_STD, effort_bias_std=_TORQUE_OFFSET_STD)
+        simulation = SimulationOptions(time_step=DEFAULT_SIMULATOR_STEP * varied.time_step_factor)
+        return blind.RecordingConditions(varied.n_recordings, noise, simulation, purpose=self.purpose)
+
+    def write_first_recording(self, file: Path) -> None:
+        """Write the first recording, which fixes initial configuration and sensors.
+
+        Raises
+        ------
+        ConfigError, DataError, ModelError
+        """
+        varied, run = EXPERIMENT_VARIATIONS[self.variation], load_config(self.config_file)
+        first = read_recordings(run, count=1)
+        if not first:
+            what = "there is no recording that says where the arms begin"
+            raise run.config_error(what, "recordings", "estimate", hint="list one")
+        system = build_system(self.simulation_settings())
+        vision = not varied.is_without_object and any(group.pose is not None for group in first[0].points)
+        values = dict(zip(system.parameters.names, map(float, system.parameters.vector()), strict=True))
+        conditions = replace(self._recording_conditions(), has_camera=vision)
+        posture = blind.initial_joint_positions(system, first[0])
+        for attempt in range(MAX_CASE_DRAWS):
+            rng = np.random.default_rng([self.seed, blind.ENSEMBLE_PURPOSES.index(self.purpose), 3, attempt])
+            try:
+                made = blind.simulate_random_motion(system, system, posture, values, values, (), rng, conditions)
+            except ModelError:
+                continue  # the motion throws the object about; draw another
+            write_recording(replace(made, name="first", description="", source="", true_parameters={}), file)
+            return
+        hint = "an object that is thrown about needs more damping, or a start of its arms in which it hangs calm"
+        what = f"none of {MAX_CASE_DRAWS} motions can be simulated"
+        raise ModelError(what, where=f"{self.config_file.name}, {varied.description}", hint=hint)
+
+    def build_ensemble(self, first: Path) -> tuple[RunSettings, blind.CaseGenerator]:
+        """Settings of the diagnosed model and the ensemble, built from the first recording.
+
+        Raises
+        ------
+        ConfigError, DataError, ModelError
+        """
+        return _ensemble(self, first, first.stat().st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=1)
+def _ensemble(experiment: BlindExperiment, first: Path, written: int) -> tuple[RunSettings, blind.CaseGenerator]:
+    """See `BlindExperiment.build_ensemble`; kept with its compiled step for the next task of the same experiment."""
+    del written
+    varied, simulated_run = EXPERIMENT_VARIATIONS[experiment.variation], experiment.simulation_settings()
+    simulated = build_system(simulated_run)
+    begun = (f"recordings.estimate=[{json.dumps(str(first))}]", "recordings.held_out=[]")
+    run = load_config(experiment.config_file, (*varied.diagnosis_overrides(simulated.driven), *begun))
+    ensemble = blind.CaseGenerator(
+        build_problem(run),
+        experiment.seed,
+        (lambda times: build_system(simulated_run, times)) if simulated.segment_layouts else None,
+        run.diagnosis.candidates,
+        run.diagnosis,
+        simulated_system=simulated,
+        conditions=experiment._recording_conditions(),
+    )
+    return run, ensemble
+
+
+def _require_compatible(run: RunSettings) -> None:
+    """Raise an error for configurations that a blind validation does not support."""
+    if run.diagnosis.noise_fraction < 1 or any(entry.std is not None for entry in run.sensors.values()):
+        what = "virtual recordings have the noise of `run_virtual_experiment`, not that of these settings"
+        raise run.config_error(what, "sensors", hint="leave sensors.*.std and diagnosis.noise_fraction out")
+    system = build_system(run)
+    if not system.driven or system.prescribed or system.servos:
+        allowed = "a robot whose arms are driven by torques, nothing prescribed"
+        raise run.config_error("a blind proof moves driven arms", "model", "arms", "mode", allowed=allowed)
+
+
+def list_experiments(
+    configs: Mapping[str, Path], seed: int, purpose: str
+) -> tuple[dict[str, BlindExperiment], frozenset[str]]:
+    """All experiments by name, and the names of those whose object has divisible links.
+
+    Variations that a configuration does not allow, as one whose frames sit on the object that is taken away, are left
+    out.
+    """
+    found: dict[str, BlindExperiment] = {}
+    chains = set()
+    for name, config in configs.items():
+        whole = load_config(config).model.object is not None
+        for variation, varied in EXPERIMENT_VARIATIONS.items():
+            if varied.is_without_object and not whole:
+                continue  # as the others are
+            experiment = BlindExperiment(config, variation, seed, purpose)
+            try:
+                system = build_system(experiment.simulation_settings())
+            except YidError as error:
+                log.info("%s.%s is left out: %s", name, variation, error.what)
+                continue
+            found[f"{name}.{variation}"] = experiment
+            if system.segment_layouts:
+                chains.add(f"{name}.{variation}")
+    return found, frozenset(chains)

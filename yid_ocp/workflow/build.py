@@ -1,42 +1,37 @@
-"""Builds the system of a run, its parameters and its compiled step."""
+"""Builds the system of a run from its settings: robot or clamps, object, frames, effects, parameters; and its step."""
 
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import (
-    GraspSettings,
-    ParameterSettings,
-    RunSettings,
-)
+from yid_ocp.config.settings import GraspSettings, ParameterSettings, RunSettings
 from yid_ocp.data.channel_checks import median_edge_lengths
+from yid_ocp.data.recording import Recording
 from yid_ocp.effects import make_effect
-from yid_ocp.errors import YidError, nearest_name_hint
+from yid_ocp.errors import DataError, YidError, nearest_name_hint
 from yid_ocp.integrator.step import Step, compile_step
-from yid_ocp.model import FlexibleObject, Grasp, Mechanism, System
+from yid_ocp.model import FlexibleObject, Grasp, Mechanism, Parameter, System, forward_kinematics
+from yid_ocp.model.mechanism import Frame, Placement
 from yid_ocp.model.objects.base import CableTopology, ClampedObject
 from yid_ocp.model.parameters import Parameters
-from yid_ocp.model.rotations import rotation_from_rpy
+from yid_ocp.model.rotations import rotation_from_rpy, transform_from_xyz_rpy
 from yid_ocp.model.servos_and_springs import PositionServoOptions, RobotJointSpring
+from yid_ocp.model.system import floating_clamp
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.workflow.clamps import clamp_mechanism, marker_parameter_values, with_extra_frames
-from yid_ocp.workflow.run_inputs import (
-    input_files,
-    load_plugins,
-    locate_errors,
-    read_recordings,
-)
+from yid_ocp.workflow.run_inputs import input_files, load_plugins, locate_errors, read_recordings, unknown_name_error
 
 _OBJECT_DAMPING_KEY = "object"  # key of the object's damping beside those of the joints
 _DEFAULT_JOINT_DAMPING = 0.05  # of joints that a damping by name does not mention [N m s/rad]
-_PlacedObject = tuple[FlexibleObject, str | None, np.ndarray | None]
+_AXES = "xyz"
+_OTHER_SIDE = {"left": "right", "right": "left"}
 
 
 def build_system(run: RunSettings, link_division: int = 1) -> System:
@@ -53,114 +48,70 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
     ConfigError, ModelError
         Names that do not exist, values outside their bounds; the error names the setting.
     """
-    model = run.model
+    model, arms = run.model, run.model.arms
     input_files(run)
     load_plugins(run)
     if isinstance(model.object, ClampedObject):
-        return _clamped_system(run, model.object)
-    robot = _robot(run)
+        return _completed(run, _clamped_system(run, model.object, model.object.kind))
+    robot = None
+    if model.robot is not None:
+        with locate_errors(run, "model", "arms", "joints"):
+            robot = read_urdf(model.robot, **urdf_options(run))
     joints = () if robot is None else robot.joint_names
-    held = clamp_mechanism(run)
+    clamps = _clamp_mechanism(run)
     damping, of_object = _dampings(run, joints)
-    for name, spring in model.springs.items():
-        if name not in joints:
-            raise run.config_error(
-                f"there is no joint '{name}'", "model", "springs", name, hint=nearest_name_hint(name, joints)
-            )
-        if spring.damping is not None:
-            damping[name] = spring.damping
+    item = model.object
     with locate_errors(run, "model", "object"):
-        objects = _objects(run, of_object, link_division)
-    mode = "driven" if arms_are_estimated_states(run) else model.arms.mode
-    for i, name in enumerate(model.arms.passive_joints):
+        objects = [] if item is None else [(item.build(of_object, link_division), *item.placement)]
+    mode = "driven" if arms_are_estimated_states(run) else arms.mode
+    for i, name in enumerate(arms.passive_joints):
         if name not in joints:
-            hint = nearest_name_hint(name, joints)
-            raise run.config_error(f"there is no joint '{name}'", "model", "arms", "passive_joints", i, hint=hint)
-    moved = tuple(name for name in joints if name not in model.arms.passive_joints)
-    grasps = [
-        Grasp(name, grasp.holder_frame, grasp.held_frame, grasp.kind, ca.SX(ca.DM(rotation_from_rpy(*grasp.rpy))))
-        for name, grasp in model.grasp.items()
-    ]
+            raise unknown_name_error(run, "joint", name, joints, "model", "arms", "passive_joints", i)
+    moved = tuple(name for name in joints if name not in arms.passive_joints)
     if robot is None and not objects:
-        raise run.config_error(
-            "the model has neither a robot nor an object", "model", hint="set model.robot or model.object"
-        )
+        hint = "set model.robot or model.object"
+        raise run.config_error("the model has neither a robot nor an object", "model", hint=hint)
     with locate_errors(run, "model", "frames"):
-        carrier, items = with_extra_frames(run, robot if held is None else held, [item for item, _, _ in objects])
+        carrier, items = _with_extra_frames(run, robot if clamps is None else clamps, [item for item, *_ in objects])
     with locate_errors(run, "model"):
         system = System.build(
             carrier,
             objects=[(item, frame, place) for item, (_, frame, place) in zip(items, objects, strict=True)],
-            grasps=grasps,
+            grasps=[
+                Grasp(name, said.holder_frame, said.held_frame, said.kind, ca.SX(ca.DM(rotation_from_rpy(*said.rpy))))
+                for name, said in model.grasp.items()
+            ],
             driven=moved if mode in ("driven", "servo") else (),
-            prescribed=held.joint_names if held is not None else moved if mode == "prescribed" else (),
+            prescribed=clamps.joint_names if clamps is not None else moved if mode == "prescribed" else (),
             damping=damping,
             gravity=model.gravity,
             point_frames=model.points,
             springs={name: RobotJointSpring(s.stiffness, s.rest_position) for name, s in model.springs.items()},
-            servos=PositionServoOptions(**vars(model.arms.servo)) if mode == "servo" else None,
+            servos=PositionServoOptions(**vars(arms.servo)) if mode == "servo" else None,
         )
     if any(said.marker_reference_pose for said in model.frames.values()) and run.recordings.estimate:
         # where markers sit when nobody says which recording is meant
-        first = replace(run, recordings=replace(run.recordings, estimate=run.recordings.estimate[:1]))
-        [places] = marker_parameter_values(run, system, read_recordings(first, "estimate")).values()
+        [places] = marker_parameter_values(run, system, read_recordings(run, count=1)).values()
         system = replace(system, parameters=system.parameters.with_values(places))
     return _completed(run, system, link_division)
 
 
-def arms_are_estimated_states(run: RunSettings) -> bool:
-    """Whether prescribed arms become estimated states, driven by measured torques and corrected by encoders."""
-    if run.model.arms.mode != "prescribed" or not run.model.grasp:
-        return False
-    recordings = read_recordings(run, "estimate")
-    return bool(recordings) and all(r.joints is not None and r.joints.effort is not None for r in recordings)
+def urdf_options(run: RunSettings) -> dict[str, Any]:
+    """Which joints and links of its robot a run takes, as options of `read_urdf`."""
+    arms = run.model.arms
+    return {"joints": arms.joints, "locked": arms.locked_joints, "exclude_links": arms.exclude_links}
 
 
-def _dampings(run: RunSettings, joints: Sequence[str]) -> tuple[dict[str, float], float]:
-    said = run.model.damping
-    if not isinstance(said, Mapping):
-        return dict.fromkeys(joints, said), said
-    known = (*joints, _OBJECT_DAMPING_KEY) if run.model.object is not None else joints
-    for name in said:
-        if name not in known:
-            raise run.config_error(
-                f"there is no joint '{name}'", "model", "damping", name, hint=nearest_name_hint(name, known)
-            )
-    if run.model.object is not None and _OBJECT_DAMPING_KEY not in said:
-        allowed = f"joints of the robot and `{_OBJECT_DAMPING_KEY}`, for all joints of the object"
-        what = "the damping is given by joint, but not that of the object"
-        raise run.config_error(
-            what, "model", "damping", allowed=allowed, hint=f"set model.damping.{_OBJECT_DAMPING_KEY}"
-        )
-    return {name: said.get(name, _DEFAULT_JOINT_DAMPING) for name in joints}, said.get(
-        _OBJECT_DAMPING_KEY, _DEFAULT_JOINT_DAMPING
-    )
+def build_step(run: RunSettings, system: System | None = None) -> Step:
+    """The compiled step of a run."""
+    said = run.problem
+    system = build_system(run) if system is None else system
+    return compile_step(system, said.time_step, said.force_split, said.constraint_force, use_compiler=said.use_compiler)
 
 
-def _completed(run: RunSettings, system: System, finer: int = 1) -> System:
-    for i, said in enumerate(run.model.effects):
-        with locate_errors(run, "model", "effects", i):
-            system = system.with_effects([make_effect(said.kind, said.location, system, dict(said.values))])
-    return replace(system, parameters=_set_parameters(run, system.parameters, finer))
-
-
-def _clamped_system(run: RunSettings, item: ClampedObject) -> System:
-    """The system of an object that brings its clamps."""
-    cable = build_cable(run)
-    assert run.model.object is not None
-    assert cable is not None
-    kind = run.model.object.kind
-    for key in ("robot", "grasp", "springs", "clamps", "frames"):
-        if getattr(run.model, key):
-            what = f"a {kind} takes no {key}: its clamps hold it"
-            raise run.config_error(what, "model", key, hint=f"remove {key}")
-    recordings = read_recordings(run, "estimate")
-    if not recordings:
-        what = f"a {kind}'s lengths come from recordings"
-        raise run.config_error(what, "recordings", "estimate", hint="list at least one")
-    with locate_errors(run, "model", "object"):
-        system = item.clamped_system(median_edge_lengths(cable.edges, recordings), run.model.gravity)
-    return _completed(run, system)
+def load_system(path: str | Path, overrides: Sequence[str] = ()) -> System:
+    """The system that a configuration file describes; errors as `load_config` and `build_system`."""
+    return build_system(load_config(path, overrides))
 
 
 def build_cable(run: RunSettings) -> CableTopology | None:
@@ -169,21 +120,79 @@ def build_cable(run: RunSettings) -> CableTopology | None:
         return run.model.object.topology() if isinstance(run.model.object, ClampedObject) else None
 
 
-def _robot(run: RunSettings) -> Mechanism | None:
-    model = run.model
-    if model.robot is None:
-        return None
-    with locate_errors(run, "model", "arms", "joints"):
-        arms = model.arms
-        return read_urdf(model.robot, joints=arms.joints, locked=arms.locked_joints, exclude_links=arms.exclude_links)
+def arms_are_estimated_states(run: RunSettings) -> bool:
+    """Whether prescribed arms become estimated states, driven by measured torques and corrected by encoders."""
+    if run.model.arms.mode != "prescribed" or not run.model.grasp:
+        return False
+    recordings = read_recordings(run)
+    return bool(recordings) and all(r.joints is not None and r.joints.effort is not None for r in recordings)
 
 
-def _objects(run: RunSettings, damping: float, link_division: int) -> list[_PlacedObject]:
-    item = run.model.object
-    return [] if item is None else [(item.build(damping, link_division), *item.placement)]
+def _dampings(run: RunSettings, joints: Sequence[str]) -> tuple[dict[str, float], float]:
+    """Damping of every joint of the robot, and of the object's joints."""
+    said, has_object = run.model.damping, run.model.object is not None
+    if isinstance(said, Mapping):
+        known = (*joints, _OBJECT_DAMPING_KEY) if has_object else joints
+        for name in said:
+            if name not in known:
+                raise unknown_name_error(run, "joint", name, known, "model", "damping", name)
+        if has_object and _OBJECT_DAMPING_KEY not in said:
+            allowed = f"joints of the robot and `{_OBJECT_DAMPING_KEY}`, for all joints of the object"
+            what = "the damping is given by joint, but not that of the object"
+            hint = f"set model.damping.{_OBJECT_DAMPING_KEY}"
+            raise run.config_error(what, "model", "damping", allowed=allowed, hint=hint)
+        of_object = said.get(_OBJECT_DAMPING_KEY, _DEFAULT_JOINT_DAMPING)
+        damping = {name: said.get(name, _DEFAULT_JOINT_DAMPING) for name in joints}
+    else:
+        damping, of_object = dict.fromkeys(joints, said), said
+    for name, spring in run.model.springs.items():
+        if name not in joints:
+            raise unknown_name_error(run, "joint", name, joints, "model", "springs", name)
+        if spring.damping is not None:
+            damping[name] = spring.damping
+    return damping, of_object
 
 
-# -- parameters -------------------------------------------------------------------------------------------------------
+def _clamped_system(run: RunSettings, item: ClampedObject, kind: str) -> System:
+    """The system of an object that brings its clamps."""
+    cable = build_cable(run)
+    assert cable is not None
+    for key in ("robot", "grasp", "springs", "clamps", "frames"):
+        if getattr(run.model, key):
+            what = f"a {kind} takes no {key}: its clamps hold it"
+            raise run.config_error(what, "model", key, hint=f"remove {key}")
+    recordings = read_recordings(run)
+    if not recordings:
+        what = f"a {kind}'s lengths come from recordings"
+        raise run.config_error(what, "recordings", "estimate", hint="list at least one")
+    with locate_errors(run, "model", "object"):
+        return item.clamped_system(median_edge_lengths(cable.edges, recordings), run.model.gravity)
+
+
+def _completed(run: RunSettings, system: System, link_division: int = 1) -> System:
+    """The system with the effects and the parameters' values of the settings."""
+    for i, said in enumerate(run.model.effects):
+        with locate_errors(run, "model", "effects", i):
+            system = system.with_effects([make_effect(said.kind, said.location, system, dict(said.values))])
+    chosen, entries = parameter_settings(run, system.parameters), []
+    for entry in system.parameters:
+        if entry.name in chosen:
+            given, factor = chosen[entry.name], link_division_factor(run, entry.name, link_division)
+            lower, upper = (entry.lower, entry.upper) if given.bounds is None else (factor * b for b in given.bounds)
+            value = entry.value if given.initial is None else factor * given.initial
+            key = [key for key in run.parameters if _matches(entry.name, key)][-1]
+            if lower < entry.lower or upper > entry.upper or lower > upper:
+                what = f"the bounds {lower:g} to {upper:g} {entry.unit} of {entry.name} are not possible"
+                allowed = f"within {entry.lower:g} to {entry.upper:g} {entry.unit}, lower first"
+                raise run.config_error(what, "parameters", key, "bounds", allowed=allowed)
+            with locate_errors(run, "parameters", key, "initial"):
+                entry = replace(entry, value=value, lower=lower, upper=upper)
+        entries.append(entry)
+    return replace(system, parameters=Parameters(entries))
+
+
+def _matches(name: str, key: str) -> bool:
+    return name == key or fnmatch.fnmatchcase(name, key)
 
 
 def parameter_settings(run: RunSettings, parameters: Parameters) -> dict[str, ParameterSettings]:
@@ -196,33 +205,18 @@ def parameter_settings(run: RunSettings, parameters: Parameters) -> dict[str, Pa
     """
     result: dict[str, ParameterSettings] = {}
     for key, given in run.parameters.items():
-        matches = [name for name in parameters.names if name == key or fnmatch.fnmatchcase(name, key)]
+        matches = [name for name in parameters.names if _matches(name, key)]
         if not matches:
             hint = nearest_name_hint(key, parameters.names) + "; all of them are listed by `yid-ocp inspect`"
             raise run.config_error(f"there is no parameter '{key}'", "parameters", key, hint=hint)
         said = {name: value for name, value in vars(given).items() if value is not None}
-        for name in matches:
-            result[name] = replace(result.get(name, ParameterSettings()), **said)
+        result |= {name: replace(result.get(name, ParameterSettings()), **said) for name in matches}
     return result
 
 
-def _set_parameters(run: RunSettings, parameters: Parameters, finer: int) -> Parameters:
-    chosen = parameter_settings(run, parameters)
-    entries = []
-    for entry in parameters:
-        if entry.name in chosen:
-            said, factor = chosen[entry.name], link_division_factor(run, entry.name, finer)
-            lower, upper = (entry.lower, entry.upper) if said.bounds is None else (factor * b for b in said.bounds)
-            value = entry.value if said.initial is None else factor * said.initial
-            key = _key_of(run, entry.name)
-            if lower < entry.lower or upper > entry.upper or lower > upper:
-                what = f"the bounds {lower:g} to {upper:g} {entry.unit} of {entry.name} are not possible"
-                allowed = f"within {entry.lower:g} to {entry.upper:g} {entry.unit}, lower first"
-                raise run.config_error(what, "parameters", key, "bounds", allowed=allowed)
-            with locate_errors(run, "parameters", key, "initial"):
-                entry = replace(entry, value=value, lower=lower, upper=upper)
-        entries.append(entry)
-    return Parameters(entries)
+def free_parameters(run: RunSettings, parameters: Parameters) -> list[str]:
+    """Names of the parameters that the settings free."""
+    return [name for name, said in parameter_settings(run, parameters).items() if said.free]
 
 
 def link_division_factor(run: RunSettings, name: str, link_division: int) -> int:
@@ -231,59 +225,138 @@ def link_division_factor(run: RunSettings, name: str, link_division: int) -> int
     return 1 if item is None else item.link_division_factor(name, link_division)
 
 
-def _key_of(run: RunSettings, name: str) -> str:
-    keys = [key for key in run.parameters if key == name or fnmatch.fnmatchcase(name, key)]
-    return keys[-1] if keys else name
-
-
-# -- data and problem -------------------------------------------------------------------------------------------------
-
-
-def build_step(run: RunSettings, system: System | None = None) -> Step:
-    """The compiled step of a run."""
-    said = run.problem
-    system = build_system(run) if system is None else system
-    return compile_step(system, said.time_step, said.force_split, said.constraint_force, use_compiler=said.use_compiler)
-
-
-# -- from a file -----------------------------------------------------------------------------------------------------
-
-
-def load_system(path: str | Path, overrides: Sequence[str] = ()) -> System:
-    """The system that a configuration file describes; errors as `load_config` and `build_system`."""
-    return build_system(load_config(path, overrides))
-
-
-# -- the second arm ---------------------------------------------------------------------------------------------------
-
-_OTHER_SIDE = {"left": "right", "right": "left"}
-
-
 def system_with_second_arm(run: RunSettings, system: System) -> System | None:
     """The run's system with the second arm at a free end of the object; None where impossible."""
-    model = run.model
-    joints = model.arms.joints
+    model, joints = run.model, run.model.arms.joints
     if joints is None or model.arms.mode != "driven" or len(model.grasp) != 1:
         return None
     side, grasp = next(iter(model.grasp.items()))
-    prefix = f"{side}_"
-    if side not in _OTHER_SIDE or not all(name.startswith(prefix) for name in (*joints, grasp.holder_frame)):
+    if side not in _OTHER_SIDE or not all(name.startswith(f"{side}_") for name in (*joints, grasp.holder_frame)):
         return None
     parents = {segment.parent_segment for segment in system.segment_layouts}
-    free = [
-        f"w_{s.name}" for s in system.segment_layouts if s.name not in parents and f"w_{s.name}" != grasp.held_frame
-    ]
+    ends = [f"w_{segment.name}" for segment in system.segment_layouts if segment.name not in parents]
+    free = [end for end in ends if end != grasp.held_frame]
     if not free:
         return None
-
-    def mirrored(name: str) -> str:
-        return f"{_OTHER_SIDE[side]}_{name.removeprefix(prefix)}"
-
-    arms = replace(model.arms, joints=(*joints, *(mirrored(name) for name in joints)))
-    added = GraspSettings(holder_frame=mirrored(grasp.holder_frame), held_frame=free[0], kind=grasp.kind, rpy=grasp.rpy)
-    changed = replace(model, arms=arms, grasp={**model.grasp, _OTHER_SIDE[side]: added})
+    other = _OTHER_SIDE[side]
+    mirrored, holder = ([f"{other}{name.removeprefix(side)}" for name in own] for own in (joints, [grasp.holder_frame]))
+    added = GraspSettings(holder_frame=holder[0], held_frame=free[0], kind=grasp.kind, rpy=grasp.rpy)
+    arms = replace(model.arms, joints=(*joints, *mirrored))
     try:
-        return build_system(replace(run, model=changed))
+        return build_system(replace(run, model=replace(model, arms=arms, grasp={**model.grasp, other: added})))
     except YidError:
-        # the robot has no other arm of that name
+        return None  # the robot has no other arm of that name
+
+
+# -- clamps and additional frames -------------------------------------------------------------------------------------
+
+
+def _clamp_mechanism(run: RunSettings) -> Mechanism | None:
+    """Mechanism of the clamps that move an object without a robot; None without clamps."""
+    model, arms = run.model, run.model.arms
+    if model.robot is not None:
+        if model.clamps:
+            hint = "remove model.clamps, or set model.robot: null; a robot holds by model.grasp or by the mount"
+            what = "clamps hold an object without a robot, and the model has one"
+            raise run.config_error(what, "model", "clamps", hint=hint)
         return None
+    for key, given in (("joints", arms.joints), ("passive", arms.passive_joints), ("locked", arms.locked_joints)):
+        if given:
+            hint = "set model.robot to its URDF file, or remove model.arms; the world or model.clamps hold an object"
+            what = "the settings name joints, but the model has no robot"
+            raise run.config_error(what, "model", "arms", key, hint=hint)
+    found: Mechanism | None = None
+    for name, clamp in model.clamps.items():
+        if clamp.origin_point == clamp.z_axis_point:
+            what = f"clamp '{name}' has one point for both ends"
+            raise run.config_error(what, "model", "clamps", name, allowed="two different points")
+        found = floating_clamp(name) if found is None else found.with_mechanism(floating_clamp(name))
+    return found
+
+
+def _with_extra_frames(
+    run: RunSettings, carrier: Mechanism | None, items: Iterable[FlexibleObject]
+) -> tuple[Mechanism | None, list[FlexibleObject]]:
+    """Robot (or clamps) and objects with the additional frames of the settings.
+
+    A frame whose place the recordings tell has the parameters NAME.x, .y, .z; see `marker_parameter_values`.
+    """
+    made = list(items)
+    for name, said in run.model.frames.items():
+        where, parent = ("model", "frames", name), said.parent_frame
+        owner = next((i for i, item in enumerate(made) if parent and item.mechanism.has_frame(parent)), None)
+        if owner is not None:
+            tree = made[owner].mechanism
+        elif said.marker_reference_pose:
+            what = f"'{name}' is placed by `marker_reference_pose`, but sits on nothing of the object"
+            allowed = "a frame of the object, such as w_SEGMENT, its end, or SEGMENT:40%"
+            raise run.config_error(what, *where, allowed=allowed, hint=f"set model.frames.{name}.parent_frame")
+        else:
+            tree = Mechanism("world", (), {}) if carrier is None else carrier
+            if parent is not None and not tree.has_frame(parent):
+                known = [*tree.frames, *(frame for item in made for frame in item.mechanism.frames)]
+                raise unknown_name_error(run, "frame", parent, known, *where, "parent_frame")
+        if said.marker_reference_pose:
+            tree = _with_marker(tree, name, str(parent))
+        else:
+            tree = tree.with_frame(name, parent, transform_from_xyz_rpy(said.xyz, said.rpy))
+        if owner is None:
+            carrier = tree
+        else:
+            made[owner] = replace(made[owner], mechanism=tree)
+    return carrier, made
+
+
+def _with_marker(tree: Mechanism, name: str, frame: str) -> Mechanism:
+    """The mechanism with a frame at a parameter's place in another one, turned like it."""
+    carrier = tree.with_frame(name, frame, np.eye(4)).frames[name]
+    entries = [Parameter(f"{name}.{axis}", 0.0, "m", description=f"{axis} of {name} in {frame}") for axis in _AXES]
+    offset = Placement(ca.SX(ca.DM.eye(3)), ca.vertcat(*(entry.symbol for entry in entries)))
+    frames = {**tree.frames, name: Frame(carrier.joint_index, carrier.placement @ offset)}
+    return replace(tree, frames=frames, parameters=tree.parameters.with_added(entries))
+
+
+def marker_parameter_values(
+    run: RunSettings, system: System, recordings: Iterable[Recording]
+) -> dict[str, dict[str, float]]:
+    """Marker positions on the object per recording, as parameter values, from its straight reference pose [m].
+
+    The object stands in the world: without its weight it is straight. Empty where no frame is placed so.
+
+    Raises
+    ------
+    ConfigError
+        The object does not stand in the world, or a marker is no point of a recording.
+    DataError
+        A recording without `straight`.
+    """
+    names = [name for name, said in run.model.frames.items() if said.marker_reference_pose]
+    if not names:
+        return {}
+    if run.model.object is not None and not run.model.object.stands_in_world:
+        what = "the object moves with what carries it, so `marker_reference_pose` does not say where it was"
+        where = ("model", "frames", names[0], "marker_reference_pose")
+        hint, allowed = f"give model.frames.{names[0]}.xyz instead", "an object whose mount stands in the world"
+        raise run.config_error(what, *where, allowed=allowed, hint=hint)
+    q = ca.SX.sym("q", system.n_coordinates)
+    kinematics = forward_kinematics(system.mechanism, q)
+    poses = [kinematics.frame_pose(name).homogeneous_matrix() for name in names]
+    function = ca.Function("straight", [q, system.parameters.symbols], [ca.horzcat(*poses)])
+    theta = system.parameters.vector({f"{name}.{axis}": 0.0 for name in names for axis in _AXES})
+    placed = np.split(np.array(function(np.zeros(system.n_coordinates), theta)), len(names), axis=1)
+    found: dict[str, dict[str, float]] = {}
+    for recording in recordings:
+        group = recording.points[0].names if recording.points else ()
+        if recording.marker_reference_pose is None:
+            hint = f"record them, or give model.frames.{names[0]}.xyz in place of marker_reference_pose: true"
+            what = "the recording does not say where its markers were while the object was held straight"
+            allowed = "positions of the points of its first group, shape (np, 3) [m]"
+            raise DataError(what, where=f"{recording.name}: straight", allowed=allowed, hint=hint)
+        found[recording.name] = {}
+        for name, pose in zip(names, placed, strict=True):
+            if name not in group:
+                what = f"'{name}' is no point of {recording.name}"
+                raise run.config_error(what, "model", "frames", name, hint=nearest_name_hint(name, group))
+            local = pose[:3, :3].T @ (recording.marker_reference_pose[group.index(name)] - pose[:3, 3])
+            found[recording.name] |= {f"{name}.{axis}": float(x) for axis, x in zip(_AXES, local, strict=True)}
+    return found

@@ -1,69 +1,100 @@
-"""Builds the estimation problem of a run: recordings, options and free parameters on a compiled step."""
+"""Builds the estimation problem of a run: recordings, options and free parameters on a compiled step.
+
+Recordings are checked before: those given twice count once, gaps are cut out; everything else is said and left.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
 
 from yid_ocp.analysis.discretisation import min_grasp_gaps
-from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import (
-    RunSettings,
+from yid_ocp.analysis.effort_checks import check_efforts
+from yid_ocp.analysis.joint_checks import (
+    RecordedJointsModel,
+    check_dynamic_excitation,
+    check_joint_excitation,
+    check_joint_limits,
 )
+from yid_ocp.analysis.point_checks import (
+    check_cable_points,
+    check_held_points,
+    check_object_points,
+    check_point_distances,
+)
+from yid_ocp.config.reader import load_config
+from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.channel_checks import median_edge_lengths
+from yid_ocp.data.checks import check_recording, duplicate_data_issue, split_at_gaps
+from yid_ocp.data.issues import ISSUE_CAUSES, Issue
 from yid_ocp.data.recording import Recording
-from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
+from yid_ocp.errors import DataError, unknown_name_details
 from yid_ocp.integrator.step import Step
 from yid_ocp.model import System
-from yid_ocp.model.objects.base import ClampedObject
+from yid_ocp.model.objects.base import CableTopology, ClampedObject, ClampPath
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.sensors.joints import EFFORT_GROUP, POSITION_GROUP, is_measured_by_arm
-from yid_ocp.workflow.build import arms_are_estimated_states, build_cable, build_step, build_system, parameter_settings
-from yid_ocp.workflow.clamps import clamp_paths, marker_parameter_values
-from yid_ocp.workflow.recording_issues import (
-    check_recordings,
-    mention_issues_in_errors,
-    object_point_issues,
-    raise_for_issues,
+from yid_ocp.workflow.build import (
+    arms_are_estimated_states,
+    build_cable,
+    build_step,
+    build_system,
+    free_parameters,
+    marker_parameter_values,
+    parameter_settings,
 )
-from yid_ocp.workflow.run_inputs import read_recordings
+from yid_ocp.workflow.run_inputs import read_recordings, unknown_name_error
 
 _START_FRAMES = 2  # of a cable's free points, from which every prediction starts
-
-
 _MAX_GRASP_GAP = 0.01  # what encoder noise and a slightly wrong length of the object can make of a grasp [m]
+_EFFECTS_BY_CAUSE = {
+    "encoder_offset": ("encoder_offset",),
+    "effort_gain": ("effort_gain",),
+    "effort_sign": ("effort_gain",),
+    "effort_offset": ("effort_offset",),
+    "effort_lag": ("effort_delay", "effort_lag"),
+    "clock_offset": ("camera_latency",),
+}
+"""Effects by which a model takes such an error into account."""
+_MOTION_PARAMETER_WORDS = ("damping", "viscous", "coulomb", "stribeck", "inertia", "tau")
+"""Words in the names of parameters that nothing at rest tells."""
+_MAX_QUOTED_ISSUES = 3  # doubts that an error quotes
 
 
 def problem_options(run: RunSettings, system: System, recordings: Sequence[Recording] = ()) -> ProblemOptions:
-    """`ProblemOptions` of a run, with values that depend on system and recordings.
+    """`ProblemOptions` of a run.
 
-    Parameters
-    ----------
-    recordings : sequence of Recording
-        Where values differ from recording to recording (a cable's edges, places of markers), those of these.
+    Values that differ from recording to recording (a cable's edges, places of markers) are those of `recordings`.
     """
     parameters = system.parameters
     chosen = parameter_settings(run, parameters)
     for name in run.problem.start_fit_parameters:
         if name not in parameters:
-            hint = nearest_name_hint(name, parameters.names)
-            raise run.config_error(f"there is no parameter '{name}'", "problem", "start_fit_parameters", hint=hint)
+            raise unknown_name_error(run, "parameter", name, parameters.names, "problem", "start_fit_parameters")
     sensors = dict(run.sensors)
+    groups = [group for recording in recordings for group in recording.points]
     if arms_are_estimated_states(run):
         # what the encoders say is what counts of the arms, as it does where they are prescribed
         sensors[POSITION_GROUP] = replace(sensors.get(POSITION_GROUP, SensorOptions()), use=True)
-        for group in {
-            group.name for recording in recordings for group in recording.points if is_measured_by_arm(group)
-        }:
-            sensors[group] = replace(sensors.get(group, SensorOptions()), use=False)
+        for name in {group.name for group in groups if is_measured_by_arm(group)}:
+            sensors[name] = replace(sensors.get(name, SensorOptions()), use=False)
     cable = build_cable(run)
     own = marker_parameter_values(run, system, recordings)
+    clamps = tuple(
+        ClampPath(name, s.origin_point, s.z_axis_point, s.roll_convention) for name, s in run.model.clamps.items()
+    )
     if cable is not None and isinstance(run.model.object, ClampedObject):
-        for group in {group.name for recording in recordings for group in recording.points}:
-            said = sensors.get(group, SensorOptions())
-            sensors[group] = said if said.points is not None else replace(said, points=cable.free_vertices)
+        clamps = cable.clamp_paths
+        for name in {group.name for group in groups}:
+            said = sensors.get(name, SensorOptions())
+            sensors[name] = said if said.points is not None else replace(said, points=cable.free_vertices)
         for recording in recordings:
             lengths = median_edge_lengths(cable.edges, [recording], _START_FRAMES)
             if values := run.model.object.recording_parameters(lengths):
@@ -71,7 +102,7 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
     return replace(
         run.problem,
         sensors=sensors,
-        clamp_paths=clamp_paths(run, cable),
+        clamp_paths=clamps,
         local_parameters=tuple(name for name, said in chosen.items() if said.per_recording),
         prior_stds={name: said.prior_std for name, said in chosen.items() if said.prior_std is not None},
         parameters_by_recording=own,
@@ -97,32 +128,30 @@ def build_problem(
         done with; with `recordings.strict` any doubt about one.
     """
     system = build_system(run) if step is None else step.system
-    free = [name for name, said in parameter_settings(run, system.parameters).items() if said.free]
+    free = free_parameters(run, system.parameters)
     if not free:
-        raise run.config_error(
-            "no parameter is free", "parameters", hint="set parameters.NAME.free: true for what is sought"
-        )
+        hint = "set parameters.NAME.free: true for what is sought"
+        raise run.config_error("no parameter is free", "parameters", hint=hint)
     same = sorted(set(run.recordings.estimate) & set(run.recordings.held_out))
     if same:
         what = "a recording is both estimated on and held out"
         raise run.config_error(what, "recordings", "held_out", allowed="one of the two", hint=same[0])
-    estimate, held_out = read_recordings(run, "estimate"), read_recordings(run, "held_out")
+    estimate, held_out = read_recordings(run), read_recordings(run, "held_out")
     if not estimate:
-        raise run.config_error(
-            "there is no recording to estimate on", "recordings", "estimate", hint="list at least one recording"
-        )
+        hint = "list at least one recording"
+        raise run.config_error("there is no recording to estimate on", "recordings", "estimate", hint=hint)
     _check_sensors(run, [*estimate, *held_out])
-    seen = check_recordings(run, system, build_cable(run), free, estimate, held_out)
-    options = problem_options(run, system, [*seen.estimate, *seen.held_out, *reference_recordings])
+    estimate, held_out, issues = _check_recordings(run, system, build_cable(run), free, estimate, held_out)
+    options = problem_options(run, system, [*estimate, *held_out, *reference_recordings])
     step = build_step(run, system) if step is None else step
-    said = replace(options, data_issues=seen.issues)
-    problem = EstimationProblem(step, seen.estimate, free, said, None, seen.held_out)
-    with mention_issues_in_errors(seen.issues):
+    said = replace(options, data_issues=issues)
+    problem = EstimationProblem(step, estimate, free, said, None, held_out)
+    with _mention_issues_in_errors(issues):
         _check_grasps_close(run, problem)
-    more = object_point_issues(problem)
+    more = _object_point_issues(problem)
     if more:
-        raise_for_issues(run, more)
-        problem = problem.with_options(replace(said, data_issues=(*seen.issues, *more)))
+        _raise_for_issues(run, more)
+        problem = problem.with_options(replace(said, data_issues=(*issues, *more)))
     return problem
 
 
@@ -131,9 +160,8 @@ def initial_grasp_gaps(problem: EstimationProblem, episode: Episode) -> dict[str
     system = problem.system
     if not system.grasps:
         return {}
-    posture = dict(
-        zip((*system.driven, *system.prescribed), map(float, episode.initial_known_coordinates), strict=True)
-    )
+    names = (*system.driven, *system.prescribed)
+    posture = dict(zip(names, map(float, episode.initial_known_coordinates), strict=True))
     theta = problem.theta.copy()
     for name, value in problem.options.parameters_by_recording.get(episode.name, {}).items():
         theta[system.parameters.index(name)] = value
@@ -156,15 +184,13 @@ def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
 
 def _check_sensors(run: RunSettings, recordings: Sequence[Recording]) -> None:
     known = {group.name for recording in recordings for group in recording.points}
-    known |= (
-        {"joints.position", "joints.effort"} if any(recording.joints is not None for recording in recordings) else set()
-    )
-    for name in run.sensors:
+    if any(recording.joints is not None for recording in recordings):
+        known |= {POSITION_GROUP, EFFORT_GROUP}
+    for name, said in run.sensors.items():
         if name not in known:
-            raise run.config_error(
-                f"no recording has a group '{name}'", "sensors", name, **unknown_name_details(name, sorted(known))
-            )
-        if run.sensors[name].effort_kind is not None and name != EFFORT_GROUP:
+            what, details = f"no recording has a group '{name}'", unknown_name_details(name, sorted(known))
+            raise run.config_error(what, "sensors", name, **details)
+        if said.effort_kind is not None and name != EFFORT_GROUP:
             hint = f"say it of {EFFORT_GROUP}, or leave it out"
             raise run.config_error(f"'{name}' holds no efforts", "sensors", name, "effort_kind", hint=hint)
 
@@ -175,3 +201,181 @@ def load_problem(path: str | Path | None = None, overrides: Sequence[str] = ()) 
     Parameters and errors as `load_config`; errors as `build_problem`.
     """
     return build_problem(load_config(path, overrides))
+
+
+# -- checks of the recordings -----------------------------------------------------------------------------------------
+
+
+def _check_recordings(
+    run: RunSettings,
+    system: System,
+    cable: CableTopology | None,
+    free: Sequence[str],
+    estimate: Sequence[Recording],
+    held_out: Sequence[Recording],
+) -> tuple[list[Recording], list[Recording], tuple[Issue, ...]]:
+    """Recordings to estimate on and to hold out, without duplicates and cut at gaps, and all issues found."""
+    doubts: list[Issue] = []
+    kept: tuple[list[Recording], list[Recording]] = [], []
+    arm = None if cable is not None else _joints_model(system)
+    anywhere = run.problem.initial_state != "equilibrium" or not system.free_indices
+    clamped = () if cable is None else cable.clamped_vertices
+    for role, recordings in zip(kept, _once(run, estimate, held_out, doubts), strict=True):
+        for recording in recordings:
+            found = check_recording(recording, _choice(run))
+            doubts += found
+            if any(doubt.weight == "refused" for doubt in found):
+                continue
+            parts = split_at_gaps(recording, clamped, anywhere)
+            doubts += parts.issues
+            for part in parts.recordings:
+                doubts += _beside_the_model(run, system, arm, cable, part)
+            role += parts.recordings
+    if arm is not None:
+        doubts += _excitation(run, arm, free, kept[0])
+    _raise_for_issues(run, doubts)
+    if not kept[0]:
+        hint = "; ".join(doubt.what for doubt in doubts if doubt.cause in ("gap", "clock_jump"))
+        what = "gaps leave nothing of the recordings to estimate on"
+        raise DataError(what, where=run.describe_location("recordings", "estimate"), hint=hint)
+    return *kept, tuple(doubts)
+
+
+def single_recording_issues(run: RunSettings, system: System, recording: Recording) -> list[Issue]:
+    """All issues of one recording, which is not cut; errors as `build_problem`."""
+    found = check_recording(recording, _choice(run))
+    _raise_for_issues(run, found)
+    found += _beside_the_model(run, system, _joints_model(system), None, recording)
+    _raise_for_issues(run, found)
+    return found
+
+
+def _joints_model(system: System) -> RecordedJointsModel | None:
+    return RecordedJointsModel.from_system(system, system.parameters.vector())
+
+
+def _choice(run: RunSettings) -> Callable[[str], SensorOptions]:
+    return lambda name: run.sensors.get(name, SensorOptions())
+
+
+def _once(
+    run: RunSettings, estimate: Sequence[Recording], held_out: Sequence[Recording], doubts: list[Issue]
+) -> tuple[list[Recording], list[Recording]]:
+    used: list[Recording] = []
+    others: list[Recording] = []
+    for recording in estimate:
+        if same := _duplicate(used, recording):
+            doubts.append(replace(same[0], what=f"{same[0].what}; it counts once"))
+        else:
+            used.append(recording)
+    for recording in held_out:
+        if same := _duplicate(used, recording):
+            what = f"a measurement is both estimated on and held out: {same[0].what}"
+            where = run.describe_location("recordings", "held_out")
+            hint = f"leave out {recording.name} or {same[1].name}"
+            raise DataError(what, where=where, allowed="one of the two", hint=hint)
+        if _duplicate(others, recording):
+            text = f"{recording.name} is held out twice; it counts once"
+            doubts.append(Issue("same_data", text, "warning", 1e3, "list every measurement once", recording.name))
+        else:
+            others.append(recording)
+    return used, others
+
+
+def _duplicate(others: Sequence[Recording], recording: Recording) -> tuple[Issue, Recording] | None:
+    """What says that a recording is one of the others, and which."""
+    return next(((same, other) for other in others if (same := duplicate_data_issue(other, recording))), None)
+
+
+def _beside_the_model(
+    run: RunSettings, system: System, arm: RecordedJointsModel | None, cable: CableTopology | None, recording: Recording
+) -> list[Issue]:
+    gravity = np.array(run.model.gravity, float)
+    recording = recording.with_effort_kind(_choice(run)(EFFORT_GROUP).effort_kind)
+    if cable is not None:
+        return list(check_cable_points(cable, recording, gravity))
+    found: list[Issue] = []
+    if arm is not None and arm.is_recorded_in(recording):
+        found += check_joint_limits(arm, recording)
+        if any(doubt.weight == "refused" for doubt in found):
+            return found
+        told = [*check_efforts(arm, recording), *check_held_points(arm, recording, _choice(run))]
+        found += [doubt for doubt in told if not _is_modelled(system, doubt)]
+    return found + list(check_point_distances(arm, system, system.parameters.vector(), recording, _choice(run)))
+
+
+def _excitation(
+    run: RunSettings, arm: RecordedJointsModel, free: Sequence[str], recordings: Sequence[Recording]
+) -> list[Issue]:
+    """Whether the motion can tell what is sought, as far as that shows without the object."""
+    asked: dict[str, list[str]] = {}
+    for name in free:
+        joint, _, quantity = name.rpartition(".")
+        if joint in arm.joint_names and quantity in ("damping", "stiffness"):
+            asked.setdefault(joint, []).append(name)
+    found = list(check_joint_excitation(recordings, asked, _choice(run)(POSITION_GROUP)))
+    if any(word in name for name in free for word in _MOTION_PARAMETER_WORDS):
+        options = _choice(run)(EFFORT_GROUP)
+        weak = [list(check_dynamic_excitation(arm, one, options)) for one in recordings if arm.is_recorded_in(one)]
+        if all(weak):  # one recording that tells is enough
+            found += [doubt for doubts in weak for doubt in doubts]
+    return found
+
+
+def _is_modelled(system: System, doubt: Issue) -> bool:
+    """Whether an effect of the model already accounts for the issue."""
+    kinds = _EFFECTS_BY_CAUSE.get(doubt.cause, ())
+    places = {effect.location for effect in system.effects if effect.kind in kinds}
+    if "camera_latency" in kinds and "camera_latency" not in doubt.setting:  # no camera's clock
+        return False
+    joint = doubt.channel.partition(".")[2]
+    return bool(places) and (not joint or joint in places)
+
+
+def _object_point_issues(problem: EstimationProblem) -> list[Issue]:
+    """Issues of measured object points, from one rollout per recording with the initial parameters."""
+    system = problem.system
+    lengths = ca.vertcat(ca.SX(0), *(length for segment in system.segment_layouts for length in segment.link_lengths))
+    size = float(ca.Function("size", [system.parameters.symbols], [ca.sum1(lengths)])(problem.theta))
+    wanted = any(samples.sensor.point_names for episode in problem.episodes for samples in episode.measurements)
+    if not size or not wanted or problem.options.clamp_paths:
+        return []
+    found: list[Issue] = []
+    for i, episode in enumerate(problem.episodes):
+        result = problem.predictor.predict_episode(episode, *problem.split(problem.initial_unknowns, i), False, None)
+        if isinstance(result, EpisodePrediction):
+            found += check_object_points(episode, result, size)
+    return found
+
+
+def _raise_for_issues(run: RunSettings, doubts: Sequence[Issue]) -> None:
+    """Raise `DataError` for issues that forbid a run; with `recordings.strict`, for any issue."""
+    grave = [doubt for doubt in doubts if run.recordings.strict or doubt.weight == "refused"]
+    if not grave:
+        return
+    first, *others = grave
+    more = [f"{doubt.where}: {doubt.what}" for doubt in others]
+    what = "; ".join([f"{ISSUE_CAUSES[first.cause]}: {first.what}", *more])
+    raise DataError(what, where=first.where, hint=first.advice + (f" ({first.setting})" if first.setting else ""))
+
+
+@contextlib.contextmanager
+def _mention_issues_in_errors(doubts: Sequence[Issue]) -> Iterator[None]:
+    """Context manager that adds known issues of the recordings to a `DataError` raised in its block."""
+    try:
+        yield
+    except DataError as error:
+        if not doubts:
+            raise
+        said = "; ".join(f"{doubt.where}: {doubt.what}" for doubt in _gravest_first(doubts)[:_MAX_QUOTED_ISSUES])
+        hint = f"first look at what is in doubt: {said}"
+        raise DataError(error.what, where=error.where, allowed=error.allowed, hint=hint) from error
+
+
+def _gravest_first(doubts: Sequence[Issue]) -> list[Issue]:
+    return sorted(doubts, key=lambda doubt: (doubt.weight == "warning", -doubt.evidence))
+
+
+def issues_result(doubts: Sequence[Issue]) -> list[dict[str, Any]]:
+    """Issues as plain data for the key `doubts` of a result."""
+    return [asdict(doubt) | {"sure": doubt.certainty_word, "where": doubt.where} for doubt in _gravest_first(doubts)]

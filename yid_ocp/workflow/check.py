@@ -9,19 +9,22 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.analysis.discretisation import largest_error_growth
+from yid_ocp.analysis.discretisation import (
+    NaturalFrequencies,
+    largest_error_growth,
+    natural_frequencies,
+)
 from yid_ocp.analysis.pinocchio_comparison import compare_system_with_pinocchio, compare_urdf_with_pinocchio
-from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings
-from yid_ocp.data.recording import Recording
+from yid_ocp.data.recording import JointGroup, PointGroup
 from yid_ocp.integrator.step import Step
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.options import SensorOptions
-from yid_ocp.progress import NULL_PROGRESS, Progress
-from yid_ocp.report.animation import Animation, ModelTrajectory, make_animation, recording_animation
+from yid_ocp.progress import Progress
+from yid_ocp.report.animation import Animation, make_animation, recording_animation
 from yid_ocp.report.summaries import check_summary
 from yid_ocp.sensors.joints import (
     EFFORT_GROUP,
@@ -31,38 +34,27 @@ from yid_ocp.sensors.joints import (
     joint_torque_noise_std,
 )
 from yid_ocp.solvers.base import covariance_and_chi2, parameter_estimates
-from yid_ocp.workflow.build import build_step
-from yid_ocp.workflow.build_problem import build_problem, initial_grasp_gaps
-from yid_ocp.workflow.command_runner import EXIT_FAILED, EXIT_WRONG_INPUT, CommandResult, run_and_print
-from yid_ocp.workflow.discretisation_check import frequency_convergence, measure_discretisation_shifts
-from yid_ocp.workflow.recording_issues import issues_result
+from yid_ocp.workflow.build import build_step, build_system, link_division_factor, urdf_options
+from yid_ocp.workflow.build_problem import build_problem, initial_grasp_gaps, issues_result
+from yid_ocp.workflow.command_runner import EXIT_FAILED, EXIT_WRONG_INPUT, CommandResult, run_configured
+from yid_ocp.workflow.prediction_outputs import predicted_trajectory
 from yid_ocp.workflow.run_folder import new_run_folder
 from yid_ocp.workflow.run_inputs import input_files
+from yid_ocp.workflow.solve import measure_discretisation_shifts
 
 _RESULT_FORMAT = "yid-check/1"
+_FREQUENCY_TOLERANCE = 0.02  # fraction by which a frequency may move when links or steps are refined, without a warning
+_N_MODES = 3
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    settings = load_config(arguments.config, arguments.overrides)
-    code = run_and_print(arguments, lambda shown: run_check(settings, arguments.out, shown), check_summary)
+    code = run_configured(arguments, _run_check, check_summary)
     return EXIT_WRONG_INPUT if code == EXIT_FAILED else code
 
 
-def run_check(run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS) -> CommandResult:
-    """Validate a run without solving it.
-
-    Returns
-    -------
-    CommandResult
-        `warnings` in its result lists what will work but should be looked at, `discretisation` how far every estimate
-        would move with a finer model if it were the initial value.
-
-    Raises
-    ------
-    ConfigError, DataError, ModelError, OutputError
-        Whatever would stop `solve`.
-    """
+def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> CommandResult[None]:
+    """Validate a run without solving it; warnings say what will work but should be looked at."""
     with new_run_folder(run, out, "check") as folder:
         folder.begin_run(run, "check")
         warnings: list[str] = []
@@ -70,7 +62,6 @@ def run_check(run: RunSettings, out: str | Path | None = None, progress: Progres
         # the equations are the same compiled or not, and a check needs only a few steps
         plain = replace(run, problem=replace(run.problem, use_compiler=False))
         step = build_step(plain)
-        model = {"name": step.system.mechanism.name, **step.sizes}
         recordings, problem = [], None
         if run.recordings.estimate:
             progress.begin_stage("placing the recordings on the model")
@@ -80,12 +71,17 @@ def run_check(run: RunSettings, out: str | Path | None = None, progress: Progres
         progress.begin_stage("comparing the bodies with another library")
         mechanics = _mechanics(plain, step, problem, warnings)
         progress.begin_stage("refining links and time step")
-        convergence = frequency_convergence(run, problem, warnings)
-        first = None if problem is None else problem.evaluate(problem.initial_unknowns)
-        moved = {} if problem is None or first is None else _moves(plain, problem, first, warnings, progress)
+        convergence = _frequency_convergence(run, problem, warnings)
+        moved, shown = {}, {}
+        if problem is not None:
+            first = problem.evaluate(problem.initial_unknowns)
+            moved = _moves(plain, problem, first, warnings, progress)
+            taken = [episode.recording for episode in (*problem.episodes, *problem.held_out)]
+            data = {"recordings": taken, "system": step.system}
+            shown = {"animations": _scenes(problem, first), "section_data": data}
         result = {
             "format": _RESULT_FORMAT,
-            "model": model,
+            "model": {"name": step.system.mechanism.name, **step.sizes},
             "mechanics": mechanics,
             "recordings": recordings,
             "convergence": convergence,
@@ -94,39 +90,25 @@ def run_check(run: RunSettings, out: str | Path | None = None, progress: Progres
             "warnings": warnings,
         }
         written = folder.write_result(result)
-        if problem is not None and first is not None:
-            taken = [episode.recording for episode in (*problem.episodes, *problem.held_out)]
-            section_data = {"recordings": taken, "system": step.system}
-            animations = _scenes(problem, first)
-            folder.write_report_page(run, written, progress, animations=animations, section_data=section_data)
-        else:
-            folder.write_report_page(run, written, progress)
-    passed = not (run.recordings.strict and warnings)
-    return CommandResult(folder.path, written, is_successful=passed)
+        folder.write_report_page(run, written, progress, **shown)
+    return CommandResult(folder.path, written, None, not (run.recordings.strict and warnings))
 
 
 def _mechanics(
     run: RunSettings, step: Step, problem: EstimationProblem | None, warnings: list[str]
 ) -> dict[str, dict[str, Any]]:
-    system, arms = step.system, run.model.arms
-    theta = system.parameters.vector()
-    posture = np.zeros(system.n_coordinates)
+    system = step.system
+    theta, posture = system.parameters.vector(), np.zeros(system.n_coordinates)
     if problem is not None:
         theta = problem.predictor.episode_theta(problem.episodes[0], theta)
         posture[[*system.driven_indices, *system.prescribed_indices]] = problem.episodes[0].initial_known_coordinates
     found = {"built": compare_system_with_pinocchio(system, theta, posture)}
     if run.model.robot is not None:
         # the file's own numbers, not those that settings or effects put in their place
-        read: dict[str, Any] = {
-            "joints": arms.joints,
-            "locked": arms.locked_joints,
-            "exclude_links": arms.exclude_links,
-        }
-        path = input_files(run)[run.model.robot]
+        read = urdf_options(run)
+        path, gravity = input_files(run)[run.model.robot], np.array(run.model.gravity, float)
         try:
-            found["file"] = compare_urdf_with_pinocchio(
-                path, read_urdf(path, **read), np.array(run.model.gravity, float), **read
-            )
+            found["file"] = compare_urdf_with_pinocchio(path, read_urdf(path, **read), gravity, **read)
         except ValueError as error:
             warnings.append(f"{path.name} cannot be compared, Pinocchio does not read it: {error}")
     warnings += [entry.words for entry in found.values() if not entry.agrees]
@@ -134,15 +116,8 @@ def _mechanics(
 
 
 def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings: list[str]) -> dict[str, Any]:
-    recording, system = episode.recording, problem.system
-    entry: dict[str, Any] = {
-        "recording": episode.name,
-        "role": role,
-        "duration": recording.duration,
-        "steps": episode.grid.steps,
-        "groups": _groups(recording),
-    }
-    noise = {}
+    recording, system, joints = episode.recording, problem.system, episode.recording.joints
+    noise = _input_noise(problem, episode)
     for samples in episode.measurements:
         known = samples.std[np.isfinite(samples.std)]
         noise[samples.sensor.group_name] = {
@@ -150,9 +125,15 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
             "std": float(np.median(known)) if known.size else None,
             "unit": samples.sensor.unit,
         }
-    entry["noise"] = _input_noise(problem, episode) | noise
+    entry: dict[str, Any] = {
+        "recording": episode.name,
+        "role": role,
+        "duration": recording.duration,
+        "steps": episode.grid.steps,
+        "groups": {getattr(group, "name", "joints"): _group(group) for group in recording.groups},
+        "noise": noise,
+    }
     rate = 1.0 / problem.step.time_step
-    joints = recording.joints
     if joints is not None:
         recorded = 1.0 / float(np.median(np.diff(joints.t)))
         if recorded < 0.5 * rate:
@@ -163,13 +144,12 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
                 f"{episode.name}: nothing says whether joints/effort is a sample, a mean or a command (attribute "
                 f"effort_kind); it is taken as a {joints.effort_kind_or_default}"
             )
-    if problem.options.initial_state != "fitted_to_points" and (
-        system.driven or system.prescribed or system.elastic_joints
-    ):
+    rests = problem.options.initial_state != "fitted_to_points"
+    if rests and (system.driven or system.prescribed or system.elastic_joints):
         torque = episode.torque[0] if system.driven else None
-        rest = problem.model_functions.equilibrium_solver.solve(
-            episode.initial_known_coordinates, problem.predictor.episode_theta(episode, problem.theta), torque
-        )
+        theta = problem.predictor.episode_theta(episode, problem.theta)
+        solver = problem.model_functions.equilibrium_solver
+        rest = solver.solve(episode.initial_known_coordinates, theta, torque)
         entry["equilibrium"] = {"found": rest.is_converged, "imbalance": rest.max_imbalance, "message": rest.message}
         if not rest.is_converged:
             warnings.append(f"{episode.name}: {rest.message} with the initial parameters")
@@ -177,40 +157,44 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
     return entry
 
 
+def _group(group: JointGroup | PointGroup) -> dict[str, Any]:
+    steps = np.diff(group.t)
+    rate = 1.0 / float(np.median(steps)) if len(steps) else 0.0
+    gap = float(np.max(steps, initial=0.0))
+    return {"samples": len(group.t), "rate": rate, "longest_gap": gap, "names": list(group.names)}
+
+
 def _input_noise(problem: EstimationProblem, episode: Episode) -> dict[str, Any]:
-    joints, errors = episode.recording.joints, episode.input_errors
+    joints, errors, noise = episode.recording.joints, episode.input_errors, {}
     if joints is None or errors is None:
         return {}
-    effort, position = (problem.options.sensors.get(group, SensorOptions()) for group in (EFFORT_GROUP, POSITION_GROUP))
-    driven, where = problem.system.driven, episode.name
-    levels = {
-        EFFORT_GROUP: (joint_torque_noise_std(joints, driven, effort, where), effort, "N m"),
-        POSITION_GROUP: (joint_angle_noise_std(joints, driven, position, where), position, "rad"),
-    }
-    noise: dict[str, Any] = {
-        group: {
+    for group, noise_std, unit in (
+        (EFFORT_GROUP, joint_torque_noise_std, "N m"),
+        (POSITION_GROUP, joint_angle_noise_std, "rad"),
+    ):
+        choice = problem.options.sensors.get(group, SensorOptions())
+        noise[group] = {
             "samples": len(joints.t),
-            "std": float(np.median(std)),
+            "std": float(np.median(noise_std(joints, problem.system.driven, choice, episode.name))),
             "unit": unit,
             "estimated": not is_noise_std_stated(joints, group, choice),
         }
-        for group, (std, choice, unit) in levels.items()
-    }
     noise[EFFORT_GROUP]["bias_std"] = float(np.median(errors.torque_bias_std))
     return noise
 
 
 def _scenes(problem: EstimationProblem, first: Evaluation) -> list[Animation]:
     """What the initial parameters make of every recording that is estimated on, or what was recorded alone."""
-    system, scenes = problem.system, []
+    scenes = []
     for i, episode in enumerate(problem.episodes):
-        theta = problem.predictor.episode_theta(episode, problem.split(problem.initial_unknowns, i)[0])
+        shared = problem.split(problem.initial_unknowns, i)[0]
         if first.ok:
-            q = first.episode_predictions[i].rollout.state[:, : system.n_coordinates]
-            told = [ModelTrajectory("with the initial values", system, theta, episode.grid.node_times, q)]
-            scenes.append(make_animation(episode.name, told, episode.recording))
+            prediction = first.episode_predictions[i]
+            told = predicted_trajectory("with the initial values", problem, episode, prediction, shared)
+            scenes.append(make_animation(episode.name, [told], episode.recording))
         else:
-            alone = recording_animation(episode.name, system, theta, episode.recording)
+            theta = problem.predictor.episode_theta(episode, shared)
+            alone = recording_animation(episode.name, problem.system, theta, episode.recording)
             scenes += [] if alone is None else [alone]
     return scenes
 
@@ -233,12 +217,62 @@ def _moves(
     return found.to_result({name: std[name].std for name in found.estimate_shifts})
 
 
-def _groups(recording: Recording) -> dict[str, dict[str, Any]]:
-    result: dict[str, dict[str, Any]] = {}
-    for group in recording.groups:
-        name = getattr(group, "name", "joints")
-        steps = np.diff(group.t)
-        rate = 1.0 / float(np.median(steps)) if len(steps) else 0.0
-        longest = float(np.max(steps)) if len(steps) else 0.0
-        result[name] = {"samples": len(group.t), "rate": rate, "longest_gap": longest, "names": list(group.names)}
-    return result
+def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, warnings: list[str]) -> dict[str, Any]:
+    """Lowest natural frequencies with twice the links and with half and a quarter of the time step.
+
+    Returns
+    -------
+    dict
+        `links` and `time_step`: lists of {value, hertz, growing, message}; empty where there is nothing to vary.
+    """
+    system, h = build_system(run), run.problem.time_step
+    names = (*system.driven, *system.prescribed)
+    if names and problem is None:
+        return {"links": [], "time_step": [], "message": "no posture is known: the run names no recording"}
+    theta, guess, posture = system.parameters.vector(), None, dict[str, float]()
+    rule = (run.problem.force_split, run.problem.constraint_force)
+    if problem is not None:
+        first = problem.episodes[0]
+        posture = dict(zip(names, map(float, first.initial_known_coordinates), strict=True)) if names else {}
+        theta = problem.predictor.episode_theta(first, theta)
+        guess = None if first.fixed_initial_state is None else first.fixed_initial_state.state[: system.n_coordinates]
+    own = natural_frequencies(system, posture, theta, h, *rule, guess)
+    if own.message:
+        return {"links": [], "time_step": [], "message": own.message}
+    if own.n_unstable_modes:
+        remedy = "problem.constraint_force: midpoint, " if rule[1] == "node" and system.grasps else ""
+        warnings.append(
+            f"{own.n_unstable_modes} modes grow from step to step about the first posture: take a shorter "
+            f"problem.time_step, {remedy}or more damping"
+        )
+    steps = [_row(h, own)]
+    steps += [_row(h / k, natural_frequencies(system, posture, theta, h / k, *rule, guess)) for k in (2, 4)]
+    _warn(warnings, "the time step goes", " s", steps)
+    rows: list[dict[str, Any]] = []
+    count = None if run.model.object is None else run.model.object.link_count
+    if count is not None:
+        other = build_system(run, link_division=2)
+        values = {
+            name: value * link_division_factor(run, name, 2)
+            for name, value in zip(system.parameters.names, theta, strict=True)
+            if name in other.parameters
+        }
+        finer = natural_frequencies(other, posture, other.parameters.vector(values), h, *rule)
+        rows = [_row(count, own), _row(2 * count, finer)]
+        _warn(warnings, "the links go", "", rows)
+    return {"links": rows, "time_step": steps, "message": ""}
+
+
+def _row(value: float, found: NaturalFrequencies) -> dict[str, Any]:
+    hertz = found.frequencies_hz[:_N_MODES].tolist()
+    return {"value": value, "hertz": hertz, "growing": found.n_unstable_modes, "message": found.message}
+
+
+def _warn(warnings: list[str], what: str, unit: str, rows: list[dict[str, Any]]) -> None:
+    """Warn of frequencies that move between the first row and the last, the finest one."""
+    coarse, fine = rows[0], rows[-1]
+    for i, (a, b) in enumerate(zip(coarse["hertz"], fine["hertz"], strict=False)):
+        if b > 0 and abs(a - b) / b > _FREQUENCY_TOLERANCE:
+            change = f"from {coarse['value']:g} to {fine['value']:g}{unit}"
+            moved = f"{a:.3g} Hz to {b:.3g} Hz ({100 * abs(a - b) / b:.2g} %)"
+            warnings.append(f"frequency {i + 1} moves from {moved} when {what} {change}")

@@ -9,10 +9,11 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
+from yid_ocp.config.reader import load_config
 from yid_ocp.files import to_json_types
 from yid_ocp.parallel import WorkerConfig
 from yid_ocp.progress import NULL_PROGRESS, AcceptedIterate, Progress
@@ -23,33 +24,48 @@ if TYPE_CHECKING:
 
 EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT = 0, 1, 2
 """Exit codes of commands that ran to their end; the last where they were told to be strict and found something."""
+Output = TypeVar("Output")
 
 
 @dataclass(frozen=True)
-class CommandResult:
-    """Result of a command: its run folder, the contents of result.json, and whether it reached its goal."""
+class CommandResult(Generic[Output]):
+    """Result of a command.
+
+    Attributes
+    ----------
+    folder : Path
+        Its run folder.
+    result : dict
+        Contents of result.json.
+    output : object
+        What the command computed.
+    is_successful : bool
+        Whether it reached its goal.
+    """
 
     folder: Path
     result: dict[str, Any]
-    is_successful: bool = field(default=True, kw_only=True)
+    output: Output
+    is_successful: bool = True
+
+
+def run_configured(
+    arguments: argparse.Namespace,
+    work: Callable[..., CommandResult[Any]],
+    summary: Callable[[Mapping[str, Any]], Sequence[SummaryBlock]],
+    *options: Any,
+) -> int:
+    """`run_and_print` of `work(settings, out, progress, *options)` with the settings of `config` and `overrides`."""
+    settings = load_config(arguments.config, arguments.overrides)
+    return run_and_print(arguments, lambda shown: work(settings, arguments.out, shown, *options), summary)
 
 
 def run_and_print(
     arguments: argparse.Namespace,
-    work: Callable[[Progress], CommandResult],
+    work: Callable[[Progress], CommandResult[Any]],
     summary: Callable[[Mapping[str, Any]], Sequence[SummaryBlock]],
 ) -> int:
-    """Do the work of a command, print its summary and run folder as `print_result` does, and return its exit code.
-
-    Parameters
-    ----------
-    arguments : Namespace
-        Of the command, with `quiet` and `json`.
-    work : callable
-        The work, given the progress to report to.
-    summary : callable
-        From the result to what is said of it.
-    """
+    """Do the work of a command, print the summary of its result and its run folder, and return its exit code."""
     with show_progress(arguments) as progress:
         outcome = work(progress)
     near = os.path.relpath(outcome.folder)
@@ -61,21 +77,9 @@ def run_and_print(
 def print_result(
     arguments: argparse.Namespace, result: Mapping[str, Any], texts: Callable[[], Sequence[str]], place: str, path: str
 ) -> None:
-    """Print a command's result: summary text, the path alone (`quiet`) or JSON (`json`).
+    """Print a command's result: its text and then `place`, the path alone (`quiet`) or JSON (`json`).
 
-    Parameters
-    ----------
-    arguments : Namespace
-        `json`: the result on standard output and nothing else there, the place on standard error; `quiet`: the path
-        alone.
-    result : mapping
-        The same as in its file.
-    texts : callable
-        What a person reads of it.
-    place : str
-        The last of these lines: where it is.
-    path : str
-        The place as a path, which may have several lines for several files.
+    Beside JSON nothing else goes to standard output; the place goes to standard error.
     """
     if arguments.json:
         print_json(result)
@@ -84,17 +88,11 @@ def print_result(
     elif arguments.quiet:
         print(path)
     else:
-        print_lines([*texts(), place])
+        print("\n".join([*texts(), place]))
 
 
 def workers_from_arguments(arguments: argparse.Namespace) -> WorkerConfig | None:
-    """Available workers from `--workers` or `--scheduler`; None where neither is given.
-
-    Raises
-    ------
-    ConfigError, WorkerError
-        As `WorkerConfig`.
-    """
+    """Available workers from `--workers` or `--scheduler`, None where neither is given; errors as `WorkerConfig`."""
     if arguments.workers is None and not arguments.scheduler:
         return None
     workers = WorkerConfig(arguments.workers, arguments.scheduler)
@@ -107,11 +105,6 @@ def print_json(result: Mapping[str, Any]) -> None:
     print(json.dumps(to_json_types(result), indent=1, allow_nan=False))
 
 
-def print_lines(texts: Sequence[str]) -> None:
-    """Print lines on standard output."""
-    print("\n".join(texts))
-
-
 # -- progress ---------------------------------------------------------------------------------------------------------
 
 _MIN_LINE_INTERVAL = 5.0  # least time between two lines of one tenth of a stage [s]
@@ -119,28 +112,28 @@ _MIN_ESTIMATE_TIME = 2.0  # time that a stage has to last before the rest of it 
 
 
 class _RemainingTime:
-    """Estimator of the remaining time of a stage from its finished parts."""
-
     def __init__(self) -> None:
         self._first: tuple[int, float] | None = None
 
     def remaining_text(self, done: int, total: int) -> str:
-        """Text with the remaining time; empty for short stages or before an estimate exists."""
+        """Text with the remaining time of a stage; empty for short stages or before an estimate exists."""
         now = time.monotonic()
-        if self._first is None:
-            # what stood there before this run began took no time
-            self._first = (done, now)
-        known, begun = self._first
+        # what stood there before this run began took no time
+        known, begun = self._first = self._first or (done, now)
         if done <= known or done >= total or now - begun < _MIN_ESTIMATE_TIME:
             return ""
         return f", about {_format_duration((now - begun) * (total - done) / (done - known))} left"
 
 
 def _format_duration(seconds: float) -> str:
-    for unit, size in (("h", 3600.0), ("min", 60.0)):
-        if seconds >= 1.5 * size:
-            return f"{seconds / size:.1f} h" if unit == "h" else f"{seconds / size:.0f} min"
-    return f"{seconds:.0f} s"
+    if seconds >= 1.5 * 3600:
+        return f"{seconds / 3600:.1f} h"
+    return f"{seconds / 60:.0f} min" if seconds >= 1.5 * 60 else f"{seconds:.0f} s"
+
+
+def _format_iterate(entry: AcceptedIterate) -> str:
+    note = f", {entry.note}" if entry.note else ""
+    return f"iteration {entry.iteration}, cost {entry.cost:.6g}, {entry.seconds:.1f} s{note}"
 
 
 class LineProgress:
@@ -179,18 +172,15 @@ class _BarProgress:
         self._text, self._left, self._begun = "", _RemainingTime(), 0.0
 
     def begin_stage(self, text: str) -> None:
-        """See `Progress`."""
         self.finish_stage()
         self._text, self._left, self._begun = text, _RemainingTime(), time.monotonic()
         self._task = self._bars.add_task(text, total=None)
 
     def report_iterate(self, entry: AcceptedIterate) -> None:
-        """See `Progress`."""
         if self._task is not None:
             self._bars.update(self._task, description=f"{self._text}: {_format_iterate(entry)}")
 
     def report_parts_done(self, done: int, total: int, text: str) -> None:
-        """See `Progress`."""
         if self._task is not None:
             words = f"{self._text}: {done} of {total}, {text}{self._left.remaining_text(done, total)}"
             self._bars.update(self._task, description=words, completed=done, total=total)
@@ -204,18 +194,9 @@ class _BarProgress:
             self._bars.console.print(f"{self._text}: {spent}", markup=False, highlight=False)
 
 
-def _format_iterate(entry: AcceptedIterate) -> str:
-    note = f", {entry.note}" if entry.note else ""
-    return f"iteration {entry.iteration}, cost {entry.cost:.6g}, {entry.seconds:.1f} s{note}"
-
-
 @contextlib.contextmanager
 def show_progress(arguments: argparse.Namespace) -> Iterator[Progress]:
-    """Context manager that yields a progress display on standard error.
-
-    Bars on a terminal. Elsewhere lines, for logs, or nothing where a program reads the result (`--json`); nothing where
-    it is asked to be quiet.
-    """
+    """Progress display on standard error: bars on a terminal, else lines; nothing if quiet or read by a program."""
     terminal = sys.stderr.isatty()
     if arguments.quiet or (arguments.json and not terminal):
         yield NULL_PROGRESS

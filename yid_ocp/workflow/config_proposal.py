@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import casadi as ca
@@ -32,6 +30,24 @@ _MIN_FRICTION_TRAVEL = 0.02  # A joint that turns less than this says nothing of
 _COPIED_COMMAND_RATIO = 1e-6  # commands nearer to the measured angles than this part of the motion are a copy of them
 _MIN_ARM_TRAVEL = 0.1  # joints that turn less than this together do not move [rad]
 _POSITION_STEP_PERCENT = 5  # places along a segment are told apart in so many percent
+_SEEN_NOISE, _STATED_NOISE = "from sample to sample in the recording", "the recording states it"
+_RESULT_KEYS = {
+    "unused_joints": "left_out",
+    "unrecorded_joints": "not_recorded",
+    "tool_frames": "frames",
+    "holder_frame": "holder",
+    "arm_mode": "mode",
+    "arm_mode_reason": "mode_why",
+    "initial_state": "start",
+    "initial_state_reason": "start_why",
+    "point_placements": "places",
+    "noise_by_group": "noise",
+    "path_cutoff": "cutoff",
+    "clock_descriptions": "clocks",
+    "still_joints": "still",
+    "reason": "why",
+}
+"""Keys of `yid-init/1` by attribute, where they differ."""
 
 
 @dataclass(frozen=True)
@@ -60,80 +76,47 @@ class _GroupNoise:
     reason: str
 
 
-_RESULT_KEYS = {
-    "unused_joints": "left_out",
-    "unrecorded_joints": "not_recorded",
-    "holder_frame": "holder",
-    "arm_mode": "mode",
-    "arm_mode_reason": "mode_why",
-    "initial_state": "start",
-    "initial_state_reason": "start_why",
-    "point_placements": "places",
-    "noise_by_group": "noise",
-    "path_cutoff": "cutoff",
-    "clock_descriptions": "clocks",
-    "still_joints": "still",
-}
-"""Keys of `yid-init/1` by attribute, where they differ."""
-
-
 @dataclass(frozen=True)
 class ConfigProposal:
     """Proposed contents of a generated configuration.
 
     Attributes
     ----------
-    joints : tuple of str
-        Recorded joints that move the object, in the URDF's order.
     unused_joints, unrecorded_joints : tuple of str
         Recorded joints that the model does not need or know, and movable ones of the URDF that were not recorded.
-    arms : tuple of Arm
-        That hold the object, the first one its root.
-    holder_frame : str
-        Frame that carries the object's root.
-    grasps : mapping of frame to point
-        Frames that hold another point of it.
-    time_step, path_cutoff : float
-        [s], [Hz]
-    still_joints : tuple of str
-        Joints that hardly turn in any recording.
     """
 
-    joints: tuple[str, ...]
+    joints: tuple[str, ...]  # recorded ones that move the object, in the URDF's order
     unused_joints: tuple[str, ...]
     unrecorded_joints: tuple[str, ...]
-    arms: tuple[_ArmChain, ...]
-    holder_frame: str
-    grasps: Mapping[str, str]
+    arms: tuple[_ArmChain, ...]  # that hold the object, the first one its root
+    holder_frame: str  # carries the object's root
+    grasps: Mapping[str, str]  # point of the object by the frame that holds it
     arm_mode: str
     arm_mode_reason: str
     initial_state: str
     initial_state_reason: str
     point_placements: Mapping[str, tuple[_PointPlacement, ...]]
     noise_by_group: Mapping[str, _GroupNoise]
-    time_step: float
-    path_cutoff: float
-    clock_descriptions: Mapping[str, str] = field(default_factory=dict)
-    still_joints: tuple[str, ...] = ()
+    time_step: float  # [s]
+    path_cutoff: float  # [Hz]
+    clock_descriptions: Mapping[str, str]
+    still_joints: tuple[str, ...]  # hardly turn in any recording
 
     def to_dict(self) -> dict[str, Any]:
         """The proposal as plain data, under the keys of `yid-init/1`."""
-        own = {_RESULT_KEYS.get(key, key): value for key, value in asdict(self).items()}
-        own["arms"] = [{"joints": arm.joints, "frames": arm.tool_frames} for arm in self.arms]
-        own["places"] = {
-            group: [{"point": place.point, "frame": place.frame, "why": place.reason} for place in places]
-            for group, places in self.point_placements.items()
-        }
-        own["noise"] = {
-            group: {"std": noise.std, "unit": noise.unit, "why": noise.reason}
-            for group, noise in self.noise_by_group.items()
-        }
-        return own
+        return dict(_with_result_keys(asdict(self)))
 
     @property
-    def marked_frames(self) -> tuple[str, ...]:
-        """Model frames marked by recorded points, without duplicates."""
-        return tuple(dict.fromkeys(p.frame for places in self.point_placements.values() for p in places if p.frame))
+    def is_seen_by_effort_alone(self) -> bool:
+        """Whether efforts of arms that move as measured are all that shows the object."""
+        return self.arm_mode == "prescribed" and not self.point_placements
+
+
+def _with_result_keys(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {_RESULT_KEYS.get(key, key): _with_result_keys(entry) for key, entry in value.items()}
+    return [_with_result_keys(entry) for entry in value] if isinstance(value, tuple) else value
 
 
 def propose_config(
@@ -170,66 +153,59 @@ def propose_config(
         As `read_urdf`.
     """
     first = recordings[0]
-    if first.joints is None:
+    recorded = first.joints
+    if recorded is None:
         allowed = "joint states of the robot, which say how the object was moved"
         raise ConfigError("the recording has no joints", where=first.name, allowed=allowed)
     whole = read_urdf(robot)
-    known = [name for name in whole.joint_names if name in first.joints.names]
+    known = [name for name in whole.joint_names if name in recorded.names]
     if not known:
-        what = f"none of the recorded joints is in the URDF: {', '.join(first.joints.names)}"
-        hint = f"rename them: --joints {first.joints.names[0]}={whole.joint_names[0]},..."
+        what = f"none of the recorded joints is in the URDF: {', '.join(recorded.names)}"
+        hint = f"rename them: --joints {recorded.names[0]}={whole.joint_names[0]},..."
         raise ConfigError(what, where=robot, allowed=", ".join(whole.joint_names), hint=hint)
     tree = read_urdf(robot, joints=known)
-    arms = _arms(tree)
-    arms = tuple(sorted(arms, key=lambda arm: -_travel(first, arm.joints)))
+    arms = tuple(sorted(_arms(tree), key=lambda arm: -_travel(first, arm.joints)))
     holder, own = _holder(tree, arms, holder, standing)
-    held = dict(grasps or {}) or _held(arms, own, branches, standing)
-    for name in held:
-        tree.frame(name)
-    carrying = [tree.frame(name).joint_index for name in (*((holder,) if not standing else ()), *held)]
+    held = dict(grasps or {})
+    if not held and standing:
+        held = {arm.tool_frames[0]: end for arm, end in zip(arms, ("w_T2", "w_T3"), strict=False)}
+    elif not held and branches:
+        held = {arm.tool_frames[0]: f"w_{branches[-1].name}" for arm in [arm for arm in arms if arm is not own][:1]}
+    carrying = [tree.frame(name).joint_index for name in (*held, *(() if standing else (holder,)))]
     needed = {j for end in carrying for j in tree.ancestor_joints(end)}
     joints = tuple(tree.joint_names[j] for j in sorted(needed))
-    used = tuple(arm for arm in arms if set(arm.joints) & set(joints))
-    mode, why = _mode(first, bool(held))
-    start, start_why = _start(recordings, joints)
-    period = float(np.median(np.diff(first.joints.t))) if len(first.joints.t) > 1 else _MAX_TIME_STEP
+    mode, why = _mode(first, recorded, bool(held))
+    moving = next(filter(None, (_moving_start(recording, joints) for recording in recordings)), "")
+    period = float(np.median(np.diff(recorded.t))) if len(recorded.t) > 1 else _MAX_TIME_STEP
     return ConfigProposal(
         joints,
-        tuple(name for name in first.joints.names if name not in joints),
-        tuple(name for name in whole.joint_names if name not in first.joints.names),
-        used or arms,
+        tuple(name for name in recorded.names if name not in joints),
+        tuple(name for name in whole.joint_names if name not in recorded.names),
+        tuple(arm for arm in arms if set(arm.joints) & set(joints)) or arms,
         holder,
         held,
         mode,
         why,
-        start,
-        start_why,
+        "estimated" if moving else "equilibrium",
+        moving or "all recordings begin at rest",
         _places(tree, first, branches, holder, standing),
-        _noise(recordings, joints),
+        _noise(first, recorded, joints),
         _time_step(period),
         min(10.0, 0.2 / period),
-        {name: _clock(group.t, group.clock) for name, group in _groups(first)},
+        {getattr(group, "name", "joints"): _clock(group.t, group.clock) for group in first.groups},
         tuple(name for name in joints if max(_travel(r, [name]) for r in recordings) < _MIN_FRICTION_TRAVEL),
     )
-
-
-def _groups(recording: Recording) -> list[tuple[str, JointGroup | PointGroup]]:
-    return [(getattr(group, "name", "joints"), group) for group in recording.groups]
 
 
 # -- arms -------------------------------------------------------------------------------------------------------------
 
 
-def _arms(tree: Mechanism) -> tuple[_ArmChain, ...]:
-    arms = []
+def _arms(tree: Mechanism) -> Iterator[_ArmChain]:
     for j in range(len(tree.joints)):
-        if j in tree.parent_indices:
-            continue
-        own = [name for name, frame in tree.frames.items() if frame.joint_index == j]
-        arms.append(
-            _ArmChain(tuple(tree.joint_names[i] for i in tree.ancestor_joints(j)), tuple(sorted(own, key=_tool_rank)))
-        )
-    return tuple(arms)
+        if j not in tree.parent_indices:
+            own = [name for name, frame in tree.frames.items() if frame.joint_index == j]
+            joints = tuple(tree.joint_names[i] for i in tree.ancestor_joints(j))
+            yield _ArmChain(joints, tuple(sorted(own, key=_tool_rank)))
 
 
 def _tool_rank(frame: str) -> tuple[int, bool]:
@@ -249,26 +225,15 @@ def _holder(tree: Mechanism, arms: Sequence[_ArmChain], frame: str | None, stand
     if frame is None or standing:
         return arms[0].tool_frames[0], arms[0]
     if frame not in tree.frames:
-        hint, allowed = (
-            nearest_name_hint(frame, tree.frames),
-            ", ".join(name for arm in arms for name in arm.tool_frames),
-        )
+        allowed = ", ".join(name for arm in arms for name in arm.tool_frames)
+        hint = nearest_name_hint(frame, tree.frames)
         raise ConfigError(f"there is no frame '{frame}'", where="--holder", allowed=allowed, hint=hint)
     carried = tree.frames[frame].joint_index
     own = next((arm for arm in arms if carried >= 0 and tree.joint_names[carried] in arm.joints), arms[0])
     return frame, own
 
 
-def _held(arms: Sequence[_ArmChain], own: _ArmChain, branches: Sequence[Segment], standing: bool) -> dict[str, str]:
-    if standing:
-        return {arm.tool_frames[0]: end for arm, end in zip(arms, ("w_T2", "w_T3"), strict=False)}
-    others = [arm for arm in arms if arm is not own]
-    return {others[0].tool_frames[0]: f"w_{branches[-1].name}"} if others and branches else {}
-
-
-def _mode(recording: Recording, closed: bool) -> tuple[str, str]:
-    joints = recording.joints
-    assert joints is not None
+def _mode(recording: Recording, joints: JointGroup, closed: bool) -> tuple[str, str]:
     seen = ", ".join(group.name for group in recording.points)
     if joints.effort is None and not seen:
         hint = "import points too (`yid-ocp import FILE --preview` lists what there is)"
@@ -287,36 +252,30 @@ def _mode(recording: Recording, closed: bool) -> tuple[str, str]:
 
 
 def _commanded(joints: JointGroup) -> bool:
-    commands = joints.position_command
-    if commands is None:
+    if joints.position_command is None:
         return False
-    apart = np.sqrt(np.mean((commands - joints.position) ** 2))
+    apart = np.sqrt(np.mean((joints.position_command - joints.position) ** 2))
     return bool(apart > _COPIED_COMMAND_RATIO * np.std(joints.position - joints.position.mean(axis=0)))
 
 
-def _start(recordings: Sequence[Recording], joints: Sequence[str]) -> tuple[str, str]:
-    """Whether every recording begins at rest."""
-    for recording in recordings:
-        moving = _moving_joint_or_point(recording, joints, min(group.t[0] for group in recording.groups))
-        if moving:
-            return "estimated", f"{moving} of {recording.name} moves at the start, which is estimated along"
-    return "equilibrium", "all recordings begin at rest"
+def _moving_start(recording: Recording, joints: Sequence[str]) -> str:
+    """What says that a recording begins in motion; empty where it begins at rest."""
+    moving = _moving_joint_or_point(recording, joints, min(group.t[0] for group in recording.groups))
+    return f"{moving} of {recording.name} moves at the start, which is estimated along" if moving else ""
 
 
 def _moving_joint_or_point(recording: Recording, joints: Sequence[str], time: float) -> str:
     """Name of a joint or point that moves just after a time, from a line fit; empty where all rest."""
+    seen = [("point {}", p.names, p.t, p.position.reshape(len(p.t), -1), _POINT_REST_SPEED) for p in recording.points]
     group = recording.joints
     if group is not None:
         values = group.position[:, [group.names.index(name) for name in joints]]
-        speeds, noise = _speeds(group.t, values, time, _REST_WINDOW)
-        fast = speeds > _JOINT_REST_SPEED + 4 * noise
+        seen.insert(0, ("joint {}", tuple(joints), group.t, values, _JOINT_REST_SPEED))
+    for words, names, t, values, rest_speed in seen:
+        speeds, noise = _speeds(t, values, time, _REST_WINDOW)
+        fast = speeds > rest_speed + 4 * noise
         if fast.any():
-            return f"joint {joints[int(np.argmax(fast))]}"
-    for seen in recording.points:
-        speeds, noise = _speeds(seen.t, seen.position.reshape(len(seen.t), -1), time, _REST_WINDOW)
-        fast = speeds > _POINT_REST_SPEED + 4 * noise
-        if fast.any():
-            return f"point {seen.names[int(np.argmax(fast)) // 3]}"
+            return words.format(names[int(np.argmax(fast)) * len(names) // len(fast)])
     return ""
 
 
@@ -343,9 +302,7 @@ def rest_split_time(recording: Recording, joints: Sequence[str]) -> float | None
     first, duration = min(group.t[0] for group in recording.groups), recording.duration
     for part in np.arange(0.75, 0.5, -0.01):
         time = first + float(part) * duration
-        if not _moving_joint_or_point(recording, joints, time) and not _moving_joint_or_point(
-            recording, joints, time + _REST_WINDOW
-        ):
+        if not any(_moving_joint_or_point(recording, joints, at) for at in (time, time + _REST_WINDOW)):
             later = recording.time_slice(time, first + duration)
             if later.joints is not None and _travel(later, joints) > _MIN_ARM_TRAVEL:
                 return time
@@ -358,70 +315,49 @@ def rest_split_time(recording: Recording, joints: Sequence[str]) -> float | None
 def _places(
     tree: Mechanism, recording: Recording, branches: Sequence[Segment], holder: str, standing: bool
 ) -> dict[str, tuple[_PointPlacement, ...]]:
-    frames = [f"w_{branch.name}" for branch in branches]
-    return {
-        group.name: tuple(
-            _named(point, frames, branches, tree)
-            or (
-                _PointPlacement(point, "", "its place is not known")
-                if standing
-                else _near(tree, recording, group, i, branches, holder)
-            )
-            for i, point in enumerate(group.names)
-        )
-        for group in recording.points
-    }
-
-
-def _named(point: str, frames: Sequence[str], branches: Sequence[Segment], tree: Mechanism) -> _PointPlacement | None:
-    owner, colon, part = point.partition(":")
+    """Places of all points: those of a frame or segment of their name, else, on an arm, where they were seen."""
     names = [branch.name for branch in branches]
-    if point in frames or point in tree.frames or (colon and owner in names and part.endswith("%")):
-        return _PointPlacement(point, point, "a frame of the model by its name")
-    if point in names:
-        return _PointPlacement(point, f"w_{point}", "the end of the segment of its name")
-    return None
+    frames = {f"w_{name}" for name in names} | set(tree.frames)
+    found: dict[str, tuple[_PointPlacement, ...]] = {}
+    for group in recording.points:
+        placed = []
+        for i, point in enumerate(group.names):
+            owner, colon, part = point.partition(":")
+            frame, reason = "", "its place is not known"
+            if point in frames or (colon and owner in names and part.endswith("%")):
+                frame, reason = point, "a frame of the model by its name"
+            elif point in names:
+                frame, reason = f"w_{point}", "the end of the segment of its name"
+            elif not standing:
+                frame, reason = _near(tree, recording, group.t, group.position[:, i], branches, holder)
+            placed.append(_PointPlacement(point, frame, reason))
+        found[group.name] = tuple(placed)
+    return found
 
 
 def _near(
-    tree: Mechanism,
-    recording: Recording,
-    group: PointGroup,
-    column: int,
-    branches: Sequence[Segment],
-    holder: str,
-) -> _PointPlacement:
-    """The place at which a point probably sits, by where it was seen from what holds the object."""
-    point = group.names[column]
-    seen = np.isfinite(group.position[:, column]).all(axis=1)
+    tree: Mechanism, recording: Recording, t: Array, position: Array, branches: Sequence[Segment], holder: str
+) -> tuple[str, str]:
+    """Frame at which a point probably sits, by where it was seen from what holds the object, and why."""
+    seen = np.isfinite(position).all(axis=1)
     if not seen.any():
-        return _PointPlacement(point, "", "it was never seen")
-    poses = _poses(tree, recording, holder, group.t[seen])
-    position = group.position[seen, column]
-    from_holder = position - poses[:, :3, 3]
+        return "", "it was never seen"
+    poses = _poses(tree, recording, holder, t[seen])
+    from_holder = position[seen] - poses[:, :3, 3]
     if len(branches) == 1:
         # an object that bends brings its points nearer, never farther: the farthest is the nearest to its arc length
         branch = branches[0]
         part = float(np.linalg.norm(from_holder, axis=1).max()) / branch.length
         if part > 1.2:
-            return _PointPlacement(
-                point, "", f"it is {part:.1f} times the length away from {holder}: is it in the same frame?"
-            )
+            return "", f"it is {part:.1f} times the length away from {holder}: is it in the same frame?"
         percent = min(100, _POSITION_STEP_PERCENT * round(100 * part / _POSITION_STEP_PERCENT))
-        return _PointPlacement(
-            point, _along(branch.name, percent), f"up to {part:.0%} of the length away from {holder}"
-        )
+        return _along(branch.name, percent), f"up to {part:.0%} of the length away from {holder}"
     local = poses[0, :3, :3].T @ from_holder[0]
-    spots = _straight(branches)
-    name, distance = min(
-        ((name, float(np.linalg.norm(local - spot))) for name, spot in spots.items()), key=lambda entry: entry[1]
-    )
-    longest = max(branch.length for branch in branches)
-    if distance > 0.5 * longest:
-        return _PointPlacement(
-            point, "", f"{distance:.2g} m away from all of the straight object: is it in the same frame?"
-        )
-    return _PointPlacement(point, name, f"{1e3 * distance:.0f} mm from there when the object is straight")
+    apart = {name: float(np.linalg.norm(local - spot)) for name, spot in _straight(branches).items()}
+    name = min(apart, key=apart.__getitem__)
+    if apart[name] > 0.5 * max(branch.length for branch in branches):
+        return "", f"{apart[name]:.2g} m away from all of the straight object: is it in the same frame?"
+    return name, f"{1e3 * apart[name]:.0f} mm from there when the object is straight"
 
 
 def _along(name: str, percent: int) -> str:
@@ -429,6 +365,7 @@ def _along(name: str, percent: int) -> str:
 
 
 def _straight(branches: Sequence[Segment]) -> dict[str, Array]:
+    """Places along the straight object, by the name of the frame there."""
     spots: dict[str, Array] = {}
     ends: dict[str | None, tuple[Array, Array]] = {None: (np.eye(3), np.zeros(3))}
     for branch in branches:
@@ -442,54 +379,46 @@ def _straight(branches: Sequence[Segment]) -> dict[str, Array]:
 
 
 def _poses(tree: Mechanism, recording: Recording, frame: str, t: Array) -> Array:
+    """Poses of a frame at recorded times, shape (N, 4, 4)."""
     group = recording.joints
     assert group is not None
     q = ca.SX.sym("q", len(tree.joints))
-    numeric = tree.with_numeric_values()
-    pose = ca.Function("pose", [q], [forward_kinematics(numeric, q).frame_pose(frame).homogeneous_matrix()])
+    pose = forward_kinematics(tree.with_numeric_values(), q).frame_pose(frame).homogeneous_matrix()
     columns = [group.names.index(name) for name in tree.joint_names]
     angles = np.stack([np.interp(t, group.t, group.position[:, j]) for j in columns])
-    flat = np.array(pose.map(len(t))(angles))
+    flat = np.array(ca.Function("pose", [q], [pose]).map(len(t))(angles))
     return flat.reshape(4, len(t), 4).transpose(1, 0, 2)
 
 
 # -- noise and rates --------------------------------------------------------------------------------------------------
 
 
-def _noise(recordings: Sequence[Recording], joints: Sequence[str]) -> dict[str, _GroupNoise]:
+def _noise(recording: Recording, recorded: JointGroup, joints: Sequence[str]) -> dict[str, _GroupNoise]:
     found: dict[str, _GroupNoise] = {}
-    first = recordings[0].joints
-    if first is not None:
-        at = [first.names.index(name) for name in joints]
-        for channel, unit in (("position", "rad"), ("effort", "N m")):
-            values = first.channels.get(channel)
-            if values is None:
-                continue
-            if getattr(first, f"{channel}_std") is not None:
-                found[f"joints.{channel}"] = _GroupNoise(None, unit, "the recording states it")
-            else:
-                size = max(_size(first.t, values[:, j]) for j in at)
-                least = 1e-6 if channel == "position" else 1e-3
-                found[f"joints.{channel}"] = _GroupNoise(
-                    max(size, least), unit, "from sample to sample in the recording"
-                )
-    for group in recordings[0].points:
-        found[group.name] = _point_noise(group)
-    return found
+    at = [recorded.names.index(name) for name in joints]
+    for channel, unit, least in (("position", "rad", 1e-6), ("effort", "N m", 1e-3)):
+        values = recorded.channels.get(channel)
+        if values is not None:
+            noise = _GroupNoise(None, unit, _STATED_NOISE)
+            if getattr(recorded, f"{channel}_std") is None:
+                size = max(least, *(_size(recorded.t, values[:, j]) for j in at))
+                noise = _GroupNoise(size, unit, _SEEN_NOISE)
+            found[f"joints.{channel}"] = noise
+    return found | {group.name: _point_noise(group) for group in recording.points}
 
 
 def _point_noise(group: PointGroup) -> _GroupNoise:
     if group.std is not None:
-        return _GroupNoise(None, "m", "the recording states it")
+        return _GroupNoise(None, "m", _STATED_NOISE)
     slow = len(group.t) < 2 or 1.0 / mean_sample_rate(group.t) > _SLOW_SAMPLE_PERIOD
-    sizes = []
+    sizes = [0.0]
     for i in range(len(group.names)):
         seen = np.isfinite(group.position[:, i]).all(axis=1)
         sizes += [_size(group.t[seen], column) for column in group.position[seen, i].T]
-    if slow or max(sizes, default=0.0) <= 0:
+    if slow or max(sizes) <= 0:
         std = _CAMERA_STD if slow else _MARKER_STD
         return _GroupNoise(std, "m", "a guess: the data are too slow or too clean to show it")
-    return _GroupNoise(max(sizes), "m", "from sample to sample in the recording")
+    return _GroupNoise(max(sizes), "m", _SEEN_NOISE)
 
 
 def _size(t: Array, values: Array) -> float:
@@ -512,8 +441,3 @@ def _clock(t: Array, clock: str) -> str:
     uneven = float(np.std(steps) / np.mean(steps))
     said = f"{mean_sample_rate(t):.4g} Hz, a {clock} clock"
     return said if uneven < 0.01 else f"{said}, uneven by {uneven:.0%}"
-
-
-def relative_posix_path(path: str | Path, folder: Path) -> str:
-    """POSIX path relative to a folder."""
-    return Path(os.path.relpath(Path(path).resolve(), folder.resolve())).as_posix()

@@ -6,7 +6,6 @@ import argparse
 import contextlib
 import json
 import logging
-import math
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,32 +14,31 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.analysis.estimate_history import RunEstimates, pool_estimates
+from yid_ocp.analysis.estimate_history import pool_estimates
 from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG, load_config
 from yid_ocp.config.settings import RunSettings, dump_config
-from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis import DiagnosisResult, StoredFit, diagnose
 from yid_ocp.diagnosis.baseline import BaselineData, with_baseline_prior
 from yid_ocp.diagnosis.diagnosis_result import final_model_to_dict
 from yid_ocp.diagnosis.refit import KnownFits
 from yid_ocp.errors import OutputError
-from yid_ocp.files import json_sha256, write_json
+from yid_ocp.files import from_plain_data, json_sha256, to_plain_data, write_json
 from yid_ocp.inference.whitening import whitened_by_sensor_noise
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import NULL_PROGRESS, AcceptedIterate, Progress
-from yid_ocp.report.animation import Animation, ModelTrajectory, make_animation
+from yid_ocp.report.animation import Animation, make_animation
 from yid_ocp.report.summaries import diagnose_summary
 from yid_ocp.sensors.joints import EFFORT_GROUP, POSITION_GROUP
 from yid_ocp.solvers import Solution, solve
-from yid_ocp.workflow.build_problem import build_problem
+from yid_ocp.workflow.build_problem import build_problem, issues_result
 from yid_ocp.workflow.command_runner import CommandResult, run_and_print
 from yid_ocp.workflow.plan import next_plan_settings
 from yid_ocp.workflow.prediction_outputs import (
     HeldOutPrediction,
     estimated_torque_offsets,
+    predicted_trajectory,
     write_diagnosis_trajectories,
 )
-from yid_ocp.workflow.recording_issues import issues_result
 from yid_ocp.workflow.run_folder import RunFolder, new_run_folder, software_versions
 from yid_ocp.workflow.run_history import (
     baseline_estimates,
@@ -52,11 +50,7 @@ from yid_ocp.workflow.run_history import (
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class DiagnoseCommandResult(CommandResult):
-    """Result of `run_diagnose` with the diagnosis."""
-
-    diagnosis: DiagnosisResult
+_STORE_FORMAT = "yid-refits/1"
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -70,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def run_diagnose(
     run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS
-) -> DiagnoseCommandResult:
+) -> CommandResult[DiagnosisResult]:
     """Diagnose and write the run folder; finished refits of an interrupted, identical run are reused.
 
     Raises
@@ -80,7 +74,7 @@ def run_diagnose(
     with new_run_folder(run, out, "diagnose") as folder:
         folder.begin_run(run, "diagnose", _flags(run))
         refits = JsonRefitStore(folder, folder.input_hashes, dump_config(run), software_versions())
-        told_and_kept = _Kept(progress, folder)
+        logged = _LoggedProgress(progress, folder)
         progress.begin_stage("building the model and its compiled step")
         runs = baseline_estimates(run)
         without, said = load_reference_recordings(run)
@@ -91,8 +85,21 @@ def run_diagnose(
         require_distinct_recordings(run, problem, runs, without)
         if runs:
             problem = with_baseline_prior(problem, pool_estimates(runs)[0])
+        nominal: Solution | None = None
         try:
-            finding = _found(run, problem, refits, told_and_kept, runs, without)
+            if run.diagnosis.noise_fraction < 1 and problem.held_out:
+                # in units of noise the solver would take any fit for a bad one and start again elsewhere
+                logged.begin_stage("solving the nominal model")
+                nominal = solve(problem, run.solver, callback=logged.report_iterate)
+            finding = diagnose(
+                _with_noise_only_stds(problem, run),
+                run.diagnosis.candidates,
+                thresholds=run.diagnosis,
+                progress=logged,
+                known_fits=KnownFits(nominal, refits),
+                baseline=BaselineData.from_runs(runs, without),
+                exclude=run.diagnosis.exclude,
+            )
         except KeyboardInterrupt:
             if len(refits):
                 log.warning("%d finished refits are in %s; the same command resumes them", len(refits), refits.file)
@@ -100,29 +107,25 @@ def run_diagnose(
         folder.log_event("end", verdict=finding.verdict, effects=[effect.label for effect in finding.accepted_effects])
         predicted = _held_out_predictions(finding)
         write_diagnosis_trajectories(folder.path / "trajectories.h5", finding, predicted)
-        last = finding.final_model
-        offsets = estimated_torque_offsets(last.problem, last.problem.vector(last.values))
-        told = finding.to_dict()
-        moving = not last.problem.options.clamp_paths and bool(
-            last.problem.system.driven or last.problem.system.prescribed
-        )
+        last, told = finding.final_model, finding.to_dict()
+        system = last.problem.system
+        moving = not last.problem.options.clamp_paths and bool(system.driven or system.prescribed)
         own = {
             "model": final_model_to_dict(finding),
             "doubts": issues_result(problem.options.data_issues),
-            "torque_offsets": offsets,
+            "torque_offsets": estimated_torque_offsets(last.problem, last.problem.vector(last.values)),
             "next_plan": next_plan_settings(told["confusable"] if moving else (), folder.final_path),
         }
         written = folder.write_result(told | own)
+        known = {"problem": problem, "animations": _scenes(finding, predicted)}
         more = {"finding": finding, "predictions": predicted}
-        folder.write_report_page(
-            run, written, progress, problem=problem, animations=_scenes(finding, predicted), section_data=more
-        )
+        folder.write_report_page(run, written, progress, **known, section_data=more)
     refits.delete_file()
-    return DiagnoseCommandResult(folder.path, written, finding)
+    return CommandResult(folder.path, written, finding)
 
 
 @dataclass(frozen=True)
-class _Kept:
+class _LoggedProgress:
     """Progress that is shown, and entered in the run folder's log."""
 
     shown: Progress
@@ -140,35 +143,9 @@ class _Kept:
         self.shown.report_parts_done(done, total, text)
 
 
-def _found(
-    run: RunSettings,
-    problem: EstimationProblem,
-    refits: JsonRefitStore,
-    progress: Progress,
-    runs: Sequence[RunEstimates],
-    without: Sequence[Recording],
-) -> DiagnosisResult:
-    said = run.diagnosis
-    nominal: Solution | None = None
-    if said.noise_fraction < 1 and problem.held_out:
-        # in units of noise the solver would take any fit for a bad one and start again elsewhere
-        progress.begin_stage("solving the nominal model")
-        nominal = solve(problem, run.solver, callback=progress.report_iterate)
-    return diagnose(
-        _with_noise_only_stds(problem, run),
-        said.candidates,
-        thresholds=said,
-        progress=progress,
-        known_fits=KnownFits(nominal, refits),
-        baseline=BaselineData.from_runs(runs, tuple(without)),
-        exclude=said.exclude,
-    )
-
-
 def _flags(run: RunSettings) -> list[str]:
-    if any(origin.startswith("--set") for origin in run.key_locations.values()):
-        return []
-    if any(key[:2] == ("diagnosis", "baseline") for key in run.key_locations):
+    said = run.key_locations
+    if any(at.startswith("--set") or key[:2] == ("diagnosis", "baseline") for key, at in said.items()):
         return []
     return [part for folder in run.diagnosis.baseline for part in ("--baseline", folder)]
 
@@ -184,16 +161,16 @@ def _with_noise_only_stds(problem: EstimationProblem, run: RunSettings) -> Estim
         if level is None:
             what = f"the fraction of noise in the {field} of '{group}' is given, but not the {field}"
             raise run.config_error(what, "diagnosis", "noise_fraction", hint=f"set sensors.{group}.{field}")
-        smaller: dict[str, Any] = {field: _times(share, level)}
-        sensors[group] = replace(sensors[group], **smaller)
+        by_name = isinstance(level, Mapping)
+        smaller: Any = {name: share * std for name, std in level.items()} if by_name else share * level
+        sensors[group] = replace(sensors[group], **{field: smaller})
+    prior = options.multivariate_prior
     return problem.with_options(
         replace(
             options,
             sensors=sensors,
             prior_stds={name: share * std for name, std in options.prior_stds.items()},
-            multivariate_prior=options.multivariate_prior.scaled_by(
-                dict.fromkeys(options.multivariate_prior.parameter_names, share)
-            ),
+            multivariate_prior=prior.scaled_by(dict.fromkeys(prior.parameter_names, share)),
             huber_threshold=options.huber_threshold / share,
             weak_prior_factor=options.weak_prior_factor**share if options.weak_prior_factor > 0 else 0.0,
             start_configuration_std=share * options.start_configuration_std,
@@ -203,13 +180,13 @@ def _with_noise_only_stds(problem: EstimationProblem, run: RunSettings) -> Estim
 
 
 def _noise_levels(problem: EstimationProblem) -> set[tuple[str, str]]:
+    """Groups and fields of `SensorOptions` whose standard deviations count in the problem."""
     levels = {(samples.sensor.group_name, "std") for episode in problem.episodes for samples in episode.measurements}
     recorded = [e.recording.joints.position_std for e in problem.episodes if e.recording.joints is not None]
     encoders = problem.options.sensors.get(POSITION_GROUP)
-    if (EFFORT_GROUP, "std") in levels and any(std is not None and np.any(std) for std in recorded):
+    noisy = any(std is not None and np.any(std) for std in recorded)
+    if ((EFFORT_GROUP, "std") in levels and noisy) or (encoders is not None and encoders.std is not None):
         levels.add((POSITION_GROUP, "std"))  # the encoders' noise is part of that of efforts
-    if encoders is not None and encoders.std is not None:
-        levels.add((POSITION_GROUP, "std"))
     for errors in (episode.input_errors for episode in problem.episodes):
         if errors is not None:
             given = {
@@ -219,10 +196,6 @@ def _noise_levels(problem: EstimationProblem) -> set[tuple[str, str]]:
             }
             levels |= {level for level, std in given.items() if np.any(std > 0)}
     return levels
-
-
-def _times(share: float, std: float | Mapping[str, float]) -> float | Mapping[str, float]:
-    return {name: share * value for name, value in std.items()} if isinstance(std, Mapping) else share * std
 
 
 def _held_out_predictions(finding: DiagnosisResult) -> list[HeldOutPrediction]:
@@ -243,23 +216,17 @@ def _scenes(finding: DiagnosisResult, predicted: Sequence[HeldOutPrediction]) ->
     fits |= {"with the effects": finding.final_model} if finding.accepted_effects else {}
     scenes = []
     for episode, *outcomes in predicted:
-        told = []
-        for (name, fit), outcome in zip(fits.items(), outcomes, strict=False):
-            system, predictor = fit.problem.system, fit.problem.predictor
-            theta, _ = fit.problem.split(fit.problem.vector(fit.values), 0)
-            q = outcome.rollout.state[:, : system.n_coordinates]
-            told.append(
-                ModelTrajectory(name, system, predictor.episode_theta(episode, theta), episode.grid.node_times, q)
-            )
+        told = [
+            predicted_trajectory(name, own, episode, outcome, own.split(own.vector(fit.values), 0)[0])
+            for (name, fit), outcome in zip(fits.items(), outcomes, strict=False)
+            for own in [fit.problem]
+        ]
         scenes.append(make_animation(f"{episode.name} (held out)", told, episode.recording))
     return scenes
 
 
-_STORE_FORMAT = "yid-refits/1"
-
-
 class JsonRefitStore:
-    """A store of refits in one JSON file: {format, key, refits: {name: {values, std, message}}}.
+    """A store of refits in one JSON file: {format, key, refits: {name: data of a `StoredFit`}}.
 
     The file is replaced as a whole after every refit. One that was made from other inputs, by another configuration or
     by another version is skipped with a notice.
@@ -270,10 +237,8 @@ class JsonRefitStore:
 
     def __init__(self, folder: RunFolder, *made_from: Mapping[str, str] | str) -> None:
         self.file = folder.resume_folder / "refits.json"
-        self._folder = folder
-        self._key = json_sha256(made_from)
-        self._lock = threading.Lock()
-        self._warned = False
+        self._folder, self._key = folder, json_sha256(made_from)
+        self._lock, self._warned = threading.Lock(), False
         self._known = self._read()
 
     def __len__(self) -> int:
@@ -290,18 +255,10 @@ class JsonRefitStore:
         """Store a refit and rewrite the file."""
         with self._lock:
             self._known[name] = refitted
-            refits = {
-                key: {
-                    "values": _texts(fit.values),
-                    "std": _texts(fit.std),
-                    "amplitude_std": _texts(fit.amplitude_std),
-                    "message": fit.solver_message,
-                }
-                for key, fit in self._known.items()
-            }
             try:
                 self.file.parent.mkdir(parents=True, exist_ok=True)
-                write_json(self.file, {"format": _STORE_FORMAT, "key": self._key, "refits": refits})
+                data = {"format": _STORE_FORMAT, "key": self._key, "refits": to_plain_data(self._known)}
+                write_json(self.file, data)
             except (OSError, OutputError) as error:
                 if not self._warned:
                     log.warning("finished refits cannot be kept (%s); the diagnosis goes on without", error)
@@ -318,15 +275,7 @@ class JsonRefitStore:
         try:
             held = json.loads(self.file.read_text(encoding="utf-8"))
             if (held["format"], held["key"]) == (_STORE_FORMAT, self._key):
-                return {
-                    name: StoredFit(
-                        _numbers(fit["values"]),
-                        _numbers(fit["std"]),
-                        _numbers(fit["amplitude_std"]),
-                        str(fit["message"]),
-                    )
-                    for name, fit in held["refits"].items()
-                }
+                return {name: from_plain_data(StoredFit, fit) for name, fit in held["refits"].items()}
             reason = "other inputs, another configuration or another version"
         except FileNotFoundError:
             return {}
@@ -334,11 +283,3 @@ class JsonRefitStore:
             reason = "something that cannot be read"
         log.warning("the refits in %s are from %s and are not resumed", self.file, reason)
         return {}
-
-
-def _texts(values: Mapping[str, float]) -> dict[str, float | str]:
-    return {name: value if math.isfinite(value) else str(value) for name, value in values.items()}
-
-
-def _numbers(values: Mapping[str, float | str]) -> dict[str, float]:
-    return {name: float(value) for name, value in values.items()}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import EffectSettings, ParameterSettings, RunSettings, dump_config
+from yid_ocp.config.settings import ParameterSettings, RunSettings, dump_config
 from yid_ocp.data import read_recording
 from yid_ocp.data.hdf5_io import open_checked_hdf5
 from yid_ocp.data.recording import Recording
@@ -29,7 +29,7 @@ from yid_ocp.export.models import (
 from yid_ocp.export.signals import TopicSignal, export_csv, export_mcap, signals_from_recording
 from yid_ocp.files import file_sha256, to_json_types, write_json, write_text
 from yid_ocp.model.system import System
-from yid_ocp.progress import NULL_PROGRESS, Progress
+from yid_ocp.progress import Progress
 from yid_ocp.report.summaries import export_summary
 from yid_ocp.report.terminal import recording_summary_lines, terminal_lines
 from yid_ocp.virtual.mjcf import mujoco_xml
@@ -39,35 +39,45 @@ from yid_ocp.workflow.command_runner import EXIT_DONE, print_result, show_progre
 from yid_ocp.workflow.import_recording import recording_contents
 from yid_ocp.workflow.prediction_outputs import DIAGNOSIS_TRAJECTORIES_FORMAT, SOLVE_TRAJECTORIES_FORMAT
 from yid_ocp.workflow.run_folder import software_versions
-from yid_ocp.workflow.run_history import read_run_result
+from yid_ocp.workflow.run_history import effect_values, read_run_result, with_effect_values
 from yid_ocp.workflow.run_inputs import read_recordings
 
+_MODEL_FORMATS = ("mjcf", "urdf", "sdf", "yaml")
 _MCAP = "mcap"
+_PREDICTION_TOPICS: Mapping[str, Mapping[str, str]] = {
+    SOLVE_TRAJECTORIES_FORMAT: {"predicted": "predicted"},
+    DIAGNOSIS_TRAJECTORIES_FORMAT: {"before": "nominal", "after": "with_effects"},
+}
+"""Arrays of a sensor's group, and the first part of the topics that tell them."""
+_RESERVED_GROUPS = ("where", "events", "unknowns", "recordings")
+_UNKNOWN_SHAPES: Mapping[str, Any] = {"push": "wrench", "offset": "vector", "bias": "vector"}  # by kind of unknown
+Array = NDArray[np.float64]
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     source, form = Path(arguments.source), arguments.format
-    if source.is_dir():
-        if form == "csv":
-            hint = "export a recording, or the run's signals as mcap"
-            raise ConfigError(
-                "a run is no table", where="--format csv", allowed=", ".join((*MODEL_FORMATS, _MCAP)), hint=hint
-            )
-        if form == _MCAP:
-            written, notes = export_run_signals(source, arguments.out)
-            paths = [str(file) for file in written]
-            result = {"format": EXPORT_FORMAT, "file": paths, "kind": form, "notes": notes}
-            print_result(arguments, result, lambda: notes, "\n".join(paths), "\n".join(paths))
-            return EXIT_DONE
+    if not source.is_dir():
+        return _export_recording(arguments, source, form)
+    if form == "csv":
+        allowed, hint = ", ".join((*_MODEL_FORMATS, _MCAP)), "export a recording, or the run's signals as mcap"
+        raise ConfigError("a run is no table", where="--format csv", allowed=allowed, hint=hint)
+    if form == _MCAP:
+        files, notes = _export_run_signals(source, arguments.out)
+        paths = [str(file) for file in files]
+        result = {"format": EXPORT_FORMAT, "file": paths, "kind": form, "notes": notes}
+        print_result(arguments, result, lambda: notes, "\n".join(paths), "\n".join(paths))
+    else:
         with show_progress(arguments) as progress:
-            manifest = export_model(source, arguments.out, form or "mjcf", progress)
-        print_result(
-            arguments, manifest, lambda: terminal_lines(export_summary(manifest)), arguments.out, arguments.out
-        )
-        return EXIT_DONE
+            manifest = _export_model(source, Path(arguments.out), form or "mjcf", progress)
+        out = arguments.out
+        print_result(arguments, manifest, lambda: terminal_lines(export_summary(manifest)), out, out)
+    return EXIT_DONE
+
+
+def _export_recording(arguments: argparse.Namespace, source: Path, form: str | None) -> int:
     if form not in (None, "csv", _MCAP):
-        allowed = f"csv or {_MCAP} of a recording; {', '.join(MODEL_FORMATS)} of a run folder of `solve` or `diagnose`"
+        allowed = f"csv or {_MCAP} of a recording; {', '.join(_MODEL_FORMATS)} of a run folder of `solve` or `diagnose`"
         raise ConfigError(f"{source.name} is no run folder", where=f"--format {form}", allowed=allowed)
     recording = read_recording(source, allow_nan_effort=True)
     result, notes = recording_contents(recording), []
@@ -80,13 +90,12 @@ def run(arguments: argparse.Namespace) -> int:
         files = export_csv(recording, arguments.out)
     paths = [str(file) for file in files]
     result |= {"format": EXPORT_FORMAT, "file": paths, "kind": form or "csv", "notes": [*result["notes"], *notes]}
-    print_result(
-        arguments, result, lambda: [*notes, *recording_summary_lines(recording)], "\n".join(paths), "\n".join(paths)
-    )
+    texts = [*notes, *recording_summary_lines(recording)]
+    print_result(arguments, result, lambda: texts, "\n".join(paths), "\n".join(paths))
     return EXIT_DONE
 
 
-MODEL_FORMATS = ("mjcf", "urdf", "sdf", "yaml")
+# -- models -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -98,84 +107,74 @@ class _CalibratedModel:
     parameter_values: Mapping[str, float]
     parameter_stds: Mapping[str, float | None]
 
+    def system(self, labels: Iterable[str] | None = None, nominal: bool = False) -> System:
+        """The system with the labelled effects, all of them when absent; `nominal`: of those the nominal model has."""
+        run = self.nominal_settings if nominal else self.settings
+        if labels is None:
+            return build_system(run)
+        kept = {"", *labels}
+        effects = tuple(effect for effect in run.model.effects if f"{effect.kind}@{effect.location}" in kept)
+        # parameters, and patterns of them, are named after their effect
+        owners = {name: name.rpartition(".")[0] if "@" in name else "" for name in run.parameters}
+        parameters = {name: said for name, said in run.parameters.items() if owners[name] in kept}
+        return build_system(replace(run, model=replace(run.model, effects=effects), parameters=parameters))
 
-def _read_calibrated_model(folder: str | Path) -> _CalibratedModel:
-    folder = Path(folder)
+    def values_for(self, system: System) -> dict[str, float]:
+        """Values of the parameters that a system has."""
+        return {name: value for name, value in self.parameter_values.items() if name in system.parameters}
+
+    def text(self, form: str, system: System) -> str:
+        """A system of this model with its values, as a file of a format."""
+        values = self.values_for(system)
+        if form == "mjcf":
+            return mujoco_xml(system, values, emulate=True, actuators=True)
+        return system_to_urdf(system, values) if form == "urdf" else system_to_sdf(system, values)
+
+
+def _read_calibrated_model(folder: Path) -> _CalibratedModel:
     result = read_run_result(folder)
     try:
         parameters = {str(name): dict(entry) for name, entry in result.get("model", result)["parameters"].items()}
         values = {name: float(entry["value"]) for name, entry in parameters.items()}
     except (LookupError, TypeError, ValueError, AttributeError) as error:
-        raise DataError(
-            "the result has no parameters", where=str(folder / "result.json"), hint="run it again"
-        ) from error
+        where = str(folder / "result.json")
+        raise DataError("the result has no parameters", where=where, hint="run it again") from error
     nominal = load_config(folder / "config.yaml")
-    known = {f"{effect.kind}@{effect.location}" for effect in nominal.model.effects}
-    found: dict[str, dict[str, float]] = {}
-    for name, value in values.items():
-        label, _, quantity = name.rpartition(".")
-        if "@" in label and label not in known:
-            found.setdefault(label, {})[quantity] = value
-    effects = [
-        EffectSettings(kind=label.partition("@")[0], location=label.partition("@")[2], values=own)
-        for label, own in found.items()
-    ]
     std = {name: entry.get("std") for name, entry in parameters.items() if entry.get("free")}
-    model = replace(nominal.model, effects=(*nominal.model.effects, *effects))
-    return _CalibratedModel(replace(nominal, model=model), nominal, values, std)
+    return _CalibratedModel(with_effect_values(nominal, effect_values(values)), nominal, values, std)
 
 
-def export_model(
-    folder: str | Path, out: str | Path, form: str = "mjcf", progress: Progress = NULL_PROGRESS
-) -> dict[str, Any]:
-    """Write the final model of a run and `OUT.manifest.json`, which lists what the format represents.
-
-    Parameters
-    ----------
-    folder : str or Path
-        Run folder of `solve` or `diagnose`.
-    out : str or Path
-        File to write.
-    form : str
-        Of `MODEL_FORMATS`.
-
-    Returns
-    -------
-    dict
-        The manifest; of `yaml`, which says all that the run does, without one beside it.
-
-    Raises
-    ------
-    ConfigError, DataError, ModelError, OutputError
-    """
-    if form not in MODEL_FORMATS:
-        raise _unknown(form)
-    calibrated, out = _read_calibrated_model(folder), Path(out)
+def _export_model(folder: Path, out: Path, form: str, progress: Progress) -> dict[str, Any]:
+    """Write the final model of a run and, but for `yaml`, a manifest of what the format represents; returns this."""
+    if form not in _MODEL_FORMATS:
+        why = "mjcf: UsdPhysics has no schema for cables yet, nor springs on joints that turn about three axes"
+        hint, allowed = why if form == "usd" else "", ", ".join(_MODEL_FORMATS)
+        raise ConfigError(f"there is no format '{form}'", where="--format", allowed=allowed, hint=hint)
+    calibrated = _read_calibrated_model(folder)
     progress.begin_stage("building the model")
+    full = calibrated.system()
     if form == "yaml":
-        write_text(out, dump_config(_settings_with_estimates(calibrated)))
+        write_text(out, dump_config(_settings_with_estimates(calibrated, full)))
         return {"format": EXPORT_FORMAT, "file": str(out), "kind": form, "effects": {}, "parameters": {}, "gate": None}
-    system, said = _expressible(calibrated, form)
-    text = _written(form, system, _own(calibrated.parameter_values, system))
-    full = build_system(calibrated.settings)
+    system, said = _expressible(calibrated, full, form)
+    text = calibrated.text(form, system)
+    grasp = FormatSupport("not representable", f"{form.upper()} describes a tree: close the loop in the engine")
+    if form == "mjcf":
+        grasp = FormatSupport("native", "equality constraints between sites, or a tendon where it gives way")
+    parameters = {}
+    for name, entry in parameter_support(full, said, form).items():
+        own, stds = full.parameters[name], calibrated.parameter_stds
+        known = {"value": calibrated.parameter_values.get(name, own.value), "unit": own.unit}
+        parameters[name] = known | {"estimated": name in stds, "std": stds.get(name), **vars(entry)}
     manifest: dict[str, Any] = {
         "format": EXPORT_FORMAT,
         "file": out.name,
         "kind": form,
-        "run": str(Path(folder).resolve()),
-        "result": file_sha256(Path(folder) / "result.json"),
+        "run": str(folder.resolve()),
+        "result": file_sha256(folder / "result.json"),
         "effects": {label: vars(entry) for label, entry in said.items()},
-        "parameters": {
-            name: {
-                "value": calibrated.parameter_values.get(name, full.parameters[name].value),
-                "unit": full.parameters[name].unit,
-                "estimated": name in calibrated.parameter_stds,
-                "std": calibrated.parameter_stds.get(name),
-                **vars(entry),
-            }
-            for name, entry in parameter_support(full, said, form).items()
-        },
-        "grasps": {grasp.name: vars(_said_of_grasp(form)) for grasp in full.grasps},
+        "parameters": parameters,
+        "grasps": {own.name: vars(grasp) for own in full.grasps},
         "gate": None,
         "versions": software_versions(),
     }
@@ -185,97 +184,47 @@ def export_model(
     manifest = to_json_types(manifest)
     write_text(out, text)
     try:
-        write_json(_manifest_path(out), manifest)
+        write_json(out.with_name(f"{out.name}.manifest.json"), manifest)
     except BaseException:
         out.unlink(missing_ok=True)  # a model without its manifest would be silent about what it lacks
         raise
     return manifest
 
 
-def _manifest_path(out: Path) -> Path:
-    return out.with_name(f"{out.name}.manifest.json")
-
-
-def _settings_with_estimates(calibrated: _CalibratedModel) -> RunSettings:
-    system = build_system(calibrated.settings)
-    chosen = dict(parameter_settings(calibrated.settings, system.parameters))
-    for name in calibrated.parameter_stds:
-        chosen.setdefault(name, ParameterSettings(free=True))
-    values = calibrated.parameter_values
-    parameters = {
-        name: replace(said, initial=values[name]) if name in calibrated.parameter_stds else said
-        for name, said in chosen.items()
+def _settings_with_estimates(calibrated: _CalibratedModel, system: System) -> RunSettings:
+    chosen = parameter_settings(calibrated.settings, system.parameters)
+    estimates = {
+        name: replace(chosen.get(name, ParameterSettings(free=True)), initial=calibrated.parameter_values[name])
+        for name in calibrated.parameter_stds
     }
-    return replace(calibrated.settings, parameters=parameters)
+    return replace(calibrated.settings, parameters=chosen | estimates)
 
 
-def _unknown(form: str) -> ConfigError:
-    hint = ""
-    if form == "usd":
-        hint = "mjcf: UsdPhysics has no schema for cables yet, nor springs on joints that turn about three axes"
-    return ConfigError(f"there is no format '{form}'", where="--format", allowed=", ".join(MODEL_FORMATS), hint=hint)
-
-
-def _own(values: Mapping[str, float], system: System) -> dict[str, float]:
-    return {name: value for name, value in values.items() if name in system.parameters}
-
-
-def _written(form: str, system: System, values: Mapping[str, float]) -> str:
-    writers: Mapping[str, Callable[[System, Mapping[str, float]], str]] = {
-        "mjcf": lambda system, values: mujoco_xml(system, values, emulate=True, actuators=True),
-        "urdf": system_to_urdf,
-        "sdf": system_to_sdf,
-    }
-    return writers[form](system, values)
-
-
-def _said_of_grasp(form: str) -> FormatSupport:
-    if form == "mjcf":
-        return FormatSupport("native", "equality constraints between sites, or a tendon where it gives way")
-    return FormatSupport("not representable", f"{form.upper()} describes a tree: close the loop in the engine")
-
-
-def _expressible(calibrated: _CalibratedModel, form: str) -> tuple[System, dict[str, FormatSupport]]:
-    system = build_system(calibrated.settings)
-    said = effect_support(system, _own(calibrated.parameter_values, system), form)
+def _expressible(calibrated: _CalibratedModel, full: System, form: str) -> tuple[System, dict[str, FormatSupport]]:
+    """The system without the effects that a format cannot tell, and what it makes of each."""
+    said = effect_support(full, calibrated.values_for(full), form)
     for _ in range(len(said) + 1):
-        kept = [label for label, entry in said.items() if entry.status != "not representable" and _acts(entry)]
-        system = _with(calibrated.settings, kept)
+        kept = [
+            label
+            for label, entry in said.items()
+            if entry.status != "not representable" and not entry.how.startswith("neutral")
+        ]
+        system = calibrated.system(kept)
         try:
-            _written(form, system, _own(calibrated.parameter_values, system))
+            calibrated.text(form, system)
             return system, said
         except ModelError as error:
             for label in kept:  # what the table cannot tell: it depends on where the effect sits
-                alone = _with(calibrated.settings, [label])
                 try:
-                    _written(form, alone, _own(calibrated.parameter_values, alone))
+                    calibrated.text(form, calibrated.system([label]))
                 except ModelError as own:
                     said[label] = FormatSupport("not representable", own.what)
                     break
             else:
                 what = f"the model cannot be written as {form.upper()}: {error.what}"
-                hint = error.hint or f"another format: {', '.join(MODEL_FORMATS)}"
+                hint = error.hint or f"another format: {', '.join(_MODEL_FORMATS)}"
                 raise ModelError(what, where=error.where, allowed=error.allowed, hint=hint) from error
     raise AssertionError("effects run out")
-
-
-def _acts(said: FormatSupport) -> bool:
-    return not said.how.startswith("neutral")
-
-
-def _with(run: RunSettings, labels: Sequence[str]) -> System:
-    effects = tuple(effect for effect in run.model.effects if f"{effect.kind}@{effect.location}" in labels)
-    model, kept = replace(run.model, effects=effects), set(labels)
-    parameters = {name: said for name, said in run.parameters.items() if _owner(name) in ("", *kept)}
-    return build_system(replace(run, model=model, parameters=parameters))
-
-
-def _owner(name: str) -> str:
-    """Label of the effect whose parameter, or pattern of parameters, a name is; empty for none."""
-    return name.rpartition(".")[0] if "@" in name else ""
-
-
-# -- the gate ---------------------------------------------------------------------------------------------------------
 
 
 def _gate(calibrated: _CalibratedModel, system: System, text: str, progress: Progress) -> dict[str, Any]:
@@ -285,9 +234,7 @@ def _gate(calibrated: _CalibratedModel, system: System, text: str, progress: Pro
         recordings = read_recordings(calibrated.settings, which)
         if not recordings:
             return {"status": "not done", "reason": "the run has no recordings"}
-        kept = [f"{e.kind}@{e.location}" for e in calibrated.nominal_settings.model.effects]
-        present = [f"{e.kind}@{e.location}" for e in system.effects]
-        nominal = _with(calibrated.nominal_settings, [label for label in kept if label in present])
+        nominal = calibrated.system([f"{e.kind}@{e.location}" for e in system.effects], nominal=True)
         before = _replayed(mujoco_xml(nominal, emulate=True, actuators=True), nominal, recordings, progress)
         after = _replayed(text, system, recordings, progress, 1)
     except (DataError, ModelError) as error:
@@ -298,7 +245,7 @@ def _gate(calibrated: _CalibratedModel, system: System, text: str, progress: Pro
             "noise": error.noise_rms,
             "before": before[name].rmse,
             "after": error.rmse,
-            "fall": _fall([before[name]], [error]),
+            "fall": _fall([(before[name], error)]),
         }
         for name, error in after.items()
     }
@@ -308,79 +255,49 @@ def _gate(calibrated: _CalibratedModel, system: System, text: str, progress: Pro
         "recordings": [recording.name for recording in recordings],
         "bandwidth": REPLAY_BANDWIDTH,
         "channels": channels,
-        "fall": _fall([before[name] for name in after], list(after.values())),
+        "fall": _fall([(before[name], error) for name, error in after.items()]),
     }
 
 
 def _replayed(
     text: str, system: System, recordings: Sequence[Recording], progress: Progress, round_: int = 0
 ) -> dict[str, ReplayMismatch]:
+    """Errors of all recordings together, by channel."""
     found: dict[str, list[ReplayMismatch]] = {}
     for i, recording in enumerate(recordings):
         progress.report_parts_done(round_ * len(recordings) + i, 2 * len(recordings), recording.name)
         for name, error in replay_in_mujoco(text, system, recording).items():
             found.setdefault(name, []).append(error)
-    return {name: _together(errors) for name, errors in found.items()}
+    return {
+        name: ReplayMismatch(_rms([e.rmse for e in errors]), _rms([e.noise_rms for e in errors]), errors[0].unit)
+        for name, errors in found.items()
+    }
 
 
-def _together(errors: Sequence[ReplayMismatch]) -> ReplayMismatch:
-    rmse, noise = (
-        (sum(getattr(error, key) ** 2 for error in errors) / len(errors)) ** 0.5 for key in ("rmse", "noise_rms")
-    )
-    return ReplayMismatch(rmse, noise, errors[0].unit)
+def _rms(values: Sequence[float]) -> float:
+    return float((sum(value**2 for value in values) / len(values)) ** 0.5)
 
 
-def _fall(before: Sequence[ReplayMismatch], after: Sequence[ReplayMismatch]) -> float | None:
-    """By what part the error beyond the noise falls, channels weighed by their error before; None if there was none."""
-    gone = [
-        1 - (b.rmse_beyond_noise and a.rmse_beyond_noise / b.rmse_beyond_noise)
-        for b, a in zip(before, after, strict=True)
-    ]
-    real = [(part, b) for part, b in zip(gone, before, strict=True) if b.rmse_beyond_noise > 0]
-    return sum(part for part, _ in real) / len(real) if real else None
+def _fall(pairs: Sequence[tuple[ReplayMismatch, ReplayMismatch]]) -> float | None:
+    """Mean part by which errors beyond the noise fall, of pairs before and after; None if there was none before."""
+    parts = [1 - a.rmse_beyond_noise / b.rmse_beyond_noise for b, a in pairs if b.rmse_beyond_noise > 0]
+    return sum(parts) / len(parts) if parts else None
 
 
-Array = NDArray[np.float64]
-_PREDICTION_TOPICS: Mapping[str, Mapping[str, str]] = {
-    SOLVE_TRAJECTORIES_FORMAT: {"predicted": "predicted"},
-    DIAGNOSIS_TRAJECTORIES_FORMAT: {"before": "nominal", "after": "with_effects"},
-}
-"""Arrays of a sensor's group, and the first part of the topics that tell them."""
-_RESERVED_GROUPS = ("where", "events", "unknowns", "recordings")
+# -- signals ----------------------------------------------------------------------------------------------------------
 
 
-def export_run_signals(folder: str | Path, out: str | Path) -> tuple[list[Path], list[str]]:
-    """Write `OUT/RECORDING.mcap` for every recording of a run.
-
-    Topics: `/measured/...`, `/predicted/...` (of a diagnosis `/nominal/...` and `/with_effects/...`) and
-    `/residual/...`, predicted minus measured, with `joints/QUANTITY` or `points/GROUP/POINT` behind; the whole
-    configuration as `/predicted/joint_states`, what moves it as `/predicted/driven_efforts` (of servos as
-    `/predicted/commands`) and `/predicted/prescribed_efforts`. Of a diagnosis also `/unknown/joint_states` (forces),
-    `/unknown/push/SEGMENT`, `/unknown/offset/GRASP`, `/unknown/bias/POINT` and `/events/CHANNEL`.
-
-    Parameters
-    ----------
-    folder : str or Path
-        Run folder of `solve` or `diagnose`.
-    out : str or Path
-        Folder to write to.
-
-    Raises
-    ------
-    ConfigError, DataError, OutputError
-    """
-    folder, out = Path(folder), Path(out)
+def _export_run_signals(folder: Path, out: str) -> tuple[list[Path], list[str]]:
+    """Write `OUT/RECORDING.mcap` for every recording of a run; its topics stand in docs/reports.md."""
+    source, files, notes = folder / "trajectories.h5", [], []
     read_run_result(folder)
-    files, notes = [], []
-    with open_checked_hdf5(folder / "trajectories.h5") as file:
+    with open_checked_hdf5(source) as file:
         form = str(file.attrs.get("format", ""))
         if form not in _PREDICTION_TOPICS:
-            what = f"the trajectories are of format '{form}'"
-            raise DataError(
-                what, where=str(folder / "trajectories.h5"), allowed=", ".join(_PREDICTION_TOPICS), hint="run it again"
-            )
+            what, allowed = f"the trajectories are of format '{form}'", ", ".join(_PREDICTION_TOPICS)
+            raise DataError(what, where=str(source), allowed=allowed, hint="run it again")
         for name, signals in _recordings(file, form).items():
-            files.append(out / f"{name}.mcap")
+            files.append(Path(out) / f"{name}.mcap")
             shift = export_mcap(signals, files[-1])
             if shift:
                 notes.append(f"{files[-1].name}: {shift:g} s were added to all times, as stamps cannot be negative")
@@ -405,15 +322,17 @@ def _recordings(file: h5py.File, form: str) -> dict[str, list[TopicSignal]]:
 
 def _of_recording(group: h5py.Group, predictions: Mapping[str, str]) -> Iterator[TopicSignal]:
     if "q" in group:
-        joints, t = _texts(group.attrs["joints"]), np.array(group["t"])
-        yield TopicSignal("/predicted/joint_states", "joints", t, {"position": np.array(group["q"])}, joints)
-        if "command" in group:
-            values = {"position": np.array(group["command"])}
-            yield TopicSignal("/predicted/commands", "joints", t[:-1], values, _texts(group.attrs["driven"]))
-        for key, names in (("torque", "driven"), ("effort", "prescribed")):
-            if key in group and len(group.attrs[names]):
-                values = {"effort": np.array(group[key])}
-                yield TopicSignal(f"/predicted/{names}_efforts", "joints", t[:-1], values, _texts(group.attrs[names]))
+        t = np.array(group["t"])
+        for key, names, topic, quantity in (
+            ("q", "joints", "joint_states", "position"),
+            ("command", "driven", "commands", "position"),
+            ("torque", "driven", "driven_efforts", "effort"),
+            ("effort", "prescribed", "prescribed_efforts", "effort"),
+        ):
+            if key in group and (key in ("q", "command") or len(group.attrs[names])):
+                values = np.array(group[key])
+                told = _texts(group.attrs[names])
+                yield TopicSignal(f"/predicted/{topic}", "joints", t[: len(values)], {quantity: values}, told)
     for sensor in group.values():
         if not isinstance(sensor, h5py.Group):
             continue
@@ -434,8 +353,8 @@ def _of_sensor(sensor: h5py.Group, begin: str, values: Array) -> Iterator[TopicS
         names = [channel.rsplit(".", 1)[1] for channel in channels]
         yield TopicSignal(f"/{begin}/joints/{quantity}", "joints", t, {quantity: values}, names)
         return
+    kind: Any = "vector" if begin.startswith("residual") else "point"
     for i, channel in enumerate(channels):
-        kind: Any = "vector" if begin.startswith("residual") else "point"
         yield TopicSignal(f"/{begin}/points/{_topic(channel)}", kind, t, {"xyz": values[:, 3 * i : 3 * i + 3]})
 
 
@@ -452,24 +371,17 @@ def _unknown_signals(group: h5py.Group) -> Iterator[TopicSignal]:
     if forces:
         told = [names[i] for i in forces]
         yield TopicSignal("/unknown/joint_states", "joints", edges, {"effort": held[:, forces]}, told)
-    shapes: Mapping[str, tuple[str, Any]] = {
-        "push": ("push", "wrench"), "offset": ("offset", "vector"), "bias": ("bias", "vector")
-    }  # fmt: skip
-    for kind, (words, form) in shapes.items():
-        for owner, columns in _triples(names, kinds, kind).items():
-            if kept[[i for i in columns if i is not None]].any():
-                xyz = np.stack([np.zeros(len(edges)) if i is None else held[:, i] for i in columns], axis=1)
-                yield TopicSignal(f"/unknown/{words}/{_topic(owner)}", form, edges, {"xyz": xyz})
-
-
-def _triples(names: Sequence[str], kinds: Sequence[str], kind: str) -> dict[str, list[int | None]]:
-    """Columns of x, y and z by owner: `left.x`, `T1.push_y`; None where one has no unknown."""
-    found: dict[str, list[int | None]] = {}
-    for i, name in enumerate(names):
-        owner, axis = name[:-2].removesuffix(".push"), name[-1]
-        if kinds[i] == kind and axis in "xyz":
-            found.setdefault(owner, [None, None, None])["xyz".index(axis)] = i
-    return found
+    for kind, form in _UNKNOWN_SHAPES.items():
+        # x, y and z by owner: `left.x`, `T1.push_y`
+        owners: dict[str, dict[int, int]] = {}
+        for i, name in enumerate(names):
+            if kinds[i] == kind and name[-1] in "xyz":
+                owners.setdefault(name[:-2].removesuffix(".push"), {})["xyz".index(name[-1])] = i
+        for owner, columns in owners.items():
+            if kept[list(columns.values())].any():
+                xyz = np.zeros((len(edges), 3))
+                xyz[:, list(columns)] = held[:, list(columns.values())]
+                yield TopicSignal(f"/unknown/{kind}/{_topic(owner)}", form, edges, {"xyz": xyz})
 
 
 def _topic(name: str) -> str:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Mapping, Sequence
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import config_json_schema
@@ -15,16 +18,12 @@ from yid_ocp.errors import ConfigError, DataError, OutputError, unknown_name_det
 from yid_ocp.files import atomic_write, write_text
 from yid_ocp.model.objects.base import InitObject, comma_separated_numbers, init_templates
 from yid_ocp.model.urdf import read_urdf
+from yid_ocp.options import OptionInfo, dataclass_options, split_annotated
 from yid_ocp.progress import Progress
+from yid_ocp.version import package_version
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.command_runner import EXIT_DONE, print_result, show_progress
-from yid_ocp.workflow.commented_config import commented_config_text
-from yid_ocp.workflow.config_proposal import (
-    ConfigProposal,
-    propose_config,
-    relative_posix_path,
-    rest_split_time,
-)
+from yid_ocp.workflow.config_proposal import ConfigProposal, propose_config, rest_split_time
 from yid_ocp.workflow.import_recording import is_recording_file, read_foreign_recording, reader_options_from_arguments
 
 _RESULT_FORMAT = "yid-init/1"
@@ -33,30 +32,30 @@ _SCHEMA_FILE = "yid-ocp.schema.json"
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    out = Path(arguments.out)
+    out, robot = Path(arguments.out), arguments.robot
     if out.suffix not in (".yaml", ".yml"):
         raise ConfigError(f"the configuration is called '{out.name}'", where="--out", allowed="NAME.yaml")
-    read_urdf(arguments.robot)
+    read_urdf(robot)
     item = _object_from_arguments(arguments)
     with show_progress(arguments) as progress:
         made = _recordings(arguments, out, progress)
     recordings = [recording or read_recording(file) for file, recording in made.items()]
-    proposal = propose_config(
-        arguments.robot,
-        recordings,
-        item.settings.model_segments(),
-        holder=arguments.holder,
-        grasps=_grasps(arguments.grasp),
-        standing=item.stands_in_world,
-    )
+    segments, grasps = item.settings.model_segments(), _grasps(arguments.grasp)
+    asked = {"holder": arguments.holder, "grasps": grasps, "standing": item.stands_in_world}
+    proposal = propose_config(robot, recordings, segments, **asked)
     made = _split(made, recordings, proposal, out)
-    _refuse_existing([out, *(file for file, raw in made.items() if raw is not None)], arguments.replace)
+    written = {file: raw for file, raw in made.items() if raw is not None}
+    for file in (out, *written):
+        if file.exists() and not arguments.replace:
+            raise OutputError("the file is there already", where=str(file), hint="choose another --out, or --replace")
+
+    def near(path: str | Path) -> str:
+        return Path(os.path.relpath(Path(path).resolve(), out.parent.resolve())).as_posix()
+
+    files, where = list(map(near, made)), robot if robot.startswith(("package:", "default:")) else near(robot)
     imports = reader_options_from_arguments(arguments)
-    robot = arguments.robot
-    where = robot if robot.startswith(("package:", "default:")) else relative_posix_path(robot, out.parent)
-    files = [relative_posix_path(file, out.parent) for file in made]
-    text = commented_config_text(where, arguments.object, item, proposal, files, imports, _SCHEMA_FILE)
-    _write(out, text, {file: raw for file, raw in made.items() if raw is not None})
+    lines = _config_lines(where, arguments.object, item, proposal, files, imports)
+    _write(out, "\n".join(lines) + "\n", written)
     result = {"format": _RESULT_FORMAT, "configuration": str(out), "recordings": files, "proposal": proposal.to_dict()}
     print_result(arguments, result, lambda: _summary_lines(proposal, out), f"configuration: {out}", str(out))
     return EXIT_DONE
@@ -106,18 +105,18 @@ def _grasps(given: Sequence[str]) -> dict[str, str]:
 
 
 def _recordings(arguments: argparse.Namespace, out: Path, progress: Progress) -> dict[Path, Recording | None]:
+    """Recordings by file, those that are imported with their contents."""
     options = reader_options_from_arguments(arguments)
     made: dict[Path, Recording | None] = {}
-    for name in arguments.files:
-        file = Path(name)
-        if is_recording_file(file):
-            if options:
-                flags = ", ".join(options)
-                raise ConfigError(f"{file.name} is a recording already", where=flags, hint="leave these options out")
-            made[file] = None
-        else:
+    for file in map(Path, arguments.files):
+        if not is_recording_file(file):
             recording = read_foreign_recording(file, options, progress)
             made[out.parent / f"{recording.name}.h5"] = recording
+        elif options:
+            what, flags = f"{file.name} is a recording already", ", ".join(options)
+            raise ConfigError(what, where=flags, hint="leave these options out")
+        else:
+            made[file] = None
     if len(made) < len(arguments.files):
         raise DataError("two of the files would become one recording", where=", ".join(arguments.files))
     return made
@@ -127,27 +126,16 @@ def _split(
     made: dict[Path, Recording | None], recordings: Sequence[Recording], proposal: ConfigProposal, out: Path
 ) -> dict[Path, Recording | None]:
     """A single recording in two files where it comes to rest in between, the second one to be held out."""
-    if len(recordings) > 1:
-        return made
-    [whole] = recordings
-    time = rest_split_time(whole, proposal.joints)
+    time = rest_split_time(recordings[0], proposal.joints) if len(recordings) == 1 else None
     if time is None:
         return made
+    [whole] = recordings
     first, last = (min(g.t[0] for g in whole.groups), max(g.t[-1] for g in whole.groups))
-    note = f"of {whole.source or whole.name}, from {{:.6g}} s to {{:.6g}} s"
-    parts = {"estimate": (first, time), "held_out": (time, last)}
-    return {
-        out.parent / f"{whole.name}_{name}.h5": replace(
-            whole.time_slice(*span), name=f"{whole.name}_{name}", notes=(*whole.notes, note.format(*span))
-        )
-        for name, span in parts.items()
-    }
-
-
-def _refuse_existing(files: Sequence[Path], allowed: bool) -> None:
-    for file in files:
-        if file.exists() and not allowed:
-            raise OutputError("the file is there already", where=str(file), hint="choose another --out, or --replace")
+    parts: dict[Path, Recording | None] = {}
+    for role, begin, end in (("estimate", first, time), ("held_out", time, last)):
+        name, note = f"{whole.name}_{role}", f"of {whole.source or whole.name}, from {begin:.6g} s to {end:.6g} s"
+        parts[out.parent / f"{name}.h5"] = replace(whole.time_slice(begin, end), name=name, notes=(*whole.notes, note))
+    return parts
 
 
 def _write(out: Path, text: str, made: Mapping[Path, Recording]) -> None:
@@ -176,5 +164,219 @@ def _summary_lines(proposal: ConfigProposal, out: Path) -> list[str]:
     ]
     for group, places in proposal.point_placements.items():
         lines += [f"{group}: {place.point} at {place.frame or '?'}, {place.reason}" for place in places]
-    lines += ["", f"next: yid-ocp check {out}, then yid-ocp solve {out}", ""]
-    return lines
+    return [*lines, "", f"next: yid-ocp check {out}, then yid-ocp solve {out}", ""]
+
+
+# -- text of the configuration ----------------------------------------------------------------------------------------
+
+_PLAIN_TEXT = re.compile(r"[A-Za-z_/][\w./@-]*")  # text that YAML reads as it stands
+_YAML_KEYWORDS = ("true", "false", "null", "yes", "no", "on", "off")
+_COMMENT_COLUMN = 44
+_ALWAYS_WRITTEN_SETTINGS = ("kind", "links")
+
+
+def _config_lines(
+    robot: str,
+    noun: str,
+    item: InitObject,
+    proposal: ConfigProposal,
+    recordings: Sequence[str],
+    imports: Mapping[str, Any],
+) -> Iterator[str]:
+    """Commented YAML lines: every setting has a comment beside it or in the line above."""
+    yield f"# yaml-language-server: $schema={_SCHEMA_FILE}"
+    yield f"# Written by `yid-ocp init` {package_version()}. Everything may be changed; docs/settings.md has all keys."
+    yield "# What the recordings say stands beside each line. Next: `yid-ocp check` on this file, then `yid-ocp solve`."
+    about = _text(f"A {noun.replace('_', ' ')} moved by {robot}.")
+    yield _line("", "description", about, "one sentence for the report")
+    yield ""
+    yield "model:"
+    yield _line("  ", "robot", _text(robot), "URDF file, or package:NAME of example-robot-data")
+    yield from _arms(proposal)
+    yield from _object(item, proposal)
+    yield from _effects(proposal)
+    yield ""
+    yield from _recording_lines(recordings, imports)
+    yield ""
+    yield from _sensors(proposal)
+    yield ""
+    yield from _parameters(item, proposal)
+    yield ""
+    yield "problem:"
+    step, cutoff = f"{proposal.time_step:g}", f"{proposal.path_cutoff:.3g}"
+    yield _line("  ", "time_step", step, "[s]; `check` says how far estimates move with half of it")
+    yield _line("  ", "initial_state", proposal.initial_state, proposal.initial_state_reason)
+    yield _line("  ", "path_cutoff", cutoff, "low-pass of prescribed motion [Hz], above what the arm does")
+    yield ""
+    yield "solver:"
+    yield _line("  ", "name", "gauss_newton", "multiple_shooting where it does not converge")
+
+
+def _line(indent: str, key: str, value: str, comment: str = "") -> str:
+    text = f"{indent}{key}: {value}".rstrip()
+    return f"{text:<{_COMMENT_COLUMN - 2}}  # {comment}" if comment else text
+
+
+def _text(value: str) -> str:
+    plain = _PLAIN_TEXT.fullmatch(value) and value.lower() not in _YAML_KEYWORDS
+    return value if plain else json.dumps(value, ensure_ascii=False)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(f'{_text(str(k))}: {_value(v)}' for k, v in value.items())}}}"
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(_value, value))}]"
+    return _text(value) if isinstance(value, str) else json.dumps(value)
+
+
+def _number(value: float) -> str:
+    text = f"{value:.2g}"
+    return text if "e" not in text or "." in text.partition("e")[0] else text.replace("e", ".0e")
+
+
+def _listed(indent: str, key: str, values: Iterable[str], comment: str) -> list[str]:
+    """A key with a list, on several lines where one is too long."""
+    rows, row = [], ""
+    for value in map(_text, values):
+        if row and len(row) + len(value) > 90:
+            rows.append(row)
+            row = ""
+        row += f"{value}, "
+    rows.append(row)
+    text = f",\n{indent}  {' ' * len(key)} ".join(entry.rstrip(", ") for entry in rows)
+    return [f"{indent}# {comment}", f"{indent}{key}: [{text}]"]
+
+
+def _arms(proposal: ConfigProposal) -> Iterator[str]:
+    unused, mode = proposal.unused_joints, proposal.arm_mode
+    yield "  arms:"
+    yield from _listed("    ", "joints", proposal.joints, "recorded joints that move the object")
+    if unused:
+        yield f"    # recorded too, but not needed for what holds the object: {', '.join(unused)}"
+    if unused or not set(proposal.unrecorded_joints) <= set(proposal.joints):
+        yield "    # all other joints of the URDF stay at zero; another value: locked_joints: {JOINT: VALUE} [rad or m]"
+    yield _line("    ", "mode", mode, proposal.arm_mode_reason)
+    other = "prescribed moves it as its encoders say"
+    if mode == "prescribed":
+        other = "driven moves the arm by its efforts instead, under a tracking filter: for efforts one trusts"
+    yield f"{' ' * _COMMENT_COLUMN}# {other}"
+    if mode == "servo":
+        yield _line("    ", "servo", "", "their gains, dampings, delays and limits are parameters, below")
+        held = "until the next; interpolated: straight lines in between"
+        yield _line("      ", "command_interpolation", "held", held)
+        carried = "true where the controller carries the arm's own weight"
+        yield _line("      ", "has_gravity_compensation", "false", carried)
+
+
+def _object(item: InitObject, proposal: ConfigProposal) -> Iterator[str]:
+    """The object, what holds it, its damping, and points on it."""
+    holder, grasps = proposal.holder_frame, proposal.grasps
+    yield "  object:"
+    if item.stands_in_world:
+        yield "    # `mount: {parent_frame: FRAME, xyz: [x, y, z], rpy: [r, p, y]}` says where it stands"
+    else:
+        frames = [name for arm in proposal.arms[:1] for name in arm.tool_frames if name != holder]
+        yield "    # its root sits in this frame and leaves it along z, unless xyz [m] and rpy [rad] say else"
+        yield f"    # other frames there: {', '.join(frames[:8]) or 'none'}"
+        yield f"    mount: {{parent_frame: {_text(holder)}, xyz: [0.0, 0.0, 0.0], rpy: [0.0, 0.0, 0.0]}}"
+    yield from _settings_lines("    ", item.settings)
+    if grasps:
+        yield _line("  ", "grasp", "", "what else holds it: point 3, axis 5, weld 6 equations")
+    for i, (frame, point) in enumerate(grasps.items()):
+        yield f"    grasp_{i + 1}: {{holder_frame: {_text(frame)}, held_frame: {_text(point)}, kind: point}}"
+    dampings = [value for name, (value, _) in item.start_values.items() if name.endswith(".damping")]
+    if dampings:
+        yield _line("  ", "damping", f"{{object: {max(dampings):.2g}}}", "where the search for it starts [N m^2 s]")
+    else:
+        yield _line("  ", "damping", "0.05", "viscous, of every coordinate [N m s/rad]")
+    tips = [f"w_{segment.name}" for segment in item.settings.model_segments()]
+    marked = [place.frame for places in proposal.point_placements.values() for place in places if place.frame]
+    wanted = dict.fromkeys([*tips, *marked, *grasps.values()])
+    if set(wanted) > set(tips):
+        yield from _listed("  ", "points", wanted, "frames that sensors may see; NAME:40% along a segment")
+
+
+def _settings_lines(indent: str, settings: Any) -> Iterator[str]:
+    """Settings that differ from their defaults, and those that every reader asks for, with their descriptions."""
+    for key, option in dataclass_options(cast(Any, type(settings))).items():
+        value = getattr(settings, option.field_name)
+        if key == "mount" or (value == option.default_value and key not in _ALWAYS_WRITTEN_SETTINGS):
+            continue
+        if isinstance(value, Mapping):
+            yield f"{indent}{key}:"
+            for name, entry in value.items():
+                yield f"{indent}  {_text(name)}:"
+                yield from _settings_lines(f"{indent}    ", entry)
+            continue
+        about = next(m for m in reversed(split_annotated(option.type_hint)[1]) if isinstance(m, OptionInfo))
+        comment = about.description + (f" [{about.unit}]" if about.unit else "")
+        numbers = [float(f"{x:.8g}") for x in value] if isinstance(value, tuple) else value
+        yield _line(indent, key, f"{value:g}" if isinstance(value, float) else _value(numbers), comment)
+
+
+def _effects(proposal: ConfigProposal) -> Iterator[str]:
+    if proposal.arm_mode == "servo":
+        kind, words = "rotor_inertia", "what rotors add through their gears, free below"
+    elif proposal.is_seen_by_effort_alone:
+        kind, words = "effort_offset", "the zero of every torque sensor, free below"
+    else:
+        return
+    yield _line("  ", "effects", "", words)
+    for joint in proposal.joints:
+        yield f"    - {{kind: {kind}, location: {_text(joint)}}}"
+
+
+def _recording_lines(files: Sequence[str], imports: Mapping[str, Any]) -> Iterator[str]:
+    held = max(1, len(files) // 4) if len(files) > 1 else 0
+    yield "recordings:"
+    yield from _listed("  ", "estimate", files[: len(files) - held], "to estimate on")
+    if held:
+        yield from _listed("  ", "held_out", files[-held:], "only predicted, to see whether the model is right")
+    else:
+        yield "  # record a second motion and list it here: without one nothing shows whether the model is right"
+        yield "  held_out: []"
+    if imports:
+        yield ""
+        yield _line("", "import", "", "how files were read: `yid-ocp import FILE --config THIS`")
+    for key, value in imports.items():
+        yield f"  {key}: {_value(value)}"
+
+
+def _sensors(proposal: ConfigProposal) -> Iterator[str]:
+    if proposal.noise_by_group or proposal.clock_descriptions:
+        yield "sensors:"
+    for group, noise in proposal.noise_by_group.items():
+        places, entries, said = proposal.point_placements.get(group, ()), [], f"noise: {noise.reason}"
+        if noise.std is not None:
+            entries, said = [f"std: {_number(noise.std)}"], f"{noise.std:.2g} {noise.unit}, {noise.reason}"
+        if frames := {place.point: place.frame for place in places if place.frame and place.frame != place.point}:
+            entries.append(f"frames: {_value(frames)}")
+        if group == "joints.effort" and proposal.arm_mode == "prescribed" and not proposal.is_seen_by_effort_alone:
+            entries, said = ["use: false", *entries], "true once friction and payload of the arm are in the model"
+        # without a setting of its own, a comment
+        yield _line("  ", group, f"{{{', '.join(entries)}}}", said) if entries else f"  # {group}: {said}"
+        for place in places:
+            yield f"  #   {place.point} at {place.frame or '?'}: {place.reason}"
+    for group, clock in proposal.clock_descriptions.items():
+        yield f"  # {group} come at {clock}"
+
+
+def _parameters(item: InitObject, proposal: ConfigProposal) -> Iterator[str]:
+    free = "{free: true}"
+    yield _line("", "parameters", "", item.parameters_comment)
+    for name, (value, comment) in item.start_values.items():
+        yield _line("  ", name, f"{{free: true, initial: {_number(value)}}}", comment)
+    if proposal.arm_mode == "servo":
+        yield _line("  ", '"*.servo_gain"', free, "begins at a twentieth of a radian for the effort limit")
+        yield _line("  ", '"*.servo_damping"', free, "begins at a tenth of a second times the gain")
+        yield _line("  ", '"*.servo_delay"', free, "from a command to its torque [s]")
+        yield _line("  ", '"rotor_inertia@*.armature"', free, "of the servos' motors, at the joint [kg m^2]")
+        yield '  # "*.servo_torque_limit": {initial: 3.0}   # the URDF\'s effort limit where nothing is said'
+    if proposal.is_seen_by_effort_alone:
+        for joint in proposal.joints:
+            said, why = "{free: true, initial: 0.1, bounds: [0.0, 50.0]}", "viscous friction of the arm [N m s/rad]"
+            if joint in proposal.still_joints:
+                said, why = "{initial: 0.1}", "it hardly turns"
+            yield _line("  ", f"{joint}.damping", said, why)
+        yield _line("  ", '"effort_offset@*"', free, "zeros of the torque sensors [N m]")

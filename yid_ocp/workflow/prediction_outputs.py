@@ -15,21 +15,12 @@ from yid_ocp.data.hdf5_io import create_hdf5_atomically
 from yid_ocp.data.issues import MAX_LIMIT_RATIO, Issue
 from yid_ocp.diagnosis import DiagnosisResult
 from yid_ocp.diagnosis.localise import unknown_units
-from yid_ocp.inference.whitening import (
-    WhiteningFilter,
-    estimate_torque_bias,
-    estimate_torque_biases,
-    held_out_whitened_at,
-)
+from yid_ocp.inference import whitening
 from yid_ocp.model.objects.base import CableTopology
-from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem import EstimationProblem, prediction_errors
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.prediction_errors import (
-    clamp_displacement_baseline,
-    constant_position_baseline,
-    interpolated_displacement_baseline,
-)
+from yid_ocp.report.animation import ModelTrajectory
 from yid_ocp.solvers import Solution
 
 Array = NDArray[np.float64]
@@ -54,7 +45,8 @@ def prediction_error_entry(
         For the baselines that only a cable held by clamps has.
     """
     entry: dict[str, Any] = {"recording": episode.name, "rmse": {}, "baselines": {}}
-    fixed = _start_end(problem, episode)
+    options = problem.options
+    fixed = options.start_fit_window / problem.step.time_step if options.initial_state == "fitted_to_points" else -1.0
     if isinstance(outcome, str):
         entry["message"] = outcome
     else:
@@ -62,10 +54,21 @@ def prediction_error_entry(
             entry["rmse"] |= _errors(samples, predicted, fixed)
     for samples in episode.measurements:
         for name, predicted in _baselines(episode, samples, cable).items():
-            errors = _errors(samples, predicted, fixed)
-            if errors:
+            if errors := _errors(samples, predicted, fixed):
                 entry["baselines"].setdefault(name, {}).update(errors)
     return entry
+
+
+def _clearly_better_baseline(entry: Mapping[str, Any], channels: Sequence[str]) -> tuple[str, float, float] | None:
+    """The best baseline that all channels have, its error and the model's (rms); None where the model is as good."""
+    rms = {
+        name: float(np.sqrt(np.mean([errors[channel] ** 2 for channel in channels])))
+        for name, errors in {"": entry["rmse"], **entry["baselines"]}.items()
+        if set(channels) <= set(errors)
+    }
+    error = rms.pop("")
+    best = min(rms, key=rms.__getitem__, default=None)
+    return (best, rms[best], error) if best is not None and error > _WORSE_RATIO * rms[best] else None
 
 
 def channels_worse_than_baseline(
@@ -74,17 +77,11 @@ def channels_worse_than_baseline(
     """Channels of `prediction_error_entry` entries that a baseline without a model predicts clearly better."""
     worse = []
     for entry in entries:
-        for channel, error in entry["rmse"].items():
-            guesses = {name: errors[channel] for name, errors in entry["baselines"].items() if channel in errors}
-            best = min(guesses, key=guesses.__getitem__, default=None)
-            if best is not None and error > _WORSE_RATIO * guesses[best]:
-                said = {
-                    "recording": entry["recording"],
-                    "channel": channel,
-                    "rmse": error,
-                    "unit": _unit(channel, units),
-                }
-                worse.append(said | {"baseline": best, "guess": guesses[best]})
+        for channel in entry["rmse"]:
+            if better := _clearly_better_baseline(entry, [channel]):
+                best, guess, error = better
+                said = {"recording": entry["recording"], "channel": channel, "unit": _unit(channel, units)}
+                worse.append(said | {"rmse": error, "baseline": best, "guess": guess})
     return worse
 
 
@@ -100,40 +97,23 @@ def worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Mapp
             if channel in units:  # not the sum over a group
                 groups.setdefault(channel.rpartition(".")[0], []).append(channel)
         for group, channels in groups.items():
-            error = _together(entry["rmse"], channels)
-            known = {name: errors for name, errors in entry["baselines"].items() if set(channels) <= set(errors)}
-            guesses = {name: _together(errors, channels) for name, errors in known.items()}
-            best = min(guesses, key=guesses.__getitem__, default=None)
-            if best is None or not error > _WORSE_RATIO * guesses[best]:
-                continue
-            unit = _unit(channels[0], units)
-            found.append(
-                Issue(
-                    "worse_than_guess",
+            if better := _clearly_better_baseline(entry, channels):
+                best, guess, error = better
+                unit = _unit(channels[0], units)
+                what = (
                     f"the model is off by {error:.3g} {unit} (rms), the guess '{best}' without a model by "
-                    f"{guesses[best]:.3g} {unit}",
-                    "not_trusted",
-                    error / (_WORSE_RATIO * guesses[best]) if guesses[best] > 0 else MAX_LIMIT_RATIO,
-                    "look at the residuals, and let `yid-ocp diagnose` say what the model lacks",
-                    entry["recording"],
-                    group.partition(".")[0],
-                    group.partition(".")[2],
+                    f"{guess:.3g} {unit}"
                 )
-            )
+                evidence = error / (_WORSE_RATIO * guess) if guess > 0 else MAX_LIMIT_RATIO
+                advice = "look at the residuals, and let `yid-ocp diagnose` say what the model lacks"
+                sensor, _, channel = group.partition(".")
+                at = (entry["recording"], sensor, channel)
+                found.append(Issue("worse_than_guess", what, "not_trusted", evidence, advice, *at))
     return found
-
-
-def _together(errors: Mapping[str, float], channels: Sequence[str]) -> float:
-    return float(np.sqrt(np.mean([errors[channel] ** 2 for channel in channels])))
 
 
 def _unit(channel: str, units: Mapping[str, str]) -> str:
     return next((unit for name, unit in units.items() if name == channel or name.startswith(f"{channel}.")), "")
-
-
-def _start_end(problem: EstimationProblem, episode: Episode) -> float:
-    options = problem.options
-    return options.start_fit_window / problem.step.time_step if options.initial_state == "fitted_to_points" else -1.0
 
 
 def _errors(samples: Measurements, predicted: Array, fixed: float) -> dict[str, float]:
@@ -161,24 +141,18 @@ def _baselines(episode: Episode, samples: Measurements, cable: CableTopology | N
         group = next(group for group in recording.points if group.name == sensor.group_name)
         inside = (group.t >= episode.grid.start_time - 1e-9) & (group.t <= episode.grid.node_times[-1] + 1e-9)
         arrays = {
-            "stays": constant_position_baseline(recording, points, _START_FRAMES),
-            "moves_with_clamps": clamp_displacement_baseline(recording, points, held, _START_FRAMES),
-            "linear_carry": interpolated_displacement_baseline(
+            "stays": prediction_errors.constant_position_baseline(recording, points, _START_FRAMES),
+            "moves_with_clamps": prediction_errors.clamp_displacement_baseline(recording, points, held, _START_FRAMES),
+            "linear_carry": prediction_errors.interpolated_displacement_baseline(
                 recording, points, cable.parent_vertices, cable.child_vertices, given=_START_FRAMES
             ),
         }
         return {name: array[inside].reshape(len(samples.value), -1) for name, array in arrays.items()}
-    first = np.full(samples.value.shape[1], np.nan)
-    for column in range(len(first)):
-        seen = samples.value[np.isfinite(samples.value[:, column]), column]
-        first[column] = seen[0] if len(seen) else np.nan
+    first = np.take_along_axis(samples.value, np.isfinite(samples.value).argmax(axis=0)[None], axis=0)
     return {"stays": np.broadcast_to(first, samples.value.shape)}
 
 
-_OffsetsByRecording = dict[str, dict[str, dict[str, float]]]
-
-
-def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> _OffsetsByRecording:
+def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> dict[str, dict[str, dict[str, float]]]:
     """Estimated torque offset by recording and joint: `value`, `std`, `prior_std` [N m], held-out included.
 
     Parameters
@@ -188,39 +162,42 @@ def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> _OffsetsBy
         nothing to say.
     x : ndarray, shape (nx,)
     """
-    found: _OffsetsByRecording = {}
     if all(whitening is None for whitening in problem.whitening_filters):
-        return found
-    for episode, own in zip(problem.episodes, estimate_torque_biases(problem, x), strict=True):
-        found |= _entry(problem, episode, own)
-    apart = [e for e in problem.held_out if e.input_errors is not None and e.initial_state_shared_with is None]
-    if not any(np.any(e.input_errors.torque_bias_std > 0) for e in apart if e.input_errors is not None):
-        return found
-    held = problem if any(problem.held_out_whitening_filters) else held_out_whitened_at(problem, x)
-    for (episode, result), whitening in zip(held.predict_held_out(x), held.held_out_whitening_filters, strict=True):
-        if (
-            isinstance(whitening, WhiteningFilter)
-            and not isinstance(result, str)
-            and episode.initial_state_shared_with is None
-        ):
-            value = estimate_torque_bias(episode, result, whitening)
-            found |= _entry(held, episode, (value, whitening.torque_bias_std))
+        return {}
+    known = list(zip(problem.episodes, whitening.estimate_torque_biases(problem, x), strict=True))
+    apart = [e for e in problem.held_out if e.initial_state_shared_with is None and _has_torque_bias(e)]
+    if apart:
+        held = problem if any(problem.held_out_whitening_filters) else whitening.held_out_whitened_at(problem, x)
+        for (episode, result), own in zip(held.predict_held_out(x), held.held_out_whitening_filters, strict=True):
+            if (
+                isinstance(own, whitening.WhiteningFilter)
+                and not isinstance(result, str)
+                and episode.initial_state_shared_with is None
+            ):
+                known.append((episode, (whitening.estimate_torque_bias(episode, result, own), own.torque_bias_std)))
+    found = {}
+    for episode, estimate in known:
+        if estimate is not None and episode.input_errors is not None and _has_torque_bias(episode):
+            rows = zip(problem.system.driven, *estimate, episode.input_errors.torque_bias_std, strict=True)
+            found[episode.name] = {
+                joint: {"value": float(value), "std": float(std), "prior_std": float(prior)}
+                for joint, value, std, prior in rows
+                if prior > 0
+            }
     return found
 
 
-def _entry(
-    problem: EstimationProblem, episode: Episode, own: Sequence[Array] | None
-) -> Mapping[str, dict[str, dict[str, float]]]:
-    if own is None or episode.input_errors is None or not np.any(episode.input_errors.torque_bias_std > 0):
-        return {}
-    rows = zip(problem.system.driven, *own, episode.input_errors.torque_bias_std, strict=True)
-    return {
-        episode.name: {
-            joint: {"value": float(value), "std": float(std), "prior_std": float(prior)}
-            for joint, value, std, prior in rows
-            if prior > 0
-        }
-    }
+def _has_torque_bias(episode: Episode) -> bool:
+    return episode.input_errors is not None and bool(np.any(episode.input_errors.torque_bias_std > 0))
+
+
+def predicted_trajectory(
+    name: str, problem: EstimationProblem, episode: Episode, prediction: EpisodePrediction, theta: Array
+) -> ModelTrajectory:
+    """Trajectory of a predicted recording, to be animated; `theta`: parameters of all recordings, shape (ntheta,)."""
+    system, q = problem.system, prediction.rollout.state[:, : problem.system.n_coordinates]
+    own = problem.predictor.episode_theta(episode, theta)
+    return ModelTrajectory(name, system, own, episode.grid.node_times, q)
 
 
 SOLVE_TRAJECTORIES_FORMAT = "yid-trajectories/1"
@@ -252,25 +229,24 @@ def write_solve_trajectories(
         pairs = [("estimate", e, r) for e, r in zip(problem.episodes, done, strict=True)] + pairs
     with _file(path, SOLVE_TRAJECTORIES_FORMAT) as file:
         unknowns = file.create_group("unknowns")
-        unknowns.attrs["names"] = _texts(solution.unknown_names)
+        _store_texts(unknowns, {"names": solution.unknown_names})
         unknowns.create_dataset("x", data=solution.x)
         unknowns.create_dataset("covariance", data=solution.covariance)
         for role, episode, outcome in pairs:
-            group = file.require_group("recordings").create_group(episode.name)
+            group, system = file.require_group("recordings").create_group(episode.name), problem.system
             group.attrs["role"] = role
-            group.attrs["joints"] = _texts(problem.system.mechanism.joint_names)
-            group.attrs["driven"] = _texts(problem.system.driven)
-            group.attrs["prescribed"] = _texts(problem.system.prescribed)
+            names = {"joints": system.mechanism.joint_names, "driven": system.driven, "prescribed": system.prescribed}
+            _store_texts(group, names)
             if isinstance(outcome, str):
                 group.attrs["message"] = outcome
                 continue
-            n, rollout = problem.system.n_coordinates, outcome.rollout
+            n, rollout = system.n_coordinates, outcome.rollout
             arrays = {
                 "t": episode.grid.node_times,
                 "q": rollout.state[:, :n],
                 "p": rollout.state[:, n : 2 * n],
                 "multipliers": rollout.multipliers,
-                "command" if problem.system.servos else "torque": rollout.torque,
+                "command" if system.servos else "torque": rollout.torque,
                 "effort": rollout.effort,
             }
             _store(group, arrays)
@@ -302,16 +278,20 @@ def write_diagnosis_trajectories(path: Path, finding: DiagnosisResult, predicted
             for k, samples in enumerate(episode.measurements):
                 both = {"before": before.predicted_outputs[k], "after": after.predicted_outputs[k]}
                 _store_sensor(file.require_group(episode.name), episode, samples, both)
-        for trace in () if finding.smoother_result is None else finding.smoother_result.smoothed_unknowns:
-            assert finding.smoother_result is not None
-            episodes = finding.nominal_model.problem.episodes
+        smoothed = finding.smoother_result
+        for trace in () if smoothed is None else smoothed.smoothed_unknowns:
+            assert smoothed is not None
+            problem = finding.nominal_model.problem
             group = file.create_group(f"where/{trace.recording}")
-            group.attrs["start"] = next(e.grid.start_time for e in episodes if e.name == trace.recording)
-            group.attrs["unknowns"] = _texts(trace.unknown_names)
-            group.attrs["locations"] = _texts([source.location for source in trace.unknown_groups])
-            group.attrs["kinds"] = _texts([source.kind for source in trace.unknown_groups])
-            group.attrs["units"] = _texts(unknown_units(finding.nominal_model.problem.system, trace))
-            variance = np.array([finding.smoother_result.group_variance[source] for source in trace.unknown_groups])
+            group.attrs["start"] = next(e.grid.start_time for e in problem.episodes if e.name == trace.recording)
+            texts = {
+                "unknowns": trace.unknown_names,
+                "locations": [source.location for source in trace.unknown_groups],
+                "kinds": [source.kind for source in trace.unknown_groups],
+                "units": unknown_units(problem.system, trace),
+            }
+            _store_texts(group, texts)
+            variance = np.array([smoothed.group_variance[source] for source in trace.unknown_groups])
             arrays = {
                 "edges": trace.interval_edges,
                 "mean": trace.posterior_mean * trace.reference_std,
@@ -336,7 +316,7 @@ def _store_sensor(
     parent: h5py.Group, episode: Episode, samples: Measurements, predicted: Mapping[str, NDArray[np.float64]]
 ) -> None:
     group = parent.create_group(samples.sensor.group_name)
-    group.attrs["channels"] = _texts(samples.sensor.channel_names)
+    _store_texts(group, {"channels": samples.sensor.channel_names})
     group.attrs["unit"] = samples.sensor.unit
     times = episode.grid.start_time + episode.grid.time_step * (samples.node + samples.fraction)
     _store(group, {"t": times, "measured": samples.value, **predicted, "std": samples.std})
@@ -347,5 +327,6 @@ def _store(group: h5py.Group, arrays: Mapping[str, ArrayLike]) -> None:
         group.create_dataset(name, data=array, compression="gzip", shuffle=True)
 
 
-def _texts(values: Sequence[str]) -> NDArray[np.object_]:
-    return np.array(values, dtype=h5py.string_dtype())
+def _store_texts(group: h5py.Group, texts: Mapping[str, Sequence[str]]) -> None:
+    for name, values in texts.items():
+        group.attrs[name] = np.array(values, dtype=h5py.string_dtype())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import logging
 import os
@@ -29,6 +30,7 @@ from yid_ocp.workflow.run_inputs import input_files, plugin_versions
 
 log = logging.getLogger(__name__)
 _UNFINISHED, _LOCK, _NAMES = ".partial", "lock", 1000
+_FULL_HINT = "choose a folder on a disk with room, with --out"
 
 
 @dataclass
@@ -37,16 +39,12 @@ class RunFolder:
 
     Attributes
     ----------
-    final_path : Path
-        Its name when complete.
-    path : Path
-        Where it is now; the same as `final_path` in the end.
+    final_path, path : Path
+        Its name when complete, and where it is now; the same in the end.
     resume_folder : Path
         Where an interrupted run may leave what the next one with the same name, or none, can use; not made here.
     input_hashes : dict of str to str
         SHA-256 of every file that the run reads, by name; see `begin_run`.
-    command_line : str
-        What gives its result again; see `begin_run`.
     """
 
     final_path: Path
@@ -54,42 +52,43 @@ class RunFolder:
     resume_folder: Path
     _log: TextIO = field(repr=False)
     input_hashes: dict[str, str] = field(default_factory=dict)
-    command_line: str = ""
+    _command_line: str = ""
     _begun: float = field(default_factory=time.perf_counter, repr=False)
 
     def begin_run(self, run: RunSettings, command: str, flags: Sequence[str] = ()) -> None:
-        """Write config.yaml, hash what the run reads and log the start; errors as `input_files`.
+        """Write config.yaml, hash what the run reads and log the start of a command with its flags.
 
-        Parameters
-        ----------
-        flags : sequence of str
-            That the command was given beside its configuration.
+        Errors as `input_files`.
         """
         self.write_text_file("config.yaml", dump_config(run))
         self.input_hashes |= {name: file_sha256(path) for name, path in input_files(run).items()}
-        self.command_line = _reproducing_command(run, self.final_path, command, flags)
-        self.log_event("start", command=command, versions=software_versions(), inputs=self.input_hashes)
+        origins = list(run.key_locations.values())
+        said = [] if any(origin.startswith("embedded default") for origin in origins) else [run.config_file]
+        if any(origin.startswith("--set") for origin in origins):
+            near = os.path.relpath(self.final_path)
+            said = [str((self.final_path if near.startswith("..") else Path(near)) / "config.yaml")]
+        self.log_start([command, *said, *flags])
 
-    def write_result(self, result: Mapping[str, Any]) -> dict[str, Any]:
-        """Write result.json with command, date, inputs and versions; returns what was written."""
-        made = {
-            "command": self.command_line,
-            "date": local_time_text(),
-            "inputs": self.input_hashes,
-            "versions": software_versions(),
-        }
-        return self.write_json_file("result.json", {**result, **made})
+    def log_start(self, words: Sequence[str]) -> None:
+        """Log the start of a command with what it reads; `words`: those that give its result again."""
+        self._command_line = shlex.join(["yid-ocp", *words])
+        self.log_event("start", command=words[0], versions=software_versions(), inputs=self.input_hashes)
+
+    def write_result(self, result: Mapping[str, Any], name: str = "result.json") -> dict[str, Any]:
+        """Write a result with command, date, inputs and versions; returns what was written.
+
+        Infinities become null, and `notes` says where.
+        """
+        made = {"command": self._command_line, "date": local_time_text(), "inputs": self.input_hashes}
+        notes: list[str] = []
+        clean: dict[str, Any] = to_json_types({**result, **made, "versions": software_versions()}, notes)
+        if notes:
+            clean["notes"] = _grouped(notes)
+        self.write_text_file(name, json.dumps(clean, indent=1, allow_nan=False) + "\n")
+        return clean
 
     def write_report_page(self, run: RunSettings, result: Mapping[str, Any], progress: Progress, **known: Any) -> None:
-        """Write report.html, unless the settings want none.
-
-        Parameters
-        ----------
-        result : mapping
-            As it was written.
-        **known
-            What the page can show beside it, by the attributes of `ReportData`.
-        """
+        """Write report.html, unless the settings want none; `known`: attributes of `ReportData` beside the result."""
         if run.output.write_report:
             progress.begin_stage("writing the report")
             write_report(self.path / "report.html", ReportData(run.name, run.description, result, **known))
@@ -97,25 +96,13 @@ class RunFolder:
     def log_event(self, event: str, **entries: Any) -> None:
         """Add a line to log.jsonl."""
         line = {"seconds": round(time.perf_counter() - self._begun, 4), "event": event, **entries}
-        try:
+        with _refusing("written", self.final_path, _FULL_HINT):
             self._log.write(json.dumps(to_json_types(line), allow_nan=False) + "\n")
             self._log.flush()
-        except OSError as error:
-            hint = "choose a folder on a disk with room, with --out"
-            raise _refusal("written", error, self.final_path, hint) from error
 
     def write_text_file(self, name: str, text: str) -> None:
         """Write a text file."""
         write_text(self.path / name, text)
-
-    def write_json_file(self, name: str, data: Mapping[str, Any]) -> dict[str, Any]:
-        """Write JSON without infinities: they become null, and `notes` says where; returns what was written."""
-        notes: list[str] = []
-        clean = to_json_types(data, notes)
-        if notes:
-            clean["notes"] = _grouped(notes)
-        self.write_text_file(name, json.dumps(clean, indent=1, allow_nan=False) + "\n")
-        return dict(clean)
 
 
 class _Lines(logging.Handler):
@@ -132,10 +119,8 @@ def _grouped(notes: list[str]) -> list[str]:
     groups: dict[str, list[str]] = {}
     for note in notes:
         groups.setdefault(note.rpartition(".")[2], []).append(note)
-    result: list[str] = []
-    for tail, texts in groups.items():
-        result += [f"{tail} ({len(texts)} times)"] if len(texts) > 3 else texts
-    return result
+    merged = ([f"{tail} ({len(texts)} times)"] if len(texts) > 3 else texts for tail, texts in groups.items())
+    return list(itertools.chain.from_iterable(merged))
 
 
 @contextlib.contextmanager
@@ -157,17 +142,20 @@ def new_run_folder(run: RunSettings, out: str | Path | None = None, command: str
     OutputError
         The folder exists and is not empty, another run is making it, or it cannot be made or written to.
     """
-    targets = _targets(run, out, command)
+    stem = "-".join(filter(None, (run.name, command)))
+    targets = _targets(run, out, stem)
     made = [parent for parent in targets[0].parents if not parent.exists()]
     with interruption.defer_interruption():  # no folder without anybody who knows of it
         try:
-            target, lock = _reserved(targets)
-            temporary = Path(lock.lock_file).parent
-            lines = (temporary / "log.jsonl").open("w", encoding="utf-8")
-        except OSError as error:
-            _clear(None, made)
-            raise _refusal("made", error, targets[0], "choose a writable folder with --out") from error
-    partial = target.with_name(f"{_stem(run, command) if out is None else target.name}.partial")
+            with _refusing("made", targets[0], "choose a writable folder with --out"):
+                target, lock = _reserved(targets)
+                temporary = Path(lock.lock_file).parent
+                lines = (temporary / "log.jsonl").open("w", encoding="utf-8")
+        except OutputError as error:
+            if isinstance(error.__cause__, OSError):
+                _clear(None, made)
+            raise
+    partial = target.with_name(f"{stem if out is None else target.name}.partial")
     folder = RunFolder(target, temporary, partial, lines)
     with contextlib.ExitStack() as held:
         held.callback(lock.release)
@@ -183,22 +171,19 @@ def new_run_folder(run: RunSettings, out: str | Path | None = None, command: str
             with interruption.defer_interruption(), contextlib.suppress(OSError):
                 lines.close()
             _clear(temporary, made)
-            if isinstance(error, OutputError) and str(temporary) in error.where:
-                raise _in_words_of(error, temporary, target) from error
+            if isinstance(error, OutputError) and str(temporary) in error.where:  # its reader knows another name
+                where = error.where.replace(str(temporary), str(target))
+                raise OutputError(error.what, where=where, allowed=error.allowed, hint=_FULL_HINT) from error
             raise
 
 
 def _publish(folder: RunFolder, lock: FileLock) -> None:
     """Give the complete folder its name, or the next free one where somebody took it: nothing finished is lost."""
-    temporary, number = folder.path, 1
-    try:
+    temporary, target = folder.path, folder.final_path
+    with _refusing("written", target, _FULL_HINT):
         folder._log.close()
-    except OSError as error:
-        hint = "choose a folder on a disk with room, with --out"
-        raise _refusal("written", error, folder.final_path, hint) from error
     Path(lock.lock_file).unlink(missing_ok=True)
-    target = folder.final_path
-    while True:
+    for number in itertools.count(2):
         try:
             if target.is_dir():
                 target.rmdir()
@@ -208,23 +193,22 @@ def _publish(folder: RunFolder, lock: FileLock) -> None:
             if not os.path.lexists(target) or number > _NAMES:
                 what = f"the run is complete but its folder cannot be renamed: {os_error_reason(error)}"
                 raise OutputError(what, where=str(target), hint=f"its results stay in {temporary}") from error
-            number += 1
             target = folder.final_path.with_name(f"{folder.final_path.name}-{number}")
     if target != folder.final_path:
         log.warning("%s was taken while the run went on: its folder is %s", folder.final_path, target)
     folder.path = target
 
 
-def _in_words_of(error: OutputError, temporary: Path, target: Path) -> OutputError:
-    """An error on a file of the unfinished folder with the name that its reader knows."""
-    where = error.where.replace(str(temporary), str(target))
-    hint = "choose a folder on a disk with room, with --out"
-    return OutputError(error.what, where=where, allowed=error.allowed, hint=hint)
-
-
 def _reserved(targets: Sequence[Path]) -> tuple[Path, FileLock]:
     """The first name that no other run has or makes, and the lock that keeps it; it stands in the unfinished folder."""
-    _clear_left(targets[0].parent)
+    parent = targets[0].parent
+    for temporary in parent.glob(f".*{_UNFINISHED}") if parent.is_dir() else ():  # left by killed runs
+        if (temporary / _LOCK).is_file():  # else not ours, or complete but for its name
+            with contextlib.suppress(OSError):
+                lock = _locked(temporary)
+                if lock is not None:
+                    _clear(temporary, [])
+                    lock.release()
     for target in targets:
         if len(targets) > 1 and os.path.lexists(target):
             continue
@@ -241,10 +225,8 @@ def _reserved(targets: Sequence[Path]) -> tuple[Path, FileLock]:
             if entry.name != _LOCK:
                 shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
         return target, lock
-    hint = "choose another name with --out, or wait for the other run"
-    raise OutputError(
-        "another run is making this folder", where=str(targets[0]), allowed="a name of its own for every run", hint=hint
-    )
+    hint, allowed = "choose another name with --out, or wait for the other run", "a name of its own for every run"
+    raise OutputError("another run is making this folder", where=str(targets[0]), allowed=allowed, hint=hint)
 
 
 def _locked(temporary: Path) -> FileLock | None:
@@ -252,25 +234,12 @@ def _locked(temporary: Path) -> FileLock | None:
     lock = FileLock(temporary / _LOCK, is_singleton=False, thread_local=False)
     try:
         lock.acquire(timeout=0)
-    except Timeout:
+    except (Timeout, FileNotFoundError):
         return None
-    except FileNotFoundError:
-        return None
-    if not Path(lock.lock_file).exists():
-        lock.release()
-        return None
-    return lock
-
-
-def _clear_left(parent: Path) -> None:
-    for temporary in parent.glob(f".*{_UNFINISHED}") if parent.is_dir() else ():
-        if not (temporary / _LOCK).is_file():  # not ours, or complete but for its name
-            continue
-        with contextlib.suppress(OSError):
-            lock = _locked(temporary)
-            if lock is not None:
-                _clear(temporary, [])
-                lock.release()
+    if Path(lock.lock_file).exists():
+        return lock
+    lock.release()
+    return None
 
 
 @contextlib.contextmanager
@@ -287,17 +256,23 @@ def _logged(folder: RunFolder) -> Iterator[None]:
         logger.setLevel(level)
 
 
-def _refusal(what: str, error: OSError, target: Path, hint: str) -> OutputError:
-    return OutputError(f"the run folder cannot be {what}: {os_error_reason(error)}", where=str(target), hint=hint)
+@contextlib.contextmanager
+def _refusing(what: str, target: Path, hint: str) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        reason = f"the run folder cannot be {what}: {os_error_reason(error)}"
+        raise OutputError(reason, where=str(target), hint=hint) from error
 
 
-def _targets(run: RunSettings, out: str | Path | None, command: str) -> list[Path]:
+def _targets(run: RunSettings, out: str | Path | None, stem: str) -> list[Path]:
     if out is None:
         parent = Path(run.output.runs_folder) if run.output.runs_folder is not None else Path.cwd() / "runs"
-        stem = _stem(run, command, time.strftime("%Y%m%d-%H%M%S"))
+        stem = f"{stem}-{time.strftime('%Y%m%d-%H%M%S')}"
         return [parent / name for name in (stem, *(f"{stem}-{i}" for i in range(2, _NAMES)))]
+    allowed = "a new name, or an empty folder"
     if not str(out).strip() or "\0" in str(out):
-        raise OutputError("this is no name of a folder", where="--out", allowed="a new name, or an empty folder")
+        raise OutputError("this is no name of a folder", where="--out", allowed=allowed)
     try:
         target = Path(out).expanduser().absolute()
         is_folder = target.is_dir()
@@ -308,15 +283,10 @@ def _targets(run: RunSettings, out: str | Path | None, command: str) -> list[Pat
         raise OutputError(what, where=str(out)[:200], hint="choose a writable folder with --out") from error
     if filled:
         hint = "choose another name with --out, or leave it out for a numbered one"
-        problem_text = "the run folder exists and is not empty"
-        raise OutputError(problem_text, where=str(target), allowed="a new name, or an empty folder", hint=hint)
+        raise OutputError("the run folder exists and is not empty", where=str(target), allowed=allowed, hint=hint)
     if is_file:
         raise OutputError("the run folder's name is that of a file", where=str(target), hint="choose another --out")
     return [target]
-
-
-def _stem(run: RunSettings, *parts: str) -> str:
-    return "-".join(part for part in (run.name, *parts) if part)
 
 
 def _clear(temporary: Path | None, made: Sequence[Path]) -> None:
@@ -331,16 +301,6 @@ def _clear(temporary: Path | None, made: Sequence[Path]) -> None:
 def local_time_text() -> str:
     """Local date and time with UTC offset, as text."""
     return datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
-
-
-def _reproducing_command(run: RunSettings, folder: Path, command: str, flags: Sequence[str] = ()) -> str:
-    origins = list(run.key_locations.values())
-    if any(origin.startswith("--set") for origin in origins):
-        near = os.path.relpath(folder)
-        said = [str((folder if near.startswith("..") else Path(near)) / "config.yaml")]
-    else:
-        said = [] if any(origin.startswith("embedded default") for origin in origins) else [run.config_file]
-    return shlex.join(["yid-ocp", command, *said, *flags])
 
 
 def software_versions() -> dict[str, str]:

@@ -6,16 +6,13 @@ import contextlib
 import importlib.util
 import sys
 import traceback
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from importlib import metadata, resources
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.config.settings import (
-    RunSettings,
-)
+from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.effects import EFFECTS
@@ -48,7 +45,8 @@ def load_plugins(run: RunSettings) -> None:
             with _registering(name, f"{entry.value} of {of}", "update that package, or remove it", None, imported):
                 entry.load()
             _loaded[name] = of
-    for path, where in _plugin_files(run):
+    for i, plugin in enumerate(run.plugins):
+        path, where = Path(plugin), run.describe_location("plugins", i)
         name, digest = str(path.resolve()), file_sha256(path)
         if _loaded.get(name, digest) != digest:
             raise ConfigError("the plug-in changed after it was loaded", where=where, hint="start a new Python")
@@ -56,10 +54,6 @@ def load_plugins(run: RunSettings) -> None:
             with _registering(f"plug-in {path.name}", where, f"correct {path.name}", path):
                 _run(path, digest)
             _loaded[name] = digest
-
-
-def _plugin_files(run: RunSettings) -> list[tuple[Path, str]]:
-    return [(Path(path), run.describe_location("plugins", i)) for i, path in enumerate(run.plugins)]
 
 
 def plugin_versions() -> dict[str, str]:
@@ -90,7 +84,7 @@ def _run(path: Path, digest: str) -> None:
         raise
 
 
-@contextmanager
+@contextlib.contextmanager
 def _registering(
     name: str, where: str, hint: str, path: Path | None = None, nothing_new: bool = False
 ) -> Iterator[None]:
@@ -100,10 +94,8 @@ def _registering(
         yield
         unchanged = all(set(registry) == known for registry, known in zip(_REGISTRIES, before, strict=True))
         if unchanged and not nothing_new:
-            decorators = "@EFFECTS.register(NAME) or @SENSOR_READERS.register(NAME)"
-            raise ConfigError(
-                f"the {name} registers nothing", where=where, allowed=f"a class or function under {decorators}"
-            )
+            allowed = "a class or function under @EFFECTS.register(NAME) or @SENSOR_READERS.register(NAME)"
+            raise ConfigError(f"the {name} registers nothing", where=where, allowed=allowed)
     except (Exception, SystemExit) as error:
         for registry, known in zip(_REGISTRIES, before, strict=True):
             registry.unregister(set(registry) - known)
@@ -137,17 +129,17 @@ def locate_errors(run: RunSettings, *path: str | int) -> Iterator[None]:
         raise type(error)(error.what, where=where, allowed=error.allowed, hint=error.hint) from error
 
 
+def unknown_name_error(run: RunSettings, noun: str, name: str, known: Iterable[str], *path: str | int) -> ConfigError:
+    """A `ConfigError` (not raised here) about a name in the settings that is none, with the nearest known one."""
+    return run.config_error(f"there is no {noun} '{name}'", *path, hint=nearest_name_hint(name, known))
+
+
 def input_files(run: RunSettings) -> dict[str, Path]:
     """Every file that a run reads, by its name in the settings: configuration, plug-ins, robot, recordings.
 
-    Raises
-    ------
-    ConfigError
-        One does not exist; the error names the setting and the nearest file that does.
+    `ConfigError` where one does not exist, which names the setting and the nearest file that does.
     """
-    files: dict[str, Path] = {}
-    if run.config_file:
-        files["configuration"] = Path(run.config_file)
+    files = {"configuration": Path(run.config_file)} if run.config_file else {}
     for i, path in enumerate(run.plugins):
         files[path] = _existing(run, Path(path), "plug-in", "plugins", i)
     robot = run.model.robot
@@ -166,11 +158,9 @@ def input_files(run: RunSettings) -> dict[str, Path]:
 def _existing(run: RunSettings, file: Path, noun: str, *key: str | int) -> Path:
     if is_file(file):
         return file
-    folder = file.parent
-    names = [entry.name for entry in folder.glob(f"*{file.suffix}")] if folder.is_dir() else []
-    hint = (
-        nearest_name_hint(file.name, names) if names else "check the path, which is relative to the configuration file"
-    )
+    names = [entry.name for entry in file.parent.glob(f"*{file.suffix}")] if file.parent.is_dir() else []
+    check = "check the path, which is relative to the configuration file"
+    hint = nearest_name_hint(file.name, names) if names else check
     raise run.config_error(f"there is no such {noun}: {file}", *key, hint=hint)
 
 
@@ -181,17 +171,14 @@ def recording_path(path: str) -> Path:
     return Path(str(resources.files("yid_ocp.data").joinpath("defaults", path.removeprefix("default:"))))
 
 
-def read_recordings(run: RunSettings, which: str) -> list[Recording]:
-    """Recordings under `recordings.estimate` or `recordings.held_out`, each with a name of its own.
+def read_recordings(run: RunSettings, which: str = "estimate", count: int | None = None) -> list[Recording]:
+    """The first so many, or all, recordings under `recordings.estimate` or `recordings.held_out`, each named uniquely.
 
-    Raises
-    ------
-    DataError
-        As `read_recording`; the error names the setting.
+    Errors as `read_recording`, which name the setting.
     """
     paths: Sequence[str] = getattr(run.recordings, which)
     result: list[Recording] = []
-    for i, path in enumerate(paths):
+    for i, path in enumerate(paths[:count]):
         file = _existing(run, recording_path(path), "recording", "recordings", which, i)
         with locate_errors(run, "recordings", which, i):
             recording = read_recording(file)

@@ -6,34 +6,40 @@ import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from yid_ocp.analysis.clock_checks import check_fit_residuals
-from yid_ocp.analysis.compare import decide_cable_memory
+from yid_ocp.analysis.compare import CableMemoryDecision, decide_cable_memory
+from yid_ocp.analysis.discretisation import (
+    DiscretisationShift,
+    RefinedProblem,
+    StepErrorGrowth,
+    discretisation_shifts,
+    inflate_estimates,
+    joint_subdivision,
+    largest_error_growth,
+)
 from yid_ocp.analysis.profile import with_profile_intervals
-from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.issues import Issue
-from yid_ocp.inference.uncertainty import covariance_to_dict, mark_not_trusted
+from yid_ocp.data.recording import Recording
+from yid_ocp.errors import YidError
+from yid_ocp.inference.uncertainty import covariance_to_dict, mark_not_trusted, typical_parameter_sizes
+from yid_ocp.integrator.step import with_time_step
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
+from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.prediction_errors import rmse_by_channel
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.summaries import solve_summary
 from yid_ocp.solvers import Iterate, Solution, Status, solve
-from yid_ocp.workflow.build import build_cable
-from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.command_runner import CommandResult, run_and_print
-from yid_ocp.workflow.discretisation_check import (
-    DiscretisationShifts,
-    measure_discretisation_shifts,
-    requested_refinements,
-    with_discretisation_uncertainty,
-    with_stability_check,
-)
+from yid_ocp.workflow.build import build_cable, build_step, build_system, link_division_factor
+from yid_ocp.workflow.build_problem import build_problem, issues_result
+from yid_ocp.workflow.command_runner import CommandResult, run_configured
 from yid_ocp.workflow.prediction_outputs import (
     channels_worse_than_baseline,
     estimated_torque_offsets,
@@ -41,35 +47,27 @@ from yid_ocp.workflow.prediction_outputs import (
     worse_than_baseline_issues,
     write_solve_trajectories,
 )
-from yid_ocp.workflow.recording_issues import issues_result
-from yid_ocp.workflow.run_folder import new_run_folder
+from yid_ocp.workflow.run_folder import RunFolder, new_run_folder
 
+Array = NDArray[np.float64]
+_Refinement = Literal["links", "time_step"]
+
+_MIN_STEPS_TO_COMPILE = 2000  # steps of one evaluation from which on compiling a finer model saves time
+_Prediction = tuple[Episode, EpisodePrediction | str]
 _RESULT_FORMAT = "yid-solve/1"
-
-
-@dataclass(frozen=True)
-class SolveCommandResult(CommandResult):
-    """Result of `run_solve` with the solution and its problem; successful where the solver converged."""
-
-    solution: Solution
-    problem: EstimationProblem
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    settings = load_config(arguments.config, arguments.overrides)
-    return run_and_print(arguments, lambda shown: run_solve(settings, arguments.out, shown), solve_summary)
+    return run_configured(arguments, run_solve, solve_summary)
 
 
 def run_solve(
     run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS
-) -> SolveCommandResult:
-    """Estimate, validate and write the run folder.
+) -> CommandResult[Solution]:
+    """Estimate, validate and write the run folder; successful where the solver converged.
 
-    Returns
-    -------
-    SolveCommandResult
-        Also where the solver failed: the run folder then holds the reason and the best point.
+    Where it failed the run folder holds the reason and the best point.
 
     Raises
     ------
@@ -78,35 +76,22 @@ def run_solve(
     with new_run_folder(run, out) as folder:
         folder.begin_run(run, "solve")
         progress.begin_stage("building the model and its compiled step")
-        problem = build_problem(run)
-        progress.begin_stage(f"solving for {len(problem.initial_unknowns)} unknowns by {run.solver.name}")
-
-        def iterate(entry: Iterate) -> None:
-            values = {name: float(value) for name, value in zip(problem.shared_parameters, entry.x, strict=False)}
-            folder.log_event(
-                "iterate", iteration=entry.iteration, cost=entry.cost, gradient=entry.gradient_norm, x=values
-            )
-            progress.report_iterate(entry)
-
-        solution = solve(problem, run.solver, callback=iterate, limits=run.diagnosis.fit_gap_limits)
-        safe = decide_cable_memory(problem, run.solver, solution, run.diagnosis.fit_gap_limits)
+        safe = solve_and_log(run, build_problem(run), folder, progress)
         solution, stability = with_stability_check(safe.problem, safe.solution)
         problem = solution.problem or safe.problem
         solution = with_profile_intervals(problem, solution, progress)
         finer = DiscretisationShifts({})
         if solution.evaluation is not None:
-            finer = measure_discretisation_shifts(
-                run, problem, solution.x, solution.evaluation, requested_refinements(run), progress
-            )
+            at = (solution.x, solution.evaluation, _requested_refinements(run))
+            finer = measure_discretisation_shifts(run, problem, *at, progress)
         # the ± and the verdict of everything below count how far the estimate is from a fine model's
-        data_std, solution = solution.std, with_discretisation_uncertainty(solution, finer)
+        data_std, solution = solution.std, _with_discretisation_uncertainty(solution, finer)
         progress.begin_stage("predicting the held-out recordings")
         held_out = problem.predict_held_out(solution.x)
         cable = build_cable(run)
         solution, doubts = with_fit_issues(problem, solution, held_out, cable)
-        folder.log_event(
-            "end", status=solution.status.value, message=solution.message, seconds_solving=solution.wall_time
-        )
+        end = {"status": solution.status.value, "message": solution.message, "seconds_solving": solution.wall_time}
+        folder.log_event("end", **end)
         write_solve_trajectories(folder.path / "trajectories.h5", problem, solution, held_out)
         more = {
             "doubts": issues_result(doubts),
@@ -119,22 +104,34 @@ def run_solve(
         }
         written = folder.write_result(solve_result(problem, solution, held_out, cable) | more)
         folder.write_report_page(run, written, progress, problem=problem, solution=solution, held_out=tuple(held_out))
-    done = solution.status == Status.CONVERGED
-    return SolveCommandResult(folder.path, written, solution, problem, is_successful=done)
+    return CommandResult(folder.path, written, solution, solution.status == Status.CONVERGED)
+
+
+def solve_and_log(
+    run: RunSettings, problem: EstimationProblem, folder: RunFolder, progress: Progress
+) -> CableMemoryDecision:
+    """Solve by the run's solver, every iterate logged and shown; without cable memory where it is not supported."""
+    progress.begin_stage(f"solving for {len(problem.initial_unknowns)} unknowns by {run.solver.name}")
+
+    def iterate(entry: Iterate) -> None:
+        values = {name: float(value) for name, value in zip(problem.shared_parameters, entry.x, strict=False)}
+        folder.log_event("iterate", iteration=entry.iteration, cost=entry.cost, gradient=entry.gradient_norm, x=values)
+        progress.report_iterate(entry)
+
+    limits = run.diagnosis.fit_gap_limits
+    return decide_cable_memory(problem, run.solver, solve(problem, run.solver, callback=iterate, limits=limits), limits)
 
 
 def with_fit_issues(
     problem: EstimationProblem,
     solution: Solution,
-    held_out: Sequence[tuple[Episode, EpisodePrediction | str]],
+    held_out: Sequence[_Prediction],
     cable: CableTopology | None = None,
 ) -> tuple[Solution, tuple[Issue, ...]]:
     """The solution with untrusted verdicts where its fit raises issues, and all issues of the data.
 
     Parameters
     ----------
-    problem : EstimationProblem
-        As it was solved.
     held_out : sequence of (Episode, EpisodePrediction or str)
         From `EstimationProblem.predict_held_out`.
     cable : CableTopology, optional
@@ -142,33 +139,30 @@ def with_fit_issues(
     """
     if solution.evaluation is None:
         return solution, problem.options.data_issues
-    fitted, predicted, residuals = _predictions(problem, solution, held_out, cable)
-    found = check_fit_residuals(problem, solution.x, solution.evaluation) + worse_than_baseline_issues(
-        [*predicted, *fitted], _units(residuals)
-    )
-    if all(doubt.weight == "warning" for doubt in found):
-        return solution, (*problem.options.data_issues, *found)
-    believed = replace(solution.goodness_of_fit, believed=False)
-    solution = replace(solution, goodness_of_fit=believed, parameters=mark_not_trusted(solution.parameters))
+    errors, units, _ = _prediction_errors(problem, solution, held_out, cable)
+    found = check_fit_residuals(problem, solution.x, solution.evaluation) + worse_than_baseline_issues(errors, units)
+    if any(doubt.weight != "warning" for doubt in found):
+        believed = replace(solution.goodness_of_fit, believed=False)
+        solution = replace(solution, goodness_of_fit=believed, parameters=mark_not_trusted(solution.parameters))
     return solution, (*problem.options.data_issues, *found)
 
 
 def _covariance_result(solution: Solution, data_std: Mapping[str, float]) -> dict[str, Any]:
-    names = [name for name in data_std if name in solution.unknown_names]
-    at = [solution.unknown_names.index(name) for name in names]
     if not solution.covariance.size:
         return {"names": [], "matrix": []}
+    names = [name for name in data_std if name in solution.unknown_names]
+    at = [solution.unknown_names.index(name) for name in names]
     return covariance_to_dict(names, solution.covariance[np.ix_(at, at)], [data_std[name] for name in names])
 
 
 def solve_result(
     problem: EstimationProblem,
     solution: Solution,
-    held_out: Sequence[tuple[Episode, EpisodePrediction | str]],
+    held_out: Sequence[_Prediction],
     cable: CableTopology | None = None,
 ) -> dict[str, Any]:
     """Entries of `yid-solve/1` without inputs and versions."""
-    fitted, predicted, residuals = _predictions(problem, solution, held_out, cable)
+    errors, units, residuals = _prediction_errors(problem, solution, held_out, cable)
     return {
         "format": _RESULT_FORMAT,
         "status": solution.status.value,
@@ -178,33 +172,150 @@ def solve_result(
         "iterations": solution.n_iterations,
         "evaluations": solution.n_evaluations,
         "seconds": solution.wall_time,
-        "fit": asdict(solution.goodness_of_fit)
-        | {"worse_than_guess": channels_worse_than_baseline([*predicted, *fitted], _units(residuals))},
+        "fit": asdict(solution.goodness_of_fit) | {"worse_than_guess": channels_worse_than_baseline(errors, units)},
         "residuals": residuals,
-        "held_out": predicted,
+        "held_out": errors[: len(held_out)],
     }
 
 
-def _predictions(
-    problem: EstimationProblem,
-    solution: Solution,
-    held_out: Sequence[tuple[Episode, EpisodePrediction | str]],
-    cable: CableTopology | None,
-) -> tuple[list[dict[str, Any]], list[dict[str, Any]], Mapping[str, Any]]:
-    """Errors of the recordings that were fitted and of those held out beside guesses, and of every channel fitted."""
+def _prediction_errors(
+    problem: EstimationProblem, solution: Solution, held_out: Sequence[_Prediction], cable: CableTopology | None
+) -> tuple[list[dict[str, Any]], dict[str, str], Mapping[str, Any]]:
+    """Errors beside baselines of recordings held out and then of those fitted, units, and errors of channels fitted."""
     residuals: Mapping[str, Any] = {}
-    fitted: list[dict[str, Any]] = []
+    pairs = list(held_out)
     if solution.evaluation is not None:
-        done = solution.episode_predictions
-        able = [(r, e) for r, e in zip(done, problem.episodes, strict=True) if not isinstance(r, str)]
+        fitted = list(zip(problem.episodes, solution.episode_predictions, strict=True))
+        able = [(result, episode) for episode, result in fitted if not isinstance(result, str)]
         residuals = rmse_by_channel([result for result, _ in able], [episode for _, episode in able])
-        fitted = [prediction_error_entry(problem, *pair, cable) for pair in zip(problem.episodes, done, strict=True)]
-    return (
-        fitted,
-        [prediction_error_entry(problem, episode, outcome, cable) for episode, outcome in held_out],
-        residuals,
-    )
+        pairs += fitted
+    units = {channel: entry["unit"] for channel, entry in residuals.items()}
+    return [prediction_error_entry(problem, *pair, cable) for pair in pairs], units, residuals
 
 
-def _units(residuals: Mapping[str, Any]) -> dict[str, str]:
-    return {channel: entry["unit"] for channel, entry in residuals.items()}
+# -- discretisation ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class DiscretisationShifts:
+    """Shifts of the estimates with a finer discretisation.
+
+    Attributes
+    ----------
+    estimate_shifts : mapping of parameter to DiscretisationShift
+        Of every shared free parameter; empty where nothing was tried.
+    notes : tuple of str
+        Why something that was asked for is not known.
+    """
+
+    estimate_shifts: Mapping[str, DiscretisationShift]
+    notes: tuple[str, ...] = ()
+
+    def to_result(self, std: Mapping[str, float]) -> dict[str, Any]:
+        """Shifts for result.json in the parameter's unit, with the standard deviation from the data alone."""
+        return {name: {**asdict(own), "std": std.get(name)} for name, own in self.estimate_shifts.items()}
+
+
+def _requested_refinements(run: RunSettings) -> tuple[_Refinement, ...]:
+    """Refinements that a run's settings request after a solve, by default those that matter for its object."""
+    said, item = run.output.discretisation_check, run.model.object
+    if said is None:
+        said = "both" if item is not None and item.default_link_refinement else "time_step"
+    return {"none": (), "time_step": ("time_step",), "both": ("links", "time_step")}[said]  # type: ignore[return-value]
+
+
+def measure_discretisation_shifts(
+    run: RunSettings,
+    problem: EstimationProblem,
+    x: Array,
+    at_x: Evaluation,
+    what: tuple[_Refinement, ...],
+    progress: Progress = NULL_PROGRESS,
+    *,
+    models_alone: bool = False,
+) -> DiscretisationShifts:
+    """Shifts of the estimates when every link is divided in two and when the time step is halved.
+
+    Parameters
+    ----------
+    x : ndarray, shape (nx,)
+    at_x : Evaluation
+        With its Jacobian.
+    models_alone : bool
+        At a point that is no estimate; see `discretisation_shifts`.
+    """
+    found: dict[str, dict[str, float]] = {}
+    notes: list[str] = []
+    for key in what:
+        words = "twice the links" if key == "links" else "half the time step"
+        if key == "links" and (run.model.object is None or run.model.object.link_count is None):
+            continue
+        progress.begin_stage(f"trying {words}")
+        try:
+            refined = _with_twice_the_links(run, problem) if key == "links" else _with_half_the_step(problem)
+            own = discretisation_shifts(refined, problem, x, at_x, model_difference_only=models_alone)
+        except YidError as error:
+            own = error.what
+        if isinstance(own, str):
+            notes.append(f"what {words} would change is not known: {own}")
+        else:
+            found[key] = own
+    links, steps = found.get("links", {}), found.get("time_step", {})
+    names = problem.shared_parameters if found else ()
+    made = {name: DiscretisationShift(links.get(name), steps.get(name)) for name in names}
+    return DiscretisationShifts(made, tuple(notes))
+
+
+def _with_discretisation_uncertainty(solution: Solution, found: DiscretisationShifts) -> Solution:
+    sizes = {} if solution.problem is None else typical_parameter_sizes(solution.problem, solution.x)
+    return replace(solution, parameters=inflate_estimates(solution.parameters, found.estimate_shifts, sizes))
+
+
+def _with_twice_the_links(run: RunSettings, problem: EstimationProblem) -> RefinedProblem:
+    system, options = build_system(run, link_division=2), problem.options
+    steps = sum(episode.grid.steps for episode in problem.episodes)
+    compiled = problem.step.is_compiled and steps > _MIN_STEPS_TO_COMPILE
+    step = build_step(replace(run, problem=replace(run.problem, use_compiler=compiled)), system)
+    factors = {name: float(link_division_factor(run, name, 2)) for name in system.parameters.names}
+    priors = {name: std * factors.get(name, 1.0) for name, std in options.prior_stds.items()}
+    options = replace(options, prior_stds=priors, multivariate_prior=options.multivariate_prior.scaled_by(factors))
+    made = EstimationProblem(step, _recordings(problem), problem.free, options)
+    return RefinedProblem(made, factors, joint_subdivision(problem.system, system))
+
+
+def _with_half_the_step(problem: EstimationProblem) -> RefinedProblem:
+    step = with_time_step(problem.step, problem.step.time_step / 2)
+    return RefinedProblem(EstimationProblem(step, _recordings(problem), problem.free, problem.options))
+
+
+def _recordings(problem: EstimationProblem) -> list[Recording]:
+    return [episode.recording for episode in problem.episodes]
+
+
+def with_stability_check(problem: EstimationProblem, solution: Solution) -> tuple[Solution, dict[str, Any]]:
+    """The solution, marked as not converged where the step is unstable, and stability data for result.json.
+
+    Along the recorded motions, at the start of the search and at the estimate. A search may begin where the step is not
+    stable and leave that place; one that ends there has followed the step's own errors.
+    """
+    begin, end = (largest_error_growth(problem, problem.initial_unknowns), largest_error_growth(problem, solution.x))
+    found = {"start": _growth_result(begin), "estimate": _growth_result(end)}
+    if end is not None and not end.is_stable:
+        status = Status.STALLED if solution.status == Status.CONVERGED else solution.status
+        message = f"at the estimate {end.description} ({solution.message})"
+        return replace(solution, status=status, message=message), found
+    if solution.status == Status.FAILED and begin is not None and not begin.is_stable:
+        return replace(solution, message=f"at the start {begin.description} ({solution.message})"), found
+    return solution, found
+
+
+def _growth_result(growth: StepErrorGrowth | None) -> dict[str, Any] | None:
+    if growth is None:
+        return None
+    return {
+        "recording": growth.recording_name,
+        "decades": growth.growth_decades,
+        "factor": growth.max_step_factor,
+        "time": growth.max_growth_time,
+        "time_step": growth.time_step,
+    }
