@@ -96,13 +96,13 @@ def test_names_that_are_not_there_are_refused(cli, repository, tmp_path, left_no
 
 def test_a_failed_solve_leaves_no_point_to_judge_at(cli, repository, tmp_path, monkeypatch):
     from yid_ocp.solvers import GaussNewton, Status, solve
-    from yid_ocp.workflow import identifiability
+    from yid_ocp.workflow import solve as solve_command
 
     def failing(problem, solver, callback=None, limits=None):
         done = solve(problem, GaussNewton(max_iterations=1))
         return replace(done, status=Status.FAILED, message="the rollout failed", evaluation=None)
 
-    monkeypatch.setattr(identifiability, "solve", failing)
+    monkeypatch.setattr(solve_command, "solve", failing)
     done = cli("identifiability", repository / "configs" / "springs_series_ends.yaml", "--out", tmp_path / "run")
     assert done.code == 1
     assert "failed: the rollout failed; there is no point at which to judge" in done.out

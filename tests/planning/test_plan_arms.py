@@ -59,7 +59,7 @@ def test_the_middle_of_a_cable_stays_below_a_lid(repository, tmp_path):
     box = f"plan.box=[[0.0, -1.0, -0.6], [1.5, 1.0, {lid}]]"
     _, kept = planned(repository, tmp_path / "kept", "plan_cable", *quick, box, "plan.frames_in_box=['cable:50%']")
     assert kept.is_successful, kept.result["message"]
-    assert kept.plan.point_trajectories["cable:50%"][:, 2].max() < lid + 2e-4
+    assert kept.output.point_trajectories["cable:50%"][:, 2].max() < lid + 2e-4
 
 
 def test_a_path_of_the_free_tip_is_followed_as_far_as_it_says(repository, tmp_path):
