@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,27 +69,20 @@ def levenberg_marquardt(
 ) -> LeastSquaresResult:
     """Minimise |r(x)|^2 by damped Gauss-Newton steps, the damping in units of the columns' norms.
 
-    Parameters
-    ----------
-    residual_function : callable
-        From x to residual (m,) and Jacobian (m, n).
-    initial_guess : ndarray, shape (n,)
-    projection : callable, optional
-        Brings a trial point back to where it may be.
-    max_step : float
-        No component moves by more in one step.
-    max_iterations : int
-    step_tolerance, cost_tolerance : float
-        Converged when no component would move by more, or when the cost falls by less than this part.
+    The residual function gives r (m,) and its Jacobian (m, n); a projection brings a trial point back to where it may
+    be. No component moves by more than `max_step` in one step. It has converged when no component would move by more
+    than `step_tolerance`, or when the cost falls by less than the part `cost_tolerance`.
 
     References
     ----------
     Nocedal and Wright (2006), Numerical Optimization, section 10.3, doi:10.1007/978-0-387-40065-5.
     """
+
+    def model_at(x: Array) -> _SumOfSquares:
+        return _SumOfSquares(*residual_function(x))
+
     limits = max_step, max_iterations, step_tolerance, cost_tolerance, 1e-12
-    x, model, used, converged = _descend(
-        lambda x: _SumOfSquares(*residual_function(x)), initial_guess, projection, *limits
-    )
+    x, model, used, converged = _descend(model_at, initial_guess, projection, *limits)
     return LeastSquaresResult(x, model.cost, model.jacobian, used, converged)
 
 
@@ -112,18 +105,6 @@ def minimize_by_damped_newton(
     return DampedNewtonResult(*_descend(quadratic_model, initial_guess, None, *limits))
 
 
-class _Model(Protocol):
-    """A local model of a cost."""
-
-    @property
-    def cost(self) -> float: ...
-
-    def damped_step(self, damping: float) -> Array: ...
-
-
-_M = TypeVar("_M", bound=_Model)
-
-
 class _SumOfSquares:
     """Local model of |r|^2 from residual (m,) and Jacobian (m, n)."""
 
@@ -137,8 +118,11 @@ class _SumOfSquares:
         return np.asarray(-np.linalg.lstsq(stacked, target, rcond=None)[0])
 
 
+_Model = TypeVar("_Model", LocalQuadraticModel, _SumOfSquares)
+
+
 def _descend(
-    model_at: Callable[[Array], _M],
+    model_at: Callable[[Array], _Model],
     start: Array,
     project: _Projection | None,
     max_step: float,
@@ -146,7 +130,7 @@ def _descend(
     step_tolerance: float,
     cost_tolerance: float,
     min_damping: float,
-) -> tuple[Array, _M, int, bool]:
+) -> tuple[Array, _Model, int, bool]:
     """The minimiser, its model, iterations used, and whether it converged."""
     x = np.array(start, float)
     model, damping = model_at(x), _FIRST_DAMPING

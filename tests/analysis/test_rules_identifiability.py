@@ -22,8 +22,8 @@ from yid_ocp.analysis.identifiability import (
 from yid_ocp.analysis.parameter_combinations import DirectionComponent, describe_combination, join_names, sparse_basis
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError, SolverError
+from yid_ocp.inference.uncertainty import percent_text
 from yid_ocp.model import Grasp
-from yid_ocp.solvers.fit_messages import percent_text
 
 
 def judged(problem, at=None, **more):

@@ -48,10 +48,10 @@ def arm() -> Mechanism:
 
 
 def small_y(foot: np.ndarray):
-    """T1 of two links, T2 and T3 of one."""
+    """Three segments of one link each."""
     turn = [rotation_from_rpy(lean, 0.2, 0.0) for lean in (-0.8, 0.8)]
     segments = (
-        Segment("T1", 0.4, 0.08, 0.03, 2, damping=0.02),
+        Segment("T1", 0.4, 0.08, 0.03, 1, damping=0.02),
         Segment("T2", 0.25, 0.04, 0.02, 1, parent="T1", rest_rotation=turn[0], damping=0.02),
         Segment("T3", 0.3, 0.05, 0.02, 1, parent="T1", rest_rotation=turn[1], damping=0.02),
     )
@@ -68,7 +68,7 @@ def position(mechanism: Mechanism, frame: str, q: np.ndarray) -> np.ndarray:
 def build(prescribed: bool = False, grasped: bool = True) -> System:
     """The arm at `POSTURE` holding the tip of T2 of the undeformed object, 2 cm beside it."""
     robot, item = arm(), small_y(np.eye(4))
-    gap = position(robot, "left_gripper", POSTURE) - position(item.mechanism, "w_T2", np.zeros(12))
+    gap = position(robot, "left_gripper", POSTURE) - position(item.mechanism, "w_T2", np.zeros(9))
     foot = homogeneous_transform(np.eye(3), gap + np.array([0.01, -0.02, -0.015]))
     names = robot.joint_names
     return System.build(

@@ -44,13 +44,8 @@ def residual(problem, x, torque=0.0, posture=0.0, reference=None):
     feedback = episode.tracking_feedback
     if reference is not None and feedback is not None:
         feedback = replace(feedback, reference=feedback.reference + reference)
-    changed = replace(
-        episode,
-        torque=episode.torque + torque,
-        measured_driven_angles=arm,
-        tracking_feedback=feedback,
-        input_errors=errors,
-    )
+    torques = {"torque": episode.torque + torque, "measured_driven_angles": arm}
+    changed = replace(episode, **torques, tracking_feedback=feedback, input_errors=errors)
     result = problem.predictor.predict_episode(changed, *problem.split(x, 0), False)
     return _sensor_whitened_residual(changed.measurements, result).residual
 
@@ -161,12 +156,9 @@ def test_without_errors_of_inputs_nothing_changes(urdf_folder):
     problem = EstimationProblem(step, [made], ("elbow.stiffness",), ProblemOptions(**TRACKED))
     assert not problem.has_process_noise
     assert whitened_at(problem, problem.initial_unknowns) is problem
-
-
-def test_the_papers_cost_knows_no_noise(urdf_folder):
-    problem = problem_of(urdf_folder, encoders=False, weighting="paper")
-    assert not problem.has_process_noise
-    assert {s.sensor.group_name for s in problem.episodes[0].measurements} == {"points_arm", "points_camera"}
+    paper = problem_of(urdf_folder, encoders=False, weighting="paper")
+    assert not paper.has_process_noise
+    assert {s.sensor.group_name for s in paper.episodes[0].measurements} == {"points_arm", "points_camera"}
 
 
 def test_a_constant_error_is_seen_and_its_spread_said(urdf_folder):

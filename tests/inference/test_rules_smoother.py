@@ -13,7 +13,7 @@ import threadpoolctl
 from yid_ocp.diagnosis.localise import localise_gap
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.inference import smoother, smoother_model
-from yid_ocp.inference.smoother_model import IntervalModel, LinearResidualModel, UnknownGroup
+from yid_ocp.inference.smoother_model import LinearResidualModel, UnknownGroup, _IntervalModel
 
 FORCE, OTHER_FORCE, BIAS = UnknownGroup("T1", "force"), UnknownGroup("T2", "force"), UnknownGroup("camera", "bias")
 SOURCES = (FORCE, OTHER_FORCE, BIAS)
@@ -36,7 +36,7 @@ def made(seed: int, parameters=2, recording="run", size=None, loose=0.3) -> Line
         outside[:, 0] *= 0.0 if size is None else 1.0
         by_unknown = rng.standard_normal((ROWS, len(SOURCES)))
         intervals.append(
-            IntervalModel(
+            _IntervalModel(
                 rng.standard_normal((ROWS, 1 + parameters)),
                 rng.standard_normal((ROWS, STATES)),
                 by_unknown,

@@ -35,8 +35,8 @@ GOOD, BAD = GoodnessOfFit(1.0, 0.5, True), GoodnessOfFit(9.0, 0.0, False)
 # -- verdicts ---------------------------------------------------------------------------------------------------------
 
 
-def stiffness(value, std, said, lower=0.0, upper=math.inf):
-    return ParameterEstimate(value, std, "N m/rad", 3.0, lower, upper, True, said)
+def stiffness(value, std, said):
+    return ParameterEstimate(value, std, "N m/rad", 3.0, 0.0, 100.0, True, said)
 
 
 @pytest.mark.parametrize(
@@ -54,19 +54,15 @@ def stiffness(value, std, said, lower=0.0, upper=math.inf):
         (0.1, 0.2, "identifiable", (None, 0.5), "identifiable", 0.2),
         (0.1, 0.2, "identifiable", (0.02, 5.0), "weak", 4.9 / 1.959963984540054),
         (0.25, 0.26, "identifiable", (0.06, None), "weak", math.inf),
-        # its bound is far away
+        # its bound is far away, and within reach
         (50.0, 1.0, "identifiable", (None, 51.0), "weak", math.inf),
+        (98.0, 2.0, "weak", (95.0, None), "weak", 2.0),
     ],
 )
 def test_no_verdict_and_no_spread_contradicts_a_profile(value, std, said, interval, expected, spread):
     found = with_profile_interval(stiffness(value, std, said), interval, 10.0)
     assert (found.verdict, found.interval, found.value) == (expected, interval, value)
     assert found.std == pytest.approx(spread, rel=1e-12)
-
-
-def test_an_upper_bound_within_reach_ends_an_interval():
-    found = with_profile_interval(stiffness(8.0, 2.0, "weak", upper=10.0), (5.0, None), 5.0)
-    assert (found.verdict, found.std) == ("weak", 2.0)
 
 
 @pytest.mark.parametrize(
@@ -379,6 +375,14 @@ def test_a_value_near_its_bound_lies_at_it(value, at_bound):
     assert (estimated(problem, [value], [[0.0025]])["k0"].verdict == "at_bound") is at_bound
 
 
+def test_far_beyond_its_bound_only_the_slope_of_the_cost_counts():
+    rows = np.vstack([[[0.5]], np.zeros((10000, 1))])
+    problem = MadeUp(linear(rows, [-100.0, *np.zeros(10000)]), (5.0,), upper=10.0)
+    lower, upper = estimated(problem, [10.0], [[4.0]])["k0"].interval
+    # slope d = 2.71/2
+    assert (upper, upper - lower) == (10.0, pytest.approx(1.353 / (0.5 * 95.0), rel=0.01))
+
+
 def test_a_point_that_is_no_fit_says_nothing_of_bounds_and_misfit():
     problem = MadeUp(linear([[2.0]]), (3.0,), upper=3.0)
     assert estimated(problem, [3.0], [[0.01]], None)["k0"].verdict == "identifiable"
@@ -394,12 +398,8 @@ def test_a_stiffness_well_known_to_be_near_zero_is_found():
 
 
 def test_the_size_that_a_parameter_might_have():
-    assert typical_parameter_sizes(MadeUp(linear(np.eye(1)), (3.0,)), np.ones(1))["k0"] == 3.0
-    assert typical_parameter_sizes(MadeUp(linear(np.eye(1)), (3.0,), upper=8.0), np.ones(1))["k0"] == 4.0
-    assert (
-        typical_parameter_sizes(MadeUp(linear(np.eye(1)), (3.0,), upper=8.0, priors={"k0": 0.5}), np.ones(1))["k0"]
-        == 0.5
-    )
+    for how, size in (({}, 3.0), ({"upper": 8.0}, 4.0), ({"upper": 8.0, "priors": {"k0": 0.5}}, 0.5)):
+        assert typical_parameter_sizes(MadeUp(linear(np.eye(1)), (3.0,), **how), np.ones(1))["k0"] == size
     three = MadeUp(linear(np.eye(2)), (3.0, 5.0), fixed=(9.0,))
     assert typical_parameter_sizes(three, np.array([1.0, 5.0]))["k0"] == 7.0
     assert typical_parameter_sizes(three, np.array([1.0, 0.0]))["k0"] == 9.0

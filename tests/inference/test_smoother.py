@@ -21,8 +21,8 @@ from yid_ocp.inference import smoother_model
 from yid_ocp.inference.smoother import run_smoother
 from yid_ocp.inference.smoother_model import (
     _FORCE_POINT,
-    IntervalModel,
     _generalized_forces_per_newton,
+    _IntervalModel,
     _segment_weights,
     linear_residual_models,
 )
@@ -94,7 +94,7 @@ def test_the_linear_model_predicts_what_a_small_push_does(driven, monkeypatch, f
 
     def as_they_are(observed, by_state, by_unknown, transition, drive):
         none = np.zeros((observed.shape[1], observed.shape[1]))
-        return IntervalModel(observed, by_state, by_unknown, transition, drive, none, len(observed))
+        return _IntervalModel(observed, by_state, by_unknown, transition, drive, none, len(observed))
 
     monkeypatch.setattr(smoother_model, "_compressed", as_they_are)
     recording = recorded(driven, {}, 1)

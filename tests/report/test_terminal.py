@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from yid_ocp.data import JointGroup, Recording
-from yid_ocp.inference.uncertainty import parameter_verdict
+from yid_ocp.inference.uncertainty import VERDICT_PREDICATES, VERDICT_WORDS, parameter_verdict
 from yid_ocp.report import summaries, terminal
 from yid_ocp.report.terminal import CodeBlock, SummaryStatement, SummaryTable
-from yid_ocp.solvers.fit_messages import VERDICT_PREDICATES, VERDICT_WORDS
 
 GOOD = {"chi2_per_dof": 1.03, "p_value": 0.3, "explains": True, "believed": True, "worse_than_guess": []}
 BAD = {"chi2_per_dof": 41.7, "p_value": 0.0, "explains": False, "believed": True, "worse_than_guess": []}

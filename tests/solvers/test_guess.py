@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from yid_ocp.integrator.step import compile_step_like
-from yid_ocp.model import Parameters
-from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers.initial_guess import guess_node_states
 
 START = np.array([5.0, 4.0])
@@ -64,20 +59,3 @@ def test_what_fits_is_the_rollout_and_what_does_not_is_rest_where_the_arm_was(pr
     found = guess_node_states(problem, nodes, START, strays)
     np.testing.assert_allclose(found.node_states[0][:, driven], episode.measured_driven_angles, atol=1e-12)
     assert np.abs(rolled.state[:, driven] - episode.measured_driven_angles).max() > 1e-4
-
-
-def test_bounds_hold_larger_parameters_back(one_arm, recording):
-    entries = one_arm.system.parameters
-    parameters = Parameters(replace(p, upper=12.0) if p.name == "T1.bend" else p for p in entries)
-    system = replace(one_arm.system, parameters=parameters)
-    step = compile_step_like(one_arm, system)
-    problem = EstimationProblem(step, [recording], ("T1.bend", "T2.bend"), ProblemOptions(duration=0.1))
-    told = []
-
-    def misfit(i, state, x):
-        told.append(x.tolist())
-        return 1e3
-
-    guess_node_states(problem, nodes_of(problem), START, misfit)
-    tried = [list(pair) for pair in dict.fromkeys(map(tuple, told))]
-    assert tried == [[5.0, 4.0], [12.0, 16.0], [10.0, 8.0], [12.0, 40.0]]

@@ -45,7 +45,7 @@ def moved(urdf_folder):
     return make
 
 
-@pytest.mark.parametrize(("stiffness", "rest_angle"), [(8.0, 1.8), (8.0, -1.5), (25.0, 0.3)])
+@pytest.mark.parametrize(("stiffness", "rest_angle"), [(8.0, -1.5), (25.0, 0.3)])
 def test_a_spring_relaxed_elsewhere_is_found_from_its_neutral_value(moved, stiffness, rest_angle):
     problem = moved("joint_spring", {"stiffness": stiffness, "rest_angle": rest_angle}, ("stiffness", "rest_angle"))
     assert problem.initial_unknowns[1] == 0.0
@@ -62,14 +62,6 @@ def test_from_its_neutral_value_a_spring_that_would_have_to_push_stays_at_zero(m
     problem = moved("joint_spring", {"stiffness": 8.0, "rest_angle": 1.8}, ("stiffness", "rest_angle"))
     held = GaussNewton().minimize_cost(problem, problem.initial_unknowns, None)
     assert held.x[1] == 0.0
-
-
-def test_a_spring_that_is_not_there_is_found_to_be_none(moved):
-    problem = moved("joint_spring", {}, ("stiffness", "rest_angle"))
-    solution = solve(problem, GaussNewton())
-    entry = solution.parameters["joint_spring@elbow.stiffness"]
-    assert abs(entry.value) < max(3 * entry.std, 0.1) if np.isfinite(entry.std) else True
-    assert entry.verdict in ("at_bound", "identifiable", "not_identifiable")
 
 
 def test_an_amplitude_seen_at_its_neutral_value_begins_there(moved):

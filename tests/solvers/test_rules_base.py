@@ -42,9 +42,8 @@ def test_a_gradient_that_pushes_against_a_bound_does_not_count(x, gradient, expe
 
 
 def test_a_recorder_keeps_points_as_they_were_and_tells_them():
-    told = []
+    told, x = [], np.array([1.0])
     recorder = IterationRecorder(told.append)
-    x = np.array([1.0])
     recorder.n_evaluations = 3
     recorder.record_iterate(9.0, x, 0.5, "first")
     x[0] = 2.0
@@ -54,7 +53,6 @@ def test_a_recorder_keeps_points_as_they_were_and_tells_them():
     assert (first.iteration, first.cost, first.x[0], first.gradient_norm, first.n_evaluations) == (0, 9.0, 1.0, 0.5, 3)
     assert (first.note, second.note, second.iteration) == ("first", "", 1)
     assert 0 <= first.seconds <= second.seconds < 5
-    IterationRecorder(None).record_iterate(1.0, x, 0.0)
 
 
 # -- restarts ---------------------------------------------------------------------------------------------------------
@@ -70,48 +68,43 @@ def misfit(cost_at):
     return rows
 
 
+def starts(solver):
+    return [start for start, _ in solver.runs]
+
+
 def test_a_good_fit_is_not_started_again():
     solver = Steps([[1.0], [2.0]])
     solution = solve(MadeUp(misfit(lambda x: 4.9)), solver)
     assert solver.runs == [([1.0], 10.0)]
-    assert solution.message == "run 1"
-    assert (solution.status, solution.solver_name, solution.n_iterations, solution.n_evaluations) == (
-        Status.CONVERGED,
-        "made_up",
-        1,
-        2,
-    )
+    assert (solution.status, solution.message, solution.solver_name) == (Status.CONVERGED, "run 1", "made_up")
+    assert (solution.n_iterations, solution.n_evaluations) == (1, 2)
     assert solution.goodness_of_fit.chi2_per_dof == pytest.approx(4.9)
     assert solution.cost == pytest.approx(0.5 * 9 * 4.9)
 
 
-def test_a_poor_fit_is_started_again_from_multiples_of_the_start_and_the_best_is_kept():
-    at = {1.0: 9.0, 4.0: 7.0, 2.0: 6.0, 10.0: 8.0}
+@pytest.mark.parametrize(
+    ("chi2_at", "tried", "kept", "message"),
+    [
+        ({1.0: 9.0, 4.0: 7.0, 2.0: 6.0, 10.0: 8.0}, [1.0, 4.0, 2.0, 10.0], 2.0, "run 3 (best of 4 starts)"),
+        ({1.0: 9.0, 4.0: 4.0}, [1.0, 4.0], 4.0, "run 2 (best of 2 starts)"),
+        (dict.fromkeys((1.0, 4.0, 2.0, 10.0), 5.5), [1.0, 4.0, 2.0, 10.0], 1.0, "run 1 (best of 4 starts)"),
+    ],
+    ids=["the best is kept", "the first good fit ends it", "the first of equals"],
+)
+def test_a_poor_fit_is_started_again_from_multiples_of_the_start(chi2_at, tried, kept, message):
     solver, told = Steps(), []
-    solution = solve(MadeUp(misfit(at.get)), solver, callback=told.append)
-    assert [start for start, _ in solver.runs] == [[1.0], [4.0], [2.0], [10.0]]
-    assert solution.x.tolist() == [2.0]
-    assert solution.message == "run 3 (best of 4 starts)"
-    notes = ["", *(f"start {n} of at most 4: initial values x {x}" for n, x in ((2, 4), (3, 2), (4, 10)))]
-    assert [entry.note for entry in solution.history] == [entry.note for entry in told] == notes
-    assert (solution.n_evaluations, solution.n_iterations) == (4, 3)
-    assert len(told) == 4
+    solution = solve(MadeUp(misfit(chi2_at.get)), solver, callback=told.append)
+    assert starts(solver) == [[x] for x in tried]
+    assert (solution.x.tolist(), solution.message) == ([kept], message)
+    notes = [f"start {n} of at most 4: initial values x {x:g}" for n, x in enumerate(tried[1:], 2)]
+    assert [entry.note for entry in solution.history] == [entry.note for entry in told] == ["", *notes]
+    assert (solution.n_evaluations, solution.n_iterations) == (len(tried), len(tried) - 1)
 
 
 def test_a_poor_fit_is_left_alone_where_that_is_asked_for():
     solver = Steps()
     assert solve(MadeUp(misfit(lambda x: 9.0)), solver, restarts=False).message == "run 1"
-    assert [start for start, _ in solver.runs] == [[1.0]]
-
-
-def test_starting_again_ends_with_the_first_good_fit():
-    at = {1.0: 9.0, 4.0: 4.0}
-    solver = Steps()
-    assert solve(MadeUp(misfit(at.get)), solver).message == "run 2 (best of 2 starts)"
-    assert [start for start, _ in solver.runs] == [[1.0], [4.0]]
-    same = dict.fromkeys((1.0, 4.0, 2.0, 10.0), 5.5)
-    kept = solve(MadeUp(misfit(same.get)), Steps())
-    assert (kept.x.tolist(), kept.message) == ([1.0], "run 1 (best of 4 starts)")
+    assert starts(solver) == [[1.0]]
 
 
 def test_a_failed_fit_is_started_again_and_loses():
@@ -123,21 +116,20 @@ def test_a_failed_fit_is_started_again_and_loses():
     assert solution.evaluation is not None
 
 
-def test_new_starts_stay_within_bounds_and_move_positive_unknowns_only():
-    problem = MadeUp(misfit(lambda x: 9.0), (1.0,), upper=3.0)
+@pytest.mark.parametrize(
+    ("bounds", "given", "tried"),
+    [
+        ({"upper": 3.0}, None, [1.0, 3.0, 2.0, 3.0]),
+        ({"lower": -5.0}, None, [1.0] * 4),
+        ({"upper": 3.0}, [0.5], [0.5, 2.0, 1.0, 3.0]),
+        ({"upper": 3.0}, [7.0], [3.0] * 4),
+    ],
+    ids=["bounds", "not positive", "a start of one's own", "beyond the bounds"],
+)
+def test_new_starts_stay_within_bounds_and_move_positive_unknowns_only(bounds, given, tried):
     solver = Steps()
-    solve(problem, solver)
-    assert [start for start, _ in solver.runs] == [[1.0], [3.0], [2.0], [3.0]]
-    either = MadeUp(misfit(lambda x: 9.0), (1.0,), lower=-5.0)
-    solver = Steps()
-    solve(either, solver)
-    assert [start for start, _ in solver.runs] == [[1.0]] * 4
-    given = Steps()
-    solve(problem, given, [0.5])
-    assert [start for start, _ in given.runs] == [[0.5], [2.0], [1.0], [3.0]]
-    beyond = Steps()
-    solve(MadeUp(misfit(lambda x: 1.0), upper=3.0), beyond, [7.0])
-    assert beyond.runs[0][0] == [3.0]
+    solve(MadeUp(misfit(lambda x: 9.0), (1.0,), **bounds), solver, given)
+    assert starts(solver) == [[x] for x in tried]
 
 
 def test_the_papers_cost_says_nothing_of_noise_and_is_not_started_again():
@@ -180,13 +172,6 @@ def reaching(limit):
     return rows
 
 
-def test_a_start_that_can_be_rolled_out_needs_no_shorter_horizon():
-    solver = Steps([[1.0], [2.0]])
-    solution = solve(MadeUp(reaching(lambda x: 10.0)), solver)
-    assert solver.runs == [([1.0], 10.0)]
-    assert [entry.note for entry in solution.history] == ["", ""]
-
-
 def test_a_start_that_fails_is_approached_over_longer_and_longer_horizons():
     # every run takes the value further, by which the rollout holds longer
     limits = {1.0: 1.3, 2.0: 1.3, 3.0: 4.9, 4.0: 6.0, 5.0: 10.0}
@@ -194,21 +179,10 @@ def test_a_start_that_fails_is_approached_over_longer_and_longer_horizons():
     told = []
     problem = MadeUp(reaching(lambda x: limits.get(x, 0.0)), count=10)
     solution = solve(problem, solver, callback=told.append)
-    assert [(start, pytest.approx(duration)) for start, duration in solver.runs] == [
-        ([1.0], 0.6),
-        ([2.0], 1.2),
-        ([3.0], 2.5),
-        ([4.0], 5.0),
-        ([5.0], 10.0),
-    ]
-    assert [entry.note for entry in solution.history] == [
-        "first 0.6 s",
-        "first 0.6 s",
-        "first 1.2 s",
-        "first 2.5 s",
-        "first 5 s",
-        "",
-    ]
+    runs = [([1.0], 0.6), ([2.0], 1.2), ([3.0], 2.5), ([4.0], 5.0), ([5.0], 10.0)]
+    assert [(start, pytest.approx(duration)) for start, duration in solver.runs] == runs
+    notes = ["first 0.6 s", "first 0.6 s", "first 1.2 s", "first 2.5 s", "first 5 s", ""]
+    assert [entry.note for entry in solution.history] == notes
     assert (solution.n_evaluations, len(told)) == (6, 6)
 
 
@@ -263,7 +237,7 @@ def test_passes_begin_where_the_last_one_ended_and_end_when_one_changes_nothing(
     solver = Carrying([[1.0], [2.0]], [[2.0], [2.5]], [[2.5]], [[99.0]])
     problem = Disturbed(linear(np.eye(1), [-2.5]))
     solution = solve(problem, solver, restarts=False)
-    assert [start for start, _ in solver.runs] == [[1.0], [2.0], [2.5]]
+    assert starts(solver) == [[1.0], [2.0], [2.5]]
     assert problem.frozen == [([1.0], None), ([2.0], "warm"), ([2.5], "warm")]
     assert solution.x.tolist() == [2.5]
     assert solution.problem.frozen_at == [2.5]
@@ -328,12 +302,6 @@ def test_a_method_that_cannot_carry_the_noise_says_so_and_runs_once():
     assert problem.frozen == []
     assert solution.problem is problem
     assert solution.message == ("run 1; weighted by the sensors' noise alone, without the noise that drives the motion")
-
-
-def test_without_noise_that_drives_the_motion_there_is_one_pass():
-    solver = Carrying([[1.0], [2.0]], [[3.0]])
-    solve(MadeUp(linear(np.eye(1), [-2.0])), solver)
-    assert len(solver.runs) == 1
 
 
 # -- predictions ------------------------------------------------------------------------------------------------------

@@ -69,27 +69,24 @@ def test_a_point_is_an_end_where_no_step_within_the_bounds_promises_much(x, resi
 
 @pytest.mark.parametrize(
     ("size", "slope", "residual", "expected"),
-    [(100.0, 0.01, -5.0, False), (1.0, 1e-3, -5.0, True), (1e-3, 10.0, -0.5, True), (1.0, 10.0, -0.5, False)],
-    ids=["large", "a small one is not worth it", "small", "a large one is worth it"],
+    [
+        (100.0, [[0.01]], [-5.0], False),
+        (1.0, [[1e-3]], [-5.0], True),
+        (1e-3, [[10.0]], [-0.5], True),
+        (1.0, [[10.0]], [-0.5], False),
+        (1.0, [[1e-9]], [50.0], True),
+        (1.0, [[1.0], [0.0]], [1.0, 100.0], True),
+    ],
+    ids=["large", "not worth a large one", "small", "worth a large one", "not informed", "a small part of the cost"],
 )
 def test_no_step_longer_than_the_unknowns_size_counts(size, slope, residual, expected):
-    problem = MadeUp(linear([[slope]], [residual]), lower=-np.inf, scales=(size,))
+    problem = MadeUp(linear(slope, residual), lower=-np.inf, scales=(size,))
     assert is_stationary(problem, np.zeros(1), problem.evaluate([0.0])) is expected
 
 
-def test_what_nothing_informs_keeps_no_search_from_its_end():
-    problem = MadeUp(lambda x, duration: (np.array([50.0]), np.array([[1e-9]])), (1.0,))
-    assert is_stationary(problem, np.ones(1), problem.evaluate([1.0]))
+def test_without_unknowns_a_search_is_at_its_end():
     none = MadeUp(linear(np.zeros((2, 0)), [3.0, 3.0]), ())
     assert is_stationary(none, np.zeros(0), none.evaluate(np.zeros(0)))
-
-
-def test_a_part_of_a_large_cost_is_as_little_as_a_part_of_the_noise():
-    def rows(x, duration):
-        return np.array([1.0, 100.0]), np.array([[1.0], [0.0]])
-
-    problem = MadeUp(rows, (1.0,), lower=-np.inf)
-    assert is_stationary(problem, np.ones(1), problem.evaluate([1.0]))
 
 
 def test_the_promise_of_a_step_is_the_fall_of_a_linear_models_cost():

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from made_problems import MadeUp
@@ -33,41 +31,6 @@ def disturbed(start):
     problem = MadeUp(ringing, [start], duration=2.0)
     problem.has_process_noise = True
     return problem
-
-
-def fit_at(problem, x, evaluation=None):
-    """A fit that ended at `x`."""
-    at = problem.evaluate(x) if evaluation is None else evaluation
-    return SimpleNamespace(weighted=problem, evaluation=at, result=SimpleNamespace(x=x))
-
-
-def test_a_start_is_proposed_where_the_cost_rises_less_than_the_fit_predicts():
-    problem = disturbed(ALIAS)
-    found = base._other_valleys(fit_at(problem, np.array([ALIAS])))
-    assert found
-    assert any(abs(x[0] / ALIAS - factor) < 1e-9 for x in found for factor in (1.6, 2.5))
-    assert len(found) <= base._MAX_LOCAL_MINIMUM_STARTS
-
-
-def test_no_start_is_proposed_for_what_has_one_valley():
-    def straight(x, horizon):
-        return np.array([(x[0] - 2.0) / 0.2, 0.0, 0.0]), np.array([[1 / 0.2], [0.0], [0.0]])
-
-    problem = MadeUp(straight, [2.0])
-    problem.has_process_noise = True
-    assert base._other_valleys(fit_at(problem, np.array([2.0]))) == []
-
-
-@pytest.mark.parametrize("sure", [True, False], ids=["well known", "no noise drives the motion"])
-def test_nothing_is_evaluated_where_nothing_is_doubtful(sure):
-    problem = disturbed(ALIAS)
-    problem.has_process_noise = sure
-    at = problem.evaluate(np.array([ALIAS]))
-    if sure:
-        at = type(at)(at.cost, at.residual, 1e3 * at.jacobian, at.ok, at.message, at.episode_predictions)
-    before = len(problem.asked)
-    assert base._other_valleys(fit_at(problem, np.array([ALIAS]), at)) == []
-    assert len(problem.asked) == before
 
 
 def test_a_search_that_ends_in_the_wrong_valley_goes_on_from_the_other(monkeypatch):

@@ -18,14 +18,19 @@ from numpy.typing import NDArray
 from yid_ocp.analysis.profile import with_profile_intervals
 from yid_ocp.inference.linearized_residual import bounded_least_squares_step
 from yid_ocp.inference.null_test import DEFAULT_GAP_CRITERIA, GapCriteria
-from yid_ocp.inference.uncertainty import MAX_IDENTIFIABLE_RELATIVE_STD, ParameterEstimate
+from yid_ocp.inference.uncertainty import (
+    MAX_IDENTIFIABLE_RELATIVE_STD,
+    VERDICT_PREDICATES,
+    VERDICT_WORDS,
+    ParameterEstimate,
+    interval_text,
+)
 from yid_ocp.inference.whitening import without_input_errors
 from yid_ocp.model.objects.cable import START_SPEED_PARAMETER, START_SPEED_SCALE_PARAMETER
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.solvers import GaussNewton, Iterate, Solution, Status, solve
 from yid_ocp.solvers.base import Solver, uses_process_noise_covariance
-from yid_ocp.solvers.fit_messages import VERDICT_PREDICATES, VERDICT_WORDS, interval_text
 
 Array = NDArray[np.float64]
 

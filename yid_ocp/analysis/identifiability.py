@@ -22,13 +22,17 @@ from yid_ocp.inference.uncertainty import (
     MAX_IDENTIFIABLE_RELATIVE_STD,
     MAX_WEAK_RELATIVE_STD,
     MIN_UNINFORMED_RELATIVE_STD,
+    VERDICT_WORDS,
     ParameterEstimate,
     assess_goodness_of_fit,
     covariance_and_chi2,
     covariance_of_fit,
+    finite_or_none,
     parameter_estimates,
+    parameter_text,
     parameter_unknown_names,
     parameter_verdict,
+    percent_text,
     typical_parameter_sizes,
     with_profile_interval,
 )
@@ -39,7 +43,6 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.progress import NULL_PROGRESS, ParallelProgress, Progress
 from yid_ocp.solvers.base import Solution
-from yid_ocp.solvers.fit_messages import VERDICT_WORDS, finite_or_none, parameter_text, percent_text
 
 Array = NDArray[np.float64]
 InitialStateKnowledge = Literal["assumed", "known", "unknown"]

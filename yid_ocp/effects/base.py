@@ -73,7 +73,7 @@ class ParameterDefinition:
     reciprocal_power: int = 1
     range_scale: Callable[[System, str], float] | None = None
 
-    def at_location(self, system: System, location: str) -> ParameterDefinition:
+    def _at_location(self, system: System, location: str) -> ParameterDefinition:
         """The definition with the bounds and the range that hold at a location."""
         if self.range_scale is None:
             return self
@@ -156,7 +156,7 @@ class EffectBase:
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
         """Definitions of the effect's parameters with the bounds and ranges of the location."""
-        return tuple(definition.at_location(system, location) for definition in cls.declared_parameters)
+        return tuple(definition._at_location(system, location) for definition in cls.declared_parameters)
 
     @classmethod
     def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:

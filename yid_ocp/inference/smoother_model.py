@@ -232,7 +232,7 @@ def _generalized_forces_per_newton(system: System, theta: Array, q: Array, segme
 
 
 @dataclass(frozen=True)
-class IntervalModel:
+class _IntervalModel:
     """Linear model of one interval: residual, transition of the state at its beginning, input of the unknowns.
 
     Attributes
@@ -279,7 +279,7 @@ class LinearResidualModel:
     """
 
     recording: str
-    intervals: tuple[IntervalModel, ...]
+    intervals: tuple[_IntervalModel, ...]
     interval_edges: Array
     unknown_names: tuple[str, ...]
     unknown_groups: tuple[UnknownGroup, ...]
@@ -488,7 +488,7 @@ def _bias_slopes(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> Arr
     return np.concatenate(found)
 
 
-def _compressed(observed: Array, by_state: Array, by_unknown: Array, transition: Array, drive: Array) -> IntervalModel:
+def _compressed(observed: Array, by_state: Array, by_unknown: Array, transition: Array, drive: Array) -> _IntervalModel:
     """An interval with no more rows than columns: what is orthogonal to all columns only adds to the products."""
     joined, count = np.hstack([by_state, by_unknown]), len(observed)
     rest = np.zeros((observed.shape[1], observed.shape[1]))
@@ -498,4 +498,4 @@ def _compressed(observed: Array, by_state: Array, by_unknown: Array, transition:
         rest = observed.T @ observed - turned.T @ turned
         observed, joined = turned, r
     ns = by_state.shape[1]
-    return IntervalModel(observed, joined[:, :ns], joined[:, ns:], transition, drive, rest, count)
+    return _IntervalModel(observed, joined[:, :ns], joined[:, ns:], transition, drive, rest, count)

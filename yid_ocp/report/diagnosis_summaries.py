@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from yid_ocp.inference.uncertainty import VERDICT_WORDS, parameter_text
 from yid_ocp.report.tables import (
     format_error_and_unit,
     issue_blocks,
@@ -25,7 +26,6 @@ from yid_ocp.report.terminal import (
     make_statements,
     nonempty_tables,
 )
-from yid_ocp.solvers.fit_messages import VERDICT_WORDS, parameter_text
 
 _MIN_GAP_SHARE, _MAX_WINDOWS = 0.005, 6  # of places that are listed
 _MAX_CANDIDATES = 15  # candidates that are listed; result.json has them all

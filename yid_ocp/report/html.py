@@ -11,10 +11,10 @@ from importlib import util
 from pathlib import Path
 
 from yid_ocp.files import write_text
+from yid_ocp.inference.uncertainty import VERDICT_WORDS
 from yid_ocp.report.figures import DARK_MODE_COLORS, figure_html
 from yid_ocp.report.sections import REPORT_SECTIONS, ReportData, render_sections
 from yid_ocp.report.terminal import CodeBlock, SummaryTable
-from yid_ocp.solvers.fit_messages import VERDICT_WORDS
 
 log = logging.getLogger(__name__)
 _SHARED_SCRIPT_LEVELS = 2

@@ -6,6 +6,7 @@ import statistics
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from yid_ocp.inference.uncertainty import VERDICT_WORDS, fit_message, interval_text, parameter_text, percent_text
 from yid_ocp.report.diagnosis_summaries import batch_summary, blind_summary, diagnose_summary, history_summary
 from yid_ocp.report.tables import (
     MAX_SINGLE_CHANNELS,
@@ -27,7 +28,6 @@ from yid_ocp.report.terminal import (
     make_statements,
     nonempty_tables,
 )
-from yid_ocp.solvers.fit_messages import VERDICT_WORDS, fit_message, interval_text, parameter_text, percent_text
 
 _BASELINE_DESCRIPTIONS = {
     "stays": "points stay where they were first seen",

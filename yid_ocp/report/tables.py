@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from yid_ocp.data.issues import ISSUE_CAUSES
+from yid_ocp.inference.uncertainty import fit_message
 from yid_ocp.report.terminal import (
     CodeBlock,
     SummaryBlock,
@@ -15,7 +16,6 @@ from yid_ocp.report.terminal import (
     make_statements,
     nonempty_tables,
 )
-from yid_ocp.solvers.fit_messages import fit_message
 
 _MAX_ISSUES_PER_CAUSE = 3
 _MAX_OFFSET_RECORDINGS = 4  # recordings side by side

@@ -21,12 +21,15 @@ from yid_ocp.errors import ConfigError, YidError
 from yid_ocp.inference.linearized_residual import is_stationary
 from yid_ocp.inference.null_test import DEFAULT_GAP_CRITERIA, GapCriteria
 from yid_ocp.inference.uncertainty import (
+    VERDICT_WORDS,
     GoodnessOfFit,
     ParameterEstimate,
     assess_goodness_of_fit,
     covariance_and_chi2,
     covariance_of_fit,
+    finite_or_none,
     parameter_estimates,
+    parameter_text,
 )
 from yid_ocp.inference.whitening import whitened_at, whitened_by_sensor_noise
 from yid_ocp.problem.episodes import EpisodePrediction
@@ -34,7 +37,6 @@ from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
 from yid_ocp.problem.prediction_errors import ChannelPrediction, channel_predictions
 from yid_ocp.registry import Registry
-from yid_ocp.solvers.fit_messages import VERDICT_WORDS, finite_or_none, parameter_text
 from yid_ocp.solvers.initial_guess import initialize_free_effects
 
 if TYPE_CHECKING:
@@ -168,8 +170,8 @@ class Solution(ReprMixin):
         except ImportError as error:
             raise ConfigError("pandas is not installed", hint="pip install 'yid-ocp[pandas]'") from error
         entries = sorted(self.parameters.items(), key=lambda entry: not entry[1].free)
-        rows = {name: (e.value, e.std, *e.interval_ends, e.unit, e.verdict, e.free, e.initial) for name, e in entries}
         columns = ["value", "std", "lower", "upper", "unit", "verdict", "free", "initial"]
+        rows = {name: (e.value, e.std, *e.interval_ends, e.unit, e.verdict, e.free, e.initial) for name, e in entries}
         return pandas.DataFrame.from_dict(rows, orient="index", columns=columns).rename_axis("parameter")
 
 
@@ -310,11 +312,13 @@ def solve(
 
 @dataclass(frozen=True)
 class _Fit:
-    """End of one run of a solver, evaluated, and the problem as it was weighted."""
+    """End of one run of a solver from one start, evaluated, and the problem as it was weighted."""
 
     result: SolverResult
     evaluation: Evaluation
     weighted: EstimationProblem
+    n_evaluations: int
+    history: Sequence[Iterate]
 
 
 class _MultiStartSearch:
@@ -324,9 +328,12 @@ class _MultiStartSearch:
         self, problem: EstimationProblem, solver: Solver, callback: IterationCallback | None, start: Array
     ) -> None:
         self._problem, self._solver, self._callback = problem, solver, callback
-        self._begun = time.perf_counter()
-        self._best, self._n_evaluations, self._history = _fit_from(problem, solver, start, callback)
-        self._n_fits = self._n_starts = 1
+        self._begun, self._n_starts = time.perf_counter(), 1
+        self._fits = [_fit_from(problem, solver, start, callback)]
+
+    @property
+    def _best(self) -> _Fit:
+        return min(self._fits, key=lambda fit: fit.evaluation.cost)
 
     def restart(self, first: Array, limits: GapCriteria) -> None:
         """Try other starts as far as the best fit so far gives reason to."""
@@ -335,7 +342,7 @@ class _MultiStartSearch:
             if _good_fit(self._problem, self._best.evaluation):
                 break
             self._try(self._multiple(first, factor), f"initial values x {factor:g}", most)
-        once = self._n_fits == 1 and noisy and _accounts_for_process_noise(self._solver)
+        once = len(self._fits) == 1 and noisy and _accounts_for_process_noise(self._solver)
         if once and np.any(_doubtful(self._best, first)):
             self._try(self._multiple(first, RESTART_FACTORS[0]), f"initial values x {RESTART_FACTORS[0]:g}", 2)
         if not uses_process_noise_covariance(self._solver):
@@ -359,15 +366,12 @@ class _MultiStartSearch:
         note = f"start {self._n_starts} of at most {most}: {what}"
         log.info("starting again: %s", note)
         try:
-            again, more, steps = _fit_from(self._problem, self._solver, x, _noting(self._callback, note))
+            again = _fit_from(self._problem, self._solver, x, _noting(self._callback, note))
         except YidError as error:
             # another start is a chance, never a reason to lose what is there
             log.info("no fit from there: %s", error)
             return
-        self._n_fits, self._n_evaluations = self._n_fits + 1, self._n_evaluations + more
-        self._history.extend(replace(entry, note=note) for entry in steps)
-        if again.evaluation.cost < self._best.evaluation.cost:
-            self._best = again
+        self._fits.append(replace(again, history=[replace(entry, note=note) for entry in again.history]))
 
     def solution(self, limits: GapCriteria) -> Solution:
         """Solution of the best fit, with its uncertainty."""
@@ -384,8 +388,8 @@ class _MultiStartSearch:
             parameter_estimates(problem, result.x, finish, covariance, fit),
             finish.cost,
             fit,
-            tuple(self._history),
-            self._n_evaluations,
+            tuple(entry for one in self._fits for entry in one.history),
+            sum(one.n_evaluations for one in self._fits),
             time.perf_counter() - self._begun,
             finish if finish.ok else None,
             self._solver.name,
@@ -406,20 +410,18 @@ class _MultiStartSearch:
         if status == Status.CONVERGED and not ended:
             stopped = f"the search stopped where a further step would lower the cost ({message})"
             return Status.STALLED, f"{stopped}; {_STALLED_REMEDY}"
-        return status, message + (f" (best of {self._n_fits} starts)" if self._n_fits > 1 else "")
+        return status, message + (f" (best of {len(self._fits)} starts)" if len(self._fits) > 1 else "")
 
 
 def _noting(callback: IterationCallback | None, note: str) -> IterationCallback | None:
     """The callback for a part of the search, whose points say which part it is."""
     if callback is None or not note:
         return callback
-    return lambda entry: callback(replace(entry, note=", ".join(filter(None, (note, entry.note)))))
+    return lambda entry: callback(replace(entry, note=f"{note}, {entry.note}" if entry.note else note))
 
 
-def _fit_from(
-    problem: EstimationProblem, solver: Solver, x: Array, callback: IterationCallback | None
-) -> tuple[_Fit, int, list[Iterate]]:
-    """Fit, number of evaluations and history of one start, by shorter horizons where the rollout fails there."""
+def _fit_from(problem: EstimationProblem, solver: Solver, x: Array, callback: IterationCallback | None) -> _Fit:
+    """The fit of one start, by shorter horizons where the rollout fails there."""
     history: list[Iterate] = []
     evaluations = 0
     if getattr(solver, "needs_rollout", True) and not problem.evaluate(x, derivatives=False).ok:
@@ -453,7 +455,7 @@ def _fit_from(
     if problem.has_process_noise and passes == 1 and _accounts_for_process_noise(solver):
         # it had the errors themselves as unknowns; what is judged is their likelihood about its answer
         weighted = whitened_at(problem, x, warm, rounds=2)
-    return _Fit(result, weighted.evaluate(x, equilibrium_guesses=warm), weighted), evaluations, history
+    return _Fit(result, weighted.evaluate(x, equilibrium_guesses=warm), weighted, evaluations, history)
 
 
 def _doubtful(fit: _Fit, first: Array) -> NDArray[np.bool_]:

@@ -144,10 +144,9 @@ def _saved(problem: EstimationProblem, history: Sequence[Iterate], now: Evaluati
         return None
     before, last = history[-1 - _PATIENCE_STEPS], history[-1]
     saved, unit = before.cost - last.cost, problem.data_noise_unit**2
-    if (
-        saved > _NEGLIGIBLE_COST_REDUCTION * unit
-        or achievable_reduction(problem, last.x, now) > 0.5 * CHI2_95_TWO_SIDED * unit
-    ):
+    if saved > _NEGLIGIBLE_COST_REDUCTION * unit:
+        return None
+    if achievable_reduction(problem, last.x, now) > 0.5 * CHI2_95_TWO_SIDED * unit:
         return None
     std = np.sqrt(np.maximum(np.diag(covariance_and_chi2(problem, now)[0]), 0.0))
     return saved if np.all(np.abs(last.x - before.x) <= _NEGLIGIBLE_MOVE_STDS * std) else None

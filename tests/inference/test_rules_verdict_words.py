@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from yid_ocp.solvers import fit_messages
+from yid_ocp.inference import uncertainty
 
 
 @pytest.mark.parametrize(
@@ -20,7 +20,7 @@ from yid_ocp.solvers import fit_messages
     ],
 )
 def test_an_interval_may_have_open_ends(interval, expected):
-    assert fit_messages.interval_text(*interval) == expected
+    assert uncertainty.interval_text(*interval) == expected
 
 
 @pytest.mark.parametrize(
@@ -36,23 +36,23 @@ def test_an_interval_may_have_open_ends(interval, expected):
     ],
 )
 def test_a_value_is_told_with_what_is_known_of_it(std, interval, expected):
-    assert fit_messages.parameter_text(22.1234, std, interval) == expected
+    assert uncertainty.parameter_text(22.1234, std, interval) == expected
 
 
 @pytest.mark.parametrize("chi2", [None, math.nan])
 @pytest.mark.parametrize("explains", [True, False])
 def test_a_fit_without_a_misfit_is_not_judged(chi2, explains):
-    assert fit_messages.fit_message(chi2, explains) == "whether the model explains the recordings is not known"
+    assert uncertainty.fit_message(chi2, explains) == "whether the model explains the recordings is not known"
 
 
 def test_a_fit_is_told_with_its_misfit_and_what_follows():
-    assert fit_messages.fit_message(1.0449, True).endswith("to within their noise (chi2 per degree of freedom is 1.04)")
-    bad = fit_messages.fit_message(9.0, False)
+    assert uncertainty.fit_message(1.0449, True).endswith("to within their noise (chi2 per degree of freedom is 1.04)")
+    bad = uncertainty.fit_message(9.0, False)
     assert "does not explain the recordings (chi2 per degree of freedom is 9," in bad
     assert bad.endswith("run `yid-ocp diagnose`")
 
 
 def test_tables_say_the_same_as_sentences():
-    assert fit_messages.VERDICT_WORDS["weak"] == "weakly determined"
-    assert fit_messages.VERDICT_WORDS["not_identifiable"] == "cannot be found"
-    assert set(fit_messages.VERDICT_WORDS) == set(fit_messages.VERDICT_PREDICATES)
+    assert uncertainty.VERDICT_WORDS["weak"] == "weakly determined"
+    assert uncertainty.VERDICT_WORDS["not_identifiable"] == "cannot be found"
+    assert set(uncertainty.VERDICT_WORDS) == set(uncertainty.VERDICT_PREDICATES)
