@@ -5,13 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from yid_ocp.effects import EFFECTS, SENSOR_KINDS, candidate_effects, make_effect
-from yid_ocp.integrator.rollout import simulate
-from yid_ocp.integrator.statics import EquilibriumSolver
-from yid_ocp.integrator.step import compile_step
-from yid_ocp.virtual.experiment import baxter_foam_y_system
-
-POSTURE = (-0.55, -1.0, -0.2, 1.3, -0.1, 1.1, 0.0)
+from yid_ocp.effects import SENSOR_KINDS, candidate_effects, make_effect
 
 
 def largest(difference, reference) -> float:
@@ -33,11 +27,15 @@ def test_all_together_change_nothing(mode, benches, all_effects, sensors) -> Non
         assert largest(bench.reading(full, sensor) - nominal, nominal) < 1e-10
 
 
-@pytest.mark.parametrize("kind", [kind for kind in EFFECTS if not kind.startswith("servo_")])
+# those that add joints or coordinates, or have an infinite neutral value
+STRUCTURAL = ("grasp_compliance", "grasp_slip", "hysteresis", "joint_presliding", "junction_compliance")
+STRUCTURAL += ("length_scale", "mount_compliance", "payload", "standard_linear_solid")
+
+
+@pytest.mark.parametrize("kind", STRUCTURAL)
 def test_alone_it_changes_nothing_and_has_a_slope(kind, benches) -> None:
     bench = benches["driven"]
     places = [place for k, place in candidate_effects(bench.system, SENSOR_KINDS) if k == kind]
-    assert places, f"{kind} fits nowhere"
     effect = make_effect(kind, places[-1], bench.system)
     assert effect.neutral_values == {entry.name: entry.value for entry in effect.parameters}
     step = bench.step(effect)
@@ -48,21 +46,3 @@ def test_alone_it_changes_nothing_and_has_a_slope(kind, benches) -> None:
     q, p, z = np.split(run.start, [step.sizes["n"], 2 * step.sizes["n"]])
     a, _, _ = step.jacobians(q, p, bench.torque[0], run.theta, internal=z)
     assert np.max(np.abs(a)) < 1e6
-
-
-def test_the_papers_system_with_all_candidates(all_effects) -> None:
-    system = baxter_foam_y_system(1)
-    everything = system.with_effects(all_effects(system))
-    assert everything.mechanism.joint_names[:7] == system.driven
-    results = []
-    for one in (system, everything):
-        step = compile_step(one, 0.01, use_compiler=False)
-        theta = one.parameters.vector()
-        rest = EquilibriumSolver(step).solve(POSTURE, theta)
-        assert rest.is_converged
-        torque = np.tile(rest.holding_torque, (5, 1)) + np.linspace(0, 1, 5)[:, None]
-        rollout = simulate(step, theta, rest.state, 5, torque)
-        assert rollout.status.is_converged
-        names = one.mechanism.joint_names
-        results.append(rollout.state[:, [names.index(name) for name in system.mechanism.joint_names]])
-    assert largest(results[1] - results[0], results[0]) < 1e-10

@@ -46,10 +46,7 @@ class _JointInsertion(EffectBase):
     declared_parameters = (compliance("rad/(N m)", 1.0, (1 / 500, 1 / 5), "two-axis spring", "N m/rad"),)
 
     def _sprung(self, system: System, hung: tuple[str, ...], at: Placement | None, label: str) -> System:
-        """The system with two massless joints `LABEL_x`, `LABEL_y` between some joints and what they hang on.
-
-        They sit at the placement `at` of the carrier, at that of the only joint hung where there is none.
-        """
+        """The system with joints `LABEL_x` and `LABEL_y` under some others, at a placement of what they hang on."""
         tree = system.mechanism
         first = min(tree.joint_index(joint) for joint in hung)
         carrier = tree.joints[first].parent_index

@@ -70,11 +70,7 @@ class ChannelNoiseLevel:
 
 @dataclass(frozen=True)
 class _ResidualWindow:
-    """Test of one channel's residual in one time window [s].
-
-    `z_score` is the excess of r'r over its expectation, in standard deviations; it is flagged where it is more than
-    chance among all windows (false-discovery rate).
-    """
+    """Test of one channel in a time window [s]: excess of r'r in standard deviations, flagged beyond chance."""
 
     recording: str
     channel: str

@@ -4,8 +4,8 @@ The unknowns of `smoother_model` change from interval to interval by
 
     d_{j+1} = a d_j + sqrt(1 - a^2) s eta_j,
 
-forgetting with the time constant `MEMORY`; this is |d|^2_Q + gamma |d_{j+1} - d_j|^2 of a weak constraint with Q and
-gamma stated as a standard deviation s and a memory. The cost is linear in the number of intervals (Kalman filter,
+forgetting with the time constant `_CORRELATION_TIME`; this is |d|^2_Q + gamma |d_{j+1} - d_j|^2 of a weak constraint,
+Q and gamma stated as a standard deviation s and a memory. The cost is linear in the number of intervals (Kalman filter,
 disturbance smoother: de Jong 1989, doi:10.2307/2290075). Free parameters are regression effects of the filter, so that
 whatever they can explain is left to them. Groups of unknowns (a segment's forces, a joint's, a camera's biases, ...)
 are added one after the other, that which raises the evidence most first, their standard deviations s being those of
@@ -224,10 +224,7 @@ def _backwards(done: _Filtered) -> _Smoothed:
 
 @dataclass(frozen=True)
 class _State:
-    """All recordings at given variances.
-
-    `shift` (ntheta,) is that of the free parameters in units of their scales, `spread` (ntheta, ntheta) its covariance.
-    """
+    """All recordings at given variances: `shift` of the scaled free parameters, its covariance `spread`."""
 
     recordings: tuple[_Smoothed, ...]
     shift: Array

@@ -98,11 +98,7 @@ class _LinearizedEpisode:
 
 @dataclass(frozen=True)
 class _SmootherUnknowns:
-    """What gets an unknown, and how large it may be: first forces, then offsets, pushes and biases.
-
-    These are at coordinates (`forced`), constraint rows (`grasped`), segments (`pushed`), and groups of samples with
-    their columns (`biased`).
-    """
+    """Unknown forces at coordinates, offsets of constraints, pushes on segments, biases of (samples, column)."""
 
     names: tuple[str, ...]
     sources: tuple[UnknownGroup, ...]
@@ -459,10 +455,7 @@ def _loose_start(course: _LinearizedEpisode) -> Array:
 def _interval_response(
     steps: tuple[Array, Array, Array], slopes: ResidualSlopes, first: int
 ) -> tuple[Array, Array, Array]:
-    """The state at an interval's end by that at its beginning, by unknowns, and its rows by both.
-
-    From (A_k, E_k, effort's slopes) of its steps; states inside it are eliminated.
-    """
+    """An interval's end by its beginning and by unknowns, its rows by both, from (A_k, E_k, effort's slopes)."""
     a, e, by_effort = steps
     count, ns, driving = len(a), a.shape[1], e.shape[2]
     node = np.zeros((count + 1, ns, ns + driving))

@@ -85,10 +85,7 @@ class _FilterStep:
 
 @dataclass(frozen=True)
 class _SmoothedInputErrors:
-    """Smoothed b (nu,) and w (N, nu) [N m], and the rollout's state less the true one (N + 1, nx).
-
-    The last is known where encoders are measurements.
-    """
+    """Smoothed b (nu,), w (N, nu) [N m]; beside encoders the state's error (N + 1, nx), rollout less truth."""
 
     torque_bias: Array
     torque_noise: Array
@@ -432,10 +429,7 @@ def _relinearized(
     known: Sequence[ResidualWhitener | None],
     at: Sequence[tuple[Episode, Array, Array, Array]],
 ) -> tuple[tuple[Episode, ...], tuple[WhiteningFilter | None, ...]]:
-    """Filters about the torque offsets estimated at (episode, theta, offset), linearized at another theta so far.
-
-    They come with the episodes, which have the input errors about which their filters are linearized.
-    """
+    """Episodes and filters about the torque offsets at (episode, theta, offset), so far linearized at a theta."""
     pairs = zip(map(_own_filter, known), at, strict=True)
     made = tuple(own and _settled(predictor, own, *told) for own, told in pairs)
     both = zip(episodes, made, strict=True)

@@ -180,10 +180,7 @@ def initialize_free_effects(problem: EstimationProblem, x: Array) -> Array:
 
 
 def _with_effect_begun(problem: EstimationProblem, x: Array, effect: EffectBase, place: dict[str, int]) -> Array | None:
-    """The start with one effect at the best of its shapes, as far as the linear model tells.
-
-    None where the neutral value is as good a start as any: nothing but the amplitude is free, and it is seen there.
-    """
+    """The start with an effect at its best shape; None where only its amplitude is free, and seen at neutral."""
     amplitudes = [place[name] for name in effect.amplitude_names if name in place]
     shapes = [place[name] for name in effect.shape_names if name in place]
     expected = {place[name]: limits for name, limits in effect.prior_ranges.items() if name in place}

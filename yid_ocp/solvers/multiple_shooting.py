@@ -317,10 +317,7 @@ class _Watch(ca.Callback):
 
 @dataclass(frozen=True)
 class _Linearization:
-    """Whitened residual, its derivative by the unknowns and its change by closing the defects; largest defect.
-
-    `node_slopes` has for every recording the derivatives of its node states by its unknowns and by closing the defects.
-    """
+    """Whitened residual, its slopes by unknowns and by closing the defects, and those of all node states."""
 
     cost: float
     defect: float

@@ -6,10 +6,10 @@ The unknowns are, in this order,
 
 with x = (q, p, z). `rest` is the equilibrium at the first posture (coordinates sought, internal ones, forces of the
 grasps), of which x_0 is a function; it is absent where a start is given. The constraints are the equations of that
-equilibrium and the rows of every `Stage`; the objective has the whitened samples, interpolated between nodes, and the
-priors. What was recorded are parameters. Where noise drives the motion its errors are unknowns too, after
+equilibrium and the rows of every `NlpStage`; the objective has the whitened samples, interpolated between nodes, and
+the priors. What was recorded are parameters. Where noise drives the motion its errors are unknowns too, after
 the states of their recording, with their standard deviations as priors: at the optimum this is the likelihood of
-`problem.noise`, but for what that linearises.
+`inference.whitening`, but for what that linearises.
 """
 
 from __future__ import annotations
@@ -137,10 +137,7 @@ def unknowns_from_program(problem: EstimationProblem, program: NonlinearProgram,
 
 @dataclass(frozen=True)
 class _Places:
-    """Where the unknowns of one recording stand, and the parameters that drive it.
-
-    `errors` are those of the torque of every step, (N, ne), `first` those of the first angles, as `_DrivenStage` wants.
-    """
+    """Places of a recording's unknowns and inputs; `errors` of each step's torque, `first` of the first angles."""
 
     free: IndexArray
     rest: IndexArray
