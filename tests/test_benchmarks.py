@@ -126,13 +126,6 @@ def test_errors_that_nobody_states_must_not_pass_for_findings(coverage, changed)
         assert any(f"{silent} of 40 twins warn" in line for line in lines) is said
 
 
-def test_recipes_decide_what_is_kept(coverage):
-    recipes = [cell.recipe for cell in coverage.CELLS.values()]
-    # how a twin is solved does not change its recording
-    assert coverage.CELLS["steps_5ms"].recipe == coverage.CELLS["no_torque_error"].recipe
-    assert len({coverage.json_sha256(recipe) for recipe in recipes}) == len(recipes) - 1
-
-
 @pytest.mark.slow
 def test_standard_deviations_of_a_few_twins(coverage, tmp_path):
     """Six twins of a cell that holds: all z values together lie within the 99.9 % band of chi-squared."""
@@ -298,19 +291,6 @@ def test_points_are_measured_stored_and_shown(growth, tmp_path, monkeypatch, cap
     with pytest.raises(SystemExit):
         growth.main(["depth"])
     assert "there is no axis 'depth'; choose from variables, horizon" in capsys.readouterr().err
-
-
-def test_workers_that_are_always_busy_and_waste_nothing_are_worth_themselves(growth, monkeypatch):
-    def shared(settings, count, cases):
-        return {"workers": count, "cpu": 10.0 * (1 if count == 1 else 1.25), "occupied": 1.0 / count}, [1.0] * cases
-
-    monkeypatch.setattr(growth, "case", lambda *_: None)
-    monkeypatch.setattr(growth, "shared", shared)
-    found = growth.efficiency([1, 2], 3, True)
-    assert [point["efficiency"] for point in found] == [1.0, pytest.approx(0.8 * 0.5)]
-    monkeypatch.setattr(growth, "shared", lambda settings, count, cases: (shared(settings, count, cases)[0], [count]))
-    with pytest.raises(AssertionError, match="workers change the answers"):
-        growth.efficiency([1, 2], 3, True)
 
 
 # -- kills.py and step_order.py ---------------------------------------------------------------------------------------

@@ -124,7 +124,7 @@ class ArmSettings:
             "encoders correct"
         ),
     ] = "driven"
-    servo: Annotated[ServoSettings, OptionInfo("of the mode servo")] = field(default_factory=ServoSettings)
+    servo: Annotated[ServoSettings, OptionInfo("of the mode servo")] = ServoSettings()
     passive_joints: Annotated[
         tuple[str, ...], OptionInfo("joints among them that nothing drives, whatever the mode")
     ] = ()
@@ -152,7 +152,7 @@ class ModelSettings:
         Mapping[str, ClampSettings],
         OptionInfo("what moves an object without a robot, by name; a cable has its own at both ends"),
     ] = field(default_factory=dict)
-    arms: Annotated[ArmSettings, OptionInfo("the robot's joints")] = field(default_factory=ArmSettings)
+    arms: Annotated[ArmSettings, OptionInfo("the robot's joints")] = ArmSettings()
     frames: Annotated[
         Mapping[str, FrameSettings],
         OptionInfo(
@@ -377,8 +377,8 @@ class TrackSettings:
             "frames of the scene without robot and object, by the same camera in the same place: left out of the others"
         ),
     ] = None
-    virtual_frames: Annotated[VirtualFramesSettings, OptionInfo("what is filmed without frames")] = field(
-        default_factory=VirtualFramesSettings
+    virtual_frames: Annotated[VirtualFramesSettings, OptionInfo("what is filmed without frames")] = (
+        VirtualFramesSettings()
     )
     keep_frames: Annotated[
         bool, OptionInfo("whether a virtual frame sequence's frames are written to the run folder")
@@ -437,34 +437,24 @@ class RunSettings:
     plugins: Annotated[
         tuple[_FilePath, ...], OptionInfo("Python files that register effects or sensors; they are run")
     ] = ()
-    model: Annotated[ModelSettings, OptionInfo("what the world is made of")] = field(default_factory=ModelSettings)
-    recordings: Annotated[RecordingSettings, OptionInfo("the data")] = field(default_factory=RecordingSettings)
-    import_: Annotated[ImportSettings, OptionInfo("how files of other tools become recordings")] = field(
-        default_factory=ImportSettings
-    )
+    model: Annotated[ModelSettings, OptionInfo("what the world is made of")] = ModelSettings()
+    recordings: Annotated[RecordingSettings, OptionInfo("the data")] = RecordingSettings()
+    import_: Annotated[ImportSettings, OptionInfo("how files of other tools become recordings")] = ImportSettings()
     sensors: Annotated[Mapping[str, SensorOptions], OptionInfo("by group of the recordings: points, joints.effort")] = (
         field(default_factory=dict)
     )
     parameters: Annotated[Mapping[str, ParameterSettings], OptionInfo("by name or pattern")] = field(
         default_factory=dict
     )
-    problem: Annotated[ProblemSettings, OptionInfo("what is compared with the recordings and how")] = field(
-        default_factory=ProblemSettings
-    )
+    problem: Annotated[ProblemSettings, OptionInfo("what is compared with the recordings and how")] = ProblemSettings()
     solver: Annotated[Solver, RegistryChoice(SOLVERS, "gauss_newton"), OptionInfo("how the cost is lowered")] = field(
         default_factory=GaussNewton
     )
-    compare: Annotated[CompareSettings, OptionInfo("which methods are compared")] = field(
-        default_factory=CompareSettings
-    )
-    diagnosis: Annotated[DiagnosisSettings, OptionInfo("how a gap is diagnosed")] = field(
-        default_factory=DiagnosisSettings
-    )
-    track: Annotated[TrackSettings, OptionInfo("how a camera's frames are tracked")] = field(
-        default_factory=TrackSettings
-    )
-    plan: Annotated[PlanSettings, OptionInfo("which motion is planned")] = field(default_factory=PlanSettings)
-    output: Annotated[OutputSettings, OptionInfo("where results go")] = field(default_factory=OutputSettings)
+    compare: Annotated[CompareSettings, OptionInfo("which methods are compared")] = CompareSettings()
+    diagnosis: Annotated[DiagnosisSettings, OptionInfo("how a gap is diagnosed")] = DiagnosisSettings()
+    track: Annotated[TrackSettings, OptionInfo("how a camera's frames are tracked")] = TrackSettings()
+    plan: Annotated[PlanSettings, OptionInfo("which motion is planned")] = PlanSettings()
+    output: Annotated[OutputSettings, OptionInfo("where results go")] = OutputSettings()
     name: str = "run"
     config_file: str = field(default="", compare=False)
     key_locations: Mapping[tuple[str | int, ...], str] = field(default_factory=dict, compare=False, repr=False)

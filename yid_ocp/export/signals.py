@@ -27,7 +27,6 @@ _MESSAGE_TYPES: Mapping[_SignalKind, str] = {
     "wrench": "geometry_msgs/msg/WrenchStamped",
 }
 _WORLD_FRAME = "world"
-_AXES = ("x", "y", "z")
 
 
 @dataclass(frozen=True)
@@ -36,8 +35,6 @@ class TopicSignal:
 
     Attributes
     ----------
-    topic : str
-    kind : "joints", "point", "vector" or "wrench"
     t : ndarray, shape (M,)
         [s]
     values : mapping of str to ndarray, shape (M, n)
@@ -45,8 +42,6 @@ class TopicSignal:
         of a wrench. Messages without a number are left out.
     names : sequence of str
         Of the joints.
-    frame : str
-        Coordinate frame of points and vectors.
     """
 
     topic: str
@@ -59,12 +54,6 @@ class TopicSignal:
 
 def export_mcap(signals: Sequence[TopicSignal], path: str | os.PathLike[str]) -> float:
     """Write signals into one MCAP file, with the definitions of their messages, in the order of time.
-
-    Parameters
-    ----------
-    signals : sequence of TopicSignal
-    path : path-like
-        File to write.
 
     Returns
     -------
@@ -120,12 +109,11 @@ def signals_from_recording(recording: Recording) -> list[TopicSignal]:
             }
             for topic, channels in parts.items():
                 values = {name: own[channel] for name, channel in channels.items() if channel in own}
-                if values:
-                    found.append(TopicSignal(topic, "joints", group.t, values, group.names))
-            continue
-        for i, name in enumerate(group.names):
-            topic, place = f"/points/{group.name}/{name}", {"xyz": group.position[:, i]}
-            found.append(TopicSignal(topic, "point", group.t, place, frame=group.frame or _WORLD_FRAME))
+                found += [TopicSignal(topic, "joints", group.t, values, group.names)] if values else []
+        else:
+            for i, name in enumerate(group.names):
+                topic, place = f"/points/{group.name}/{name}", {"xyz": group.position[:, i]}
+                found.append(TopicSignal(topic, "point", group.t, place, frame=group.frame or _WORLD_FRAME))
     return found
 
 
@@ -170,7 +158,7 @@ def export_csv(recording: Recording, folder: str | os.PathLike[str]) -> tuple[Pa
             stem, columns = "joints", [f"{channel}_{name}" for channel in group.channels for name in group.names]
             table = np.column_stack([group.t, *group.channels.values()])
         else:
-            stem, columns = group.name, [f"{name}_{axis}" for name in group.names for axis in _AXES]
+            stem, columns = group.name, [f"{name}_{axis}" for name in group.names for axis in "xyz"]
             table = np.column_stack([group.t, group.position.reshape(len(group.t), -1)])
         written.append(folder / f"{stem}.csv")
         with atomic_write(written[-1]) as temporary, temporary.open("x", encoding="utf-8", newline="") as file:

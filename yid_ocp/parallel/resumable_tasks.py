@@ -115,7 +115,7 @@ def run_tasks(
     progress: TaskProgressCallback | None = None,
     code: str | None = None,
 ) -> list[TaskResult]:
-    """Results of a function for all tasks; those already stored in the folder are not computed again.
+    """Results of a function for all tasks, in their order; those already stored in the folder are not computed again.
 
     A task that raises leaves `HASH.error.json` and a warning, and the others go on; the next run tries it again. An
     interruption leaves the results that are finished. A worker of other sources than these does nothing.
@@ -124,20 +124,13 @@ def run_tasks(
     ----------
     function : callable
         At the top of an importable module; returns what JSON can hold.
-    tasks : sequence of Task
     folder : Path
         Of results; made where absent.
     workers : WorkerConfig or concurrent.futures.Executor
         Processes of this machine stop at once when the run is interrupted, and one that dies takes no task with it but
         the one that killed it. Workers of a scheduler end the task that they are at.
-    progress : callable, optional
     code : str, optional
         Hash of the sources that results depend on, where that is not the whole package; see `version.source_hash`.
-
-    Returns
-    -------
-    list of TaskResult
-        In the order of the tasks.
 
     Raises
     ------
