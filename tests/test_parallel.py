@@ -215,26 +215,23 @@ def test_paths_are_absolute_for_workers_elsewhere(tmp_path, threads, monkeypatch
 # -- what is wrong ----------------------------------------------------------------------------------------------------
 
 
-def test_a_failing_task_is_recorded_and_the_others_go_on(tmp_path, threads, caplog):
-    broken = tmp_path / "broken"
-    found = run_tasks(fragile, tasks_of(5, broken=str(broken)), tmp_path / "results", threads)
+def test_a_failing_task_is_recorded_tried_again_and_the_others_go_on(tmp_path, threads, caplog):
+    broken, folder = tmp_path / "broken", tmp_path / "results"
+    found = run_tasks(fragile, tasks_of(5, broken=str(broken)), folder, threads)
     assert [entry.value for entry in found] == [0, 1, 2, None, 4]
     assert [entry.error for entry in found] == ["", "", "", "ZeroDivisionError: no 3", ""]
     assert [record.getMessage() for record in caplog.records] == ["task 3 failed: ZeroDivisionError: no 3"]
-    (file,) = (tmp_path / "results").glob("*.error.json")
-    assert json.loads(file.read_text())["name"] == "task 3"
-    assert "no 3" in json.loads(file.read_text())["error"]
-
-
-def test_a_failed_task_is_tried_again_and_its_record_goes(tmp_path, threads):
-    broken, folder = tmp_path / "broken", tmp_path / "results"
+    (file,) = folder.glob("*.error.json")
+    kept = json.loads(file.read_text())
+    assert (kept["name"], kept["error"]) == ("task 3", "ZeroDivisionError: no 3")
+    other = tmp_path / "other"
     broken.write_text("")
-    (failed,) = run_tasks(fragile, tasks_of(1, broken=str(broken)), folder, threads)
+    (failed,) = run_tasks(fragile, tasks_of(1, broken=str(broken)), other, threads)
     assert failed.error
     broken.unlink()
-    (done,) = run_tasks(fragile, tasks_of(1, broken=str(broken)), folder, threads)
+    (done,) = run_tasks(fragile, tasks_of(1, broken=str(broken)), other, threads)
     assert (done.value, done.error, done.was_resumed) == (0, "", False)
-    assert [path.name.count(".") for path in folder.iterdir()] == [1]
+    assert [path.name.count(".") for path in other.iterdir()] == [1], "the record of the failure goes"
 
 
 def test_a_result_that_json_cannot_hold_is_a_failure(tmp_path, threads):

@@ -7,7 +7,6 @@ import difflib
 import functools
 import io
 import json
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass
@@ -62,18 +61,13 @@ def load_config(
         No such file, not YAML, an unknown or missing key, a value of the wrong kind or outside its range; it names
         file, line and key, what is allowed and the nearest known key.
     """
-    if path is None:
-        entry = resources.files("yid_ocp.data").joinpath("defaults", default)
-        text, name, origin, base = entry.read_text(encoding="utf-8"), Path(default).stem, "embedded default", Path.cwd()
-        file = str(entry)
-    else:
-        given = Path(path)
-        text, name, origin, base, file = _read(given), given.stem, str(path), given.resolve().parent, str(given)
-    data, places = _parse(text, origin)
+    embedded = Path(str(resources.files("yid_ocp.data").joinpath("defaults", default)))
+    file, origin = (embedded, "embedded default") if path is None else (Path(path), str(path))
+    data, places = _parse(_read(file), origin)
     for override in overrides:
         _override(data, places, override)
-    run = _Reader(places, origin, base).build(RunSettings, data, ())
-    return dataclasses.replace(run, name=name, config_file=file, key_locations=places)
+    run = _Reader(places, origin, Path.cwd() if path is None else file.resolve().parent).build(RunSettings, data, ())
+    return dataclasses.replace(run, name=file.stem, config_file=str(file), key_locations=places)
 
 
 def settable_keys(prefix: str, path: str | Path | None = None) -> list[str]:
@@ -101,9 +95,8 @@ def _read(path: Path) -> str:
         raise ConfigError("there is no such configuration file", where=str(path), hint=hint) from error
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
-        raise ConfigError(
-            f"the configuration cannot be read: {reason}", where=str(path), allowed="a YAML file in UTF-8"
-        ) from error
+        what = f"the configuration cannot be read: {reason}"
+        raise ConfigError(what, where=str(path), allowed="a YAML file in UTF-8") from error
 
 
 def _parse(text: str, origin: str) -> tuple[dict[str, Any], dict[_KeyPath, str]]:
@@ -183,9 +176,8 @@ def _override(data: dict[str, Any], places: dict[_KeyPath, str], text: str) -> N
     key, equals, value_text = text.partition("=")
     origin = f"--set {key.strip()}"
     if not equals or not key.strip():
-        raise ConfigError(
-            f"'{text}' does not set anything", where="--set", allowed="KEY=VALUE, for example problem.time_step=0.005"
-        )
+        example = "KEY=VALUE, for example problem.time_step=0.005"
+        raise ConfigError(f"'{text}' does not set anything", where="--set", allowed=example)
     path, hint = _key_path(RunSettings, key.strip().split("."), origin, data)
     try:
         value = _loaded(value_text, origin) if value_text.strip() else None
@@ -294,9 +286,8 @@ class _Reader:
             raise ConfigError(what, where=self.where(path), allowed="keys: " + ", ".join(keys), hint=hint)
         word = sections.selected_variant(raw)
         if not isinstance(word, str) or word not in sections.classes:
-            raise sections.unknown_variant_error(
-                word, self.where((*path, sections.selector_key) if sections.selector_key in raw else path)
-            )
+            at = (*path, sections.selector_key) if sections.selector_key in raw else path
+            raise sections.unknown_variant_error(word, self.where(at))
         known, kind = sections.variant_options(word), sections.classes[word]
         for name in raw:
             if name not in known:
@@ -306,19 +297,17 @@ class _Reader:
             if name in raw:
                 values[option.field_name] = self.build(option.type_hint, raw[name], (*path, name))
             elif option.default_value is MISSING:
-                raise ConfigError(
-                    f"the key '{name}' is missing", where=self.where(path), allowed=describe_type(option.type_hint)
-                )
+                what = f"the key '{name}' is missing"
+                raise ConfigError(what, where=self.where(path), allowed=describe_type(option.type_hint))
         return kind(**values)
 
     def _leaf(self, hint: Any, raw: Any, path: _KeyPath) -> Any:
         try:
             text = json.dumps(raw)
+            json.loads(text, parse_constant=_refuse_nan)
             value = _adapter(hint).validate_json(text, strict=True)
         except (ValidationError, TypeError, ValueError) as error:
             raise self._wrong(raw, hint, path) from error
-        if "NaN" in text and _has_nan(raw):
-            raise self._wrong(raw, hint, path)
         return _absolute(value, hint, self.base)
 
     def _wrong(self, raw: Any, hint: Any, path: _KeyPath) -> ConfigError:
@@ -348,12 +337,10 @@ def _adapter(hint: Any) -> TypeAdapter[Any]:
     return TypeAdapter(hint)
 
 
-def _has_nan(raw: Any) -> bool:
-    if isinstance(raw, dict):
-        return any(map(_has_nan, raw.values()))
-    if isinstance(raw, list):
-        return any(map(_has_nan, raw))
-    return isinstance(raw, float) and math.isnan(raw)
+def _refuse_nan(word: str) -> float:
+    if word == "NaN":
+        raise ValueError("not a number")
+    return float(word)
 
 
 def _absolute(value: Any, hint: Any, base: Path) -> Any:
