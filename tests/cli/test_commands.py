@@ -39,18 +39,18 @@ def test_help_imports_nothing_but_the_standard_library(arguments):
     done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.rstrip().endswith("BEYOND ['yid_ocp']")
+    module = subprocess.run([sys.executable, "-m", "yid_ocp", *arguments], capture_output=True, text=True, check=False)
+    assert (module.returncode, module.stdout) == (0, done.stdout.partition("BEYOND")[0])
 
 
-def test_as_a_module():
-    done = subprocess.run([sys.executable, "-m", "yid_ocp", "--version"], capture_output=True, text=True, check=False)
-    assert done.returncode == 0
-    assert done.stdout.startswith("yid-ocp ")
-
-
-def test_every_command_is_a_file_of_workflow(repository):
+def test_every_command_is_a_file_of_workflow_and_prints_json(repository):
     for row in COMMANDS:
         source = (repository / "yid_ocp" / "workflow" / f"{row.workflow_module}.py").read_text()
         assert "\ndef run(arguments: argparse.Namespace) -> int:\n" in source
+        if row.name not in ("schema", "completion"):
+            made = argparse.ArgumentParser()
+            row.add_arguments(made)
+            assert {"--json", "--quiet"} <= set(made._option_string_actions), row.name
     assert len({row.name for row in COMMANDS}) == len(COMMANDS)
 
 
@@ -220,14 +220,6 @@ def test_a_wrong_command_line_is_told_like_all_that_is_wrong(cli, arguments, wor
     assert (done.code, done.out) == (2, "")
     for word in words:
         assert word in done.err
-
-
-def test_every_command_that_works_prints_json():
-    for row in COMMANDS:
-        if row.name not in ("schema", "completion"):
-            made = argparse.ArgumentParser()
-            row.add_arguments(made)
-            assert {"--json", "--quiet"} <= set(made._option_string_actions), row.name
 
 
 def test_check(cli, pendulum, tmp_path):

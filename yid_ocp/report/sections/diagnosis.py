@@ -121,7 +121,7 @@ def _where(finding: DiagnosisResult) -> _Chapter | None:
     if smoothed is None:
         return None
     noticed, silent = (
-        ", ".join(place.location for place in finding.gap_locations if place.is_observable is seen)
+        ", ".join(place.location for place in finding.gap_locations if place.is_observable == seen)
         for seen in (True, False)
     )
     sentences = [
