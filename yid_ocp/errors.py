@@ -56,8 +56,7 @@ class ResourceError(YidError):
     """The machine has too little memory."""
 
 
-_MAX_LISTED_NAMES, _N_NEAREST_NAMES = 40, 8
-"""Largest number of names listed in full where none is similar, and number of names listed otherwise."""
+_MAX_LISTED_NAMES, _N_NEAREST_NAMES = 40, 8  # names listed in full where none is similar, and listed otherwise
 
 
 class UnknownNameDetails(TypedDict):

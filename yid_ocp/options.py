@@ -35,11 +35,7 @@ _TYPE_WORDS = {float: "a number", int: "a whole number", bool: "true or false", 
 
 @dataclass(frozen=True)
 class OptionInfo:
-    """Annotation of an option: its meaning and SI unit, empty for text and pure numbers.
-
-    `is_path` tells that the text names a file, relative to the configuration; `package:NAME` and `default:NAME` are
-    kept.
-    """
+    """Annotation of an option: its meaning and SI unit; `is_path` for files, relative to the configuration."""
 
     description: str = ""
     unit: str = ""
@@ -71,15 +67,13 @@ class Option:
 def dataclass_options(kind: type) -> Mapping[str, Option]:
     """Options of a dataclass by key, which is the field's name without a trailing `_`."""
     hints = get_type_hints(kind, include_extras=True)
-    return {
-        entry.name.removesuffix("_"): Option(
-            hints[entry.name],
-            entry.default if entry.default_factory is MISSING else entry.default_factory(),
-            entry.name,
-        )
-        for entry in dataclasses.fields(kind)
-        if any(isinstance(marker, OptionInfo) for marker in split_annotated(hints[entry.name])[1])
-    }
+    found = {}
+    for entry in dataclasses.fields(kind):
+        hint = hints[entry.name]
+        if any(isinstance(marker, OptionInfo) for marker in split_annotated(hint)[1]):
+            default = entry.default if entry.default_factory is MISSING else entry.default_factory()
+            found[entry.name.removesuffix("_")] = Option(hint, default, entry.name)
+    return found
 
 
 def split_annotated(hint: Any) -> tuple[Any, list[Any]]:

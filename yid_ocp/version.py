@@ -10,8 +10,7 @@ from importlib import metadata
 from pathlib import Path
 
 _SOURCE_SUFFIXES = (".py", ".c")
-_NUMERICAL_PACKAGES = ("casadi", "numpy", "scipy", "h5py")
-"""Packages whose versions are stored with every result."""
+_NUMERICAL_PACKAGES = ("casadi", "numpy", "scipy", "h5py")  # whose versions are stored with every result
 
 
 def package_version() -> str:
@@ -49,12 +48,9 @@ def software_fingerprint() -> dict[str, str]:
 
 def fingerprint_differences(here: Mapping[str, str], there: Mapping[str, str]) -> list[str]:
     """Descriptions of the entries in which two fingerprints differ."""
-
-    def shown(name: str, value: str) -> str:
-        return value[:12] if name == "code" else value
-
+    length = {"code": 12}
     return [
-        f"{name} {shown(name, there.get(name, 'unknown'))} instead of {shown(name, value)}"
+        f"{name} {there.get(name, 'unknown')[: length.get(name)]} instead of {value[: length.get(name)]}"
         for name, value in here.items()
         if there.get(name) != value
     ]
