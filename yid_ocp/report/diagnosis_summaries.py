@@ -342,11 +342,9 @@ def _history_sentences(result: Mapping[str, Any]) -> list[str]:
         )
     for name in drifted:
         entry = result["parameters"][name]
-        first, *_, last = (own["value"] for own in entry["values"].values())
-        text.append(
-            f"{name} is not the same in all runs: {first:.4g} in the first, {last:.4g} {entry['unit']} in the last "
-            f"(p {_relation(entry['p_value'])})."
-        )
+        values = [own["value"] for own in entry["values"].values()]
+        ends = f"{values[0]:.4g} in the first, {values[-1]:.4g} {entry['unit']} in the last"
+        text.append(f"{name} is not the same in all runs: {ends} (p {_relation(entry['p_value'])}).")
     if wrong:
         text.append(f"Distrust {' and '.join(wrong)}: without it the others agree, or agree far better.")
     elif drifted and len(runs) == 2:
