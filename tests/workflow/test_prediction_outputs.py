@@ -23,7 +23,7 @@ from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.synthetic_recording import recording_from_prediction
 from yid_ocp.report.summaries import _noise_words
-from yid_ocp.report.tables import torque_offset_rows
+from yid_ocp.report.terminal import torque_offset_rows
 from yid_ocp.solvers import GaussNewton, solve
 from yid_ocp.workflow.build_problem import load_problem
 from yid_ocp.workflow.check import _input_noise

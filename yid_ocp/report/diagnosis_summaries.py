@@ -11,20 +11,18 @@ from pathlib import Path
 from typing import Any
 
 from yid_ocp.inference.uncertainty import VERDICT_WORDS, parameter_text
-from yid_ocp.report.tables import (
-    format_error_and_unit,
-    issue_blocks,
-    p_value_text,
-    torque_offset_rows,
-)
 from yid_ocp.report.terminal import (
     CodeBlock,
     SummaryBlock,
     SummaryStatement,
     SummaryTable,
     TableRows,
+    format_error_and_unit,
+    issue_blocks,
     make_statements,
     nonempty_tables,
+    p_value_text,
+    torque_offset_rows,
 )
 
 _MIN_GAP_SHARE, _MAX_WINDOWS = 0.005, 6  # of places that are listed

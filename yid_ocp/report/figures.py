@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.report.tables import display_scale_and_unit
+from yid_ocp.report.terminal import display_scale_and_unit
 
 if TYPE_CHECKING:
     import plotly.graph_objects
 
 Array = NDArray[np.float64]
 
+# on a dark page each becomes what templates/dark.json says; figures use no other colors
 TEXT_COLOR, GRID_COLOR, BACKGROUND_COLOR = "#22303c", "#d9dee3", "#ffffff"
 LINE_COLORS = ("#0b6e99", "#c2571a", "#5b8c2a", "#8a4f9e")
 _LINE_DASHES = ("solid", "dash", "dot", "dashdot")
@@ -28,23 +29,6 @@ DIVERGING_COLORSCALE = (
     (1.0, "#b2182b"),
 )
 SEQUENTIAL_COLORSCALE = ((0.0, BACKGROUND_COLOR), (0.5, "#b9d9e6"), (0.9, "#0b6e99"), (1.0, "#06405a"))
-DARK_MODE_COLORS: Mapping[str, str] = {
-    TEXT_COLOR: "#e3e9ee",
-    GRID_COLOR: "#3b4650",
-    BACKGROUND_COLOR: "#151b20",
-    LINE_COLORS[0]: "#4fb3dc",
-    LINE_COLORS[1]: "#f2955a",
-    LINE_COLORS[2]: "#9acb62",
-    LINE_COLORS[3]: "#cba0dc",
-    MEASURED_COLOR: "#98a5b0",
-    "#2166ac": "#6fb2f2",
-    "#92c5de": "#37627f",
-    "#f4a582": "#86493a",
-    "#b2182b": "#f3737d",
-    "#b9d9e6": "#1f4a5e",
-    "#06405a": "#a9e0f6",
-}
-"""What every color becomes on a dark page; figures use no other colors."""
 _MAX_CURVE_POINTS = 1200  # points of a curve; beyond this the page grows and the eye sees no more
 _MAX_SINGLE_PRECISION_TIME = 1e4  # times from which single precision loses milliseconds [s]
 _ROW_HEIGHT, _LOW_ROW_HEIGHT, _ROW_GAP = 130, 76, 30  # in a figure of rows [px]

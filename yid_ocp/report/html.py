@@ -12,7 +12,7 @@ from pathlib import Path
 
 from yid_ocp.files import write_text
 from yid_ocp.inference.uncertainty import VERDICT_WORDS
-from yid_ocp.report.figures import DARK_MODE_COLORS, figure_html
+from yid_ocp.report.figures import figure_html
 from yid_ocp.report.sections import REPORT_SECTIONS, ReportData, render_sections
 from yid_ocp.report.terminal import CodeBlock, SummaryTable
 
@@ -57,7 +57,7 @@ def write_report(path: Path, findings: ReportData) -> bool:
     environment.tests["command"] = lambda block: isinstance(block, CodeBlock)
     sections, shared = render_sections(findings, environment), _shared_script(path)
     packed = "" if shared else _packed_script()
-    known = {"findings": findings, "sections": sections, "dark": DARK_MODE_COLORS, "shared": shared, "packed": packed}
+    known = {"findings": findings, "sections": sections, "shared": shared, "packed": packed}
     write_text(path, environment.get_template("page.html").render(known))
     return True
 

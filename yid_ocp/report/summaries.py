@@ -8,25 +8,23 @@ from typing import Any
 
 from yid_ocp.inference.uncertainty import VERDICT_WORDS, fit_message, interval_text, parameter_text, percent_text
 from yid_ocp.report.diagnosis_summaries import batch_summary, blind_summary, diagnose_summary, history_summary
-from yid_ocp.report.tables import (
+from yid_ocp.report.terminal import (
     MAX_SINGLE_CHANNELS,
+    CodeBlock,
+    SummaryBlock,
+    SummaryStatement,
+    SummaryTable,
+    TableRows,
     bounds_text,
     channel_unit,
     discretisation_sentences,
     display_scale_and_unit,
     format_error_and_unit,
     issue_blocks,
-    misfit_blocks,
-    torque_offset_rows,
-)
-from yid_ocp.report.terminal import (
-    CodeBlock,
-    SummaryBlock,
-    SummaryStatement,
-    SummaryTable,
-    TableRows,
     make_statements,
+    misfit_blocks,
     nonempty_tables,
+    torque_offset_rows,
 )
 
 _BASELINE_DESCRIPTIONS = {

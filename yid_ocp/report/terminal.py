@@ -1,4 +1,4 @@
-"""Summary blocks (statements, tables, code) and their lines on a terminal."""
+"""Summary blocks (statements, tables, code), parts that several summaries share, and their lines on a terminal."""
 
 from __future__ import annotations
 
@@ -6,13 +6,18 @@ import math
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 from yid_ocp.data import Recording
+from yid_ocp.data.issues import ISSUE_CAUSES
 from yid_ocp.data.readers import FileContents
+from yid_ocp.inference.uncertainty import fit_message
 
 TableRows = list[Sequence[str]]
 _StatementKind = Literal["note", "verdict", "conclusion"]
+_MAX_ISSUES_PER_CAUSE = 3
+_MAX_OFFSET_RECORDINGS = 4  # recordings side by side
+MAX_SINGLE_CHANNELS = 4  # a group of more points is shown as a whole; result.json has every point
 _PROSE_WIDTH, _NOTE_WIDTH, _MAX_UNWRAPPED_NOTE = 100, 118, 200
 """Widths to which sentences and notes are wrapped, and characters of a note that is left in one line."""
 
@@ -70,6 +75,99 @@ def make_statements(texts: Iterable[str], kind: _StatementKind = "note") -> list
 def nonempty_tables(*tables: SummaryTable) -> list[SummaryBlock]:
     """The tables that have at least one row below the header."""
     return [table for table in tables if len(table.rows) > 1]
+
+
+# -- shared by several summaries ---------------------------------------------------------------------------------------
+
+
+def display_scale_and_unit(unit: str) -> tuple[float, str]:
+    """Scale factor and unit for display: metres become millimetres, other units stay."""
+    return (1e3, "mm") if unit == "m" else (1.0, unit)
+
+
+def format_error_and_unit(value: float | None, unit: str) -> tuple[str, str]:
+    """Formatted value and display unit of an error; a dash for None."""
+    factor, shown = display_scale_and_unit(unit)
+    return ("–" if value is None else f"{factor * value:.3g}"), shown
+
+
+def p_value_text(p_value: float) -> str:
+    """A p-value, as a bound where it vanishes."""
+    return f"{p_value:.2g}" if p_value > 1e-12 else "< 1e-12"
+
+
+def channel_unit(units: Mapping[str, str], channel: str) -> str:
+    """Unit of a channel, or of the first member of a group; empty where it is not known."""
+    return next((unit for name, unit in units.items() if name == channel or name.startswith(f"{channel}.")), "")
+
+
+def issue_blocks(result: Mapping[str, Any]) -> list[SummaryBlock]:
+    """Summary blocks on issues of the recordings: a table and advice; empty without issues."""
+    doubts = result.get("doubts", ())
+    rows: TableRows = [("in doubt", "where", "how sure", "times its limit")]
+    advice: list[SummaryBlock] = []
+    for cause in dict.fromkeys(entry["cause"] for entry in doubts):
+        alike, words = [entry for entry in doubts if entry["cause"] == cause], ISSUE_CAUSES[cause]
+        more = [""] * (_MAX_ISSUES_PER_CAUSE - 1) + [f" and {len(alike) - _MAX_ISSUES_PER_CAUSE} more"]
+        shown = alike[:_MAX_ISSUES_PER_CAUSE]
+        for entry, others in zip(shown, more if len(alike) > len(shown) else [""] * len(shown), strict=True):
+            rows.append((words, entry["where"] + others, entry["sure"], f"{entry['evidence']:.3g}"))
+            advice.append(SummaryStatement(f"{words}: {entry['what']}; {entry['advice']}"))
+            advice += [CodeBlock(entry["setting"])] if entry["setting"] else []
+    if any(entry["weight"] != "warning" for entry in doubts):
+        text = "no number is said to be found while a recording of the run is in doubt"
+        advice.append(SummaryStatement(text, "verdict"))
+    return [*nonempty_tables(SummaryTable(rows, "In doubt")), *advice]
+
+
+def misfit_blocks(fit: Mapping[str, Any]) -> list[SummaryBlock]:
+    """What is said before anything else: a guess does better, or the model does not explain the recordings."""
+    worse, said = fit.get("worse_than_guess", ()), []
+    for entry in worse[:MAX_SINGLE_CHANNELS]:
+        own, other = (" ".join(format_error_and_unit(entry[key], entry["unit"])).rstrip() for key in ("rmse", "guess"))
+        where = f"{entry['channel']} of {entry['recording']}"
+        said.append(f"worse than a guess without a model: {where}, {own} against {other} ({entry['baseline']})")
+    if len(worse) > MAX_SINGLE_CHANNELS:
+        said.append(f"and so for {len(worse) - MAX_SINGLE_CHANNELS} more channels, in result.json")
+    return make_statements([*said, "" if fit["explains"] else fit_message(fit["chi2_per_dof"], False)], "conclusion")
+
+
+def discretisation_sentences(result: Mapping[str, Any]) -> list[str]:
+    """One sentence per refinement on the estimates that it shifts by more than their standard deviation."""
+    said = []
+    for key, words in (("links", "twice the links"), ("time_step", "half the time step")):
+        tried = {name: own for name, own in result.get("discretisation", {}).items() if own[key] is not None}
+        moved = {n: own for n, own in tried.items() if own["std"] is not None and abs(own[key]) > own["std"]}
+        changes = [f"{name} by {own[key]:+.2g} (± {own['std']:.2g} from the data)" for name, own in moved.items()]
+        if moved:
+            said.append(f"with {words} these move by more than the data's standard deviation: {', '.join(changes)}")
+        elif tried:
+            said.append(f"with {words} no estimate moves by more than its standard deviation")
+    return said
+
+
+def torque_offset_rows(result: Mapping[str, Any]) -> TableRows:
+    """Table rows of the torque offsets of a result, one per joint; only the header without offsets."""
+    offsets: Mapping[str, Mapping[str, Any]] = result.get("torque_offsets", {})
+    shown = dict(list(offsets.items())[:_MAX_OFFSET_RECORDINGS])
+    rows: TableRows = [("torque offset [N m]", *shown, "expected")]
+    for joint in dict.fromkeys(joint for entry in shown.values() for joint in entry):
+        own = [entry.get(joint) for entry in shown.values()]
+        cells = ["" if known is None else f"{known['value']:.2f} ± {known['std']:.2f}" for known in own]
+        priors = dict.fromkeys(f"± {known['prior_std']:.2g}" for known in own if known is not None)
+        rows.append((joint, *cells, ", ".join(priors)))
+    left = len(offsets) - len(shown)
+    rows += [(f"{left} more recordings are in result.json", *("" for _ in shown), "")] if left else []
+    return rows
+
+
+def bounds_text(entry: Mapping[str, Any], digits: int) -> str:
+    """Bounds of a parameter, `-inf` and `inf` where it has none."""
+    ends = ((entry["lower"], "-inf"), (entry["upper"], "inf"))
+    return " to ".join(free if end is None else f"{end:.{digits}g}" for end, free in ends)
+
+
+# -- on a terminal -----------------------------------------------------------------------------------------------------
 
 
 def terminal_lines(blocks: Sequence[SummaryBlock]) -> list[str]:

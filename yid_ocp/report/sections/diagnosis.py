@@ -20,7 +20,7 @@ from yid_ocp.report import categorical_charts, figures
 from yid_ocp.report.categorical_charts import BeforeAfter, RankedCandidate, TimeMapRow
 from yid_ocp.report.figures import TimePlot
 from yid_ocp.report.sections import ReportData, register_section
-from yid_ocp.report.tables import display_scale_and_unit, format_error_and_unit
+from yid_ocp.report.terminal import display_scale_and_unit, format_error_and_unit
 
 _MAX_CANDIDATES = 15  # candidates; the rest is in result.json
 _MAX_MAPS = 3  # recordings of which a map is drawn; trajectories.h5 has them all
