@@ -27,6 +27,7 @@ from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
+from yid_ocp.problem.model_functions import NodeValues
 
 STD = 2e-3
 STEPS = 60
@@ -151,7 +152,7 @@ def swinging(request, urdf_folder):
 def rolled_out(problem, rest, theta, kick=None):
     """Whitened readings along a rollout from the rest under the filter's first gain, shape (sensor, node, output)."""
     step, episode = problem.step, problem.episodes[0]
-    system, n = step.system, step.sizes["n"]
+    system = step.system
     torque = np.tile(rest.holding_torque, (STEPS + 1, 1))
     if kick is not None:
         torque[0] += kick
@@ -168,11 +169,10 @@ def rolled_out(problem, rest, theta, kick=None):
     found = []
     for samples in episode.measurements:
         std = np.nanmedian(samples.std, axis=0)
-        effort = np.zeros((STEPS + 1, n))
+        effort = np.zeros((STEPS + 1, step.sizes["n"]))
         effort[:, list(system.prescribed_indices)] = rollout.effort
-        function = problem.model_functions.compiled_sensor(samples.sensor, ())
-        state = rollout.state[:-1]
-        found.append(function(state[:, :n], state[:, 2 * n :], effort, theta)[0][:, :, 0] / std)
+        values = NodeValues.along_trajectory(step, rollout.state[:-1], effort)
+        found.append(problem.model_functions.compiled_sensor(samples.sensor)(values, theta).output / std)
     return found
 
 

@@ -324,8 +324,10 @@ def read(system: System, effects, sensor, q=None, effort=None) -> np.ndarray:
     n = whole.n_coordinates
     at = (
         np.zeros(n) if q is None else q,
+        np.zeros(n),
         np.zeros(len(whole.internal_coordinates)),
         np.zeros(n) if effort is None else effort,
+        np.zeros(whole.n_constraints),
     )
     return np.array(function(*at, whole.parameters.vector())[0]).ravel()
 

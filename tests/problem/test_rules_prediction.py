@@ -206,7 +206,7 @@ def test_a_problem_is_as_recorded_unless_an_effect_may_change_it(urdf_folder):
 def test_efforts_along_a_rollout_are_those_of_driven_and_prescribed_joints(urdf_folder):
     problem = problem_of(urdf_folder, "driven and prescribed", seeds=(1,))
     rollout = problem.evaluate(problem.initial_unknowns, False).episode_predictions[0].rollout
-    effort = problem.predictor.joint_efforts(rollout)
+    effort = problem.predictor.node_values(rollout).load
     assert effort.shape == (STEPS + 1, 2)
     np.testing.assert_array_equal(effort[:-1, 0], rollout.effort[:, 0])
     np.testing.assert_array_equal(effort[:-1, 1], rollout.torque[:, 0])

@@ -39,8 +39,8 @@ def read() -> Read:
     ) -> np.ndarray:
         n = system.n_coordinates
         function = sensor_function(system, sensor, ())
-        state = (np.zeros(n) if q is None else q, np.zeros(len(system.internal_coordinates)))
-        loads = np.zeros(n) if effort is None else effort
-        return np.array(ca.densify(function(*state, loads, system.parameters.vector())[0])).ravel()
+        at = (np.zeros(n) if q is None else q, np.zeros(n), np.zeros(len(system.internal_coordinates)))
+        loads = (np.zeros(n) if effort is None else effort, np.zeros(system.n_constraints))
+        return np.array(ca.densify(function(*at, *loads, system.parameters.vector())[0])).ravel()
 
     return outputs

@@ -1,16 +1,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import casadi as ca
 import numpy as np
 import pytest
+from held_rod import held_rod
+from small_problems import H, measured
 
+from yid_ocp.data import JointGroup, PointGroup, Recording
 from yid_ocp.effects import make_effect
+from yid_ocp.errors import SolverError
+from yid_ocp.integrator.step import compile_step
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.system import MidpointState, NodeState, StepTerms, System
-from yid_ocp.sensors import EffortSensor, PointSensor, Sensor, sensor_function
+from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.sensors import Channel, EffortSensor, PointSensor, Sensor, sensor_function
+from yid_ocp.solvers.symbolic_transcription import transcribe
 
 LABEL = "drift@left"
 
@@ -34,7 +41,7 @@ class Drift:
 
     def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
         memory = self.internal_coordinates[f"{LABEL}.memory"]
-        return output + self.parameters[f"{LABEL}.gain"].symbol * (memory**2 + ca.sin(state.effort[0]))
+        return output + self.parameters[f"{LABEL}.gain"].symbol * (memory**2 + ca.sin(state.load[0]))
 
 
 CAMERA = PointSensor("points_camera", ("w_T1", "w_T2"), ("w_T1", "w_T2"), tuple(map(tuple, np.eye(4))))
@@ -53,15 +60,9 @@ def whole(system: System) -> System:
 def test_outputs_have_a_row_for_every_reading(whole: System, sensor: Sensor) -> None:
     function = sensor_function(whole, sensor, NAMES)
     rows = sensor.outputs_per_channel * len(sensor.channel_names)
-    shapes = [function.size_out(i) for i in range(5)]
-    assert shapes == [
-        (rows, 1),
-        (rows, whole.n_coordinates),
-        (rows, 1),
-        (rows, whole.n_coordinates),
-        (rows, len(NAMES)),
-    ]
-    assert sensor_function(whole, sensor, ()).size_out(4) == (rows, 0)
+    n = whole.n_coordinates
+    assert [function.size_out(i) for i in range(7)] == [(rows, size) for size in (1, n, 0, 1, n, 0, len(NAMES))]
+    assert sensor_function(whole, sensor, ()).size_out(6) == (rows, 0)
 
 
 @pytest.mark.parametrize("sensor", [CAMERA, EFFORT], ids=["points", "effort"])
@@ -70,19 +71,21 @@ def test_derivatives_agree_with_differences(whole: System, sensor: Sensor) -> No
     function = sensor_function(whole, sensor, NAMES)
     at = [
         rng.uniform(-0.6, 0.6, whole.n_coordinates),
+        np.zeros(whole.n_coordinates),
         np.array([0.4]),
         rng.uniform(-1, 1, whole.n_coordinates),
+        np.zeros(0),
         whole.parameters.vector(),
     ]
     exact = [np.array(ca.densify(value)) for value in function(*at)[1:]]
-    columns = [
-        range(whole.n_coordinates),
-        range(1),
-        range(whole.n_coordinates),
-        [whole.parameters.index(name) for name in NAMES],
-    ]
+    columns = {
+        0: range(whole.n_coordinates),
+        2: range(1),
+        3: range(whole.n_coordinates),
+        5: [whole.parameters.index(name) for name in NAMES],
+    }
     step = 1e-6
-    for which, indices in enumerate(columns):
+    for which, indices in columns.items():
         differences = []
         for index in indices:
             above, below = ([x.copy() for x in at] for _ in range(2))
@@ -91,7 +94,7 @@ def test_derivatives_agree_with_differences(whole: System, sensor: Sensor) -> No
             ahead, behind = (np.array(function(*x)[0]).ravel() for x in (above, below))
             differences.append((ahead - behind) / (2 * step))
         np.testing.assert_allclose(exact[which], np.transpose(differences), rtol=1e-7, atol=1e-8)
-    assert np.abs(exact[1]).max() > 0.01, "the memory of an effect is seen"
+    assert np.abs(exact[2]).max() > 0.01, "the memory of an effect is seen"
 
 
 def test_effects_act_one_after_the_other_on_every_channel(whole: System) -> None:
@@ -101,6 +104,53 @@ def test_effects_act_one_after_the_other_on_every_channel(whole: System) -> None
     effort[a], effort[b] = 2.0, 3.0
     assert a == 0
     function = sensor_function(whole, EFFORT, ())
-    read = np.array(function(np.zeros(whole.n_coordinates), [0.5], effort, whole.parameters.vector())[0]).ravel()
+    still = np.zeros(whole.n_coordinates)
+    read = np.array(function(still, still, [0.5], effort, [], whole.parameters.vector())[0]).ravel()
     drift = 0.2 * (0.25 + np.sin(2.0))
     assert read == pytest.approx([2.0 + drift, 0.8 * 3.0 + drift])
+
+
+@dataclass(frozen=True)
+class Hand(Sensor):
+    """How fast the elbow turns and what holds the hand: what a node has beside its coordinates."""
+
+    channel = Channel("hand", "touch", "1")
+    group_name: str = "hand.touch"
+    frame_names = point_names = ()
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        return tuple(f"hand.touch.{name}" for name in ("speed", "force"))
+
+    def ideal_reading(self, state: NodeState) -> ca.SX:
+        return ca.vertcat(state.v[1] * ca.cos(state.q[0]), state.lam[0])
+
+
+def test_velocities_and_constraint_forces_are_read_along_a_rollout(urdf_folder):
+    names = ("T1.bend", "shoulder.damping", "clock_scale@clock.scale")
+    held = held_rod(urdf_folder, driven=("shoulder",), damping=0.3)
+    held = held.with_effects([make_effect("clock_scale", "clock", held)])
+    step = compile_step(held, H, use_compiler=False)
+    t = H * np.arange(41)
+    joints = JointGroup(("shoulder", "elbow"), t, np.zeros((41, 2)), effort=np.sin(4 * t)[:, None] * [1.0, 0.0])
+    options = ProblemOptions(feedback="none", weighting="paper")
+    tip = PointGroup("points", ("tip",), t, np.zeros((41, 1, 3)), 1.0)
+    problem = EstimationProblem(step, [Recording(joints, (tip,), name="held")], names, options)
+    samples = measured(Hand(), [3, 7, 20, 39], [0.0, 0.5, 0.0, 1.0], np.zeros((4, 2)), span=(0, 40))
+    problem = problem.with_episodes([replace(problem.episodes[0], measurements=(samples,))], [])
+    x = problem.initial_unknowns
+    evaluation = problem.evaluate(x)
+    [prediction] = evaluation.episode_predictions
+    rollout, scale = prediction.rollout, problem.theta[held.parameters.index(names[2])]
+    speed = np.gradient(rollout.state[:, 1], H) * np.cos(rollout.state[:, 0]) / scale
+    force = np.append(rollout.multipliers[:, 0], rollout.multipliers[-1, 0]) / H / scale
+    expected = np.stack([np.interp([3, 7.5, 20, 40], np.arange(41), series) for series in (speed, force)], axis=1)
+    np.testing.assert_allclose(prediction.predicted_outputs[0], expected, rtol=1e-9, atol=1e-12)
+    rows, gradient = problem.residual_rows.data, problem.cost_and_gradient(x)[1]
+    np.testing.assert_allclose(gradient, evaluation.jacobian.T @ evaluation.residual, rtol=1e-6)
+    for i, size in enumerate(1e-5 * np.abs(x)):
+        ends = [problem.evaluate(x + sign * size * np.eye(3)[i]).residual[rows] for sign in (1, -1)]
+        numeric, exact = (ends[0] - ends[1]) / (2 * size), evaluation.jacobian[rows, i]
+        np.testing.assert_allclose(exact, numeric, atol=1e-5 * np.abs(numeric).max())
+    with pytest.raises(SolverError, match="depends on velocities or constraint forces"):
+        transcribe(problem)

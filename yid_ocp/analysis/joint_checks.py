@@ -20,8 +20,9 @@ from yid_ocp.model.mechanism import Joint
 from yid_ocp.model.system import System
 from yid_ocp.parallel import LockedCache
 from yid_ocp.problem.signal_filters import LowPassFilter
-from yid_ocp.sensors.base import SensorUsage
-from yid_ocp.sensors.joints import EFFORT_GROUP, POSITION_GROUP, values_by_joint
+from yid_ocp.sensors import SensorOptions
+from yid_ocp.sensors.base import values_by_joint
+from yid_ocp.sensors.joints import EFFORT_GROUP, POSITION_GROUP
 
 Array = NDArray[np.float64]
 
@@ -223,7 +224,7 @@ def effect_setting_line(kind: str, location: str, quantity: str, value: float) -
 # -- excitation --------------------------------------------------------------------------------------------------------
 
 
-def check_dynamic_excitation(arm: RecordedJointsModel, recording: Recording, effort: SensorUsage) -> Iterator[Issue]:
+def check_dynamic_excitation(arm: RecordedJointsModel, recording: Recording, effort: SensorOptions) -> Iterator[Issue]:
     """Issue where efforts due to speed and acceleration do not exceed the noise of measured efforts.
 
     Weight and stiffness can be found from static configurations; damping, friction and inertia only from these efforts,
@@ -259,7 +260,7 @@ def check_dynamic_excitation(arm: RecordedJointsModel, recording: Recording, eff
         yield Issue("weak_excitation", words, "warning", depth, advice, recording.name, "joints", "position")
 
 
-def _noise(joints: JointGroup, names: Sequence[str], effort: SensorUsage) -> Array:
+def _noise(joints: JointGroup, names: Sequence[str], effort: SensorOptions) -> Array:
     """White noise of efforts, as stated, else as seen, shape (k,) [N m]."""
     given = effort.std if effort.std is not None else joints.effort_std
     if given is not None:
@@ -269,7 +270,7 @@ def _noise(joints: JointGroup, names: Sequence[str], effort: SensorUsage) -> Arr
 
 
 def check_joint_excitation(
-    recordings: Sequence[Recording], asked: Mapping[str, Sequence[str]], position: SensorUsage
+    recordings: Sequence[Recording], asked: Mapping[str, Sequence[str]], position: SensorOptions
 ) -> Iterator[Issue]:
     """Issues of joints that have free parameters but hardly move in any recording.
 

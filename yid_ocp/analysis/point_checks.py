@@ -24,10 +24,10 @@ from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.system import System
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
-from yid_ocp.sensors.base import SensorUsage
+from yid_ocp.sensors import SensorOptions
 
 Array = NDArray[np.float64]
-_SensorChoices = Callable[[str], SensorUsage]
+_SensorChoices = Callable[[str], SensorOptions]
 
 _HELD_POINT_TOLERANCE = 0.01
 """How far a point may be from where the arm holds it: what calibration and a tool's measures leave [m]."""
@@ -56,7 +56,7 @@ class _Change:
 # -- points that the arm holds ----------------------------------------------------------------------------------------
 
 
-def _held_point_frames(system: System, group: PointGroup, choice: SensorUsage) -> dict[str, str]:
+def _held_point_frames(system: System, group: PointGroup, choice: SensorOptions) -> dict[str, str]:
     """Model frame that each point of a group marks; for a grasped point, the frame of the arm that holds it."""
     holders = {grasp.held_frame: grasp.holder_frame for grasp in system.grasps}
     wanted = group.names if choice.points is None else choice.points

@@ -247,7 +247,7 @@ def nlp_stage_sparsity(
     measured[np.arange(f), np.arange(f)] = True  # priors
     for sensor in sensors:
         function = sensor_function(system, sensor, tuple(free))
-        by_q, by_z, by_theta = (_mask(function.sparsity_out(i)) for i in (1, 2, 4))
+        by_q, by_z, by_theta = (_mask(function.sparsity_out(i)) for i in (1, 3, 6))
         reading = np.hstack([by_theta, by_q, np.zeros((len(by_q), n), bool), by_z])
         measured |= _times(reading.T, reading)
     row_spans, row_labels = _spans(symbols, [("del", kept), ("internal", None), ("constraint", None), ("p1", None)])

@@ -279,7 +279,6 @@ def _summarize_rows(names: Sequence[str]) -> str:
 
 def _readings(step: Step, episode: Episode, state: Array, theta: Array) -> list[_Readings]:
     system, n = step.system, step.system.n_coordinates
-    effort = np.zeros(n)
     found = []
     for samples in episode.measurements:
         used = np.any(samples.is_used, axis=0)
@@ -288,9 +287,8 @@ def _readings(step: Step, episode: Episode, state: Array, theta: Array) -> list[
             continue
         std = np.array([np.nanmedian(known[:, k]) if u else np.inf for k, u in enumerate(used)])
         function = sensor_function(system, samples.sensor, system.parameters.names)
-        _, by_q, by_z, by_effort, by_theta = (
-            np.array(x.full()) / std[:, None] for x in function.call([state[:n], state[2 * n :], effort, theta])
-        )
+        at = [state[:n], np.zeros(n), state[2 * n :], np.zeros(n), np.zeros(system.n_constraints), theta]
+        _, by_q, _, by_z, by_effort, _, by_theta = (np.array(x.full()) / std[:, None] for x in function.call(at))
         by_state = np.hstack([by_q, np.zeros_like(by_q), by_z])
         found.append(_Readings(samples.sensor.group_name, by_state, by_effort, by_theta))
     return found

@@ -110,11 +110,8 @@ def episode_sensitivities(
 
 def _by_state(course: NominalTrajectory, sensor: Sensor) -> Array:
     """Slopes of a sensor's readings at every node by the state there, shape (N + 1, k, nx)."""
-    n, state = course.model_functions.step.sizes["n"], course.rollout.state
-    _, by_q, by_z, _, _ = course.model_functions.compiled_sensor(sensor, ())(
-        state[:, :n], state[:, 2 * n :], course.joint_efforts, course.theta
-    )
-    return np.concatenate([by_q, np.zeros_like(by_q), by_z], axis=2)
+    read = course.model_functions.compiled_sensor(sensor)(course.node_values, course.theta)
+    return np.concatenate([read.by_q, np.zeros_like(read.by_q), read.by_z], axis=2)
 
 
 def _read_angles(encoders: EstimationProblem, x: Array, i: int, blur: Array) -> Array:

@@ -440,9 +440,9 @@ class RunSettings:
     model: Annotated[ModelSettings, OptionInfo("what the world is made of")] = ModelSettings()
     recordings: Annotated[RecordingSettings, OptionInfo("the data")] = RecordingSettings()
     import_: Annotated[ImportSettings, OptionInfo("how files of other tools become recordings")] = ImportSettings()
-    sensors: Annotated[Mapping[str, SensorOptions], OptionInfo("by group of the recordings: points, joints.effort")] = (
-        field(default_factory=dict)
-    )
+    sensors: Annotated[
+        Mapping[str, SensorOptions], OptionInfo("by group of the recordings: points, joints.effort, motors.current")
+    ] = field(default_factory=dict)
     parameters: Annotated[Mapping[str, ParameterSettings], OptionInfo("by name or pattern")] = field(
         default_factory=dict
     )

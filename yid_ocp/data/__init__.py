@@ -10,6 +10,7 @@ from yid_ocp.data.readers.csv import CsvOptions as CsvOptions
 from yid_ocp.data.readers.csv import read_csv as read_csv
 from yid_ocp.data.readers.lerobot import read_lerobot as read_lerobot
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS as JOINT_CHANNEL_UNITS
+from yid_ocp.data.recording import ChannelGroup as ChannelGroup
 from yid_ocp.data.recording import JointGroup as JointGroup
 from yid_ocp.data.recording import PointGroup as PointGroup
 from yid_ocp.data.recording import Recording as Recording

@@ -15,7 +15,6 @@ from yid_ocp.data.issues import (
     Array,
     Issue,
     SensorChoiceLookup,
-    group_name,
     median_sample_period,
 )
 from yid_ocp.data.recording import Recording
@@ -255,7 +254,7 @@ def overstated_noise_issues(recording: Recording, choice: SensorChoiceLookup) ->
 
 
 def _clock(recording: Recording, name: str) -> str:
-    return next(group.clock for group in recording.groups if group_name(group) == name)
+    return next(group.clock for group in recording.groups if group.name == name)
 
 
 def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:

@@ -30,7 +30,6 @@ from yid_ocp.data.issues import (
     Issue,
     SampleGroup,
     SensorChoiceLookup,
-    group_name,
     median_sample_period,
 )
 from yid_ocp.data.recording import PointGroup, Recording
@@ -182,7 +181,7 @@ def check_recording(recording: Recording, choice: SensorChoiceLookup, driving: b
 
 
 def _units_of_time(recording: Recording) -> Iterator[Issue]:
-    for group in recording.groups:
+    for group in recording.all_groups:
         step, slowest = median_sample_period(group.t), QUALITY_LIMITS.max_joint_period
         if isinstance(group, PointGroup):
             slowest = QUALITY_LIMITS.max_point_period
@@ -194,14 +193,14 @@ def _units_of_time(recording: Recording) -> Iterator[Issue]:
         guess = f": in {unit} it would be {1 / (step * SECONDS_PER_CLOCK_UNIT[unit]):.4g} Hz" if unit else ""
         yield Issue(
             "time_unit",
-            f"{group_name(group)}/t has {rate}{guess}",
+            f"{group.name}/t has {rate}{guess}",
             "refused",
             step / slowest,
             f"write times in seconds (divide by {1 / SECONDS_PER_CLOCK_UNIT[unit]:.0e})"
             if unit
             else "write times in seconds",
             "",
-            group_name(group),
+            group.name,
             "t",
         )
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.data.recording import JointGroup, PointGroup
-from yid_ocp.sensors.base import SensorUsage
+from yid_ocp.sensors import SensorOptions
 
 Array = NDArray[np.float64]
 SampleGroup = JointGroup | PointGroup
@@ -128,14 +128,9 @@ ISSUE_CAUSES: Mapping[str, str] = {
 }
 """Description of every cause of an issue, as shown in tables."""
 
-SensorChoiceLookup = Callable[[str], SensorUsage]
+SensorChoiceLookup = Callable[[str], SensorOptions]
 
 
 def median_sample_period(t: Array) -> float:
     """Median time between samples [s]; zero for fewer than two."""
     return float(np.median(np.diff(t))) if len(t) > 1 else 0.0
-
-
-def group_name(group: SampleGroup) -> str:
-    """Name of a group; `joints` for the joints."""
-    return group.name if isinstance(group, PointGroup) else "joints"

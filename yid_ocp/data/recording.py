@@ -6,14 +6,14 @@ import numbers
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
-from yid_ocp.errors import DataError, unknown_name_details
-from yid_ocp.sensors.base import EffortKind
+from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
+from yid_ocp.sensors.base import EffortKind, declared_channels
 
 Array = NDArray[np.float64]
 ClockKind = Literal["recorded", "nominal"]
@@ -70,6 +70,8 @@ class JointGroup(ReprMixin):
     clock : {'recorded', 'nominal'}
         Whether `t` was measured or is a sample index times a nominal period.
     """
+
+    name: ClassVar[str] = "joints"
 
     names: tuple[str, ...]
     t: Array
@@ -183,6 +185,49 @@ class PointGroup(ReprMixin):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
+class ChannelGroup(ReprMixin):
+    """Values of channels that sensors declare (`sensors.Channel`), on one clock.
+
+    Arrays are copied, made float64 and read-only.
+
+    Attributes
+    ----------
+    name : str
+        Declared group, `motors` for example, or that, `_` and a word of one's own.
+    names : tuple of str, length k
+        Of joints, or whatever the columns are.
+    t : ndarray, shape (M,)
+        Strictly increasing time [s].
+    values : mapping of quantity to ndarray, shape (M, k) or (M, k, components)
+        In the channel's unit.
+    stds : mapping of str to float or ndarray, shape (k,)
+        Noise by attribute (`QUANTITY_std`, `QUANTITY_bias_std`), where known, in the channel's unit.
+    clock : {'recorded', 'nominal'}
+    """
+
+    name: str
+    names: tuple[str, ...]
+    t: Array
+    values: Mapping[str, Array]
+    stds: Mapping[str, float | Array] = field(default_factory=dict)
+    clock: ClockKind = "recorded"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "names", tuple(self.names))
+        object.__setattr__(self, "t", read_only_array(self.t, f"{self.name}/t"))
+        values = {key: read_only_array(value, f"{self.name}/{key}") for key, value in self.values.items()}
+        stds = {key: read_only_array(std, f"{self.name}, attribute {key}") for key, std in self.stds.items()}
+        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "stds", {key: float(std) if std.ndim == 0 else std for key, std in stds.items()})
+
+    def _summary(self) -> ReprSummary:
+        return ReprSummary(f"{self.name}, {', '.join(self.names)}, {_sampled(self.t)}: {', '.join(self.values)}")
+
+    def _rows(self, rows: NDArray[np.bool_]) -> ChannelGroup:
+        return replace(self, t=self.t[rows], values={key: value[rows] for key, value in self.values.items()})
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Recording(ReprMixin):
     """One recording of a robot or of a virtual experiment, in SI units.
 
@@ -206,6 +251,8 @@ class Recording(ReprMixin):
         Positions of the points of the first group while the object was held straight, in that group's frame [m].
     notes : tuple of str
         What an import left out or changed, in words.
+    channel_groups : tuple of ChannelGroup
+        What further sensors measured; every group has its own clock.
     """
 
     joints: JointGroup | None = None
@@ -217,9 +264,11 @@ class Recording(ReprMixin):
     true_parameters: Mapping[str, float] = field(default_factory=dict)
     marker_reference_pose: Array | None = None
     notes: tuple[str, ...] = ()
+    channel_groups: tuple[ChannelGroup, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", tuple(self.points))
+        object.__setattr__(self, "channel_groups", tuple(self.channel_groups))
         object.__setattr__(self, "true_parameters", dict(self.true_parameters))
         object.__setattr__(self, "notes", tuple(self.notes))
         if self.marker_reference_pose is not None:
@@ -235,13 +284,26 @@ class Recording(ReprMixin):
             own = self.joints
             rows.append(("joints", ", ".join(own.names), _sampled(own.t), ", ".join(own.channels)))
         rows += [(g.name, ", ".join(g.names), _sampled(g.t), "position") for g in self.points]
-        span = f", {self.duration:.4g} s" if self.groups else ""
+        rows += [(g.name, ", ".join(g.names), _sampled(g.t), ", ".join(g.values)) for g in self.channel_groups]
+        span = f", {self.duration:.4g} s" if self.all_groups else ""
         return ReprSummary(f"'{self.name}', {joints} and {points}{span}", rows)
 
     @property
     def groups(self) -> tuple[JointGroup | PointGroup, ...]:
-        """All groups there are, joints first."""
+        """Groups of joints and points, joints first."""
         return ((self.joints,) if self.joints is not None else ()) + self.points
+
+    @property
+    def all_groups(self) -> tuple[JointGroup | PointGroup | ChannelGroup, ...]:
+        """All groups there are, joints first, then points."""
+        return (*self.groups, *self.channel_groups)
+
+    @property
+    def sensor_keys(self) -> tuple[str, ...]:
+        """Keys under `sensors` that settings may have for this recording."""
+        own = [f"joints.{quantity}" for quantity in ("effort", "position") if self.joints is not None]
+        own += [group.name for group in self.points]
+        return (*own, *(f"{group.name}.{quantity}" for group in self.channel_groups for quantity in group.values))
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -256,7 +318,7 @@ class Recording(ReprMixin):
     @property
     def duration(self) -> float:
         """Time from the first sample of any group to the last of any [s]."""
-        return float(max(group.t[-1] for group in self.groups) - min(group.t[0] for group in self.groups))
+        return float(max(group.t[-1] for group in self.all_groups) - min(group.t[0] for group in self.all_groups))
 
     def with_effort_kind(self, kind: EffortKind | None) -> Recording:
         """The recording with the given effort kind; unchanged for None."""
@@ -284,16 +346,20 @@ class Recording(ReprMixin):
         DataError
             If nothing was recorded in between, or `start` is not before `stop`.
         """
-        masks = [(g.t >= start - _TIME_TOLERANCE) & (g.t <= stop + _TIME_TOLERANCE) for g in self.groups]
-        kept = [group._rows(mask) for group, mask in zip(self.groups, masks, strict=True) if mask.any()]
-        first, last = min(g.t[0] for g in self.groups), max(g.t[-1] for g in self.groups)
+        masks = [(g.t >= start - _TIME_TOLERANCE) & (g.t <= stop + _TIME_TOLERANCE) for g in self.all_groups]
+        kept = [group._rows(mask) for group, mask in zip(self.all_groups, masks, strict=True) if mask.any()]
+        first, last = min(g.t[0] for g in self.all_groups), max(g.t[-1] for g in self.all_groups)
         what, allowed = f"nothing was recorded from {start:g} s to {stop:g} s", f"within {first:g} s to {last:g} s"
         require_data(start < stop and bool(kept), what, f"recording '{self.name}'", f"start < stop, {allowed}")
         joints = next((group for group in kept if isinstance(group, JointGroup)), None)
         points = tuple(group for group in kept if isinstance(group, PointGroup))
         first_kept = bool(points) and points[0].name == self.points[0].name
         return replace(
-            self, joints=joints, points=points, marker_reference_pose=self.marker_reference_pose if first_kept else None
+            self,
+            joints=joints,
+            points=points,
+            channel_groups=tuple(group for group in kept if isinstance(group, ChannelGroup)),
+            marker_reference_pose=self.marker_reference_pose if first_kept else None,
         )
 
     def select_points(self, names: Iterable[str]) -> Recording:
@@ -355,7 +421,7 @@ def validate_recording(recording: Recording, *, allow_nan_effort: bool = False, 
         machine; `straight` does not match the first group of points.
     """
     origin = where or f"recording '{recording.name}'"
-    require_data(bool(recording.groups), "the recording has no group", origin, "joints, points, points_<name>")
+    require_data(bool(recording.all_groups), "the recording has no group", origin, "joints, points, points_<name>")
     _check_text(origin, recording.description, recording.source, *recording.notes)
     for key, value in recording.true_parameters.items():
         good = isinstance(value, numbers.Real) and not isinstance(value, bool) and bool(np.isfinite(value))
@@ -368,6 +434,10 @@ def validate_recording(recording: Recording, *, allow_nan_effort: bool = False, 
         require_data(legal, f"a group of points is called '{group.name}'", origin, "points, points_<name>")
         require_data(names.count(group.name) == 1, f"two groups of points are called '{group.name}'", origin)
         _validate_points(group, f"{origin}: {group.name}")
+    for channels in recording.channel_groups:
+        repeated = sum(group.name == channels.name for group in recording.channel_groups) > 1
+        require_data(not repeated, f"two groups are called '{channels.name}'", origin)
+        _validate_channels(channels, f"{origin}: {channels.name}")
     if recording.marker_reference_pose is not None:
         _validate_straight(recording.marker_reference_pose, recording.points, f"{origin}: straight")
     return recording
@@ -453,10 +523,7 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
     for name in JOINT_STD_FIELDS:
         std, place = getattr(joints, name), f"{where}, attribute {name}"
         if std is not None:
-            if np.ndim(std) > 0:
-                _check_shape(std, (len(joints.names),), place, "one number or (nj,)")
-            good = bool(np.all((np.asarray(std) >= 0) & (np.asarray(std) <= _LARGEST_SPREAD)))
-            require_data(good, f"{name} is {std}", place, f"not negative, and at most {_LARGEST_SPREAD:g}")
+            _validate_std(std, len(joints.names), name, place, "one number or (nj,)")
     if joints.effort_kind is not None:
         place, kinds = f"{where}, attribute effort_kind", get_args(EffortKind)
         hint = "leave the attribute out where it is not known"
@@ -494,6 +561,33 @@ def _validate_points(group: PointGroup, where: str) -> None:
         _check_pose(group.pose, f"{where}, attribute pose")
 
 
+def _validate_channels(group: ChannelGroup, where: str) -> None:
+    _check_names_and_clock(group, where)
+    declared = {channel.quantity: channel for channel in declared_channels(group.name)}
+    fields = [name for channel in declared.values() for name in channel.std_fields]
+    require_data(bool(group.values), "the group has no values", where, ", ".join(declared))
+    for noun, found, known in (("dataset", group.values, declared), ("attribute", group.stds, fields)):
+        for name in found:
+            what = f"no sensor declares a {noun} '{name}' here"
+            allowed = ", ".join(known) or "groups that a sensor declares"
+            require_data(name in known, what, where, allowed, nearest_name_hint(name, known))
+    for quantity, values in group.values.items():
+        parts = len(declared[quantity].components)
+        shape = (len(group.t), len(group.names), *([parts] if parts else []))
+        _check_shape(values, shape, f"{where}/{quantity}", "(M, k, 3)" if parts else "(M, k)")
+        finite = bool(np.isfinite(values).all())
+        require_data(finite, "a value is not finite", f"{where}/{quantity}", "finite numbers")
+    for name, std in group.stds.items():
+        _validate_std(std, len(group.names), name, f"{where}, attribute {name}", "one number or (k,)")
+
+
+def _validate_std(std: float | Array, count: int, name: str, where: str, letters: str) -> None:
+    if np.ndim(std) > 0:
+        _check_shape(np.asarray(std), (count,), where, letters)
+    good = bool(np.all((np.asarray(std) >= 0) & (np.asarray(std) <= _LARGEST_SPREAD)))
+    require_data(good, f"{name} is {std}", where, f"not negative, and at most {_LARGEST_SPREAD:g}")
+
+
 def _validate_straight(straight: Array, groups: Sequence[PointGroup], where: str) -> None:
     require_data(bool(groups), "the positions of a straight object belong to no points", where, "a group of points")
     _check_shape(straight, (len(groups[0].names), 3), where, "(np, 3), for the first group of points")
@@ -524,7 +618,7 @@ def _close(array: Array, expected: Array) -> bool:
     return bool(np.allclose(array, expected, rtol=0, atol=1e-6))
 
 
-def _check_names_and_clock(group: JointGroup | PointGroup, where: str) -> None:
+def _check_names_and_clock(group: JointGroup | PointGroup | ChannelGroup, where: str) -> None:
     require_data(bool(group.names), "the group has no names", where)
     require_data(group.t.size > 0, "the group has no samples", where)
     for name in group.names:

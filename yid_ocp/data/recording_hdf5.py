@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from yid_ocp.data.recording import (
     JOINT_STD_FIELDS,
     POINT_GROUP_NAME_PATTERN,
     Array,
+    ChannelGroup,
     JointGroup,
     PointGroup,
     Recording,
@@ -26,6 +27,8 @@ from yid_ocp.data.recording import (
 )
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
 from yid_ocp.files import file_sha256
+from yid_ocp.sensors import CHANNELS
+from yid_ocp.sensors.base import declared_channels
 
 _RECORDING_FORMAT = "yid-recording/1"
 
@@ -97,6 +100,13 @@ def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
         for group in recording.points:
             attributes = [name for name in _POINT_ATTRIBUTES if name != "std"]
             _write_group(file.create_group(group.name), group, _POINT_UNITS, attributes)
+        for channels in recording.channel_groups:
+            target, declared = file.create_group(channels.name), declared_channels(channels.name)
+            units = {"t": "s"} | {c.quantity: c.unit for c in declared}
+            for name, values in {"t": channels.t, **channels.values}.items():
+                target.create_dataset(name, data=values).attrs["unit"] = units[name]
+            names = np.array(channels.names, dtype=h5py.string_dtype())
+            target.attrs.update(names=names, clock=channels.clock, **channels.stds)
         if recording.marker_reference_pose is not None:
             file.create_dataset(_STRAIGHT, data=recording.marker_reference_pose).attrs["unit"] = "m"
 
@@ -121,14 +131,13 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
     }
     what = f"the format of the file is '{texts['format']}'" if texts["format"] else "the file does not say its format"
     require_data(texts["format"] == _RECORDING_FORMAT, what, f"{origin}, attribute format", _RECORDING_FORMAT)
-    joints, points, straight = None, [], None
+    joints, points, straight, channels = None, [], None, []
+    further = sorted({CHANNELS[kind].group for kind in CHANNELS} - {"joints", "points"})
+    allowed = ", ".join(["joints, points, points_<name>", *(f"{name}, {name}_<name>" for name in further), _STRAIGHT])
     for name in map(str, file):
-        where, legal = (
-            f"{origin}: {name}",
-            name in ("joints", _STRAIGHT) or POINT_GROUP_NAME_PATTERN.fullmatch(name) is not None,
-        )
-        hint = "" if legal else nearest_name_hint(name, ("joints", "points", _STRAIGHT))
-        allowed = f"joints, points, points_<name>, {_STRAIGHT}"
+        where, declared = f"{origin}: {name}", declared_channels(name)
+        legal = name in ("joints", _STRAIGHT) or POINT_GROUP_NAME_PATTERN.fullmatch(name) is not None or bool(declared)
+        hint = "" if legal else nearest_name_hint(name, ("joints", "points", *further, _STRAIGHT))
         require_data(legal, f"the format has no group '{name}'", origin, allowed, hint)
         if name == _STRAIGHT:
             straight = _read_dataset(file[name], where, "m")
@@ -136,6 +145,15 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
         require_data(isinstance(file[name], h5py.Group), f"'{name}' is not a group", where, "a group of datasets")
         if name == "joints":
             joints = JointGroup(**_read_group(file[name], where, _JOINT_UNITS, _JOINT_ATTRIBUTES, ("names",)))
+        elif declared:
+            units = {c.quantity: c.unit for c in declared}
+            fields = tuple(entry for c in declared for entry in c.std_fields)
+            found = _read_group(
+                file[name], where, {"t": "s", **units}, ("names", "clock", *fields), ("names",), needed={"t"}
+            )
+            parts = ({key: found[key] for key in keys if key in found} for keys in (units, fields, ("clock",)))
+            values, stds, clock = parts
+            channels.append(ChannelGroup(name, found["names"], found["t"], values, stds, **clock))
         else:
             required = ("names", "sensor", "frame")
             values = _read_group(file[name], where, _POINT_UNITS, _POINT_ATTRIBUTES, required)
@@ -143,21 +161,35 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
     truth = _truth(texts["truth"], f"{origin}, attribute truth") if texts["truth"] else {}
     notes = _notes(texts["notes"], f"{origin}, attribute notes") if texts["notes"] else ()
     return Recording(
-        joints, tuple(points), texts["description"], texts["source"], path.stem, digest, truth, straight, notes
+        joints,
+        tuple(points),
+        texts["description"],
+        texts["source"],
+        path.stem,
+        digest,
+        truth,
+        straight,
+        notes,
+        tuple(channels),
     )
 
 
 def _read_group(
-    group: h5py.Group, where: str, units: Mapping[str, str], attributes: Sequence[str], required: Iterable[str]
+    group: h5py.Group,
+    where: str,
+    units: Mapping[str, str],
+    attributes: Sequence[str],
+    required: Iterable[str],
+    needed: Set[str] = frozenset({"t", "position"}),
 ) -> dict[str, Any]:
-    for noun, found, known, needed in (
-        ("dataset", set(map(str, group)), tuple(units), {"t", "position"}),
+    for noun, found, known, wanted in (
+        ("dataset", set(map(str, group)), tuple(units), needed),
         ("attribute", set(map(str, group.attrs)), attributes, set(required)),
     ):
         for name in sorted(found - set(known)):
             what = f"the format has no {noun} '{name}' here"
             raise DataError(what, where=where, **unknown_name_details(name, known))
-        for name in sorted(needed - found):
+        for name in sorted(wanted - found):
             raise DataError(f"the {noun} '{name}' is missing", where=where, allowed=", ".join(known))
     both = "std" in group and "std" in group.attrs
     require_data(not both, "`std` is both a dataset and an attribute", where, "one of the two")

@@ -40,7 +40,7 @@ from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import Measurements, subtract_estimated_biases
 from yid_ocp.problem.options import SensorOptions
 from yid_ocp.problem.signal_filters import effort_filter
-from yid_ocp.sensors.joints import values_by_joint
+from yid_ocp.sensors.base import values_by_joint
 
 Array = NDArray[np.float64]
 _RecordingRollout = tuple[Episode, EpisodePrediction, Array]
@@ -279,8 +279,9 @@ def _read_forces(
         if not samples.sensor.effort_joints or samples.node.ndim > 1 or len(samples.node) < 10:
             continue
         error, held = _allowed(torques, run, samples.node, limits)
-        weight = np.where(samples.is_used, samples.weight, 0.0)
-        value = np.where(samples.is_used, predicted - samples.value, 0.0)
+        unit_effort = samples.sensor.effort_per_output
+        weight = np.where(samples.is_used, samples.weight, 0.0) / unit_effort
+        value = np.where(samples.is_used, predicted - samples.value, 0.0) * unit_effort
         times = sample_times(episode, samples)
         # what lies closer together than an interval counts together
         bins = np.unique(np.floor((times - times[0]) / _FORCE_INTERVAL + 1e-6), return_inverse=True)[1]
@@ -435,7 +436,6 @@ def _wrong_samples(problem: EstimationProblem, run: _RecordingRollout) -> Iterat
         t = sample_times(episode, samples)
         for column, channel in enumerate(samples.channel_of_column):
             seen = samples.is_used[:, column]
-            axis = f".{'xyz'[column % 3]}" if samples.sensor.outputs_per_channel == 3 else ""
             frame = (
                 samples.sensor.frame_names[column // samples.sensor.outputs_per_channel]
                 if samples.sensor.frame_names
@@ -445,7 +445,7 @@ def _wrong_samples(problem: EstimationProblem, run: _RecordingRollout) -> Iterat
             if samples.sensor.outputs_per_channel == 1:
                 location = channel.rpartition(".")[2]
             values = (samples.value - predicted)[seen, column]
-            about = (episode.name, location, f"{channel}{axis}", samples.sensor.unit)
+            about = (episode.name, location, samples.sensor.output_names[column], samples.sensor.unit)
             yield from _alone(t[seen], values, samples.std[seen, column], about)
     joints = episode.recording.joints
     if joints is None:
@@ -585,8 +585,7 @@ def _counting(
                 spoilt = event.channel == channel.rpartition(".")[2] or event.kind == "sample"
                 inside = (t[:, column] > event.start_time - smear) & (t[:, column] < event.end_time + smear)
             else:
-                axis = f".{'xyz'[column % 3]}" if samples.sensor.outputs_per_channel == 3 else ""
-                spoilt = event.channel == f"{channel}{axis}"
+                spoilt = event.channel == samples.sensor.output_names[column]
                 inside = (t[:, column] > event.start_time) & (t[:, column] < event.end_time)
             if spoilt:
                 hidden[:, column] |= inside

@@ -46,6 +46,11 @@ def make_effect(kind: str, location: str, system: System, values: Mapping[str, f
     return base.build_effect(kind, location, system, values or {})
 
 
+def sensor_kinds() -> frozenset[str]:
+    """`SENSOR_KINDS` and what effects of one's own require."""
+    return frozenset(SENSOR_KINDS).union(*(EFFECTS[kind].required_sensors for kind in EFFECTS))
+
+
 def candidate_effects(system: System, recorded_sensors: Collection[str]) -> list[tuple[str, str]]:
     """Every (kind, location) that is possible in a system and visible in a recording, by kind.
 
@@ -54,17 +59,17 @@ def candidate_effects(system: System, recorded_sensors: Collection[str]) -> list
     system : System
         Without the effects in question.
     recorded_sensors : collection of str
-        What was recorded, among `SENSOR_KINDS`. What works only on prescribed joints is left out where no effort was
+        What was recorded, among `sensor_kinds`. What works only on prescribed joints is left out where no effort was
         recorded, for there nothing would show it.
 
     Raises
     ------
     ModelError
-        An entry that is not in `SENSOR_KINDS`.
+        An entry that is not in `sensor_kinds`.
     """
-    present = set(recorded_sensors)
-    for name in sorted(present - set(SENSOR_KINDS)):
-        raise ModelError(f"there is no kind of sensor '{name}'", **unknown_name_details(name, SENSOR_KINDS))
+    present, known = set(recorded_sensors), sensor_kinds()
+    for name in sorted(present - known):
+        raise ModelError(f"there is no kind of sensor '{name}'", **unknown_name_details(name, sorted(known)))
     unseen = set() if "joints.effort" in present else set(system.prescribed)
     found = []
     for kind in EFFECTS:

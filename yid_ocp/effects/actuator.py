@@ -79,7 +79,7 @@ class _DistortedReading(EffectBase):
         """The recorded value: the true one plus the error."""
         if not self._is_own(channel):
             return output
-        return output + self._error(state.effort[state.system.mechanism.joint_index(self.location)])
+        return output + self._error(state.load[state.system.mechanism.joint_index(self.location)])
 
     def corrected_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
         """The true value: the recorded one less the error."""

@@ -11,13 +11,14 @@ import scipy.linalg
 import scipy.optimize
 from numpy.typing import NDArray
 
+from yid_ocp.errors import DataError
 from yid_ocp.integrator.step_model import Rollout, TrackingFeedback
 from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.model_functions import ModelFunctions
+from yid_ocp.problem.model_functions import ModelFunctions, NodeValues
 
 Array = NDArray[np.float64]
 
@@ -26,9 +27,8 @@ Array = NDArray[np.float64]
 class NominalTrajectory:
     """Nominal trajectory of an episode and its measurements, about which residuals are linearized.
 
-    Measurements are shifted by their delays to the times at which they were true; `joint_efforts` (N + 1, n) are those
-    of prescribed and driven joints. The derivatives of the start by the first angles and the first torque of the driven
-    joints, shape (nx, nu), are zero where it does not follow from them.
+    Measurements are shifted by their delays to the times at which they were true. The derivatives of the start by the
+    first angles and the first torque of the driven joints, shape (nx, nu), are zero where it does not follow from them.
     """
 
     model_functions: ModelFunctions
@@ -36,7 +36,7 @@ class NominalTrajectory:
     rollout: Rollout
     measurements: Sequence[Measurements]
     tracking_feedback: TrackingFeedback | None
-    joint_efforts: Array
+    node_values: NodeValues
     initial_state_by_angles: Array
     initial_state_by_torque: Array
 
@@ -54,7 +54,7 @@ def nominal_trajectory(
         result.rollout,
         [predictor.measurements_at_true_times(samples, own) for samples in episode.measurements],
         episode.tracking_feedback,
-        predictor.joint_efforts(result.rollout),
+        predictor.node_values(result.rollout),
         by_angles,
         none if rest is None else rest.state_by_torque,
     )
@@ -77,18 +77,22 @@ class ResidualSlopes:
     @staticmethod
     def along(course: NominalTrajectory) -> ResidualSlopes:
         """From the sensors' own derivatives along the trajectory."""
-        step, theta, state = course.model_functions.step, course.theta, course.rollout.state
+        step, theta = course.model_functions.step, course.theta
         n, nx, fixed = step.sizes["n"], step.sizes["nx"], list(step.system.prescribed_indices)
         found: list[NDArray[np.int64]] = []
         parts: list[tuple[Array, ...]] = []
         for samples in course.measurements:
             used = samples.evaluation_nodes
-            function = course.model_functions.compiled_sensor(samples.sensor, ())
-            _, by_q, by_z, by_load, _ = function(
-                state[used, :n], state[used, 2 * n :], course.joint_efforts[used], theta
-            )
-            slopes = np.zeros((len(used), by_q.shape[1], nx))
-            slopes[:, :, :n], slopes[:, :, 2 * n :] = by_q, by_z
+            function = course.model_functions.compiled_sensor(samples.sensor)
+            read = function(course.node_values.at(used), theta)
+            if read.needs_neighbours:
+                raise DataError(
+                    f"'{samples.sensor.group_name}' depends on velocities or constraint forces, which cannot be "
+                    "weighted beside noise that drives the motion",
+                    hint=f"set sensors.{samples.sensor.group_name}.use: false, or prescribe the arms' motion",
+                )
+            slopes = np.zeros((*read.output.shape, nx))
+            slopes[:, :, :n], slopes[:, :, 2 * n :] = read.by_q, read.by_z
             sample, column = np.nonzero(samples.is_used)
             at = (sample, column) if samples.node.ndim > 1 else (sample,)
             node, fraction, weight = samples.node[at], samples.fraction[at], samples.weight[sample, column]
@@ -96,7 +100,7 @@ class ResidualSlopes:
             later, shares = np.minimum(place + 1, len(used) - 1), (weight * (1 - fraction), weight * fraction)
             nodes = ((place, shares[0]), (later, shares[1]))
             by_state = (samples.decorrelate(share[:, None] * slopes[k, column]) for k, share in nodes)
-            by_effort = (samples.decorrelate(share[:, None] * by_load[k, column][:, fixed]) for k, share in nodes)
+            by_effort = (samples.decorrelate(share[:, None] * read.by_load[k, column][:, fixed]) for k, share in nodes)
             found.append(np.minimum(node, len(course.rollout.torque)))
             parts.append((*by_state, *by_effort))
         arrays = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))

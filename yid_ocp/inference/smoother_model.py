@@ -139,13 +139,12 @@ def _smoother_unknowns(course: _LinearizedEpisode, limits: SmootherThresholds) -
         sensor = samples.sensor
         if sensor.effort_joints:
             continue  # at a prescribed joint a bias and a force are the same
-        for column, channel in enumerate(samples.channel_of_column):
+        for column, name in enumerate(sensor.output_names):
             if not np.any(samples.is_used[:, column]):
                 continue
-            axis = f".{'xyz'[column % 3]}" if sensor.outputs_per_channel == 3 else ""
             frame = sensor.frame_names[column // sensor.outputs_per_channel] if sensor.frame_names else ""
             biased.append((k, column))
-            names.append(f"{channel}{axis}")
+            names.append(name)
             sources.append(UnknownGroup(sensor_bias_location(course.system, sensor, frame), "bias"))
             reference.append(limits.bias_prior_std * float(np.nanmedian(samples.std[:, column])))
     held, biases = np.array(grasped, int), tuple(biased)

@@ -151,8 +151,14 @@ class NodeState:
     ----------
     q, z : casadi.SX, shape (n, 1) and (nz, 1)
         `kinematics` is at q; `internal_rows` has the row of each internal coordinate in z by name.
-    effort : casadi.SX, shape (n, 1)
-        Torque at every joint that has one: the motor torque where driven, the predicted effort where prescribed.
+    v : casadi.SX, shape (n, 1)
+        Velocity, the mean of the midpoint velocities (q_{k+1} - q_k)/h of the steps before and after the node; at the
+        first and the last node that of the one step there, half a step off [rad/s or m/s].
+    load : casadi.SX, shape (n, 1)
+        Torque at every joint that has one: the motor torque where driven, the predicted effort where prescribed, of
+        the step that begins at the node, at the last node of the step before [N m or N].
+    lam : casadi.SX, shape (m, 1)
+        Constraint forces lam_k/h of the same step [N or N m].
     camera_pose : Placement or None
         Pose in the world of the camera that measures; None for any other sensor.
     marked_frame : str or None
@@ -162,8 +168,10 @@ class NodeState:
     system: System
     kinematics: Kinematics
     q: ca.SX
+    v: ca.SX
     z: ca.SX
-    effort: ca.SX
+    load: ca.SX
+    lam: ca.SX
     internal_rows: Mapping[str, int]
     camera_pose: Placement | None = None
     marked_frame: str | None = None

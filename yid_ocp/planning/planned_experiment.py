@@ -36,7 +36,7 @@ from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.signal_filters import effort_filter
-from yid_ocp.sensors.joints import EFFORT_GROUP, POSITION_GROUP
+from yid_ocp.sensors.joints import POSITION_GROUP
 
 Array = NDArray[np.float64]
 
@@ -125,9 +125,7 @@ class PlannedExperiment:
             position_std=stds[0], effort_std=stds[1], effort_bias_std=stds[2],
         )  # fmt: skip
         q = rollout.state[:, : system.n_coordinates]
-        groups = [
-            self._seen(samples, q, fastest) for samples in base.measurements if samples.sensor.outputs_per_channel == 3
-        ]
+        groups = [self._seen(samples, q, fastest) for samples in base.measurements if samples.sensor.point_names]
         return Recording(group, tuple(groups), "a planned motion", "yid_ocp plan", _PLANNED_RECORDING_NAME)
 
     def _seen(self, samples: Measurements, q: Array, fastest: float) -> PointGroup:
@@ -150,11 +148,7 @@ class PlannedExperiment:
 
     @cached_property
     def _frames(self) -> dict[tuple[str, ...], FramePositions]:
-        found = {
-            s.sensor.frame_names
-            for s in self.configured_problem.episodes[0].measurements
-            if s.sensor.outputs_per_channel == 3
-        }
+        found = {s.sensor.frame_names for s in self.configured_problem.episodes[0].measurements if s.sensor.point_names}
         return {frames: FramePositions(self.simulator.step.system, frames) for frames in found}
 
     def _options(self, **changes: object) -> ProblemOptions:
@@ -162,7 +156,7 @@ class PlannedExperiment:
         options, base = self.configured_problem.options, self.configured_problem.episodes[0]
         own = dict(options.sensors)
         for samples in base.measurements:
-            if samples.sensor.outputs_per_channel == 3 and samples.sensor.group_name in own:
+            if samples.sensor.point_names and samples.sensor.group_name in own:
                 own[samples.sensor.group_name] = replace(own[samples.sensor.group_name], std=None)
         given = options.parameters_by_recording
         named = {_PLANNED_RECORDING_NAME: dict(given[base.name])} if base.name in given else {}
@@ -255,7 +249,7 @@ class PlannedExperiment:
         problem, std = self._known, self._offset_std
         found = np.zeros((problem.residual_rows.without_weak_priors.stop, len(std)))
         for samples, rows in zip(problem.episodes[0].measurements, problem.residual_rows.measurements[0], strict=True):
-            if samples.sensor.group_name != EFFORT_GROUP:
+            if not samples.sensor.effort_joints:
                 continue
             joint = np.broadcast_to(np.arange(samples.value.shape[1]), samples.value.shape)[samples.is_used]
             for i, (name, size) in enumerate(std.items()):

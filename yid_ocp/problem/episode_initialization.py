@@ -13,6 +13,7 @@ from yid_ocp.errors import DataError
 from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.problem.episodes import Episode, InitialState, truncate_episode
 from yid_ocp.problem.measurements import Measurements
+from yid_ocp.problem.model_functions import NodeValues
 from yid_ocp.problem.recorded_inputs import denoised_gear_loads
 from yid_ocp.problem.unknown_vector import initial_state_limits
 
@@ -80,11 +81,11 @@ def _error(predictor: EpisodePredictor, seen: Sequence[Measurements], start: Ini
     """Root mean square error of first points at a start [standard deviations]; infinite where it is not at rest."""
     if start.failure_message:
         return math.inf
-    n, state = predictor.system.n_coordinates, start.state[None]
+    state = start.state[None]
     squares: list[Array] = []
     for samples in seen:
         read = predictor.model_functions.compiled_sensor(samples.sensor, predictor.unknowns.free_parameters)
-        predicted = read(state[:, :n], state[:, 2 * n :], np.zeros((1, n)), theta)[0][:, :, 0]
+        predicted = read(NodeValues.along_trajectory(predictor.step, state), theta).output
         squares.append(samples.whitened_residual(predicted)[samples.is_used] ** 2)
     return float(np.sqrt(np.mean(np.concatenate(squares))))
 
@@ -98,7 +99,7 @@ def _loaded(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Epis
     result = predictor.predict_episode(episode, theta, np.zeros(len(predictor.unknowns.initial_state_names)), False)
     if isinstance(result, str):
         return episode
-    load, own = episode.joint_loads.copy(), predictor.joint_efforts(result.rollout)
+    load, own = episode.joint_loads.copy(), predictor.node_values(result.rollout).load
     for samples in compared:
         at = [corrections.joint_names.index(joint) for joint in samples.sensor.effort_joints]
         column = [predictor.system.mechanism.joint_index(joint) for joint in samples.sensor.effort_joints]

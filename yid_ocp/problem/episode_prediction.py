@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from yid_ocp.errors import SolverError
 from yid_ocp.integrator.rollout import adjoint_gradient, rollout_inputs, simulate_batch
 from yid_ocp.integrator.statics import Equilibrium
 from yid_ocp.integrator.step import Step
@@ -18,7 +19,13 @@ from yid_ocp.model.system import System
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, InitialState
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.model_functions import CorrectedInputs, ModelFunctions
+from yid_ocp.problem.model_functions import (
+    CorrectedInputs,
+    ModelFunctions,
+    NodeValues,
+    node_velocity,
+    node_velocity_adjoint,
+)
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.problem.recorded_inputs import mean_step_inputs, mean_step_inputs_by_delay
 from yid_ocp.problem.signal_filters import FirstOrderLag, LowPassFilter, NodeSmoother
@@ -344,19 +351,18 @@ class EpisodePredictor:
         predicted : ndarray, shape (M, k)
         sensitivities : ndarray, shape (M, k, d)
         """
-        effort = np.zeros((len(samples.evaluation_nodes), self.system.n_coordinates))
-        read = _Trajectory(state, by_state, effort, None, None)
+        read = _Trajectory(NodeValues.along_trajectory(self.step, state), by_state, None, None, None)
         y, total = self._read(samples, read, theta, self.unknowns.free_parameters)
         return samples.interpolate(y), samples.interpolate(total)
 
-    def joint_efforts(self, rollout: Rollout) -> Array:
-        """Effort of prescribed joints and torque of driven ones along a rollout, zero elsewhere, shape (N + 1, n)."""
-        steps = len(rollout.multipliers)
-        effort = np.zeros((steps + 1, self.system.n_coordinates))
-        effort[:-1, list(self.system.prescribed_indices)] = rollout.effort
-        effort[:-1, list(self.system.driven_indices)] = rollout.torque
-        effort[-1] = effort[-2]
-        return effort
+    def node_values(self, rollout: Rollout) -> NodeValues:
+        """Values along a rollout; the load is the effort of prescribed joints and the torque of driven ones."""
+        load = np.zeros((len(rollout.state), self.system.n_coordinates))
+        load[:-1, list(self.system.prescribed_indices)] = rollout.effort
+        load[:-1, list(self.system.driven_indices)] = rollout.torque
+        load[-1] = load[-2]
+        lam = rollout.multipliers[np.minimum(np.arange(len(load)), len(load) - 2)] / self.step.time_step
+        return NodeValues.along_trajectory(self.step, rollout.state, load, lam)
 
     def _delay_in_steps(
         self, samples: Measurements, theta: Array, wanted: tuple[str, ...]
@@ -395,8 +401,13 @@ class EpisodePredictor:
         unmoved, late = samples, self._delay_in_steps(samples, theta, wanted)
         if late is not None:
             samples = samples.delayed_by(late[0])
-        effort = self.joint_efforts(rollout)[samples.evaluation_nodes]
-        along = _Trajectory(rollout.state, rollout.state_sensitivity, effort, rollout.effort_sensitivity, by_applied)
+        along = _Trajectory(
+            self.node_values(rollout),
+            rollout.state_sensitivity,
+            rollout.effort_sensitivity,
+            by_applied,
+            rollout.multipliers_sensitivity,
+        )
         y, total = self._read(samples, along, theta, wanted)
         predicted, slopes = samples.interpolate(y), samples.interpolate(total)
         if late is not None and rollout.state_sensitivity is not None:
@@ -408,21 +419,29 @@ class EpisodePredictor:
     ) -> tuple[Array, Array]:
         """Readings at the samples' nodes, (nodes, k), and their derivatives by d directions, (nodes, k, d)."""
         n, nodes = self.system.n_coordinates, samples.evaluation_nodes
-        q, z = along.state[nodes, :n], along.state[nodes, 2 * n :]
-        y, by_q, by_z, by_load, by_theta = self.model_functions.compiled_sensor(samples.sensor, wanted)(
-            q, z, along.effort, theta
-        )
+        read = self.model_functions.compiled_sensor(samples.sensor, wanted)(along.values.at(nodes), theta)
         if along.by_state is None:
-            return y[:, :, 0], np.zeros((*y.shape[:2], 0))
-        total = by_q @ along.by_state[nodes, :n]
-        if z.shape[1]:
-            total += by_z @ along.by_state[nodes, 2 * n :]
+            return read.output, np.zeros((*read.output.shape, 0))
+        total = read.by_q @ along.by_state[nodes, :n]
+        if read.by_z.shape[2]:
+            total += read.by_z @ along.by_state[nodes, 2 * n :]
+        if read.by_v.shape[2]:
+            total += read.by_v @ node_velocity(along.by_state[:, :n], nodes, self.step.time_step)
         loads = ((self.system.prescribed_indices, along.by_effort), (self.system.driven_indices, along.by_torque))
         for index, by_load_there in loads:
-            if index and by_load_there is not None and np.any(by_load[:, :, list(index)]):
-                total += by_load[:, :, list(index)] @ by_load_there[np.minimum(nodes, len(by_load_there) - 1)]
-        total[:, :, : len(wanted)] += by_theta
-        return y[:, :, 0], total
+            by_load = read.by_load[:, :, list(index)]
+            if by_load_there is not None and np.any(by_load):
+                total += by_load @ by_load_there[np.minimum(nodes, len(by_load_there) - 1)]
+        if read.by_lam.shape[2]:
+            if along.by_multipliers is None:
+                raise SolverError(
+                    f"'{samples.sensor.group_name}' depends on constraint forces, which node states do not carry",
+                    hint="use gauss_newton",
+                )
+            last = np.minimum(nodes, len(along.by_multipliers) - 1)
+            total += read.by_lam @ along.by_multipliers[last] / self.step.time_step
+        total[:, :, : len(wanted)] += read.by_theta
+        return read.output, total
 
     # -- the adjoint --------------------------------------------------------------------------------------------------
 
@@ -445,9 +464,10 @@ class EpisodePredictor:
         theta = self.episode_theta(episode, theta)
         by_state = np.zeros((episode.grid.steps + 1, self.step.sizes["nx"]))
         by_effort, by_applied = np.zeros_like(rollout.effort), np.zeros_like(rollout.torque)
-        total, read = np.zeros(len(wanted)), self._recorded(episode, rollout, theta, ())
+        by_multipliers = np.zeros_like(rollout.multipliers)
+        total, read = np.zeros(len(wanted)), self.node_values(self._recorded(episode, rollout, theta, ()))
         for samples, pull in zip(episode.measurements, pulls, strict=True):
-            total += self._pull(samples, pull, read, theta, _Pulls(by_state, by_effort, by_applied))
+            total += self._pull(samples, pull, read, theta, _Pulls(by_state, by_effort, by_applied, by_multipliers))
         if (smooth := self.effort_smoother(episode, theta)) is not None:
             by_effort = smooth.smoothing_adjoint(by_effort)
         if (lag := self.model_functions.input_corrections.effort_time_constants(theta, wanted)) is not None:
@@ -456,7 +476,8 @@ class EpisodePredictor:
         feedback = episode.tracking_feedback
         if feedback is not None:
             by_state[:-1, feedback.state_indices] -= np.einsum("kub,ku->kb", feedback.gain, by_applied)
-        by_inputs = adjoint_gradient(self.step, theta, rollout, wanted, by_state, None, by_effort, feedback)
+        by_lam = by_multipliers if np.any(by_multipliers) else None
+        by_inputs = adjoint_gradient(self.step, theta, rollout, wanted, by_state, by_lam, by_effort, feedback)
         start = self.initial_state(episode, theta, offset, wanted, result.equilibrium_guess)
         inputs = self.tracking_inputs(episode, theta, wanted, start.state, start.state_sensitivity)
         own = np.concatenate([total + by_inputs.by_theta, np.zeros(len(self.unknowns.initial_state_names))])
@@ -470,46 +491,48 @@ class EpisodePredictor:
             )
         return np.asarray(own + by_inputs.by_initial_state @ start.state_sensitivity)
 
-    def _pull(self, samples: Measurements, pull: Array, rollout: Rollout, theta: Array, pulls: _Pulls) -> Array:
+    def _pull(self, samples: Measurements, pull: Array, values: NodeValues, theta: Array, pulls: _Pulls) -> Array:
         """Spread the pull at one group's samples over states and efforts; the direct part by the parameters."""
         n, wanted = self.system.n_coordinates, self.unknowns.free_parameters
         unmoved, late = samples, self._delay_in_steps(samples, theta, wanted)
         if late is not None:
             samples = samples.delayed_by(late[0])
         at_nodes, nodes = samples.interpolation_adjoint(pull), samples.evaluation_nodes
-        q, z = rollout.state[nodes, :n], rollout.state[nodes, 2 * n :]
-        effort = self.joint_efforts(rollout)[nodes]
-        y, by_q, by_z, by_load, by_theta = self.model_functions.compiled_sensor(samples.sensor, wanted)(
-            q, z, effort, theta
-        )
-        direct = np.einsum("mk,mkq->q", at_nodes, by_theta)
+        read = self.model_functions.compiled_sensor(samples.sensor, wanted)(values.at(nodes), theta)
+        direct = np.einsum("mk,mkq->q", at_nodes, read.by_theta)
         if late is not None:
-            direct -= np.sum(pull * samples.prediction_rate(y[:, :, 0], unmoved, late[0]), axis=0) @ late[1]
-        pulls.by_state[nodes, :n] += np.einsum("mk,mkq->mq", at_nodes, by_q)
-        pulls.by_state[nodes, 2 * n :] += np.einsum("mk,mkq->mq", at_nodes, by_z)
-        last = np.minimum(nodes, len(rollout.effort) - 1)
+            direct -= np.sum(pull * samples.prediction_rate(read.output, unmoved, late[0]), axis=0) @ late[1]
+        pulls.by_state[nodes, :n] += np.einsum("mk,mkq->mq", at_nodes, read.by_q)
+        pulls.by_state[nodes, 2 * n :] += np.einsum("mk,mkq->mq", at_nodes, read.by_z)
+        last, h = np.minimum(nodes, len(pulls.by_effort) - 1), self.step.time_step
+        if read.by_v.shape[2]:
+            by_velocity = np.einsum("mk,mkq->mq", at_nodes, read.by_v)
+            pulls.by_state[:, :n] += node_velocity_adjoint(by_velocity, nodes, len(pulls.by_state), h)
+        if read.by_lam.shape[2]:
+            np.add.at(pulls.by_multipliers, last, np.einsum("mk,mkq->mq", at_nodes, read.by_lam) / h)
         loads = ((self.system.prescribed_indices, pulls.by_effort), (self.system.driven_indices, pulls.by_torque))
         for index, by_load_there in loads:
             if index:
-                np.add.at(by_load_there, last, np.einsum("mk,mkq->mq", at_nodes, by_load[:, :, list(index)]))
+                np.add.at(by_load_there, last, np.einsum("mk,mkq->mq", at_nodes, read.by_load[:, :, list(index)]))
         return np.asarray(direct)
 
 
 @dataclass(frozen=True)
 class _Trajectory:
-    """States at all nodes, efforts at the nodes that are read, and derivatives of states, efforts, applied torques."""
+    """Values at all nodes and derivatives of states, efforts, applied torques and multipliers."""
 
-    state: Array
+    values: NodeValues
     by_state: Array | None
-    effort: Array
     by_effort: Array | None
     by_torque: Array | None
+    by_multipliers: Array | None
 
 
 @dataclass(frozen=True)
 class _Pulls:
-    """Derivatives of a cost by states, efforts of prescribed joints and applied torques, added up."""
+    """Derivatives of a cost by states, efforts of prescribed joints, applied torques and multipliers, added up."""
 
     by_state: Array
     by_effort: Array
     by_torque: Array
+    by_multipliers: Array

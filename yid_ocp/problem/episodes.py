@@ -423,8 +423,7 @@ def _samples(
     )
     found = [data for kind in SENSOR_READERS for data in SENSOR_READERS[kind](around)]
     if options.weighting == "paper":
-        # its cost is in square metres
-        found = [data for data in found if data.sensor.group_name != POSITION_GROUP]
+        found = [data for data in found if data.sensor.has_paper_weight]
     # places before efforts, which follow from the motion
     found.sort(key=lambda data: bool(data.sensor.effort_joints))
     samples = tuple(place_on_grid(data, grid, recording.name) for data in found)

@@ -264,9 +264,8 @@ class InitialStateFitter:
         nz, m = step.sizes["nz"], step.sizes["m"]
         residuals, jacobians = [], []
         for group, row in task.measured:
-            y, by_q, _, _, by_theta = self._sensor(group.sensor)(
-                q, np.zeros(nz), np.zeros(step.system.n_coordinates), theta
-            )
+            still = np.zeros(len(q))
+            y, by_q, *_, by_theta = self._sensor(group.sensor)(q, still, np.zeros(nz), still, np.zeros(m), theta)
             weight = group.weight[row] / task.softness
             value = np.where(weight > 0, group.value[row], 0.0)
             wide = np.hstack([np.array(ca.densify(by_q))[:, free], np.array(ca.densify(by_theta[:, :wanted]))])

@@ -56,7 +56,7 @@ def make_time_grid(recording: Recording, time_step: float, duration: float | Non
     DataError
         The recording is shorter than two steps, or longer than `_MAX_STEPS`, or has too few samples for its length.
     """
-    t = recording.joints.t if recording.joints is not None else recording.points[0].t
+    t = recording.all_groups[0].t
     span = float(t[-1] - t[0]) if duration is None else min(duration, float(t[-1] - t[0]))
     steps = math.floor(span / time_step + 1e-6)
     if steps > _MAX_STEPS or steps > _MAX_STEPS_PER_SAMPLE * len(t):

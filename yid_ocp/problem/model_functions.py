@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -278,22 +279,75 @@ def _depends(expression: ca.SX, symbols: ca.SX) -> bool:
 
 
 @dataclass(frozen=True)
-class _SelectedDerivatives:
-    """A compiled sensor function that returns derivatives by a subset of its parameters.
+class NodeValues:
+    """Values of `model.NodeState` at K nodes: q, v, load (K, n), z (K, nz), lam (K, m), rates by the recorded clock."""
 
-    Attributes
-    ----------
-    all_derivatives : MappedFunction
-        Its last output has one column for every parameter.
-    """
+    q: Array
+    v: Array
+    z: Array
+    load: Array
+    lam: Array
+
+    @staticmethod
+    def along_trajectory(step: Step, state: Array, load: Array | None = None, lam: Array | None = None) -> NodeValues:
+        """Values at all nodes of a trajectory (K, nx); loads and constraint forces are zero when absent."""
+        n, nodes = step.sizes["n"], np.arange(len(state))
+        q, z = state[:, :n], state[:, 2 * n :]
+        v = node_velocity(q, nodes, step.time_step)
+        lam = np.zeros((len(state), step.sizes["m"])) if lam is None else lam
+        return NodeValues(q, v, z, np.zeros_like(q) if load is None else load, lam)
+
+    def at(self, nodes: NDArray[np.int64]) -> NodeValues:
+        """The values at some of the nodes."""
+        return NodeValues(self.q[nodes], self.v[nodes], self.z[nodes], self.load[nodes], self.lam[nodes])
+
+
+def node_velocity(q: Array, nodes: NDArray[np.int64], time_step: float) -> Array:
+    """Mean midpoint velocity of the steps beside some nodes of a trajectory (K, ...), shape (len(nodes), ...)."""
+    before, after = np.maximum(nodes - 1, 0), np.minimum(nodes + 1, len(q) - 1)
+    span = np.maximum(after - before, 1) * time_step
+    return np.asarray((q[after] - q[before]) / span.reshape(-1, *[1] * (q.ndim - 1)))
+
+
+def node_velocity_adjoint(pull: Array, nodes: NDArray[np.int64], count: int, time_step: float) -> Array:
+    """Transpose of `node_velocity`, shape (len(nodes), n) to (count, n)."""
+    before, after = np.maximum(nodes - 1, 0), np.minimum(nodes + 1, count - 1)
+    scaled, result = pull / ((after - before) * time_step)[:, None], np.zeros((count, pull.shape[1]))
+    np.add.at(result, after, scaled)
+    np.subtract.at(result, before, scaled)
+    return result
+
+
+class SensorReadings(NamedTuple):
+    """Readings of a sensor at K nodes, (K, k), and their derivatives, (K, k, ...), as of `sensors.sensor_function`."""
+
+    output: Array
+    by_q: Array
+    by_v: Array
+    by_z: Array
+    by_load: Array
+    by_lam: Array
+    by_theta: Array
+
+    @property
+    def needs_neighbours(self) -> bool:
+        """Whether they depend on velocities or constraint forces, which the state of a node does not hold."""
+        return self.by_v.shape[2] + self.by_lam.shape[2] > 0
+
+
+@dataclass(frozen=True)
+class CompiledSensor:
+    """A compiled sensor function with derivatives by some of its parameters, all of them where `columns` is None."""
 
     all_derivatives: MappedFunction
-    columns: tuple[int, ...]
+    columns: tuple[int, ...] | None = None
 
-    def __call__(self, *inputs: Array) -> list[Array]:
-        """Evaluate the sensor and keep the chosen columns of the parameter derivative."""
-        *rest, by_theta = self.all_derivatives(*inputs)
-        return [*rest, by_theta[:, :, list(self.columns)]]
+    def __call__(self, at: NodeValues, theta: Array) -> SensorReadings:
+        """Readings at nodes."""
+        output, *slopes = self.all_derivatives(at.q, at.v, at.z, at.load, at.lam, theta)
+        if self.columns is not None:
+            slopes[-1] = slopes[-1][:, :, list(self.columns)]
+        return SensorReadings._make([output[:, :, 0], *slopes])
 
 
 class ModelFunctions:
@@ -340,11 +394,11 @@ class ModelFunctions:
         """Momenta that effects add to those that the tracking filter follows."""
         return self._momentum(None)
 
-    def compiled_sensor(self, sensor: Sensor, wanted: tuple[str, ...]) -> MappedFunction | _SelectedDerivatives:
+    def compiled_sensor(self, sensor: Sensor, wanted: tuple[str, ...] = ()) -> CompiledSensor:
         """Compiled function of a sensor's readings, with derivatives by the parameters `wanted`."""
         if not wanted or wanted == self.parameter_names:
-            return self._sensors((sensor, bool(wanted)))
-        return _SelectedDerivatives(self._sensors((sensor, True)), self.parameter_columns(wanted))
+            return CompiledSensor(self._sensors((sensor, bool(wanted))))
+        return CompiledSensor(self._sensors((sensor, True)), self.parameter_columns(wanted))
 
     def find_equilibrium(
         self, posture: Array, theta: Array, torque: Array | None, guess: Array | None, wanted: tuple[str, ...]
@@ -359,4 +413,4 @@ class ModelFunctions:
     def _compiled(self, key: tuple[Sensor, bool]) -> MappedFunction:
         sensor, differentiated = key
         function = sensor_function(self.step.system, sensor, self.parameter_names if differentiated else ())
-        return MappedFunction(function, shared_inputs=(3,), use_compiler=self.step.is_compiled)
+        return MappedFunction(function, shared_inputs=(5,), use_compiler=self.step.is_compiled)

@@ -14,47 +14,9 @@ from yid_ocp.data.issues import Issue
 from yid_ocp.model.objects.base import ClampPath
 from yid_ocp.options import OptionInfo
 from yid_ocp.problem.measurements import ResidualWeighting
-from yid_ocp.sensors.base import EffortKind
+from yid_ocp.sensors import SensorOptions as SensorOptions
 
 _InitialStateKind = Literal["equilibrium", "estimated", "fitted_to_points"]
-_Positive = Annotated[float, Gt(0)]
-_NonNegative = Annotated[float, Ge(0)]
-
-
-@dataclass(frozen=True)
-class SensorOptions:
-    """How one sensor group of a recording is used: points, points_NAME, joints.position or joints.effort."""
-
-    use: Annotated[
-        bool | None,
-        OptionInfo(
-            "whether the estimation sees it; when absent yes, but for joints.position: the encoders of driven joints "
-            "are measurements where no points of the arm are, never beside them"
-        ),
-    ] = None
-    std: Annotated[
-        _Positive | Mapping[str, _Positive] | None,
-        OptionInfo("noise standard deviation instead of the recorded one, by name where they differ", "m, rad or N m"),
-    ] = None
-    frames: Annotated[
-        Mapping[str, str],
-        OptionInfo("frame of the model that a point marks, or T1:40%, where the two have different names"),
-    ] = field(default_factory=dict)
-    points: Annotated[tuple[str, ...] | None, OptionInfo("points to use; all that the model has when absent")] = None
-    bias_std: Annotated[
-        _NonNegative | Mapping[str, _NonNegative] | None,
-        OptionInfo(
-            "standard deviation of a constant error in each joint's torque, another in every recording, instead of the "
-            "recorded one (joints.effort only)",
-            "N m",
-        ),
-    ] = None
-    effort_kind: Annotated[
-        EffortKind | None,
-        OptionInfo(
-            "what recorded efforts are of the torque that acts, instead of what the recording says (joints.effort only)"
-        ),
-    ] = None
 
 
 @dataclass(frozen=True)

@@ -10,13 +10,14 @@ import scipy.signal
 from numpy.typing import NDArray
 
 from yid_ocp.data.recording import JointGroup, Recording
+from yid_ocp.effects import sensor_kinds
 from yid_ocp.errors import DataError, nearest_name_hint
 from yid_ocp.model.objects.base import ClampPath
 from yid_ocp.model.servos_and_springs import PositionServo
 from yid_ocp.model.system import System
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.signal_filters import LowPassFilter
-from yid_ocp.sensors import recorded_camera_pose, recorded_joint_columns
+from yid_ocp.sensors import CHANNELS, recorded_camera_pose, recorded_joint_columns
 
 Array = NDArray[np.float64]
 _SLOW_LOAD_CUTOFF_FRACTION = 0.1
@@ -172,18 +173,20 @@ def denoised_gear_loads(measured: Array, own: Array, nodes: NDArray[np.int64], t
 
 
 def recorded_sensors(recordings: Sequence[Recording]) -> frozenset[str]:
-    """Sensors that the recordings contain, in the words of `effects.candidate_effects`."""
+    """Sensors that the recordings contain, among those that effects require (`effects.sensor_kinds`)."""
     found = set()
     for recording in recordings:
-        if recording.joints is not None:
-            found.add("joints.position")
-            if recording.joints.effort is not None:
-                found.add("joints.effort")
+        own = {} if recording.joints is None else {"joints": recording.joints.channels}
+        own |= {group.name: dict(group.values) for group in recording.channel_groups}
+        for kind in CHANNELS:
+            channel = CHANNELS[kind]
+            if any(channel.is_in_group(group) and channel.quantity in values for group, values in own.items()):
+                found.add(kind)
         if any(recorded_camera_pose(group) is not None for group in recording.points):
             found.add("camera")
-        if any(group.clock == "nominal" for group in recording.groups):
+        if any(group.clock == "nominal" for group in recording.all_groups):
             found.add("nominal_clock")
-    return frozenset(found)
+    return frozenset(found) & sensor_kinds()
 
 
 def prescribed_path(

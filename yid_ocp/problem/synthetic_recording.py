@@ -7,18 +7,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate_recording
+from yid_ocp.data.recording import ChannelGroup, JointGroup, PointGroup, Recording, validate_recording
 from yid_ocp.errors import SolverError
 from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.options import SensorOptions
+from yid_ocp.sensors.base import values_by_joint
 from yid_ocp.sensors.joints import (
     EFFORT_GROUP,
     POSITION_GROUP,
     joint_angle_noise_std,
     joint_torque_bias_std,
     joint_torque_noise_std,
-    values_by_joint,
 )
 
 Array = NDArray[np.float64]
@@ -65,7 +65,13 @@ def recording_from_prediction(
     text = f"{description} Simulated with the inputs of {episode.name}.".strip()
     joints = _joints(predictor, episode, outcome, rng)
     made = Recording(
-        joints, tuple(groups), text, "yid_ocp simulate", f"{episode.name}_simulated", true_parameters=truth
+        joints,
+        tuple(groups),
+        text,
+        "yid_ocp simulate",
+        f"{episode.name}_simulated",
+        true_parameters=truth,
+        channel_groups=_channel_groups(predictor, episode, outcome, own, rng),
     )
     return validate_recording(replace(made, marker_reference_pose=_straight(made, source)))
 
@@ -80,6 +86,38 @@ def synthesize_recording(
     if isinstance(found, str):
         raise SolverError(f"the model cannot be rolled out: {found}", where=episode.name, hint="take other values")
     return recording_from_prediction(predictor, fresh, found, theta, seed)
+
+
+def _channel_groups(
+    predictor: EpisodePredictor,
+    episode: Episode,
+    outcome: EpisodePrediction,
+    theta: Array,
+    rng: np.random.Generator | None,
+) -> tuple[ChannelGroup, ...]:
+    """What sensors of declared channels read at every node."""
+    made: dict[str, ChannelGroup] = {}
+    for sensor in (samples.sensor for samples in episode.measurements):
+        name, _, quantity = sensor.group_name.rpartition(".")
+        original = next((group for group in episode.recording.channel_groups if group.name == name), None)
+        if original is None:
+            continue
+        names = tuple(channel.removeprefix(f"{sensor.group_name}.") for channel in sensor.channel_names)
+        choice = predictor.options.sensors.get(sensor.group_name, SensorOptions())
+        stds: dict[str, Array] = {}
+        for attribute, own in zip(sensor.channel.std_fields, (choice.std, choice.bias_std), strict=True):
+            given = own if own is not None else original.stds.get(attribute)
+            if given is not None:
+                stds[attribute] = values_by_joint(given, original.names, names, f"sensors.{sensor.group_name}")
+        read = predictor.model_functions.compiled_sensor(sensor)(predictor.node_values(outcome.rollout), theta).output
+        values = read.reshape(len(read), len(names), *([-1] if sensor.channel.components else []))
+        std, bias = (stds.get(attribute, np.zeros(len(names))) for attribute in sensor.channel.std_fields)
+        widen = (slice(None), *[None] * (values.ndim - 2))
+        values = _noisy(values, np.broadcast_to(std[widen], values.shape), rng)
+        values = values + _noisy(np.zeros(values.shape[1:]), np.broadcast_to(bias[widen], values.shape[1:]), rng)
+        before = made.get(name, ChannelGroup(name, names, episode.grid.node_times, {}))
+        made[name] = replace(before, values={**before.values, quantity: values}, stds={**before.stds, **stds})
+    return tuple(made.values())
 
 
 def _with_clamps(group: PointGroup, predictor: EpisodePredictor, source: Recording) -> PointGroup:

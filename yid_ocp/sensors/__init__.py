@@ -3,10 +3,13 @@
 from importlib import import_module
 from pkgutil import iter_modules
 
+from yid_ocp.sensors.base import CHANNELS as CHANNELS
 from yid_ocp.sensors.base import SENSOR_READERS as SENSOR_READERS
+from yid_ocp.sensors.base import Channel as Channel
 from yid_ocp.sensors.base import Sensor as Sensor
 from yid_ocp.sensors.base import SensorContext as SensorContext
 from yid_ocp.sensors.base import SensorData as SensorData
+from yid_ocp.sensors.base import SensorOptions as SensorOptions
 from yid_ocp.sensors.base import recorded_joint_columns as recorded_joint_columns
 from yid_ocp.sensors.base import sensor_function as sensor_function
 from yid_ocp.sensors.joints import EffortSensor as EffortSensor

@@ -1,107 +1,117 @@
-"""The interface of all sensors: channels, symbolic readings, and how measurements are taken from a recording."""
+"""The interface of all sensors: recorded channels, symbolic readings, and measurements taken from a recording."""
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, Protocol
+from dataclasses import dataclass, field, replace
+from typing import Annotated, ClassVar, Literal, Protocol
 
 import casadi as ca
 import numpy as np
+from annotated_types import Ge, Gt
 from numpy.typing import NDArray
 
-from yid_ocp.errors import DataError, nearest_name_hint
+from yid_ocp.errors import ConfigError, DataError, nearest_name_hint
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeState, System
+from yid_ocp.options import OptionInfo
 from yid_ocp.registry import Registry
 
 Array = NDArray[np.float64]
+EffortKind = Literal["sample", "mean", "command"]
+"""What a recorded effort is: the sampled torque, its mean until the next sample, or a command held until then."""
+_Positive = Annotated[float, Gt(0)]
+_NonNegative = Annotated[float, Ge(0)]
 
 
-class Sensor(ABC):
-    """A group of measured channels with one clock; hashable, as subclasses are frozen dataclasses.
+@dataclass(frozen=True)
+class SensorOptions:
+    """How one sensor group of a recording is used: points, points_NAME, joints.position or GROUP.QUANTITY."""
 
-    Channels are named `group.point` (three outputs each) or `joints.quantity.JOINT` (one output each).
+    use: Annotated[
+        bool | None,
+        OptionInfo(
+            "whether the estimation sees it; when absent yes, but for joints.position: the encoders of driven joints "
+            "are measurements where no points of the arm are, never beside them"
+        ),
+    ] = None
+    std: Annotated[
+        _Positive | Mapping[str, _Positive] | None,
+        OptionInfo("noise standard deviation instead of the recorded one, by name where they differ", "m, rad or N m"),
+    ] = None
+    frames: Annotated[
+        Mapping[str, str],
+        OptionInfo("frame of the model that a point marks, or T1:40%, where the two have different names"),
+    ] = field(default_factory=dict)
+    points: Annotated[tuple[str, ...] | None, OptionInfo("points to use; all that the model has when absent")] = None
+    bias_std: Annotated[
+        _NonNegative | Mapping[str, _NonNegative] | None,
+        OptionInfo(
+            "standard deviation of a constant error in each joint's torque, another in every recording, instead of the "
+            "recorded one (efforts and currents only)",
+            "N m",
+        ),
+    ] = None
+    effort_kind: Annotated[
+        EffortKind | None,
+        OptionInfo(
+            "what recorded efforts are of the torque that acts, instead of what the recording says (joints.effort only)"
+        ),
+    ] = None
+    constants: Annotated[
+        Mapping[str, float | Mapping[str, float]],
+        OptionInfo("constants of the sensor, by name, such as torque_constant [N m/A] of motors.current"),
+    ] = field(default_factory=dict)
+
+
+# -- what a recording holds -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A kind of recorded values: where a recording holds them, their unit, and what settings must add.
+
+    The noise stands in the group's attributes `QUANTITY_std` and `QUANTITY_bias_std`, of points in the dataset `std`.
 
     Attributes
     ----------
-    group_name : str
-        The recording's group, such as `points_camera`.
-    unit : str
-        Of the readings.
-    outputs_per_channel : int
-        3 for a point, 1 for a joint.
-    naive_prediction : "zero" or "stays"
-        What a trivial prediction without a model is: zero, or the first measured value.
-    frame_names, point_names : tuple of str
-        The mechanism's frame that each channel marks and its recorded name; none for joints.
+    group : str
+        Group of the recording; there may be several, `GROUP` and `GROUP_NAME`, each with its own clock.
+    quantity : str
+        Dataset of the group, with one column for every name of the group.
+    components : tuple of str
+        Names of the components of each value; none for a number.
+    constants : mapping of str to unit
+        Constants that `sensors.GROUP.QUANTITY.constants` may give.
     """
 
-    group_name: str
-    unit: ClassVar[str]
-    outputs_per_channel: ClassVar[int] = 1
-    naive_prediction: ClassVar[Literal["zero", "stays"]] = "stays"
-    frame_names: tuple[str, ...]
-    point_names: tuple[str, ...]
+    group: str
+    quantity: str
+    unit: str
+    components: tuple[str, ...] = ()
+    constants: Mapping[str, str] = field(default_factory=dict)
 
     @property
-    @abstractmethod
-    def channel_names(self) -> tuple[str, ...]:
-        """Names of the channels, in the order of the outputs."""
+    def std_fields(self) -> tuple[str, str]:
+        """Attributes of the group that state white noise and a constant error."""
+        return f"{self.quantity}_std", f"{self.quantity}_bias_std"
 
-    @property
-    def effort_joints(self) -> tuple[str, ...]:
-        """Names of joints whose predicted effort it reads, filtered like the path; none for other sensors."""
-        return ()
-
-    @property
-    def camera_pose(self) -> Placement | None:
-        """Pose of the camera in the world; None for any other sensor."""
-        return None
-
-    @abstractmethod
-    def ideal_reading(self, state: NodeState) -> ca.SX:
-        """What the sensor reads at a node without effects, shape (outputs_per_channel * len(channel_names), 1)."""
+    def is_in_group(self, name: str) -> bool:
+        """Whether a recording's group of this name holds the channel."""
+        return re.fullmatch(rf"{self.group}(_[^/]+)?", name) is not None
 
 
-def sensor_function(system: System, sensor: Sensor, names: tuple[str, ...]) -> ca.Function:
-    """A CasADi function for readings y(q, z, effort; theta), effects included, with their derivatives.
-
-    Parameters
-    ----------
-    system : System
-    sensor : Sensor
-    names : tuple of str
-        Parameters by which to differentiate.
-
-    Returns
-    -------
-    casadi.Function
-        (q, z, effort, theta) to (y, dy/dq, dy/dz, dy/deffort, dy/dtheta); effort has one entry for every joint.
-    """
-    rows = {name: i for i, name in enumerate(system.internal_coordinates)}
-    q, z = ca.SX.sym("q", system.n_coordinates), ca.SX.sym("z", len(rows))
-    effort = ca.SX.sym("effort", system.n_coordinates)
-    kinematics = forward_kinematics(system.mechanism, q)
-    state = NodeState(system, kinematics, q, z, effort, rows, sensor.camera_pose)
-    parts = ca.vertsplit(sensor.ideal_reading(state), sensor.outputs_per_channel)
-    read = []
-    marked = sensor.frame_names or (None,) * len(sensor.channel_names)
-    for channel, part, frame in zip(sensor.channel_names, parts, marked, strict=True):
-        for effect in system.effects:
-            part = effect.distorted_reading(channel, part, replace(state, marked_frame=frame))
-        read.append(part)
-    output = ca.vertcat(*read)
-    symbols = ca.vertcat(*system.internal_coordinates.values()) if rows else ca.SX(0, 1)
-    output = ca.densify(ca.substitute(output, symbols, z))
-    chosen = ca.vertcat(*(system.parameters[name].symbol for name in names)) if names else ca.SX(0, 1)
-    outputs = [output, *(ca.jacobian(output, x) for x in (q, z, effort, chosen))]
-    return ca.Function("sensor", [q, z, effort, system.parameters.symbols], ca.cse(outputs))
+CHANNELS: Registry[Channel] = Registry("recorded channel")
+"""Kinds of recorded values; those of `joints` and `points` have their own fields in `data.recording.Recording`."""
 
 
-# -- from a recording -------------------------------------------------------------------------------------------------
+def declared_channels(group: str) -> tuple[Channel, ...]:
+    """Channels that a sensor declares for a group of a recording other than joints and points."""
+    found = (CHANNELS[name] for name in CHANNELS)
+    return tuple(c for c in found if c.group not in ("joints", "points") and c.is_in_group(group))
 
 
 class PointData(Protocol):
@@ -144,6 +154,21 @@ class JointData(Protocol):
     def position_std(self) -> float | Array | None: ...  # noqa: D102
 
 
+class ChannelData(Protocol):
+    """A recorded group of declared channels, as in `data.recording.ChannelGroup`."""
+
+    @property
+    def name(self) -> str: ...  # noqa: D102
+    @property
+    def names(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def t(self) -> Array: ...  # noqa: D102
+    @property
+    def values(self) -> Mapping[str, Array]: ...  # noqa: D102
+    @property
+    def stds(self) -> Mapping[str, float | Array]: ...  # noqa: D102
+
+
 class RecordingData(Protocol):
     """A recording as sensors need it, as in `data.recording.Recording`."""
 
@@ -153,31 +178,148 @@ class RecordingData(Protocol):
     def joints(self) -> JointData | None: ...  # noqa: D102
     @property
     def points(self) -> Sequence[PointData]: ...  # noqa: D102
+    @property
+    def channel_groups(self) -> Sequence[ChannelData]: ...  # noqa: D102
 
 
-EffortKind = Literal["sample", "mean", "command"]
-"""What a recorded effort is: the sampled torque, its mean until the next sample, or a command held until then."""
+def recorded_joint_columns(joints: JointData, names: tuple[str, ...], where: str) -> list[int]:
+    """Column indices of the named joints in a recording; `DataError` for a joint that is not recorded."""
+    for name in names:
+        if name not in joints.names:
+            raise DataError(
+                f"joint '{name}' of the model is not recorded",
+                where=f"{where}: joints",
+                hint=nearest_name_hint(name, joints.names),
+            )
+    return [joints.names.index(name) for name in names]
 
 
-class SensorUsage(Protocol):
-    """Settings of one recorded group, as in `problem.options.SensorOptions`."""
+def values_by_joint(
+    given: float | Array | Mapping[str, float], recorded: Sequence[str], names: Sequence[str], key: str
+) -> Array:
+    """One value per joint in `names`, from one value for all, one per recorded joint, or a mapping."""
+    if isinstance(given, Mapping):
+        for name in names:
+            if name not in given:
+                raise ConfigError(f"joint '{name}' has no value", where=key, hint=nearest_name_hint(name, given))
+        return np.array([float(given[name]) for name in names])
+    wide = np.broadcast_to(np.asarray(given, float), (len(recorded),))
+    return wide[[list(recorded).index(name) for name in names]]
+
+
+# -- what a sensor reads ----------------------------------------------------------------------------------------------
+
+
+class Sensor(ABC):
+    """A group of measured channels with one clock; hashable, as subclasses are frozen dataclasses.
+
+    Channels are named `group.point` (three outputs each) or `group.quantity.JOINT` (one output each).
+
+    Attributes
+    ----------
+    channel : Channel
+        What a recording holds of it.
+    group_name : str
+        Key of its settings: a group of points, such as `points_camera`, or `joints.effort`.
+    naive_prediction : "zero" or "stays"
+        What a trivial prediction without a model is: zero, or the first measured value.
+    has_paper_weight : bool
+        Whether the source paper's cost, in square metres, counts it.
+    frame_names, point_names : tuple of str
+        The mechanism's frame that each channel marks and its recorded name; none for joints.
+    """
+
+    channel: ClassVar[Channel]
+    group_name: str
+    naive_prediction: ClassVar[Literal["zero", "stays"]] = "stays"
+    has_paper_weight: ClassVar[bool] = True
+    frame_names: tuple[str, ...]
+    point_names: tuple[str, ...]
 
     @property
-    def use(self) -> bool | None: ...  # noqa: D102
+    def unit(self) -> str:
+        """Of the readings."""
+        return self.channel.unit
+
     @property
-    def std(self) -> float | Mapping[str, float] | None: ...  # noqa: D102
+    def outputs_per_channel(self) -> int:
+        """3 for a point, 1 for a joint."""
+        return max(len(self.channel.components), 1)
+
     @property
-    def frames(self) -> Mapping[str, str]: ...  # noqa: D102
+    @abstractmethod
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the channels, in the order of the outputs."""
+
     @property
-    def points(self) -> tuple[str, ...] | None: ...  # noqa: D102
+    def output_names(self) -> tuple[str, ...]:
+        """Name of each output: its channel's, with the component where there are several."""
+        parts = [f".{part}" for part in self.channel.components] or [""]
+        return tuple(f"{name}{part}" for name in self.channel_names for part in parts)
+
     @property
-    def bias_std(self) -> float | Mapping[str, float] | None: ...  # noqa: D102
+    def effort_joints(self) -> tuple[str, ...]:
+        """Names of joints whose predicted effort it reads, filtered like the path; none for other sensors."""
+        return ()
+
     @property
-    def effort_kind(self) -> EffortKind | None: ...  # noqa: D102
+    def effort_per_output(self) -> Array:
+        """Joint effort that one unit of each output stands for, shape (len(effort_joints),) [N m per unit]."""
+        return np.ones(len(self.effort_joints))
+
+    @property
+    def camera_pose(self) -> Placement | None:
+        """Pose of the camera in the world; None for any other sensor."""
+        return None
+
+    @abstractmethod
+    def ideal_reading(self, state: NodeState) -> ca.SX:
+        """What the sensor reads at a node without effects, shape (outputs_per_channel * len(channel_names), 1)."""
+
+
+def sensor_function(system: System, sensor: Sensor, names: tuple[str, ...]) -> ca.Function:
+    """A CasADi function for readings y(q, v, z, load, lam; theta), effects included, with their derivatives.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Parameters by which to differentiate.
+
+    Returns
+    -------
+    casadi.Function
+        (q, v, z, load, lam, theta) to (y, dy/dq, dy/dv, dy/dz, dy/dload, dy/dlam, dy/dtheta), as in `NodeState`; v and
+        lam by the recorded clock. Slopes by v and lam have no columns where nothing reads them.
+    """
+    rows = {name: i for i, name in enumerate(system.internal_coordinates)}
+    n = system.n_coordinates
+    sizes = {"q": n, "v": n, "z": len(rows), "load": n, "lam": system.n_constraints}
+    at = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
+    kinematics, scale = forward_kinematics(system.mechanism, at["q"]), system.recorded_time_scale
+    true = (at["q"], at["v"] / scale, at["z"], at["load"], at["lam"] / scale)
+    state = NodeState(system, kinematics, *true, rows, sensor.camera_pose)
+    parts = ca.vertsplit(sensor.ideal_reading(state), sensor.outputs_per_channel)
+    read = []
+    marked = sensor.frame_names or (None,) * len(sensor.channel_names)
+    for channel, part, frame in zip(sensor.channel_names, parts, marked, strict=True):
+        for effect in system.effects:
+            part = effect.distorted_reading(channel, part, replace(state, marked_frame=frame))
+        read.append(part)
+    output = ca.vertcat(*read)
+    symbols = ca.vertcat(*system.internal_coordinates.values()) if rows else ca.SX(0, 1)
+    output = ca.densify(ca.substitute(output, symbols, at["z"]))
+    chosen = ca.vertcat(*(system.parameters[name].symbol for name in names)) if names else ca.SX(0, 1)
+    slopes = {name: ca.jacobian(output, symbol) for name, symbol in at.items()}
+    slopes |= {name: ca.SX(output.numel(), 0) for name in ("v", "lam") if not slopes[name].nnz()}
+    outputs = [output, *slopes.values(), ca.jacobian(output, chosen)]
+    return ca.Function("sensor", [*at.values(), system.parameters.symbols], ca.cse(outputs))
+
+
+# -- from a recording -------------------------------------------------------------------------------------------------
 
 
 class SmoothingFilter(Protocol):
-    """A zero-phase low-pass filter, as in `problem.effort_filter.LowPassFilter`."""
+    """A zero-phase low-pass filter, as in `problem.signal_filters.LowPassFilter`."""
 
     @property
     def cutoff(self) -> float: ...  # noqa: D102
@@ -195,15 +337,13 @@ class SensorContext:
 
     Attributes
     ----------
-    system : System
-    recording : RecordingData
     sensor_usage : callable
-        From a group's name to how it is used.
+        From the key of a sensor's settings to these.
     node_times : ndarray, shape (N + 1,)
         Of the rollout's nodes [s].
     time_step : float
         Between them [s].
-    effort_filter : Smoothing
+    effort_filter : SmoothingFilter
         That of efforts of prescribed joints.
     joint_mass_matrices : callable
         From joint names and some of their configurations, shape (K, k), to their part of the mass matrix in each of
@@ -212,7 +352,7 @@ class SensorContext:
 
     system: System
     recording: RecordingData
-    sensor_usage: Callable[[str], SensorUsage]
+    sensor_usage: Callable[[str], SensorOptions]
     node_times: Array
     time_step: float
     effort_filter: SmoothingFilter
@@ -225,7 +365,6 @@ class SensorData:
 
     Attributes
     ----------
-    sensor : Sensor
     t : ndarray, shape (M,)
         [s]
     value, std : ndarray, shape (M, k)
@@ -249,15 +388,3 @@ class SensorData:
 
 SENSOR_READERS: Registry[Callable[[SensorContext], list[SensorData]]] = Registry("kind of sensor")
 """Functions that take all measurements of one kind of sensor from a recording, by kind."""
-
-
-def recorded_joint_columns(joints: JointData, names: tuple[str, ...], where: str) -> list[int]:
-    """Column indices of the named joints in a recording; `DataError` for a joint that is not recorded."""
-    for name in names:
-        if name not in joints.names:
-            raise DataError(
-                f"joint '{name}' of the model is not recorded",
-                where=f"{where}: joints",
-                hint=nearest_name_hint(name, joints.names),
-            )
-    return [joints.names.index(name) for name in names]

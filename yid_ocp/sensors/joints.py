@@ -3,35 +3,40 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 import scipy.special
 
-from yid_ocp.errors import ConfigError, DataError, nearest_name_hint
+from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.model.system import NodeState
 from yid_ocp.sensors.base import (
+    CHANNELS,
     SENSOR_READERS,
     Array,
+    Channel,
     JointData,
     PointData,
     Sensor,
     SensorContext,
     SensorData,
-    SensorUsage,
+    SensorOptions,
     recorded_joint_columns,
+    values_by_joint,
 )
 
 EFFORT_GROUP = "joints.effort"
 POSITION_GROUP = "joints.position"
+_EFFORT = CHANNELS.register(EFFORT_GROUP)(Channel("joints", "effort", "N m"))
+_POSITION = CHANNELS.register(POSITION_GROUP)(Channel("joints", "position", "rad"))
 NOISE_DIFFERENCE_ORDER = 6
 """Order of the differences that estimate a noise level; they remove any motion that is slow against the sampling."""
 
 
 @dataclass(frozen=True)
-class _JointSensor(Sensor):
+class JointSensor(Sensor):
     """A sensor of named joints with one output per joint and no points."""
 
     frame_names = point_names = ()
@@ -41,27 +46,32 @@ class _JointSensor(Sensor):
 
     @property
     def channel_names(self) -> tuple[str, ...]:
-        """`joints.QUANTITY.JOINT` for every joint."""
+        """`group.quantity.JOINT` for every joint."""
         return tuple(f"{self.group_name}.{joint}" for joint in self.joint_names)
+
+    def select_joints(self, values: ca.SX, state: NodeState) -> ca.SX:
+        """Rows of all joints' values (n, 1) that are the sensor's joints, shape (nj, 1)."""
+        return ca.vertcat(*(values[state.system.mechanism.joint_index(joint)] for joint in self.joint_names))
 
 
 @dataclass(frozen=True)
-class PositionSensor(_JointSensor):
+class PositionSensor(JointSensor):
     """Encoders of named driven joints."""
 
-    unit = "rad"
+    channel = _POSITION
+    has_paper_weight = False
     group_name: str = POSITION_GROUP
 
     def ideal_reading(self, state: NodeState) -> ca.SX:
         """Angles of the joints, shape (nj, 1) [rad]."""
-        return ca.vertcat(*(state.q[state.system.mechanism.joint_index(joint)] for joint in self.joint_names))
+        return self.select_joints(state.q, state)
 
 
 @dataclass(frozen=True)
-class EffortSensor(_JointSensor):
+class EffortSensor(JointSensor):
     """Efforts of named prescribed joints, predicted by the discrete inverse dynamics."""
 
-    unit = "N m"
+    channel = _EFFORT
     naive_prediction = "zero"
     group_name: str = EFFORT_GROUP
 
@@ -72,7 +82,7 @@ class EffortSensor(_JointSensor):
 
     def ideal_reading(self, state: NodeState) -> ca.SX:
         """Efforts of the joints, shape (nj, 1) [N m]."""
-        return ca.vertcat(*(state.effort[state.system.mechanism.joint_index(joint)] for joint in self.joint_names))
+        return self.select_joints(state.load, state)
 
 
 def is_measured_by_arm(group: PointData) -> bool:
@@ -124,12 +134,46 @@ def read_joint_efforts(around: SensorContext) -> list[SensorData]:
     names = tuple(name for name in around.system.prescribed if name in joints.names)
     if not names:
         return []
-    times, low_pass, where = around.node_times, around.effort_filter, around.recording.name
-    effort = low_pass(joints.t, joints.effort[:, recorded_joint_columns(joints, names, where)])
+    effort = joints.effort[:, recorded_joint_columns(joints, names, around.recording.name)]
+    given = choice.std if choice.std is not None else joints.effort_std
+    if given is None:
+        raise DataError(
+            "the noise level of the joint efforts is neither recorded nor given",
+            where=around.recording.name,
+            hint=f"set sensors.{EFFORT_GROUP}.std [N m], from a stretch at rest or the data sheet",
+        )
+    std = values_by_joint(given, joints.names, names, f"sensors.{EFFORT_GROUP}.std")
+    is_sample = joints.effort_kind_or_default == "sample"
+    bias = joint_torque_bias_std(joints, names, choice)
+    return [smoothed_effort_data(around, EffortSensor(names), joints.t, effort, std, bias, is_sample=is_sample)]
+
+
+def smoothed_effort_data(
+    around: SensorContext, sensor: JointSensor, t: Array, values: Array, std: Array, bias: Array, *, is_sample: bool
+) -> SensorData:
+    """Measurements of a sensor of efforts, low-pass filtered and thinned out to independent samples.
+
+    Parameters
+    ----------
+    t : ndarray, shape (M,)
+    values : ndarray, shape (M, k)
+        In the sensor's unit.
+    std, bias : ndarray, shape (k,)
+        Of their white noise and of an error that is constant in the recording.
+    is_sample : bool
+        Whether a value is that at its time, not of the interval until the next.
+
+    Raises
+    ------
+    DataError
+        A recording too short for the filter.
+    """
+    times, low_pass = around.node_times, around.effort_filter
+    smooth = low_pass(t, values)
     # what stands for an interval belongs to its middle
-    period = float(np.median(np.diff(joints.t)))
-    late = 0.0 if joints.effort_kind_or_default == "sample" else 0.5 * period
-    measured = np.stack([np.interp(times, joints.t + late, column) for column in effort.T], axis=1)
+    period = float(np.median(np.diff(t)))
+    late = 0.0 if is_sample else 0.5 * period
+    measured = np.stack([np.interp(times, t + late, column) for column in smooth.T], axis=1)
     # Smoothed values repeat their neighbours: only as many are kept as count as independent. Both ends are left out:
     # the filter sees one side alone there, the impulse at node 0 depends on the motion before the recording and that at
     # the last node on the motion after it.
@@ -141,47 +185,48 @@ def read_joint_efforts(around: SensorContext) -> list[SensorData]:
     if not len(kept):
         raise DataError(
             f"{steps * step:.3g} s of efforts are too short for a filter of {low_pass.cutoff:g} Hz",
-            where=where,
+            where=around.recording.name,
             allowed=f"more than {2 * ends * step:.3g} s",
             hint="use a longer recording, or raise problem.path_cutoff",
         )
-    std, correlation = _smoothed_effort_noise(around, names, choice, period, times[kept])
-    bias = joint_torque_bias_std(joints, names, choice)
-    return [SensorData(EffortSensor(names), times[kept], measured[kept], std, (1, steps - 1), bias, correlation)]
+    unit = sensor.effort_per_output
+    total, correlation = _smoothed_effort_noise(around, sensor.joint_names, std * np.abs(unit), period, times[kept])
+    if correlation is not None:
+        correlation = correlation * np.outer(np.sign(unit), np.sign(unit))
+    return SensorData(sensor, times[kept], measured[kept], total / np.abs(unit), (1, steps - 1), bias, correlation)
 
 
 # -- noise levels -----------------------------------------------------------------------------------------------------
 
 
-def is_noise_std_stated(joints: JointData, group: str, choice: SensorUsage) -> bool:
+def is_noise_std_stated(joints: JointData, group: str, choice: SensorOptions) -> bool:
     """Whether the recording or the settings state the noise std of `joints.effort` or `joints.position`."""
-    recorded = joints.effort_std if group == EFFORT_GROUP else joints.position_std
-    return choice.std is not None or recorded is not None
+    return choice.std is not None or getattr(joints, CHANNELS[group].std_fields[0]) is not None
 
 
-def joint_angle_noise_std(joints: JointData, names: Sequence[str], choice: SensorUsage, where: str) -> Array:
+def joint_angle_noise_std(joints: JointData, names: Sequence[str], choice: SensorOptions, where: str) -> Array:
     """Noise standard deviation of driven joints' encoders, stated or estimated, shape (len(names),) [rad]."""
-    given = choice.std if choice.std is not None else joints.position_std
-    if given is None:
-        measured = joints.position[:, recorded_joint_columns(joints, tuple(names), where)]
-        return _estimated_noise_std(measured, where, POSITION_GROUP, "rad")
-    return values_by_joint(given, joints.names, names, "sensors.joints.position.std")
+    return _joint_noise_std(joints, names, choice, where, POSITION_GROUP)
 
 
-def joint_torque_noise_std(joints: JointData, names: Sequence[str], choice: SensorUsage, where: str) -> Array:
+def joint_torque_noise_std(joints: JointData, names: Sequence[str], choice: SensorOptions, where: str) -> Array:
     """Noise standard deviation of driven joints' recorded torques, stated or estimated, shape (len(names),) [N m]."""
-    given = choice.std if choice.std is not None else joints.effort_std
+    return _joint_noise_std(joints, names, choice, where, EFFORT_GROUP)
+
+
+def _joint_noise_std(joints: JointData, names: Sequence[str], choice: SensorOptions, where: str, group: str) -> Array:
+    channel = CHANNELS[group]
+    given = choice.std if choice.std is not None else getattr(joints, channel.std_fields[0])
     if given is None:
-        assert joints.effort is not None
-        measured = joints.effort[:, recorded_joint_columns(joints, tuple(names), where)]
-        return _estimated_noise_std(measured, where, EFFORT_GROUP, "N m")
-    return values_by_joint(given, joints.names, names, "sensors.joints.effort.std")
+        values = getattr(joints, channel.quantity)[:, recorded_joint_columns(joints, tuple(names), where)]
+        return _estimated_noise_std(values, where, group, channel.unit)
+    return values_by_joint(given, joints.names, names, f"sensors.{group}.std")
 
 
-def joint_torque_bias_std(joints: JointData, names: Sequence[str], choice: SensorUsage) -> Array:
+def joint_torque_bias_std(joints: JointData, names: Sequence[str], choice: SensorOptions) -> Array:
     """Standard deviation of a constant error of recorded torques, zero if unknown, shape (len(names),) [N m]."""
     given = choice.bias_std if choice.bias_std is not None else joints.effort_bias_std
-    return values_by_joint(0.0 if given is None else given, joints.names, names, "sensors.joints.effort.bias_std")
+    return values_by_joint(0.0 if given is None else given, joints.names, names, f"sensors.{EFFORT_GROUP}.bias_std")
 
 
 def _estimated_noise_std(values: Array, where: str, group: str, unit: str) -> Array:
@@ -201,51 +246,26 @@ def _estimated_noise_std(values: Array, where: str, group: str, unit: str) -> Ar
     return np.asarray(found)
 
 
-def values_by_joint(
-    given: float | Array | Mapping[str, float], recorded: Sequence[str], names: Sequence[str], key: str
-) -> Array:
-    """One value per joint in `names`, from one value for all, one per recorded joint, or a mapping."""
-    if isinstance(given, Mapping):
-        for name in names:
-            if name not in given:
-                raise ConfigError(f"joint '{name}' has no value", where=key, hint=nearest_name_hint(name, given))
-        return np.array([float(given[name]) for name in names])
-    wide = np.broadcast_to(np.asarray(given, float), (len(recorded),))
-    return wide[[list(recorded).index(name) for name in names]]
-
-
 def _smoothed_effort_noise(
-    around: SensorContext, names: tuple[str, ...], choice: SensorUsage, period: float, times: Array
+    around: SensorContext, names: tuple[str, ...], std: Array, period: float, times: Array
 ) -> tuple[Array, Array | None]:
     """Noise of filtered efforts at some times, from the effort sensors and from accelerations of noisy encoders.
 
     An acceleration that is wrong at one joint asks for a torque at every joint whose inertia is coupled with it, so
     that their errors are correlated: with M the mass matrix, the covariance is diag(s^2) + M diag(a^2) M.
 
-    Returns
-    -------
-    std : ndarray, shape (M, k)
-    correlation : ndarray, shape (M, k, k), or None
-        None where the encoders' noise is not stated.
+    Returns the standard deviation, shape (M, k), and the correlation, shape (M, k, k), None where the encoders' noise
+    is not stated.
     """
-    joints, where = around.recording.joints, around.recording.name
-    assert joints is not None
-    given = choice.std if choice.std is not None else joints.effort_std
-    if given is None:
-        raise DataError(
-            "the noise level of the joint efforts is neither recorded nor given",
-            where=where,
-            hint="set sensors.joints.effort.std [N m], from a stretch at rest or the data sheet",
-        )
-    std = values_by_joint(given, joints.names, names, "sensors.joints.effort.std")
     value_gain, _, second_gain = around.effort_filter.noise_gains(period)
-    encoders = around.sensor_usage(POSITION_GROUP)
+    joints, encoders = around.recording.joints, around.sensor_usage(POSITION_GROUP)
+    assert joints is not None
     known = encoders.std if encoders.std is not None else joints.position_std
-    angle = values_by_joint(0.0 if known is None else known, joints.names, names, "sensors.joints.position.std")
+    angle = values_by_joint(0.0 if known is None else known, joints.names, names, f"sensors.{POSITION_GROUP}.std")
     own = (std * value_gain) ** 2
     if not np.any(angle > 0):
         return np.broadcast_to(np.sqrt(own), (len(times), len(names))), None
-    measured = joints.position[:, recorded_joint_columns(joints, names, where)]
+    measured = joints.position[:, recorded_joint_columns(joints, names, around.recording.name)]
     angles = np.stack([np.interp(times, joints.t, column) for column in measured.T], axis=1)
     by_acceleration = around.joint_mass_matrices(names, angles) * (angle * second_gain)
     covariance = by_acceleration @ by_acceleration.transpose(0, 2, 1) + np.diag(own)

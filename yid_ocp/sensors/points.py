@@ -11,7 +11,18 @@ import numpy as np
 from yid_ocp.errors import ConfigError, DataError, nearest_name_hint
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeState
-from yid_ocp.sensors.base import SENSOR_READERS, PointData, Sensor, SensorContext, SensorData, SensorUsage
+from yid_ocp.sensors.base import (
+    CHANNELS,
+    SENSOR_READERS,
+    Channel,
+    PointData,
+    Sensor,
+    SensorContext,
+    SensorData,
+    SensorOptions,
+)
+
+_POINTS = CHANNELS.register("points")(Channel("points", "position", "m", ("x", "y", "z")))
 
 
 @dataclass(frozen=True)
@@ -30,9 +41,7 @@ class PointSensor(Sensor):
         4x4 pose of the camera in the world; None for a sensor that is no camera.
     """
 
-    unit = "m"
-    outputs_per_channel = 3
-
+    channel = _POINTS
     group_name: str
     point_names: tuple[str, ...]
     frame_names: tuple[str, ...]
@@ -69,7 +78,7 @@ def read_point_groups(around: SensorContext) -> list[SensorData]:
     ]
 
 
-def _points(around: SensorContext, group: PointData, choice: SensorUsage) -> SensorData:
+def _points(around: SensorContext, group: PointData, choice: SensorOptions) -> SensorData:
     where = around.recording.name
     wanted = choice.points if choice.points is not None else group.names
     frames = {p: choice.frames.get(p, p) for p in wanted}

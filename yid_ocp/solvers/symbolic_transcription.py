@@ -455,8 +455,7 @@ class _Maker:
             free = np.broadcast_to(places.free, (len(nodes), len(places.free)))
             states = places.state[nodes]
             at, data = np.hstack([free, states[:, :n], states[:, 2 * n :]]), np.zeros((len(nodes), 0), np.int64)
-        parts = [f".{axis}" for axis in "xyz"] if sensor.outputs_per_channel == 3 else [""] * sensor.outputs_per_channel
-        rows = tuple(f"{channel}{part}" for channel in sensor.channel_names for part in parts)
+        rows = sensor.output_names
         term = ProgramTerm(f"{sensor.group_name}[{episode.name}]", rows, read, at, data, places.theta)
         seen, between = samples.is_used, _between(samples, nodes if smooth is None else smooth.nodes)
         if smooth is not None:
@@ -477,15 +476,21 @@ class _Maker:
         key = (sensor, *_kind(episode))
         if key not in self._sensors:
             function = sensor_function(self._problem.system, sensor, self._names)
-            loaded = function.nnz_out(3) > 0
+            if function.size2_out(2) + function.size2_out(5):
+                raise SolverError(
+                    f"'{sensor.group_name}' depends on velocities or constraint forces, which node states do not carry",
+                    where=episode.name,
+                    hint="use gauss_newton",
+                )
+            loaded = function.nnz_out(4) > 0
             made = self._loaded(function, self._driven(episode)) if loaded else self._unloaded(function)
             self._sensors[key] = made, loaded
         return self._sensors[key]
 
     def _unloaded(self, function: ca.Function) -> LocalFunction:
         n = self._sizes["n"]
-        q, z = ca.SX.sym("q", n), ca.SX.sym("z", self._sizes["nz"])
-        y, by_q, by_z, _, by_free = function(q, z, ca.SX(ca.DM.zeros(n)), self._freed.theta)
+        q, z, still, lam = ca.SX.sym("q", n), ca.SX.sym("z", self._sizes["nz"]), ca.SX(n, 1), ca.SX(self._sizes["m"], 1)
+        y, by_q, _, by_z, _, _, by_free = function(q, still, z, still, lam, self._freed.theta)
         inputs = [ca.vertcat(self._freed.free, q, z), ca.SX(0, 1), self._freed.nominal]
         return LocalFunction("reading", inputs, y, ca.horzcat(by_free, by_q, by_z))
 
@@ -498,7 +503,8 @@ class _Maker:
         for index, values, by_these in pairs:
             for k, row in enumerate(index):
                 load[row], by_v[row, :] = values[k], by_these[k, :]
-        y, by_q, by_z, by_load, by_free = function(node[:n], node[2 * n :], load, self._freed.theta)
+        still, lam = ca.SX(n, 1), ca.SX(self._sizes["m"], 1)
+        y, by_q, _, by_z, by_load, _, by_free = function(node[:n], still, node[2 * n :], load, lam, self._freed.theta)
         at_node = ca.horzcat(by_q, ca.SX(y.numel(), n), by_z)
         rest = ca.SX(y.numel(), size - len(self._names) - 2 * nx)
         slopes = ca.mtimes(by_load, by_v) + ca.horzcat(by_free, (1 - last) * at_node, last * at_node, rest)

@@ -40,6 +40,7 @@ from yid_ocp.model import System
 from yid_ocp.model.objects.base import CableTopology, ClampedObject, ClampPath
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
+from yid_ocp.sensors.base import declared_channels
 from yid_ocp.sensors.joints import EFFORT_GROUP, POSITION_GROUP, is_measured_by_arm
 from yid_ocp.workflow.build import (
     arms_are_estimated_states,
@@ -183,9 +184,7 @@ def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
 
 
 def _check_sensors(run: RunSettings, recordings: Sequence[Recording]) -> None:
-    known = {group.name for recording in recordings for group in recording.points}
-    if any(recording.joints is not None for recording in recordings):
-        known |= {POSITION_GROUP, EFFORT_GROUP}
+    known = {key for recording in recordings for key in recording.sensor_keys}
     for name, said in run.sensors.items():
         if name not in known:
             what, details = f"no recording has a group '{name}'", unknown_name_details(name, sorted(known))
@@ -193,6 +192,13 @@ def _check_sensors(run: RunSettings, recordings: Sequence[Recording]) -> None:
         if said.effort_kind is not None and name != EFFORT_GROUP:
             hint = f"say it of {EFFORT_GROUP}, or leave it out"
             raise run.config_error(f"'{name}' holds no efforts", "sensors", name, "effort_kind", hint=hint)
+        group, _, quantity = name.rpartition(".")
+        constants = next((c.constants for c in declared_channels(group) if c.quantity == quantity), {})
+        for constant in said.constants:
+            if constant not in constants:
+                details = unknown_name_details(constant, constants)
+                what = f"'{name}' has no constant '{constant}'"
+                raise run.config_error(what, "sensors", name, "constants", **details)
 
 
 def load_problem(path: str | Path | None = None, overrides: Sequence[str] = ()) -> EstimationProblem:

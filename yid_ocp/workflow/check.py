@@ -130,7 +130,7 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
         "role": role,
         "duration": recording.duration,
         "steps": episode.grid.steps,
-        "groups": {getattr(group, "name", "joints"): _group(group) for group in recording.groups},
+        "groups": {getattr(group, "name", "joints"): _group(group) for group in recording.all_groups},
         "noise": noise,
     }
     rate = 1.0 / problem.step.time_step

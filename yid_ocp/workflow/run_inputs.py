@@ -20,12 +20,12 @@ from yid_ocp.errors import ConfigError, YidError, nearest_name_hint
 from yid_ocp.files import file_sha256, is_file
 from yid_ocp.model.urdf import resolve_urdf_path
 from yid_ocp.registry import Registry
-from yid_ocp.sensors import SENSOR_READERS
+from yid_ocp.sensors import CHANNELS, SENSOR_READERS
 
 _ENTRY_POINT_GROUP = "yid_ocp.effects"
 """Entry points of this group are modules that register effects or sensors when they are imported."""
 
-_REGISTRIES: tuple[Registry[Any], ...] = (EFFECTS, SENSOR_READERS)
+_REGISTRIES: tuple[Registry[Any], ...] = (EFFECTS, SENSOR_READERS, CHANNELS)
 _loaded: dict[str, str] = {}  # what this process has run: file or entry point, and the hash or distribution
 
 

@@ -107,10 +107,8 @@ def _course(
 ) -> np.ndarray:
     """What a sensor of points would have seen at every node, for one that looks seldom, shape (N + 1, k)."""
     problem, own = _problem_and_theta(findings, role, episode)
-    n, state = problem.system.n_coordinates, outcome.rollout.state
-    efforts = np.zeros((len(state), n))
-    seen = problem.model_functions.compiled_sensor(sensor, ())(state[:, :n], state[:, 2 * n :], efforts, own)
-    return np.asarray(seen[0][:, :, 0])
+    values = problem.predictor.node_values(outcome.rollout)
+    return problem.model_functions.compiled_sensor(sensor)(values, own).output
 
 
 @register_section("recorded", 30, "What was recorded")

@@ -1,0 +1,180 @@
+"""Motor currents: a sensor that is one file; damping found from currents that another engine made."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+from small_problems import PENDULUM
+
+from yid_ocp.data import ChannelGroup, JointGroup, Recording, read_recording, write_recording
+from yid_ocp.errors import ConfigError, DataError
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.model import System
+from yid_ocp.model.urdf import read_urdf
+from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
+from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.workflow.build_problem import load_problem
+
+CONSTANTS = {"shoulder": 0.5, "elbow": -0.2}  # [N m/A]
+TRUTH = {"shoulder.damping": 0.3, "elbow.damping": 0.2}
+NOISE = 0.05  # [A]
+T = 0.01 * np.arange(401)
+KEY = "motors.current"
+KNOWN = SensorOptions(constants={"torque_constant": CONSTANTS})
+
+
+def moved() -> list[np.ndarray]:
+    """Angles of both joints, their rates and second rates."""
+    size, rate, late = np.array([0.6, 0.5]), np.array([2.9, 3.7]), np.array([0.0, 1.0])
+    turned = T[:, None] * rate + late
+    return [size * np.sin(turned), size * rate * np.cos(turned), -size * rate**2 * np.sin(turned)]
+
+
+@pytest.fixture(scope="module")
+def made(urdf_folder) -> Recording:
+    """The motion of a double pendulum and its currents by Pinocchio's inverse dynamics, elbow first."""
+    pin = pytest.importorskip("pinocchio", reason="the other engine is Pinocchio: pip install pin")
+    model = pin.buildModelFromUrdf(str(urdf_folder / "double_pendulum.urdf"))
+    data, start, (q, v, a) = model.createData(), pin.neutral(model), moved()
+    effort = np.array(
+        [pin.rnea(model, data, pin.integrate(model, start, x), *row) for x, *row in zip(q, v, a, strict=True)]
+    )
+    effort += v * list(TRUTH.values())
+    current = effort / list(CONSTANTS.values())
+    current += NOISE * np.random.default_rng(0).standard_normal(current.shape)
+    motors = ChannelGroup(
+        "motors_left", ("elbow", "shoulder"), T, {"current": current[:, ::-1]}, {"current_std": NOISE}
+    )
+    return Recording(JointGroup(PENDULUM, T, q, position_std=0.0), name="arm", channel_groups=(motors,))
+
+
+@pytest.fixture(scope="module")
+def step(urdf_folder):
+    system = System.build(read_urdf(urdf_folder / "double_pendulum.urdf"), prescribed=PENDULUM, damping=0.1)
+    return compile_step(system, 0.01, use_compiler=False)
+
+
+def problem_of(step, made, options=KNOWN) -> EstimationProblem:
+    settings = ProblemOptions(path_cutoff=10.0, weak_prior_factor=0.0, sensors={"motors_left.current": options})
+    return EstimationProblem(step, [made], tuple(TRUTH), settings)
+
+
+def test_damping_is_found_from_currents_of_another_engine(step, made):
+    problem = problem_of(step, made)
+    [samples] = problem.episodes[0].measurements
+    assert samples.sensor.channel_names == ("motors_left.current.shoulder", "motors_left.current.elbow")
+    assert (samples.sensor.unit, samples.sensor.effort_joints) == ("A", PENDULUM)
+    solution = solve(problem, GaussNewton())
+    for name, true in TRUTH.items():
+        found = solution.parameters[name]
+        assert abs(found.value - true) < 4 * found.std < 0.1
+    assert 0.7 < solution.evaluation.cost / (samples.n_residuals / 2) < 1.3
+
+
+def test_currents_say_what_efforts_say(step, made):
+    """Over a constant, they give the residual and the slopes of an effort sensor with as much noise."""
+    motors, joints = made.channel_groups[0], made.joints
+    effort = motors.values["current"][:, ::-1] * list(CONSTANTS.values())
+    known = replace(joints, effort=effort, effort_std=NOISE * np.abs(list(CONSTANTS.values())), position_std=1e-4)
+    pair = []
+    for recording in (replace(made, joints=replace(joints, position_std=1e-4)), replace(made, joints=known)):
+        pair.append(problem_of(step, recording, replace(KNOWN, use=recording.joints.effort is None)))
+    one, other = (problem.evaluate(problem.initial_unknowns) for problem in pair)
+    assert one.cost == pytest.approx(other.cost, rel=1e-9)
+    np.testing.assert_allclose(one.jacobian.T @ one.residual, other.jacobian.T @ other.residual, rtol=1e-8)
+    _, gradient, _ = pair[0].cost_and_gradient(pair[0].initial_unknowns)
+    np.testing.assert_allclose(gradient, one.jacobian.T @ one.residual, rtol=1e-8)
+
+
+def test_a_synthetic_recording_holds_currents(step, made):
+    problem = problem_of(step, made)
+    again = problem.simulate_recording(TRUTH, seed=1)
+    [motors] = again.channel_groups
+    assert (motors.name, motors.names, motors.values["current"].shape) == ("motors_left", PENDULUM, (401, 2))
+    found = solve(problem_of(step, replace(again, name="arm")), GaussNewton()).parameters
+    assert all(abs(found[name].value - true) < 4 * found[name].std for name, true in TRUTH.items())
+
+
+def test_the_file_keeps_currents_and_refuses_what_no_sensor_declares(tmp_path, made):
+    write_recording(made, tmp_path / "run.h5")
+    again = read_recording(tmp_path / "run.h5")
+    [one], [other] = made.channel_groups, again.channel_groups
+    assert (one.name, one.names, one.stds, one.clock) == (other.name, other.names, other.stds, other.clock)
+    np.testing.assert_array_equal(one.values["current"], other.values["current"])
+    with h5py.File(tmp_path / "run.h5") as file:
+        assert {key: file["motors_left"][key].attrs["unit"] for key in ("t", "current")} == {"t": "s", "current": "A"}
+    assert made.time_slice(1.0, 2.0).channel_groups[0].t[[0, -1]] == pytest.approx([1.0, 2.0])
+    assert made.sensor_keys == ("joints.effort", "joints.position", "motors_left.current")
+    for change, message in (
+        (lambda file: file.create_group("motor"), "no group 'motor'"),
+        (lambda file: file["motors_left"].create_dataset("voltage", data=T), "no dataset 'voltage'"),
+        (lambda file: file["motors_left"].attrs.update(voltage_std=1.0), "no attribute 'voltage_std'"),
+        (lambda file: file["motors_left/current"].attrs.update(unit="mA"), "the unit is 'mA'"),
+        (lambda file: file["motors_left"].__delitem__("t"), "the dataset 't' is missing"),
+        (lambda file: file["motors_left"].__delitem__("current"), "the group has no values"),
+    ):
+        write_recording(made, tmp_path / "changed.h5")
+        with h5py.File(tmp_path / "changed.h5", "a") as file:
+            change(file)
+        with pytest.raises(DataError, match=message):
+            read_recording(tmp_path / "changed.h5")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"values": {"current": np.zeros((400, 2))}}, r"shape \(400, 2\)"),
+        ({"values": {"current": np.full((401, 2), np.nan)}}, "not finite"),
+        ({"values": {"voltage": np.zeros((401, 2))}}, "no sensor declares a dataset 'voltage'"),
+        ({"stds": {"current_std": -1.0}}, "current_std is -1.0"),
+        ({"name": "engines"}, "no sensor declares a dataset 'current'"),
+        ({"t": T[::-1]}, "does not advance"),
+    ],
+)
+def test_a_group_that_cannot_be_written_is_refused(tmp_path, made, changes, message):
+    group = replace(made.channel_groups[0], **changes)
+    with pytest.raises(DataError, match=message):
+        write_recording(replace(made, channel_groups=(group,)), tmp_path / "run.h5")
+
+
+@pytest.mark.parametrize(
+    ("options", "changes", "message"),
+    [
+        (SensorOptions(), {}, "torque constants are not given"),
+        (SensorOptions(constants={"torque_constant": 0.0}), {}, "a torque constant is zero"),
+        (SensorOptions(constants={"torque_constant": {"elbow": 1.0}}), {}, "joint 'shoulder' has no value"),
+        (KNOWN, {"stds": {}}, "noise level of the motor currents"),
+        (KNOWN, {"names": ("elbow", "sholder")}, "no joint 'sholder'"),
+        (replace(KNOWN, use=False), {}, "no measurement that the model could be compared with"),
+    ],
+)
+def test_currents_that_cannot_be_compared_are_refused(step, made, options, changes, message):
+    group = replace(made.channel_groups[0], **changes)
+    with pytest.raises((DataError, ConfigError), match=message):
+        problem_of(step, replace(made, channel_groups=(group,)), options)
+
+
+def test_a_configuration_names_them(tmp_path, urdf_folder, made):
+    write_recording(made, tmp_path / "run.h5")
+    text = f"""
+model:
+  robot: {urdf_folder / "double_pendulum.urdf"}
+  arms: {{mode: prescribed}}
+  damping: {{shoulder: 0.1, elbow: 0.1}}
+recordings: {{estimate: [run.h5]}}
+sensors: {{motors_left.current: {{constants: {{torque_constant: {{shoulder: 0.5, elbow: -0.2}}}}}}}}
+parameters: {{"*.damping": {{free: true}}}}
+"""
+    (tmp_path / "run.yaml").write_text(text)
+    problem = load_problem(tmp_path / "run.yaml")
+    assert [s.sensor.group_name for s in problem.episodes[0].measurements] == ["motors_left.current"]
+    assert load_problem(tmp_path / "run.yaml", ["sensors.motors_left.current.std=0.2"]).evaluate(
+        problem.initial_unknowns
+    ).cost == pytest.approx(problem.evaluate(problem.initial_unknowns).cost / 16, rel=1e-6)
+    with pytest.raises(ConfigError, match="has no constant 'torque_constan'"):
+        load_problem(tmp_path / "run.yaml", ["sensors.motors_left.current.constants={torque_constan: 1}"])
+    with pytest.raises(ConfigError, match=r"no recording has a group 'motors\.current'"):
+        load_problem(tmp_path / "run.yaml", ["sensors.motors.current.std=0.2"])

@@ -1,0 +1,104 @@
+"""Motor currents of prescribed joints: the predicted joint effort over a torque constant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from yid_ocp.errors import DataError, nearest_name_hint
+from yid_ocp.model.system import NodeState
+from yid_ocp.sensors.base import (
+    CHANNELS,
+    SENSOR_READERS,
+    Array,
+    Channel,
+    ChannelData,
+    SensorContext,
+    SensorData,
+    values_by_joint,
+)
+from yid_ocp.sensors.joints import JointSensor, smoothed_effort_data
+
+_CONSTANT = "torque_constant"
+_CURRENT = CHANNELS.register("motors.current")(Channel("motors", "current", "A", constants={_CONSTANT: "N m/A"}))
+
+
+@dataclass(frozen=True)
+class MotorCurrentSensor(JointSensor):
+    """Motor currents of named prescribed joints, current = joint effort / torque constant.
+
+    Attributes
+    ----------
+    torque_constants : tuple of float
+        Joint torque per current, gears included, of each joint [N m/A].
+    """
+
+    channel = _CURRENT
+    naive_prediction = "zero"
+    has_paper_weight = False
+    torque_constants: tuple[float, ...]
+
+    @property
+    def effort_joints(self) -> tuple[str, ...]:
+        """All its joints."""
+        return self.joint_names
+
+    @property
+    def effort_per_output(self) -> Array:
+        """Torque constants, shape (nj,) [N m/A]."""
+        return np.array(self.torque_constants)
+
+    def ideal_reading(self, state: NodeState) -> ca.SX:
+        """Currents of the motors, shape (nj, 1) [A]."""
+        return self.select_joints(state.load, state) / ca.DM(self.torque_constants)
+
+
+@SENSOR_READERS.register("motors.current")
+def read_motor_currents(around: SensorContext) -> list[SensorData]:
+    """Measurements of prescribed joints' motor currents, filtered like joint efforts.
+
+    Raises
+    ------
+    DataError
+        No noise level or torque constant, or a recording too short for the filter.
+    """
+    return [
+        found
+        for group in around.recording.channel_groups
+        if _CURRENT.is_in_group(group.name) and (found := _currents(around, group)) is not None
+    ]
+
+
+def _currents(around: SensorContext, group: ChannelData) -> SensorData | None:
+    key, where = f"{group.name}.{_CURRENT.quantity}", f"{around.recording.name}: {group.name}"
+    choice, names = around.sensor_usage(key), tuple(n for n in around.system.prescribed if n in group.names)
+    if choice.use is False or not names or around.recording.joints is None:
+        return None
+    for name in group.names:
+        if name not in around.system.mechanism.joint_names:
+            hint = nearest_name_hint(name, around.system.mechanism.joint_names)
+            raise DataError(f"the model has no joint '{name}'", where=where, hint=hint)
+    constants, std, bias = (
+        choice.constants.get(_CONSTANT),
+        *(
+            given if given is not None else group.stds.get(attribute)
+            for given, attribute in zip((choice.std, choice.bias_std), _CURRENT.std_fields, strict=True)
+        ),
+    )
+    if constants is None:
+        what, hint = "the motors' torque constants are not given", "[N m/A], torque at the joint over current"
+        raise DataError(what, where=where, hint=f"set sensors.{key}.constants: {{{_CONSTANT}: ...}} {hint}")
+    if std is None:
+        what = "the noise level of the motor currents is neither recorded nor given"
+        raise DataError(what, where=where, hint=f"set sensors.{key}.std [A]")
+    by_joint = [
+        values_by_joint(given, group.names, names, f"sensors.{key}.{setting}")
+        for given, setting in ((constants, "constants"), (std, "std"), (0.0 if bias is None else bias, "bias_std"))
+    ]
+    if not np.all(by_joint[0] != 0):
+        raise DataError("a torque constant is zero", where=where, allowed="a number that is not zero [N m/A]")
+    sensor = MotorCurrentSensor(names, key, tuple(by_joint[0].tolist()))
+    values = group.values[_CURRENT.quantity][:, [group.names.index(name) for name in names]]
+    return smoothed_effort_data(around, sensor, group.t, values, by_joint[1], by_joint[2], is_sample=True)
