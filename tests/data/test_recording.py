@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from recording_examples import assert_same, changed, example, finite, with_camera, with_joints
 
-from yid_ocp.data.recording import JointGroup, PointGroup, Recording, check_recorded_names, validate_recording
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate_recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.errors import DataError
 
@@ -77,35 +77,6 @@ def test_an_empty_slice_is_refused(bounds: tuple[float, float]) -> None:
     assert "0 s to 0.9 s" in caught.value.allowed
 
 
-def test_select_points_keeps_order_and_drops_empty_groups() -> None:
-    recording = example()
-    part = recording.select_points(["w_T3", "w_T1"])
-    assert [group.name for group in part.points] == ["points_camera"]
-    assert part.points[0].names == ("w_T3", "w_T1")
-    assert np.array_equal(part.points[0].position, recording.points[1].position[:, [2, 0]], equal_nan=True)
-    assert part.points[0].std is not None
-    assert part.points[0].std.shape == (4, 2, 3)
-    assert recording.select_points([]).points == ()
-
-
-def test_select_points_refuses_what_is_not_there() -> None:
-    with pytest.raises(DataError, match="no point 'w_T4'"):
-        example().select_points(["w_T4"])
-    with pytest.raises(DataError, match="no joints"):
-        dataclasses.replace(example(), joints=None).select_points([])
-
-
-def test_check_names_names_the_nearest() -> None:
-    check_recorded_names(example(), ["left_s1"], ["w_T1", "w_T2"])
-    with pytest.raises(DataError, match="no joints 'left_s2', 'elbow'") as caught:
-        check_recorded_names(example(), ["left_s2", "left_s0", "elbow"], [])
-    assert "did you mean 'left_s" in caught.value.hint
-    assert caught.value.allowed == "left_s0, left_s1"
-    with pytest.raises(DataError, match="no point 'tip'") as caught:
-        check_recorded_names(Recording(example().joints), [], ["tip"])
-    assert caught.value.allowed == "no points were recorded"
-
-
 def test_positions_of_the_straight_object_follow_their_points() -> None:
     straight = np.arange(9.0).reshape(3, 3)
     recording = validate_recording(
@@ -114,13 +85,8 @@ def test_positions_of_the_straight_object_follow_their_points() -> None:
     assert recording.marker_reference_pose is not None
     with pytest.raises(ValueError, match="read-only"):
         recording.marker_reference_pose[0, 0] = 5.0
-    kept = recording.select_points(["w_T3", "w_T1"])
-    assert np.array_equal(validate_recording(kept).marker_reference_pose, straight[[2, 0]])
-    assert recording.select_points([]).marker_reference_pose is None
     assert np.array_equal(validate_recording(recording.time_slice(0.0, 0.2)).marker_reference_pose, straight)
     assert recording.time_slice(0.4, 0.45).marker_reference_pose is None, "no frame of the points lies in between"
-    both = dataclasses.replace(example(), marker_reference_pose=np.zeros((1, 3)))
-    assert both.select_points(["w_T1"]).marker_reference_pose is None, "the group that it belongs to is gone"
 
 
 @given(st.lists(finite(1e6), min_size=2, max_size=20, unique=True), finite(1e6), finite(1e6))

@@ -87,19 +87,10 @@ _MAX_UNPACKED_BYTES = 1 << 30
 def create_hdf5_atomically(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
     """An HDF5 file in memory, written as a whole when the block ends without error.
 
-    Parameters
-    ----------
-    path : path-like
-        The file to make or replace.
-
-    Yields
-    ------
-    h5py.File
-
     Raises
     ------
     OutputError
-        If the file cannot be written; one that was there before is left as it was.
+        The file cannot be written; one that was there before is left as it was.
     """
     with atomic_write(Path(path)) as temporary:
         with h5py.File(str(temporary), "w", driver="core", backing_store=False) as file:
@@ -112,10 +103,6 @@ def create_hdf5_atomically(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
 @contextlib.contextmanager
 def open_checked_hdf5(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
     """Open an HDF5 file after checking in another process that it can be read.
-
-    Yields
-    ------
-    h5py.File
 
     Raises
     ------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numbers
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal, get_args
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
-from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
+from yid_ocp.errors import DataError, nearest_name_hint
 from yid_ocp.sensors.base import EffortKind, declared_channels
 
 Array = NDArray[np.float64]
@@ -42,31 +42,25 @@ _TIME_TOLERANCE = 1e-9  # a nominal clock is a sum of rounded periods, so its en
 
 @dataclass(frozen=True, eq=False, repr=False)
 class JointGroup(ReprMixin):
-    """Joint measurements of a robot: N samples of nj joints on one clock.
-
-    Arrays are copied, made float64 and read-only.
+    """Joint measurements of a robot: N samples of nj joints on one clock; arrays are copied and read-only.
 
     Attributes
     ----------
     names : tuple of str, length nj
-        Joint names, as in the URDF.
+        As in the URDF.
     t : ndarray, shape (N,)
         Strictly increasing time [s].
-    position : ndarray, shape (N, nj)
-        Measured joint angle [rad].
-    velocity, effort : ndarray, shape (N, nj), or None
-        Measured joint velocity [rad/s] and effort [N m].
+    position, velocity, effort : ndarray, shape (N, nj)
+        Measured [rad], [rad/s], [N m].
     position_command, velocity_command : ndarray, shape (N, nj), or None
         What the controller asked for [rad], [rad/s].
     external_effort : ndarray, shape (N, nj), or None
         Effort left when the robot's own model is taken away [N m].
-    position_std, velocity_std, effort_std : float or ndarray, shape (nj,), or None
-        Standard deviation of the noise, white from sample to sample, where known [rad], [rad/s], [N m].
-    effort_bias_std : float or ndarray, shape (nj,), or None
-        Standard deviation of what is added to a joint's effort in the whole recording alike, where known [N m].
+    position_std, velocity_std, effort_std, effort_bias_std : float or ndarray, shape (nj,), or None
+        Standard deviations of noise, white from sample to sample, and of a constant error of a joint's effort, where
+        known [rad], [rad/s], [N m].
     effort_kind : {'sample', 'mean', 'command'} or None
-        What `effort[k]` is of the true one: its value at t_k, its mean from t_k to t_{k+1}, or the value that is held
-        from t_k to t_{k+1}; None where nobody says.
+        What `effort[k]` is of the true one: its value at t_k, its mean from t_k to t_{k+1}, or held until then.
     clock : {'recorded', 'nominal'}
         Whether `t` was measured or is a sample index times a nominal period.
     """
@@ -121,30 +115,23 @@ class JointGroup(ReprMixin):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PointGroup(ReprMixin):
-    """Positions of np named points over M frames of one sensor, on its own clock.
-
-    Arrays are copied, made float64 and read-only.
+    """Positions of np named points over M frames of one sensor, on its own clock; arrays are copied and read-only.
 
     Attributes
     ----------
     name : str
         `points`, or `points_` and a word of one's own (`points_camera`, `points_arm`).
-    names : tuple of str, length np
-        Point names.
     t : ndarray, shape (M,)
         Strictly increasing time [s].
     position : ndarray, shape (M, np, 3)
         Position in `frame` [m], NaN (all three coordinates) where a point was not seen.
     std : ndarray, shape (M, np, 3), or None
         Standard deviation of the noise [m]; a number given for it is spread over the shape.
-    sensor : str
-        What saw the points, in words.
-    frame : str
-        The frame of reference of `position`.
+    sensor, frame : str
+        What saw the points, and their frame of reference.
     pose : ndarray, shape (4, 4), or None
         Of a camera: the transform from camera to world coordinates [m].
     clock : {'recorded', 'nominal'}
-        Whether `t` was measured or is a frame index times a nominal period.
     """
 
     name: str
@@ -177,11 +164,6 @@ class PointGroup(ReprMixin):
     def _rows(self, rows: NDArray[np.bool_]) -> PointGroup:
         std = None if self.std is None else self.std[rows]
         return replace(self, t=self.t[rows], position=self.position[rows], std=std)
-
-    def _select(self, names: Sequence[str]) -> PointGroup:
-        columns = [self.names.index(name) for name in names]
-        std = None if self.std is None else self.std[:, columns]
-        return replace(self, names=tuple(names), position=self.position[:, columns], std=std)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -229,14 +211,10 @@ class ChannelGroup(ReprMixin):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Recording(ReprMixin):
-    """One recording of a robot or of a virtual experiment, in SI units.
-
-    The constructor only stores; `validate_recording(Recording(...))` checks as well.
+    """One recording of a robot or of a virtual experiment, in SI units; only `validate_recording` checks it.
 
     Attributes
     ----------
-    joints : JointGroup or None
-        What the robot measured of its joints.
     points : tuple of PointGroup
         What cameras, motion capture or an arm measured of points; every group has its own clock.
     description, source : str
@@ -244,7 +222,7 @@ class Recording(ReprMixin):
     name : str
         Short name, the stem of the file.
     sha256 : str or None
-        Hash of the file read; kept by `time_slice` and `select_points`.
+        Hash of the file read.
     true_parameters : mapping of str to float
         The parameter values of a virtual experiment, in the parameters' own units; empty for a real one.
     marker_reference_pose : ndarray, shape (np, 3), or None
@@ -327,24 +305,12 @@ class Recording(ReprMixin):
         return replace(self, joints=replace(self.joints, effort_kind=kind))
 
     def time_slice(self, start: float, stop: float) -> Recording:
-        """Cut out the samples with  start <= t <= stop.
-
-        Times are kept as they are, each group's on its own clock; a group without a sample in between is left out.
-
-        Parameters
-        ----------
-        start, stop : float
-            Bounds [s], both included (within 1 ns).
-
-        Returns
-        -------
-        Recording
-            The part in between.
+        """Cut out the samples with start <= t <= stop [s], without groups that have none; times stay as they are.
 
         Raises
         ------
         DataError
-            If nothing was recorded in between, or `start` is not before `stop`.
+            Nothing was recorded in between, or `start` is not before `stop`.
         """
         masks = [(g.t >= start - _TIME_TOLERANCE) & (g.t <= stop + _TIME_TOLERANCE) for g in self.all_groups]
         kept = [group._rows(mask) for group, mask in zip(self.all_groups, masks, strict=True) if mask.any()]
@@ -362,54 +328,16 @@ class Recording(ReprMixin):
             marker_reference_pose=self.marker_reference_pose if first_kept else None,
         )
 
-    def select_points(self, names: Iterable[str]) -> Recording:
-        """Keep only the named points, in the order given, in every group that has them.
-
-        Parameters
-        ----------
-        names : iterable of str
-            Point names; none at all keeps the joints only.
-
-        Returns
-        -------
-        Recording
-            The same recording without the other points; groups left without a point are dropped.
-
-        Raises
-        ------
-        DataError
-            If a point was not recorded, or nothing is left.
-        """
-        wanted = tuple(dict.fromkeys(names))
-        check_recorded_names(self, (), wanted)
-        present = [(group, [name for name in wanted if name in group.names]) for group in self.points]
-        points = tuple(group._select(kept) for group, kept in present if kept)
-        what = "no point was selected and the recording has no joints"
-        require_data(
-            bool(points) or self.joints is not None, what, f"recording '{self.name}'", ", ".join(self.point_names)
-        )
-        straight = None
-        if self.marker_reference_pose is not None and points and points[0].name == self.points[0].name:
-            straight = self.marker_reference_pose[[self.points[0].names.index(name) for name in points[0].names]]
-        return replace(self, points=points, marker_reference_pose=straight)
-
 
 def validate_recording(recording: Recording, *, allow_nan_effort: bool = False, where: str = "") -> Recording:
-    """Check shapes, clocks, names, values and units of a recording.
+    """Check shapes, clocks, names, values and units of a recording, which is returned.
 
     Parameters
     ----------
-    recording : Recording
-        What to check.
     allow_nan_effort : bool
         Whether `effort` and `external_effort` may hold NaN.
     where : str
         What errors call the recording, its file for example; its name where empty.
-
-    Returns
-    -------
-    Recording
-        The argument itself.
 
     Raises
     ------
@@ -441,34 +369,6 @@ def validate_recording(recording: Recording, *, allow_nan_effort: bool = False, 
     if recording.marker_reference_pose is not None:
         _validate_straight(recording.marker_reference_pose, recording.points, f"{origin}: straight")
     return recording
-
-
-def check_recorded_names(recording: Recording, joints: Iterable[str], points: Iterable[str]) -> None:
-    """Check that a recording has the given joints and points.
-
-    Parameters
-    ----------
-    recording : Recording
-        What was recorded.
-    joints, points : iterable of str
-        Names of the joints and points that must be in it.
-
-    Raises
-    ------
-    DataError
-        If one is missing; the error names it and the choices that there is.
-    """
-    for noun, wanted, known in (("joint", joints, recording.joint_names), ("point", points, recording.point_names)):
-        missing = [name for name in dict.fromkeys(wanted) if name not in known]
-        if missing:
-            listed = ", ".join(f"'{name}'" for name in missing)
-            said = [(name, unknown_name_details(name, known)) for name in missing]
-            raise DataError(
-                f"the recording has no {noun}{'s' if len(missing) > 1 else ''} {listed}",
-                where=f"recording '{recording.name}'",
-                allowed=said[0][1]["allowed"] if known else f"no {noun}s were recorded",
-                hint="; ".join(f"'{name}': {own['hint']}" for name, own in said if own["hint"]),
-            )
 
 
 def _sampled(t: Array) -> str:

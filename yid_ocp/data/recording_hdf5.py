@@ -44,15 +44,8 @@ def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = Fal
 
     Parameters
     ----------
-    path : path-like
-        The HDF5 file.
     allow_nan_effort : bool
         Whether `effort` and `external_effort` may hold NaN.
-
-    Returns
-    -------
-    Recording
-        Its contents, with the file's stem as name and its hash.
 
     Raises
     ------
@@ -72,21 +65,14 @@ def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = Fal
 
 
 def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
-    """Check a recording and write it as `yid-recording/1`, whole or not at all.
-
-    Parameters
-    ----------
-    recording : Recording
-        What to write; effort may hold NaN. Its `name` and `sha256` are properties of the file and not written.
-    path : path-like
-        The HDF5 file to make or replace.
+    """Check a recording, whose efforts may hold NaN, and write it as `yid-recording/1`, whole or not at all.
 
     Raises
     ------
     DataError
         As `validate_recording`.
     OutputError
-        If the file cannot be written; one that was there before is left as it was.
+        The file cannot be written; one that was there before is left as it was.
     """
     validate_recording(recording, allow_nan_effort=True)
     with create_hdf5_atomically(path) as file:

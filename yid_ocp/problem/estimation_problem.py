@@ -277,16 +277,8 @@ class EstimationProblem(ReprMixin):
     ) -> Evaluation:
         """Residual, cost and, where asked for, Jacobian at an unknown vector.
 
-        Parameters
-        ----------
-        x : array_like, shape (nx,)
-        equilibrium_guesses : EquilibriumGuesses, optional
-            `Evaluation.equilibrium_guesses` of a nearby point; without it the search for least energy takes longer.
-
-        Returns
-        -------
-        Evaluation
-            `ok` is False, with the reason, where an equilibrium or a rollout failed.
+        `ok` is False, with the reason, where an equilibrium or a rollout failed. `equilibrium_guesses` of a nearby
+        point's evaluation shorten the search for least energy.
         """
         x = np.asarray(x, float)
         pairs = zip(self.episodes, equilibrium_guesses or (None,) * len(self.episodes), strict=True)

@@ -196,16 +196,7 @@ class Measurements:
     def residual_block(
         self, predicted: Array, slopes: Array | None = None, threshold: float = math.inf
     ) -> ResidualBlock:
-        """Residual block of these measurements with robust weights and, with slopes, its Jacobian.
-
-        Parameters
-        ----------
-        predicted : ndarray, shape (M, k)
-        slopes : ndarray, optional, shape (M, k, d)
-            Derivative of the prediction by d directions.
-        threshold : float
-            Of Huber's loss [standard deviations].
-        """
+        """Residual block with weights of Huber's loss and, with slopes of the prediction (M, k, d), its Jacobian."""
         raw = self.whitened_residual(predicted)
         cost, factor = huber_loss(raw, threshold)
         seen, jacobian = self.is_used, None
@@ -215,29 +206,18 @@ class Measurements:
         return ResidualBlock(cost, robust * raw[seen], jacobian, robust)
 
     def delayed_by(self, steps: Array) -> Measurements:
-        """The same samples shifted back by a delay of each output [steps], within the span.
-
-        Parameters
-        ----------
-        steps : ndarray, shape (k,)
-        """
+        """The same samples shifted back by a delay of each output, shape (k,) [steps], within the span."""
         position = np.clip((self.node + self.fraction)[:, None] - steps, *self.predictable_nodes)
         near = np.rint(position)
         position = np.where(np.abs(position - near) < 1e-9, near, position)
-        node = np.minimum(np.floor(position), max(self.predictable_nodes[1] - 1, self.predictable_nodes[0])).astype(
-            np.int64
-        )
+        first, last = self.predictable_nodes
+        node = np.minimum(np.floor(position), max(last - 1, first)).astype(np.int64)
         return replace(self, node=node, fraction=position - node)
 
     def prediction_rate(self, at_nodes: Array, unmoved: Measurements, steps: Array) -> Array:
         """Rate of change of a prediction per step for delayed samples, shape (M, k); at a node the mean of both sides.
 
-        Parameters
-        ----------
-        at_nodes : ndarray, shape (len(nodes), k)
-        unmoved : Measurements
-            The measurements before the delay.
-        steps : ndarray, shape (k,)
+        `at_nodes` (len(nodes), k) is the prediction, `unmoved` the measurements before the delay of `steps` (k,).
         """
         nodes, column = self.evaluation_nodes, np.arange(at_nodes.shape[1])
         if not len(nodes):  # a short piece may hold no sample of a slow sensor
@@ -295,17 +275,8 @@ def place_on_grid(data: SensorData, grid: TimeGrid, where: str) -> Measurements:
     node, fraction = grid.node_and_fraction(data.t)
     std = np.where(seen, data.std, np.nan)
     bias = np.zeros(data.value.shape[1]) if data.bias_std is None else data.bias_std
-    return Measurements(
-        data.sensor,
-        node,
-        fraction,
-        data.value,
-        weight,
-        std,
-        data.predictable_nodes or (0, grid.steps),
-        bias,
-        data.noise_correlation,
-    )
+    span = data.predictable_nodes or (0, grid.steps)
+    return Measurements(data.sensor, node, fraction, data.value, weight, std, span, bias, data.noise_correlation)
 
 
 def with_paper_weights(samples: Measurements, grid: TimeGrid) -> Measurements:
@@ -402,9 +373,7 @@ def constant_error_sensitivities(samples: Sequence[Measurements]) -> Array:
 def subtract_estimated_biases(samples: Sequence[Measurements], predicted: Sequence[Array]) -> tuple[Measurements, ...]:
     """Measurements minus their constant errors as estimated from a prediction, with zero `bias_std`.
 
-    Parameters
-    ----------
-    predicted : sequence of ndarray, shape (M, k) each
+    `predicted` has the shape (M, k) for each.
     """
     slopes = constant_error_sensitivities(samples)
     if not slopes.shape[1]:

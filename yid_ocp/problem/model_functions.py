@@ -318,7 +318,7 @@ def node_velocity_adjoint(pull: Array, nodes: NDArray[np.int64], count: int, tim
     return result
 
 
-class SensorReadings(NamedTuple):
+class _SensorReadings(NamedTuple):
     """Readings of a sensor at K nodes, (K, k), and their derivatives, (K, k, ...), as of `sensors.sensor_function`."""
 
     output: Array
@@ -336,18 +336,18 @@ class SensorReadings(NamedTuple):
 
 
 @dataclass(frozen=True)
-class CompiledSensor:
+class _CompiledSensor:
     """A compiled sensor function with derivatives by some of its parameters, all of them where `columns` is None."""
 
     all_derivatives: MappedFunction
     columns: tuple[int, ...] | None = None
 
-    def __call__(self, at: NodeValues, theta: Array) -> SensorReadings:
+    def __call__(self, at: NodeValues, theta: Array) -> _SensorReadings:
         """Readings at nodes."""
         output, *slopes = self.all_derivatives(at.q, at.v, at.z, at.load, at.lam, theta)
         if self.columns is not None:
             slopes[-1] = slopes[-1][:, :, list(self.columns)]
-        return SensorReadings._make([output[:, :, 0], *slopes])
+        return _SensorReadings._make([output[:, :, 0], *slopes])
 
 
 class ModelFunctions:
@@ -394,11 +394,11 @@ class ModelFunctions:
         """Momenta that effects add to those that the tracking filter follows."""
         return self._momentum(None)
 
-    def compiled_sensor(self, sensor: Sensor, wanted: tuple[str, ...] = ()) -> CompiledSensor:
+    def compiled_sensor(self, sensor: Sensor, wanted: tuple[str, ...] = ()) -> _CompiledSensor:
         """Compiled function of a sensor's readings, with derivatives by the parameters `wanted`."""
         if not wanted or wanted == self.parameter_names:
-            return CompiledSensor(self._sensors((sensor, bool(wanted))))
-        return CompiledSensor(self._sensors((sensor, True)), self.parameter_columns(wanted))
+            return _CompiledSensor(self._sensors((sensor, bool(wanted))))
+        return _CompiledSensor(self._sensors((sensor, True)), self.parameter_columns(wanted))
 
     def find_equilibrium(
         self, posture: Array, theta: Array, torque: Array | None, guess: Array | None, wanted: tuple[str, ...]

@@ -36,22 +36,8 @@ def _group_with_points(recording: Recording, points: Sequence[str]) -> PointGrou
 def constant_position_baseline(recording: Recording, points: Sequence[str], given: int = 2) -> Array:
     """Baseline prediction: every point stays where it was in the last given frame.
 
-    Parameters
-    ----------
-    points : sequence of str
-        To predict.
-    given : int
-        How many frames of them are known.
-
-    Returns
-    -------
-    ndarray, shape (M, len(points), 3)
-        [m]; the given frames as measured.
-
-    Raises
-    ------
-    DataError
-        A point that is not recorded or not seen in the last given frame, or too few frames.
+    The `given` first frames are as measured; shape (M, len(points), 3) [m]. Raises `DataError` for a point that is not
+    recorded or not seen in the last given frame, or too few frames.
     """
     return _carried(recording, points, (), given, np.zeros((len(points), 0)))
 
@@ -61,12 +47,7 @@ def clamp_displacement_baseline(
 ) -> Array:
     """Baseline prediction: every point moves by the clamped points' mean displacement since the last given frame.
 
-    Parameters and errors as in `constant_position_baseline`; the path of the points `clamped` is known throughout.
-
-    Returns
-    -------
-    ndarray, shape (M, len(points), 3)
-        [m]
+    Shape and errors as in `constant_position_baseline`; the path of the points `clamped` is known throughout.
     """
     share = np.full((len(points), len(clamped)), 1.0 / max(len(clamped), 1))
     return _carried(recording, points, clamped, given, share)
@@ -82,26 +63,16 @@ def interpolated_displacement_baseline(
 ) -> Array:
     """Baseline prediction: displacement interpolated in arc length along the parent; children move with their junction.
 
+    Shape and errors as in `constant_position_baseline`, and for a point of no branch.
+
     Parameters
     ----------
-    points : sequence of str
-        To predict.
     parent : sequence of str
         Points of the parent from end to end.
     children : mapping of str to sequence of str, optional
         Points of each child, the first one the parent's point at which it leaves.
     clamped : sequence of str, optional
         Points of the parent between which is interpolated; its two ends when absent.
-
-    Returns
-    -------
-    ndarray, shape (M, len(points), 3)
-        [m]
-
-    Raises
-    ------
-    DataError
-        A point that is not recorded or not seen in the last given frame, a point of no branch, too few frames.
     """
     known = tuple(clamped) if clamped is not None else (parent[0], parent[-1])
     at = _given_frame(recording, parent, given)
@@ -122,24 +93,10 @@ def interpolated_displacement_baseline(
 
 
 def position_rmse(predicted: Array, measured: Array, given: int = 2) -> float:
-    """Square root of the mean squared Euclidean error over points and frames.
+    """Square root of the mean squared Euclidean error over points and frames [m]; NaN where none is left to compare.
 
-    Parameters
-    ----------
-    predicted, measured : ndarray, shape (M, np, 3)
-        [m]; frames in which a point was not measured do not count.
-    given : int
-        Frames at the start that were given and so do not count.
-
-    Returns
-    -------
-    float
-        [m]; NaN where nothing is left to compare.
-
-    Raises
-    ------
-    DataError
-        The two differ in shape.
+    Given frames and those in which a point was not measured do not count; shapes are (M, np, 3), `DataError` where the
+    two differ.
     """
     if predicted.shape != measured.shape:
         raise DataError(f"prediction {predicted.shape} and measurement {measured.shape} differ in shape")

@@ -110,13 +110,7 @@ def stated_prior_std(
 
 
 def stated_prior_jacobian(unknowns: UnknownVectorLayout, options: ProblemOptions, std: Array) -> Array:
-    """Jacobian of the stated priors' whitened residual, which is this matrix (k, nx) times (x - initial x).
-
-    Parameters
-    ----------
-    std : ndarray, shape (nx,)
-        From `stated_prior_std`.
-    """
+    """Jacobian of the stated priors' whitened residual, which is this matrix (k, nx) times (x - initial x)."""
     joint = options.multivariate_prior.restricted_to(unknowns.shared_parameters)
     at = [unknowns.unknown_names.index(name) for name in joint.parameter_names]
     alone = [i for i in np.flatnonzero(np.isfinite(std)) if i not in at]
@@ -185,22 +179,12 @@ def check_parameter_bounds(system: System, free: Sequence[str], theta: Array) ->
                 allowed=f"{entry.lower:g} to {entry.upper:g} {entry.unit}",
             )
         if not entry.lower < entry.upper:
-            raise ConfigError(
-                f"the bounds of {name} leave no room",
-                where=f"parameters.{name}",
-                allowed="lower below upper",
-                hint="fix the parameter instead of closing its bounds",
-            )
+            what, hint = f"the bounds of {name} leave no room", "fix the parameter instead of closing its bounds"
+            raise ConfigError(what, where=f"parameters.{name}", allowed="lower below upper", hint=hint)
 
 
 def soft_logarithm(ratio: Array) -> tuple[Array, Array]:
-    """Return log(ratio) and its slope, below `MIN_LOG_RATIO` those of the parabola that continues it.
-
-    Parameters
-    ----------
-    ratio : ndarray, shape (k,)
-        Zero or above.
-    """
+    """Return log(ratio) and its slope, below `MIN_LOG_RATIO` those of the parabola that continues it."""
     below = (ratio - MIN_LOG_RATIO) / MIN_LOG_RATIO
     small = below < 0
     kept = np.where(small, MIN_LOG_RATIO, ratio)

@@ -169,17 +169,17 @@ class ChannelData(Protocol):
     def stds(self) -> Mapping[str, float | Array]: ...  # noqa: D102
 
 
-class RecordingData(Protocol):
+class _RecordingData(Protocol):
     """A recording as sensors need it, as in `data.recording.Recording`."""
 
     @property
-    def name(self) -> str: ...  # noqa: D102
+    def name(self) -> str: ...
     @property
-    def joints(self) -> JointData | None: ...  # noqa: D102
+    def joints(self) -> JointData | None: ...
     @property
-    def points(self) -> Sequence[PointData]: ...  # noqa: D102
+    def points(self) -> Sequence[PointData]: ...
     @property
-    def channel_groups(self) -> Sequence[ChannelData]: ...  # noqa: D102
+    def channel_groups(self) -> Sequence[ChannelData]: ...
 
 
 def recorded_joint_columns(joints: JointData, names: tuple[str, ...], where: str) -> list[int]:
@@ -318,17 +318,17 @@ def sensor_function(system: System, sensor: Sensor, names: tuple[str, ...]) -> c
 # -- from a recording -------------------------------------------------------------------------------------------------
 
 
-class SmoothingFilter(Protocol):
+class _SmoothingFilter(Protocol):
     """A zero-phase low-pass filter, as in `problem.signal_filters.LowPassFilter`."""
 
     @property
-    def cutoff(self) -> float: ...  # noqa: D102
+    def cutoff(self) -> float: ...
     @property
-    def settling_time(self) -> float: ...  # noqa: D102
+    def settling_time(self) -> float: ...
 
-    def __call__(self, t: Array, values: Array) -> Array: ...  # noqa: D102
-    def decorrelation_stride(self, step: float) -> int: ...  # noqa: D102
-    def noise_gains(self, step: float) -> tuple[float, float, float]: ...  # noqa: D102
+    def __call__(self, t: Array, values: Array) -> Array: ...
+    def decorrelation_stride(self, step: float) -> int: ...
+    def noise_gains(self, step: float) -> tuple[float, float, float]: ...
 
 
 @dataclass(frozen=True)
@@ -343,7 +343,7 @@ class SensorContext:
         Of the rollout's nodes [s].
     time_step : float
         Between them [s].
-    effort_filter : SmoothingFilter
+    effort_filter : _SmoothingFilter
         That of efforts of prescribed joints.
     joint_mass_matrices : callable
         From joint names and some of their configurations, shape (K, k), to their part of the mass matrix in each of
@@ -351,11 +351,11 @@ class SensorContext:
     """
 
     system: System
-    recording: RecordingData
+    recording: _RecordingData
     sensor_usage: Callable[[str], SensorOptions]
     node_times: Array
     time_step: float
-    effort_filter: SmoothingFilter
+    effort_filter: _SmoothingFilter
     joint_mass_matrices: Callable[[tuple[str, ...], Array], Array]
 
 

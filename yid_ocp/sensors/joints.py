@@ -91,14 +91,8 @@ def is_measured_by_arm(group: PointData) -> bool:
 
 
 @SENSOR_READERS.register(POSITION_GROUP)
-def read_joint_angles(around: SensorContext) -> list[SensorData]:
-    """Measurements of driven joints' angles without the first sample, which defines the initial configuration.
-
-    Raises
-    ------
-    ConfigError
-        They are asked for beside points of the arm, which as a rule are computed from them.
-    """
+def _read_joint_angles(around: SensorContext) -> list[SensorData]:
+    """Measurements of driven joints' angles without the first sample, which defines the initial configuration."""
     joints, choice, system = around.recording.joints, around.sensor_usage(POSITION_GROUP), around.system
     names = system.driven if joints is not None else ()
     arm = [group.name for group in around.recording.points if is_measured_by_arm(group)]
@@ -120,14 +114,8 @@ def read_joint_angles(around: SensorContext) -> list[SensorData]:
 
 
 @SENSOR_READERS.register(EFFORT_GROUP)
-def read_joint_efforts(around: SensorContext) -> list[SensorData]:
-    """Measurements of prescribed joints' efforts, low-pass filtered and thinned out to independent samples.
-
-    Raises
-    ------
-    DataError
-        No noise level, or a recording too short for the filter.
-    """
+def _read_joint_efforts(around: SensorContext) -> list[SensorData]:
+    """Measurements of prescribed joints' efforts, low-pass filtered and thinned out to independent samples."""
     joints, choice = around.recording.joints, around.sensor_usage(EFFORT_GROUP)
     if joints is None or joints.effort is None or choice.use is False:
         return []

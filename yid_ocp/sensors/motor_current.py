@@ -56,14 +56,8 @@ class MotorCurrentSensor(JointSensor):
 
 
 @SENSOR_READERS.register("motors.current")
-def read_motor_currents(around: SensorContext) -> list[SensorData]:
-    """Measurements of prescribed joints' motor currents, filtered like joint efforts.
-
-    Raises
-    ------
-    DataError
-        No noise level or torque constant, or a recording too short for the filter.
-    """
+def _read_motor_currents(around: SensorContext) -> list[SensorData]:
+    """Measurements of prescribed joints' motor currents, filtered like joint efforts."""
     return [
         found
         for group in around.recording.channel_groups

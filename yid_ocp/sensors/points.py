@@ -63,14 +63,8 @@ class PointSensor(Sensor):
 
 
 @SENSOR_READERS.register("points")
-def read_point_groups(around: SensorContext) -> list[SensorData]:
-    """Measurements of every used group of points.
-
-    Raises
-    ------
-    DataError
-        A group none of whose points is a frame, a chosen point that is not in it, or no noise level.
-    """
+def _read_point_groups(around: SensorContext) -> list[SensorData]:
+    """Measurements of every used group of points."""
     return [
         _points(around, group, around.sensor_usage(group.name))
         for group in around.recording.points

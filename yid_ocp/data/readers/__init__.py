@@ -33,20 +33,13 @@ def read_any(path: str | os.PathLike[str], *, progress: Progress = NULL_PROGRESS
     ----------
     path : path-like
         An HDF5 recording, a CSV file, a rosbag, an MCAP file, a ROS 2 bag folder, a C3D file or a LeRobot dataset.
-    progress : Progress, optional
-        Told of files that take long.
     **options
         Named options of the reader in `READERS`.
-
-    Returns
-    -------
-    Recording
-        The checked recording.
 
     Raises
     ------
     DataError
-        If the format or an option is not known, or the reader refuses the file.
+        The format or an option is not known, or the reader refuses the file.
     """
     path = Path(path)
     known_as = _format_of(path)
@@ -67,15 +60,10 @@ def read_any(path: str | os.PathLike[str], *, progress: Progress = NULL_PROGRESS
 def preview_file(path: str | os.PathLike[str], progress: Progress = NULL_PROGRESS) -> FileContents:
     """List the contents of a file of any known format, and the options for `read_any`.
 
-    Parameters
-    ----------
-    path : path-like
-        As `read_any`.
-
     Raises
     ------
     DataError
-        If the format is not known or the file cannot be read.
+        The format is not known or the file cannot be read.
     """
     path = Path(path)
     known_as = _format_of(path)
@@ -83,8 +71,7 @@ def preview_file(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
         return PREVIEWS[known_as](path, **_told(PREVIEWS[known_as], progress))
     recording = read_any(path)
     sources = (
-        FileSource(getattr(g, "name", "joints"), "group", len(g.t), mean_sample_rate(g.t), ", ".join(g.names))
-        for g in recording.groups
+        FileSource(g.name, "group", len(g.t), mean_sample_rate(g.t), ", ".join(g.names)) for g in recording.all_groups
     )
     return FileContents(tuple(sources), {}, ("a recording already", *recording.notes))
 

@@ -68,8 +68,6 @@ def read_c3d(
         Unit of `points`, where the file does not say it or says it wrongly.
     sensor, frame : str
         What saw the points, and their frame of reference.
-    description : str
-        What was recorded.
 
     Returns
     -------

@@ -75,8 +75,6 @@ def read_lerobot(
         Joints to keep, `name` or `recorded=name`, in this order: a gripper that is not in the model is left out so.
     units, torque_constants, gears
         As `yid_ocp.data.readers.base.ConversionOptions`. Many of these robots record degrees.
-    description : str
-        What was recorded.
 
     Returns
     -------
