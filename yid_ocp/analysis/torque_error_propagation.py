@@ -73,7 +73,7 @@ def episode_sensitivities(
     shown, told = [], []
     for samples, rows in zip(episode.measurements, problem.residual_rows.measurements[i], strict=True):
         block = evaluation.jacobian[rows]
-        if samples.sensor.outputs_per_channel == 3:
+        if samples.sensor.point_names:
             shown.append((samples.sensor, block.reshape(len(samples.value), -1, len(x))))
         else:
             told.append(block)

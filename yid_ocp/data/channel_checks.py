@@ -19,7 +19,8 @@ from yid_ocp.data.issues import (
 )
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError, nearest_name_hint
-from yid_ocp.sensors.joints import EFFORT_GROUP, NOISE_DIFFERENCE_ORDER, POSITION_GROUP
+from yid_ocp.sensors import CHANNELS
+from yid_ocp.sensors.joints import EFFORT_GROUP, NOISE_DIFFERENCE_ORDER
 
 _MAX_REPEATED_FRACTION = 0.1
 """Largest fraction of a channel's samples that may repeat the previous one."""
@@ -136,11 +137,10 @@ def _stated(recording: Recording, choice: SensorChoiceLookup, group: str, channe
     joints = recording.joints
     quantity, _, name = channel.partition(".")
     if group == "joints" and joints is not None:
-        said = choice({"position": POSITION_GROUP, "effort": EFFORT_GROUP}[quantity]).std
+        said = choice(f"joints.{quantity}").std
         if isinstance(said, Mapping):
             return float(said.get(name, 0.0))
-        own = joints.position_std if quantity == "position" else joints.effort_std
-        given = said if said is not None else own
+        given = said if said is not None else getattr(joints, CHANNELS[f"joints.{quantity}"].std_fields[0])
         if given is None:
             return 0.0
         return float(np.broadcast_to(given, (len(joints.names),))[joints.names.index(name)])

@@ -40,7 +40,7 @@ from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import Measurements, subtract_estimated_biases
 from yid_ocp.problem.options import SensorOptions
 from yid_ocp.problem.signal_filters import effort_filter
-from yid_ocp.sensors.base import values_by_joint
+from yid_ocp.sensors.base import CHANNELS, values_by_joint
 
 Array = NDArray[np.float64]
 _RecordingRollout = tuple[Episode, EpisodePrediction, Array]
@@ -436,12 +436,7 @@ def _wrong_samples(problem: EstimationProblem, run: _RecordingRollout) -> Iterat
         t = sample_times(episode, samples)
         for column, channel in enumerate(samples.channel_of_column):
             seen = samples.is_used[:, column]
-            frame = (
-                samples.sensor.frame_names[column // samples.sensor.outputs_per_channel]
-                if samples.sensor.frame_names
-                else ""
-            )
-            location = sensor_bias_location(problem.system, samples.sensor, frame)
+            location = sensor_bias_location(problem.system, samples.sensor, samples.sensor.output_frames[column])
             if samples.sensor.outputs_per_channel == 1:
                 location = channel.rpartition(".")[2]
             values = (samples.value - predicted)[seen, column]
@@ -450,7 +445,8 @@ def _wrong_samples(problem: EstimationProblem, run: _RecordingRollout) -> Iterat
     joints = episode.recording.joints
     if joints is None:
         return
-    for quantity, values, unit in (("position", joints.position, "rad"), ("effort", joints.effort, "N m")):
+    for quantity in ("position", "effort"):
+        values, unit = joints.channels.get(quantity), CHANNELS[f"joints.{quantity}"].unit
         channels = [f"joints.{quantity}.{joint}" for joint in joints.names]
         for column, (joint, channel) in enumerate(zip(joints.names, channels, strict=True)):
             floor = _floor(problem, episode, joint, quantity)
@@ -470,8 +466,7 @@ def _floor(problem: EstimationProblem, episode: Episode, joint: str, quantity: s
         return None
     group = f"joints.{quantity}"
     choice = options.sensors.get(group, SensorOptions())
-    recorded = joints.position_std if quantity == "position" else joints.effort_std
-    given = choice.std if choice.std is not None else recorded
+    given = choice.std if choice.std is not None else getattr(joints, CHANNELS[group].std_fields[0])
     std = 0.0 if given is None else float(values_by_joint(given, joints.names, (joint,), f"sensors.{group}.std")[0])
     if quantity == "effort" and joint in system.prescribed and math.isfinite(options.path_cutoff):
         # of one sample that much is left: its share of the filter's time

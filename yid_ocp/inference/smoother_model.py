@@ -142,7 +142,7 @@ def _smoother_unknowns(course: _LinearizedEpisode, limits: SmootherThresholds) -
         for column, name in enumerate(sensor.output_names):
             if not np.any(samples.is_used[:, column]):
                 continue
-            frame = sensor.frame_names[column // sensor.outputs_per_channel] if sensor.frame_names else ""
+            frame = sensor.output_frames[column]
             biased.append((k, column))
             names.append(name)
             sources.append(UnknownGroup(sensor_bias_location(course.system, sensor, frame), "bias"))

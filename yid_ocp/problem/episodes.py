@@ -30,7 +30,7 @@ from yid_ocp.problem.recorded_inputs import (
     smoothed_joint_efforts,
 )
 from yid_ocp.problem.signal_filters import LowPassFilter, effort_filter
-from yid_ocp.sensors import SENSOR_READERS, SensorContext
+from yid_ocp.sensors import CHANNELS, SENSOR_READERS, SensorContext
 from yid_ocp.sensors.joints import (
     EFFORT_GROUP,
     POSITION_GROUP,
@@ -200,10 +200,10 @@ def _recorded_input_errors(
     if not encoders and not np.any(std > 0) and not np.any(bias > 0):
         return None
     angle = joint_angle_noise_std(joints, driven, position, recording.name)
-    for group, choice, level, unit in ((EFFORT_GROUP, effort, std, "N m"), (POSITION_GROUP, position, angle, "rad")):
+    for group, choice, level in ((EFFORT_GROUP, effort, std), (POSITION_GROUP, position, angle)):
         if not is_noise_std_stated(joints, group, choice):
             words = "%s: the noise of %s is neither recorded nor configured; %.2g to %.2g %s estimated from its fastest"
-            log.warning(words + " changes", recording.name, group, level.min(), level.max(), unit)
+            log.warning(words + " changes", recording.name, group, level.min(), level.max(), CHANNELS[group].unit)
     if encoders:
         columns = [joints.names.index(name) for name in driven]
         std = np.maximum(std, _MIN_TORQUE_ERROR_FRACTION * np.maximum(np.std(joints.effort[:, columns], axis=0), 1e-3))

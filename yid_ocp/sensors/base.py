@@ -258,6 +258,12 @@ class Sensor(ABC):
         return tuple(f"{name}{part}" for name in self.channel_names for part in parts)
 
     @property
+    def output_frames(self) -> tuple[str, ...]:
+        """Frame of the mechanism that each output marks, empty where it marks none."""
+        frames = self.frame_names or ("",) * len(self.channel_names)
+        return tuple(frame for frame in frames for _ in range(self.outputs_per_channel))
+
+    @property
     def effort_joints(self) -> tuple[str, ...]:
         """Names of joints whose predicted effort it reads, filtered like the path; none for other sensors."""
         return ()

@@ -26,6 +26,7 @@ from yid_ocp.problem.options import SensorOptions
 from yid_ocp.progress import Progress
 from yid_ocp.report.animation import Animation, make_animation, recording_animation
 from yid_ocp.report.summaries import check_summary
+from yid_ocp.sensors import CHANNELS
 from yid_ocp.sensors.joints import (
     EFFORT_GROUP,
     POSITION_GROUP,
@@ -168,15 +169,12 @@ def _input_noise(problem: EstimationProblem, episode: Episode) -> dict[str, Any]
     joints, errors, noise = episode.recording.joints, episode.input_errors, {}
     if joints is None or errors is None:
         return {}
-    for group, noise_std, unit in (
-        (EFFORT_GROUP, joint_torque_noise_std, "N m"),
-        (POSITION_GROUP, joint_angle_noise_std, "rad"),
-    ):
+    for group, noise_std in ((EFFORT_GROUP, joint_torque_noise_std), (POSITION_GROUP, joint_angle_noise_std)):
         choice = problem.options.sensors.get(group, SensorOptions())
         noise[group] = {
             "samples": len(joints.t),
             "std": float(np.median(noise_std(joints, problem.system.driven, choice, episode.name))),
-            "unit": unit,
+            "unit": CHANNELS[group].unit,
             "estimated": not is_noise_std_stated(joints, group, choice),
         }
     noise[EFFORT_GROUP]["bias_std"] = float(np.median(errors.torque_bias_std))

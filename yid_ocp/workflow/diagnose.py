@@ -185,7 +185,8 @@ def _noise_levels(problem: EstimationProblem) -> set[tuple[str, str]]:
     recorded = [e.recording.joints.position_std for e in problem.episodes if e.recording.joints is not None]
     encoders = problem.options.sensors.get(POSITION_GROUP)
     noisy = any(std is not None and np.any(std) for std in recorded)
-    if ((EFFORT_GROUP, "std") in levels and noisy) or (encoders is not None and encoders.std is not None):
+    compared = any(samples.sensor.effort_joints for episode in problem.episodes for samples in episode.measurements)
+    if (compared and noisy) or (encoders is not None and encoders.std is not None):
         levels.add((POSITION_GROUP, "std"))  # the encoders' noise is part of that of efforts
     for errors in (episode.input_errors for episode in problem.episodes):
         if errors is not None:

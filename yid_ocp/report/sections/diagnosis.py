@@ -322,7 +322,8 @@ def _curves(
                 seen = np.isfinite(y) & np.isfinite(std)
                 if seen.any():
                     squares = [float(np.sum(((line - y)[seen] / std[seen]) ** 2)) for line in lines.values()]
-                    name = channel if sensor.outputs_per_channel == 1 else f"{channel}, {'xyz'[column % 3]}"
+                    part = sensor.output_names[column].removeprefix(channel).lstrip(".")
+                    name = f"{channel}, {part}" if part else channel
                     pair = figures.prediction_and_residual_plots(name, sensor.unit, t, y, std, lines)
                     found.append((squares[0] - (squares[1] if changed else 0.0), episode.name, pair))
     if not found:

@@ -86,15 +86,15 @@ def _fitted_curves(
     for samples, predicted in zip(episode.measurements, outcome.predicted_outputs, strict=True):
         sensor, grid, course = samples.sensor, episode.grid, None
         t = grid.start_time + grid.time_step * (samples.node + samples.fraction)
-        is_point = sensor.outputs_per_channel == 3
-        if is_point and len(t) < grid.steps / 2:
+        width = sensor.outputs_per_channel
+        if sensor.point_names and len(t) < grid.steps / 2:
             course = _course(findings, role, episode, outcome, sensor)
         names = sensor.channel_names
-        parts = {name: range(3 * c, 3 * c + 3) for c, name in enumerate(names)} if is_point else {}
+        parts = {name: range(width * c, width * (c + 1)) for c, name in enumerate(names)} if width > 1 else {}
         for title, columns in (parts or {sensor.group_name: range(len(names))}).items():
             curves: list[TimePlot] = []
             for i in columns:
-                name = "xyz"[i % 3] if is_point else names[i].rsplit(".", 1)[1]
+                name = sensor.output_names[i].rsplit(".", 1)[1]
                 told = (t, samples.value[:, i], samples.std[:, i], {"predicted": predicted[:, i]})
                 smooth = None if course is None else (grid.node_times, course[:, i])
                 curves += figures.prediction_and_residual_plots(name, sensor.unit, *told, smooth)
