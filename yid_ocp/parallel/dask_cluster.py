@@ -34,11 +34,9 @@ def dask_executor(
     try:
         distributed = importlib.import_module("distributed")
     except ImportError as error:
-        raise WorkerError(
-            "a scheduler needs Dask, which is not installed",
-            where="--scheduler",
-            hint="pip install 'yid-ocp[cluster]', or leave --scheduler out for processes on this machine",
-        ) from error
+        hint = "pip install 'yid-ocp[cluster]', or leave --scheduler out for processes on this machine"
+        what = "a scheduler needs Dask, which is not installed"
+        raise WorkerError(what, where="--scheduler", hint=hint) from error
     path = Path(scheduler).expanduser()
     where = {"scheduler_file": str(path)} if path.is_file() else {"address": scheduler}
     try:
@@ -48,12 +46,10 @@ def dask_executor(
         hint = "run it again once this machine is less busy"
         raise WorkerError(what, where=scheduler, allowed="a machine that has time for it", hint=hint) from error
     except (OSError, ValueError, TypeError, LookupError) as error:  # TimeoutError is an OSError
-        raise WorkerError(
-            f"no scheduler answers: {next(iter(str(error).splitlines()), type(error).__name__)}",
-            where=scheduler,
-            allowed="HOST:PORT of a running `dask scheduler`, or the path of its scheduler file",
-            hint="start one with `dask scheduler` and workers with `dask worker HOST:PORT --nthreads 1`",
-        ) from error
+        what = f"no scheduler answers: {next(iter(str(error).splitlines()), type(error).__name__)}"
+        allowed = "HOST:PORT of a running `dask scheduler`, or the path of its scheduler file"
+        hint = "start one with `dask scheduler` and workers with `dask worker HOST:PORT --nthreads 1`"
+        raise WorkerError(what, where=scheduler, allowed=allowed, hint=hint) from error
 
     def look() -> None:
         if not client.nthreads():
@@ -86,12 +82,12 @@ def _refuse_unfit(client: Any, function: _TaskFunction | None, folder: Path | No
     """
     for address, count in client.nthreads().items():
         if count > 1:
-            raise WorkerError(
+            what, allowed = (
                 f"a worker would do {count} tasks at once in one process",
-                where=address,
-                allowed="one task at a time in every process",
-                hint="start workers with --nthreads 1, and --nworkers for as many as the machine has processors",
+                "one task at a time in every process",
             )
+            hint = "start workers with --nthreads 1, and --nworkers for as many as the machine has processors"
+            raise WorkerError(what, where=address, allowed=allowed, hint=hint)
     here = software_fingerprint()
     for address, entry in client.get_versions()["workers"].items():
         said = str(entry["host"]["python"])
@@ -108,14 +104,10 @@ def _refuse_unfit(client: Any, function: _TaskFunction | None, folder: Path | No
             probe.unlink(missing_ok=True)
     for address, said in found.items():
         if isinstance(said, str):
-            raise WorkerError(
-                f"a worker cannot do the tasks: {said}",
-                where=address,
-                allowed="workers that import the same modules and see the same folders as this process",
-                hint="install yid-ocp where the workers run, and choose --out on a file system that all of them share",
-            )
-        unlike = fingerprint_differences(here, said)
-        if unlike:
+            allowed = "workers that import the same modules and see the same folders as this process"
+            hint = "install yid-ocp where the workers run, and choose --out on a file system that all of them share"
+            raise WorkerError(f"a worker cannot do the tasks: {said}", where=address, allowed=allowed, hint=hint)
+        if unlike := fingerprint_differences(here, said):
             raise _unfit(address, unlike)
 
 

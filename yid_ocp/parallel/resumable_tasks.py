@@ -32,8 +32,7 @@ from yid_ocp.parallel.threads_and_processes import InlineExecutor, process_pool,
 from yid_ocp.version import fingerprint_differences, package_source_hash, software_fingerprint
 
 _TASK_FORMAT = "yid-task/1"
-_RESULT_FILE_TIMEOUT = 60.0
-"""Timeout until a result file written by another machine is visible, as on network file systems [s]."""
+_RESULT_FILE_TIMEOUT = 60.0  # until a result file written by another machine is visible, as on network file systems [s]
 _WORKER_CHECK_INTERVAL = 60.0  # time without a finished task after which it is checked that there are workers [s]
 log = logging.getLogger(__name__)
 _TaskFunction = Callable[..., Any]
@@ -83,12 +82,9 @@ class WorkerConfig:
         if self.n_processes is not None and self.n_processes < 1:
             raise ConfigError(f"{self.n_processes} workers", where="--workers", allowed="a whole number from 1")
         if self.n_processes is not None and self.scheduler_address:
-            raise ConfigError(
-                "workers are asked for here and of a scheduler",
-                where="--workers and --scheduler",
-                allowed="one of the two",
-                hint="leave --workers out: the scheduler knows how many workers it has",
-            )
+            what, where = "workers are asked for here and of a scheduler", "--workers and --scheduler"
+            hint = "leave --workers out: the scheduler knows how many workers it has"
+            raise ConfigError(what, where=where, allowed="one of the two", hint=hint)
 
     def check_available(self) -> None:
         """Check before long work that the workers are available.
@@ -258,8 +254,7 @@ _TaskFinishedCallback = Callable[[_Job, TaskResult], None]
 
 def _perform(job: _Job) -> str:
     """Run a task and write its result file; returns the error message, empty on success."""
-    unlike = fingerprint_differences(job.maker, software_fingerprint())
-    if unlike:
+    if unlike := fingerprint_differences(job.maker, software_fingerprint()):
         return f"WorkerError: {version_mismatch_message(socket.gethostname(), unlike)}"
     begun = time.perf_counter()
     entry = {"format": _TASK_FORMAT, "name": job.task.name, "input": job.input}
