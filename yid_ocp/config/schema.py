@@ -87,8 +87,8 @@ def section_variants(hint: Any) -> SectionVariants | None:
         registry = among.registry
         classes = {name: registry[name] for name in registry}
         return SectionVariants(classes, among.selector_key, among.default_name, registry.entry_noun, nullable)
-    kinds: list[Any] = [split_annotated(member)[0] for member in union_members(bare)]
-    if len(kinds) != 1 or not dataclasses.is_dataclass(kinds[0]):
+    kinds = [split_annotated(member)[0] for member in union_members(bare)]
+    if len(kinds) != 1 or not all(map(dataclasses.is_dataclass, kinds)):
         return None
     return SectionVariants({"": kinds[0]}, is_nullable=nullable)
 
