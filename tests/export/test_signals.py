@@ -1,18 +1,24 @@
-"""MCAP files, read back by the packages of the MCAP project: every number, stamp and definition."""
+"""Signals: MCAP files, read back by the packages of the MCAP project, and tables that read back as what was written."""
 
 from __future__ import annotations
 
 import json
+import math
+import tempfile
+from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from yid_ocp.data import JointGroup, PointGroup, Recording, read_any
+from yid_ocp.data import JointGroup, PointGroup, Recording, read_any, read_csv
 from yid_ocp.errors import OutputError
-from yid_ocp.export.signals import TopicSignal, export_mcap, signals_from_recording
+from yid_ocp.export.signals import TopicSignal, export_csv, export_mcap, signals_from_recording
 
 
 def read(path) -> dict[str, list]:
@@ -166,3 +172,36 @@ def test_a_diagnosis_says_what_it_could_not_explain(tmp_path, cli):
         np.testing.assert_array_equal(places(other[f"/{name}/{point}"]), values)
         np.testing.assert_array_equal(vectors(other[f"/residual/{name}/{point}"]), values - seen)
     assert [list(told.effort) for *_, told in other["/events/elbow"]] == [[0.0], [2.0], [0.0]]
+
+
+@given(
+    hnp.arrays(float, (4, 2), elements=st.floats(-50, 50)),
+    hnp.arrays(float, (3, 2, 3), elements=st.floats(-50, 50)),
+    hnp.arrays(bool, (3, 2)),
+)
+def test_csv_round_trip(position: np.ndarray, points: np.ndarray, hidden: np.ndarray) -> None:
+    points[hidden] = np.nan
+    joints = JointGroup(("a", "b_x"), np.array([0.0, 0.1, 0.3, 1e9 / 3]), position, effort=-position)
+    camera = PointGroup("points_camera", ("p", "q r"), np.array([-1.0, 0.0, math.pi]), points)
+    with tempfile.TemporaryDirectory() as folder:
+        files = export_csv(Recording(joints, (camera,)), Path(folder) / "new" / "tables")
+        assert [file.name for file in files] == ["joints.csv", "points_camera.csv"]
+        back, (points_back,) = read_csv(files[0]).joints, read_csv(files[1]).points
+    assert back.names == joints.names
+    assert np.array_equal(back.t, joints.t)
+    assert np.array_equal(back.position, position)
+    assert np.array_equal(back.channels["effort"], -position)
+    assert list(back.channels) == ["position", "effort"]
+    assert points_back.names == camera.names
+    assert np.array_equal(points_back.t, camera.t)
+    assert np.array_equal(points_back.position, points, equal_nan=True)
+
+
+def test_export_to_an_unusable_folder(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    recording = Recording(JointGroup(("a",), np.zeros(1), np.zeros((1, 1))))
+    with pytest.raises(OutputError, match="folder cannot be made"):
+        export_csv(recording, tmp_path / "file")
+    (tmp_path / "joints.csv").mkdir()
+    with pytest.raises(OutputError, match="that of a folder"):
+        export_csv(recording, tmp_path)
