@@ -27,16 +27,13 @@ class StepFunctions:
 
     Attributes
     ----------
-    equations : DiscreteEquations
     residual : casadi.Function
         (balance, internal, constraint, p1, share of Dphi(q_m)), balance and p1 without the constraints' pull.
     jacobian_parts : casadi.Function
         (pair vectors, rest Jacobian, rest Jacobian of p1, constraint Jacobian, curvature), the last four as nonzeros;
         the curvature is the derivative of the midpoint's pull by q_k, which is that by q_{k+1}.
-    before_constraint_jacobian : casadi.Function
-        Share of Dphi(q_k) in the balance, which does not depend on the unknowns.
-    after_constraint_jacobian : casadi.Function
-        Share of Dphi(q_{k+1}) in p1.
+    before_constraint_jacobian, after_constraint_jacobian : casadi.Function
+        Share of Dphi(q_k) in the balance, which does not depend on the unknowns, and of Dphi(q_{k+1}) in p1.
     constraint_force_derivatives : casadi.Function
         Derivatives of the pull of the first of these two by (q_k, z_k), of the second by q_{k+1}.
     row_scale_and_time_step : casadi.Function
@@ -173,8 +170,8 @@ class StepIndexTables:
         Internal coordinates, tips before roots, multipliers last.
     fill_in : tuple of ndarray of int
         For each pivot, the later positions that its row and column fill.
-    joint_ancestors, residual_old_columns, p1_old_columns, p1_new_columns : tuple of ndarray of int
-        For each joint its ancestors; for each row of a Jacobian its columns that are not always zero.
+    residual_old_columns, p1_old_columns, p1_new_columns : tuple of ndarray of int
+        For each row of a Jacobian its columns that are not always zero.
     """
 
     unknown_rows: _Indices
@@ -243,13 +240,8 @@ def step_index_tables(functions: StepFunctions) -> StepIndexTables:
 def kernel_source(functions: StepFunctions, tables: StepIndexTables, batched: bool = False) -> str | None:
     """C source of the stepping kernel: `simd.c`, CasADi's functions, sizes, tables, then `kernel.c`.
 
-    Parameters
-    ----------
-    functions : StepFunctions
-    tables : StepIndexTables
-    batched : bool
-        Whether the code handles several rollouts at once, as many as `yid_simd_width` returns; None where a function
-        has no SIMD form.
+    With `batched` for several rollouts at once, as many as `yid_simd_width` returns; then None where a function has no
+    SIMD form.
     """
     made = simd_c_source(functions.all_functions) if batched else _step_source(functions.all_functions)
     if made is None:
@@ -264,6 +256,7 @@ def kernel_source(functions: StepFunctions, tables: StepIndexTables, batched: bo
 def _kernel_sizes(functions: StepFunctions, tables: StepIndexTables) -> dict[str, float]:
     e, system = functions.equations, functions.equations.system
     n, nz, m, nc = system.n_coordinates, e.z0.numel(), e.lam.numel(), len(system.prescribed)
+    left, right = e.closed_form_force_shares
     return {
         **{"N": n, "NZ": nz, "M": m, "NU": e.u.numel(), "NC": nc, "NF": n - nc},
         **{"NY": len(tables.elimination_order), "NT": n + nz + m, "NTHETA": e.theta.numel()},
@@ -272,9 +265,7 @@ def _kernel_sizes(functions: StepFunctions, tables: StepIndexTables) -> dict[str
         "SZ_IW": max(f.sz_iw() for f in functions.all_functions),
         "ROW_SCALED": int(bool(system.joint_compliances)),
         "MIDDLE": int(bool(e.constraint_impulses.midpoint_share)),
-        "CLOSED": int(e.closed_form_force is not None),
-        "CLOSED_LEFT": e.closed_form_force_shares[0],
-        "CLOSED_RIGHT": e.closed_form_force_shares[1],
+        **{"CLOSED": int(e.closed_form_force is not None), "CLOSED_LEFT": left, "CLOSED_RIGHT": right},
     }
 
 
@@ -375,22 +366,18 @@ _FORMS = {
 _TURNS = {ca.OP_SIN: "sine", ca.OP_COS: "cosine"}
 _KNOWN = {ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST, *_FORMS, *_TURNS}
 
-_LONG_INSTRUCTION_COUNT = 80_000
-"""Number of instructions above which a function is split into parts, since compile time grows superlinearly."""
-_PART_INSTRUCTION_COUNT = 300
-"""Instructions per part; with 300 a step of 151 variables compiles in half the time of 4000 and runs as fast."""
+_LONG_INSTRUCTION_COUNT = 80_000  # from which on a function is split into parts: compile time grows superlinearly
+_PART_INSTRUCTION_COUNT = 300  # with which a step of 151 variables compiles in half the time of 4000 and runs as fast
 
 
 def _is_long_function(function: ca.Function) -> bool:
-    """Whether a function is so long that its C code is split into parts."""
     return int(function.n_instructions()) > _LONG_INSTRUCTION_COUNT
 
 
 def simd_c_source(functions: Sequence[ca.Function]) -> str | None:
     """SIMD C source of SX functions with CasADi's signatures; None if one uses an operation without a SIMD form.
 
-    A long one is written as functions of `_PART_INSTRUCTION_COUNT` instructions, which hand on what later ones need in
-    the work vector.
+    A long one is written as functions of some instructions, which hand on what later ones need in the work vector.
     """
     sources = [_source(function) for function in functions]
     return None if None in sources else "\n".join(source for source in sources if source is not None)

@@ -6,7 +6,7 @@ import ctypes
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -48,65 +48,27 @@ class _Struct(ctypes.Structure):
     kept: object = None
 
 
-def _fields(kind: Any, names: str) -> tuple[tuple[str, Any], ...]:
-    return tuple((name, kind) for name in names.split())
+def _struct(*fields: str) -> type[_Struct]:
+    """A struct of fields that are given as a kind and names."""
+    kinds = {"int": ctypes.c_int, "double": ctypes.c_double, "long": ctypes.c_longlong, "pointer": ctypes.c_void_p}
+    words = [part.split() for part in fields]
+    return type("_Made", (_Struct,), {"_fields_": [(name, kinds[kind]) for kind, *names in words for name in names]})
 
 
-def _pointers(names: str) -> tuple[tuple[str, Any], ...]:
-    return _fields(ctypes.c_void_p, names)
+_Directions = _struct(
+    "int count theta_count", "pointer by_theta rows_pattern p1_pattern effort_pattern rows_nz p1_nz effort_nz w iw"
+)
+_Feedback = _struct("int count", "pointer index gain reference")
+_Motion = _struct("int steps limit", "double time_step tolerance", "pointer theta torque path feedback directions")
+_Trajectory = _struct("pointer state multipliers effort applied")
+_Sensitivities = _struct("pointer state multipliers effort torque path")
+_Partials = _struct("pointer state multipliers effort")
+_Gradient = _struct("pointer theta start torque path")
+_Linearization = _struct("pointer rows p1 rows_new rows_old rows_input p1_new p1_old p1_input rows_theta p1_theta")
+_Outcome = _struct("int step status", "double error", "long iterations factorisations memory")
 
 
-class _Directions(_Struct):
-    _fields_ = (
-        *_fields(ctypes.c_int, "count theta_count"),
-        *_pointers("by_theta rows_pattern p1_pattern effort_pattern rows_nz p1_nz effort_nz w iw"),
-    )
-
-
-class _Feedback(_Struct):
-    _fields_ = (*_fields(ctypes.c_int, "count"), *_pointers("index gain reference"))
-
-
-class _Motion(_Struct):
-    _fields_ = (
-        *_fields(ctypes.c_int, "steps limit"),
-        *_fields(ctypes.c_double, "time_step tolerance"),
-        *_pointers("theta torque path feedback directions"),
-    )
-
-
-class _Trajectory(_Struct):
-    _fields_ = _pointers("state multipliers effort applied")
-
-
-class _Sensitivities(_Struct):
-    _fields_ = _pointers("state multipliers effort torque path")
-
-
-class _Partials(_Struct):
-    _fields_ = _pointers("state multipliers effort")
-
-
-class _Gradient(_Struct):
-    _fields_ = _pointers("theta start torque path")
-
-
-class _Linearization(_Struct):
-    _fields_ = _pointers("rows p1 rows_new rows_old rows_input p1_new p1_old p1_input rows_theta p1_theta")
-
-
-class _Outcome(_Struct):
-    _fields_ = (
-        *_fields(ctypes.c_int, "step status"),
-        *_fields(ctypes.c_double, "error"),
-        *_fields(ctypes.c_longlong, "iterations factorisations memory"),
-    )
-
-
-_StructType = TypeVar("_StructType", bound=_Struct)
-
-
-def _filled(kind: type[_StructType], *values: object) -> _StructType:
+def _filled(kind: type[_Struct], *values: object) -> _Struct:
     """A struct from numbers and from the addresses of arrays and other structs; None becomes a null pointer."""
 
     def entry(value: object) -> object:
@@ -117,6 +79,11 @@ def _filled(kind: type[_StructType], *values: object) -> _StructType:
     struct = kind(*map(entry, values))
     struct.kept = values
     return struct
+
+
+def _along(state: Array, multipliers: Array, torque: Array) -> _Struct:
+    """A trajectory that is given."""
+    return _filled(_Trajectory, *(_doubles(a) for a in (state, multipliers, None, torque)))
 
 
 def _doubles(array: ArrayLike | None) -> Array | None:
@@ -215,15 +182,10 @@ class CompiledKernel:
             motions.append(self._motion(len(m.torque), m.theta, m.torque, m.prescribed_path, m.feedback, directions))
             trajectories.append(_filled(_Trajectory, out.state, out.multipliers, out.effort, out.torque))
             outs.append(out)
-        outcomes = (_Outcome * len(members))()
-        code = library.yid_rollout(
-            ctypes.c_int(len(members)),
-            (_Motion * len(members))(*motions),
-            (_Trajectory * len(members))(*trajectories),
-            (_Sensitivities * len(members))(*sensitivities) if sensitivities else None,
-            outcomes,
-        )
-        self._check(code, outcomes[0])
+        outcomes: Any = (_Outcome * len(members))()
+        given = (_Motion * len(members))(*motions), (_Trajectory * len(members))(*trajectories)
+        by = (_Sensitivities * len(members))(*sensitivities) if sensitivities else None
+        _check(library.yid_rollout(ctypes.c_int(len(members)), *given, by, outcomes), outcomes[0])
         return [
             rollout_with_status(out, sizes, o.status, o.step, o.error, (o.iterations, o.factorisations))
             for out, o in zip(outs, outcomes, strict=True)
@@ -243,18 +205,14 @@ class CompiledKernel:
         sizes, steps = self._model.sizes, len(rollout.multipliers)
         shapes = (len(names),), (sizes["nx"],), (steps, sizes["nu"]), (steps + 1, sizes["nc"])
         gradient = CostGradient(*(np.zeros(shape) for shape in shapes))
-        along = [_doubles(a) for a in (rollout.state, rollout.multipliers, None, rollout.torque)]
         partials = [_doubles(a) for a in (by_state, by_multipliers, by_effort)]
-        outcome = _Outcome()
-        directions = self._directions(names, len(names))
-        code = self._library.yid_adjoint(
-            ctypes.byref(self._motion(steps, theta, None, None, feedback, directions)),
-            ctypes.byref(_filled(_Trajectory, *along)),
-            ctypes.byref(_filled(_Partials, *partials)),
-            ctypes.byref(_filled(_Gradient, *vars(gradient).values())),
-            ctypes.byref(outcome),
+        code, _ = self._call(
+            "yid_adjoint",
+            self._motion(steps, theta, None, None, feedback, self._directions(names, len(names))),
+            _along(rollout.state, rollout.multipliers, rollout.torque),
+            _filled(_Partials, *partials),
+            _filled(_Gradient, *vars(gradient).values()),
         )
-        self._check(code, outcome)
         if code != NewtonStatus.OK:
             for array in vars(gradient).values():
                 array[:] = np.nan
@@ -265,20 +223,17 @@ class CompiledKernel:
     ) -> StepLinearization:
         """Residuals and Jacobians of many steps, evaluated in C."""
         out = allocate_linearization(self._model.sizes, len(torque), len(names), derivatives)
-        along = [_doubles(a) for a in (state, multipliers, None, torque)]
         # in the order of the struct
         matrices = [out.residual_by_new, out.residual_by_old, out.residual_by_input, out.p1_by_new, out.p1_by_old]
         matrices += [out.p1_by_input, out.residual_by_theta, out.p1_by_theta]
-        given = [out.residual, out.p1, *(matrices if derivatives else [None] * len(matrices))]
-        outcome = _Outcome()
-        directions = self._directions(names, len(names)) if derivatives else None
-        code = self._library.yid_linearize(
-            ctypes.byref(self._motion(len(torque), theta, None, None, None, directions)),
-            ctypes.byref(_filled(_Trajectory, *along)),
-            ctypes.byref(_filled(_Linearization, *given)),
-            ctypes.byref(outcome),
+        self._call(
+            "yid_linearize",
+            self._motion(
+                len(torque), theta, None, None, None, self._directions(names, len(names)) if derivatives else None
+            ),
+            _along(state, multipliers, torque),
+            _filled(_Linearization, out.residual, out.p1, *(matrices if derivatives else [None] * len(matrices))),
         )
-        self._check(code, outcome)
         return out
 
     def step_jacobians(
@@ -288,17 +243,11 @@ class CompiledKernel:
         sizes, loads = self._model.sizes, load_rows.shape[1]
         width = sizes["nx"] + sizes["nu"] + loads
         after, effort = (np.zeros((len(torque), sizes[key], width)) for key in ("nx", "nc"))
-        along = [_doubles(a) for a in (state, multipliers, None, torque)]
-        rows, momentum = np.ascontiguousarray(load_rows, float), np.ascontiguousarray(load_momentum, float)
-        outcome = _Outcome()
-        code = self._library.yid_slopes(
-            ctypes.byref(self._motion(len(torque), theta, None, None, None, None)),
-            ctypes.byref(_filled(_Trajectory, *along)),
-            ctypes.c_int(loads),
-            *(ctypes.c_void_p(a.ctypes.data) for a in (rows, momentum, after, effort)),
-            ctypes.byref(outcome),
+        motion = self._motion(len(torque), theta, None, None, None, None)
+        added = [np.ascontiguousarray(x, float) for x in (load_rows, load_momentum)]
+        code, outcome = self._call(
+            "yid_slopes", motion, _along(state, multipliers, torque), loads, *added, after, effort
         )
-        self._check(code, outcome)
         if code != NewtonStatus.OK:
             raise np.linalg.LinAlgError(f"the equations of step {outcome.step} are singular")
         return after, effort
@@ -311,10 +260,22 @@ class CompiledKernel:
         hold = _filled(_Feedback, nu, driven, stiffness * np.eye(nu), _doubles(given[:nu])) if nu else None
         inputs = (_doubles(theta), _doubles(held), _doubles(given[nu:]))
         motion = _filled(_Motion, 1, EQUILIBRIUM_ITERATION_LIMIT, self._model.time_step, tolerance, *inputs, hold, None)
-        w, outcome = np.array(unknowns, float), _Outcome()
-        code = self._library.yid_rest(ctypes.byref(motion), ctypes.c_void_p(w.ctypes.data), ctypes.byref(outcome))
-        self._check(code, outcome)
+        w = np.array(unknowns, float)
+        code, outcome = self._call("yid_rest", motion, w)
         return w, outcome.error, code == NewtonStatus.OK
+
+    def _call(self, function: str, *arguments: object) -> tuple[int, Any]:
+        """Status and outcome of a function of the library, which takes structs and arrays by address."""
+
+        def passed(value: object) -> object:
+            if isinstance(value, np.ndarray):
+                return ctypes.c_void_p(value.ctypes.data)
+            return ctypes.byref(value) if isinstance(value, _Struct) else value
+
+        outcome = _Outcome()
+        code = getattr(self._library, function)(*map(passed, arguments), ctypes.byref(outcome))
+        _check(code, outcome)
+        return code, outcome
 
     def _motion(
         self,
@@ -323,8 +284,8 @@ class CompiledKernel:
         torque: Array | None,
         path: Array | None,
         feedback: TrackingFeedback | None,
-        directions: _Directions | None,
-    ) -> _Motion:
+        directions: _Struct | None,
+    ) -> _Struct:
         loop = None
         if feedback is not None:
             index = np.ascontiguousarray(feedback.state_indices, np.int32)
@@ -333,7 +294,7 @@ class CompiledKernel:
         numbers = (steps, NEWTON_ITERATION_LIMIT, self._model.time_step, self._model.tolerance)
         return _filled(_Motion, *numbers, *inputs, loop, directions)
 
-    def _directions(self, names: tuple[str, ...], count: int) -> _Directions:
+    def _directions(self, names: tuple[str, ...], count: int) -> _Struct:
         if not names:
             return _filled(_Directions, count, 0)
         columns = self._theta_columns(names)
@@ -341,9 +302,10 @@ class CompiledKernel:
         w, iw = np.zeros(columns.work), np.zeros(columns.work, np.int64)
         return _filled(_Directions, count, len(names), columns.address, *columns.patterns, *values, w, iw)
 
-    def _check(self, code: int, outcome: _Outcome) -> None:
-        if code == NewtonStatus.OUT_OF_MEMORY:
-            raise out_of_memory_error("the work on one step", outcome.memory)
+
+def _check(code: int, outcome: Any) -> None:
+    if code == NewtonStatus.OUT_OF_MEMORY:
+        raise out_of_memory_error("the work on one step", outcome.memory)
 
 
 def _batch_key(member: RolloutInputs) -> Hashable:
@@ -366,7 +328,7 @@ def _batched_library(model: StepModel) -> tuple[ctypes.CDLL, int] | None:
 
 
 def _theta_columns(model: StepModel, kernel: ctypes.CDLL, names: tuple[str, ...]) -> _ThetaColumns:
-    """Compile the derivatives by some parameters and make sure that they fit the kernel, which does not look.
+    """Compiled derivatives by some parameters, which fit the kernel (it does not look).
 
     To differentiate again what is in the cache would take longer than all that a diagnosis does with it; they follow
     from the kernel's equations and the places of the parameters.

@@ -35,9 +35,7 @@ _NATIVE_FLAGS = ("-march=native",)
 # GCC's time on a step of 50 variables, and what it makes runs as fast without. Other compilers refuse these words.
 _GCC_FLAGS = ("-fno-tree-dominator-opts", "-fno-tree-ccp", "-fno-tree-bit-ccp")
 
-# -O2 takes 1.7 times as long on a step of 43 variables, for a gain of 2 to 4 %, and minutes on single functions of tens
-# of thousands of lines.
-_OPTIMIZATION_FLAG = "-O1"
+_OPTIMIZATION_FLAG = "-O1"  # -O2 takes 1.7 times as long on a step of 43 variables, for a gain of 2 to 4 %
 # What runs for seconds in all and is new for every model is worth no more: -O1 takes a minute on 70 000 lines, this
 # three seconds, for code that is still two or three times as fast as CasADi's own machine.
 _NO_OPTIMIZATION_FLAG = "-O0"
@@ -55,12 +53,9 @@ def _compiler_path() -> str | None:
     names = () if wanted == "none" else (wanted,) if wanted else ("cc", "gcc", "clang")
     path = next((found for name in names if (found := shutil.which(name))), None)
     if path is None and wanted not in (None, "", "none"):
-        raise ConfigError(
-            f"there is no compiler '{wanted}'",
-            where="the environment's variable CC",
-            allowed="name or path of a C compiler, without options; none",
-            hint="unset CC to have cc, gcc or clang found",
-        )
+        allowed, hint = "name or path of a C compiler, without options; none", "unset CC to have cc, gcc or clang found"
+        what, where = f"there is no compiler '{wanted}'", "the environment's variable CC"
+        raise ConfigError(what, where=where, allowed=allowed, hint=hint)
     if path is None:
         _LOG.warning("no C compiler: everything works without compiled code, about ten times slower")
     return path
@@ -77,12 +72,9 @@ def _cache_folder() -> Path:
         raise OutputError(what, where=str(folder), hint=hint) from error
     info = folder.stat()
     if hasattr(os, "getuid") and (info.st_uid != os.getuid() or info.st_mode & (stat.S_IWGRP | stat.S_IWOTH)):
-        raise OutputError(
-            "the cache of compiled code belongs to, or is writable by, somebody else",
-            where=str(folder),
-            allowed="a folder that you own, writable by you alone",
-            hint=f"chmod 700 it, or set YID_OCP_CACHE to another folder ({folder.name})",
-        )
+        what = "the cache of compiled code belongs to, or is writable by, somebody else"
+        hint = f"chmod 700 it, or set YID_OCP_CACHE to another folder ({folder.name})"
+        raise OutputError(what, where=str(folder), allowed="a folder that you own, writable by you alone", hint=hint)
     return folder
 
 
@@ -110,13 +102,8 @@ def _machine() -> str:
 def compile_library(source: str, make: Callable[[], str] | None = None) -> ctypes.CDLL | None:
     """Shared library of a C source, from the cache if present; None if no compiler works.
 
-    Parameters
-    ----------
-    source : str
-        C text, or what determines it. The cache key is the hash of this text, the flags, the compiler, the processor
-        and CasADi's version.
-    make : callable, optional
-        Returns the C text if `source` is not the C text; called only if the library is not in the cache.
+    The cache key is the hash of this text, the flags, the compiler, the processor and CasADi's version. With `make`,
+    which returns the C text and is called only if the library is not in the cache, `source` is what determines it.
     """
     target = _library_file(source, _OPTIMIZATION_FLAG, make)
     if target is None:
@@ -207,15 +194,9 @@ def _is_ours(built: Path) -> bool:
 
 
 class MappedFunction:
-    """A CasADi function evaluated at many points at once, compiled where possible.
+    """A CasADi function of dense columns evaluated at many points at once, compiled where possible.
 
-    Parameters
-    ----------
-    function : casadi.Function
-        Inputs are dense columns.
-    shared_inputs : sequence of int
-        Positions of the inputs that are the same at every point.
-    use_compiler : bool
+    `shared_inputs` are the positions of inputs that are the same at every point.
     """
 
     def __init__(self, function: ca.Function, shared_inputs: Sequence[int] = (), use_compiler: bool = True) -> None:
@@ -254,17 +235,7 @@ int yid_map(int count, const double **in, double **out) {{
 """
 
     def __call__(self, *inputs: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Evaluate the function at all points.
-
-        Parameters
-        ----------
-        *inputs : ndarray, shape (count, size) or, where shared, (size,)
-
-        Returns
-        -------
-        list of ndarray, shape (count, rows, columns)
-            Dense, one for each output.
-        """
+        """Values at all points, (count, rows, columns), dense, for inputs (count, size) or, where shared, (size,)."""
         count = next((len(x) for i, x in enumerate(inputs) if i not in self.shared_inputs), 1)
         arrays = [np.ascontiguousarray(x, dtype=float) for x in inputs]
         for i, array in enumerate(arrays):

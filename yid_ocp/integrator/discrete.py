@@ -41,19 +41,11 @@ ConstraintForcePlacement = Literal["node", "midpoint"]
 
 
 @dataclass(frozen=True)
-class ConstraintImpulses:
-    """Constraint Jacobians that give the constraint impulses of a step, with closed-form derivatives by q.
+class _ConstraintImpulses:
+    """Dphi (m, n) and d(Dphi(q)' lam)/dq (n, n) at q_k, q_m and q_{k+1}; the Jacobians have one sparsity.
 
-    The balance loses (share_0 Dphi(q_k) + share_m Dphi(q_m))' lam, p1 loses share_m (Dphi(q_m) - Dphi(q_{k+1}))' lam.
-
-    Attributes
-    ----------
-    start_share, midpoint_share : float
-        Their sum is one.
-    before_jacobian, middle_jacobian, after_jacobian : casadi.SX, shape (m, n)
-        Dphi at q_k, q_m and q_{k+1}, all of one sparsity.
-    before_force_by_q, middle_force_by_q, after_force_by_q : casadi.SX, shape (n, n)
-        d(Dphi(q)' lam)/dq there.
+    The balance loses (start Dphi(q_k) + share Dphi(q_m))' lam, p1 loses share (Dphi(q_m) - Dphi(q_{k+1}))' lam, where
+    start and share, at the midpoint, add up to one.
     """
 
     start_share: float
@@ -84,15 +76,10 @@ class DiscreteEquations:
 
     Attributes
     ----------
-    q0, q1, z0, z1 : casadi.SX, shape (n, 1) and (nz, 1)
-        Coordinates and internal coordinates at the two nodes.
-    p0 : casadi.SX, shape (n, 1)
-        p_k [N m s].
-    lam : casadi.SX, shape (m, 1)
-        Multipliers of the step [N s].
-    u : casadi.SX, shape (nu, 1)
-        Motor torques held over the step [N m], or what servos are commanded [rad or m].
-    theta : casadi.SX, shape (ntheta, 1)
+    q0, q1, z0, z1, p0 : casadi.SX, shape (n, 1) and (nz, 1)
+        Coordinates and internal coordinates at the two nodes; p_k [N m s].
+    lam, u, theta : casadi.SX, shape (m, 1), (nu, 1) and (ntheta, 1)
+        Multipliers of the step [N s]; motor torques held over it [N m], or what servos are commanded [rad or m].
     time_step, h : casadi.SX
         Recorded step [s], and the step in the equations: this times `System.recorded_time_scale`.
     momentum_balance, p1 : casadi.SX, shape (n, 1)
@@ -108,14 +95,12 @@ class DiscreteEquations:
     balance_remainder, p1_remainder : casadi.SX, shape (n, 1)
         `momentum_balance` and `p1` without the bodies' Lagrangian, p_k, the constraint impulses and the closed force;
         this gives the Jacobians without differentiating the tree.
-    closed_form_force : ForceWithDerivatives or None
-        Sum of the forces that effects give with their slopes, at the midpoint.
-    closed_form_force_shares : (float, float)
-        Parts of its impulse h F in `momentum_balance` and in `p1`.
-    constraint_impulses : ConstraintImpulses
-        The constraints' part of `momentum_balance` and of `p1`, before `row_scale`.
+    closed_form_force, closed_form_force_shares : ForceWithDerivatives or None, (float, float)
+        Sum of the forces that effects give with their slopes, at the midpoint, and the parts of its impulse h F in
+        `momentum_balance` and in `p1`.
     row_scale : casadi.SX, shape (n, 1)
-        Factor on each row of the bodies' part, in the balance and in p1 (1, or the compliance of a compliant one).
+        Factor on each row of the bodies' part and of the `constraint_impulses`, in the balance and in p1 (1, or the
+        compliance of a compliant one).
     """
 
     system: System
@@ -142,7 +127,7 @@ class DiscreteEquations:
     p1_remainder: ca.SX
     closed_form_force: ForceWithDerivatives | None
     closed_form_force_shares: tuple[float, float]
-    constraint_impulses: ConstraintImpulses
+    constraint_impulses: _ConstraintImpulses
     row_scale: ca.SX
 
     @property
@@ -200,20 +185,19 @@ def discrete_equations(
     Marsden and West (2001), Acta Numerica 10:357, section 3, doi:10.1017/S096249290100006X.
     Johnson and Murphey (2009), IEEE Trans. Robotics 25(6):1249, doi:10.1109/TRO.2009.2032955.
     """
-    if force_split not in get_args(ForceSplit):
-        raise ModelError(f"force_split = '{force_split}'", allowed=", ".join(get_args(ForceSplit)))
-    if constraint_force not in get_args(ConstraintForcePlacement):
-        allowed = ", ".join(get_args(ConstraintForcePlacement))
-        raise ModelError(f"constraint_force = '{constraint_force}'", allowed=allowed)
+    rules = (("force_split", force_split, ForceSplit), ("constraint_force", constraint_force, ConstraintForcePlacement))
+    for name, said, known in rules:
+        if said not in get_args(known):
+            raise ModelError(f"{name} = '{said}'", allowed=", ".join(get_args(known)))
     at = _Symbols.from_system(system)
     lam, h, qm, vm = at.lam, at.h, at.qm, at.vm
     kinematics = forward_kinematics(system.mechanism, qm)
     rigid = rigid_body_derivatives(kinematics, vm, system.gravity)
-    terms = _summed_terms(system, at, kinematics)
-    extra_q, extra_v = ca.gradient(terms.lagrangian, qm), ca.gradient(terms.lagrangian, vm)
+    lagrangian, force, internal, closed = _summed_terms(system, at, kinematics)
+    extra_q, extra_v = ca.gradient(lagrangian, qm), ca.gradient(lagrangian, vm)
 
     share = 1.0 if force_split == "left" else 0.5
-    push = h * (terms.force + terms.viscous)
+    push = h * force
     scale, spring = _row_scale(system, at)
     pulls = _constraint_pulls(system, at, kinematics, 0.0 if constraint_force == "node" else 0.5)
     constraint, gain = _constraint(system, at)
@@ -222,12 +206,10 @@ def discrete_equations(
     by_q, by_v = rigid.lagrangian_by_q, rigid.lagrangian_by_v
     balance = at.p0 + scale * (h / 2 * by_q - by_v - pulls.left_jacobian.T @ lam) + balance_rest
     p1 = scale * (h / 2 * by_q + by_v - pulls.right_jacobian.T @ lam) + p1_rest
-    closed = terms.closed
     if closed is not None:
         balance += share * h * scale * closed.force
         p1 += (1 - share) * h * scale * closed.force
         closed = ForceWithDerivatives(at.placed(closed.force), at.placed(closed.A), at.placed(closed.T))
-    fields = ("lagrangian_by_q", "lagrangian_by_v", "kinetic_energy", "potential_energy", "S", "D", "F", "B", "G")
     symbols = {name: getattr(at, name) for name in ("q0", "q1", "z0", "z1", "p0", "lam", "u", "time_step", "h")}
     return DiscreteEquations(
         system=system,
@@ -236,12 +218,12 @@ def discrete_equations(
         **symbols,
         theta=system.parameters.symbols,
         momentum_balance=at.placed(balance),
-        internal_residual=at.placed(terms.internal),
-        internal_residual_at_rest=at.placed(terms.internal_at_rest),
+        internal_residual=at.placed(internal[0]),
+        internal_residual_at_rest=at.placed(internal[1]),
         constraint_residual=constraint,
         constraint_relaxation_gain=gain,
         p1=at.placed(p1),
-        rigid_body_terms=RigidBodyDerivatives(**{name: at.placed(getattr(rigid, name)) for name in fields}),
+        rigid_body_terms=RigidBodyDerivatives(**{name: at.placed(value) for name, value in vars(rigid).items()}),
         balance_remainder=at.placed(balance_rest),
         p1_remainder=at.placed(p1_rest),
         closed_form_force=closed,
@@ -290,22 +272,13 @@ class _Symbols:
         return ca.densify(placed) if dense else placed
 
 
-@dataclass(frozen=True)
-class _SummedTerms:
-    """What springs, dampers, inputs and effects add up to at the midpoint, as in `Terms`; equations as columns."""
-
-    lagrangian: ca.SX
-    force: ca.SX
-    viscous: ca.SX
-    internal: ca.SX
-    internal_at_rest: ca.SX
-    closed: ForceWithDerivatives | None
-
-
-def _summed_terms(system: System, at: _Symbols, kinematics: Kinematics) -> _SummedTerms:
+def _summed_terms(
+    system: System, at: _Symbols, kinematics: Kinematics
+) -> tuple[ca.SX, ca.SX, tuple[ca.SX, ca.SX], ForceWithDerivatives | None]:
+    """Lagrangian, force, internal equations (in motion, at rest) and closed force of springs, inputs and effects."""
     names = tuple(system.internal_coordinates)
-    rows = {name: i for i, name in enumerate(names)}
-    state = MidpointState(system, kinematics, at.qm, at.vm, at.zm, at.z_rate, at.u, at.pull_rate, rows, at.h)
+    rows_of = {name: i for i, name in enumerate(names)}
+    state = MidpointState(system, kinematics, at.qm, at.vm, at.zm, at.z_rate, at.u, at.pull_rate, rows_of, at.h)
     energy = -system.elastic_energy(at.qm)
     force, viscous = system.input_force(at.u, at.qm, at.vm), system.viscous_force(at.vm)
     equations: dict[str, ca.SX] = {}
@@ -319,18 +292,12 @@ def _summed_terms(system: System, at: _Symbols, kinematics: Kinematics) -> _Summ
         equations.update(terms.internal_equations)
         at_rest.update(terms.static_equations)
         closed += [] if terms.force_with_derivatives is None else [terms.force_with_derivatives]
-    missing = [name for name in names if name not in equations]
-    if missing:
+    if missing := [name for name in names if name not in equations]:
         raise ModelError(f"internal coordinate '{missing[0]}' has no equation")
     parts = ([getattr(c, name) for c in closed] for name in ("force", "A", "T"))
-    return _SummedTerms(
-        energy,
-        force,
-        viscous,
-        ca.vertcat(*(equations[name] for name in names)) if names else ca.SX(0, 1),
-        ca.vertcat(*(at_rest.get(name, equations[name]) for name in names)) if names else ca.SX(0, 1),
-        ForceWithDerivatives(*(sum(rest, first) for first, *rest in parts)) if closed else None,
-    )
+    summed = ForceWithDerivatives(*(sum(rest, first) for first, *rest in parts)) if closed else None
+    internal = [ca.vertcat(ca.SX(0, 1), *(rows[name] for name in names)) for rows in (equations, equations | at_rest)]
+    return energy, force + viscous, (internal[0], internal[1]), summed
 
 
 def _row_scale(system: System, at: _Symbols) -> tuple[ca.SX, ca.SX]:
@@ -358,7 +325,7 @@ def _constraint(system: System, at: _Symbols) -> tuple[ca.SX, ca.SX | None]:
     return ca.densify(closure - system.constraint_compliance() * at.lam / at.h), gain
 
 
-def _constraint_pulls(system: System, at: _Symbols, middle: Kinematics, share_m: float) -> ConstraintImpulses:
+def _constraint_pulls(system: System, at: _Symbols, middle: Kinematics, share_m: float) -> _ConstraintImpulses:
     parts: dict[str, ca.SX] = {}
     for name, q, z in (("before", at.q0, at.z0), ("after", at.q1, at.z1)):
         found = _constraint_derivatives(system, forward_kinematics(system.mechanism, q), q, at.lam)
@@ -369,7 +336,7 @@ def _constraint_pulls(system: System, at: _Symbols, middle: Kinematics, share_m:
     jacobians = ("before_jacobian", "middle_jacobian", "after_jacobian")
     before, middle_sparsity, after = (parts[name].sparsity() for name in jacobians)
     parts |= {name: ca.project(parts[name], before + middle_sparsity + after) for name in jacobians}
-    return ConstraintImpulses(1.0 - share_m, share_m, **parts)
+    return _ConstraintImpulses(1.0 - share_m, share_m, **parts)
 
 
 def _constraint_derivatives(system: System, kinematics: Kinematics, q: ca.SX, lam: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -377,7 +344,7 @@ def _constraint_derivatives(system: System, kinematics: Kinematics, q: ca.SX, la
 
     A point moves with d2x/dq_i dq_j = w_i x dx/dq_j, a direction with d2v/dq_i dq_j = w_i x (w_j x v), for i above j.
     """
-    n = system.n_coordinates
+    n, turning = system.n_coordinates, [joint.kind != "prismatic" for joint in system.mechanism.joints]
     blocks, hessian, row = [ca.SX(0, n)], ca.SX(n, n), 0
 
     def add(i: int, j: int, entry: ca.SX) -> None:
@@ -395,7 +362,7 @@ def _constraint_derivatives(system: System, kinematics: Kinematics, q: ca.SX, la
             block += sign * jacobian
             chain = system.mechanism.ancestor_joints(frame.joint_index)
             for above, i in enumerate(chain):
-                if system.mechanism.joints[i].kind == "prismatic":
+                if not turning[i]:
                     continue
                 turned = cross_product(part[:3], kinematics.joint_screws[i][:3])
                 for j in chain[above:]:
@@ -409,7 +376,7 @@ def _constraint_derivatives(system: System, kinematics: Kinematics, q: ca.SX, la
         for a, b in [(part[3 + k] * a, b) for k, pairs in enumerate(rows) for a, b in pairs]:
             turns: list[dict[int, ca.SX]] = []
             for frame, vector, other in ((holder, a, b), (held, b, a)):
-                chain = _turning(system, frame)
+                chain = [j for j in system.mechanism.ancestor_joints(frame.joint_index) if turning[j]]
                 turns.append({j: cross_product(kinematics.joint_screws[j][:3], vector) for j in chain})
                 for above, i in enumerate(chain):
                     turned = cross_product(other, kinematics.joint_screws[i][:3])
@@ -432,19 +399,17 @@ def _direction_products(grasp: Grasp, kinematics: Kinematics) -> list[list[tuple
     return [[(0.5 * a[i], b[j]), (-0.5 * a[j], b[i])] for i, j in ((2, 1), (0, 2), (1, 0))]
 
 
-def _turning(system: System, frame: Frame) -> tuple[int, ...]:
-    joints = system.mechanism.joints
-    return tuple(j for j in system.mechanism.ancestor_joints(frame.joint_index) if joints[j].kind != "prismatic")
-
-
 def _grasped(system: System, grasp: Grasp, side: str) -> Frame:
     """The frame whose origin is the grasped point, on one side of a grasp."""
     if side == "holder":
-        frame = system.mechanism.frame(grasp.holder_frame)
-        return Frame(frame.joint_index, frame.placement @ Placement(grasp.held_orientation, grasp.holder_offset))
-    frame = system.mechanism.frame(grasp.held_frame)
-    back = Placement(ca.SX(ca.DM.eye(3)), ca.vertcat(0, 0, -grasp.axial_slip))
-    return Frame(frame.joint_index, frame.placement @ back)
+        frame, local = (
+            system.mechanism.frame(grasp.holder_frame),
+            Placement(grasp.held_orientation, grasp.holder_offset),
+        )
+    else:
+        frame = system.mechanism.frame(grasp.held_frame)
+        local = Placement(ca.SX(ca.DM.eye(3)), ca.vertcat(0, 0, -grasp.axial_slip))
+    return Frame(frame.joint_index, frame.placement @ local)
 
 
 @dataclass(frozen=True)

@@ -26,14 +26,10 @@ class NlpStage:
 
     Attributes
     ----------
-    time_step : float
-        h [s]
     x0, x1 : casadi.SX, shape (nx, 1)
-        States (q, p, z) at the two nodes.
-    lam, u, theta : casadi.SX
-        As in `DiscreteEquations`.
+        States (q, p, z) at the two nodes, `time_step` [s] apart.
     residual : casadi.SX, shape (nr, 1)
-        Constraint residual, zero if the step equations hold.
+        Zero if the step equations hold.
     residual_names : tuple of str
         Names of the rows: `del[JOINT]`, `internal[NAME]`, `constraint[GRASP.x]`, `p1[JOINT]`.
     prescribed_effort : casadi.SX, shape (nc, 1)

@@ -16,10 +16,8 @@ from yid_ocp.parallel import CASADI_LOCK
 
 Array = NDArray[np.float64]
 
-_STEPS_PER_CHUNK = 50
-"""Number of steps linearised at once, limited because their matrices are dense."""
-_MIN_SLOPE = 1e-12
-"""Smallest derivative by an internal state that is not regarded as rounding error."""
+_STEPS_PER_CHUNK = 50  # linearised at once, few because their matrices are dense
+_MIN_SLOPE = 1e-12  # derivatives by an internal state up to here are rounding
 _ALL_STEPS = slice(None)
 
 
@@ -33,14 +31,10 @@ def simulate(
     feedback: TrackingFeedback | None = None,
     directions: SensitivityDirections | None = None,
 ) -> Rollout:
-    """Simulate a system, with forward sensitivities if directions are given.
-
-    For many parameters, initial states or inputs `simulate_batch` is faster.
+    """Simulate a system, with forward sensitivities if directions are given; `simulate_batch` is faster for many.
 
     Parameters
     ----------
-    step : Step
-    theta : array_like, shape (ntheta,)
     start : array_like, shape (nx,)
         Initial (q, p, z).
     steps : int
@@ -49,8 +43,6 @@ def simulate(
         Nominal motor torque of every step [N m]; zero when absent.
     path : array_like, shape (N + 1, nc), optional
         Prescribed coordinates at every node; held at their initial value when absent.
-    feedback : TrackingFeedback, optional
-    directions : SensitivityDirections, optional
 
     Returns
     -------
@@ -134,17 +126,12 @@ def adjoint_gradient(
 
     Parameters
     ----------
-    step : Step
-    theta : array_like, shape (ntheta,)
     rollout : Rollout
         From `simulate` with the same theta and feedback.
     names : sequence of str
         Parameters by which to differentiate.
-    by_state : array_like, shape (N + 1, nx)
-        Partial derivatives of the cost by the state at every node.
-    by_multipliers : array_like, shape (N, m), optional
-    by_effort : array_like, shape (N, nc), optional
-    feedback : TrackingFeedback, optional
+    by_state, by_multipliers, by_effort : array_like, shape (N + 1, nx), (N, m) and (N, nc)
+        Partial derivatives of the cost.
     """
     sizes, steps, check = step.sizes, len(rollout.multipliers), float_array_of_shape
     outer = check("by_state", by_state, (steps + 1, sizes["nx"]))
@@ -172,14 +159,10 @@ def generalized_momentum(step: Step, q: ArrayLike, v: ArrayLike, theta: ArrayLik
 
 @dataclass(frozen=True)
 class LinearizedStep:
-    """Jacobians A_k, B_k, E_k of one step by the implicit function theorem, at the applied torque.
+    """Jacobians of one step by the implicit function theorem, at the applied torque.
 
-    Attributes
-    ----------
-    state_by_state, state_by_torque, state_by_load : ndarray, shape (nx, nx), (nx, nu) and (nx, e)
-        A_k = dx_{k+1}/dx_k, B_k = dx_{k+1}/du_k, E_k = dx_{k+1}/d(additional loads).
-    effort_by_state, effort_by_torque, effort_by_load : ndarray, shape (nc, nx), (nc, nu) and (nc, e)
-        Of the effort that the prescribed coordinates need at node k.
+    A_k = dx_{k+1}/dx_k (nx, nx), B_k = dx_{k+1}/du_k (nx, nu), E_k = dx_{k+1}/d(additional loads) (nx, e), and the same
+    of the effort that the prescribed coordinates need at node k (nc, ...).
     """
 
     state_by_state: Array
@@ -192,15 +175,7 @@ class LinearizedStep:
 
 @dataclass(frozen=True)
 class AdditionalLoads:
-    """First-order effect of e additional loads on the equations of every step, one column each.
-
-    Attributes
-    ----------
-    residual : ndarray, shape (nt, e)
-        Added to the balance, internal and constraint equations.
-    next_momentum : ndarray, shape (n, e)
-        Added to p_{k+1}.
-    """
+    """First-order effect of e additional loads on every step: added to its equations (nt, e) and to p_{k+1} (n, e)."""
 
     residual: Array
     next_momentum: Array

@@ -33,16 +33,11 @@ class Equilibrium:
         Motor torque that holds the posture [N m], or command of its servos [rad or m].
     constraint_reactions : ndarray, shape (m,)
         [N or N m]
-    state_by_theta : ndarray, shape (nx, len(names))
-        Derivative of `state` by the parameters asked for.
-    state_by_known_coordinates : ndarray, shape (nx, nk)
-        Derivative by the known coordinates (driven, then prescribed).
-    state_by_torque : ndarray, shape (nx, nu)
-        Derivative by the measured torque.
-    is_converged : bool
+    state_by_theta, state_by_known_coordinates, state_by_torque : ndarray, shape (nx, len(names)), (nx, nk) and (nx, nu)
+        Derivatives of `state` by the parameters asked for, by the known coordinates (driven, then prescribed), and by
+        the measured torque.
     max_imbalance : float
         Largest remaining imbalance [N m] or constraint violation [m].
-    message : str
     """
 
     state: Array
@@ -67,11 +62,8 @@ _HOLD_STIFFNESS_WITH_TORQUE = 1e3
 _HOLD_STIFFNESS_WITH_COMMAND = 1e-9
 
 _ENERGY_ITERATION_LIMIT = 300  # of the search for the lowest energy
-
 _MIN_RECIPROCAL_CONDITION = 1e-14  # reciprocal of the condition beyond which equations have no solution of their own
-
-# A holding spring that gives by more than this means that the posture does not fit the grasp [rad].
-_MAX_HOLD_DEFLECTION = 0.02
+_MAX_HOLD_DEFLECTION = 0.02  # of a holding spring, by more than which the posture does not fit the grasp [rad]
 
 
 class EquilibriumSolver:
@@ -112,7 +104,6 @@ class EquilibriumSolver:
         ----------
         posture : array_like, shape (nk,)
             Known coordinates, driven then prescribed [rad or m].
-        theta : array_like, shape (ntheta,)
         torque : array_like, shape (nu,), optional
             Measured torque at the posture [N m]; the holding spring then only makes up for noise. Of servos what they
             are commanded: the posture is then where the search begins.
@@ -176,8 +167,7 @@ class EquilibriumSolver:
         A straight chain at full stretch is a singular point of the grasp constraints, from which Newton cannot leave.
         """
         system = self.step.system
-        size = len(self.free_coordinates) + self.step.sizes["nz"] + self.step.sizes["m"]
-        first = np.zeros(size)
+        first = np.zeros(len(self.free_coordinates) + self.step.sizes["nz"] + self.step.sizes["m"])
         q = np.zeros(system.n_coordinates)
         q[list(self.known_coordinates)] = given
         q = q if guess is None else np.asarray(guess, float)
@@ -297,18 +287,15 @@ class EquilibriumSolver:
         return state, total[:, : len(names)], total[:, len(names) :]
 
     def _explain(self, state: Array, theta: Array, error: float) -> str:
-        system, step = self.step.system, self.step
-        text = f"no equilibrium found (remaining imbalance {error:.2g})"
-        e, n = step.equations, system.n_coordinates
+        system, step, e = self.step.system, self.step, self.step.equations
+        text, n = f"no equilibrium found (remaining imbalance {error:.2g})", system.n_coordinates
         if not system.grasps or not np.all(np.isfinite(state)):
             return text
         with CASADI_LOCK:
             phi = ca.Function("phi", [e.q1, e.z1, e.lam, e.theta, e.time_step], [e.constraint_violation])
         gap = np.array(phi(state[:n], state[2 * n :], 0, theta, step.time_step)).ravel()
-        row = 0
         for grasp in system.grasps:
-            distance = float(np.linalg.norm(gap[row : row + 3]))
-            row += grasp.n_equations
+            distance, gap = float(np.linalg.norm(gap[:3])), gap[grasp.n_equations :]
             if distance > 1e-4:
                 text += f"; grasp '{grasp.name}' is out of reach by {1e3 * distance:.3g} mm"
         return text

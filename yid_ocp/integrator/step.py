@@ -102,14 +102,11 @@ class Step(ReprMixin):
 
         Returns
         -------
-        q1, p1 : ndarray, shape (n,)
-        lam : ndarray, shape (m,)
+        q1, p1, lam : ndarray, shape (n,), (n,) and (m,)
         status : StepStatus
         """
-        rollout = self._single(q0, p0, u, theta, prescribed, internal, None)
-        n = self.system.n_coordinates
-        after = rollout.state[1]
-        return after[:n], after[n : 2 * n], rollout.multipliers[0], rollout.status
+        rollout, n = self._single(q0, p0, u, theta, prescribed, internal, None), self.sizes["n"]
+        return rollout.state[1, :n], rollout.state[1, n : 2 * n], rollout.multipliers[0], rollout.status
 
     def jacobians(
         self,
@@ -121,19 +118,9 @@ class Step(ReprMixin):
         internal: ArrayLike | None = None,
         names: Sequence[str] | None = None,
     ) -> tuple[Array, Array, Array]:
-        """Derivatives of the step map by the implicit function theorem.
+        """Derivatives of (q, p, z)_{k+1} by the implicit function theorem; arguments as of a step.
 
-        Parameters
-        ----------
-        names : sequence of str, optional
-            Parameters by which to differentiate; all of theta when absent.
-
-        Returns
-        -------
-        A : ndarray, shape (nx, nx)
-            d(q, p, z)_{k+1}/d(q, p, z)_k.
-        B_u : ndarray, shape (nx, nu)
-        B_theta : ndarray, shape (nx, len(names))
+        Returns A (nx, nx) by (q, p, z)_k, B_u (nx, nu) and B_theta (nx, len(names)), by all of theta without `names`.
         """
         sizes = self.sizes
         chosen = tuple(self.system.parameters.names if names is None else names)
@@ -160,15 +147,13 @@ class Step(ReprMixin):
         sizes, check = self.sizes, float_array_of_shape
         z0 = np.zeros(sizes["nz"]) if internal is None else check("internal", internal, (sizes["nz"],))
         start = np.concatenate([check("q0", q0, (sizes["n"],)), check("p0", p0, (sizes["n"],)), z0])
-        if prescribed is None:
-            if sizes["nc"]:
-                what = f"{sizes['nc']} coordinates are prescribed"
-                raise ModelError(what, where="step", hint="pass prescribed=(s0, s1)")
-            path = np.zeros((2, 0))
-        else:
-            if len(prescribed) != 2:
-                raise ModelError(f"prescribed has {len(prescribed)} entries", allowed="the pair (s0, s1)")
-            path = np.stack([check("prescribed", s, (sizes["nc"],)) for s in prescribed])
+        if prescribed is None and sizes["nc"]:
+            what = f"{sizes['nc']} coordinates are prescribed"
+            raise ModelError(what, where="step", hint="pass prescribed=(s0, s1)")
+        ends = ((), ()) if prescribed is None else prescribed
+        if len(ends) != 2:
+            raise ModelError(f"prescribed has {len(ends)} entries", allowed="the pair (s0, s1)")
+        path = np.stack([check("prescribed", s, (sizes["nc"],)) for s in ends])
         start[list(self.system.prescribed_indices)] = path[0]
         torque = check("u", u, (sizes["nu"],))[None, :]
         values = check("theta", theta, (sizes["ntheta"],))
@@ -215,13 +200,7 @@ def compile_step(
 
 
 def with_time_step(step: Step, time_step: float) -> Step:
-    """A copy of a step with another time step [s], from the same equations and compiled code.
-
-    Raises
-    ------
-    ModelError
-        Time step not positive.
-    """
+    """A copy of a step with another, positive, time step [s], from the same equations and compiled code."""
     model = replace(step.model, time_step=_positive(time_step), tolerance=newton_tolerance(time_step))
     return Step(model, step.kernel.with_model(model), step.is_compiled)
 

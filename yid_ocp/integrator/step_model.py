@@ -18,11 +18,10 @@ from yid_ocp.model.system import System
 
 Array = NDArray[np.float64]
 
-# Newton iterations of one step before it is given up.
 NEWTON_ITERATION_LIMIT = 60
-
-# The same of an equilibrium, which is looked for from far away.
+"""Newton iterations of one step before it is given up."""
 EQUILIBRIUM_ITERATION_LIMIT = 100
+"""The same of an equilibrium, which is looked for from far away."""
 
 # Newton stops when a correction of the coordinates is below TOLERANCE [rad or m], with short time steps below
 # RATE_TOLERANCE times the step: what is left undone is momentum lost in every step, mass times correction over step.
@@ -33,8 +32,7 @@ _COORDINATE_TOLERANCE, _VELOCITY_TOLERANCE, _ROUNDING_FLOOR = 1e-12, 1e-10, 1e-1
 class StepModel:
     """Equations, functions and index tables of one step, from which a kernel is built.
 
-    `sizes` holds n, nz, m, nu, nc, nx and ntheta, `time_step` is h [s], `tolerance` Newton's on the coordinates
-    [rad or m].
+    `sizes` holds n, nz, m, nu, nc, nx and ntheta, `time_step` is h [s], `tolerance` Newton's [rad or m].
     """
 
     system: System
@@ -59,9 +57,11 @@ def build_step_model(
     n, nz = system.n_coordinates, e.z0.numel()
     sizes = {"n": n, "nz": nz, "m": e.lam.numel(), "nu": e.u.numel(), "nc": len(system.prescribed)}
     sizes |= {"nx": 2 * n + nz, "ntheta": e.theta.numel()}
-    if tolerance is None:
-        tolerance = newton_tolerance(time_step)
-    return StepModel(system, e, functions, codegen.step_index_tables(functions), sizes, float(time_step), tolerance)
+    tables, limit = (
+        codegen.step_index_tables(functions),
+        newton_tolerance(time_step) if tolerance is None else tolerance,
+    )
+    return StepModel(system, e, functions, tables, sizes, float(time_step), limit)
 
 
 def newton_tolerance(time_step: float) -> float:
@@ -102,8 +102,6 @@ class StepStatus:
 
     Attributes
     ----------
-    code : NewtonStatus
-    completed_steps : int
     last_correction : float
         Last Newton correction [rad or m].
     newton_iterations, factorisations : int
@@ -111,7 +109,7 @@ class StepStatus:
     prescribed_effort : ndarray, shape (nc,)
         Effort that the prescribed coordinates needed at the first node of the last step [N m].
     internal_coordinates : ndarray, shape (nz,)
-        Internal coordinates after the last step.
+        After the last step.
     """
 
     code: NewtonStatus
@@ -145,14 +143,10 @@ class SensitivityDirections:
 
     Attributes
     ----------
-    parameter_names : tuple of str
-        Parameters of theta.
     initial_state_tangents : ndarray, shape (nx, d)
         Derivative of the initial state (q, p, z).
     torque_tangents : ndarray, optional, shape (N, nu, d)
-        Derivative of the nominal torque.
     prescribed_tangents : ndarray, optional, shape (N + 1, nc, d)
-        Derivative of the prescribed coordinates.
     """
 
     parameter_names: tuple[str, ...]
@@ -196,15 +190,11 @@ class RolloutInputs:
 
     Attributes
     ----------
-    theta : ndarray, shape (ntheta,)
-    initial_state : ndarray, shape (nx,)
-        Initial (q, p, z).
+    theta, initial_state : ndarray, shape (ntheta,) and (nx,)
+        The state is (q, p, z).
     torque : ndarray, shape (N, nu)
         Nominal motor torque of every step [N m].
     prescribed_path : ndarray, shape (N + 1, nc)
-        Prescribed coordinates at every node.
-    feedback : TrackingFeedback, optional
-    directions : SensitivityDirections, optional
     """
 
     theta: Array
@@ -217,7 +207,7 @@ class RolloutInputs:
 
 @dataclass(frozen=True)
 class Rollout:
-    """A simulated trajectory and, if requested, its forward sensitivities.
+    """A simulated trajectory and, if requested, its forward sensitivities; NaN after a failed step.
 
     Attributes
     ----------
@@ -227,12 +217,11 @@ class Rollout:
         [N s]
     effort : ndarray, shape (N, nc)
         Effort of prescribed coordinates at nodes 0..N-1 [N m]; at node 0 it assumes that p_0 came from a step before
-        (`Rest` gives such a p_0); after p_0 = dL/dv it holds only half a step's impulse, half the effort.
+        (an `Equilibrium` gives such a p_0); after p_0 = dL/dv it holds only half a step's impulse, half the effort.
     torque : ndarray, shape (N, nu)
         Applied torque [N m].
     state_sensitivity, multipliers_sensitivity, effort_sensitivity : ndarray, shape (..., d), or None
-        Derivatives of state, multipliers and effort by the directions; NaN after a failed step, like all arrays.
-    status : StepStatus
+        Derivatives by the directions.
     """
 
     state: Array
@@ -247,18 +236,10 @@ class Rollout:
 
 @dataclass(frozen=True)
 class CostGradient:
-    """Gradient of a scalar cost along a rollout, from the adjoint.
+    """Gradient of a scalar cost along a rollout, from the adjoint; NaN where a step's equations turned out singular.
 
-    Attributes
-    ----------
-    by_theta : ndarray, shape (len(names),)
-    by_initial_state : ndarray, shape (nx,)
-    by_torque : ndarray, shape (N, nu)
-        By the nominal torque.
-    by_prescribed_path : ndarray, shape (N + 1, nc)
-        By the prescribed coordinates at every node, those at node 0 as in `by_initial_state`.
-
-    All NaN where a step's equations turned out singular.
+    By the chosen parameters, the initial state (nx,), the nominal torque (N, nu) and the prescribed coordinates at
+    every node (N + 1, nc), those at node 0 as in `by_initial_state`.
     """
 
     by_theta: Array
@@ -274,17 +255,15 @@ class StepLinearization:
     Attributes
     ----------
     residual : ndarray, shape (N, nt)
-        Residual of every step: momentum balance (n), internal (nz) and constraint (m) equations.
+        Of every step: momentum balance (n), internal (nz) and constraint (m) equations.
     p1 : ndarray, shape (N, n)
         p_{k+1} that follows from the other values.
     residual_by_new, p1_by_new : ndarray, shape (N, nt, nt) and (N, n, nt)
         Derivatives by (q_{k+1}, z_{k+1}, lam_k).
     residual_by_old, p1_by_old : ndarray, shape (N, nt, n + nz) and (N, n, n + nz)
         Derivatives by (q_k, z_k); that of the balance by p_k is the identity.
-    residual_by_input, p1_by_input : ndarray, shape (N, nt, nu) and (N, n, nu)
-        Derivatives by the torque.
-    residual_by_theta, p1_by_theta : ndarray, shape (N, nt, ntheta) and (N, n, ntheta)
-        Derivatives by the chosen parameters.
+    residual_by_input, p1_by_input, residual_by_theta, p1_by_theta : ndarray, shape (N, ..., nu) and (N, ..., ntheta)
+        Derivatives by the torque and by the chosen parameters.
     """
 
     residual: Array
@@ -331,33 +310,20 @@ class StepKernel(Protocol):
     def step_jacobians(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, load_rows: Array, load_momentum: Array
     ) -> tuple[Array, Array]:
-        """Jacobians of the single steps of a finished rollout by the implicit function theorem.
+        """Derivatives of the steps of a finished rollout by (q, p, z), torque and loads (implicit function theorem).
 
         `load_rows` (nt, e) and `load_momentum` (n, e) are what e additional loads add to the residual and to p_{k+1}.
-
-        Returns
-        -------
-        state, effort : ndarray, shape (N, nx, nx + nu + e) and (N, nc, nx + nu + e)
-            Derivatives of the state after the step and of the effort by (q, p, z) before it, torque and loads.
-
-        Raises
-        ------
-        numpy.linalg.LinAlgError
-            A step's equations are singular.
+        Returns those of the state after the step, shape (N, nx, nx + nu + e), and of the effort, (N, nc, nx + nu + e);
+        `numpy.linalg.LinAlgError` where a step's equations are singular.
         """
 
     def find_equilibrium(
         self, theta: Array, unknowns: Array, given: Array, held: Array, stiffness: float, tolerance: float
     ) -> tuple[Array, float, bool]:
-        """Solve `EquilibriumEquations` by Newton's iteration, beginning at `unknowns`.
+        """Solve `EquilibriumEquations` by Newton's iteration, beginning at `unknowns`, shape (ny,).
 
-        Returns
-        -------
-        unknowns : ndarray, shape (ny,)
-            The last point.
-        error : float
-            Largest imbalance [N m] or violation of a constraint [m] there, which counts as rest up to `tolerance`.
-        converged : bool
+        Returns the last point, the largest imbalance [N m] or violation of a constraint [m] there, and whether that
+        counts as rest, being up to `tolerance`.
         """
 
 
@@ -365,18 +331,12 @@ def allocate_rollout(sizes: dict[str, int], steps: int, count: int | None) -> Ro
     """A rollout filled with NaN, with `count` directions or none, for a kernel to write into."""
     shapes: dict[str, tuple[int, ...]] = {"state": (steps + 1, sizes["nx"]), "multipliers": (steps, sizes["m"])}
     shapes |= {"effort": (steps, sizes["nc"]), "torque": (steps, sizes["nu"])}
-    differentiated = ("state", "multipliers", "effort")
+    names = [f"{name}_sensitivity" for name in ("state", "multipliers", "effort")]
     if count is not None:
-        shapes |= {f"{name}_sensitivity": (*shapes[name], count) for name in differentiated}
+        shapes |= {name: (*shapes[name.removesuffix("_sensitivity")], count) for name in names}
     arrays = _arrays(f"a rollout of {steps} steps with {count or 0} derivatives", shapes, math.nan)
-    by_state, by_multipliers, by_effort = (arrays.pop(f"{name}_sensitivity", None) for name in differentiated)
-    return Rollout(
-        **arrays,
-        state_sensitivity=by_state,
-        multipliers_sensitivity=by_multipliers,
-        effort_sensitivity=by_effort,
-        status=StepStatus(NewtonStatus.OK, 0, 0.0, 0, 0),
-    )
+    absent = {} if count is not None else dict.fromkeys(names)
+    return Rollout(**arrays, **absent, status=StepStatus(NewtonStatus.OK, 0, 0.0, 0, 0))
 
 
 def allocate_linearization(sizes: dict[str, int], count: int, width: int, derivatives: bool) -> StepLinearization:

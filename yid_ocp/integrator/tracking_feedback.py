@@ -18,7 +18,6 @@ from yid_ocp.errors import ModelError
 from yid_ocp.integrator.compiler import MappedFunction
 from yid_ocp.integrator.step import Step, compile_step_like
 from yid_ocp.integrator.step_model import NEWTON_ITERATION_LIMIT, TrackingFeedback
-from yid_ocp.model.system import System
 from yid_ocp.parallel import LockedCache
 
 Array = NDArray[np.float64]
@@ -30,18 +29,8 @@ _NEWTON_ITERATIONS = 5
 def proportional_feedback(step: Step, measured: ArrayLike, gains: ArrayLike) -> TrackingFeedback:
     """Feedback u_k = ubar_k - K (q_k - qbar_k) with a constant diagonal K on the driven joints.
 
-    Parameters
-    ----------
-    step : Step
-    measured : array_like, shape (N + 1, nu)
-        Measured angles qbar of the driven joints at every node [rad].
-    gains : array_like, shape (nu,) or scalar
-        [N m/rad]
-
-    Raises
-    ------
-    ModelError
-        A negative gain, or a number of gains that is neither one nor nu.
+    `measured` are their angles qbar at every node, shape (N + 1, nu) [rad], `gains` one or one arm's worth or nu
+    [N m/rad]; `ModelError` of another number of gains, or a negative one.
     """
     reference = np.asarray(measured, float)
     nu = step.sizes["nu"]
@@ -74,12 +63,10 @@ def lqr_feedback(
 
     Parameters
     ----------
-    step : Step
     measured : array_like, shape (N + 1, nu)
         Angles of the driven joints at every node [rad], smooth enough to be differenced.
     torque : array_like, shape (N, nu)
         Measured torques [N m].
-    theta : array_like, shape (ntheta,)
     angle_std, rate_std, torque_std : float or array_like
         Standard deviations that weigh the same [rad], [rad/s], [N m].
     arms : Step, optional
@@ -123,35 +110,21 @@ def lqr_feedback(
 def arms_only_step(step: Step) -> Step:
     """The step of a system of the driven joints only, without the object and everything else.
 
-    Raises
-    ------
-    ModelError
-        The driven joints do not come first in the configuration.
+    `ModelError` where the driven joints do not come first in the configuration.
     """
-    return compile_step_like(step, _arms_only(step.system))
-
-
-def _arms_only(system: System) -> System:
-    mechanism = system.mechanism
+    system, mechanism = step.system, step.system.mechanism
     keep = [mechanism.joint_index(name) for name in system.driven]
     if sorted(keep) != list(range(len(keep))):
         what = "the LQR filter needs the driven joints to come first in the configuration"
         raise ModelError(what, where=", ".join(system.driven), hint="use proportional gains instead")
     frames = {name: frame for name, frame in mechanism.frames.items() if frame.joint_index < len(keep)}
     arms = replace(mechanism, joints=mechanism.joints[: len(keep)], frames=frames, link_chains={})
-    wanted: Sequence[str] = system.driven
-    return replace(
-        system,
-        mechanism=arms,
-        elastic_joints=(),
-        grasps=(),
-        prescribed=(),
-        joint_compliances={},
-        segment_layouts=(),
-        point_frames=(),
-        effects=(),
-        joint_damping={name: value for name, value in system.joint_damping.items() if name in wanted},
+    nothing = dict.fromkeys(
+        ("elastic_joints", "grasps", "prescribed", "segment_layouts", "point_frames", "effects"), ()
     )
+    damping = {name: value for name, value in system.joint_damping.items() if name in system.driven}
+    arms_only = replace(system, mechanism=arms, joint_compliances={}, joint_damping=damping, **nothing)
+    return compile_step_like(step, arms_only)
 
 
 def _reference_momentum(arm_step: Step, measured: Array, torque: Array, theta: Array) -> Array:
@@ -205,10 +178,8 @@ class DrivenJointMotion:
         Held over every step [N m].
     initial_internal : ndarray, shape (nz,)
         Internal coordinates at the first node.
-    angles_sensitivity : ndarray, shape (N + 1, nu, d), or None
+    angles_sensitivity, torque_sensitivity, initial_internal_sensitivity : ndarray, shape (..., d), or None
         Derivatives by d parameters and what follows these; None where nothing depends on them.
-    torque_sensitivity : ndarray, shape (N, nu, d), or None
-    initial_internal_sensitivity : ndarray, shape (nz, d), or None
     """
 
     angles: Array
@@ -219,7 +190,7 @@ class DrivenJointMotion:
     initial_internal_sensitivity: Array | None = None
 
     @property
-    def angles_before_and_after(self) -> tuple[Array, Array]:
+    def _before_and_after(self) -> tuple[Array, Array]:
         """Angles before and after the step to every node but the last; before the first node the joints are at rest."""
         return _one_before(self.angles[:-1]), self.angles[:-1]
 
@@ -231,14 +202,7 @@ class MomentumShift:
     than the recorded one, or an effect such as an armature, the same motion has another momentum, and the feedback
     would counteract the difference: at a wrist, whose gain by momentum times h/2 is near one, by half of the effect.
 
-    Parameters
-    ----------
-    step : Step
-
-    Attributes
-    ----------
-    parameter_names : tuple of str
-        Names of effect parameters on which the momentum of a motion under known torques depends.
+    `parameter_names` are those of effects on which the momentum of a motion under known torques depends.
     """
 
     def __init__(self, step: Step) -> None:
@@ -297,18 +261,13 @@ class MomentumShift:
     ) -> tuple[Array, Array]:
         """Momentum with effects minus recorded, at every node but the last, (N, nu), and its derivatives, (N, nu, d).
 
-        Parameters
-        ----------
-        recorded, true : DrivenJointMotion
-            The recorded motion, and the motion corrected for effects; only the latter's derivatives are used.
-        theta : ndarray, shape (ntheta,)
-        names : sequence of str
-            Parameters of the first of the d derivatives.
+        `recorded` is the recorded motion, `true` that corrected for effects, whose derivatives alone are used; `names`
+        are the parameters of the first of the d derivatives.
         """
         steps, plain_theta = len(true.torque), self.theta_without_effects(theta)
         still = np.zeros((steps, len(self._kept)))
         plain, *_ = self._maps(False)(
-            *recorded.angles_before_and_after, still, still, _one_before(recorded.torque), plain_theta, self._time_step
+            *recorded._before_and_after, still, still, _one_before(recorded.torque), plain_theta, self._time_step
         )
         slopes = (true.angles_sensitivity, true.torque_sensitivity, true.initial_internal_sensitivity)
         width = max((len(names), *(x.shape[-1] for x in slopes if x is not None)))
@@ -316,7 +275,7 @@ class MomentumShift:
         z, by_z = self._remembered(true, theta, wanted, width)
         moved = by_z is not None or true.angles_sensitivity is not None
         value, by_theta, *by_all = self._maps(moved)(
-            *true.angles_before_and_after, _one_before(z), z, _one_before(true.torque), theta, self._time_step
+            *true._before_and_after, _one_before(z), z, _one_before(true.torque), theta, self._time_step
         )
         total = np.zeros((*value.shape[:2], width))
         for column, own in wanted:
@@ -391,7 +350,7 @@ class _Memory:
 
     def along(self, motion: DrivenJointMotion, start: Array, theta: Array) -> Array:
         """Values at every node but the last, shape (N, k)."""
-        before, now = motion.angles_before_and_after
+        before, now = motion._before_and_after
         found = [start]
         if len(now) > 1:
             repeated = np.tile(theta[:, None], len(now) - 1), np.tile(self._time_step[:, None], len(now) - 1)
@@ -402,7 +361,7 @@ class _Memory:
         self, motion: DrivenJointMotion, values: Array, start: list[int], theta: Array, columns: _Wanted, width: int
     ) -> Array:
         """Derivatives of the values, shape (N, k, d)."""
-        before, now = motion.angles_before_and_after
+        before, now = motion._before_and_after
         by_old, by_before, by_now, by_theta = self._maps(None)(_one_before(values), before, now, theta, self._time_step)
         total = np.zeros((*values.shape, width))
         for column, own in columns:
