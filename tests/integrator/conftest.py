@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -184,11 +185,15 @@ def thick_air(joint: str, coefficient: float, viscosity: float, buoyancy: float)
     return Added("air", joint, parameters, change=change, add=add)
 
 
-def cable(**changes) -> System:
-    """Three links, nine coordinates, standing on the ground."""
-    options = {"links": 3, "bend": 2.0, "twist": 1.0, "damping": 0.01, **changes.pop("segment", {})}
-    segment = Segment("C", 0.6, 0.3, 0.05, **options)
-    return System.build(objects=[(flexible_object([segment], name="cable"), None, None)], **changes)
+def cable_object(**changes):
+    """Three links, nine coordinates."""
+    options = {"mass": 0.3, "radius": 0.05, "links": 3, "bend": 2.0, "twist": 1.0, "damping": 0.01, **changes}
+    return flexible_object([Segment("C", 0.6, **options)], name="cable")
+
+
+def cable(**options) -> System:
+    """The cable, standing on the ground."""
+    return System.build(objects=[(cable_object(), None, None)], **options)
 
 
 def tip(mechanism: Mechanism, frame: str, q: np.ndarray) -> np.ndarray:
@@ -203,12 +208,15 @@ def clamped_cable(kind: str, effects=()) -> tuple[System, np.ndarray]:
     pose = tip(cable().mechanism, "w_C", bent)
     clamp = floating_clamp("clamp")
     grasp = Grasp("clamp", "clamp", "w_C", kind, held_orientation=ca.SX(ca.DM(pose[:3, :3])))
-    segment = Segment("C", 0.6, 0.3, 0.05, links=3, bend=2.0, twist=1.0, damping=0.01)
-    objects = [(flexible_object([segment], name="cable"), None, None)]
+    objects = [(cable_object(), None, None)]
     system = System.build(
         clamp, objects=objects, grasps=[grasp], prescribed=clamp.joint_names, driven=["C_1_x", "C_2_z"], effects=effects
     )
     return system, np.concatenate([pose[:3, 3], np.zeros(3), bent])
+
+
+def soft_clamp(relaxation: float | None = None) -> tuple[System, np.ndarray]:
+    return clamped_cable("point", [creeping_grasp("clamp", 0.05), soft_grasp("clamp", 1e-4, relaxation)])
 
 
 @dataclass(frozen=True)
@@ -263,33 +271,18 @@ def closed_loop(urdf_folder, effects=()) -> tuple[System, np.ndarray]:
 
 
 BUILDERS = {
-    "closed_loop": lambda folder: make_case(*closed_loop(folder)),
-    "closed_loop_node": lambda folder: make_case(*closed_loop(folder), rule=("symmetric", "node")),
-    "closed_loop_left": lambda folder: make_case(*closed_loop(folder), rule=("left", "node")),
-    "closed_loop_left_midpoint": lambda folder: make_case(*closed_loop(folder), rule=("left", "midpoint")),
-    "welded_cable": lambda folder: make_case(*clamped_cable("weld"), strength=0.05),
-    "aligned_cable": lambda folder: make_case(*clamped_cable("axis"), strength=0.05),
-    "creeping_cable": lambda folder: make_case(
-        *clamped_cable("point", [creeping_grasp("clamp", 0.05), soft_grasp("clamp", 1e-4)]),
-        time_step=5e-4,
-        strength=0.05,
-    ),
-    "relaxing_cable": lambda folder: make_case(
-        *clamped_cable("point", [creeping_grasp("clamp", 0.05), soft_grasp("clamp", 1e-4, relaxation=2e-3)]),
-        time_step=5e-4,
-        strength=0.05,
-    ),
-    "relaxing_cable_node": lambda folder: make_case(
-        *clamped_cable("point", [creeping_grasp("clamp", 0.05), soft_grasp("clamp", 1e-4, relaxation=2e-3)]),
-        time_step=5e-4,
-        strength=0.05,
-        rule=("left", "node"),
-    ),
-    "thick_air": lambda folder: make_case(
-        *closed_loop(folder, [thick_air("nod", 0.05, 0.2, 0.4)]), rule=("left", "node")
-    ),
-    "thick_air_symmetric": lambda folder: make_case(*closed_loop(folder, [thick_air("slide", 0.05, 0.2, -0.4)])),
-    "soft_cable": lambda folder: make_case(
+    "closed_loop": lambda f: make_case(*closed_loop(f)),
+    "closed_loop_node": lambda f: make_case(*closed_loop(f), rule=("symmetric", "node")),
+    "closed_loop_left": lambda f: make_case(*closed_loop(f), rule=("left", "node")),
+    "closed_loop_left_midpoint": lambda f: make_case(*closed_loop(f), rule=("left", "midpoint")),
+    "welded_cable": lambda f: make_case(*clamped_cable("weld"), strength=0.05),
+    "aligned_cable": lambda f: make_case(*clamped_cable("axis"), strength=0.05),
+    "creeping_cable": lambda f: make_case(*soft_clamp(), time_step=5e-4, strength=0.05),
+    "relaxing_cable": lambda f: make_case(*soft_clamp(2e-3), time_step=5e-4, strength=0.05),
+    "relaxing_cable_node": lambda f: make_case(*soft_clamp(2e-3), time_step=5e-4, strength=0.05, rule=("left", "node")),
+    "thick_air": lambda f: make_case(*closed_loop(f, [thick_air("nod", 0.05, 0.2, 0.4)]), rule=("left", "node")),
+    "thick_air_symmetric": lambda f: make_case(*closed_loop(f, [thick_air("slide", 0.05, 0.2, -0.4)])),
+    "soft_cable": lambda f: make_case(
         cable(
             driven=["C_2_x", "C_1_z"],
             effects=[maxwell_branch("C_0_x", 3.0, 0.02), soft_joint("C_1_y", 0.2), soft_joint("C_1_z", 0.0)],
@@ -297,9 +290,9 @@ BUILDERS = {
         np.array([0.2, -0.1, 0.1, 0.15, 0.1, 0.0, 0.1, -0.2, 0.05]),
         strength=0.05,
     ),
-    "growing": lambda folder: make_case(
+    "growing": lambda f: make_case(
         System.build(
-            read_urdf(folder / "mixed_joints.urdf"),
+            read_urdf(f / "mixed_joints.urdf"),
             driven=["spin", "nod"],
             damping=0.2,
             effects=[growing_link("nod", 0.1, 0.01), growing_link("hinge", -0.2, 0.02)],
@@ -317,22 +310,9 @@ def case(request, urdf_folder) -> Case:
 @pytest.fixture(scope="session")
 def parts():
     """The builders above, for tests that need a system of their own."""
-
-    class Parts:
-        Added = Added
-        maxwell_branch = staticmethod(maxwell_branch)
-        soft_joint = staticmethod(soft_joint)
-        soft_grasp = staticmethod(soft_grasp)
-        thick_air = staticmethod(thick_air)
-        creeping_grasp = staticmethod(creeping_grasp)
-        cable = staticmethod(cable)
-        clamped_cable = staticmethod(clamped_cable)
-        closed_loop = staticmethod(closed_loop)
-        builders = BUILDERS
-        make_case = staticmethod(make_case)
-        tip = staticmethod(tip)
-
-    return Parts
+    own = (Added, maxwell_branch, soft_joint, soft_grasp, thick_air, creeping_grasp, cable, cable_object, clamped_cable)
+    made = {function.__name__: function for function in (*own, closed_loop, make_case, tip)}
+    return SimpleNamespace(**made, builders=BUILDERS)
 
 
 # An allocator that gives out `yid_grants` pieces of memory and then none, and counts those that were not given back.

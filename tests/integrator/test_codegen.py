@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import math
 import shutil
-import subprocess
 from dataclasses import replace
 from importlib import resources
 
@@ -151,15 +150,6 @@ def test_without_vectors_members_are_done_one_by_one(parts, urdf_folder, monkeyp
         assert_same(one, alone(case, member))
 
 
-def test_few_members_do_not_ask_for_a_batch(parts, urdf_folder, monkeypatch):
-    case = parts.builders["closed_loop"](urdf_folder)
-    monkeypatch.setattr(compiled, "_batched_library", lambda model: pytest.fail("compiled for nothing"))
-    plain = [replace(member, directions=None) for member in members_of(case)]
-    assert len(case.step.kernel.rollout_batch(plain[:2])) == 2
-    monkeypatch.setattr(compiled, "MIN_STEPS_TO_COMPILE_BATCH", 10**9)
-    assert len(case.step.kernel.rollout_batch(plain)) == 8
-
-
 # -- arithmetic --------------------------------------------------------------------------------------------------------
 
 DRIVER = """
@@ -265,38 +255,6 @@ def test_a_step_of_long_functions_is_the_same(parts, urdf_folder, monkeypatch, n
     kernel = compiled.CompiledKernel(model, compiler.compile_library(text))
     for member, found in zip(members, kernel.rollout_batch(members), strict=True):
         assert_same(found, alone(case, member), TOLERANCE)
-
-
-MAIN = """
-#include <stdio.h>
-#include <stdlib.h>
-int main(int count, char **said) {
-    const int many = atoi(said[1]);
-    double *in = malloc(2 * many * sizeof(double)), *out = malloc(OUTPUTS * many * sizeof(double));
-    if (count != 2 || fread(in, sizeof(double), 2 * many, stdin) != (size_t)(2 * many)) return 1;
-    yid_try(in, out, many);
-    fwrite(out, sizeof(double), OUTPUTS * many, stdout);
-    return yid_simd_width() == 4 ? 0 : 2;
-}
-"""
-
-
-def test_arithmetic_of_a_batch_on_another_processor(tmp_path):
-    """ARM, by a cross compiler and an emulator; its C library rounds here and there otherwise."""
-    cross = shutil.which("aarch64-linux-gnu-gcc")
-    emulator = shutil.which("qemu-aarch64-static") or shutil.which("qemu-aarch64")
-    if cross is None or emulator is None:
-        pytest.skip("there is no cross compiler for ARM (gcc-aarch64-linux-gnu), or no emulator (qemu-user-static)")
-    function, points = everything(), tried_points()
-    text, program = tmp_path / "simd.c", tmp_path / "batch"
-    text.write_text(arithmetic_source(function) + MAIN)
-    flags = [flag for flag in compiler._COMMON_FLAGS if flag not in ("-fPIC", "-shared")]
-    subprocess.run([cross, "-O2", *flags, "-static", str(text), "-o", str(program), "-lm"], check=True)
-    said = subprocess.run(
-        [emulator, program, str(len(points))], input=points.tobytes(), capture_output=True, check=True
-    )
-    found = np.frombuffer(said.stdout).reshape(len(points), function.numel_out(0))
-    assert_those_of_casadi(found, function, points, 1e-12)
 
 
 def test_an_operation_without_a_form_is_refused():

@@ -10,76 +10,10 @@ import pytest
 from yid_ocp.integrator.step import compile_step_like
 from yid_ocp.integrator.step_model import SensitivityDirections
 
-EPSILON = 1e-5
-
-
-def central(function, x, epsilon=EPSILON):
-    """Columns of the Jacobian by central differences; `function` gives an array."""
-    columns = []
-    for i in range(len(x)):
-        shift = np.zeros(len(x))
-        shift[i] = epsilon * max(1.0, abs(x[i]))
-        columns.append((function(x + shift) - function(x - shift)) / (2 * shift[i]))
-    return np.stack(columns, axis=-1)
-
-
-def agree(actual, expected, tolerance):
-    """Relative to the largest entry of each column, or absolutely where that is small."""
-    scale = np.maximum(np.max(np.abs(expected), axis=0, initial=0.0), 0.1)
-    assert actual.shape == expected.shape
-    assert np.max(np.abs(actual - expected) / scale, initial=0.0) < tolerance
-
 
 def sizes_of(theta):
     """Natural size of each parameter; only compliances are zero here."""
     return np.where(theta == 0, 1e-2, np.abs(theta))
-
-
-def after_one(case, theta=None, start=None, torque=None, path=None):
-    rollout = case.rollout(theta, start, case.torque[:1] if torque is None else torque[None, :], case.path[:2])
-    assert rollout.status.is_converged, rollout.status.message
-    return rollout.state[1]
-
-
-def test_step_jacobians_against_differences(case):
-    step, n = case.step, case.step.system.n_coordinates
-    q0, p0, z0 = case.start[:n], case.start[n : 2 * n], case.start[2 * n :]
-    prescribed = (case.path[0], case.path[1]) if step.sizes["nc"] else None
-    A, B_u, B_theta = step.jacobians(q0, p0, case.torque[0], case.theta, prescribed, z0)
-    small = np.repeat([1.0, 0.05, 1.0], [n, n, step.sizes["nz"]])  # momenta are
-    by_share = central(lambda x: after_one(case, start=case.start + x * small), 0 * case.start)
-    agree(A * small, by_share, 1e-6)
-    size = sizes_of(case.theta)
-    by_share = central(lambda x: after_one(case, theta=case.theta + x * size), 0 * case.theta)
-    agree(B_theta * size, by_share, 1e-6)
-    agree(B_u, central(lambda x: after_one(case, torque=x), case.torque[0]), 1e-6)
-
-
-def test_step_jacobians_of_the_grasped_y(golden, single_step, theta_golden):
-    trep, theta, step = golden("single"), theta_golden("single"), single_step
-    q, p, u, n = trep.q[40], trep.p[40], trep.u[40], step.system.n_coordinates
-    A, B_u, B_theta = step.jacobians(q, p, u, theta)
-
-    def move(x):
-        q1, p1, _, status = step(x[:n], x[n : 2 * n], x[2 * n : 2 * n + 7], x[2 * n + 7 :])
-        assert status.is_converged, status.message
-        return np.concatenate([q1, p1])
-
-    expected = central(move, np.concatenate([q, p, u, theta]))
-    agree(A, expected[:, : 2 * n], 1e-6)
-    agree(B_u, expected[:, 2 * n : 2 * n + 7], 1e-6)
-    agree(B_theta, expected[:, 2 * n + 7 :], 1e-6)
-
-
-def test_chosen_parameters_only(case):
-    names = case.step.system.parameters.names
-    n = case.step.system.n_coordinates
-    prescribed = (case.path[0], case.path[1]) if case.step.sizes["nc"] else None
-    arguments = (case.start[:n], case.start[n : 2 * n], case.torque[0], case.theta, prescribed, case.start[2 * n :])
-    everything = case.step.jacobians(*arguments)[2]
-    chosen = [names[-1], names[0]]
-    few = case.step.jacobians(*arguments, names=chosen)[2]
-    np.testing.assert_allclose(few, everything[:, [-1, 0]], rtol=1e-12, atol=1e-14)
 
 
 def random_cost(case, seed=11):

@@ -72,36 +72,6 @@ def arm(urdf_folder):
     )
 
 
-def test_a_system_at_rest_stays_there(arm):
-    theta = arm.step.system.parameters.vector()
-    rest = arm.solve([0.4], theta)
-    assert rest.is_converged, rest.message
-    stayed = simulate(arm.step, theta, rest.state, 20, torque=np.tile(rest.holding_torque, (20, 1)))
-    np.testing.assert_allclose(stayed.state, np.tile(rest.state, (21, 1)), rtol=0, atol=1e-9)
-
-
-def test_derivatives_of_an_equilibrium(arm):
-    names = ("shoulder.stiffness", "elbow.mass", "shoulder.rest")
-    parameters = arm.step.system.parameters
-    theta, posture, torque = parameters.vector(), np.array([0.4]), np.array([0.3])
-    rest = arm.solve(posture, theta, torque, names=names)
-    assert rest.is_converged, rest.message
-
-    def slope(change, size=1e-5):
-        plus, minus = (arm.solve(*change(sign * size), guess=rest.state[:2]).state for sign in (1, -1))
-        return (plus - minus) / (2 * size)
-
-    for column, name in enumerate(names):
-        unit = np.eye(len(theta))[parameters.index(name)]
-        expected = slope(lambda e, unit=unit: (posture, theta + e * unit, torque))
-        np.testing.assert_allclose(rest.state_by_theta[:, column], expected, rtol=1e-6, atol=1e-8)
-        assert np.max(np.abs(expected)) > 1e-3
-    np.testing.assert_allclose(
-        rest.state_by_known_coordinates[:, 0], slope(lambda e: (posture + e, theta, torque)), atol=1e-8
-    )
-    np.testing.assert_allclose(rest.state_by_torque[:, 0], slope(lambda e: (posture, theta, torque + e)), atol=1e-8)
-
-
 def derivatives(step, rest, given, held, stiffness, theta):
     """Of the state by theta and by the known coordinates, by CasADi from the equations of rest as a whole."""
     e, n = equilibrium_equations(step.equations), step.system.n_coordinates

@@ -94,18 +94,6 @@ def test_rollouts_adjoints_and_linearizations(parts, urdf_folder, monkeypatch, t
     assert_same(together, [everything(plain)(theta) for theta in thetas])
 
 
-def test_parameter_sets_that_are_compiled_while_others_run(parts, urdf_folder, use_compiler):
-    system, q = parts.closed_loop(urdf_folder)
-    theta, still = system.parameters.vector(), np.zeros(len(q))
-    shared, plain = (compile_step(system, 2e-3, use_compiler=use_compiler) for _ in range(2))
-    sets = [system.parameters.names[i : i + 2] for i in range(THREADS)]
-
-    def jacobians(step):
-        return lambda names: step.jacobians(q, still, np.ones(2), theta, (q[[4]], q[[4]]), names=names)
-
-    assert_same(at_once(jacobians(shared), sets), [jacobians(plain)(names) for names in sets])
-
-
 def test_equilibria(parts, monkeypatch):
     system = parts.cable()
     shared, plain = (EquilibriumSolver(compile_step(system, 1e-3, use_compiler=False)) for _ in range(2))

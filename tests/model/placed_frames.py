@@ -11,7 +11,7 @@ from yid_ocp.model import forward_kinematics
 def numbers(expression, parameters=None) -> np.ndarray:
     """The value of an expression, at nominal parameters where it has any."""
     if parameters is None:
-        return np.array(ca.DM(expression))
+        return np.array(ca.DM(ca.densify(expression)))
     function = ca.Function("numbers", [parameters.symbols], [expression])
     return np.array(ca.densify(function(parameters.vector())))
 

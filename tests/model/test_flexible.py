@@ -11,10 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from placed_frames import numbers, positions
 
-from yid_ocp.errors import ConfigError, ModelError
+from yid_ocp.errors import ModelError
 from yid_ocp.model import Segment, flexible_object
 from yid_ocp.model.flexible import polyline_rotations
-from yid_ocp.model.objects.foam_y import y_object
 from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 
 
@@ -189,16 +188,6 @@ def test_errors_of_a_segment(name):
         flexible_object([Segment("T1", 1.0, 1.0, 0.1), Segment(**options)])
     for word in [*words, f"segment {options['name']}"]:
         assert word in str(caught.value)
-
-
-def test_negative_stiffness_is_refused():
-    with pytest.raises(ConfigError, match=r"A\.bend = -1"):
-        flexible_object([Segment("A", 1.0, 1.0, 0.1, bend=-1.0)])
-
-
-def test_unknown_segment_has_a_near_name():
-    with pytest.raises(ModelError, match="did you mean 'T1'"):
-        y_object().segment_layout("T11")
 
 
 @pytest.mark.parametrize(

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import casadi as ca
 import numpy as np
 import pytest
+from placed_frames import numbers
 
 from yid_ocp.errors import ModelError
 from yid_ocp.model.mechanism import Inertia, merge_bodies
 from yid_ocp.model.objects.foam_y import y_object
 from yid_ocp.model.rotations import homogeneous_transform, transform_from_xyz_rpy
 from yid_ocp.model.urdf import read_urdf
-
-
-def numbers(expression) -> np.ndarray:
-    return np.array(ca.DM(expression))
 
 
 def test_joined_mechanisms_hang_on_a_frame(urdf_folder):

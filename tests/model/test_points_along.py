@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.errors import ModelError
-from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object, forward_kinematics
+from yid_ocp.model import Mechanism, Segment, flexible_object, forward_kinematics
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.objects.cable import cable_system
 from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
@@ -55,17 +55,6 @@ def test_inside_a_link_it_lies_on_the_straight_line_and_turns_with_it(percent, b
     np.testing.assert_allclose(point[:3, :3], far[:3, :3], atol=1e-12)
 
 
-def test_ends_of_links_are_those_that_have_names():
-    tree = branched().mechanism
-    names = ["T1:25%", "T1:50%", "T1:100%", "T2:75%"]
-    for found, known in zip(
-        places(tree, names, bent(tree)),
-        places(tree, ["T1_0_tip", "T1_1_tip", "w_T1", "T2_2_tip"], bent(tree)),
-        strict=True,
-    ):
-        np.testing.assert_allclose(found, known, atol=1e-12)
-
-
 def test_it_follows_the_length():
     tree = branched().mechanism
     [point] = places(tree, ["T1:40%"], values={"T1.length": 1.6})
@@ -89,22 +78,6 @@ def test_points_stay_when_the_tree_is_put_together():
     more = tree.with_inserted_joints(2, [replace(tree.joints[0], name="extra")])
     [again] = places(more, ["T1:40%"])
     np.testing.assert_allclose(again, found[1], atol=1e-12)
-
-
-def test_a_grasp_holds_a_point_along_a_segment():
-    """And what it holds is the same place of a finer chain."""
-    for links in (4, 8):
-        system = System.build(
-            None, objects=[(branched(links), None, None)], grasps=[Grasp("hand", "object_root", "T1:40%")]
-        )
-        q = ca.SX(ca.DM(np.zeros(system.n_coordinates)))
-        gap = system.grasps[0].constraint_residual(forward_kinematics(system.mechanism.with_numeric_values(), q))
-        assert np.linalg.norm(np.array(ca.DM(gap))) == pytest.approx(0.32)
-
-
-def test_sensors_may_see_it():
-    system = System.build(None, objects=[(branched(), None, None)], point_frames=["w_T1", "T2:30%"])
-    assert system.point_frames == ("w_T1", "T2:30%")
 
 
 def test_a_cable_is_counted_from_clamp_to_clamp():

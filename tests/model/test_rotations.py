@@ -8,11 +8,11 @@ import casadi as ca
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+from placed_frames import numbers
 from scipy.spatial.transform import Rotation
 
 from yid_ocp.model.rotations import (
     axis_angle_rotation,
-    homogeneous_transform,
     rotation_from_rpy,
     rpy_from_rotation,
     snap_to_unit_entries,
@@ -23,10 +23,6 @@ from yid_ocp.model.rotations import (
 ANGLES = st.floats(-math.pi, math.pi)
 OBLIQUE = ((0.6, 0.0, 0.8), (1 / 3, -2 / 3, 2 / 3))
 AXES = st.sampled_from([*map(tuple, np.eye(3)), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0), *OBLIQUE])
-
-
-def numbers(expression: ca.SX) -> np.ndarray:
-    return np.array(ca.DM(expression))
 
 
 @given(axis=AXES, angle=ANGLES)
@@ -70,8 +66,3 @@ def test_entries_next_to_0_and_1_are_meant_to_be_these():
     rounded = snap_to_unit_entries(matrix)
     np.testing.assert_array_equal(rounded, [[1.0, 0.0, -1.0], [1 + 1e-10, 0.5, -1e-10]])
     assert matrix[0, 0] != 1.0
-
-
-def test_a_transform_turns_then_moves():
-    matrix = homogeneous_transform(rotation_from_rpy(0.0, 0.0, math.pi / 2), [1.0, 2.0, 3.0])
-    np.testing.assert_allclose(matrix @ [1.0, 0.0, 0.0, 1.0], [1.0, 3.0, 3.0, 1.0], atol=1e-15)

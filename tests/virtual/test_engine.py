@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 from virtual_examples import SYSTEMS, TRUTH, Runs
 
-from yid_ocp.errors import ConfigError, DataError, ModelError
+from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model.kinematics import forward_kinematics, rigid_body_derivatives
 from yid_ocp.model.objects.foam_y import y_object
 from yid_ocp.model.system import Grasp, System
@@ -40,22 +39,10 @@ def test_grasps_hold(runs: Runs, arms: int) -> None:
     np.testing.assert_allclose(np.linalg.norm(gaps, axis=2), run.grasp_separation, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("arms", [1, 2])
-def test_halving_the_inner_step_changes_little(runs: Runs, arms: int) -> None:
-    coarse, fine = runs(arms, 1e-4), runs(arms, 5e-5, 2.0)
-    np.testing.assert_array_equal(coarse.t[:201], fine.t)
-    assert np.linalg.norm(coarse.point_positions[:201] - fine.point_positions, axis=-1).max() < 5e-5
-
-
-@pytest.mark.parametrize("arms", [1, 2])
-def test_the_motion_excites_the_object_at_moderate_speed(runs: Runs, arms: int) -> None:
-    run, system = runs(arms, 1e-4), SYSTEMS[arms]
-    held = [system.point_frames.index(grasp.held_frame) for grasp in system.grasps]
-    extent = np.ptp(run.point_positions[:, held], axis=0).max(-1)
-    assert np.all((extent > 0.1) & (extent < 0.25))
-    assert np.abs(run.v[:, list(system.driven_indices)]).max() < 1.5
-    limits = [system.mechanism.joints[j].effort_limit for j in system.driven_indices]
-    assert np.all(np.abs(run.effort).max(0) < limits)
+def test_halving_the_inner_step_changes_little(runs: Runs) -> None:
+    coarse, fine = runs(2, 1e-4), runs(2, 5e-5, 1.0)
+    np.testing.assert_array_equal(coarse.t[:101], fine.t)
+    assert np.linalg.norm(coarse.point_positions[:101] - fine.point_positions, axis=-1).max() < 5e-5
 
 
 @pytest.mark.parametrize("arms", [1, 2])
@@ -145,12 +132,6 @@ def test_simulations_that_do_not_fit_are_refused() -> None:
     motion = random_multisine(system, seed=0)
     with pytest.raises(ModelError, match="driven joints"):
         simulate_in_mujoco(replace(system, driven=system.driven[:3], prescribed=system.driven[3:]), None, motion)
-
-
-def test_without_mujoco_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(DataError, match=r"yid-ocp\[blind\]"):
-        simulate_in_mujoco(SYSTEMS[1], None, random_multisine(SYSTEMS[1], seed=0))
 
 
 def test_the_constraint_solver_converges_on_a_fine_chain() -> None:

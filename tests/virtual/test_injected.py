@@ -139,32 +139,20 @@ def reading(duration=1.0) -> Recording:
 
 
 @pytest.mark.parametrize(
-    ("label", "values", "channel", "expected"),
+    ("kind", "values", "channel", "expected"),
     [
-        ("effort_gain@left_s1", {"scale": 1.1}, "effort", lambda r: r.joints.effort[:, 1] * 1.1),
-        ("effort_offset@left_s1", {"offset": 0.2}, "effort", lambda r: r.joints.effort[:, 1] + 0.2),
-        ("encoder_offset@left_s1", {"offset": 0.01}, "position", lambda r: r.joints.position[:, 1] + 0.01),
-        (
-            "series_elasticity@left_s1",
-            {"stiffness": 500.0},
-            "position",
-            lambda r: r.joints.position[:, 1] + r.joints.effort[:, 1] / 500,
-        ),
-        (
-            "backlash@left_s1",
-            {"width": 0.01},
-            "position",
-            lambda r: r.joints.position[:, 1] + 0.005 * np.tanh(r.joints.effort[:, 1] / 0.2),
-        ),
+        ("effort_gain", {"scale": 1.1}, "effort", lambda position, effort: effort * 1.1),
+        ("effort_offset", {"offset": 0.2}, "effort", lambda position, effort: effort + 0.2),
+        ("encoder_offset", {"offset": 0.01}, "position", lambda position, effort: position + 0.01),
+        ("series_elasticity", {"stiffness": 500.0}, "position", lambda position, effort: position + effort / 500),
+        ("backlash", {"width": 0.01}, "position", lambda position, effort: position + 0.005 * np.tanh(effort / 0.2)),
     ],
 )
-def test_errors_of_joint_sensors_are_those_of_the_table(label, values, channel, expected):
-    kind, _, place = label.partition("@")
-    recording = reading()
-    wrong = with_sensor_error(recording, SYSTEM, kind, place, values)
-    assert getattr(wrong.joints, channel)[:, 1] == pytest.approx(expected(recording))
-    other = getattr(wrong.joints, channel)[:, 2]
-    assert other == pytest.approx(getattr(recording.joints, channel)[:, 2])
+def test_errors_of_joint_sensors_are_those_of_the_table(kind, values, channel, expected):
+    true = reading()
+    wrong = getattr(with_sensor_error(true, SYSTEM, kind, "left_s1", values).joints, channel)
+    assert wrong[:, 1] == pytest.approx(expected(true.joints.position[:, 1], true.joints.effort[:, 1]))
+    assert wrong[:, 2] == pytest.approx(getattr(true.joints, channel)[:, 2])
 
 
 def test_what_is_recorded_late_acts_later():

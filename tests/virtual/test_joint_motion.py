@@ -8,10 +8,7 @@ import pytest
 from virtual_examples import SYSTEMS
 
 from yid_ocp.errors import ModelError
-from yid_ocp.model.flexible import Segment, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_derivatives
-from yid_ocp.model.system import Grasp, System
-from yid_ocp.model.urdf import read_urdf
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine
 
 mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
@@ -32,19 +29,6 @@ def test_initial_posture_reaches_the_tubes_within_the_limits() -> None:
         assert np.abs(np.array(phi(full))).max() < 1e-8
     with pytest.raises(ModelError, match="miss the grasped points"):
         grasping_joint_angles(SYSTEMS[1], {"T1.length": 3.0})
-
-
-def test_other_robots_start_from_the_middle_of_their_range() -> None:
-    robot = read_urdf("package:panda", locked={"panda_finger_joint1": 0.0, "panda_finger_joint2": 0.0})
-    beam = flexible_object([Segment("B", 0.5, 0.2, 0.01, links=2)])
-    names = robot.joint_names[:7]
-    placement = np.eye(4)
-    placement[:3, 3] = [0.5, 0.0, 0.0]
-    system = System.build(
-        robot, objects=[(beam, None, placement)], grasps=[Grasp("hand", "panda_hand", "w_B")], driven=names
-    )
-    posture = grasping_joint_angles(system)
-    assert set(names) <= set(posture)
 
 
 def test_motion_starts_smoothly_and_is_drawn_from_the_seed() -> None:

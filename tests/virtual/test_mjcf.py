@@ -3,13 +3,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import casadi as ca
-import numpy as np
 import pytest
-from virtual_examples import SYSTEMS, TRUTH, clamped_beam
+from virtual_examples import SYSTEMS, TRUTH, assert_same_mechanics, clamped_beam
 
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model.flexible import Segment, flexible_object
-from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_derivatives
 from yid_ocp.model.mechanism import Frame, Placement
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.system import Grasp, MidpointState, StepTerms, System, floating_clamp
@@ -29,33 +27,7 @@ mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: 
     ids=["single", "dual", "clamp", "along"],
 )
 def test_mechanics_equals_the_symbolic_one(system: System, values: dict[str, float]) -> None:
-    q, v = ca.SX.sym("q", system.n_coordinates), ca.SX.sym("v", system.n_coordinates)
-    kinematics = forward_kinematics(system.mechanism, q)
-    rigid = rigid_body_derivatives(kinematics, v, system.gravity)
-    bias = ca.jtimes(rigid.lagrangian_by_v, q, v) - rigid.lagrangian_by_q
-    passive = system.viscous_force(v) - ca.gradient(system.elastic_energy(q), q)
-    points = ca.horzcat(*(kinematics.frame_position(name) for name in system.point_frames))
-    ours = ca.Function(
-        "ours", [q, v, system.parameters.symbols], [mass_matrix(rigid, system.mechanism), bias, passive, points]
-    )
-    model = mujoco.MjModel.from_xml_string(mujoco_xml(system, values))
-    data = mujoco.MjData(model)
-    order = [model.joint(name).id for name in system.mechanism.joint_names]
-    assert model.nv == system.n_coordinates
-    rng = np.random.default_rng(0)
-    for _ in range(3):
-        posture, velocity = rng.uniform(-1, 1, system.n_coordinates), rng.uniform(-1, 1, system.n_coordinates)
-        data.qpos[order], data.qvel[order] = posture, velocity
-        mujoco.mj_forward(model, data)
-        mass = np.zeros((model.nv, model.nv))
-        for column in range(model.nv):
-            mujoco.mj_mulM(model, data, mass[column], np.eye(model.nv)[column])
-        expected = [np.array(ca.densify(e)) for e in ours(posture, velocity, system.parameters.vector(values))]
-        np.testing.assert_allclose(mass[np.ix_(order, order)], expected[0], rtol=0, atol=1e-9)
-        np.testing.assert_allclose(data.qfrc_bias[order], expected[1].ravel(), rtol=0, atol=1e-9)
-        np.testing.assert_allclose(data.qfrc_passive[order], expected[2].ravel(), rtol=0, atol=1e-9)
-        seen = np.array([data.site(name).xpos for name in system.point_frames])
-        np.testing.assert_allclose(seen, expected[3].T, rtol=0, atol=1e-9)
+    assert_same_mechanics(system, values)
 
 
 @dataclass(frozen=True)

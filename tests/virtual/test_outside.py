@@ -17,7 +17,6 @@ from yid_ocp.virtual.injected import (
     _SLIP_TIMES,
     _WALL_DISTANCE,
     _WARM_UP_TIME,
-    OUT_OF_LIBRARY_EFFECTS,
     InjectedEffect,
     _InjectedTerms,
     run_injected_experiment,
@@ -219,11 +218,3 @@ def test_torque_ripples_with_the_angle_and_wind_waits_for_the_motion():
     assert bench.force(q)[bench.address("left_e1")] == pytest.approx(math.sin(18.0))
     assert not Bench("gusts", "T3", 0.1, running=False).force(q, time=1.0).any()
     assert Bench("gusts", "T3", 0.1).force(q, time=1.0).any()
-
-
-def test_none_is_forgotten():
-    assert set(OUT_OF_LIBRARY_EFFECTS) == {
-        *("tether", "magnet", "wall", "crease", "cross_stiffness", "quadratic_stiffness", "stiffness_drift"),
-        *("one_way_damping", "warming_gear", "saturating_drive", "shifting_load", "slipping_grasp"),
-        *("torque_ripple", "gusts"),
-    }

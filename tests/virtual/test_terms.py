@@ -8,13 +8,12 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+from virtual_examples import assert_same_mechanics
 
 from yid_ocp.effects import EFFECTS, make_effect
 from yid_ocp.errors import ModelError
 from yid_ocp.export.models import effect_support
 from yid_ocp.model import Grasp, Segment, System, flexible_object
-from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_derivatives
-from yid_ocp.model.system import MidpointState
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.virtual.mjcf import ParameterEvaluator, compile_mjcf, joint_dynamics, mujoco_xml
 
@@ -98,37 +97,7 @@ def test_every_kind_of_the_library_is_looked_at() -> None:
 def test_mechanics_equals_the_symbolic_one(system: System, kind: str) -> None:
     if kind == "cubic_stiffness" and not hasattr(mujoco.MjModel, "jnt_stiffnesspoly"):
         pytest.skip("this MuJoCo has no polynomial stiffness")
-    changed = with_effect(system, kind, *MECHANICAL[kind])
-    q, v = ca.SX.sym("q", changed.n_coordinates), ca.SX.sym("v", changed.n_coordinates)
-    kinematics = forward_kinematics(changed.mechanism, q)
-    rigid = rigid_body_derivatives(kinematics, v, changed.gravity)
-    [effect] = changed.effects
-    none = ca.SX(0, 1)
-    terms = effect.step_terms(MidpointState(changed, kinematics, q, v, none, none, none, none, {}, ca.SX(1)))
-    passive = changed.viscous_force(v) - ca.gradient(changed.elastic_energy(q), q) + ca.gradient(terms.lagrangian, q)
-    for joint, compliance in changed.joint_compliances.items():
-        at = changed.mechanism.joint_index(joint)
-        passive[at] -= (q[at] + changed.joint_relaxation_times[joint] * v[at]) / compliance
-    if terms.dissipative_force is not None:
-        passive += terms.dissipative_force
-    mass = mass_matrix(rigid, changed.mechanism) + ca.hessian(terms.lagrangian, v)[0]
-    bias = ca.jtimes(rigid.lagrangian_by_v, q, v) - rigid.lagrangian_by_q
-    ours = ca.Function("ours", [q, v, changed.parameters.symbols], [mass, bias, passive])
-    model = compile_mjcf(mujoco_xml(changed))
-    data = mujoco.MjData(model)
-    order = [model.joint(name).id for name in changed.mechanism.joint_names]
-    rng = np.random.default_rng(0)
-    for _ in range(2):
-        posture, velocity = rng.uniform(-1, 1, changed.n_coordinates), rng.uniform(-1, 1, changed.n_coordinates)
-        data.qpos[order], data.qvel[order] = posture, velocity
-        mujoco.mj_forward(model, data)
-        full = np.zeros((model.nv, model.nv))
-        for column in range(model.nv):
-            mujoco.mj_mulM(model, data, full[column], np.eye(model.nv)[column])
-        expected = [np.array(ca.densify(e)) for e in ours(posture, velocity, changed.parameters.vector())]
-        np.testing.assert_allclose(full[np.ix_(order, order)], expected[0], rtol=0, atol=1e-9)
-        np.testing.assert_allclose(data.qfrc_bias[order], expected[1].ravel(), rtol=0, atol=1e-9)
-        np.testing.assert_allclose(data.qfrc_passive[order], expected[2].ravel(), rtol=1e-9, atol=1e-9)
+    assert_same_mechanics(with_effect(system, kind, *MECHANICAL[kind]), {})
 
 
 @pytest.mark.parametrize("kind", [*MECHANICAL, *OTHERS])

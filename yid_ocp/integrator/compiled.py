@@ -48,24 +48,30 @@ class _Struct(ctypes.Structure):
     kept: object = None
 
 
-def _struct(*fields: str) -> type[_Struct]:
+def _struct(name: str, *fields: str) -> type[_Struct]:
     """A struct of fields that are given as a kind and names."""
     kinds = {"int": ctypes.c_int, "double": ctypes.c_double, "long": ctypes.c_longlong, "pointer": ctypes.c_void_p}
     words = [part.split() for part in fields]
-    return type("_Made", (_Struct,), {"_fields_": [(name, kinds[kind]) for kind, *names in words for name in names]})
+    return type(name, (_Struct,), {"_fields_": [(field, kinds[kind]) for kind, *names in words for field in names]})
 
 
 _Directions = _struct(
-    "int count theta_count", "pointer by_theta rows_pattern p1_pattern effort_pattern rows_nz p1_nz effort_nz w iw"
+    "Directions",
+    "int count theta_count",
+    "pointer by_theta rows_pattern p1_pattern effort_pattern rows_nz p1_nz effort_nz w iw",
 )
-_Feedback = _struct("int count", "pointer index gain reference")
-_Motion = _struct("int steps limit", "double time_step tolerance", "pointer theta torque path feedback directions")
-_Trajectory = _struct("pointer state multipliers effort applied")
-_Sensitivities = _struct("pointer state multipliers effort torque path")
-_Partials = _struct("pointer state multipliers effort")
-_Gradient = _struct("pointer theta start torque path")
-_Linearization = _struct("pointer rows p1 rows_new rows_old rows_input p1_new p1_old p1_input rows_theta p1_theta")
-_Outcome = _struct("int step status", "double error", "long iterations factorisations memory")
+_Feedback = _struct("Feedback", "int count", "pointer index gain reference")
+_Motion = _struct(
+    "Motion", "int steps limit", "double time_step tolerance", "pointer theta torque path feedback directions"
+)
+_Trajectory = _struct("Trajectory", "pointer state multipliers effort applied")
+_Sensitivities = _struct("Sensitivities", "pointer state multipliers effort torque path")
+_Partials = _struct("Partials", "pointer state multipliers effort")
+_Gradient = _struct("Gradient", "pointer theta start torque path")
+_Linearization = _struct(
+    "Linearization", "pointer rows p1 rows_new rows_old rows_input p1_new p1_old p1_input rows_theta p1_theta"
+)
+_Outcome = _struct("Outcome", "int step status", "double error", "long iterations factorisations memory")
 
 
 def _filled(kind: type[_Struct], *values: object) -> _Struct:
@@ -183,9 +189,9 @@ class CompiledKernel:
             trajectories.append(_filled(_Trajectory, out.state, out.multipliers, out.effort, out.torque))
             outs.append(out)
         outcomes: Any = (_Outcome * len(members))()
-        given = (_Motion * len(members))(*motions), (_Trajectory * len(members))(*trajectories)
+        filled = (_Motion * len(members))(*motions), (_Trajectory * len(members))(*trajectories)
         by = (_Sensitivities * len(members))(*sensitivities) if sensitivities else None
-        _check(library.yid_rollout(ctypes.c_int(len(members)), *given, by, outcomes), outcomes[0])
+        _check(library.yid_rollout(ctypes.c_int(len(members)), *filled, by, outcomes), outcomes[0])
         return [
             rollout_with_status(out, sizes, o.status, o.step, o.error, (o.iterations, o.factorisations))
             for out, o in zip(outs, outcomes, strict=True)

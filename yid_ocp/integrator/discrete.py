@@ -376,7 +376,7 @@ def _constraint_derivatives(system: System, kinematics: Kinematics, q: ca.SX, la
         for a, b in [(part[3 + k] * a, b) for k, pairs in enumerate(rows) for a, b in pairs]:
             turns: list[dict[int, ca.SX]] = []
             for frame, vector, other in ((holder, a, b), (held, b, a)):
-                chain = [j for j in system.mechanism.ancestor_joints(frame.joint_index) if turning[j]]
+                chain = tuple(j for j in system.mechanism.ancestor_joints(frame.joint_index) if turning[j])
                 turns.append({j: cross_product(kinematics.joint_screws[j][:3], vector) for j in chain})
                 for above, i in enumerate(chain):
                     turned = cross_product(other, kinematics.joint_screws[i][:3])

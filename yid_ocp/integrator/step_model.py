@@ -335,8 +335,8 @@ def allocate_rollout(sizes: dict[str, int], steps: int, count: int | None) -> Ro
     if count is not None:
         shapes |= {name: (*shapes[name.removesuffix("_sensitivity")], count) for name in names}
     arrays = _arrays(f"a rollout of {steps} steps with {count or 0} derivatives", shapes, math.nan)
-    absent = {} if count is not None else dict.fromkeys(names)
-    return Rollout(**arrays, **absent, status=StepStatus(NewtonStatus.OK, 0, 0.0, 0, 0))
+    first = [arrays[name] for name in ("state", "multipliers", "effort", "torque")]
+    return Rollout(*first, *[arrays.get(name) for name in names], status=StepStatus(NewtonStatus.OK, 0, 0.0, 0, 0))
 
 
 def allocate_linearization(sizes: dict[str, int], count: int, width: int, derivatives: bool) -> StepLinearization:

@@ -119,11 +119,9 @@ def arms_only_step(step: Step) -> Step:
         raise ModelError(what, where=", ".join(system.driven), hint="use proportional gains instead")
     frames = {name: frame for name, frame in mechanism.frames.items() if frame.joint_index < len(keep)}
     arms = replace(mechanism, joints=mechanism.joints[: len(keep)], frames=frames, link_chains={})
-    nothing = dict.fromkeys(
-        ("elastic_joints", "grasps", "prescribed", "segment_layouts", "point_frames", "effects"), ()
-    )
     damping = {name: value for name, value in system.joint_damping.items() if name in system.driven}
-    arms_only = replace(system, mechanism=arms, joint_compliances={}, joint_damping=damping, **nothing)
+    without = replace(system, elastic_joints=(), grasps=(), prescribed=(), segment_layouts=(), point_frames=())
+    arms_only = replace(without, mechanism=arms, joint_compliances={}, joint_damping=damping, effects=())
     return compile_step_like(step, arms_only)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, NoReturn
 
 import casadi as ca
 import numpy as np
@@ -324,49 +324,32 @@ def _segment_parameters(segment: Segment) -> dict[str, Parameter]:
 
 
 def _check(segment: Segment, known: Mapping[str, SegmentLayout]) -> None:
-    name, parent, at, axes = segment.name, segment.parent, segment.parent_link_index, segment.joint_axes
+    parent, at, axes = segment.parent, segment.parent_link_index, segment.joint_axes
     section, lengths, turns = segment.cross_section, segment.link_lengths, segment.link_rest_rotations
+    count = segment.links if lengths is None else len(lengths)
+
+    def refuse(what: str, allowed: str = "", hint: str = "") -> NoReturn:
+        raise ModelError(what, where=f"segment {segment.name}", allowed=allowed, hint=hint)
+
+    if segment.name in known:
+        refuse(f"two segments are called '{segment.name}'")
+    if parent is not None and parent not in known:
+        what = f"parent '{parent}' of segment '{segment.name}' does not come before it"
+        refuse(what, hint=nearest_name_hint(parent, known))
+    if (segment.radius is None) == (section is None):
+        refuse("a segment needs a radius or a section", "one of the two", "cross_section: [0.001, 0.08]")
     sizes = {"mass": segment.mass, **({"length": segment.length} if lengths is None else {})}
     sizes |= {} if segment.radius is None else {"radius": segment.radius}
-    sizes |= {f"cross_section[{i}]": size for i, size in enumerate(section or ())}
-    count, links = segment.links if lengths is None else len(lengths), 0
-    if parent is not None and parent in known:
-        links = len(known[parent].link_joints)
-    far, apart = f"parent '{parent}' of segment '{name}' does not come before it", set(axes) <= set(UNIT_AXES)
-    rules: list[tuple[bool, str, str, str]] = [
-        (name in known, f"two segments are called '{name}'", "", ""),
-        (parent is not None and parent not in known, far, "", nearest_name_hint(str(parent), known)),
-        (
-            (segment.radius is None) == (section is None),
-            "a segment needs a radius or a section",
-            "one of the two",
-            "cross_section: [0.001, 0.08]",
-        ),
-        *(
-            (not (math.isfinite(value) and value > 0), f"{what} = {value}", "a positive number in SI units", "")
-            for what, value in sizes.items()
-        ),
-        (lengths is None and count < 1, f"links = {count}", "a whole number from 1", ""),
-        (lengths is not None and not min(lengths, default=0.0) > 0, "a link has no length", "positive lengths [m]", ""),
-        (
-            turns is not None and len(turns) != count - 1,
-            f"{0 if turns is None else len(turns)} link rotations for {count} links",
-            f"{count - 1}",
-            "",
-        ),
-        (
-            at is not None and parent is not None and not 0 <= at < links,
-            f"parent_link_index = {at}",
-            f"0 to {links - 1}",
-            "",
-        ),
-        (
-            not axes or len(set(axes)) < len(axes) or not apart,
-            f"joint_axes = '{axes}'",
-            "letters of x, y, z, each at most once",
-            "",
-        ),
-    ]
-    for is_wrong, what, allowed, hint in rules:
-        if is_wrong:
-            raise ModelError(what, where=f"segment {name}", allowed=allowed, hint=hint)
+    for quantity, value in (sizes | {f"cross_section[{i}]": size for i, size in enumerate(section or ())}).items():
+        if not (math.isfinite(value) and value > 0):
+            refuse(f"{quantity} = {value}", "a positive number in SI units")
+    if lengths is None and count < 1:
+        refuse(f"links = {count}", "a whole number from 1")
+    if lengths is not None and not min(lengths, default=0.0) > 0:
+        refuse("a link has no length", "positive lengths [m]")
+    if turns is not None and len(turns) != count - 1:
+        refuse(f"{len(turns)} link rotations for {count} links", f"{count - 1}")
+    if at is not None and parent is not None and not 0 <= at < (links := len(known[parent].link_joints)):
+        refuse(f"parent_link_index = {at}", f"0 to {links - 1}")
+    if not axes or len(set(axes)) < len(axes) or not set(axes) <= set(UNIT_AXES):
+        refuse(f"joint_axes = '{axes}'", "letters of x, y, z, each at most once")

@@ -244,17 +244,10 @@ class Mechanism(ReprMixin):
         for joint in other.joints:
             parent, local = moved(joint.parent_index, joint.placement)
             joints.append(replace(joint, parent_index=parent, placement=local))
-        frames = dict(self.frames)
-        for name, entry in other.frames.items():
-            index, local = moved(entry.joint_index, entry.placement)
-            frames[name] = Frame(index, local)
-        return Mechanism(
-            f"{self.name}+{other.name}" if self.joints else other.name,
-            tuple(joints),
-            frames,
-            self.parameters.with_added(other.parameters),
-            {**self.link_chains, **other.link_chains},
-        )
+        added = {name: Frame(*moved(entry.joint_index, entry.placement)) for name, entry in other.frames.items()}
+        both, chains = self.parameters.with_added(other.parameters), {**self.link_chains, **other.link_chains}
+        name = f"{self.name}+{other.name}" if self.joints else other.name
+        return Mechanism(name, tuple(joints), {**self.frames, **added}, both, chains)
 
     def with_frame(self, name: str, frame: str | None, placement: ArrayLike) -> Mechanism:
         """The mechanism with one additional frame, at a pose (4, 4) in the one it is fixed to (the world for None)."""
@@ -275,18 +268,12 @@ class Mechanism(ReprMixin):
 
     def map_expressions(self, change: Callable[[ca.SX], ca.SX]) -> Mechanism:
         """The mechanism with `change` applied to every expression of its placements and inertias."""
+        moved = [(joint, joint.placement.map_expressions(change)) for joint in self.joints]
         joints = tuple(
-            replace(
-                joint,
-                placement=joint.placement.map_expressions(change),
-                bodies=tuple(b.map_expressions(change) for b in joint.bodies),
-            )
-            for joint in self.joints
+            replace(joint, placement=placement, bodies=tuple(b.map_expressions(change) for b in joint.bodies))
+            for joint, placement in moved
         )
-        frames = {
-            name: Frame(frame.joint_index, frame.placement.map_expressions(change))
-            for name, frame in self.frames.items()
-        }
+        frames = {name: Frame(f.joint_index, f.placement.map_expressions(change)) for name, f in self.frames.items()}
         return replace(self, joints=joints, frames=frames)
 
     def with_inserted_joints(self, index: int, chain: Sequence[Joint]) -> Mechanism:
@@ -314,12 +301,8 @@ def _fraction(name: str, said: str) -> float:
     except ValueError:
         value = math.nan
     if not 0.0 <= value <= 100.0:
-        raise ModelError(
-            f"'{said}' is no place along '{name.partition(':')[0]}'",
-            where=name,
-            allowed="a percentage of its length from 0% to 100%, base to tip",
-            hint=f"{name.partition(':')[0]}:40%",
-        )
+        line, allowed = name.partition(":")[0], "a percentage of its length from 0% to 100%, base to tip"
+        raise ModelError(f"'{said}' is no place along '{line}'", where=name, allowed=allowed, hint=f"{line}:40%")
     return value / 100.0
 
 

@@ -54,16 +54,9 @@ def baxter_foam_y_system(arms: int) -> System:
 class ArmSensorNoise:
     """Standard deviations of the noise on what the arm measures, drawn anew for every sample but for the bias.
 
-    Attributes
-    ----------
-    position_std, velocity_std : float
-        Standard deviation of a joint's reading [rad], [rad/s].
-    effort_std, effort_bias_std : float or tuple of float, length nj
-        Standard deviation of the white noise, and of the constant offset, of a recorded (not the applied) torque [N m].
-    point_std : float
-        Standard deviation of each coordinate of a grasped point [m].
-    records_effort_std : bool
-        Whether the recording states the standard deviation of torques; it always states the others.
+    Of a joint's reading [rad], [rad/s], of a recorded (not the applied) torque, white and constant, one or nj [N m],
+    and of each coordinate of a grasped point [m]. The recording always states the others, torques' where
+    `records_effort_std` says so.
     """
 
     position_std: float = 2e-4
@@ -112,16 +105,14 @@ class VirtualExperiment:
         `random_multisine` with `seed` where absent.
     initial_joint_angles : mapping of str to float, optional
         Initial angles [rad or m]; `grasping_joint_angles` where absent.
-    simulation : SimulationOptions
-    arm_noise : ArmSensorNoise
     camera : PointCamera, optional
         None for no camera.
     injected_terms : SimulatorTerms, optional
         Forces and model changes that are not in the system's description.
     seed : int
         Seed of all noise; each sensor has its own stream, so that leaving one out changes no other.
-    recording_name, description : str
-        Name and description of the recording; how it was made is appended to the description.
+    description : str
+        Of the recording; how it was made is appended.
     gear_play : mapping of joint to float
         Backlash of gears behind servos, full width [rad].
     """
@@ -143,18 +134,12 @@ def run_virtual_experiment(
 ) -> Recording:
     """Simulate a robot moving the object and return the recording of encoders, torques, points and camera.
 
-    Parameters
-    ----------
-    system : System
-    values : mapping of str to float, optional
-        True parameter values; nominal where absent.
-    experiment : VirtualExperiment, optional
-
     Returns
     -------
     Recording
         `joints`: index k is node k, `effort[k]` is what `effort_kind` says. `points_arm` at the same times, for the
-        grasped points; `points_camera` with its own clock. `truth` holds all stiffness, damping and mass parameters.
+        grasped points; `points_camera` with its own clock. `true_parameters` holds all stiffness, damping and mass
+        parameters: `values`, nominal where absent.
 
     Raises
     ------
@@ -167,10 +152,9 @@ def run_virtual_experiment(
     seeds = np.random.SeedSequence(chosen.seed).spawn(len(_STREAMS))
     streams = {name: np.random.default_rng(seed) for name, seed in zip(_STREAMS, seeds, strict=True)}
     duration = chosen.simulation.duration
-    posture = chosen.initial_joint_angles
+    posture, motion = chosen.initial_joint_angles, chosen.motion
     if posture is None:
         posture = grasping_joint_angles(system, values)
-    motion = chosen.motion
     if motion is None:
         excitation = MultisineOptions(duration=duration)
         motion = random_multisine(system, values, seed=chosen.seed, initial_joint_angles=posture, excitation=excitation)
@@ -184,9 +168,8 @@ def run_virtual_experiment(
     groups = [_arm_points(system, held, run, chosen.arm_noise, streams)] if held else []
     if chosen.camera is not None and len(run.frame_times):
         groups.append(_camera_points(system, visible, run, chosen.camera, streams))
-    theta = system.parameters.vector(values)
-    names = system.parameters.names
-    truth = {n: float(theta[i]) for i, n in enumerate(names) if n.rpartition(".")[2] in _TRUE_QUANTITIES}
+    theta = zip(system.parameters.names, map(float, system.parameters.vector(values)), strict=True)
+    truth = {name: value for name, value in theta if name.rpartition(".")[2] in _TRUE_QUANTITIES}
     made = _how_it_was_made(chosen, system, seen=len(run.frame_times) > 0)
     joints = _joints(system, run, chosen, streams)
     about = f"{chosen.description} {made}".strip(), "yid_ocp virtual experiment", chosen.recording_name

@@ -76,17 +76,13 @@ class _EffectContext:
         """Ids, stiffnesses and rest angles of a segment's elastic joints."""
         links = self.system.segment_layout(segment).link_joints
         joints = [joint for link in links for joint in link if joint in self.joint_stiffness]
-        return (
-            np.array([model.joint(j).id for j in joints]),
-            np.array([self.joint_stiffness[j] for j in joints]),
-            np.array([self.rest_angles[j] for j in joints]),
-        )
+        stiffness, rest = (np.array([of[j] for j in joints]) for of in (self.joint_stiffness, self.rest_angles))
+        return np.array([model.joint(j).id for j in joints]), stiffness, rest
 
-    def bend_joint_ids(self, model: Any, segment: str) -> tuple[Array, Array]:
-        """Ids of the joints that bend a segment about x and about y."""
+    def bend_joint_ids(self, model: Any, segment: str) -> Array:
+        """Ids of the joints that bend a segment about x, then of those about y."""
         links = self.system.segment_layout(segment).link_joints
-        x, y = (np.array([model.joint(link[axis]).id for link in links]) for axis in (0, 1))
-        return x, y
+        return np.array([model.joint(link[axis]).id for axis in (0, 1) for link in links])
 
     def link_body_ids(self, model: Any, segment: str) -> list[int]:
         """Ids of the bodies of a segment's links."""
@@ -106,6 +102,18 @@ def _joint_force(at: Any, law: Callable[[Any, Any, float], Any]) -> _ForceCallba
         data.qfrc_passive[at] += law(data.qpos[at], data.qvel[at], data.time)
 
     return push
+
+
+def _joint_law(law: Callable[[Any, float, float], float]) -> Callable[[_EffectContext, Any, str, Any], _ForceCallback]:
+    """An effect that is a force law(size, q, v) of one joint."""
+    return lambda scene, model, joint, size: _joint_force(model.joint(joint).id, lambda q, v, t: law(size, q, v))
+
+
+def _bend_law(law: Callable[[float, Array], Array]) -> Callable[[_EffectContext, Any, str, float], _ForceCallback]:
+    """An effect that is a force law(size, q) of the bends of a segment, those about x first."""
+    return lambda scene, model, segment, size: _joint_force(
+        scene.bend_joint_ids(model, segment), lambda q, v, t: law(size, q)
+    )
 
 
 def _body_force(body: int, force: Array | Callable[[Any], Array]) -> _ForceCallback:
@@ -200,24 +208,6 @@ def _gravity_scale(scene: _EffectContext, model: Any, place: str, size: _Values)
     return _in_turn([_body_force(body, size["fraction"] * model.body_mass[body] * gravity) for body in bodies])
 
 
-def _joint_spring(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
-    # not MuJoCo's own spring, whose rest angle the search for the equilibrium uses to hold the arm
-    return _joint_force(model.joint(place).id, lambda q, v, t: -size["stiffness"] * (q - size["rest_angle"]))
-
-
-def _joint_coulomb(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
-    at = model.joint(place).id
-    return _joint_force(at, lambda q, v, t: -size["tau_c"] * math.tanh(v / _FRICTION_SMOOTHING_SPEED))
-
-
-def _joint_stribeck(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
-    def friction(q: float, v: float, t: float) -> float:
-        fall = math.exp(-((v / size["v_stribeck"]) ** 2))
-        return -size["tau_s"] * fall * math.tanh(v / _FRICTION_SMOOTHING_SPEED)
-
-    return _joint_force(model.joint(place).id, friction)
-
-
 def _joint_presliding(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
     def advance(s: float, q: float, v: float, step: float) -> float:
         way = math.copysign(1.0, v)
@@ -275,36 +265,30 @@ def _weigh(scene: _EffectContext, model: Any, place: str, size: _Values) -> None
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
-# a force that is worked out here
 _FORCES: Mapping[str, Callable[[_EffectContext, Any, str, _Values], _ForceCallback]] = {
-    made.__name__.removeprefix("_"): made
-    for made in (
-        *(_cubic_stiffness, _standard_linear_solid, _hysteresis, _aerodynamic_drag, _gravity_scale, _joint_spring),
-        *(_joint_coulomb, _joint_stribeck, _joint_presliding, _effort_lag),
-    )
+    "cubic_stiffness": _cubic_stiffness,
+    "standard_linear_solid": _standard_linear_solid,
+    "hysteresis": _hysteresis,
+    "aerodynamic_drag": _aerodynamic_drag,
+    "gravity_scale": _gravity_scale,
+    # not MuJoCo's own spring, whose rest angle the search for the equilibrium uses to hold the arm
+    "joint_spring": _joint_law(lambda size, q, v: -size["stiffness"] * (q - size["rest_angle"])),
+    "joint_coulomb": _joint_law(lambda size, q, v: -size["tau_c"] * math.tanh(v / _FRICTION_SMOOTHING_SPEED)),
+    "joint_stribeck": _joint_law(
+        lambda size, q, v: (
+            -size["tau_s"] * math.exp(-((v / size["v_stribeck"]) ** 2)) * math.tanh(v / _FRICTION_SMOOTHING_SPEED)
+        )
+    ),
+    "joint_presliding": _joint_presliding,
+    "effort_lag": _effort_lag,
 }
+"""Forces of the library's effects that are worked out here."""
 _FORCE_KINDS = tuple(_FORCES)
 INJECTABLE_KINDS = (*_DESCRIPTION_KINDS, *_MUJOCO_MODEL_KINDS, *_FORCE_KINDS, *_SENSOR_ERROR_KINDS)
 """Effect kinds of the library that can be simulated in MuJoCo."""
 
 
 # -- effects outside the library --------------------------------------------------------------------------------------
-
-
-def _torque_ripple(scene: _EffectContext, model: Any, joint: str, size: float) -> _ForceCallback:
-    """Torque that ripples with the joint's angle [N m]."""
-    return _joint_force(model.joint(joint).id, lambda q, v, t: size * math.sin(60.0 * q))
-
-
-def _cross_stiffness(scene: _EffectContext, model: Any, segment: str, size: float) -> _ForceCallback:
-    """A spring that couples the two bends [N m/rad]."""
-    both = np.concatenate(scene.bend_joint_ids(model, segment))
-    return _joint_force(both, lambda q, v, t: -size * np.roll(q, len(q) // 2))
-
-
-def _quadratic_stiffness(scene: _EffectContext, model: Any, segment: str, size: float) -> _ForceCallback:
-    """Springs that are stiffer one way than the other [N m/rad^2]."""
-    return _joint_force(np.concatenate(scene.bend_joint_ids(model, segment)), lambda q, v, t: -size * q**2)
 
 
 def _gusts(scene: _EffectContext, model: Any, segment: str, size: float) -> _ForceCallback:
@@ -393,7 +377,7 @@ def _one_way_damping(scene: _EffectContext, model: Any, segment: str, size: floa
     MuJoCo is told of it as its own damping, which it integrates implicitly: a light branch under so much explicit
     damping bursts.
     """
-    both = np.concatenate(scene.bend_joint_ids(model, segment))
+    both = scene.bend_joint_ids(model, segment)
     usual = model.dof_damping[both].copy()
 
     def push(_: Any, data: Any) -> None:
@@ -450,11 +434,16 @@ def _slipping_grasp(scene: _EffectContext, model: Any, grasp: str, size: float) 
 
 
 OUT_OF_LIBRARY_EFFECTS: Mapping[str, Callable[[_EffectContext, Any, str, float], _ForceCallback]] = {
-    made.__name__.removeprefix("_"): made
-    for made in (
-        *(_torque_ripple, _cross_stiffness, _quadratic_stiffness, _gusts, _crease, _tether, _magnet, _wall),
-        *(_stiffness_drift, _one_way_damping, _saturating_drive, _warming_gear, _shifting_load, _slipping_grasp),
-    )
+    "torque_ripple": _joint_law(lambda size, q, v: size * math.sin(60.0 * q)),  # with the joint's angle [N m]
+    "cross_stiffness": _bend_law(lambda size, q: -size * np.roll(q, len(q) // 2)),  # couples the two [N m/rad]
+    "quadratic_stiffness": _bend_law(lambda size, q: -size * q**2),  # stiffer one way than the other [N m/rad^2]
+    **{
+        made.__name__.removeprefix("_"): made
+        for made in (
+            *(_gusts, _crease, _tether, _magnet, _wall, _stiffness_drift, _one_way_damping, _saturating_drive),
+            *(_warming_gear, _shifting_load, _slipping_grasp),
+        )
+    },
 }
 """Effects outside the library by kind: forces by the scene, MuJoCo's model, a place and a size."""
 
@@ -485,16 +474,8 @@ def run_injected_experiment(
     """Simulate a virtual experiment with effects that are absent from the system's description.
 
     `system` is nominal, with driven joints; `true_parameters` of the recording are those `values`, and the experiment's
-    own `injected_terms` are replaced.
-
-    Raises
-    ------
-    ConfigError
-        A kind that cannot be done here.
-    ModelError
-        A payload that is too far off, or takes away what is not there.
-    ConfigError, ModelError, DataError
-        As `run_virtual_experiment`.
+    own `injected_terms` are replaced. `ConfigError` of a kind that cannot be done here, `ModelError` of a payload that
+    is too far off or takes away what is not there, else as `run_virtual_experiment`.
     """
     known = (*INJECTABLE_KINDS, *OUT_OF_LIBRARY_EFFECTS)
     for effect in effects:

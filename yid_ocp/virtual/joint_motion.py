@@ -51,11 +51,10 @@ class MultisineMotion:
 
     Attributes
     ----------
-    joints : tuple of str, length nj
     amplitude, frequency, phase : ndarray, shape (nj, nf)
         [rad or m], [Hz], [rad]
     ramp_time : float
-        Duration of the ramp [s].
+        [s]
     """
 
     joints: tuple[str, ...]
@@ -127,7 +126,10 @@ def random_multisine(
     """
     chosen = excitation or MultisineOptions()
     rng = np.random.default_rng(seed)
-    motion = _drawn(system, chosen, rng)
+    shape = len(system.driven), chosen.sines_per_joint
+    frequency, phase = _drawn_frequencies(chosen.frequency_band, shape, rng), rng.uniform(0.0, 2 * math.pi, shape)
+    amplitude = rng.uniform(0.7, 1.3, shape) / frequency
+    motion = MultisineMotion(system.driven, amplitude, frequency, phase, chosen.ramp_time)
     times = np.linspace(0.0, chosen.duration, 251)
     start = grasping_joint_angles(system, values) if initial_joint_angles is None else initial_joint_angles
     tree = replace(system.mechanism, parameters=system.parameters).with_numeric_values(values)
@@ -160,15 +162,6 @@ def _scaled(motion: MultisineMotion, joints: Sequence[int], factors: Array) -> M
     amplitude = motion.amplitude.copy()
     amplitude[list(joints)] *= factors[:, None]
     return replace(motion, amplitude=amplitude)
-
-
-def _drawn(system: System, excitation: MultisineOptions, rng: np.random.Generator) -> MultisineMotion:
-    """Frequencies, phases and relative amplitudes at random."""
-    shape = len(system.driven), excitation.sines_per_joint
-    frequency = _drawn_frequencies(excitation.frequency_band, shape, rng)
-    phase = rng.uniform(0.0, 2 * math.pi, shape)
-    amplitude = rng.uniform(0.7, 1.3, shape) / frequency
-    return MultisineMotion(system.driven, amplitude, frequency, phase, excitation.ramp_time)
 
 
 def _drawn_frequencies(band: tuple[float, float], shape: tuple[int, int], rng: np.random.Generator) -> Array:
@@ -219,10 +212,10 @@ def grasping_joint_angles(
 
     Only positions are matched; of several solutions one near the initial guess is returned.
 
+    Sought are the joints that carry a grasp's holder and are not elastic.
+
     Parameters
     ----------
-    system : System
-        Those joints are sought that carry a grasp's holder and are not elastic.
     values : mapping of str to float, optional
         Parameter values; nominal where absent.
     start_angles : mapping of str to float, optional

@@ -58,17 +58,12 @@ _DRY_FRICTION_PARAMETERS: Mapping[str, str] = {"joint_coulomb": "tau_c", "joint_
 
 _POINTS = 3  # at which equations are compared
 _ROUNDING = 1e-9
-# aspects of an effect for which MuJoCo has an equivalent term
-_NATIVE_ASPECTS = frozenset(
-    {
-        *("stiffness", "rest", "damping", "geometry", "inertia", "weight"),
-        *("gravity", "grasp", "sprung_joint", "armature", "cubic_stiffness", "servo"),
-    }
-)
 EMULATED_ASPECTS = frozenset({"dry_friction", "grasp_compliance"})
 """Aspects that MuJoCo can only approximate."""
-# aspects of sensors and recorded torques that do not enter the mechanics
+# aspects of sensors and recorded torques, which do not enter the mechanics
 _IGNORED_ASPECTS = frozenset({"reading", "torque_gain", "torque_offset", "torque_delay", "torque_lag"})
+# aspects for which MuJoCo has an equivalent term
+_NATIVE_ASPECTS = frozenset(MODEL_ASPECTS) - EMULATED_ASPECTS - _IGNORED_ASPECTS - {"clock", "memory", "force"}
 
 _JOINTS_PER_BODY = 6  # as many as MuJoCo allows
 _ROTOR = 5e-4  # [kg m^2] of a motor behind play, as little as lets it rest at a stop
@@ -77,15 +72,7 @@ _AXIS_LEVER = 0.1  # [m] between the two points that keep two axes parallel
 
 @dataclass(frozen=True)
 class JointDynamics:
-    """Spring, damping, inertia and friction at one joint, in SI units of its coordinate.
-
-    Attributes
-    ----------
-    stiffness, constant_force : float
-        Force -stiffness q + pull.
-    cubic_stiffness, damping, armature, dry_friction : float
-        Force -cubic q^3, force -damping v, inertia, dry friction.
-    """
+    """Terms at one joint in SI units of its coordinate: the force is constant - stiffness q - cubic q^3 - damping v."""
 
     stiffness: float = 0.0
     constant_force: float = 0.0
@@ -96,19 +83,6 @@ class JointDynamics:
 
     def __add__(self, other: JointDynamics) -> JointDynamics:
         return JointDynamics(*(getattr(self, name) + getattr(other, name) for name in vars(self)))
-
-
-@dataclass(frozen=True)
-class _ActuatorResponse:
-    """Applied torque of a driven joint from the recorded one: gain x recorded - offset, delay [s], first-order lag [s].
-
-    With a position servo it is the commanded position instead.
-    """
-
-    gain: float = 1.0
-    subtracted_offset: float = 0.0
-    delay: float = 0.0
-    lag_time: float = 0.0
 
 
 class ParameterEvaluator:
@@ -176,9 +150,9 @@ def effect_terms_and_aspects(
             sizes = ((name, size) for entry in terms.values() for name, size in vars(entry).items())
             aspects |= {"rest" if name == "constant_force" else name for name, size in sizes if size}
     for joint in system.driven:
-        own = _actuation(system, (effect,), joint, value)
-        changed = {"torque_gain": own.gain != 1, "torque_offset": own.subtracted_offset != 0}
-        changed |= {"torque_lag": own.lag_time != 0, "torque_delay": own.delay > 0, "reading": own.delay < 0}
+        gain, offset, delay, lag = _actuation(system, (effect,), joint, value)
+        changed = {"torque_gain": gain != 1, "torque_offset": offset != 0, "torque_lag": lag != 0}
+        changed |= {"torque_delay": delay > 0, "reading": delay < 0}
         aspects |= {name for name, does in changed.items() if does}
     return terms, aspects or {"reading"}
 
@@ -208,8 +182,14 @@ def joint_dynamics(system: System, value: ParameterEvaluator) -> dict[str, Joint
     return found
 
 
-def _actuation(system: System, effects: Iterable[Effect], joint: str, value: ParameterEvaluator) -> _ActuatorResponse:
-    """As the estimation has it: the last effect is the nearest to the reading."""
+def _actuation(
+    system: System, effects: Iterable[Effect], joint: str, value: ParameterEvaluator
+) -> tuple[float, float, float, float]:
+    """A joint's torque (or a servo's command) from its record, as the estimation has it: gain, offset, delay, lag.
+
+    It is gain x recorded - offset, late by the delay [s] and with a first-order lag [s]; the last effect is the nearest
+    to the reading.
+    """
     reading, known = ca.SX.sym("reading"), [e for e in effects if isinstance(e, RecordingErrorEffect)]
     true, servo = reading, system.servos.get(joint)
     channel = f"joints.{'effort' if servo is None else 'position'}.{joint}"
@@ -220,7 +200,7 @@ def _actuation(system: System, effects: Iterable[Effect], joint: str, value: Par
     gain = ca.jacobian(true, reading)
     numbers = [ca.substitute(part, reading, 0) for part in (gain, true)] + [late, lag]
     one, none, delay, constant = (float(value(number)[0]) for number in numbers)
-    return _ActuatorResponse(one, -none, delay, constant)
+    return one, -none, delay, constant
 
 
 def _joint_terms(system: System, effect: Effect, value: ParameterEvaluator) -> dict[str, JointDynamics] | None:
@@ -457,9 +437,9 @@ def _add_grasps(system: System, value: ParameterEvaluator, root: Element, time_s
 def _add_actuators(system: System, value: ParameterEvaluator, actuator: Element, time_step: float) -> None:
     """Actuators from recorded torques to those that act, and position servos."""
     for joint in system.driven:
-        found = _actuation(system, system.effects, joint, value)
+        gain, offset, delay, lag = _actuation(system, system.effects, joint, value)
         attributes, servo = {"name": joint, "joint": joint}, system.servos.get(joint)
-        gain, bias, delay, between = found.gain, [-found.subtracted_offset, 0.0, 0.0], found.delay, "linear"
+        bias, between = [-offset, 0.0, 0.0], "linear"
         if servo is not None:
             own, damping, late, tightness = (float(value(x)[0]) for x in servo.coefficients)
             gain, bias, delay = own * gain, [own * bias[0], -own, -damping], delay + late
@@ -470,8 +450,8 @@ def _add_actuators(system: System, value: ParameterEvaluator, actuator: Element,
         attributes["gainprm"] = xml_numbers([gain])
         if any(bias):
             attributes |= {"biastype": "affine", "biasprm": xml_numbers(bias)}
-        if found.lag_time > 0:
-            attributes |= {"dyntype": "filterexact", "dynprm": xml_numbers([found.lag_time])}
+        if lag > 0:
+            attributes |= {"dyntype": "filterexact", "dynprm": xml_numbers([lag])}
         if delay > 0:
             if not hasattr(import_mujoco().MjModel, "actuator_delay"):
                 what, allowed = f"the torque of '{joint}' acts late", "MuJoCo with delays of actuators (3.5 or newer)"

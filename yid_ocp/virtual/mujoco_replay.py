@@ -35,15 +35,9 @@ _INERTIA_EVERY = 20  # steps; an arm's inertia hardly changes meanwhile
 
 @dataclass(frozen=True)
 class ReplayMismatch:
-    """Deviation of a replayed model from the recording in one channel or group.
+    """Deviation of a replayed model from the recording in one channel or group, in `unit`; of points the distance.
 
-    Attributes
-    ----------
-    rmse : float
-        Root mean square deviation; of points that of the distance.
-    noise_rms : float
-        Root mean square expected from sensor noise alone, zero if the recording does not state it.
-    unit : str
+    `noise_rms` is expected from sensor noise alone, zero if the recording does not state it.
     """
 
     rmse: float
@@ -64,11 +58,8 @@ def replay_in_mujoco(text: str, system: System, recording: Recording) -> dict[st
     they were commanded and nothing else. Prescribed joints follow the recorded angles; the torque that this takes is
     compared with the recorded one.
 
-    Returns
-    -------
-    dict of str to ReplayMismatch
-        `joints.position` of driven joints [rad] or `joints.effort` of prescribed ones [N m], all joints together, and
-        `GROUP.POINT` of every point of the model [m].
+    Returns `joints.position` of driven joints [rad] or `joints.effort` of prescribed ones [N m], all joints together,
+    and `GROUP.POINT` of every point of the model [m].
 
     Raises
     ------

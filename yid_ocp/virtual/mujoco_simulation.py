@@ -55,18 +55,14 @@ class SimulatorTerms(Protocol):
 
 @dataclass(frozen=True)
 class SimulationOptions:
-    """Duration, rates and time step of a simulation.
+    """Duration [s], rates [Hz] and time step [s] of a simulation.
 
     Attributes
     ----------
-    duration : float
-        [s]
-    sample_rate : float
-        Rate of the recorded samples [Hz].
     time_step : float
-        Of the simulator [s]; must divide the controller's period.
+        Of the simulator; must divide the controller's period.
     controller_rate : float, optional
-        Rate at which torques are computed, held in between [Hz], a multiple of `sample_rate`, which it is where absent.
+        At which torques are computed, held in between, a multiple of `sample_rate`, which it is where absent.
     effort_kind : {'sample', 'mean', 'command'}
         What is recorded of the torque: a `command` needs a controller that is no faster than the recording.
     """
@@ -79,7 +75,7 @@ class SimulationOptions:
 
     def __post_init__(self) -> None:
         controller, periods = self._controller_rate, self.controller_periods_per_sample
-        inner = self.simulator_steps_per_period
+        inner = self._steps_per_period
         if periods < 1 or abs(periods * self.sample_rate / controller - 1.0) > 1e-9:
             what = f"controller_rate = {controller:g} Hz is no multiple of the recording's {self.sample_rate:g} Hz"
             raise ConfigError(what, allowed="rate k, k whole")
@@ -89,9 +85,8 @@ class SimulationOptions:
         if self.effort_kind not in get_args(EffortKind):
             raise ConfigError(f"effort_kind = '{self.effort_kind}'", allowed=", ".join(get_args(EffortKind)))
         if self.effort_kind == "command" and periods > 1:
-            what = (
-                f"a command of a controller at {controller:g} Hz is not held over a sample of {self.sample_rate:g} Hz"
-            )
+            what = f"a command of a controller at {controller:g} Hz"
+            what += f" is not held over a sample of {self.sample_rate:g} Hz"
             allowed = "sample or mean, or a controller as fast as the recording"
             raise ConfigError(what, where="effort_kind", allowed=allowed)
 
@@ -105,14 +100,8 @@ class SimulationOptions:
         return round(self._controller_rate / self.sample_rate)
 
     @property
-    def simulator_steps_per_period(self) -> int:
-        """Number of simulator steps per controller period."""
+    def _steps_per_period(self) -> int:
         return round(1.0 / (self._controller_rate * self.time_step))
-
-    @property
-    def sample_periods(self) -> int:
-        """Number N of sample periods; N + 1 samples are recorded."""
-        return round(self.duration * self.sample_rate)
 
 
 @dataclass(frozen=True)
@@ -163,12 +152,10 @@ def simulate_in_mujoco(
 
     Parameters
     ----------
-    system : System
     values : mapping of str to float or None
         Nominal where absent.
     motion : JointMotion
         Of exactly the driven joints.
-    simulation : SimulationOptions, optional
     initial_joint_angles : mapping of str to float, optional
         Initial angles [rad or m]; `grasping_joint_angles` where absent.
     frame_times : array_like, shape (M,)
@@ -284,12 +271,6 @@ def _lost(scene: MujocoScene) -> bool:
     return any(scene.data.warning[int(getattr(kinds, name))].number > 0 for name in _LOST)
 
 
-def _refuse_lost(scene: MujocoScene) -> None:
-    if _lost(scene):
-        hint = "take a shorter time_step, or a posture whose grippers are nearer to what they hold"
-        raise ModelError("the simulation diverged before the motion began", where="MuJoCo", hint=hint)
-
-
 class TrackingController:
     """Computed-torque controller: the arms' inverse dynamics along the motion, the grasps' load at rest, feedback.
 
@@ -306,19 +287,15 @@ class TrackingController:
         self._load = balance - self._arm_torque(self._rest[scene.moved_joint_ids], zero, zero)
 
     def apply_input(self, t: float) -> Array:
-        """Apply the torques at time t [s] and return them, shape (nu,) [N m]."""
-        torque = self.compute_torque(t)
-        self._scene.data.qfrc_applied[self._scene.moved_joint_ids] = torque
-        return torque
-
-    def compute_torque(self, t: float) -> Array:
-        """Torques at time t [s] from the scene's state then, shape (nu,) [N m]."""
+        """Apply the torques at time t [s], from the scene's state then, and return them, shape (nu,) [N m]."""
         data, driven = self._scene.data, self._scene.moved_joint_ids
         offset, velocity, acceleration = self._motion.offset_and_derivatives(t)
         reference = self._rest[driven] + offset
         demand = acceleration + 2 * _BANDWIDTH * (velocity - data.qvel[driven])
         demand += _BANDWIDTH**2 * (reference - data.qpos[driven])
-        return np.asarray(self._load + self._arm_torque(reference, velocity, demand))
+        torque = np.asarray(self._load + self._arm_torque(reference, velocity, demand))
+        data.qfrc_applied[driven] = torque
+        return torque
 
     def _arm_torque(self, q: Array, v: Array, a: Array) -> Array:
         shadow, driven = self._shadow, self._scene.moved_joint_ids
@@ -389,7 +366,9 @@ def _calming(scene: MujocoScene, held: Any) -> Iterator[float]:
         step(held, data, nstep=block)
         held.eq_solref[:] = firm
     for _ in range(math.ceil(_SETTLING_LIMIT / (block * held.opt.timestep))):
-        _refuse_lost(scene)
+        if _lost(scene):
+            hint = "take a shorter time_step, or a posture whose grippers are nearer to what they hold"
+            raise ModelError("the simulation diverged before the motion began", where="MuJoCo", hint=hint)
         yield (calm := float(np.abs(data.qvel).max()))
         step(held, data, nstep=block)
     what = f"the object does not come to rest in {_SETTLING_LIMIT:g} s (largest velocity {calm:.2g} rad/s)"
@@ -405,8 +384,8 @@ def _play(
 ) -> SimulationResult:
     """Simulate period by period of the controller, the torque held in each; `frames` count the simulator's steps."""
     mujoco, model, data = scene.mujoco, scene.model, scene.data
-    steps, periods = simulation.sample_periods, simulation.controller_periods_per_sample
-    inner = simulation.simulator_steps_per_period
+    steps, periods = round(simulation.duration * simulation.sample_rate), simulation.controller_periods_per_sample
+    inner = simulation._steps_per_period
     q, v, torques, points, error, seen = [], [], [], [], [], []
     for tick in range(steps * periods + 1):
         mujoco.mj_kinematics(model, data)

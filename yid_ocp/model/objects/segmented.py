@@ -70,25 +70,20 @@ class SegmentSettings:
         # a rigidity does not depend on the number of links, a stiffness per joint does
         factor = 1 if self.stiffness_per_curvature else n
         lengths, index = self.link_lengths, self.parent_link_index
+        same = ("mass", "radius", "parent", "stiffness_per_curvature", "clamped_at_base", "joint_axes", "cross_section")
+        options: dict[str, Any] = {key: getattr(self, key) for key in (*same, "link_length_parameters")}
         return Segment(
             name,
             self.length if self.length is not None else float(sum(lengths or ())),
-            self.mass,
-            self.radius,
-            self.links * n,
-            None if lengths is None else [length / n for length in lengths for _ in range(n)],
-            self.parent,
-            None if index is None else (index + 1) * n - 1,  # a child stays at the same place of its parent
-            rotation_from_rpy(*self.rpy),
+            **options,
+            links=self.links * n,
+            link_lengths=None if lengths is None else [length / n for length in lengths for _ in range(n)],
+            parent_link_index=None if index is None else (index + 1) * n - 1,  # a child stays where it is on its parent
+            rest_rotation=rotation_from_rpy(*self.rpy),
             bend=Segment.bend * factor,
             twist=Segment.twist * factor,
             damping=damping * factor,
             twist_damping=damping * factor if self.separate_twist_damping else None,
-            stiffness_per_curvature=self.stiffness_per_curvature,
-            clamped_at_base=self.clamped_at_base,
-            joint_axes=self.joint_axes,
-            cross_section=self.cross_section,
-            link_length_parameters=self.link_length_parameters,
         )
 
 
@@ -127,12 +122,8 @@ def _beam(numbers: Mapping[str, Any], links: int) -> InitObject:
     length, mass = required_numbers("a beam", numbers, {name: SIZE_MEANINGS[name] for name in ("length", "mass")})
     section = _section(numbers)
     if section is None and "radius" not in numbers:
-        raise ConfigError(
-            "a beam needs a radius or a section",
-            where="--radius",
-            allowed=SIZE_MEANINGS["radius"],
-            hint="add --radius NUMBER, or --section WIDTH,HEIGHT",
-        )
+        what, hint = "a beam needs a radius or a section", "add --radius NUMBER, or --section WIDTH,HEIGHT"
+        raise ConfigError(what, where="--radius", allowed=SIZE_MEANINGS["radius"], hint=hint)
     radius = None if section else float(numbers["radius"])
     return _init_object("beam", {"beam": _init_segment(links, length, mass, radius, cross_section=section)})
 
@@ -141,12 +132,9 @@ def _tree(numbers: Mapping[str, Any], links: int) -> InitObject:
     if numbers.get("branch"):
         return _init_object("tree", _grown([_branch(text, links) for text in numbers["branch"]]))
     if not numbers.get("branches"):
-        raise ConfigError(
-            "a tree needs branches",
-            where="--branch",
-            allowed="--branch NAME=LENGTH,MASS,RADIUS[,ROLL,PITCH,YAW] for each, or --branches NUMBER of equal ones",
-            hint="--branches 4 --length 0.4 --mass 0.03 --radius 0.008",
-        )
+        allowed = "--branch NAME=LENGTH,MASS,RADIUS[,ROLL,PITCH,YAW] for each, or --branches NUMBER of equal ones"
+        hint = "--branches 4 --length 0.4 --mass 0.03 --radius 0.008"
+        raise ConfigError("a tree needs branches", where="--branch", allowed=allowed, hint=hint)
     length, mass, radius = required_numbers("each branch of a tree", numbers, SIZE_MEANINGS)
     count, quarter = numbers["branches"], 1.5707963
     if not 1 <= count <= 16:
