@@ -93,24 +93,6 @@ def test_what_a_library_was_made_with_is_part_of_its_key(cache, tmp_path, monkey
     assert len(list(cache.iterdir())) == 2
 
 
-@needs_compiler
-def test_a_step_compiled_again_runs_no_compiler(cache, runs, pendulum):
-    theta = pendulum.parameters.vector()
-    arguments = ([0.3, 0.1], [0.0, 0.0], [], theta)
-    step = compile_step(pendulum, 0.01)
-    expected = step.jacobians(*arguments)
-    compilations = [command for command in runs if "-shared" in command]
-    assert len(compilations) == 2  # the step, and its derivatives by theta
-    del runs[:]
-    again = compile_step(pendulum, 0.01)
-    for actual, one in zip(again.jacobians(*arguments), expected, strict=True):
-        np.testing.assert_array_equal(actual, one)
-    assert [command for command in runs if "-shared" in command] == []
-    other = compile_step(pendulum, 0.02)
-    assert other.is_compiled
-    assert [command for command in runs if "-shared" in command] == []
-
-
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="this system has no file owners and modes")
 @pytest.mark.parametrize("mode", [0o720, 0o702, 0o777])
 def test_a_cache_that_others_may_write_is_refused(cache, mode):

@@ -5,13 +5,9 @@ import math
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from yid_ocp.errors import ConfigError, ModelError, YidError, nearest_name_hint, unknown_name_details
 from yid_ocp.model import Parameter, Parameters
-
-NUMBERS = st.floats(-1e6, 1e6, allow_nan=False)
 
 
 @pytest.fixture
@@ -57,16 +53,6 @@ def test_bounds(three):
     lower, upper = three.bounds(["T1.mass", "wind@object.speed"])
     np.testing.assert_array_equal(lower, [0.0, -math.inf])
     np.testing.assert_array_equal(upper, [1.0, math.inf])
-
-
-@given(values=st.lists(NUMBERS, min_size=1, max_size=8), data=st.data())
-def test_vector_is_a_round_trip(values, data):
-    entries = Parameters(Parameter(f"p{i}", value, "1") for i, value in enumerate(values))
-    np.testing.assert_array_equal(entries.vector(), values)
-    chosen = data.draw(st.dictionaries(st.sampled_from(entries.names), NUMBERS))
-    theta = entries.vector(chosen)
-    expected = {**dict(zip(entries.names, values, strict=True)), **chosen}
-    assert dict(zip(entries.names, theta, strict=True)) == expected
 
 
 @pytest.mark.parametrize(

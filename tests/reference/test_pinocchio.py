@@ -160,18 +160,6 @@ def test_mass_matrix_gravity_and_inverse_dynamics(twin):
         close(potential, height, abs(height))
 
 
-@pytest.mark.parametrize("robot", ["baxter", "ur5"])
-def test_rounding_of_nearly_exact_placements_moves_nothing_visibly(robot, monkeypatch):
-    rounded = read_urdf(f"package:{robot}").with_numeric_values()
-    monkeypatch.setattr(rotations, "_SNAP_TOLERANCE", 0.0)
-    exact = read_urdf(f"package:{robot}").with_numeric_values()
-    moved = [
-        np.max(np.abs(np.array(ca.DM(a.placement.homogeneous_matrix() - b.placement.homogeneous_matrix()))))
-        for a, b in zip(rounded.joints, exact.joints, strict=True)
-    ]
-    assert 0 < max(moved) < 1e-11
-
-
 def test_generated_object_has_the_frames_of_its_urdf(urdf_folder):
     model = pin.buildModelFromUrdf(str(urdf_folder / "y_object.urdf"))
     assert all(model.existFrame(name) for name in y_object().mechanism.frames)

@@ -7,13 +7,14 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+from virtual_examples import SYSTEMS, TRUTH
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.effects import EFFECTS, make_effect
 from yid_ocp.errors import ConfigError
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import MidpointState
-from yid_ocp.virtual.experiment import VirtualExperiment, baxter_foam_y_system, with_sensor_error
+from yid_ocp.virtual.experiment import VirtualExperiment, with_sensor_error
 from yid_ocp.virtual.injected import (
     _FORCE_KINDS,
     _MUJOCO_MODEL_KINDS,
@@ -30,8 +31,7 @@ from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
 mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
 
-SYSTEM = baxter_foam_y_system(1)
-TRUTH = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T3.bend": 11.5, "T3.twist": 9.7}
+SYSTEM = SYSTEMS[1]
 SIZES = {
     "kelvin_voigt@T1": {"tau": 0.05},
     "joint_viscous@left_s1": {"b": 1.3},

@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 import pytest
+from virtual_examples import SYSTEMS, TRUTH
 
-from yid_ocp.virtual.experiment import VirtualExperiment, baxter_foam_y_system
+from yid_ocp.virtual.experiment import VirtualExperiment
 from yid_ocp.virtual.injected import (
     _CORD_LENGTH,
     _CREASE_ANGLE,
@@ -27,8 +28,7 @@ from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
 mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
 
-SYSTEM = baxter_foam_y_system(1)
-TRUTH = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T3.bend": 11.5, "T3.twist": 9.7}
+SYSTEM = SYSTEMS[1]
 
 
 class Bench:

@@ -37,7 +37,7 @@ _PointEvaluator = Callable[[Array], Array]
 
 
 class InterpretedKernel:
-    """Step kernel in CasADi's interpreter and NumPy; threads may share it.
+    """Step kernel in CasADi's interpreter and NumPy, of the methods of `CompiledKernel`; threads may share it.
 
     A point is a column of all `DiscreteEquations.arguments`. The outputs are the rows of the balance, internal and
     constraint equations, then p1, then the effort of prescribed coordinates.
@@ -204,7 +204,7 @@ class InterpretedKernel:
         by_multipliers: Array | None,
         by_effort: Array | None,
     ) -> CostGradient:
-        """Gradient of a cost along a rollout by the backward recursion of the costate."""
+        """Gradient of a cost whose partial derivatives along the rollout are given, by the recursion of the costate."""
         sizes, at, steps = self._model.sizes, self._at, len(rollout.torque)
         slopes, n = self._evaluators()[-1], sizes["n"]
         by_theta, by_torque = np.zeros(len(names)), np.zeros((steps, sizes["nu"]))
@@ -235,7 +235,7 @@ class InterpretedKernel:
     def linearize(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, names: tuple[str, ...], derivatives: bool
     ) -> StepLinearization:
-        """Residuals and Jacobians of many steps, evaluated one after another."""
+        """Residuals of len(torque) steps along a trajectory and, with `derivatives`, their Jacobians, one by one."""
         (value, _, slopes), at = self._evaluators(), self._at
         out = allocate_linearization(self._model.sizes, len(torque), len(names), derivatives)
         new, old = np.concatenate([at["q1"], at["z1"], at["lam"]]), np.concatenate([at["q0"], at["z0"]])
@@ -254,7 +254,12 @@ class InterpretedKernel:
     def step_jacobians(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, load_rows: Array, load_momentum: Array
     ) -> tuple[Array, Array]:
-        """Jacobians of single steps from the linearized equations."""
+        """Derivatives of the steps of a finished rollout by (q, p, z), torque and loads (implicit function theorem).
+
+        `load_rows` (nt, e) and `load_momentum` (n, e) are what e additional loads add to the residual and to p_{k+1}.
+        Returns those of the state after the step, shape (N, nx, nx + nu + e), and of the effort, (N, nc, nx + nu + e);
+        `numpy.linalg.LinAlgError` where a step's equations are singular.
+        """
         sizes = self._model.sizes
         point = self._point(theta, state[0], state[1], multipliers[0], torque[0])
         h = float(self._model.functions.row_scale_and_time_step(*(point[index] for index in self._at.values()))[1])
@@ -282,7 +287,11 @@ class InterpretedKernel:
     def find_equilibrium(
         self, theta: Array, unknowns: Array, given: Array, held: Array, stiffness: float, tolerance: float
     ) -> tuple[Array, float, bool]:
-        """Static equilibrium by `damped_newton`."""
+        """Solve `EquilibriumEquations` by `damped_newton`, beginning at `unknowns`, shape (ny,).
+
+        Returns the last point, the largest imbalance [N m] or violation of a constraint [m] there, and whether that
+        counts as rest, being up to `tolerance`.
+        """
         function, known = self._rest(None), (given, held, stiffness, theta, self._model.time_step)
         return damped_newton(lambda w: function.call([w, *known]), unknowns, tolerance)
 

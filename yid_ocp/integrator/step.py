@@ -19,7 +19,6 @@ from yid_ocp.integrator.step_model import (
     Rollout,
     RolloutInputs,
     SensitivityDirections,
-    StepKernel,
     StepModel,
     StepStatus,
     build_step_model,
@@ -35,7 +34,7 @@ class Step(ReprMixin):
     """Step map of a system over one time step; made by `compile_step`. `is_compiled`: by generated C code."""
 
     model: StepModel
-    kernel: StepKernel
+    kernel: CompiledKernel | InterpretedKernel
     is_compiled: bool
 
     def _summary(self) -> ReprSummary:

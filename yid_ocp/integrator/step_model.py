@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -276,55 +275,6 @@ class StepLinearization:
     p1_by_input: Array
     residual_by_theta: Array
     p1_by_theta: Array
-
-
-class StepKernel(Protocol):
-    """Interface of the compiled and the interpreted implementation of a step."""
-
-    def with_model(self, model: StepModel) -> StepKernel:
-        """A kernel of the same equations with another step model, which differs in the time step."""
-
-    def rollout(self, inputs: RolloutInputs) -> Rollout:
-        """Simulate one rollout."""
-
-    def rollout_batch(self, members: Sequence[RolloutInputs]) -> list[Rollout]:
-        """Simulate all members, in batches where that is faster; equal to `rollout` of each but for rounding."""
-
-    def adjoint_gradient(
-        self,
-        theta: Array,
-        rollout: Rollout,
-        feedback: TrackingFeedback | None,
-        names: tuple[str, ...],
-        by_state: Array,
-        by_multipliers: Array | None,
-        by_effort: Array | None,
-    ) -> CostGradient:
-        """Gradient of a cost whose partial derivatives along the rollout are given."""
-
-    def linearize(
-        self, theta: Array, state: Array, multipliers: Array, torque: Array, names: tuple[str, ...], derivatives: bool
-    ) -> StepLinearization:
-        """Residuals of len(torque) steps along a trajectory and, with `derivatives`, their Jacobians."""
-
-    def step_jacobians(
-        self, theta: Array, state: Array, multipliers: Array, torque: Array, load_rows: Array, load_momentum: Array
-    ) -> tuple[Array, Array]:
-        """Derivatives of the steps of a finished rollout by (q, p, z), torque and loads (implicit function theorem).
-
-        `load_rows` (nt, e) and `load_momentum` (n, e) are what e additional loads add to the residual and to p_{k+1}.
-        Returns those of the state after the step, shape (N, nx, nx + nu + e), and of the effort, (N, nc, nx + nu + e);
-        `numpy.linalg.LinAlgError` where a step's equations are singular.
-        """
-
-    def find_equilibrium(
-        self, theta: Array, unknowns: Array, given: Array, held: Array, stiffness: float, tolerance: float
-    ) -> tuple[Array, float, bool]:
-        """Solve `EquilibriumEquations` by Newton's iteration, beginning at `unknowns`, shape (ny,).
-
-        Returns the last point, the largest imbalance [N m] or violation of a constraint [m] there, and whether that
-        counts as rest, being up to `tolerance`.
-        """
 
 
 def allocate_rollout(sizes: dict[str, int], steps: int, count: int | None) -> Rollout:

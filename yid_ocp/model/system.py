@@ -91,14 +91,12 @@ class Grasp:
         """Constraint residual phi(q), shape (equations, 1): positions [m], then direction or orientation [rad]."""
         holder = kinematics.frame_pose(self.holder_frame) @ Placement(self.held_orientation, self.holder_offset)
         held = kinematics.frame_pose(self.held_frame)
-        point = held.translation - held.rotation[:, 2] * self.axial_slip
-        rows = [holder.translation - point]
+        rows = [holder.translation - (held.translation - held.rotation[:, 2] * self.axial_slip)]
         if self.kind == "axis":
             rows.append(holder.rotation[:, :2].T @ held.rotation[:, 2])
         elif self.kind == "weld":
             error = holder.rotation.T @ held.rotation
-            pairs = ((2, 1), (0, 2), (1, 0))
-            rows.append(0.5 * ca.vertcat(*(error[i, j] - error[j, i] for i, j in pairs)))
+            rows.append(0.5 * ca.vertcat(*(error[i, j] - error[j, i] for i, j in ((2, 1), (0, 2), (1, 0)))))
         return ca.vertcat(*rows)
 
     def axis_misalignment(self, kinematics: Kinematics) -> ca.SX:
@@ -477,11 +475,9 @@ class System(ReprMixin):
 
     def elastic_energy(self, q: ca.SX) -> ca.SX:
         """Elastic energy, the sum of 1/2 stiffness (q - rest)^2 over the elastic joints [J]."""
-        energy = ca.SX(0)
-        for spring in self.elastic_joints:
-            deflection = q[self.mechanism.joint_index(spring.joint_name)] - spring.rest_angle
-            energy += 0.5 * spring.stiffness * deflection**2
-        return energy
+        index = self.mechanism.joint_index
+        terms = (0.5 * s.stiffness * (q[index(s.joint_name)] - s.rest_angle) ** 2 for s in self.elastic_joints)
+        return sum(terms, ca.SX(0))
 
     def viscous_force(self, v: ca.SX) -> ca.SX:
         """Generalized force of all viscous dampers, shape (n, 1) [N m]."""
@@ -501,8 +497,7 @@ class System(ReprMixin):
 
     def constraint_residual(self, kinematics: Kinematics) -> ca.SX:
         """Constraint residual phi(q) of all grasps, shape (m, 1)."""
-        rows = [grasp.constraint_residual(kinematics) for grasp in self.grasps]
-        return ca.vertcat(*rows) if rows else ca.SX(0, 1)
+        return ca.vertcat(ca.SX(0, 1), *(grasp.constraint_residual(kinematics) for grasp in self.grasps))
 
     def constraint_relaxation_times(self) -> ca.SX | None:
         """Relaxation times T in phi + T dphi/dt = C lam / h, shape (m, 1) [s]; None where no grasp has one."""
@@ -513,8 +508,7 @@ class System(ReprMixin):
 
     def constraint_compliance(self) -> ca.SX:
         """Diagonal of C in phi(q_{k+1}) = C lam_k / h, shape (m, 1)."""
-        rows = [grasp.compliance for grasp in self.grasps for _ in range(grasp.n_equations)]
-        return ca.vertcat(*rows) if rows else ca.SX(0, 1)
+        return ca.vertcat(ca.SX(0, 1), *(grasp.compliance for grasp in self.grasps for _ in range(grasp.n_equations)))
 
 
 def _check_names(

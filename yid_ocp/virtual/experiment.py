@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -285,6 +285,16 @@ def _camera_pose(target: Array) -> Array:
     return pose
 
 
+# what is misread, by true position and effort
+_JOINT_SENSOR_ERRORS: Mapping[str, tuple[str, Callable[[Array, Array, Mapping[str, float]], Array]]] = {
+    "effort_gain": ("effort", lambda q, u, size: u * size["scale"]),
+    "effort_offset": ("effort", lambda q, u, size: u + size["offset"]),
+    "encoder_offset": ("position", lambda q, u, size: q + size["offset"]),
+    "series_elasticity": ("position", lambda q, u, size: q + u / size["stiffness"]),
+    "backlash": ("position", lambda q, u, size: q + size["width"] / 2 * np.tanh(u / 0.2)),
+}
+
+
 def with_sensor_error(
     recording: Recording, system: System, kind: str, place: str, values: Mapping[str, float]
 ) -> Recording:
@@ -297,25 +307,17 @@ def with_sensor_error(
     assert joints is not None
     if joints.effort is None:
         raise ModelError("the recording has no efforts", where=f"{kind}@{place}", allowed="arms that torques move")
-    position, effort = joints.position.copy(), joints.effort.copy()
     if kind == "effort_delay":
+        effort = joints.effort.copy()
         # what is recorded now acts only after the delay
         for name in joints_by_arm(system)[place]:
             column = joints.names.index(name)
             effort[:, column] = np.interp(joints.t + values["delay"], joints.t, joints.effort[:, column])
         return replace(recording, joints=replace(joints, effort=effort))
-    at = joints.names.index(place)
-    if kind == "effort_gain":
-        effort[:, at] *= values["scale"]
-    elif kind == "effort_offset":
-        effort[:, at] += values["offset"]
-    elif kind == "encoder_offset":
-        position[:, at] += values["offset"]
-    elif kind == "series_elasticity":
-        position[:, at] += joints.effort[:, at] / values["stiffness"]
-    elif kind == "backlash":
-        position[:, at] += values["width"] / 2 * np.tanh(joints.effort[:, at] / 0.2)
-    return replace(recording, joints=replace(joints, position=position, effort=effort))
+    at, (channel, read) = joints.names.index(place), _JOINT_SENSOR_ERRORS[kind]
+    wrong = {"position": joints.position.copy(), "effort": joints.effort.copy()}
+    wrong[channel][:, at] = read(joints.position[:, at], joints.effort[:, at], values)
+    return replace(recording, joints=replace(joints, position=wrong["position"], effort=wrong["effort"]))
 
 
 def _camera_error(

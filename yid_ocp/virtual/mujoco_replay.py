@@ -99,10 +99,9 @@ class _Path:
     """Recorded angles, smoothed over some samples, as a motion from the first of them."""
 
     def __init__(self, joints: tuple[str, ...], t: Array, position: Array, smoothed: float) -> None:
-        self.joints = joints
+        self.joints, self._start, self._last = joints, position[:_START].mean(axis=0), float(t[-1])
         spline = CubicSpline(t, gaussian_filter1d(position, smoothed, axis=0) if smoothed else position)
         self._values = [spline, spline.derivative(1), spline.derivative(2)]
-        self._start, self._last = position[:_START].mean(axis=0), float(t[-1])
 
     def offset_and_derivatives(self, t: float) -> tuple[Array, Array, Array]:
         """Offset from the start, velocity and acceleration at a time [s]."""
