@@ -51,7 +51,7 @@ def test_merged_bodies_weigh_what_they_weigh_together():
 
 
 def test_a_frame_that_the_file_does_not_have(urdf_folder):
-    robot = read_urdf(urdf_folder / "double_pendulum.urdf", parametric=False)
+    robot = read_urdf(urdf_folder / "double_pendulum.urdf").with_numeric_values()
     at = homogeneous_transform(np.eye(3), [0.1, 0.2, 0.3])
     more = robot.with_frame("load", "tip", at).with_frame("wall", None, at)
     tip, load = more.frame("tip"), more.frame("load")

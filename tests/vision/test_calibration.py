@@ -64,7 +64,7 @@ def still(t):
 def robot(tmp_path_factory):
     file = tmp_path_factory.mktemp("arm") / "arm.urdf"
     file.write_text(ARM)
-    tree = read_urdf(file, parametric=False)
+    tree = read_urdf(file).with_numeric_values()
     return ArticulatedSurfaces(tree, load_robot_meshes(file, tree))
 
 

@@ -20,7 +20,7 @@ from yid_ocp.vision.surface_meshes import (
 @pytest.fixture(scope="module")
 def ball(urdf_folder):
     """A ball of 0.1 m on the second joint's frame of a double pendulum, and a box in the world."""
-    tree = read_urdf(urdf_folder / "double_pendulum.urdf", parametric=False)
+    tree = read_urdf(urdf_folder / "double_pendulum.urdf").with_numeric_values()
     placed = np.eye(4)
     placed[:3, 3] = [0.0, 5.0, 0.0]
     return ArticulatedSurfaces(
@@ -99,7 +99,7 @@ def test_tubes_have_their_lengths_and_radii(system):
 
 
 def test_what_cannot_be_seen_is_said(tmp_path, urdf_folder):
-    tree = read_urdf(urdf_folder / "double_pendulum.urdf", parametric=False)
+    tree = read_urdf(urdf_folder / "double_pendulum.urdf").with_numeric_values()
     with pytest.raises(DataError, match="no object"):
         tube_meshes_by_joint(System.build(tree))
     with pytest.raises(ModelError, match="no URDF file"):

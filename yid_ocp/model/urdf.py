@@ -95,7 +95,6 @@ def read_urdf(
     path: str | Path,
     joints: Sequence[str] | None = None,
     locked: Mapping[str, float] | None = None,
-    parametric: bool = True,
     exclude_links: Sequence[str] = (),
 ) -> Mechanism:
     """A mechanism from a URDF file with the chosen joints kept and the others locked.
@@ -109,15 +108,14 @@ def read_urdf(
         first; all movable ones when absent.
     locked : mapping of str to float, optional
         Value at which a joint that is not kept is locked [rad or m]; zero, or the nearest bound, when absent.
-    parametric : bool
-        Whether each kept joint's bodies get the parameter `joint.mass` [kg] (inertia in proportion).
     exclude_links : sequence of str
         Links to leave out with all that hangs on them, such as a tool that is not mounted.
 
     Returns
     -------
     Mechanism
-        Links without a kept joint above them are fixed to the world. Every link is a frame of its name.
+        Each kept joint's bodies have the parameter `JOINT.mass` [kg] (inertia in proportion). Links without a kept
+        joint above them are fixed to the world. Every link is a frame of its name.
 
     Raises
     ------
@@ -148,7 +146,7 @@ def read_urdf(
     for entry in order:
         carrier, at, source = placed[entry]
         carried = merge_bodies(bodies.get(entry, ()))
-        if carried is not None and parametric:
+        if carried is not None:
             mass = float(carried.mass)
             parameter = Parameter(f"{entry}.mass", mass, "kg", 0.0, math.inf, f"mass of what {entry} carries")
             parameters.append(parameter)
@@ -383,7 +381,7 @@ def mechanism_to_urdf(mechanism: Mechanism, values: Mapping[str, float] | None =
     """URDF text of a mechanism: one link per joint, named frames as links on fixed joints.
 
     Bodies are merged into one inertial per link. Placements keep full precision. Reading the text back with
-    `read_urdf(..., parametric=False)` gives the same numbers to 1e-12.
+    `read_urdf` gives the same numbers to 1e-12.
     """
     mechanism = mechanism.with_numeric_values(values)
     robot = ElementTree.Element("robot", name=mechanism.name)

@@ -256,7 +256,6 @@ def mujoco_xml(
     values: Mapping[str, float] | None = None,
     *,
     time_step: float = 5e-4,
-    integrator: str = "implicitfast",
     emulate: bool = False,
     actuators: bool = False,
     gear_play: Mapping[str, float] | None = None,
@@ -275,9 +274,6 @@ def mujoco_xml(
         Parameter values by name; nominal where absent.
     time_step : float
         Of the simulator [s]; grasps are held with a time constant of two steps.
-    integrator : str
-        `implicitfast`, `implicit`, `Euler` or `RK4`; the twist of a thin tube has a damping time of some 10 us,
-        which an explicit one cannot follow.
     emulate : bool
         Whether approximations are allowed: sticking dry friction for a smoothed one, a tendon for a compliant point
         grasp. Refused otherwise.
@@ -306,7 +302,8 @@ def mujoco_xml(
     SubElement(root, "compiler", angle="radian", autolimits="false", inertiafromgeom="false")
     # the Newton solver of MuJoCo 4.0 does not converge on fine chains in its sparse form
     search = {"iterations": "100", "tolerance": "1e-14", "jacobian": "dense"}
-    rules = {"timestep": xml_numbers([time_step]), "integrator": integrator}
+    # the twist of a thin tube has a damping time of some 10 us, which an explicit rule cannot follow
+    rules = {"timestep": xml_numbers([time_step]), "integrator": "implicitfast"}
     rules["gravity"] = xml_numbers(value(system.gravity))
     option = SubElement(root, "option", {**rules, **search})
     SubElement(option, "flag", contact="disable")
