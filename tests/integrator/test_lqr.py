@@ -15,7 +15,7 @@ from yid_ocp.model import Segment, System, flexible_object, forward_kinematics
 from yid_ocp.model.kinematics import mass_matrix, rigid_body_derivatives
 from yid_ocp.model.urdf import read_urdf
 
-ANGLE, RATE, TORQUE = 0.02, 0.3, 1.5
+ANGLE, RATE, TORQUE = 0.02, 0.3, 1.0
 STEPS, TIME_STEP = 300, 5e-3
 
 
@@ -53,7 +53,7 @@ def test_gains_far_from_the_end_solve_the_riccati_equation(step, robot):
     inertia, by_q = (np.array(ca.densify(x)) for x in function(posture, [0, 0]))
     torque = np.tile(-by_q.ravel(), (STEPS, 1))
     theta = step.system.parameters.vector()
-    loop = lqr_feedback(step, np.tile(posture, (STEPS + 1, 1)), torque, theta, ANGLE, RATE, TORQUE)
+    loop = lqr_feedback(step, np.tile(posture, (STEPS + 1, 1)), torque, theta)
     n = step.system.n_coordinates
     np.testing.assert_array_equal(loop.state_indices, [0, 1, n, n + 1])
 
@@ -73,7 +73,7 @@ def test_gains_far_from_the_end_solve_the_riccati_equation(step, robot):
 def test_the_reference_is_a_motion_of_the_arm_alone(step, motion):
     """It holds the angles and, by the arm's own equations, the momenta; the first one from a standing start."""
     _, torque, swung = motion
-    loop = lqr_feedback(step, swung.state[:, :2], torque, step.system.parameters.vector(), ANGLE, RATE, TORQUE)
+    loop = lqr_feedback(step, swung.state[:, :2], torque, step.system.parameters.vector())
     np.testing.assert_allclose(loop.reference[1:], swung.state[1:-1], rtol=0, atol=1e-9)
 
 

@@ -61,6 +61,7 @@ _HOLD_STIFFNESS_WITH_TORQUE = 1e3
 # derivatives by the command are those by the posture over it.
 _HOLD_STIFFNESS_WITH_COMMAND = 1e-9
 
+_REST_TOLERANCE = 1e-10  # imbalance [N m] and constraint violation [m] up to which all is at rest
 _ENERGY_ITERATION_LIMIT = 300  # of the search for the lowest energy
 _MIN_RECIPROCAL_CONDITION = 1e-14  # reciprocal of the condition beyond which equations have no solution of their own
 _MAX_HOLD_DEFLECTION = 0.02  # of a holding spring, by more than which the posture does not fit the grasp [rad]
@@ -96,7 +97,6 @@ class EquilibriumSolver:
         torque: ArrayLike | None = None,
         guess: ArrayLike | None = None,
         names: Sequence[str] = (),
-        tolerance: float = 1e-10,
     ) -> Equilibrium:
         """Find the equilibrium for given driven and prescribed coordinates.
 
@@ -111,8 +111,6 @@ class EquilibriumSolver:
             Configuration to start from; the undeformed object when absent.
         names : sequence of str
             Parameters by which to differentiate.
-        tolerance : float
-            Largest imbalance [N m] and constraint violation [m] that counts as rest.
 
         Returns
         -------
@@ -129,7 +127,7 @@ class EquilibriumSolver:
         count = len(self.free_coordinates) + nz
         best: tuple[bool, float, float, Array] | None = None
         for start in self._guesses(given, guess):
-            w, error, converged = step.kernel.find_equilibrium(theta, start, given, held, stiffness, tolerance)
+            w, error, converged = step.kernel.find_equilibrium(theta, start, given, held, stiffness, _REST_TOLERANCE)
             inner = w[count - nz : count]
             energy = float(self._energy(ca.DM(self._configuration(w, given)), inner, hold, theta))
             found = (not converged, energy if converged else error, error, w)
@@ -142,7 +140,7 @@ class EquilibriumSolver:
         if failed and guess is None:
             lowest = self._lowest_energy(theta, hold)
             if lowest is not None:
-                return self.solve(posture, theta, torque, lowest, names, tolerance)
+                return self.solve(posture, theta, torque, lowest, names)
         q = self._configuration(w, given)
         give = hold.give(q, system)
         state, by_theta, by_posture = self._differentiate(w, q, theta, hold, tuple(names))

@@ -22,8 +22,8 @@ from yid_ocp.parallel import LockedCache
 
 Array = NDArray[np.float64]
 _Wanted = Sequence[tuple[int, int]]  # a column of derivatives, and which of the parameters it is by
-_NEWTON_ITERATIONS = 5
-"""Newton iterations for a law of an internal coordinate that is nonlinear in its next value."""
+_NEWTON_ITERATIONS = 5  # for a law of an internal coordinate that is nonlinear in its next value
+_ANGLE_STD, _RATE_STD, _TORQUE_STD = 0.02, 0.3, 1.0  # errors that weigh the same in the LQR [rad], [rad/s], [N m]
 
 
 def proportional_feedback(step: Step, measured: ArrayLike, gains: ArrayLike) -> TrackingFeedback:
@@ -50,16 +50,14 @@ def lqr_feedback(
     measured: ArrayLike,
     torque: ArrayLike,
     theta: ArrayLike,
-    angle_std: ArrayLike = 0.02,
-    rate_std: float = 0.3,
-    torque_std: ArrayLike = 1.0,
     arms: Step | None = None,
 ) -> TrackingFeedback:
     """Feedback of a finite-horizon LQR of the driven arms, linearised about their measured motion.
 
-    Minimises the sum of |dq|^2/angle_std^2 + |M^-1 dp|^2/rate_std^2 + |du|^2/torque_std^2 over the recording for the
-    arms without the object; the gains act on the arms' angles and momenta. The reference momentum follows from the
-    measured angles and torques by the arms' own DEL equations, so that it means the same as the model's.
+    Minimises the sum of |dq|^2/angle^2 + |M^-1 dp|^2/rate^2 + |du|^2/torque^2 over the recording for the arms without
+    the object, with the errors that weigh the same; the gains act on the arms' angles and momenta. The reference
+    momentum follows from the measured angles and torques by the arms' own DEL equations, so that it means the same as
+    the model's.
 
     Parameters
     ----------
@@ -67,8 +65,6 @@ def lqr_feedback(
         Angles of the driven joints at every node [rad], smooth enough to be differenced.
     torque : array_like, shape (N, nu)
         Measured torques [N m].
-    angle_std, rate_std, torque_std : float or array_like
-        Standard deviations that weigh the same [rad], [rad/s], [N m].
     arms : Step, optional
         From `arms_only_step`; made when absent.
 
@@ -86,8 +82,7 @@ def lqr_feedback(
     momenta = _reference_momentum(arm_step, reference, torques, arm_theta)
     steps = len(reference) - 1
 
-    weight_u = np.diag(1.0 / np.broadcast_to(np.asarray(torque_std, float), (nu,)) ** 2)
-    weight_q = np.diag(1.0 / np.broadcast_to(np.asarray(angle_std, float), (nu,)) ** 2)
+    weight_q, weight_u = (np.eye(nu) * (1.0 / std**2) for std in (_ANGLE_STD, _TORQUE_STD))
     gain = np.zeros((steps, nu, 2 * nu))
     cost: Array | None = None
     states = np.hstack([reference, momenta])[:-1]
@@ -95,7 +90,7 @@ def lqr_feedback(
     for k in reversed(range(steps)):
         a, b = by_state[k], by_torque[k]
         rate = a[:nu, nu:] / step.time_step
-        stage = scipy.linalg.block_diag(weight_q, rate.T @ rate / rate_std**2)
+        stage = scipy.linalg.block_diag(weight_q, rate.T @ rate / _RATE_STD**2)
         cost = stage if cost is None else cost
         inner = weight_u + b.T @ cost @ b
         gain[k] = np.linalg.solve(inner, b.T @ cost @ a)
