@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -285,8 +286,8 @@ def allocate_rollout(sizes: dict[str, int], steps: int, count: int | None) -> Ro
     if count is not None:
         shapes |= {name: (*shapes[name.removesuffix("_sensitivity")], count) for name in names}
     arrays = _arrays(f"a rollout of {steps} steps with {count or 0} derivatives", shapes, math.nan)
-    first = [arrays[name] for name in ("state", "multipliers", "effort", "torque")]
-    return Rollout(*first, *[arrays.get(name) for name in names], status=StepStatus(NewtonStatus.OK, 0, 0.0, 0, 0))
+    values: dict[str, Any] = dict.fromkeys(names) | arrays
+    return Rollout(**values, status=StepStatus(NewtonStatus.OK, 0, 0.0, 0, 0))
 
 
 def allocate_linearization(sizes: dict[str, int], count: int, width: int, derivatives: bool) -> StepLinearization:
