@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal, Protocol, TypedDict, Unpack, runtime_checkable
+from typing import TYPE_CHECKING, Literal, Protocol, TypedDict, runtime_checkable
 
 import casadi as ca
 import numpy as np
@@ -26,6 +26,9 @@ from yid_ocp.model.servos_and_springs import (
     joint_spring_parameters,
     without_gravity,
 )
+
+if TYPE_CHECKING:
+    from typing import Unpack  # Python 3.11
 
 _GraspKind = Literal["point", "axis", "weld"]
 _GRASP_EQUATION_NAMES: dict[str, tuple[str, ...]] = {

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Protocol, Self, runtime_checkable
+from typing import Annotated, Any, ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from annotated_types import Ge, Le
@@ -275,7 +275,7 @@ class ObjectKind:
             if any(isinstance(m, OptionInfo) and m.is_path for m in split_annotated(option.type_hint)[1])
         }
 
-    def without_folders(self) -> Self:
+    def without_folders(self) -> ObjectKind:
         """The same object with file names in place of paths, to be compared with that of another run."""
         names = {key: Path(file).name for key, file in self.input_files().items()}
         return replace(self, **names)
