@@ -47,7 +47,7 @@ def _channels(recording: Recording, *wanted: str) -> Iterator[tuple[str, str, Ar
 
 def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
     """Issues for channels that repeat one value although they are noisy elsewhere or their velocity is not zero."""
-    joints, found = recording.joints, []
+    joints = recording.joints
     for group, channel, t, values in _channels(recording, "position", "effort", "points"):
         if len(t) <= QUALITY_LIMITS.min_stuck_samples:
             continue
@@ -76,25 +76,12 @@ def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
         if quantity == "effort" and values[begin] in (0.0, np.max(values), np.min(values)):
             continue  # no effort was recorded, or it is cut off: other causes
         if evidence >= 1:
-            also = (
-                f", while its velocity turns it by {turned:.2g} rad"
-                if turned > QUALITY_LIMITS.max_unseen_rotation
-                else ""
-            )
-            found.append((group, channel, float(t[begin]), float(t[end]), evidence, also))
-    for group, channel, start, stop, evidence, also in found:
-        yield Issue(
-            "stuck",
-            f"{channel} repeats one value for {stop - start:.3g} s{also}",
-            "not_trusted",
-            evidence,
-            "leave that stretch or that channel out, and look at the sensor",
-            "",
-            group,
-            channel,
-            start,
-            stop,
-        )
+            start, stop = float(t[begin]), float(t[end])
+            what = f"{channel} repeats one value for {stop - start:.3g} s"
+            if turned > QUALITY_LIMITS.max_unseen_rotation:
+                what += f", while its velocity turns it by {turned:.2g} rad"
+            advice = "leave that stretch or that channel out, and look at the sensor"
+            yield Issue("stuck", what, "not_trusted", evidence, advice, "", group, channel, start, stop)
 
 
 def _longest_run(same: NDArray[np.bool_]) -> tuple[int, int]:
@@ -169,35 +156,21 @@ def excess_noise_issues(recording: Recording, choice: SensorChoiceLookup) -> Ite
         )
         setting = f"sensors.{'joints.' + channel.partition('.')[0] if group == 'joints' else group}.std"
         if step > 0 and (size > QUALITY_LIMITS.max_noise_ratio * stated > 0 or (few and stated == 0)):
-            yield Issue(
-                "quantised",
-                f"{channel} moves in steps of {step:.3g}, which is noise of {size:.2g}"
-                + (f"; {stated:.2g} is stated" if stated else ""),
-                "not_trusted",
-                size / (QUALITY_LIMITS.max_noise_ratio * stated) if stated else 16 * step / wide,
-                "state the noise that the steps make, or record with more digits",
-                "",
-                group,
-                channel,
-                setting=f"{setting}: {size:.2g}",
-            )
+            what = f"{channel} moves in steps of {step:.3g}, which is noise of {size:.2g}"
+            what += f"; {stated:.2g} is stated" if stated else ""
+            ratio = size / (QUALITY_LIMITS.max_noise_ratio * stated) if stated else 16 * step / wide
+            advice, line = "state the noise that the steps make, or record with more digits", f"{setting}: {size:.2g}"
+            yield Issue("quantised", what, "not_trusted", ratio, advice, "", group, channel, setting=line)
             continue
         seen = max(white_noise_std(t, column) for column in columns)
         if _clock(recording, group) == "nominal":
             # when a sample was taken is known to half a period, which looks like noise wherever something moves
             seen -= min(seen, 0.5 * max(float(np.mean(np.abs(np.diff(column)))) for column in columns))
         if seen > QUALITY_LIMITS.max_noise_ratio * stated > 0:
-            yield Issue(
-                "noise",
-                f"{channel} has noise of {seen:.2g} from sample to sample; {stated:.2g} is stated",
-                "not_trusted",
-                seen / (QUALITY_LIMITS.max_noise_ratio * stated),
-                "state the noise that is there",
-                "",
-                group,
-                channel,
-                setting=f"{setting}: {seen:.2g}",
-            )
+            what = f"{channel} has noise of {seen:.2g} from sample to sample; {stated:.2g} is stated"
+            ratio, line = seen / (QUALITY_LIMITS.max_noise_ratio * stated), f"{setting}: {seen:.2g}"
+            advice = "state the noise that is there"
+            yield Issue("noise", what, "not_trusted", ratio, advice, "", group, channel, setting=line)
 
 
 def overstated_noise_issues(recording: Recording, choice: SensorChoiceLookup) -> Iterator[Issue]:
@@ -239,18 +212,13 @@ def overstated_noise_issues(recording: Recording, choice: SensorChoiceLookup) ->
         line = f"{{{', '.join(f'{name}: {size:.2g}' for name, size in own.items())}}}"
         if len(set(own.values())) == 1 or not sensor.startswith("joints."):  # a group of points takes one number
             line = f"{max(own.values()):.2g}"
-        yield Issue(
-            "noise_overstated",
-            f"{channel} has noise of {seen_of[channel]:.2g} or less; {stated:.2g} is stated"
-            + (f", and so for {len(low)} of {len(entries)} channels" if len(low) > 1 else ""),
-            "warning",
-            stated / (QUALITY_LIMITS.max_overstatement_ratio * seen_of[channel]),
-            "state the noise that is there: as stated every ± is too wide, and a small gap is not seen",
-            "",
-            sensor.partition(".")[0],
-            channel,
-            setting=f"sensors.{sensor}.std: {line}" if len(low) == len(entries) or line[0] == "{" else "",
-        )
+        what = f"{channel} has noise of {seen_of[channel]:.2g} or less; {stated:.2g} is stated"
+        what += f", and so for {len(low)} of {len(entries)} channels" if len(low) > 1 else ""
+        ratio = stated / (QUALITY_LIMITS.max_overstatement_ratio * seen_of[channel])
+        advice = "state the noise that is there: as stated every ± is too wide, and a small gap is not seen"
+        setting = f"sensors.{sensor}.std: {line}" if len(low) == len(entries) or line[0] == "{" else ""
+        group = sensor.partition(".")[0]
+        yield Issue("noise_overstated", what, "warning", ratio, advice, "", group, channel, setting=setting)
 
 
 def _clock(recording: Recording, name: str) -> str:
@@ -276,20 +244,14 @@ def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:
                 and held >= QUALITY_LIMITS.min_clipped_samples / 2
                 and apart >= 2
             ):
-                first, last = np.flatnonzero(at)[[0, -1]]
-                yield Issue(
-                    "saturated",
-                    f"{channel} is exactly {sign * levels[-1]:.4g} N m in {at.sum()} samples and never beyond",
-                    "not_trusted",
-                    at.sum() / QUALITY_LIMITS.min_clipped_samples,
+                begin, end = map(float, t[np.flatnonzero(at)[[0, -1]]])
+                what = f"{channel} is exactly {sign * levels[-1]:.4g} N m in {at.sum()} samples and never beyond"
+                advice = (
                     "leave what is cut off out, or record within the sensor's range; where it is what a controller "
-                    "asked for, say sensors.joints.effort.kind: command",
-                    "",
-                    group,
-                    channel,
-                    float(t[first]),
-                    float(t[last]),
+                    "asked for, say sensors.joints.effort.kind: command"
                 )
+                ratio = at.sum() / QUALITY_LIMITS.min_clipped_samples
+                yield Issue("saturated", what, "not_trusted", ratio, advice, "", group, channel, begin, end)
 
 
 def median_edge_lengths(

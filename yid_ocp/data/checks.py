@@ -131,18 +131,10 @@ def _doubt(recording: Recording, t: Array, gap: int, allowed: float, said: str) 
     what = f"nothing was recorded of what drives the model for {length:.3g} s"
     if jumped:
         what = f"the clock jumps by {length - median_sample_period(t):.3g} s while the joints go on as if it had not"
-    return Issue(
-        "clock_jump" if jumped else "gap",
-        f"{what}; {said}",
-        "warning",
-        length / allowed,
-        "find what lost the samples, or list the part that is wanted as a recording of its own",
-        recording.name,
-        "joints" if joints is not None else "",
-        "t",
-        float(t[gap]),
-        float(t[gap + 1]),
-    )
+    cause, group = "clock_jump" if jumped else "gap", "joints" if joints is not None else ""
+    advice = "find what lost the samples, or list the part that is wanted as a recording of its own"
+    what, begin, end = f"{what}; {said}", float(t[gap]), float(t[gap + 1])
+    return Issue(cause, what, "warning", length / allowed, advice, recording.name, group, "t", begin, end)
 
 
 def check_recording(recording: Recording, choice: SensorChoiceLookup, driving: bool = True) -> list[Issue]:
@@ -191,18 +183,9 @@ def _units_of_time(recording: Recording) -> Iterator[Issue]:
         rate = f"a sample every {step:.4g} s"
         unit = fitting[0] if fitting else ""
         guess = f": in {unit} it would be {1 / (step * SECONDS_PER_CLOCK_UNIT[unit]):.4g} Hz" if unit else ""
-        yield Issue(
-            "time_unit",
-            f"{group.name}/t has {rate}{guess}",
-            "refused",
-            step / slowest,
-            f"write times in seconds (divide by {1 / SECONDS_PER_CLOCK_UNIT[unit]:.0e})"
-            if unit
-            else "write times in seconds",
-            "",
-            group.name,
-            "t",
-        )
+        what, advice = f"{group.name}/t has {rate}{guess}", "write times in seconds"
+        advice += f" (divide by {1 / SECONDS_PER_CLOCK_UNIT[unit]:.0e})" if unit else ""
+        yield Issue("time_unit", what, "refused", step / slowest, advice, "", group.name, "t")
 
 
 def _common_clock(recording: Recording) -> Iterator[Issue]:
@@ -216,32 +199,18 @@ def _common_clock(recording: Recording) -> Iterator[Issue]:
             far = min(abs(begin - last), abs(first - end))
             epoch = (abs(begin) > MIN_EPOCH_SECONDS) != (abs(first) > MIN_EPOCH_SECONDS)
             since = "one of them counts from 1970: " if epoch else ""
-            yield Issue(
-                "clock_base",
-                f"{since}joints were recorded from {first:.10g} to {last:.10g} s, {group.name} from {begin:.10g} to "
-                f"{end:.10g} s",
-                "refused",
-                MAX_LIMIT_RATIO if epoch else 1 + far / max(last - first, 1e-9),
-                "write the times of all groups on one clock",
-                "",
-                group.name,
-                "t",
-            )
+            spans = f"from {first:.10g} to {last:.10g} s, {group.name} from {begin:.10g} to {end:.10g} s"
+            ratio = MAX_LIMIT_RATIO if epoch else 1 + far / max(last - first, 1e-9)
+            what, advice = f"{since}joints were recorded {spans}", "write the times of all groups on one clock"
+            yield Issue("clock_base", what, "refused", ratio, advice, "", group.name, "t")
             continue
         slack = max(QUALITY_LIMITS.max_clock_mismatch_fraction * (last - first), 5 * median_sample_period(group.t))
         late, over = begin - first, end - last
         shift = min(late, over) if late > 0 else max(late, over)
         if late * over > 0 and abs(shift) > slack:
-            yield Issue(
-                "clock_offset",
-                f"{group.name} begins {late:+.3g} s from the joints and ends {over:+.3g} s from them",
-                "not_trusted",
-                abs(shift) / slack,
-                "shift its times to the joints' clock",
-                "",
-                group.name,
-                "t",
-            )
+            what = f"{group.name} begins {late:+.3g} s from the joints and ends {over:+.3g} s from them"
+            advice = "shift its times to the joints' clock"
+            yield Issue("clock_offset", what, "not_trusted", abs(shift) / slack, advice, "", group.name, "t")
 
 
 def _dropped(recording: Recording, driving: bool) -> Iterator[Issue]:
@@ -258,16 +227,10 @@ def _dropped(recording: Recording, driving: bool) -> Iterator[Issue]:
     small = count[count < 50]  # what is longer is a gap
     missing = float(np.sum(small - 1) / np.sum(small))
     if even > 0.9 and missing > QUALITY_LIMITS.max_missing_fraction:
-        yield Issue(
-            "dropped_samples",
-            f"{100 * missing:.2g} % of the samples of a clock of {1 / base:.4g} Hz are missing",
-            "warning",
-            missing / QUALITY_LIMITS.max_missing_fraction,
-            "find what lost them; between those that are left the recorded torques are interpolated",
-            "",
-            "joints",
-            "t",
-        )
+        what = f"{100 * missing:.2g} % of the samples of a clock of {1 / base:.4g} Hz are missing"
+        advice = "find what lost them; between those that are left the recorded torques are interpolated"
+        ratio = missing / QUALITY_LIMITS.max_missing_fraction
+        yield Issue("dropped_samples", what, "warning", ratio, advice, "", "joints", "t")
 
 
 # -- motion -----------------------------------------------------------------------------------------------------------
@@ -307,37 +270,22 @@ def _velocities(recording: Recording) -> Iterator[Issue]:
     typical = float(np.median(ratio[known]))
     alike = bool(len(wrong) == len(known) and np.all(np.abs(ratio[known] / typical - 1) < 0.2))
     if alike and typical > 0 and len(known) >= min(2, len(names)):
-        degrees = abs(typical / DEGREES_PER_RADIAN - 1) < 0.1
-        yield Issue(
-            "degrees" if degrees else "time_scale",
-            f"all angles turn {typical:.3g} times as fast as the recorded velocities say",
-            "not_trusted",
-            max(typical, 1 / typical) / QUALITY_LIMITS.max_rate_ratio,
-            "convert angles to radians"
-            if degrees
-            else f"multiply times by {typical:.3g}, or find what is wrong with velocities",
-            "",
-            "joints",
-            "position" if degrees else "t",
-        )
+        cause, channel = "time_scale", "t"
+        advice = f"multiply times by {typical:.3g}, or find what is wrong with velocities"
+        if abs(typical / DEGREES_PER_RADIAN - 1) < 0.1:
+            cause, channel, advice = "degrees", "position", "convert angles to radians"
+        what = f"all angles turn {typical:.3g} times as fast as the recorded velocities say"
+        ratio_beyond = max(typical, 1 / typical) / QUALITY_LIMITS.max_rate_ratio
+        yield Issue(cause, what, "not_trusted", ratio_beyond, advice, "", "joints", channel)
         return
     for j in wrong:
-        cause = (
-            "angle_sign"
-            if ratio[j] < 0 and abs(abs(ratio[j]) - 1) < QUALITY_LIMITS.max_rate_ratio - 1
-            else "angle_scale"
-        )
-        size = abs(ratio[j])
-        yield Issue(
-            cause,
-            f"the angle of {names[j]} turns {ratio[j]:.3g} times as fast as its recorded velocity says",
-            "not_trusted",
-            MAX_LIMIT_RATIO if cause == "angle_sign" else max(size, 1 / size) / QUALITY_LIMITS.max_rate_ratio,
-            f"divide the angle of {names[j]} by {ratio[j]:.3g}",
-            "",
-            "joints",
-            f"position.{names[j]}",
-        )
+        size, cause = abs(ratio[j]), "angle_scale"
+        evidence = max(size, 1 / size) / QUALITY_LIMITS.max_rate_ratio
+        if ratio[j] < 0 and abs(size - 1) < QUALITY_LIMITS.max_rate_ratio - 1:
+            cause, evidence = "angle_sign", MAX_LIMIT_RATIO
+        what = f"the angle of {names[j]} turns {ratio[j]:.3g} times as fast as its recorded velocity says"
+        advice = f"divide the angle of {names[j]} by {ratio[j]:.3g}"
+        yield Issue(cause, what, "not_trusted", evidence, advice, "", "joints", f"position.{names[j]}")
 
 
 def _exchanged(names: Sequence[str], by_angle: Array, by_velocity: Array, fit: Array, ratio: Array) -> Iterator[Issue]:
@@ -347,16 +295,10 @@ def _exchanged(names: Sequence[str], by_angle: Array, by_velocity: Array, fit: A
         for j in off[place + 1 :]:
             across = [float(np.corrcoef(by_angle[:, a], by_velocity[:, b])[0, 1]) for a, b in ((i, j), (j, i))]
             if min(across) > 0.9:
-                yield Issue(
-                    "swapped_joints",
-                    f"the angle of {names[i]} turns as the velocity of {names[j]} says, and the other way round",
-                    "not_trusted",
-                    min(across) / max(abs(fit[i]), abs(fit[j]), 1e-3),
-                    "exchange the two columns",
-                    "",
-                    "joints",
-                    f"position.{names[i]}",
-                )
+                what = f"the angle of {names[i]} turns as the velocity of {names[j]} says, and the other way round"
+                evidence, advice = min(across) / max(abs(fit[i]), abs(fit[j]), 1e-3), "exchange the two columns"
+                channel = f"position.{names[i]}"
+                yield Issue("swapped_joints", what, "not_trusted", evidence, advice, "", "joints", channel)
 
 
 def _standstill(recording: Recording) -> Iterator[Issue]:
@@ -371,14 +313,9 @@ def _standstill(recording: Recording) -> Iterator[Issue]:
         noise = 6 * float(np.median(known)) if len(known) else 0.0
         moved.append(size / max(QUALITY_LIMITS.min_point_travel, noise))
     if max(moved, default=2.0) < 1.0:
-        yield Issue(
-            "standstill",
-            f"no joint turns by {QUALITY_LIMITS.min_joint_motion:g} rad and no point moves by more than its noise",
-            "warning",
-            1 / max(*moved, 1e-3),
-            "record a motion; what a posture at rest says is all that can be found",
-            "",
-        )
+        what = f"no joint turns by {QUALITY_LIMITS.min_joint_motion:g} rad and no point moves by more than its noise"
+        advice = "record a motion; what a posture at rest says is all that can be found"
+        yield Issue("standstill", what, "warning", 1 / max(*moved, 1e-3), advice, "")
 
 
 def _smoothed(values: Array) -> Array:
@@ -418,11 +355,5 @@ def duplicate_data_issue(one: Recording, other: Recording) -> Issue | None:
     few = min(len(group.t) for recording in (one, other) for group in recording.groups[:1])
     if count < min(QUALITY_LIMITS.min_shared_samples, 0.5 * few):
         return None
-    return Issue(
-        "same_data",
-        f"{count} samples of {other.name} are those of {one.name} to the last digit",
-        "warning",
-        MAX_LIMIT_RATIO,
-        "list every measurement once",
-        other.name,
-    )
+    what = f"{count} samples of {other.name} are those of {one.name} to the last digit"
+    return Issue("same_data", what, "warning", MAX_LIMIT_RATIO, "list every measurement once", other.name)
