@@ -193,7 +193,7 @@ def recording_summary_lines(recording: Recording) -> list[str]:
     """Text lines on the contents of a recording."""
     rows: TableRows = [("group", "samples", "names")]
     for group in recording.all_groups:
-        rows.append((getattr(group, "name", "joints"), str(len(group.t)), ", ".join(group.names)))
+        rows.append((group.name, str(len(group.t)), ", ".join(group.names)))
     return [*aligned_table_lines(rows), "", f"{recording.duration:g} s", *_note_lines(recording.notes)]
 
 

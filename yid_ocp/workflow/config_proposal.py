@@ -192,7 +192,7 @@ def propose_config(
         _noise(first, recorded, joints),
         _time_step(period),
         min(10.0, 0.2 / period),
-        {getattr(group, "name", "joints"): _clock(group.t, group.clock) for group in first.groups},
+        {group.name: _clock(group.t, group.clock) for group in first.groups},
         tuple(name for name in joints if max(_travel(r, [name]) for r in recordings) < _MIN_FRICTION_TRAVEL),
     )
 

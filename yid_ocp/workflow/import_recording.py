@@ -59,10 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def recording_contents(recording: Recording) -> dict[str, Any]:
     """Contents of a recording as plain data: duration, groups and notes."""
-    groups = {
-        getattr(group, "name", "joints"): {"samples": len(group.t), "names": list(group.names)}
-        for group in recording.all_groups
-    }
+    groups = {group.name: {"samples": len(group.t), "names": list(group.names)} for group in recording.all_groups}
     return {"duration": recording.duration, "groups": groups, "notes": list(recording.notes)}
 
 

@@ -73,7 +73,7 @@ def run_simulate(
             result |= {"status": "failed", "message": made}
         else:
             write_recording(recording, folder.path / "recording.h5")
-            groups = {getattr(g, "name", "joints"): {"samples": len(g.t)} for g in recording.all_groups}
+            groups = {g.name: {"samples": len(g.t)} for g in recording.all_groups}
             truth = dict(recording.true_parameters)
             result |= {"duration": recording.duration, "groups": groups, "truth": truth}
         written = folder.write_result(result)
