@@ -46,8 +46,7 @@ if TYPE_CHECKING:
 
     __version__: str
 
-# One row for each module; what a later part of the package offers (identifiability, diagnose, compare) is entered
-# here and imported above.
+# what is entered here is imported above as well
 _HOMES: dict[str, tuple[str, ...]] = {
     "analysis.identifiability": ("identifiability",),
     "analysis.step_symbols": ("StepSymbols",),

@@ -16,6 +16,7 @@ import tempfile
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from typing import Any, NoReturn
 
@@ -74,10 +75,6 @@ def _working(parser: argparse.ArgumentParser, absent: str = "as many as there ar
     parser.add_argument("--workers", metavar="N", type=int, help=text)
     text = "HOST:PORT of a Dask scheduler, or its scheduler file, whose workers do the work instead"
     parser.add_argument("--scheduler", metavar="ADDRESS", default="", help=text)
-
-
-def _solve(parser: argparse.ArgumentParser) -> None:
-    _doubting(parser, optional=True)
 
 
 def _diagnose(parser: argparse.ArgumentParser) -> None:
@@ -143,10 +140,8 @@ def _simulate(parser: argparse.ArgumentParser) -> None:
 
 def _inspect(parser: argparse.ArgumentParser) -> None:
     _configured(parser)
-    text = (
-        "print an equation, with ROW, COLUMN its derivative, such as 'del[T1_0_x], q1[T1_0_x]', or where a parameter "
-    )
-    text += "enters; may be repeated"
+    text = "print an equation, with ROW, COLUMN its derivative, such as 'del[T1_0_x], q1[T1_0_x]', or where a "
+    text += "parameter enters; may be repeated"
     parser.add_argument("--entry", metavar="ROW[, COLUMN]", action="append", default=[], dest="entries", help=text)
     text = "folder for the equations as CasADi functions, C and a LaTeX sheet"
     parser.add_argument("--export", metavar="DIR", help=text)
@@ -201,10 +196,9 @@ def _init(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--replace", action="store_true", help="write over files that are there")
     text = "what is held, such as cable, beam, tree or foam_y, the paper's; an unknown word lists all"
     parser.add_argument("--object", metavar="KIND", required=True, help=text)
-    for name, text in (("length", "[m]"), ("mass", "[kg]"), ("radius", "[m]")):
-        parser.add_argument(
-            f"--{name}", type=float, metavar="NUMBER", help=f"of the object, of each equal branch {text}"
-        )
+    for name, unit in (("length", "m"), ("mass", "kg"), ("radius", "m")):
+        text = f"of the object, of each equal branch [{unit}]"
+        parser.add_argument(f"--{name}", type=float, metavar="NUMBER", help=text)
     parser.add_argument("--section", metavar="X,Y", help="extents of a rectangular cross section [m], not a radius")
     text = "further number of some kinds of objects; an unknown name lists them; may be repeated"
     parser.add_argument("--number", metavar="NAME=VALUE", action="append", default=[], help=text)
@@ -247,7 +241,7 @@ def _schema(parser: argparse.ArgumentParser) -> None:
 
 COMMANDS: tuple[CliCommand, ...] = (
     CliCommand("init", "write a commented configuration from a robot and recordings of it", "init", _init),
-    CliCommand("solve", "estimate the free parameters from recordings", "solve", _solve),
+    CliCommand("solve", "estimate the free parameters from recordings", "solve", partial(_doubting, optional=True)),
     CliCommand("compare", "run several methods on one problem and say whether they agree", "compare", _doubting),
     CliCommand(
         "identifiability",
