@@ -6,6 +6,17 @@ import pytest
 
 from yid_ocp.cli import main
 
+PENDULUM = """\
+model:
+  robot: {urdf}
+  springs:
+    elbow: {{stiffness: 3.0, rest_position: 0.1}}
+  arms: {{mode: prescribed, passive_joints: [elbow]}}
+  damping: 0.2
+  points: [{points}]
+parameters:
+  elbow.stiffness: {{free: true}}
+"""
 LIMITS = '<limit lower="-1.2" upper="1.2" effort="40" velocity="6"/>'
 
 
@@ -24,6 +35,18 @@ def moved(limited_urdf):
     from small_problems import pendulum_step
 
     return pendulum_step(limited_urdf.parent, prescribed=("shoulder",))
+
+
+@pytest.fixture
+def pendulum(limited_urdf, tmp_path):
+    """Write a configuration of the pendulum with more lines."""
+
+    def write(more, points="tip"):
+        file = tmp_path / "pendulum.yaml"
+        file.write_text(PENDULUM.format(urdf=limited_urdf, points=points) + more)
+        return file
+
+    return write
 
 
 @pytest.fixture

@@ -17,33 +17,22 @@ from yid_ocp.report.summaries import plan_summary
 from yid_ocp.report.terminal import terminal_lines
 from yid_ocp.workflow.plan import next_plan_settings, run_plan
 
-CONFIG = """\
-model:
-  robot: {urdf}
-  springs:
-    elbow: {{stiffness: 3.0, rest_position: 0.1}}
-  arms: {{mode: prescribed, passive_joints: [elbow]}}
-  damping: 0.2
-  points: [tip, lower]
-recordings: {{estimate: [{recording}]}}
-parameters:
-  elbow.stiffness: {{free: true}}
-  elbow.damping: {{free: true}}
-problem: {{use_compiler: false, path_cutoff: 15.0, feedback: none}}
+PLAN = """\
+  elbow.damping: {free: true}
+recordings: {estimate: [RECORDING]}
+problem: {use_compiler: false, path_cutoff: 15.0, feedback: none}
 plan:
-  {{goal: information, duration: 0.8, hold_duration: 0.4, n_spline_coefficients: 3, n_random_starts: 2,
-    limits: {{max_acceleration: 15.0}}}}
+  {goal: information, duration: 0.8, hold_duration: 0.4, n_spline_coefficients: 3, n_random_starts: 2,
+    limits: {max_acceleration: 15.0}}
 """
 PAIR = ("joint_coulomb@shoulder", "joint_viscous@shoulder")
 
 
 @pytest.fixture
-def config(limited_urdf, tmp_path):
+def config(limited_urdf, pendulum, tmp_path):
     recording = tmp_path / "recording.h5"
     write_recording(taken(pendulum_step(limited_urdf.parent, prescribed=("shoulder",)), 3, steps=140), recording)
-    file = tmp_path / "pendulum.yaml"
-    file.write_text(CONFIG.format(urdf=limited_urdf, recording=recording))
-    return file
+    return pendulum(PLAN.replace("RECORDING", str(recording)), "tip, lower")
 
 
 def diagnosed(folder, stiffness, verdict="confusable"):

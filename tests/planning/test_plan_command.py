@@ -15,27 +15,16 @@ from yid_ocp.data import read_recording
 from yid_ocp.workflow.plan import compile_planning_step, identified_parameters, run_plan
 from yid_ocp.workflow.simulate import run_simulate
 
-CONFIG = """\
-model:
-  robot: {urdf}
-  springs:
-    elbow: {{stiffness: 3.0, rest_position: 0.1}}
-  arms: {{mode: prescribed, passive_joints: [elbow]}}
-  damping: 0.2
-  points: [tip]
-parameters:
-  elbow.stiffness: {{free: true}}
-problem: {{use_compiler: false, path_cutoff: .inf}}
-plan: {{point: tip, target_offset: [0.0, 0.15, 0.04], start_joint_positions: {{shoulder: 0.2}}, duration: 0.7,
-  hold_duration: 0.3, position_tolerance: 0.02}}
+PLAN = """\
+problem: {use_compiler: false, path_cutoff: .inf}
+plan: {point: tip, target_offset: [0.0, 0.15, 0.04], start_joint_positions: {shoulder: 0.2}, duration: 0.7,
+  hold_duration: 0.3, position_tolerance: 0.02}
 """
 
 
 @pytest.fixture
-def config(limited_urdf, tmp_path):
-    file = tmp_path / "pendulum.yaml"
-    file.write_text(CONFIG.format(urdf=limited_urdf))
-    return file
+def config(pendulum):
+    return pendulum(PLAN)
 
 
 def solved(folder, stiffness, std, status="converged", **more):

@@ -50,7 +50,7 @@ def main() -> None:
     pose, clouds = made.sequence.camera_pose, []
     for i, q in enumerate(made.true_configurations):
         points = made.sequence.load_world_cloud(i)
-        cloud = voxel_averages(points[region.bounds_at(q, pose[:3, 3]).contains(points)], VOXEL)
+        cloud = voxel_averages(points[region.membership_at(q, pose[:3, 3])(points)], VOXEL)
         cloud = cloud.select(is_not_outlier(cloud, 12, 4.0))
         cloud = cloud.select(~robot.is_within_distance(cloud.points, q, 0.03))
         clouds.append((cloud.points - pose[:3, 3]) @ pose[:3, :3])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.errors import ConfigError
-from yid_ocp.vision import CloudFilterOptions
+from yid_ocp.vision import CloudFilterOptions, ShapeFitOptions, SkeletonOptions, TrackOptions
 from yid_ocp.vision.point_cloud import (
     ObjectRegion,
     is_not_outlier,
@@ -61,7 +61,7 @@ def test_the_robot_goes_with_its_padding(system, run):
 
 
 def test_where_the_object_can_be(system, run):
-    region = ObjectRegion(system, CloudFilterOptions()).bounds_at(run.q[0], CAMERA)
+    region = ObjectRegion(system, CloudFilterOptions()).membership_at(run.q[0], CAMERA)
     foot = np.array([0.85, 0.0, -0.93])
     inside = {
         "floor": foot + np.array([0.3, 0.0, 0.02]),
@@ -69,17 +69,28 @@ def test_where_the_object_can_be(system, run):
         "beyond reach": foot + np.array([0.0, 1.2, 1.4]),
     }
     for reason, point in inside.items():
-        assert not region.contains(point[None])[0], reason
-    assert region.contains(run.point_positions.reshape(-1, 3)).all()
-    assert region.contains((foot + np.array([0.0, 0.0, 0.1]))[None]).all()
+        assert not region(point[None])[0], reason
+    assert region(run.point_positions.reshape(-1, 3)).all()
+    assert region((foot + np.array([0.0, 0.0, 0.1]))[None]).all()
     box = CloudFilterOptions(
         box_lower=(0.5, -2.0, -2.0), box_upper=(2.0, 2.0, 0.0), floor_height=-0.9, max_depth_behind_base=None
     )
-    region = ObjectRegion(system, box).bounds_at(run.q[0], CAMERA)
+    region = ObjectRegion(system, box).membership_at(run.q[0], CAMERA)
     points = np.array([[0.85, 0.0, -0.1], [0.4, 0.0, -0.1], [0.85, 0.0, 0.1], [0.85, 0.0, -0.91]])
-    assert region.contains(points).tolist() == [True, False, False, False]
+    assert region(points).tolist() == [True, False, False, False]
 
 
-def test_options_are_checked():
-    with pytest.raises(ConfigError, match="padding = -1"):
-        CloudFilterOptions(robot_padding=-1.0)
+@pytest.mark.parametrize(
+    ("options", "wrong"),
+    [
+        (CloudFilterOptions, {"robot_padding": -1.0}),
+        (SkeletonOptions, {"segment_neighbours": 1}),
+        (SkeletonOptions, {"neighbour_radius": 0.0}),
+        (TrackOptions, {"max_distance_in_radii": 0.0}),
+        (ShapeFitOptions, {"surface_noise_std": 0.0}),
+    ],
+)
+def test_options_are_checked(options, wrong):
+    [(name, value)] = wrong.items()
+    with pytest.raises(ConfigError, match=f"{name} = {value:g}"):
+        options(**wrong)

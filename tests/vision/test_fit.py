@@ -182,7 +182,6 @@ def test_what_cannot_be_fitted_is_said(whole, urdf_folder):
     for error, message, ask in (
         (DataError, "no object", lambda: ShapeFitter(System.build(read_urdf(urdf_folder / "double_pendulum.urdf")))),
         (DataError, "no point", lambda: whole.fit_frame(sight, whole.rest_configuration)),
-        (ConfigError, "surface_noise_std = 0", lambda: ShapeFitOptions(surface_noise_std=0.0)),
         (ConfigError, "no pass", lambda: ShapeFitOptions(node_loss_scales=(), surface_loss_scales=())),
     ):
         with pytest.raises(error, match=message):

@@ -106,17 +106,24 @@ def test_damaged_clouds_are_refused(folder, name, make, message):
         read_frames(folder).load_cloud(0)
 
 
-def test_a_lens_with_distortion_survives_the_disk(tmp_path):
-    camera = CameraIntrinsics(8, 6, 10.0, 10.0, 3.5, 2.5, "equidistant", (0.01, 0.0, 0.0, 0.0))
-    depth = np.full((6, 8), 1.5)
+@pytest.mark.parametrize("lens", [(), ("equidistant", (0.01, 0.0, 0.0, 0.0))])
+def test_depth_images_and_their_lens_survive_the_disk(tmp_path, lens):
+    camera, depth = CameraIntrinsics(8, 6, 10.0, 10.0, 3.5, 2.5, *lens), np.linspace(1.0, 2.0, 48).reshape(6, 8)
+    depth[0, :3] = np.nan
     sequence = FrameSequence(np.array([0.1]), ("a",), POSE, lambda i: camera.points_from_depth(depth), camera)
-    write_frame_folder(sequence, tmp_path / "sequence", depth=[depth])
-    again = read_frames(tmp_path / "sequence")
+    folder = tmp_path / "sequence"
+    write_frame_folder(sequence, folder, depth=[depth])
+    again = read_frames(folder)
     assert again.intrinsics == camera
     assert np.allclose(again.load_cloud(0), sequence.load_cloud(0), atol=1e-3)
-    changed(tmp_path / "sequence", intrinsics={**again.intrinsics.__dict__, "coefficients": ["far"]})
+    changed(folder, intrinsics={**again.intrinsics.__dict__, "coefficients": ["far"]})
     with pytest.raises(DataError, match="coefficients are"):
-        read_frames(tmp_path / "sequence")
+        read_frames(folder)
+    changed(folder, intrinsics=None)
+    with pytest.raises(DataError, match="intrinsics are missing"):
+        read_frames(folder)
+    with pytest.raises(OutputError, match="intrinsics"):
+        write_frame_folder(FrameSequence.from_clouds([0.1], [CLOUD], POSE), tmp_path / "other", depth=[depth])
 
 
 def test_units_and_frames_of_clouds(folder):
@@ -125,22 +132,6 @@ def test_units_and_frames_of_clouds(folder):
     assert np.allclose(read_frames(folder, unit="m").load_cloud(0), CLOUD, atol=1e-6)
     changed(folder, unit="m", frame="world")
     assert np.allclose(read_frames(folder).load_world_cloud(0), CLOUD, atol=1e-6)
-
-
-def test_depth_images(tmp_path):
-    camera = CameraIntrinsics(8, 6, 10.0, 10.0, 3.5, 2.5)
-    depth = np.linspace(1.0, 2.0, 48).reshape(6, 8)
-    depth[0, :3] = np.nan
-    sequence = FrameSequence(np.array([0.1]), ("a",), POSE, lambda i: camera.points_from_depth(depth), camera)
-    write_frame_folder(sequence, tmp_path / "sequence", depth=[depth])
-    again = read_frames(tmp_path / "sequence")
-    assert again.intrinsics == camera
-    assert np.allclose(again.load_cloud(0), sequence.load_cloud(0), atol=1e-3)
-    changed(tmp_path / "sequence", intrinsics=None)
-    with pytest.raises(DataError, match="intrinsics are missing"):
-        read_frames(tmp_path / "sequence")
-    with pytest.raises(OutputError, match="intrinsics"):
-        write_frame_folder(FrameSequence.from_clouds([0.1], [CLOUD], POSE), tmp_path / "other", depth=[depth])
 
 
 @pytest.mark.parametrize(

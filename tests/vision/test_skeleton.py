@@ -1,9 +1,7 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
-from yid_ocp.errors import ConfigError
 from yid_ocp.vision import SkeletonOptions
 from yid_ocp.vision.point_cloud import WeightedCloud, extract_skeleton
 
@@ -96,10 +94,3 @@ def test_points_at_one_place_do_not_hang_it():
     )
     lonely = SkeletonOptions(neighbour_radius=0.01, min_segment_points=1)
     assert len(extract_skeleton(ring, np.random.default_rng(0), lonely).nodes)
-
-
-def test_options_are_checked():
-    with pytest.raises(ConfigError, match="neighbours = 1"):
-        SkeletonOptions(segment_neighbours=1)
-    with pytest.raises(ConfigError, match="radius = 0"):
-        SkeletonOptions(neighbour_radius=0.0)

@@ -41,7 +41,7 @@ _MIN_VISIBLE_MOTION = 1e-4  # of a point that a camera may see, for a change of 
 
 
 @dataclass(frozen=True)
-class ParameterPrecision:
+class _ParameterPrecision:
     """Relative standard deviations of a parameter, from the existing recordings, from the planned one and from both.
 
     Infinite without information. The verdict is that from the planned recording alone.
@@ -55,30 +55,17 @@ class ParameterPrecision:
 
 @dataclass(frozen=True, eq=False)
 class InformativeMotionPlan(PlannedMotion):
-    """The most informative motion that was found, with predicted parameter precisions.
+    """The most informative motion that was found, with predicted parameter precisions."""
 
-    Attributes
-    ----------
-    effect_distances : mapping of (str, str) to (float, float)
-        For each pair of effects, distance of the change by the first from what the second and all free unknowns can
-        imitate, in standard deviations of the data: in the recordings and in the plan. Empty without effects.
-    start_results : tuple of MotionSearchResult
-        Results of the random initial motions, in the order drawn.
-    active_limits : mapping of str to tuple of str
-        Names of the joints, springs or frames that reach a limit, by kind of limit.
-    unobservable_parameters : mapping of str to str
-        Parameters that no motion informs, each with a sentence on which measurement would.
-    unidentifiable_directions : tuple of str
-        Sentences on directions that the planned recording would leave unidentifiable.
-    """
-
-    parameter_precisions: Mapping[str, ParameterPrecision]
+    parameter_precisions: Mapping[str, _ParameterPrecision]
+    # for each pair of effects, distance of the change by the first from what the second and all free unknowns can
+    # imitate, in standard deviations of the data: in the recordings and in the plan; empty without effects
     effect_distances: Mapping[tuple[str, str], tuple[float, float]]
-    start_results: tuple[MotionSearchResult, ...]
+    start_results: tuple[MotionSearchResult, ...]  # of the random initial motions, in the order drawn
     best_start_index: int
-    active_limits: Mapping[str, tuple[str, ...]]
-    unobservable_parameters: Mapping[str, str]
-    unidentifiable_directions: tuple[str, ...]
+    active_limits: Mapping[str, tuple[str, ...]]  # joints, springs or frames that reach a limit, by kind of limit
+    unobservable_parameters: Mapping[str, str]  # which no motion informs, each with the measurement that would
+    unidentifiable_directions: tuple[str, ...]  # sentences on what the planned recording would leave unidentifiable
 
 
 def plan_informative_motion(
@@ -351,7 +338,7 @@ def _judged(experiment: PlannedExperiment, criterion: OptimalityCriterion, found
         return -math.inf
 
 
-def _parameters(experiment: PlannedExperiment, w: Array) -> tuple[dict[str, ParameterPrecision], tuple[str, ...]]:
+def _parameters(experiment: PlannedExperiment, w: Array) -> tuple[dict[str, _ParameterPrecision], tuple[str, ...]]:
     """Parameters of the nominal problem before, after and with both, and what the planned recording leaves open."""
     problem = experiment.configured_problem
     before = identifiability(problem.with_parameter_values(experiment.parameter_values))
@@ -365,7 +352,7 @@ def _parameters(experiment: PlannedExperiment, w: Array) -> tuple[dict[str, Para
     for name, std in zip(shared, together, strict=True):
         first, last = before.parameters[name].std_relative, after.parameters[name].std_relative
         least = min(first, last, float(std) if std < MAX_WEAK_RELATIVE_STD else math.inf)
-        found[name] = ParameterPrecision(first, last, least, after.parameters[name].verdict)
+        found[name] = _ParameterPrecision(first, last, least, after.parameters[name].verdict)
     return found, tuple(entry.words for entry in after.unidentifiable_directions)
 
 

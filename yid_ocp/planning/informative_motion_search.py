@@ -50,15 +50,11 @@ class DOptimality:
     chosen_columns: tuple[int, ...]
     parameter_columns: tuple[int, ...]
 
-    def column_covariance(self, rows: Array) -> Array:
-        """Covariance of all columns' unknowns with the prior, shape (columns, columns)."""
-        information = rows.T @ rows
-        information[np.diag_indices_from(information)] += _prior(len(information), self.parameter_columns)
-        return np.asarray(scipy.linalg.inv(information))
-
     def value_and_gradient(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
         """Criterion [nat] at sensitivities (nr, columns) to relative changes, and its gradient by them if asked for."""
-        whole, chosen = self.column_covariance(rows), list(self.chosen_columns)
+        information, chosen = rows.T @ rows, list(self.chosen_columns)
+        information[np.diag_indices_from(information)] += _prior(len(information), self.parameter_columns)
+        whole = np.asarray(scipy.linalg.inv(information))
         own = whole[np.ix_(chosen, chosen)]
         found = -0.5 * float(np.linalg.slogdet(own)[1])
         if not slope:
@@ -163,7 +159,7 @@ class InformativeMotionSearch:
             w = 0.8 * w
         return np.zeros_like(w)
 
-    def criterion_and_sensitivities(self, w: Array) -> tuple[float, Array | None]:
+    def _value_and_rows(self, w: Array) -> tuple[float, Array | None]:
         """Criterion and sensitivities of a motion; minus infinity where it cannot be simulated."""
         rows = self.experiment.search_sensitivities(w)
         return (-np.inf, None) if rows is None else (self.criterion.value_and_gradient(rows, False)[0], rows)
@@ -171,7 +167,7 @@ class InformativeMotionSearch:
     def improve_motion(self, start: Array, rounds: int, progress: Progress = NULL_PROGRESS) -> MotionSearchResult:
         """Improve a motion that keeps the limits until convergence."""
         w, radius = start, _INITIAL_TRUST_RADIUS
-        value, rows = self.criterion_and_sensitivities(w)
+        value, rows = self._value_and_rows(w)
         first, finished, done = value, False, 0
         while rows is not None and done < rounds and not finished:
             done += 1
@@ -187,7 +183,7 @@ class InformativeMotionSearch:
                 still = not np.any(np.abs(step) > _MIN_STEP)
                 if still:
                     break
-                there, its = self.criterion_and_sensitivities(w + step)
+                there, its = self._value_and_rows(w + step)
                 small = radius <= _MIN_TRUST_RADIUS
                 if its is not None and there > value:
                     gained, w, value, rows = there - value, w + step, there, its

@@ -330,7 +330,7 @@ class PlannedMotion:
 
 
 @dataclass(frozen=True)
-class EndEquilibrium:
+class _EndEquilibrium:
     """An equilibrium at which the point rests near its target."""
 
     joint_positions: Array  # (nc,), moved joints [rad or m]
@@ -408,7 +408,7 @@ def check_standstill_limits(step: Step, theta: Array, rest: Equilibrium, limits:
 
 def solve_end_equilibrium(
     step: Step, theta: Array, start: Equilibrium, point: FramePositions, place: Array, tolerance: float
-) -> EndEquilibrium:
+) -> _EndEquilibrium:
     """Solve for joint positions within their limits, near the start, at which the point rests nearest to its target.
 
     Raises `ConfigError` where no joint moves the point.
@@ -444,7 +444,7 @@ def solve_end_equilibrium(
     distance = float(np.linalg.norm(point_and_slope(rest)[0] - place)) if rest.is_converged else np.inf
     near = (found.x - lower < 1e-3) | (upper - found.x < 1e-3)
     limits = tuple(name for name, one in zip(system.prescribed, near, strict=True) if one)
-    return EndEquilibrium(found.x, rest, distance, limits)
+    return _EndEquilibrium(found.x, rest, distance, limits)
 
 
 def _last_kept(function: Callable[[Array], tuple[Array, Array]]) -> Callable[[Array], tuple[Array, Array]]:
@@ -459,7 +459,7 @@ def _last_kept(function: Callable[[Array], tuple[Array, Array]]) -> Callable[[Ar
     return at
 
 
-def check_target_reachable(end: EndEquilibrium, name: str, place: Array, tolerance: float) -> None:
+def check_target_reachable(end: _EndEquilibrium, name: str, place: Array, tolerance: float) -> None:
     """Raise `ConfigError` where the point cannot rest at its target."""
     if end.target_distance <= REACHED_TOLERANCE_FACTOR * tolerance:
         return

@@ -74,19 +74,8 @@ def plan_motion(
 ) -> MotionPlan:
     """Plan a motion of a step's prescribed joints that brings a point to a target.
 
-    Parameters
-    ----------
-    step : Step
-        Arms prescribed, nothing driven.
-    theta : ndarray, optional, shape (ntheta,)
-        Parameters of the model; the system's values when absent.
-    known : ParameterCovariance, optional
-        Covariance of some of them.
-
-    Returns
-    -------
-    MotionPlan
-        Also where no motion within the limits was found: `message` says which one is passed, and by how much.
+    Parameters are the system's values when `theta` is absent; the covariance of some of them may be `known`. There is a
+    plan also where no motion within the limits was found: its `message` says which one is passed, and by how much.
 
     Raises
     ------
@@ -207,8 +196,7 @@ def _attempt(rows: PlanResidualsAndLimits, known: ParameterCovariance) -> Motion
         finer = _at_rest(rows.simulator, half, rows.simulator.theta)
         if _steady(rows, finer, shot.w):
             break
-        guess, goal = shot.w, (rows.target, rows.quasi_static_coefficients, rows.inside)
-        rows = PlanResidualsAndLimits(finer, options, rows.point, *goal)
+        guess, rows = shot.w, replace(rows, simulator=finer)
     return _outcome(rows, replace(shot, n_evaluations=evaluations), known)
 
 
@@ -250,8 +238,7 @@ def _scenarios(rows: PlanResidualsAndLimits, known: ParameterCovariance) -> list
                 entry = system.parameters[name]
                 floor = max(entry.lower, 0.2 * theta[i]) if theta[i] > 0 else entry.lower
                 theta[i] = np.clip(theta[i] + change, floor, entry.upper)
-            goal = rows.options, rows.point, rows.target, rows.quasi_static_coefficients
-            found.append(PlanResidualsAndLimits(_at_rest(mover, mover.step, theta), *goal))
+            found.append(replace(rows, simulator=_at_rest(mover, mover.step, theta), inside=None))
     return found
 
 

@@ -34,7 +34,7 @@ class ValueWithJacobian:
 
 
 @dataclass(frozen=True, eq=False)
-class LimitRows:
+class _LimitRows:
     """Bounds of limit rows of one kind."""
 
     description: str  # the limited quantity, with its unit
@@ -44,7 +44,7 @@ class LimitRows:
     row_names: tuple[str, ...]  # joint, spring or frame of each row
 
 
-def scaled_bounds(limits: Sequence[LimitRows]) -> tuple[Array, Array, Array]:
+def scaled_bounds(limits: Sequence[_LimitRows]) -> tuple[Array, Array, Array]:
     """Units of all limit rows, and their lower and upper bounds in these units, shape (rows,) each."""
     unit, lower, upper = (np.concatenate([getattr(rows, k) for rows in limits]) for k in ("unit", "lower", "upper"))
     return unit, lower / unit, upper / unit
@@ -58,29 +58,23 @@ def _stacked(parts: list[ValueWithJacobian]) -> ValueWithJacobian:
     return ValueWithJacobian(value, np.vstack(known) if len(known) == len(slopes) and known else None)
 
 
+@dataclass(eq=False)
 class PlanResidualsAndLimits:
-    """Residuals and limit rows of a planned motion, for one set of parameters.
+    """Residuals and limit rows of a planned motion, for one set of parameters."""
 
-    `point` is the frame that is to arrive at `target` (3,) [m], and all frames that are to rest; `inside` those that
-    stay in the box. Of motions that do equally well, the one nearest to the quasi-static unknowns (K, nc) is wanted.
-    """
+    simulator: PathSimulator
+    options: PlanOptions
+    point: FramePositions  # of the frame that is to arrive, and of all frames that are to rest
+    target: Array  # (3,), where it is to arrive [m]
+    quasi_static_coefficients: Array  # (K, nc); of motions that do equally well, the one nearest to them is wanted
+    inside: FramePositions | None = None  # frames that stay in the box
 
-    def __init__(
-        self,
-        mover: PathSimulator,
-        options: PlanOptions,
-        point: FramePositions,
-        target: Array,
-        simple: Array,
-        inside: FramePositions | None = None,
-    ) -> None:
-        self.simulator, self.options, self.point, self.target, self.inside = mover, options, point, target, inside
-        self.quasi_static_coefficients = simple
-        self.joints = [mover.step.system.mechanism.joints[i] for i in mover.joint_indices]
-        self.effort_limit = options.limits.effort_fraction * np.array([joint.effort_limit for joint in self.joints])
-        self._springs = sorted(
-            {mover.step.system.mechanism.joint_index(spring.joint_name) for spring in mover.step.system.elastic_joints}
-        )
+    def __post_init__(self) -> None:
+        system = self.simulator.step.system
+        self._joints = [system.mechanism.joints[i] for i in self.simulator.joint_indices]
+        able = self.options.limits.effort_fraction
+        self._effort_limit = able * np.array([joint.effort_limit for joint in self._joints])
+        self._springs = sorted({system.mechanism.joint_index(spring.joint_name) for spring in system.elastic_joints})
         self.limit_rows = self._bounded()
 
     @property
@@ -114,8 +108,8 @@ class PlanResidualsAndLimits:
         parts.append(_rows(bend @ w, _by_coefficients(bend, w), _ACCELERATION_WEIGHT**-0.5))
         parts.append(_rows(w - self.quasi_static_coefficients, np.eye(size), _QUASI_STATIC_DISTANCE))
         if options.effort_weight:
-            finite = np.isfinite(self.effort_limit)
-            unit = self.effort_limit[finite] / np.sqrt(options.effort_weight)
+            finite = np.isfinite(self._effort_limit)
+            unit = self._effort_limit[finite] / np.sqrt(options.effort_weight)
             by_effort = None if rollout.effort_sensitivity is None else rollout.effort_sensitivity[:, finite, -size:]
             if by_effort is not None:
                 by_effort = by_effort / unit[:, None]
@@ -128,7 +122,7 @@ class PlanResidualsAndLimits:
         n, moved, pushed = mover.step.system.n_coordinates, rollout.state_sensitivity, rollout.effort_sensitivity
         controls = [mover.path.control_point_matrix(order) for order in (1, 2)]
         parts = [ValueWithJacobian((matrix @ w).ravel(), _by_coefficients(matrix, w)) for matrix in controls]
-        finite = np.isfinite(self.effort_limit)
+        finite = np.isfinite(self._effort_limit)
         by_effort = None if pushed is None else pushed[every, finite, -size:].reshape(-1, size)
         parts.append(ValueWithJacobian(rollout.effort[every, finite].ravel(), by_effort))
         if self.options.limits.max_spring_angle is not None:
@@ -140,18 +134,18 @@ class PlanResidualsAndLimits:
             parts.append(ValueWithJacobian(at.ravel(), None if slope is None else slope.reshape(-1, size)))
         return _stacked(parts)
 
-    def _bounded(self) -> list[LimitRows]:
+    def _bounded(self) -> list[_LimitRows]:
         mover, limits = self.simulator, self.options.limits
-        names = tuple(joint.name for joint in self.joints)
-        speed = limits.velocity_fraction * np.array([joint.velocity_limit for joint in self.joints])
+        names = tuple(joint.name for joint in self._joints)
+        speed = limits.velocity_fraction * np.array([joint.velocity_limit for joint in self._joints])
         sharp = np.full(len(names), limits.max_acceleration)
         count = len(mover.path.control_point_matrix())
         found = [_even("velocity [rad/s or m/s]", names, speed, count - 1)]
         found.append(_even("acceleration [rad/s^2 or m/s^2]", names, sharp, count - 2))
-        finite = np.isfinite(self.effort_limit)
+        finite = np.isfinite(self._effort_limit)
         steps = len(range(0, len(mover.node_times) - 1, _LIMIT_NODE_STRIDE))
         able = tuple(name for name, one in zip(names, finite, strict=True) if one)
-        found.append(_even("effort [N m or N]", able, self.effort_limit[finite], steps))
+        found.append(_even("effort [N m or N]", able, self._effort_limit[finite], steps))
         nodes = len(range(0, len(mover.node_times), _LIMIT_NODE_STRIDE))
         if limits.max_spring_angle is not None:
             springs = tuple(mover.step.system.mechanism.joint_names[i] for i in self._springs)
@@ -159,10 +153,10 @@ class PlanResidualsAndLimits:
         if self.inside is not None and self.options.box is not None:
             low, high = (np.tile(corner, len(self.inside.names) * nodes) for corner in self.options.box)
             axes = tuple(f"{name}, {axis}" for name in self.inside.names for axis in "xyz")
-            found.append(LimitRows("place [m]", low, high, np.full(len(low), 0.1), axes * nodes))
+            found.append(_LimitRows("place [m]", low, high, np.full(len(low), 0.1), axes * nodes))
         return found
 
-    def limits_with_values(self, value: Array) -> Iterator[tuple[LimitRows, Array]]:
+    def limits_with_values(self, value: Array) -> Iterator[tuple[_LimitRows, Array]]:
         """Every kind of limit with its rows of `limit_values`."""
         ends = np.cumsum([len(rows.row_names) for rows in self.limit_rows])
         return zip(self.limit_rows, np.split(value, ends[:-1]), strict=True)
@@ -190,9 +184,9 @@ def _rows(value: Array, slope: Array | None, unit: float) -> ValueWithJacobian:
     return ValueWithJacobian(scale * value.ravel(), None if slope is None else scale * slope.reshape(value.size, -1))
 
 
-def _even(what: str, names: tuple[str, ...], limit: Array, count: int) -> LimitRows:
+def _even(what: str, names: tuple[str, ...], limit: Array, count: int) -> _LimitRows:
     upper = np.tile(limit, count)
-    return LimitRows(what, -upper, upper, np.where(np.isfinite(upper), upper, 1.0), names * count)
+    return _LimitRows(what, -upper, upper, np.where(np.isfinite(upper), upper, 1.0), names * count)
 
 
 _INITIAL_PENALTY, _PENALTY_GROWTH, _MAX_PENALTY = 1e3, 10.0, 1e8

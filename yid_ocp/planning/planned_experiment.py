@@ -125,10 +125,10 @@ class PlannedExperiment:
             position_std=stds[0], effort_std=stds[1], effort_bias_std=stds[2],
         )  # fmt: skip
         q = rollout.state[:, : system.n_coordinates]
-        groups = [self._seen(samples, q, fastest) for samples in base.measurements if samples.sensor.point_names]
+        groups = [self._seen(samples, frames, q, fastest) for samples, frames in self._points]
         return Recording(group, tuple(groups), "a planned motion", "yid_ocp plan", _PLANNED_RECORDING_NAME)
 
-    def _seen(self, samples: Measurements, q: Array, fastest: float) -> PointGroup:
+    def _seen(self, samples: Measurements, frames: FramePositions, q: Array, fastest: float) -> PointGroup:
         """Points of one sensor along the motion, their information per second as in the recording."""
         mover, base = self.simulator, self.configured_problem.episodes[0]
         sensor, spent = samples.sensor, base.grid.steps * base.grid.time_step
@@ -139,7 +139,7 @@ class PlannedExperiment:
         dense = 1.0 / (stride * mover.step.time_step)
         with np.errstate(divide="ignore"):
             std = np.sqrt(dense * spent / inverse)
-        places = self._frames[sensor.frame_names].positions_and_jacobian(q[at], mover.theta)[0]
+        places = frames.positions_and_jacobian(q[at], mover.theta)[0]
         places = np.where(np.isfinite(std), places, np.nan).reshape(len(at), -1, 3)
         std = np.broadcast_to(np.where(np.isfinite(std), std, 1.0).reshape(-1, 3), places.shape)
         group = next(g for g in base.recording.points if g.name == sensor.group_name)
@@ -147,17 +147,19 @@ class PlannedExperiment:
         return PointGroup(*points, times, places, std.copy(), group.sensor, pose=group.pose)
 
     @cached_property
-    def _frames(self) -> dict[tuple[str, ...], FramePositions]:
-        found = {s.sensor.frame_names for s in self.configured_problem.episodes[0].measurements if s.sensor.point_names}
-        return {frames: FramePositions(self.simulator.step.system, frames) for frames in found}
+    def _points(self) -> list[tuple[Measurements, FramePositions]]:
+        """Measurements of points, each with their frames."""
+        system, measured = self.simulator.step.system, self.configured_problem.episodes[0].measurements
+        seen = [samples for samples in measured if samples.sensor.point_names]
+        return [(samples, FramePositions(system, samples.sensor.frame_names)) for samples in seen]
 
     def _options(self, **changes: object) -> ProblemOptions:
         """The problem's options for the planned recording alone, which states its points' noise itself."""
         options, base = self.configured_problem.options, self.configured_problem.episodes[0]
         own = dict(options.sensors)
-        for samples in base.measurements:
-            if samples.sensor.point_names and samples.sensor.group_name in own:
-                own[samples.sensor.group_name] = replace(own[samples.sensor.group_name], std=None)
+        for name in (samples.sensor.group_name for samples, _ in self._points):
+            if name in own:
+                own[name] = replace(own[name], std=None)
         given = options.parameters_by_recording
         named = {_PLANNED_RECORDING_NAME: dict(given[base.name])} if base.name in given else {}
         same = {"sensors": own, "duration": None, "known_initial_states": {}, "parameters_by_recording": named}

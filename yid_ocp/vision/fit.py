@@ -401,8 +401,8 @@ class ShapeFitter:
 
     def initial_shape_finder(self) -> InitialShapeFinder:
         """Finder of initial shapes for a system with a free root (`initial_shapes.with_free_root`)."""
-        by_owner = {name: self._lengths[self._links_of({name})] for name in dict.fromkeys(self.link_segments)}
-        return InitialShapeFinder(self.system, self._tree, self.rest_configuration, self.bend_joints, by_owner)
+        lengths = {name: self._lengths[self._links_of({name})] for name in dict.fromkeys(self.link_segments)}
+        return InitialShapeFinder(self.system, self._tree, self.rest_configuration, self.bend_joints, lengths)
 
     def _size_rows(self, q: Array, task: _Task | None, evidence: ShapeEvidence) -> DimensionEquations:
         """What a frame's points say of lengths and radii at its shape."""

@@ -219,17 +219,9 @@ def read_frames(
 ) -> FrameSequence:
     """Open the frames of a camera, which are then read one at a time.
 
-    Parameters
-    ----------
-    path : path-like
-        A folder (`read_frame_folder`); a bag of ROS 1 or ROS 2, an MCAP file or a RealSense file;
-        or an Azure Kinect's `.mkv`, where the build of Open3D reads it.
-    pose : array_like, shape (4, 4), optional
-        Camera in the world, instead of the folder's; others do not say it.
-    unit : str, optional
-        Unit of clouds, instead of the folder's.
-    topic : str, optional
-        Of a bag: of the clouds or depth images.
+    They are a folder (`read_frame_folder`), a bag of ROS 1 or ROS 2, an MCAP file or a RealSense file, of which `topic`
+    names the clouds or depth images, or an Azure Kinect's `.mkv`, where the build of Open3D reads it. The camera's
+    `pose` (4, 4) in the world and the `unit` of clouds replace the folder's; others do not say them.
 
     Raises
     ------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -117,30 +117,6 @@ class CloudFilterOptions:
         check_option_bounds(self, "filter options")
 
 
-@dataclass(frozen=True, eq=False)
-class _RegionBounds:
-    """Bounds of the region that the object can reach."""
-
-    lower: Array
-    upper: Array
-    root_position: Array
-    max_reach: float
-    camera_to_robot_direction: Array
-    max_distance_along_direction: float
-
-    def contains(self, points: Array) -> Mask:
-        """Whether points, shape (N, 3), lie inside, shape (N,)."""
-        inside = np.ones(len(points), bool)
-        for axis in range(3):  # column by column, which is quicker than whole rows on large clouds
-            inside &= (points[:, axis] >= self.lower[axis]) & (points[:, axis] <= self.upper[axis])
-        rest = np.flatnonzero(inside)
-        inside[rest] = points[rest] @ self.camera_to_robot_direction <= self.max_distance_along_direction
-        rest = np.flatnonzero(inside)
-        away = points[rest] - self.root_position
-        inside[rest] = np.einsum("ij,ij->i", away, away) <= self.max_reach**2
-        return inside
-
-
 class ObjectRegion:
     """Region that the object can reach, from the length of its branches and the floor.
 
@@ -184,8 +160,8 @@ class ObjectRegion:
         bases = [np.array(ca.DM(joint.placement.translation)).ravel() for joint in roots]
         self._base = np.mean(bases, axis=0) if bases else None
 
-    def bounds_at(self, q: ArrayLike, camera: ArrayLike) -> _RegionBounds:
-        """The region with the robot at a configuration, shape (n,), seen from a camera's position, shape (3,) [m]."""
+    def membership_at(self, q: ArrayLike, camera: ArrayLike) -> Callable[[Array], Mask]:
+        """Test whether points (N, 3) lie inside, the robot at a configuration (n,), seen from a camera at (3,) [m]."""
         centre = np.array(self._root(np.asarray(q, float))).ravel()
         ahead, limit = np.zeros(3), 0.0
         if self._behind is not None and self._base is not None:
@@ -193,7 +169,19 @@ class ObjectRegion:
             length = float(np.linalg.norm(ahead))
             ahead = ahead / length if length > 0 else np.zeros(3)
             limit = float(ahead @ self._base) + self._behind
-        return _RegionBounds(self._lower, self._upper, centre, self._radius, ahead, limit)
+
+        def contains(points: Array) -> Mask:
+            inside = np.ones(len(points), bool)
+            for axis in range(3):  # column by column, which is quicker than whole rows on large clouds
+                inside &= (points[:, axis] >= self._lower[axis]) & (points[:, axis] <= self._upper[axis])
+            rest = np.flatnonzero(inside)
+            inside[rest] = points[rest] @ ahead <= limit
+            rest = np.flatnonzero(inside)
+            away = points[rest] - centre
+            inside[rest] = np.einsum("ij,ij->i", away, away) <= self._radius**2
+            return inside
+
+        return contains
 
 
 def voxel_averages(points: Array, size: float) -> WeightedCloud:

@@ -49,11 +49,6 @@ class TubeLinks:
     free_end_links: tuple[int, ...]  # links whose end nothing holds and nothing grows on
     tube_lengths: Array  # (K,), length of the whole tube that a link belongs to [m]
 
-    @property
-    def link_lengths(self) -> Array:
-        """Length of each link, shape (K,) [m]."""
-        return np.asarray(np.linalg.norm(self.link_ends[:, 1] - self.link_ends[:, 0], axis=1))
-
 
 def nearest_on_tubes(
     corners: Array, radius: Array, points: Array, share: float = 1.0
@@ -136,16 +131,16 @@ class CloudObservation:
     end_anchors: Sequence[EndAnchor] = ()  # ends of the object that were seen
 
     @cached_property
-    def point_tree(self) -> cKDTree:
+    def _point_tree(self) -> cKDTree:
         """Search tree of the points."""
         return cKDTree(self.points)
 
     @cached_property
-    def point_spacing(self) -> float:
+    def _point_spacing(self) -> float:
         """Usual distance of a point from its nearest neighbour [m]."""
         if len(self.points) < 2:
             return math.inf
-        return max(float(np.median(self.point_tree.query(self.points, k=2)[0][:, 1])), 1e-4)
+        return max(float(np.median(self._point_tree.query(self.points, k=2)[0][:, 1])), 1e-4)
 
     def is_hidden(self, places: Array, radius: Array, margin: float) -> Mask:
         """Whether places are hidden from the camera or removed by filters, shape (S,)."""
@@ -163,7 +158,7 @@ def assess_shape(tubes: TubeLinks, seen: CloudObservation, near: float) -> Shape
     away = _faces_away_from_camera(normal, seen.points - seen.camera_position)
     size = np.abs(np.where(away, -distance, distance) - tubes.radius[link])
     close = size < near
-    tree, spacing = seen.point_tree, seen.point_spacing
+    tree, spacing = seen._point_tree, seen._point_spacing
     noise = _TO_SIGMA * weighted_median(size[close], seen.point_weights[close]) if close.any() else near / _SIGMAS
     # where points lie in between others is not known better than from one to the next
     noise = max(noise, spacing / math.sqrt(12.0))
@@ -215,7 +210,7 @@ def tube_like_nodes_and_points(sight: CloudObservation, radius: float) -> tuple[
     """
     within = _SURROUNDINGS * radius
     thin = np.zeros(len(sight.skeleton_nodes), bool)
-    for i, around in enumerate(sight.point_tree.query_ball_point(sight.skeleton_nodes, within)):
+    for i, around in enumerate(sight._point_tree.query_ball_point(sight.skeleton_nodes, within)):
         if len(around) > 3:
             away = sight.points[around] - sight.points[around].mean(axis=0)
             second = float(np.linalg.eigvalsh(away.T @ away / len(around))[1])
@@ -258,7 +253,7 @@ def _coverage(
     tubes: TubeLinks, seen: CloudObservation, own: Mask, link: Integers, along: Array, gate: float
 ) -> tuple[Array, Array]:
     """Shares of each link that have own points, and that visibly have none."""
-    lengths = tubes.link_lengths
+    lengths = np.linalg.norm(tubes.link_ends[:, 1] - tubes.link_ends[:, 0], axis=1)
     count = np.maximum(_STATIONS, np.ceil(lengths / (2 * tubes.radius))).astype(np.int64)
     first = np.concatenate([[0], np.cumsum(count)[:-1]])
     station = first[link] + np.minimum((along * count[link]).astype(np.int64), count[link] - 1)
@@ -292,7 +287,7 @@ def _end_offset(tubes: TubeLinks, link: int, seen: CloudObservation, gate: float
     And which points lie about the axis between the tip and there.
     """
     (start, tip), radius = tubes.link_ends[link], float(tubes.radius[link])
-    length, thick = float(np.linalg.norm(tip - start)), max(radius, 2 * seen.point_spacing)
+    length, thick = float(np.linalg.norm(tip - start)), max(radius, 2 * seen._point_spacing)
     axis, behind = (tip - start) / length, max(3, int(length / thick))
     edges = thick * np.arange(-behind, max(3, int(_AHEAD * tubes.tube_lengths[link] / thick)) + 1.0)
     away = seen.points - tip

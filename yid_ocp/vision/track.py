@@ -106,10 +106,8 @@ def track_object(
     ------
     DataError
         No joint angles, time stamps of another clock, or not one good frame; the error lists the reasons.
-    ConfigError
-        A point that the system does not have.
-    ModelError
-        Meshes that cannot be read.
+    ConfigError, ModelError
+        A point that the system does not have; meshes that cannot be read.
     """
     tracker = FrameTracker(scene, recording, sequence, options or TrackOptions(), empty)
     told = progress or (lambda done, total, text: None)
@@ -146,19 +144,9 @@ class _Look:
 
 
 class FrameTracker:
-    """Tracker of single frames of a sequence, in any process.
+    """Tracker of single frames of a sequence, in any process; parameters as of `track_object`.
 
-    Parameters
-    ----------
-    scene, recording, sequence, options, empty
-        As `track_object`.
-
-    Attributes
-    ----------
-    frame_order : tuple of int
-        All frames by their stamps.
-    calibration_frames : tuple of int
-        Frames from which what is common to all of them is found.
+    `frame_order` are all frames by their stamps, `calibration_frames` those from which the camera is calibrated.
     """
 
     def __init__(
@@ -201,7 +189,7 @@ class FrameTracker:
         if self.robot_surfaces is not None and self.joint_time_span is not None and scene.robot_urdf is not None:
             held_at = self.shape_fitter.gripper_positions_at
             self.arm_surface = ArmSurface(
-                self.robot_surfaces, self.configuration_at_rest, held_at, self._widest + _GRIP
+                self.robot_surfaces, self._configuration_at_rest, held_at, self._widest + _GRIP
             )
         self.frame_order, self._reasons = _by_stamp(sequence.stamps)
         usable = [i for i in self.frame_order if i not in self._reasons]
@@ -213,7 +201,7 @@ class FrameTracker:
         self._shapes: dict[tuple[float, ...], ShapeFitter] = {(): self.shape_fitter}
         self.calibration_frames = _spread(usable, options.calibration.n_frames) if self.arm_surface is not None else ()
 
-    def configuration_at_rest(self, t: float) -> Array:
+    def _configuration_at_rest(self, t: float) -> Array:
         """Configuration at a time on the joints' clock with the object at rest; constant beyond the recording."""
         q = self.shape_fitter.rest_configuration.copy()
         if self.joint_angles_at is not None:
@@ -301,11 +289,11 @@ class FrameTracker:
         self, q: Array, calibration: CameraCalibration, background: BackgroundPoints
     ) -> Callable[[Array], Mask]:
         """Which places the filters leave no points of, the robot at a configuration."""
-        region = self.object_region.bounds_at(q, calibration.camera_position)
+        is_inside = self.object_region.membership_at(q, calibration.camera_position)
         within = self.options.filters.robot_padding + self._widest
 
         def removed(places: Array) -> Mask:
-            gone = ~region.contains(places) | background.contains(places, self._widest)
+            gone = ~is_inside(places) | background.contains(places, self._widest)
             if self.robot_surfaces is not None:
                 gone |= self.robot_surfaces.is_within_distance(places, q, within)
             return gone
@@ -330,8 +318,8 @@ class FrameTracker:
         found, finite = self._finite(self.sequence, index)
         points = calibration.camera_state.to_world(found)
         filters = self.options.filters
-        q = self.configuration_at_rest(float(calibration.camera_state.to_joint_time(self.sequence.stamps[index])))
-        inside = self.object_region.bounds_at(q, calibration.camera_position).contains(points)
+        q = self._configuration_at_rest(float(calibration.camera_state.to_joint_time(self.sequence.stamps[index])))
+        inside = self.object_region.membership_at(q, calibration.camera_position)(points)
         if not inside.any():
             raise DataError("no point lies where the object can be: check the camera's pose")
         if filters.object_colours and self.sequence.load_colours is not None:
@@ -345,7 +333,21 @@ class FrameTracker:
 
     def track_frame(self, index: int, common: SequenceCalibration) -> FrameReport:
         """Report of one frame, independent of other frames."""
-        return self._work(index, common).report
+        work, look = self._look(index, common.camera_calibration, common.background)
+        if look is None:
+            return work.report
+        begun = time.process_time()
+        shape = self._shape(common.dimensions)
+        fits = [shape.fit_frame(sight, look.q, starts) for sight, starts in zip(look.sights, look.starts, strict=True)]
+        fits.sort(key=lambda fit: fit.mean_distance)
+        reason = rejection_reason(fits[0], shape, self.options)
+        anywhere = self.initial_shape_finder is not None
+        if anywhere and not reason and is_self_touching(fits[0].link_ends, shape.link_radii):
+            reason = "the object crosses or touches itself"
+        other = fits[1] if len(fits) > 1 and fits[1].mean_distance < _AS_GOOD * fits[0].mean_distance else None
+        spent = work.report.cpu_seconds + time.process_time() - begun
+        work.say(shape_fit=fits[0], alternative_fit=other, cpu_seconds=spent, drop_reason=reason)
+        return work.report
 
     def frame_stages(self, frame: FrameReport, common: SequenceCalibration) -> FrameStages | None:
         """Processing stages of a frame, for figures; None if its cloud cannot be read."""
@@ -353,10 +355,9 @@ class FrameTracker:
             cloud = common.camera_calibration.camera_state.to_world(self.sequence.load_cloud(frame.index))
         except DataError:
             return None
-        work, camera = self._work(frame.index, common), common.camera_calibration.camera_position
+        work, _ = self._look(frame.index, common.camera_calibration, common.background)
         filtered = None if work.filtered is None else work.filtered.points
-        fit = work.report.shape_fit
-        return FrameStages(frame.name, frame.drop_reason, camera, cloud, filtered, work.skeleton, fit)
+        return FrameStages(frame, common.camera_calibration.camera_position, cloud, filtered, work.skeleton)
 
     def unprocessed_report(self, index: int, calibration: CameraCalibration, reason: str) -> FrameReport:
         """Report of a frame before processing, with the reason if it is dropped."""
@@ -401,30 +402,13 @@ class FrameTracker:
         """Poses of what moves with the robot at a time, by the names of the links."""
         if self.robot_surfaces is None:
             return {}
-        poses = self.robot_surfaces.part_poses_at(self.configuration_at_rest(t))
+        poses = self.robot_surfaces.part_poses_at(self._configuration_at_rest(t))
         tree, found = self.system.mechanism, {}
         for joint, pose in zip(self.robot_surfaces.part_joints, poses, strict=True):
             if joint >= 0:  # a frame beside the joint's moving side has its link's name, as far as the model has it
                 frames = (name for name, frame in tree.frames.items() if frame.joint_index == joint)
                 found[next(frames, tree.joint_names[joint])] = pose
         return found
-
-    def _work(self, index: int, common: SequenceCalibration) -> _Work:
-        work, look = self._look(index, common.camera_calibration, common.background)
-        if look is None:
-            return work
-        begun = time.process_time()
-        shape = self._shape(common.dimensions)
-        fits = [shape.fit_frame(sight, look.q, starts) for sight, starts in zip(look.sights, look.starts, strict=True)]
-        fits.sort(key=lambda fit: fit.mean_distance)
-        reason = rejection_reason(fits[0], shape, self.options)
-        anywhere = self.initial_shape_finder is not None
-        if anywhere and not reason and is_self_touching(fits[0].link_ends, shape.link_radii):
-            reason = "the object crosses or touches itself"
-        other = fits[1] if len(fits) > 1 and fits[1].mean_distance < _AS_GOOD * fits[0].mean_distance else None
-        spent = work.report.cpu_seconds + time.process_time() - begun
-        work.say(shape_fit=fits[0], alternative_fit=other, cpu_seconds=spent, drop_reason=reason)
-        return work
 
     def _look(
         self, index: int, calibration: CameraCalibration, background: BackgroundPoints
@@ -453,7 +437,7 @@ class FrameTracker:
                 work.say(stamp_delay=own.delay)
                 if is_stamped_late(own, options.clock):
                     raise DataError(f"its stamp is late: by {1e3 * own.delay:.0f} ms")
-        q = self.configuration_at_rest(t)
+        q = self._configuration_at_rest(t)
         filters, kept = options.filters, np.ones(len(cloud), bool)
         if self.robot_surfaces is not None:
             kept = ~self.robot_surfaces.is_within_distance(cloud.points, q, filters.robot_padding)

@@ -62,13 +62,11 @@ def count_drop_reasons(frames: Iterable[FrameReport]) -> dict[str, int]:
 class FrameStages:
     """Processing stages of one frame, for figures; stages that a dropped frame did not reach are None."""
 
-    frame_name: str
-    drop_reason: str  # why the frame was dropped; empty for a good one
+    report: FrameReport
     camera_position: Array  # (3,) [m]
     raw_points: Array  # (N, 3), in the world [m]
-    filtered_points: Array | None = None  # (N, 3), what the filters left [m]
-    skeleton: CloudSkeleton | None = None
-    shape_fit: FrameShapeFit | None = None
+    filtered_points: Array | None  # (N, 3), what the filters left [m]
+    skeleton: CloudSkeleton | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,24 +157,24 @@ def draw_frame_stages(stages: FrameStages, folder: str | os.PathLike[str]) -> li
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"the folder cannot be made: {error.strerror}", where=str(path)) from error
-    parts = [] if stages.filtered_points is None else [stages.filtered_points]
-    parts += [] if stages.shape_fit is None else [stages.shape_fit.link_ends.reshape(-1, 3)]
+    report, parts = stages.report, [] if stages.filtered_points is None else [stages.filtered_points]
+    parts += [] if report.shape_fit is None else [report.shape_fit.link_ends.reshape(-1, 3)]
     near = np.concatenate([np.empty((0, 3)), *parts])
-    stem = "".join(letter if letter.isalnum() else "_" for letter in Path(stages.frame_name).stem)
+    stem = "".join(letter if letter.isalnum() else "_" for letter in Path(report.name).stem)
     written, pictures = [], _pictures(stages)
     for number, picture in enumerate(pictures, start=1):
         name, title = picture[:2]
         target = path / f"{stem}_{number}_{name}.png"
         frame = stages.raw_points if name == "cloud" or not len(near) else near
-        ended = f"\n{stages.drop_reason}" if number == len(pictures) and stages.drop_reason else ""
-        _write(target, f"{stages.frame_name}: {title}{ended}", frame, stages.camera_position, picture)
+        ended = f"\n{report.drop_reason}" if number == len(pictures) and report.drop_reason else ""
+        _write(target, f"{report.name}: {title}{ended}", frame, stages.camera_position, picture)
         written.append(target)
     return written
 
 
 def _pictures(stages: FrameStages) -> list[_Picture]:
     """The pictures of every stage that the frame came to, in order."""
-    raw, near, skeleton, fit = stages.raw_points, stages.filtered_points, stages.skeleton, stages.shape_fit
+    raw, near, skeleton, fit = stages.raw_points, stages.filtered_points, stages.skeleton, stages.report.shape_fit
     made: list[_Picture] = [("cloud", f"{len(raw)} points of the camera", [(raw, _GREY, 0.4)], [], "")]
     if near is None:
         return made

@@ -27,14 +27,10 @@ for _format in iter_modules(__path__):
 
 
 def read_any(path: str | os.PathLike[str], *, progress: Progress = NULL_PROGRESS, **options: Any) -> Recording:
-    """Read a recording of any known format, chosen by its suffix.
+    """Read and check a recording of any known format, chosen by its suffix.
 
-    Parameters
-    ----------
-    path : path-like
-        An HDF5 recording, a CSV file, a rosbag, an MCAP file, a ROS 2 bag folder, a C3D file or a LeRobot dataset.
-    **options
-        Named options of the reader in `READERS`.
+    It is an HDF5 recording, a CSV file, a rosbag, an MCAP file, a ROS 2 bag folder, a C3D file or a LeRobot dataset.
+    The options are those of the reader in `READERS`, by name.
 
     Raises
     ------
@@ -58,13 +54,7 @@ def read_any(path: str | os.PathLike[str], *, progress: Progress = NULL_PROGRESS
 
 
 def preview_file(path: str | os.PathLike[str], progress: Progress = NULL_PROGRESS) -> FileContents:
-    """List the contents of a file of any known format, and the options for `read_any`.
-
-    Raises
-    ------
-    DataError
-        The format is not known or the file cannot be read.
-    """
+    """Contents of a file of any known format, and the options for `read_any`; errors as that."""
     path = Path(path)
     known_as = _format_of(path)
     if known_as in PREVIEWS:

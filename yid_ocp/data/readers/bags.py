@@ -61,7 +61,7 @@ class BagMessage:
 
 
 @dataclass(frozen=True)
-class BagTopic:
+class _BagTopic:
     """A topic of a bag with its type and number of messages."""
 
     name: str
@@ -93,7 +93,7 @@ class OpenBag:
             self.reader.open()
             for c in self.reader.connections:
                 counted[c.topic, c.msgtype] += c.msgcount
-        self.topics = tuple(BagTopic(topic, kind, count) for (topic, kind), count in sorted(counted.items()))
+        self.topics = tuple(_BagTopic(topic, kind, count) for (topic, kind), count in sorted(counted.items()))
 
     @contextmanager
     def reading(self) -> Iterator[None]:
@@ -144,7 +144,7 @@ def bag_clock(
 class _Contents:
     """A bag and the messages of it that can be used, in its order."""
 
-    bag: OpenBag
+    file: OpenBag
     states: tuple[BagMessage, ...]
     places: tuple[BagMessage, ...]
 
@@ -208,7 +208,7 @@ def read_bag(
     seen = _named_places(bag, options.points, str(path))
     if not groups and not seen:
         allowed = f"topics of the types {', '.join((*_KNOWN, _TREES[0]))}"
-        raise bag.bag.nothing_usable("the bag has no joint states and no points", allowed)
+        raise bag.file.nothing_usable("the bag has no joint states and no points", allowed)
     places = [message for entries in seen.values() for _, message in entries]
     seconds = bag_clock([*(m for entry in groups for m in entry.messages), *places])
     joint_group, more = _on_one_clock(groups, seconds, str(path))
@@ -221,7 +221,7 @@ def read_bag(
     turned = {message.source for message in places if message.content.axes is not None}
     if turned and pose_axes is None:
         more = (*more, f"orientations of {', '.join(sorted(turned))} were left out (pose_axes keeps them)")
-    left = [f"{t.name} was left out ({t.kind}, {t.count})" for t in bag.bag.topics if t.name not in used]
+    left = [f"{t.name} was left out ({t.kind}, {t.count})" for t in bag.file.topics if t.name not in used]
     own = options.description, path.name, path.stem, digest
     raw = Recording(joint_group, tuple(found), *own, notes=(*notes, *more, *left))
     return convert_to_si_and_validate(raw, str(path), replace(options, joints=None, points=None))
@@ -239,8 +239,8 @@ def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
     names = _names_of(bag)
     options: dict[str, Any] = {}
     notes: list[str] = []
-    sources = [_preview_source(topic, bag, names) for topic in bag.bag.topics]
-    states = bag.bag.topics_of(JOINT_STATE)
+    sources = [_preview_source(topic, bag, names) for topic in bag.file.topics]
+    states = bag.file.topics_of(JOINT_STATE)
     owners: dict[str, list[str]] = {}
     for message in bag.states:
         for joint in message.content.name:
@@ -335,9 +335,9 @@ class _States:
 
 def _joints(bag: _Contents, options: BagOptions, where: str) -> tuple[list[_States], tuple[str, ...]]:
     """Choose topics, joints and the messages that have them; with what was left out."""
-    known, topics, command = bag.bag.topics_of(JOINT_STATE), options.joint_topics, options.command_topic
+    known, topics, command = bag.file.topics_of(JOINT_STATE), options.joint_topics, options.command_topic
     for topic in (*(topics or ()), *((command,) if command else ())):
-        bag.bag.check_topic(topic, known, "joint states")
+        bag.file.check_topic(topic, known, "joint states")
     chosen = [topic for topic in (known if topics is None else topics) if topic != command]
     wanted = None if options.joints is None else parse_renamings(options.joints, "joint", where)
     found, notes = [], []
@@ -436,7 +436,7 @@ _MessagesByFrame = dict[str, list[tuple[str, BagMessage]]]
 def _names_of(bag: _Contents) -> dict[str, str]:
     """Topics that become points by themselves, and the last part of each that says what was seen."""
     names = {}
-    for topic in bag.bag.topics_of(*_PLACES):
+    for topic in bag.file.topics_of(*_PLACES):
         parts = [part for part in topic.split("/") if part]
         telling = [part for part in parts if part.lower() not in _PLAIN_WORDS]
         names[topic] = (telling or parts)[-1]
@@ -447,10 +447,10 @@ def _named_places(bag: _Contents, points: Mapping[str, str] | None, where: str) 
     """Sort the points by frame of reference, each with its name."""
     present = sorted({message.source for message in bag.places})
     names = _names_of(bag) if points is None else dict(points)
-    known = [*present, *(f"{tree}:FRAME" for tree in bag.bag.topics_of(*_TREES))]
+    known = [*present, *(f"{tree}:FRAME" for tree in bag.file.topics_of(*_TREES))]
     for source in () if points is None else names:
         if source not in present:
-            bag.bag.check_topic(source, known, "points")
+            bag.file.check_topic(source, known, "points")
     check_point_names(names, where)
     groups: _MessagesByFrame = {}
     for message in bag.places:
@@ -498,7 +498,7 @@ def _positions(
 # -- preview ----------------------------------------------------------------------------------------------------------
 
 
-def _preview_source(topic: BagTopic, bag: _Contents, names: Mapping[str, str]) -> FileSource:
+def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) -> FileSource:
     own = [m for m in (*bag.states, *bag.places) if m.source.partition(":")[0] == topic.name]
     logged = [message.logged for message in own]
     span = 1e-9 * (max(logged) - min(logged)) if logged else 0.0

@@ -71,18 +71,7 @@ _MAX_PLAUSIBLE_VALUES = {"position": 2.1 * math.pi, "points": 20.0}
 
 
 def parse_units(words: Iterable[str]) -> dict[str, str]:
-    """Unit of each quantity, parsed from `quantity=unit` or from a unit alone.
-
-    Parameters
-    ----------
-    words : iterable of str
-        `deg`, `mm`, `velocity=rpm`.
-
-    Raises
-    ------
-    DataError
-        A unit that measures nothing here.
-    """
+    """Unit of each quantity, parsed from words such as `deg`, `mm` or `velocity=rpm`; `DataError` for no unit."""
     units: dict[str, str] = {}
     for word in words:
         quantity, equals, unit = word.partition("=")
@@ -106,11 +95,8 @@ def _factors(units: Mapping[str, str], where: str) -> dict[str, float]:
     factors = dict.fromkeys(_QUANTITIES, 1.0)
     for quantity, unit in units.items():
         if quantity not in _QUANTITIES:
-            raise DataError(
-                f"a unit is given for '{quantity}', which is no quantity",
-                where=where,
-                **unknown_name_details(quantity, _QUANTITIES),
-            )
+            what = f"a unit is given for '{quantity}', which is no quantity"
+            raise DataError(what, where=where, **unknown_name_details(quantity, _QUANTITIES))
         known = {_spaceless(name): factor for name, factor in _TO_SI[_QUANTITIES[quantity]].items()}
         if _spaceless(unit) not in known:
             what, names = f"'{unit}' is not a unit of '{quantity}'", tuple(_TO_SI[_QUANTITIES[quantity]])
@@ -122,10 +108,7 @@ def _factors(units: Mapping[str, str], where: str) -> dict[str, float]:
 def parse_renamings(entries: Iterable[str], noun: str, where: str) -> dict[str, str]:
     """Mapping from recorded names to new names, parsed from `name` or `recorded=name`.
 
-    Raises
-    ------
-    DataError
-        An empty name, or one that is given twice.
+    `DataError` for an empty name, or one that is given twice.
     """
     found: dict[str, str] = {}
     for entry in entries:
@@ -169,16 +152,15 @@ def convert_to_si_and_validate(raw: Recording, where: str, options: ConversionOp
     if group is not None:
         channels: dict[str, Any] = {name: factors[name] * values for name, values in group.channels.items()}
         if "effort" in channels:
-            current = _spaceless(units.get("effort", "")) in _CURRENTS
-            constants, gears = options.torque_constants or {}, options.gears or {}
-            channels["effort"] = channels["effort"] * _torque_factors(group.names, current, constants, gears, where)
+            channels["effort"] = channels["effort"] * _torque_factors(group.names, options, where)
         group = replace(group, t=factors["t"] * group.t, **channels)
+    length = factors["points"]
     seen = tuple(
         replace(
             entry,
             t=factors["t"] * entry.t,
-            position=factors["points"] * entry.position,
-            std=None if entry.std is None else factors["points"] * entry.std,
+            position=length * entry.position,
+            std=None if entry.std is None else length * entry.std,
         )
         for entry in seen
     )
@@ -220,39 +202,30 @@ def check_point_names(chosen: Mapping[str, str], where: str) -> None:
         raise DataError(what, where=where, allowed="a name for each", hint=f"name them: points {shared[0]}=NAME, ...")
 
 
-def _torque_factors(
-    names: Sequence[str], current: bool, constants: Mapping[str, float], gears: Mapping[str, float], where: str
-) -> Array:
+def _torque_factors(names: Sequence[str], options: ConversionOptions, where: str) -> Array:
     """N m per recorded number of every joint, shape (nj,)."""
+    constants, gears = options.torque_constants or {}, options.gears or {}
     for word, given in (("torque_constants", constants), ("gears", gears)):
         for pattern, value in given.items():
             if not fnmatch.filter(names, pattern):
-                raise DataError(
-                    f"{word} is given for '{pattern}', which is no joint",
-                    where=where,
-                    **unknown_name_details(pattern, names),
-                )
+                what = f"{word} is given for '{pattern}', which is no joint"
+                raise DataError(what, where=where, **unknown_name_details(pattern, names))
             if not (math.isfinite(value) and value != 0):
                 raise DataError(f"{word} of '{pattern}' is {value:g}", where=where, allowed="a number that is not zero")
-    if not current:
+    if _spaceless((options.units or {}).get("effort", "")) not in _CURRENTS:
         if constants or gears:
-            raise DataError(
-                "torque constants or gears are given, but the efforts are no currents",
-                where=where,
-                allowed="units effort=A or effort=mA beside them",
-                hint="set the unit of effort to A",
-            )
+            what = "torque constants or gears are given, but the efforts are no currents"
+            allowed = "units effort=A or effort=mA beside them"
+            raise DataError(what, where=where, allowed=allowed, hint="set the unit of effort to A")
         return np.ones(len(names))
     factors = np.ones(len(names))
     for j, name in enumerate(names):
         own = [value for pattern, value in constants.items() if fnmatch.fnmatchcase(name, pattern)]
         if not own:
-            raise DataError(
-                f"the effort of '{name}' is a current, and its torque constant is not given",
-                where=where,
-                allowed="torque_constants for every joint [N m/A]",
-                hint=f"--torque-constants {name}=0.1, or '*=0.1' for all",
-            )
+            what = f"the effort of '{name}' is a current, and its torque constant is not given"
+            allowed = "torque_constants for every joint [N m/A]"
+            hint = f"--torque-constants {name}=0.1, or '*=0.1' for all"
+            raise DataError(what, where=where, allowed=allowed, hint=hint)
         ratio = [value for pattern, value in gears.items() if fnmatch.fnmatchcase(name, pattern)]
         factors[j] = own[-1] * (ratio[-1] if ratio else 1.0)
     return factors
@@ -293,24 +266,10 @@ _MAX_INTERPOLATED_PERIODS = 5.0
 
 
 def merge_on_fastest_clock(groups: Sequence[tuple[str, JointGroup]], where: str) -> tuple[JointGroup, tuple[str, ...]]:
-    """Merge the joints of several sources onto the clock of the fastest one.
+    """Merge the joints of several named sources onto the clock of the fastest one, and say in words what was done.
 
     Values of the others are interpolated linearly between their samples. A time at which one of them has no sample
     within `_MAX_INTERPOLATED_PERIODS` of its periods on both sides is left out, so that a gap stays a gap.
-
-    Parameters
-    ----------
-    groups : sequence of (str, JointGroup)
-        Name of every source, and its joints with strictly increasing times on the same clock.
-    where : str
-        What errors call the file.
-
-    Returns
-    -------
-    JointGroup
-        All joints, with the channels that every source has.
-    tuple of str
-        What was done, in words.
 
     Raises
     ------
@@ -329,10 +288,12 @@ def merge_on_fastest_clock(groups: Sequence[tuple[str, JointGroup]], where: str)
         listed = "; ".join(f"{name}: {group.t[0]:.6g} to {group.t[-1]:.6g} s" for name, group in groups)
         raise DataError("the joint states share no time", where=where, allowed=listed, hint="choose one of the topics")
     t = clock.t[kept]
-    channels: dict[str, Any] = {
-        channel: np.hstack([_at(group.t, values, t) for _, group in groups for values in [group.channels[channel]]])
-        for channel in clock.channels
-    }
+
+    def joined(channel: str) -> Array:
+        columns = ((group.t, column) for _, group in groups for column in group.channels[channel].T)
+        return np.stack([np.interp(t, known, column) for known, column in columns], axis=1)
+
+    channels: dict[str, Any] = {channel: joined(channel) for channel in clock.channels}
     notes = []
     others = [entry for i, entry in enumerate(groups) if i != fastest]
     moved = [source for source, group in others if not np.isin(t, group.t).all()]
@@ -357,10 +318,6 @@ def _can_interpolate(known: Array, t: Array) -> NDArray[np.bool_]:
     period = float(np.median(np.diff(known))) if len(known) > 1 else 0.0
     gap = known[np.minimum(after, len(known) - 1)] - known[np.maximum(before, 0)]
     return np.asarray(inside & (gap <= _MAX_INTERPOLATED_PERIODS * period + 1e-12))
-
-
-def _at(known: Array, values: Array, t: Array) -> Array:
-    return np.stack([np.interp(t, known, column) for column in values.T], axis=1)
 
 
 def _check_separate(groups: Sequence[tuple[str, JointGroup]], where: str) -> None:

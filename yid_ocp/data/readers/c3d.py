@@ -52,32 +52,18 @@ def read_c3d(
     frame: str = "world",
     description: str = "",
 ) -> Recording:
-    """Read the markers of a C3D file.
+    """Read the markers of a C3D file as points in one group called `points`, on a nominal clock from zero on.
 
-    The file says its rate and its unit. A marker that was not seen in a frame (residual -1, NaN, or exactly the origin)
-    is NaN. A subject in front of the name (`Subject:tip`) is left out where the rest is unique. In `notes` are markers
-    without a label, what a model of a body has computed (angles, forces, moments, powers) and analog channels.
-
-    Parameters
-    ----------
-    path : path-like
-        The file.
-    points : mapping of marker to name, optional
-        Markers to keep; all labelled ones that were ever seen when absent.
-    units : mapping of quantity to unit, optional
-        Unit of `points`, where the file does not say it or says it wrongly.
-    sensor, frame : str
-        What saw the points, and their frame of reference.
-
-    Returns
-    -------
-    Recording
-        The checked recording, its points in one group called `points`, on a nominal clock from zero on.
+    The file says its rate and its unit; `units` where it does not or wrongly. A marker that was not seen in a frame
+    (residual -1, NaN, or exactly the origin) is NaN. A subject in front of the name (`Subject:tip`) is left out where
+    the rest is unique. In `notes` are markers without a label, what a model of a body has computed (angles, forces,
+    moments, powers) and analog channels. `points` are markers to keep, each with its name; all labelled ones that were
+    ever seen when absent.
 
     Raises
     ------
     DataError
-        If `ezc3d` is not installed, the file cannot be read or has no markers, or as `validate`.
+        If `ezc3d` is not installed, the file cannot be read or has no markers, or as `validate_recording`.
     """
     path = Path(path)
     digest = file_sha256(path)
@@ -117,9 +103,8 @@ def _markers(path: Path) -> _Markers:
     try:
         import ezc3d
     except ImportError as error:
-        raise DataError(
-            "reading C3D files needs the package ezc3d", where=str(path), hint="pip install 'yid-ocp[c3d]'"
-        ) from error
+        hint = "pip install 'yid-ocp[c3d]'"
+        raise DataError("reading C3D files needs the package ezc3d", where=str(path), hint=hint) from error
     check_readable_in_fork(path, _complaint, "C3D")
     try:
         file = ezc3d.c3d(str(path))
@@ -145,19 +130,16 @@ def _markers(path: Path) -> _Markers:
     position[unseen] = np.nan
     why = {}
     for i, label in enumerate(labels):
-        if label in computed:
-            why[i] = "computed by a model, no place"
-        elif not label or label.startswith("*"):
-            why[i] = "it has no label"
-        elif unseen[:, i].all():
-            why[i] = "never seen"
+        unlabelled = not label or label.startswith("*")
+        reason = "computed by a model, no place" if label in computed else "it has no label" if unlabelled else ""
+        if reason or unseen[:, i].all():
+            why[i] = reason or "never seen"
     kept = [i for i in range(len(labels)) if i not in why]
     if not kept:
         what = "no labelled marker of the C3D file was ever seen"
         raise DataError(what, where=str(path), allowed="labelled 3-D points", hint="label them and export it again")
-    others = [
-        FileSource(labels[i] or f"marker {i + 1}", "marker", int((~unseen[:, i]).sum()), rate, "", why[i]) for i in why
-    ]
+    counts = (~unseen).sum(axis=0)
+    others = [FileSource(labels[i] or f"marker {i + 1}", "marker", int(counts[i]), rate, "", why[i]) for i in why]
     others += [FileSource(name, "analog", 0, math.nan, "", "an analog channel") for name in analog]
     names = _short([labels[i] for i in kept])
     t = np.arange(len(position)) / rate

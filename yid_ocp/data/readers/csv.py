@@ -94,8 +94,13 @@ def read_csv(path: str | os.PathLike[str], options: CsvOptions = _DEFAULTS) -> R
 def _raw(meanings: Sequence[tuple[str, str]], table: Array, where: str, options: CsvOptions = _DEFAULTS) -> Recording:
     """The table's joints and points in its own units."""
     t = table[:, meanings.index(("t", ""))]
-    joint_names, channels = _joint_columns(meanings, table, where)
-    point_names, position = _point_columns(meanings, table, where)
+    found = [meaning for meaning in meanings if meaning[0] in JOINT_CHANNEL_UNITS]
+    joint_names = tuple(dict.fromkeys(joint for _, joint in found))
+    used = dict.fromkeys(["position", *(channel for channel, _ in found)]) if found else {}
+    channels = {name: _gather(meanings, table, [(name, joint) for joint in joint_names], where) for name in used}
+    point_names = tuple(dict.fromkeys(point for axis, point in meanings if axis in _AXES))
+    wanted = [(axis, name) for name in point_names for axis in _AXES]
+    position = _gather(meanings, table, wanted, where).reshape(len(table), len(point_names), 3)
     joint_rows = point_rows = np.arange(len(t))
     if joint_names and point_names:
         joint_rows = np.flatnonzero(~np.isnan(np.hstack(list(channels.values()))).all(axis=1))
@@ -222,12 +227,10 @@ def _read_table(path: Path, options: CsvOptions) -> tuple[list[tuple[str, str]],
     if not rows:
         raise DataError("the table has no rows", where=str(path), allowed="one header row, then one row per time")
     if len(bad) > _MOST_BAD * (len(rows) + len(bad)):
-        raise DataError(
-            f"{len(bad)} of {len(rows) + len(bad)} lines are no rows of {len(names)} numbers",
-            where=f"{path}, line {bad[0]}",
-            allowed="a table most of whose lines are rows of numbers",
-            hint="look at it with --preview; set the delimiter or leave columns of text out",
-        )
+        what = f"{len(bad)} of {len(rows) + len(bad)} lines are no rows of {len(names)} numbers"
+        where, allowed = f"{path}, line {bad[0]}", "a table most of whose lines are rows of numbers"
+        hint = "look at it with --preview; set the delimiter or leave columns of text out"
+        raise DataError(what, where=where, allowed=allowed, hint=hint)
     notes: tuple[str, ...] = ()
     if bad:
         listed = ", ".join(map(str, bad[:_LISTED])) + (", ..." if len(bad) > _LISTED else "")
@@ -292,15 +295,11 @@ def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> 
     for name in header:
         own = _given_meaning(name, given[name], where) if name in given else _conventional_meaning(name)
         if own is None and name not in given:
-            raise DataError(
-                f"the meaning of column '{name}' is not known",
-                where=where,
-                allowed="t, "
-                + ", ".join(f"{prefix}<joint>" for prefix in _PREFIXES)
-                + ", <point>_x, <point>_y, <point>_z",
-                hint=f"rename it, or say what it is: columns {name}=position:JOINT, or {name}={SKIP_COLUMN} to leave "
-                "it out",
+            allowed = f"t, {', '.join(f'{prefix}<joint>' for prefix in _PREFIXES)}, <point>_x, <point>_y, <point>_z"
+            hint = (
+                f"rename it, or say what it is: columns {name}=position:JOINT, or {name}={SKIP_COLUMN} to leave it out"
             )
+            raise DataError(f"the meaning of column '{name}' is not known", where=where, allowed=allowed, hint=hint)
         if own and own in meanings:
             other = header[meanings.index(own)]
             raise DataError(f"columns '{other}' and '{name}' mean the same, {' '.join(own).strip()}", where=where)
@@ -331,28 +330,11 @@ def _given_meaning(column: str, given: str, where: str) -> tuple[str, str] | Non
     kind, _, name = given.partition(":")
     known = (*JOINT_CHANNEL_UNITS, *_AXES)
     if not name or kind not in known:
-        raise DataError(
-            f"column '{column}' is given the meaning '{given}'",
-            where=where,
-            allowed=f"t, {SKIP_COLUMN}, or KIND:NAME with a joint's or a point's name and one of {', '.join(known)}",
-            hint=nearest_name_hint(kind, known) if kind not in known else f"{kind}:NAME",
-        )
+        what, allowed = f"column '{column}' is given the meaning '{given}'", f"t, {SKIP_COLUMN}, or KIND:NAME with a "
+        allowed += f"joint's or a point's name and one of {', '.join(known)}"
+        hint = nearest_name_hint(kind, known) if kind not in known else f"{kind}:NAME"
+        raise DataError(what, where=where, allowed=allowed, hint=hint)
     return kind, name
-
-
-def _joint_columns(
-    meanings: Sequence[tuple[str, str]], table: Array, where: str
-) -> tuple[tuple[str, ...], dict[str, Array]]:
-    found = [meaning for meaning in meanings if meaning[0] in JOINT_CHANNEL_UNITS]
-    names = tuple(dict.fromkeys(joint for _, joint in found))
-    used = dict.fromkeys(["position", *(channel for channel, _ in found)]) if found else {}
-    return names, {channel: _gather(meanings, table, [(channel, name) for name in names], where) for channel in used}
-
-
-def _point_columns(meanings: Sequence[tuple[str, str]], table: Array, where: str) -> tuple[tuple[str, ...], Array]:
-    names = tuple(dict.fromkeys(point for axis, point in meanings if axis in _AXES))
-    wanted = [(axis, name) for name in names for axis in _AXES]
-    return names, _gather(meanings, table, wanted, where).reshape(len(table), len(names), 3)
 
 
 def _gather(meanings: Sequence[tuple[str, str]], table: Array, wanted: Sequence[tuple[str, str]], where: str) -> Array:

@@ -59,32 +59,18 @@ def read_lerobot(
     gears: Mapping[str, float] | None = None,
     description: str = "",
 ) -> Recording:
-    """Read one episode of a LeRobot dataset.
+    """Read one episode, from zero on, of the folder of a LeRobot dataset.
 
     `observation.state` is the measured position of the joints, or position, velocity and effort where the names of its
     entries end in `.pos`, `.vel` and `.torque`, `.effort` or `.current`; `action` is the commanded position. Times are
-    frame numbers over the frames a second, a nominal clock. Images and other features are in `notes`.
-
-    Parameters
-    ----------
-    path : path-like
-        Folder of the dataset, with `meta/info.json`.
-    episode : int
-        Which one, from zero on.
-    joints : sequence of str, optional
-        Joints to keep, `name` or `recorded=name`, in this order: a gripper that is not in the model is left out so.
-    units, torque_constants, gears
-        As `yid_ocp.data.readers.base.ConversionOptions`. Many of these robots record degrees.
-
-    Returns
-    -------
-    Recording
-        The checked recording.
+    frame numbers over the frames a second, a nominal clock. Images and other features are in `notes`. The other options
+    are those of `ConversionOptions`: a gripper that is not in the model is left out with `joints`; many of these robots
+    record degrees.
 
     Raises
     ------
     DataError
-        If `pyarrow` is not installed, the dataset is not understood or has no such episode, or as `validate`.
+        If `pyarrow` is not installed, the dataset is not understood or has no such episode, or as `validate_recording`.
     """
     dataset = _dataset(Path(path))
     table, file = _episode(dataset, episode)
