@@ -9,7 +9,6 @@ import pytest
 from yid_ocp.integrator.discrete import discrete_equations
 from yid_ocp.model import System, forward_kinematics
 from yid_ocp.model.kinematics import rigid_body_derivatives
-from yid_ocp.model.urdf import read_urdf
 
 FORCE_LEFT = {"symmetric": 0.5, "left": 1.0}
 PULL_MIDDLE = {"node": 0.0, "midpoint": 0.5}
@@ -26,9 +25,6 @@ SYSTEMS = {
     "closed_loop": lambda parts, folder: parts.closed_loop(folder)[0],
     "welded_cable": lambda parts, folder: parts.clamped_cable("weld")[0],
     "aligned_cable": lambda parts, folder: parts.clamped_cable("axis")[0],
-    "open_chain": lambda parts, folder: System.build(
-        read_urdf(folder / "mixed_joints.urdf"), driven=["nod", "slide"], damping=0.3
-    ),
 }
 
 

@@ -25,9 +25,7 @@ _ELBOW_UP_ANGLES: Mapping[str, float] = {
     f"{side}_{joint}": sign * value if joint in ("s0", "e0", "w0", "w2") else value
     for side, sign in (("left", 1.0), ("right", -1.0))
     for joint, value in zip(BAXTER_ARM_JOINTS, (-0.40, -1.13, -0.15, 1.19, -0.08, 1.13, 0.0), strict=True)
-}
-"""Initial guess of Baxter's joint angles [rad]: elbow above the hand, the right arm mirrored."""
-
+}  # of Baxter, where a search begins [rad]: elbow above the hand, the right arm mirrored
 _PULL = 1e-5  # [m/rad]; moves the gripper by less than 1e-9 m
 
 
@@ -87,17 +85,14 @@ class MultisineOptions:
         default, on two arms, lets the foam Y snap from one shape to another.
     max_joint_speed : float
         Largest joint speed [rad/s]; an arm that would exceed it travels less.
-    sines_per_joint : int
-        One in each of as many equal parts (in log frequency) of `frequency_band`, and as many that shake.
-    frequency_band, shake_frequency_band : (float, float)
-        Lowest and highest frequency [Hz]; those that shake well below half the rate of what records the torque.
+    sines_per_joint, frequency_band, shake_frequency_band : int, (float, float)
+        One sine in each of as many equal parts (in log frequency) of the band [Hz], and as many in that of those that
+        shake, which is well below half the rate of what records the torque.
     ramp_time, duration : float
         [s]
-    shake_torque_rms : float
+    shake_torque_rms, max_shake_speed : float
         Root mean square of the torque that each joint's own inertia takes beside its travel [N m], in sines of equal
-        torque, none faster than `max_shake_speed`. Zero leaves torques as gentle as the travel.
-    max_shake_speed : float
-        Largest velocity of one of these sines [rad/s]; what light wrists reach first.
+        torque, none faster than this [rad/s], which light wrists reach first. Zero leaves torques gentle.
     """
 
     gripper_travel: float = 0.11

@@ -106,21 +106,17 @@ class SimulationOptions:
 
 @dataclass(frozen=True)
 class SimulationResult:
-    """Noise-free trajectories of a simulation.
+    """Noise-free trajectories of a simulation at the times t, shape (N + 1,) [s].
 
     Attributes
     ----------
-    t : ndarray, shape (N + 1,)
-        [s]
     q, v : ndarray, shape (N + 1, n)
-        [rad or m]
     effort : ndarray, shape (N + 1, nu)
         Torque at t_k, or its mean from t_k to t_{k+1}, as `effort_kind` says [N m], or what servos were commanded at
         t_k; the last row was computed and not applied.
-    frame_times : ndarray, shape (M,)
-        Times of the camera's frames, rounded to the simulator's step [s].
     point_positions, frame_point_positions : ndarray, shape (N + 1, np, 3) and (M, np, 3)
-        Positions of `system.point_frames` in the world, at `t` and at `frame_times` [m].
+        Positions of `system.point_frames` in the world, at `t` and at `frame_times`, the camera's (M,) rounded to the
+        simulator's step [m].
     grasp_separation : ndarray, shape (N + 1, number of grasps)
         Distance between the two ends of each grasp [m].
     """
