@@ -154,12 +154,11 @@ def smoothed(monkeypatch, models, **limits):
 NOTHING = dict.fromkeys(SOURCES, 0.0)
 
 
-@pytest.mark.parametrize("smooth", [True, False])
 @pytest.mark.parametrize("variance", [(0.0, 0.0, 0.0), (0.8, 0.0, 0.0), (0.5, 1.5, 0.2)])
-def test_the_evidence_has_parameters_and_all_recordings_in_it(variance, smooth):
+def test_the_evidence_has_parameters_and_all_recordings_in_it(variance):
     models = [made(1), made(2)]
     at = dict(zip(SOURCES, variance, strict=True))
-    state, reference = smoother._run(models, at, smooth), Dense(models, at)
+    state, reference = smoother._run(models, at), Dense(models, at)
     assert state.log_evidence == pytest.approx(reference.log_evidence, rel=1e-9)
     np.testing.assert_allclose(state.shift, reference.theta, rtol=1e-8)
     np.testing.assert_allclose(
@@ -181,7 +180,7 @@ def test_scores_leave_to_parameters_what_they_explain():
 
 
 def test_variances_so_large_that_rounding_shows_are_never_the_best():
-    assert smoother._run([made(1, loose=1e12)], NOTHING, smooth=False).log_evidence == -math.inf
+    assert smoother._run([made(1, loose=1e12)], NOTHING).log_evidence == -math.inf
 
 
 @pytest.mark.parametrize("column", [0, 1, 2])
@@ -219,8 +218,8 @@ def test_the_best_variance_of_a_group_is_searched_over_all_sizes():
     ]
     some = {FORCE: 0.0, BIAS: 0.3}
     [(most, here)] = smoother._largest_evidences(both, some, [FORCE])
-    assert most == pytest.approx(smoother._run(both, some | {FORCE: here}, smooth=False).log_evidence, rel=1e-9)
-    assert most > smoother._run(both, some, smooth=False).log_evidence + 1
+    assert most == pytest.approx(smoother._run(both, some | {FORCE: here}).log_evidence, rel=1e-9)
+    assert most > smoother._run(both, some).log_evidence + 1
 
 
 @pytest.mark.parametrize("column", [0, 1, 2])
@@ -374,12 +373,11 @@ def test_a_place_that_does_as_well_is_told():
     twice = replace(model, intervals=tuple(intervals), unknown_groups=(HERE, LIKE, OTHER))
     variance = {HERE: 50.0, LIKE: 0.0, OTHER: 0.0}
     state = smoother._run([twice], variance)
-    weight = smoother._weights([twice], variance, state)
-    assert weight[HERE] > 100
-    found = smoother._instead([twice], variance, state.log_evidence, weight, Thresholds())
+    drop, found = smoother._alternatives([twice], variance, state, Thresholds())
+    assert drop[HERE] > 100
     assert found == {HERE: (LIKE,)}
-    strict = Thresholds(location_tie=1.0, min_log_bayes_factor=1e-9)
-    assert LIKE not in smoother._instead([twice], variance, state.log_evidence + 1e3, weight, strict)[HERE]
+    strict, better = Thresholds(location_tie=1.0, min_log_bayes_factor=1e-9), replace(state, log_evidence=1e6)
+    assert LIKE not in smoother._alternatives([twice], variance, better, strict)[1][HERE]
 
 
 def test_it_is_named_beside_the_place_but_its_own_other_unknowns_are_not():

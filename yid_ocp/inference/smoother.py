@@ -232,11 +232,11 @@ class _State:
     log_evidence: float
 
 
-def _run(models: Sequence[LinearResidualModel], variance: Mapping[UnknownGroup, float], smooth: bool = True) -> _State:
-    """All recordings at given variances; their unknowns where they are to be smoothed."""
+def _run(models: Sequence[LinearResidualModel], variance: Mapping[UnknownGroup, float]) -> _State:
+    """All recordings at given variances; without smoothed unknowns where rounding shows."""
 
     def run(model: LinearResidualModel) -> tuple[_Filtered, _Smoothed | None]:
-        done = _forwards(model, model.unknown_variance(variance), smooth)
+        done = _forwards(model, model.unknown_variance(variance), True)
         return done, _backwards(done) if done.updates else None
 
     filtered, smoothed = zip(*map_in_threads(run, models), strict=True)
@@ -401,11 +401,11 @@ def run_smoother(
         variance, state = max(found.values(), key=lambda entry: entry[1].log_evidence)
         before, after, taken, samples = _explained(models, variance, nothing, state)
         degrees = max(float(samples) - len(nothing.shift), 1.0)
-        weight = _weights(models, variance, state)
+        drop, alternatives = _alternatives(models, variance, state, limits)
         return SmootherResult(
             tuple(_trace(model, done, state) for model, done in zip(models, state.recordings, strict=True)),
             variance,
-            weight,
+            drop,
             # what unknowns of the reference size add to r'r on average is the variance of their scores
             {s: math.sqrt(limits.detectable_chi2 / max(v, 1e-300)) for s, (_, v) in _scores(models, nothing).items()},
             before,
@@ -414,7 +414,7 @@ def run_smoother(
             max(degrees - taken, 1.0),
             {"none": 0.0} | gain,
             limits.min_log_bayes_factor,
-            _instead(models, variance, state.log_evidence, weight, limits),
+            alternatives,
         )
 
 
@@ -475,32 +475,22 @@ def _explained(
     return before, after, taken, samples
 
 
-def _weights(
-    models: Sequence[LinearResidualModel], variance: dict[UnknownGroup, float], state: _State
-) -> dict[UnknownGroup, float]:
-    """Fall of the log evidence without each group."""
-    weight = dict.fromkeys(variance, 0.0)
-    for source in [s for s, v in variance.items() if v]:
-        less = _run(models, variance | {source: 0.0}, smooth=False)
-        weight[source] = max(state.log_evidence - less.log_evidence, 0.0)
-    return weight
-
-
-def _instead(
+def _alternatives(
     models: Sequence[LinearResidualModel],
     variance: dict[UnknownGroup, float],
-    evidence: float,
-    weight: Mapping[UnknownGroup, float],
+    state: _State,
     limits: SmootherThresholds,
-) -> dict[UnknownGroup, tuple[UnknownGroup, ...]]:
-    """Groups that would keep most of what each group at work raises the evidence by, or all but what is chance."""
-    found: dict[UnknownGroup, tuple[UnknownGroup, ...]] = {}
+) -> tuple[dict[UnknownGroup, float], dict[UnknownGroup, tuple[UnknownGroup, ...]]]:
+    """Fall of the log evidence without each group, and those that would keep most of it, or all but what is chance."""
+    drop, found = dict.fromkeys(variance, 0.0), {}
     for source in [s for s, v in variance.items() if v]:
         less = variance | {source: 0.0}
-        scores = _scores(models, _run(models, less))
+        without = _run(models, less)
+        drop[source] = max(state.log_evidence - without.log_evidence, 0.0)
+        scores = _scores(models, without)
         # promise at no variance says little of how far a group gets: all of them are asked
         asked = [s for s, v in variance.items() if not v and scores[s][0] > scores[s][1]]
-        lost = max(limits.min_log_bayes_factor, (1 - limits.location_tie) * weight[source])
+        least = state.log_evidence - max(limits.min_log_bayes_factor, (1 - limits.location_tie) * drop[source])
         reached = zip(asked, _largest_evidences(models, less, asked), strict=True)
-        found[source] = tuple(other for other, (reach, _) in reached if reach >= evidence - lost)
-    return found
+        found[source] = tuple(other for other, (reach, _) in reached if reach >= least)
+    return drop, found
