@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,122 +17,118 @@ from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.workflow.build import build_system
 
 START = 1_700_000_000 * 10**9
-QUARTER = 1.5707963
 CURVED = "stiffness_per_curvature: true, clamped_at_base: true"
 
-UR5 = """\
+MODEL = """\
 model:
-  robot: package:ur5
-  arms: {{mode: driven}}
+  robot: {robot}
+  arms: {arms}
   object:
     kind: segments
-    mount: {{parent_frame: tool0}}
+    mount: {{parent_frame: {frame}}}
     segments:
-      cable: {{length: 1.0, mass: 0.1, radius: 0.005, links: {links}, joint_axes: xy, {curved}}}
-  damping: {{shoulder_pan_joint: 0.1, object: 5.0e-4}}
-  points: [w_cable, "cable:50%"]
-parameters: {{cable.bend: {{initial: 0.03}}}}
-"""
-UR5_POSTURE = {
-    "shoulder_pan_joint": 0.3, "shoulder_lift_joint": -1.2, "elbow_joint": 1.6, "wrist_1_joint": -1.9708,
-    "wrist_2_joint": -1.5708, "wrist_3_joint": 0.0,
-}  # fmt: skip
-UR5_POINTS = {"w_cable": "tip", "cable:50%": "middle"}
-UR5_TRUTH = {"cable.bend": 0.03, "cable.damping": 5e-4}
-
-PANDA = """\
-model:
-  robot: package:panda
-  arms:
-    mode: driven
-    joints: [panda_joint1, panda_joint2, panda_joint3, panda_joint4, panda_joint5, panda_joint6, panda_joint7]
-    exclude_links: [panda_hand]
-  object:
-    kind: segments
-    mount: {{parent_frame: panda_link8}}
-    segments:
-{branches}
-  damping: {{panda_joint1: 0.1, object: 2.0e-3}}
-  points: [w_b1, w_b2, w_b3, w_b4]
+{segments}
+  damping: {damping}
+  points: [{points}]
+  effects: [{effects}]
 parameters: {{{parameters}}}
 """
-PANDA_POSTURE = dict(zip((f"panda_joint{i}" for i in range(1, 8)), (0.0, -0.4, 0.0, -2.0, 0.0, 1.6, 0.8), strict=True))
-PANDA_BENDS = {"b1": 0.10, "b2": 0.15, "b3": 0.20, "b4": 0.25}
-PANDA_POINTS = {f"w_b{i}": f"marker_{i}" for i in range(1, 5)}
-PANDA_TRUTH = {f"{name}.bend": value for name, value in PANDA_BENDS.items()}
 
 
-SERVO = """\
-model:
-  robot: default:servo_arm.urdf
-  arms: {{mode: servo}}
-  object:
-    kind: segments
-    mount: {{parent_frame: gripper}}
-    segments:
-      rod: {{length: 0.4, mass: 0.04, radius: 0.003, links: {links}, joint_axes: xy, {curved}}}
-  damping: {{pan: 0.05, object: 4.0e-4}}
-  points: [w_rod, "rod:50%"]
-  effects: [{effects}]
-parameters:
-  rod.bend: {{initial: 0.03}}
-  "*.servo_gain": {{initial: 45.0}}
-  "*.servo_damping": {{initial: 2.0}}
-  "*.servo_delay": {{initial: 0.03}}
-"""
+@dataclass(frozen=True)
+class Newcomer:
+    """A robot with something flexible in its hand, as it is in truth.
+
+    Attributes
+    ----------
+    settings : dict
+        Of `MODEL` but for the segments; parameters by name.
+    segments : dict of str to str
+        Settings of each, without the number of links.
+    points : dict of str to str
+        What the user calls them, by frame.
+    """
+
+    links: int
+    settings: Mapping[str, str]
+    parameters: Mapping[str, float]
+    segments: Mapping[str, str]
+    posture: Mapping[str, float]
+    points: Mapping[str, str]
+    truth: Mapping[str, float]
+
+    def text(self, links: int) -> str:
+        shapes = (f"      {n}: {{{s}, links: {links or self.links}, joint_axes: xy}}" for n, s in self.segments.items())
+        values = ", ".join(f'"{name}": {{initial: {value}}}' for name, value in self.parameters.items())
+        named = {"points": ", ".join(f'"{name}"' for name in self.points), "effects": "", "segments": "\n".join(shapes)}
+        return MODEL.format(**named | dict(self.settings), parameters=values)
+
+    def simulate(
+        self, folder: Path, seed: int, duration: float, excitation: MultisineOptions | None = None, links: int = 0
+    ) -> Recording:
+        """Joints at 100 Hz without efforts, points at 50 Hz to half a millimetre under names of their own."""
+        file = folder / "truth.yaml"
+        file.write_text(self.text(links))
+        system = build_system(load_config(file))
+        excitation = excitation or MultisineOptions(max_joint_speed=1.0, duration=duration, frequency_band=(0.3, 1.5))
+        start = {"initial_joint_angles": self.posture, "seed": seed}
+        seen = {"point_std": 5e-4, "frame_rate": 50.0, "has_dropouts": False, "hidden_probability": 0.0}
+        experiment = VirtualExperiment(
+            motion=random_multisine(system, None, excitation=excitation, **start),
+            simulation=SimulationOptions(duration, time_step=2e-4),
+            arm_noise=ArmSensorNoise(position_std=1e-4),
+            camera=PointCamera(pose=np.eye(4), **seen),
+            **start,
+        )
+        made = run_virtual_experiment(system, None, experiment)
+        [group] = made.points
+        names = tuple(self.points[name] for name in group.names)
+        return Recording(
+            made.joints, (PointGroup("points", names, group.t, group.position, None, "mocap"),), name="run"
+        )
+
+
+UR5 = Newcomer(
+    16,
+    {"robot": "package:ur5", "arms": "{mode: driven}", "frame": "tool0",
+     "damping": "{shoulder_pan_joint: 0.1, object: 5.0e-4}"},
+    {"cable.bend": 0.03},
+    {"cable": f"length: 1.0, mass: 0.1, radius: 0.005, {CURVED}"},
+    {"shoulder_pan_joint": 0.3, "shoulder_lift_joint": -1.2, "elbow_joint": 1.6, "wrist_1_joint": -1.9708,
+     "wrist_2_joint": -1.5708, "wrist_3_joint": 0.0},
+    {"w_cable": "tip", "cable:50%": "middle"},
+    {"cable.bend": 0.03, "cable.damping": 5e-4},
+)  # fmt: skip
+PANDA_JOINTS = [f"panda_joint{i}" for i in range(1, 8)]
+PANDA_TRUTH = {"b1.bend": 0.10, "b2.bend": 0.15, "b3.bend": 0.20, "b4.bend": 0.25}
+PANDA = Newcomer(
+    10,
+    {"robot": "package:panda", "frame": "panda_link8", "damping": "{panda_joint1: 0.1, object: 2.0e-3}",
+     "arms": f"{{mode: driven, joints: [{', '.join(PANDA_JOINTS)}], exclude_links: [panda_hand]}}"},
+    PANDA_TRUTH,
+    {f"b{i + 1}": f"length: 0.4, mass: 0.03, radius: 0.004, {CURVED}, rpy: [0.0, 1.5707963, {round(1.5707963 * i, 7)}]"
+     for i in range(4)},
+    dict(zip(PANDA_JOINTS, (0.0, -0.4, 0.0, -2.0, 0.0, 1.6, 0.8), strict=True)),
+    {f"w_b{i}": f"marker_{i}" for i in range(1, 5)},
+    PANDA_TRUTH,
+)  # fmt: skip
 SERVO_POSTURE = {"pan": 0.0, "lift": 0.4, "elbow": 1.0, "wrist_flex": 0.3, "wrist_roll": 0.0}
-SERVO_POINTS = {"w_rod": "tip", "rod:50%": "middle"}
-SERVO_TRUTH = {"cable.bend": 0.03, "cable.damping": 4e-4}
+SERVO_VALUES = {"gain": 45.0, "damping": 2.0, "delay": 0.03}
+SERVO = Newcomer(
+    12,
+    {"robot": "default:servo_arm.urdf", "arms": "{mode: servo}", "frame": "gripper",
+     "damping": "{pan: 0.05, object: 4.0e-4}",
+     "effects": ", ".join(f"{{kind: rotor_inertia, location: {joint}, values: {{armature: 0.01}}}}"
+                          for joint in SERVO_POSTURE)},
+    {"rod.bend": 0.03, **{f"*.servo_{name}": value for name, value in SERVO_VALUES.items()}},
+    {"rod": f"length: 0.4, mass: 0.04, radius: 0.003, {CURVED}"},
+    SERVO_POSTURE,
+    {"w_rod": "tip", "rod:50%": "middle"},
+    {"cable.bend": 0.03, "cable.damping": 4e-4},
+)  # fmt: skip
 SERVOS = {
-    f"{joint}.servo_{name}": value
-    for joint in ("lift", "elbow", "wrist_flex")
-    for name, value in {"gain": 45.0, "damping": 2.0, "delay": 0.03}.items()
+    f"{joint}.servo_{name}": value for joint in ("lift", "elbow", "wrist_flex") for name, value in SERVO_VALUES.items()
 }
-
-
-def servo_text(links: int = 12) -> str:
-    rotors = (f"{{kind: rotor_inertia, location: {joint}, values: {{armature: 0.01}}}}" for joint in SERVO_POSTURE)
-    return SERVO.format(links=links, curved=CURVED, effects=", ".join(rotors))
-
-
-def ur5_text(links: int = 16) -> str:
-    return UR5.format(links=links, curved=CURVED)
-
-
-def panda_text(links: int = 10) -> str:
-    shape = f"length: 0.4, mass: 0.03, radius: 0.004, links: {links}, joint_axes: xy, {CURVED}"
-    turns = [f"rpy: [0.0, {QUARTER}, {round(QUARTER * i, 7)}]" for i in range(4)]
-    branches = [f"      {name}: {{{shape}, {turn}}}" for name, turn in zip(PANDA_BENDS, turns, strict=True)]
-    parameters = ", ".join(f"{name}.bend: {{initial: {value}}}" for name, value in PANDA_BENDS.items())
-    return PANDA.format(branches="\n".join(branches), parameters=parameters)
-
-
-def simulated(
-    folder: Path,
-    text: str,
-    posture: Mapping[str, float],
-    points: Mapping[str, str],
-    seed: int,
-    duration: float,
-    excitation: MultisineOptions | None = None,
-) -> Recording:
-    """Joints at 100 Hz without efforts, points at 50 Hz to half a millimetre under names of their own."""
-    file = folder / "truth.yaml"
-    file.write_text(text)
-    system = build_system(load_config(file))
-    excitation = excitation or MultisineOptions(max_joint_speed=1.0, duration=duration, frequency_band=(0.3, 1.5))
-    experiment = VirtualExperiment(
-        motion=random_multisine(system, None, seed=seed, initial_joint_angles=posture, excitation=excitation),
-        initial_joint_angles=posture,
-        simulation=SimulationOptions(duration, time_step=2e-4),
-        arm_noise=ArmSensorNoise(position_std=1e-4),
-        camera=PointCamera(point_std=5e-4, frame_rate=50.0, has_dropouts=False, hidden_probability=0.0, pose=np.eye(4)),
-        seed=seed,
-    )
-    made = run_virtual_experiment(system, None, experiment)
-    [seen] = made.points
-    names = tuple(points[name] for name in seen.names)
-    return Recording(made.joints, (PointGroup("points", names, seen.t, seen.position, None, "mocap"),), name="run")
 
 
 def write_mcap(recording: Recording, folder: Path) -> Path:

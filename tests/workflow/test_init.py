@@ -15,6 +15,7 @@ from ruamel.yaml import YAML
 from yid_ocp.cli import main
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import config_json_schema
+from yid_ocp.config.settings import RunSettings
 from yid_ocp.data import JointGroup, PointGroup, Recording, read_recording, write_recording
 from yid_ocp.workflow.build import build_system, parameter_settings
 
@@ -70,6 +71,16 @@ def init(*words: str, files: Sequence[str] = ("one.h5",)) -> int:
     return main(["init", "wrist.urdf", *files, "--out", "run.yaml", *words])
 
 
+def proposed(recording: Recording, *words: str) -> RunSettings:
+    """The configuration that is written for a recording."""
+    write_recording(recording, Path("one.h5"))
+    assert init(*(words or CABLE), "--replace") == 0
+    return load_config("run.yaml")
+
+
+SHORT = np.arange(0, 2, 1 / RATE)
+
+
 def test_the_file_loads_and_says_what_was_recorded(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert init(*CABLE) == 0
     assert "m1 at cable:50%" in capsys.readouterr().out
@@ -97,7 +108,7 @@ def test_the_file_loads_and_says_what_was_recorded(bench: Path, capsys: pytest.C
 def test_several_recordings_are_split_and_a_rest_splits_one(bench: Path) -> None:
     names = []
     for i in range(4):
-        write_recording(moved(np.arange(0, 2, 1 / RATE), seed=i), bench / f"run_{i}.h5")
+        write_recording(moved(SHORT, seed=i), bench / f"run_{i}.h5")
         names.append(f"run_{i}.h5")
     assert init(*CABLE, files=names) == 0
     recordings = load_config("run.yaml").recordings
@@ -117,16 +128,13 @@ def test_several_recordings_are_split_and_a_rest_splits_one(bench: Path) -> None
 
 @pytest.mark.parametrize("parts", [(0.5, 1.0), ()], ids=["joints and points", "joints alone"])
 def test_a_start_in_motion_is_estimated(parts: Sequence[float], bench: Path) -> None:
-    recording = moved(np.arange(0, 2, 1 / RATE), parts=parts, effort=True, moving=True)
-    write_recording(recording, bench / "one.h5")
-    assert init(*CABLE) == 0
-    assert load_config("run.yaml").problem.initial_state == "estimated"
+    run = proposed(moved(SHORT, parts=parts, effort=True, moving=True))
+    assert run.problem.initial_state == "estimated"
 
 
 def test_efforts_alone_bring_zeros_and_friction_of_the_arm(bench: Path) -> None:
-    write_recording(moved(np.arange(0, 2, 1 / RATE), parts=(), effort=True), bench / "one.h5")
-    assert init("--object", "beam", "--length", "0.5", "--mass", "0.1", "--section", "0.001,0.05") == 0
-    run = load_config("run.yaml")
+    beam = ("--object", "beam", "--length", "0.5", "--mass", "0.1", "--section", "0.001,0.05")
+    run = proposed(moved(SHORT, parts=(), effort=True), *beam)
     assert [effect.kind for effect in run.model.effects] == ["effort_offset"] * 2
     assert run.parameters["roll.damping"].free
     assert run.sensors["joints.effort"].std == pytest.approx(1.0, rel=0.2)
@@ -136,21 +144,17 @@ def test_efforts_alone_bring_zeros_and_friction_of_the_arm(bench: Path) -> None:
 
 
 def test_efforts_beside_points_are_left_alone(bench: Path) -> None:
-    write_recording(moved(np.arange(0, 2, 1 / RATE), effort=True), bench / "one.h5")
-    assert init(*CABLE) == 0
-    run = load_config("run.yaml")
+    run = proposed(moved(SHORT, effort=True))
     assert run.sensors["joints.effort"].use is False
     assert not run.model.effects
 
 
 def test_commands_without_efforts_are_followed_by_servos(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    made = moved(np.arange(0, 2, 1 / RATE))
+    made = moved(SHORT)
     assert made.joints is not None
     commands = np.vstack([made.joints.position[6:], np.tile(made.joints.position[-1:], (6, 1))])
-    write_recording(replace(made, joints=replace(made.joints, position_command=commands)), bench / "one.h5")
-    assert init(*CABLE) == 0
+    run = proposed(replace(made, joints=replace(made.joints, position_command=commands)))
     assert "mode: servo: commanded positions were recorded" in capsys.readouterr().out
-    run = load_config("run.yaml")
     assert run.model.arms.mode == "servo"
     assert run.model.arms.servo.command_interpolation == "held"
     system = build_system(run)
@@ -161,9 +165,7 @@ def test_commands_without_efforts_are_followed_by_servos(bench: Path, capsys: py
     # a copy of the measured angles is no command, and efforts say more than commands
     for changes in ({"position_command": made.joints.position}, {"effort": np.ones_like(commands)}):
         other = replace(made.joints, **{"position_command": commands, **changes})
-        write_recording(replace(made, joints=other), bench / "one.h5")
-        assert init(*CABLE, "--replace") == 0
-        assert load_config("run.yaml").model.arms.mode == "prescribed"
+        assert proposed(replace(made, joints=other)).model.arms.mode == "prescribed"
 
 
 def test_a_servo_arm_without_commands_is_told_what_is_missing(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -176,15 +178,14 @@ def test_a_servo_arm_without_commands_is_told_what_is_missing(bench: Path, capsy
 
 
 def test_a_tree_gets_its_markers_where_they_are(bench: Path) -> None:
-    write_recording(moved(np.arange(0, 2, 1 / RATE), parts=(0.4, 1.0)), bench / "one.h5")
-    assert init("--object", "tree", "--branch", "up=0.5,0.05,0.004", "--branch", "side=0.3,0.03,0.004,0,1.57,0") == 0
-    run = load_config("run.yaml")
+    tree = ("--object", "tree", "--branch", "up=0.5,0.05,0.004", "--branch", "side=0.3,0.03,0.004,0,1.57,0")
+    run = proposed(moved(SHORT, parts=(0.4, 1.0)), *tree)
     assert run.sensors["points"].frames == {"m1": "up:40%", "m2": "w_up"}
     assert {"w_up", "w_side", "up:40%"} == set(build_system(run).point_frames)
 
 
 def test_a_file_of_another_tool_is_imported_along(bench: Path) -> None:
-    recording = moved(np.arange(0, 2, 1 / RATE))
+    recording = moved(SHORT)
     assert recording.joints is not None
     columns = ["t,r,p,ax,ay,az"]
     for t, q, x in zip(recording.joints.t, recording.joints.position, recording.points[0].position, strict=True):
@@ -198,13 +199,8 @@ def test_a_file_of_another_tool_is_imported_along(bench: Path) -> None:
     assert np.allclose(made.joints.position, recording.joints.position)
     assert made.point_names == ("cable:100%",)
     # the section repeats the import
-    assert run.import_.columns == {
-        "r": "position:roll",
-        "p": "position:pitch",
-        "ax": "x:tip",
-        "ay": "y:tip",
-        "az": "z:tip",
-    }
+    columns = {"r": "position:roll", "p": "position:pitch", "ax": "x:tip", "ay": "y:tip", "az": "z:tip"}
+    assert run.import_.columns == columns
     assert main(["import", "bag.csv", "--out", "again.h5", "--config", "run.yaml"]) == 0
     assert np.array_equal(read_recording("again.h5").points[0].position, made.points[0].position)
 
@@ -246,7 +242,7 @@ def test_what_is_missing_is_named_and_nothing_is_written(
 
 
 def test_recordings_that_do_not_fit_are_refused(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    recording = moved(np.arange(0, 2, 1 / RATE), parts=())
+    recording = moved(SHORT, parts=())
     write_recording(recording, bench / "one.h5")
     assert init(*CABLE) == 2
     assert "nothing in the recording shows what the object does" in capsys.readouterr().err
@@ -257,17 +253,16 @@ def test_recordings_that_do_not_fit_are_refused(bench: Path, capsys: pytest.Capt
     assert "--joints shoulder=roll" in told
     assert not (bench / "bag.h5").exists()
     (bench / "run.yaml").write_text("kept: true\n")
-    write_recording(moved(np.arange(0, 2, 1 / RATE)), bench / "one.h5")
+    write_recording(moved(SHORT), bench / "one.h5")
     assert init(*CABLE) == 2
     assert "is there already" in capsys.readouterr().err
     assert (bench / "run.yaml").read_text() == "kept: true\n"
 
 
 def test_points_in_another_frame_are_not_placed(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_recording(moved(np.arange(0, 2, 1 / RATE), far=3.0), bench / "one.h5")
-    assert init(*CABLE) == 0
+    run = proposed(moved(SHORT, far=3.0))
     assert "is it in the same frame?" in capsys.readouterr().out
-    assert not load_config("run.yaml").sensors["points"].frames
+    assert not run.sensors["points"].frames
     # and `check` says what is missing
     assert main(["check", "run.yaml"]) == 2
     assert "none of the points of group 'points' is a frame of the model" in capsys.readouterr().err

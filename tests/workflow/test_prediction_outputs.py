@@ -14,7 +14,6 @@ from yid_ocp.data import read_recording, write_recording
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.diagnosis.events import NO_EVENTS
 from yid_ocp.errors import OutputError
-from yid_ocp.inference.uncertainty import ParameterEstimate, mark_not_trusted
 from yid_ocp.inference.whitening import whitened_at, without_input_errors
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
@@ -60,17 +59,16 @@ def test_a_solution_with_its_predictions(solved, tmp_path):
         assert list(missing) == []
         episode, outcome = problem.episodes[0], solution.episode_predictions[0]
         n = problem.system.n_coordinates
-        np.testing.assert_array_equal(made["t"], episode.grid.node_times)
-        np.testing.assert_array_equal(made["q"], outcome.rollout.state[:, :n])
-        np.testing.assert_array_equal(made["p"], outcome.rollout.state[:, n : 2 * n])
-        np.testing.assert_array_equal(made["effort"], outcome.rollout.effort)
+        state, sensor, samples = outcome.rollout.state, made["joints.effort"], episode.measurements[0]
+        arrays = {"t": episode.grid.node_times, "q": state[:, :n], "p": state[:, n : 2 * n]}
+        for name, values in (arrays | {"effort": outcome.rollout.effort}).items():
+            np.testing.assert_array_equal(made[name], values)
         assert {"multipliers", "torque"} < set(made)
-        sensor, samples = made["joints.effort"], episode.measurements[0]
         assert list(sensor.attrs["channels"]) == list(samples.sensor.channel_names)
         assert sensor.attrs["unit"] == "N m"
-        np.testing.assert_array_equal(sensor["measured"], samples.value)
-        np.testing.assert_array_equal(sensor["predicted"], outcome.predicted_outputs[0])
-        np.testing.assert_array_equal(sensor["std"], samples.std)
+        arrays = {"measured": samples.value, "predicted": outcome.predicted_outputs[0], "std": samples.std}
+        for name, values in arrays.items():
+            np.testing.assert_array_equal(sensor[name], values)
         inside = np.min(np.abs(sensor["t"][()][:, None] - episode.recording.joints.t[None, :]), axis=1)
         assert np.max(inside) < 0.5 * problem.step.time_step
 
@@ -173,26 +171,26 @@ def test_the_table_has_a_row_for_a_joint_and_a_column_for_a_recording():
     assert len(torque_offset_rows({"torque_offsets": {}})) == len(torque_offset_rows({})) == 1, "a head alone"
 
 
-def simulated(problem, seed):
+def simulated(problem, seeds):
     episode = problem.episodes[0]
     outcome = problem.predictor.predict_episode(episode, *problem.split(problem.initial_unknowns, 0), False)
-    return recording_from_prediction(problem.predictor, episode, outcome, problem.theta, seed).joints
+    known = (problem.predictor, episode, outcome, problem.theta)
+    return [recording_from_prediction(*known, seed).joints for seed in seeds]
 
 
 def test_simulated_torques_are_wrong_as_the_estimation_expects_and_say_so(step):
     problem = problem_of(step)
-    exact = simulated(problem, None)
-    errors = np.array([(simulated(problem, seed).effort - exact.effort)[:, 0] for seed in range(60)])
+    exact, *wrong = simulated(problem, [None, *range(60)])
+    errors = np.array([(joints.effort - exact.effort)[:, 0] for joints in wrong])
     # for 60 draws a standard deviation is good to a tenth of itself
     assert errors.mean(axis=1).std() == pytest.approx(OFFSET, rel=0.3)
     assert (errors - errors.mean(axis=1, keepdims=True)).std() == pytest.approx(WHITE, rel=0.05)
-    made = simulated(problem, 1)
-    for group in (made, exact):
+    for group in (wrong[0], exact):
         assert (group.effort_std, group.effort_bias_std, group.position_std) == (WHITE, OFFSET, ANGLE)
     # settings come before what the recording says
     sensors = {"joints.effort": SensorOptions(std={"shoulder": 0.4}, bias_std=0.7)}
     options = ProblemOptions(feedback="proportional", proportional_gains=(9.0,), sensors=sensors)
-    made = simulated(problem_of(step, options=options), 1)
+    [made] = simulated(problem_of(step, options=options), [1])
     assert (made.effort_std, made.effort_bias_std) == (0.4, 0.7)
 
 
@@ -244,18 +242,6 @@ def test_the_best_guess_counts():
     (doubt,) = worse_than_baseline_issues([said], UNITS)
     assert doubt.what == "the model is off by 0.2 m (rms), the guess 'stays' without a model by 0.1 m"
     assert doubt.evidence == pytest.approx(0.2 / 0.105)
-
-
-def test_what_was_found_is_not_trusted_and_what_was_not_stays_so():
-    one = ParameterEstimate(1.0, 0.1, "N m/rad", 1.0, 0.0, 9.0, True, "identifiable")
-    known = {
-        "found": one,
-        "weak": replace(one, verdict="weak"),
-        "lost": replace(one, verdict="not_identifiable"),
-        "fixed": replace(one, free=False, verdict="fixed"),
-    }
-    verdicts = {name: made.verdict for name, made in mark_not_trusted(known).items()}
-    assert verdicts == {"found": "not_trusted", "weak": "not_trusted", "lost": "not_identifiable", "fixed": "fixed"}
 
 
 @pytest.mark.parametrize(("factor", "believed"), [(1.0, True), (0.4, False)])

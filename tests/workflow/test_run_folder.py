@@ -20,23 +20,20 @@ def settings(pendulum):
     return load_config(pendulum)
 
 
-def test_a_folder_appears_when_the_block_ends(settings, tmp_path):
-    with new_run_folder(settings, tmp_path / "run") as folder:
-        folder.write_text_file("a.txt", "a")
-        assert not (tmp_path / "run").exists()
-        assert folder.path != folder.final_path
-    assert folder.path == folder.final_path == tmp_path / "run"
-    assert {path.name for path in folder.path.iterdir()} == {"a.txt", "log.jsonl"}
-
-
-def test_a_folder_that_is_left_by_an_error_is_not_there(settings, tmp_path):
-    def failing() -> None:
-        with new_run_folder(settings, tmp_path / "deep" / "run") as folder:
+def test_a_folder_appears_when_the_block_ends_and_not_when_it_is_left_by_an_error(settings, tmp_path):
+    def write(out, error=None) -> None:
+        with new_run_folder(settings, out) as folder:
             folder.write_text_file("a.txt", "a")
-            raise KeyError("a")
+            assert not out.exists()
+            assert folder.path != folder.final_path
+            if error:
+                raise error
+        assert folder.path == folder.final_path == out
 
+    write(tmp_path / "run")
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {"a.txt", "log.jsonl"}
     with pytest.raises(KeyError):
-        failing()
+        write(tmp_path / "deep" / "run", KeyError("a"))
     assert not (tmp_path / "deep").exists()
 
 
@@ -71,21 +68,15 @@ def test_messages_of_the_library_are_logged_while_the_folder_is_made(settings, t
     assert [(line["source"], line["text"]) for line in lines] == [("yid_ocp.test", "inside")]
 
 
-def test_a_folder_in_use_is_refused_and_an_unnamed_one_is_numbered(settings, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.parametrize(("name", "message"), [("used", "not empty"), ("used/file", "that of a file")])
+def test_a_folder_in_use_is_refused(settings, tmp_path, name, message):
     (tmp_path / "used").mkdir()
     (tmp_path / "used" / "file").write_text("")
-    for name, message in (("used", "not empty"), ("used/file", "that of a file")):
-        with pytest.raises(OutputError, match=message), new_run_folder(settings, name):
-            pass
-    monkeypatch.setattr("yid_ocp.workflow.run_folder.time.strftime", lambda _: "now")
-    for _ in range(2):
-        with new_run_folder(settings, None, "check"):
-            pass
-    assert {path.name for path in (tmp_path / "runs").iterdir()} == {"pendulum-check-now", "pendulum-check-now-2"}
+    with pytest.raises(OutputError, match=message), new_run_folder(settings, tmp_path / name):
+        pass
 
 
-def test_a_name_is_reserved_from_the_start(settings, tmp_path, monkeypatch):
+def test_an_unnamed_one_is_numbered_and_its_name_reserved_from_the_start(settings, tmp_path, monkeypatch):
     monkeypatch.setattr("yid_ocp.workflow.run_folder.time.strftime", lambda _: "now")
     monkeypatch.chdir(tmp_path)
     with contextlib.ExitStack() as runs:
@@ -94,6 +85,8 @@ def test_a_name_is_reserved_from_the_start(settings, tmp_path, monkeypatch):
             folder.write_text_file("number.txt", str(i))
     names = ["pendulum-check-now", "pendulum-check-now-2", "pendulum-check-now-3"]
     assert [(tmp_path / "runs" / name / "number.txt").read_text() for name in names] == ["0", "1", "2"]
+    with new_run_folder(settings, None, "check") as folder:
+        assert folder.final_path.name == "pendulum-check-now-4"
 
 
 def test_a_name_that_another_run_has_is_refused_before_the_work(settings, tmp_path):

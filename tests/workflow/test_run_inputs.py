@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shlex
-import subprocess
-import sys
 from importlib import metadata
 from types import SimpleNamespace
 
@@ -122,18 +120,14 @@ def replace_dist(entry, dist):
     return entry._for(dist)
 
 
-def test_a_diagnosis_names_it_and_its_command_repeats_the_result(kinds, rubbing, repository, tmp_path) -> None:
-    file = tmp_path / "pushed.yaml"
+def test_a_diagnosis_names_it_and_its_command_repeats_the_result(kinds, rubbing, tmp_path, cli) -> None:
     (tmp_path / "own.py").write_text(EFFECT.format(kind="constant"))
     text = re.sub(r"candidates: \[.*?\]", "candidates: [constant]", rubbing.read_text())
-    file.write_text(f"plugins: [own.py]\n{text}")
-    script = f"import sys; sys.path[:0] = [{str(repository)!r}]; from yid_ocp.cli import main; sys.exit(main())"
-    results = []
-    command = ["diagnose", str(file), "--set", "output.write_report=false"]
+    (tmp_path / "pushed.yaml").write_text(f"plugins: [own.py]\n{text}")
+    command, results = ["diagnose", tmp_path / "pushed.yaml", "--set", "output.write_report=false"], []
     for name in ("first", "second"):
-        run = [sys.executable, "-c", script, *command, "--out", str(tmp_path / name)]
-        done = subprocess.run(run, cwd=tmp_path, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
+        done = cli(*command, "--out", tmp_path / name)
+        assert done.code == 0, done.err
         results.append(json.loads((tmp_path / name / "result.json").read_text()))
         command = shlex.split(results[-1]["command"])[1:]
     assert results[0]["inputs"][str(tmp_path / "own.py")] == file_sha256(tmp_path / "own.py")

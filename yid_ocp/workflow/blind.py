@@ -263,8 +263,8 @@ class _Proof:
 def _prepare_experiment(experiment: Mapping[str, Any], folder: str, name: str) -> dict[str, int]:
     """Task: write an experiment's first recording and the detectable size of every candidate."""
     first = Path(folder) / f"{name}.h5"
-    BlindExperiment(**experiment).write_first_recording(first)
-    _, ensemble = BlindExperiment(**experiment).build_ensemble(first)
+    BlindExperiment(**experiment)._write_first_recording(first)
+    _, ensemble = BlindExperiment(**experiment)._build_ensemble(first)
     detectable = [entry.to_dict() for entry in ensemble.detectable_effects]
     write_json(Path(folder) / f"{name}.json", detectable)
     return {"candidates": len(detectable)}
@@ -274,7 +274,7 @@ def _draw_case(
     experiment: Mapping[str, Any], first: Path, detectable: Path, planned: Mapping[str, Any], folder: str
 ) -> dict[str, Any]:
     """Task: write the recordings of a case; returns its label and the data given to its diagnosis."""
-    _, ensemble = BlindExperiment(**experiment).build_ensemble(first)
+    _, ensemble = BlindExperiment(**experiment)._build_ensemble(first)
     ensemble.load_detectable_effects(json.loads(detectable.read_text("utf-8")))
     case, label = ensemble.draw_case(blind.PlannedCase(**planned))
     for recording in (*case.estimation_recordings, case.held_out_recording):
@@ -297,7 +297,7 @@ def diagnose_case_task(
 
     For calibration, one without a gap has `open` too: the statistics of a diagnosis that takes anything for a gap.
     """
-    run, ensemble = BlindExperiment(**experiment).build_ensemble(first)
+    run, ensemble = BlindExperiment(**experiment)._build_ensemble(first)
     case, candidates = _case(name, recordings, without), run.diagnosis.candidates
     begun = time.perf_counter()
     try:
@@ -318,7 +318,7 @@ def _true_effect_closure(
     experiment: Mapping[str, Any], first: Path, name: str, recordings: Sequence[Path], label: Mapping[str, Any]
 ) -> float | None:
     """Task: fraction of a case's gap closed by its refitted true effects; None where it cannot be computed."""
-    run, ensemble = BlindExperiment(**experiment).build_ensemble(first)
+    run, ensemble = BlindExperiment(**experiment)._build_ensemble(first)
     case = _case(name, recordings, ())
     try:
         best = blind.best_possible_closure(ensemble, case, blind.CaseLabel.from_dict(label), run.diagnosis.candidates)
@@ -398,13 +398,8 @@ class BlindExperiment:
         simulation = SimulationOptions(time_step=DEFAULT_SIMULATOR_STEP * varied.time_step_factor)
         return blind.RecordingConditions(varied.n_recordings, noise, simulation, purpose=self.purpose)
 
-    def write_first_recording(self, file: Path) -> None:
-        """Write the first recording, which fixes initial configuration and sensors.
-
-        Raises
-        ------
-        ConfigError, DataError, ModelError
-        """
+    def _write_first_recording(self, file: Path) -> None:
+        """Write the first recording, which fixes initial configuration and sensors."""
         varied, run = EXPERIMENT_VARIATIONS[self.variation], load_config(self.config_file)
         first = read_recordings(run, count=1)
         if not first:
@@ -427,19 +422,14 @@ class BlindExperiment:
         what = f"none of {MAX_CASE_DRAWS} motions can be simulated"
         raise ModelError(what, where=f"{self.config_file.name}, {varied.description}", hint=hint)
 
-    def build_ensemble(self, first: Path) -> tuple[RunSettings, blind.CaseGenerator]:
-        """Settings of the diagnosed model and the ensemble, built from the first recording.
-
-        Raises
-        ------
-        ConfigError, DataError, ModelError
-        """
+    def _build_ensemble(self, first: Path) -> tuple[RunSettings, blind.CaseGenerator]:
+        """Settings of the diagnosed model and the ensemble, built from the first recording."""
         return _ensemble(self, first, first.stat().st_mtime_ns)
 
 
 @functools.lru_cache(maxsize=1)
 def _ensemble(experiment: BlindExperiment, first: Path, written: int) -> tuple[RunSettings, blind.CaseGenerator]:
-    """See `BlindExperiment.build_ensemble`; kept with its compiled step for the next task of the same experiment."""
+    """See `BlindExperiment._build_ensemble`; kept with its compiled step for the next task of the same experiment."""
     del written
     varied, simulated_run = EXPERIMENT_VARIATIONS[experiment.variation], experiment.simulation_settings()
     simulated = build_system(simulated_run)

@@ -41,7 +41,7 @@ from yid_ocp.workflow.command_runner import EXIT_FAILED, EXIT_WRONG_INPUT, Comma
 from yid_ocp.workflow.prediction_outputs import predicted_trajectory
 from yid_ocp.workflow.run_folder import new_run_folder
 from yid_ocp.workflow.run_inputs import input_files
-from yid_ocp.workflow.solve import measure_discretisation_shifts
+from yid_ocp.workflow.solve import measure_discretisation_shifts, shift_results
 
 _RESULT_FORMAT = "yid-check/1"
 _FREQUENCY_TOLERANCE = 0.02  # fraction by which a frequency may move when links or steps are refined, without a warning
@@ -207,12 +207,14 @@ def _moves(
     if not at_x.ok:
         warnings.append(f"the model cannot be rolled out with the initial parameters: {at_x.message}")
         return {}
-    found = measure_discretisation_shifts(run, problem, x, at_x, ("links", "time_step"), progress, models_alone=True)
-    warnings += found.notes
+    shifts, notes = measure_discretisation_shifts(
+        run, problem, x, at_x, ("links", "time_step"), progress, models_alone=True
+    )
+    warnings += notes
     # how poorly initial values fit says nothing of how sure the data will be of what fits
     covariance, _ = covariance_and_chi2(problem, replace(at_x, residual=np.zeros_like(at_x.residual)))
     std = parameter_estimates(problem, x, at_x, covariance, None)
-    return found.to_result({name: std[name].std for name in found.estimate_shifts})
+    return shift_results(shifts, {name: std[name].std for name in shifts})
 
 
 def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, warnings: list[str]) -> dict[str, Any]:

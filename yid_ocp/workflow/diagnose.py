@@ -65,12 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
 def run_diagnose(
     run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS
 ) -> CommandResult[DiagnosisResult]:
-    """Diagnose and write the run folder; finished refits of an interrupted, identical run are reused.
-
-    Raises
-    ------
-    ConfigError, DataError, ModelError, SolverError, OutputError
-    """
+    """Diagnose and write the run folder; finished refits of an interrupted, identical run are reused."""
     with new_run_folder(run, out, "diagnose") as folder:
         folder.begin_run(run, "diagnose", _flags(run))
         refits = JsonRefitStore(folder, folder.input_hashes, dump_config(run), software_versions())

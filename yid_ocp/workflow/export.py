@@ -56,43 +56,38 @@ Array = NDArray[np.float64]
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    source, form = Path(arguments.source), arguments.format
-    if not source.is_dir():
-        return _export_recording(arguments, source, form)
-    if form == "csv":
+    source, form, out = Path(arguments.source), arguments.format, arguments.out
+    if source.is_dir() and form not in ("csv", _MCAP):
+        with show_progress(arguments) as progress:
+            manifest = _export_model(source, Path(out), form or "mjcf", progress)
+        print_result(arguments, manifest, lambda: terminal_lines(export_summary(manifest)), out, out)
+        return EXIT_DONE
+    if source.is_dir() and form == "csv":
         allowed, hint = ", ".join((*_MODEL_FORMATS, _MCAP)), "export a recording, or the run's signals as mcap"
         raise ConfigError("a run is no table", where="--format csv", allowed=allowed, hint=hint)
-    if form == _MCAP:
-        files, notes = _export_run_signals(source, arguments.out)
-        paths = [str(file) for file in files]
-        result = {"format": EXPORT_FORMAT, "file": paths, "kind": form, "notes": notes}
-        print_result(arguments, result, lambda: notes, "\n".join(paths), "\n".join(paths))
-    else:
-        with show_progress(arguments) as progress:
-            manifest = _export_model(source, Path(arguments.out), form or "mjcf", progress)
-        out = arguments.out
-        print_result(arguments, manifest, lambda: terminal_lines(export_summary(manifest)), out, out)
-    return EXIT_DONE
-
-
-def _export_recording(arguments: argparse.Namespace, source: Path, form: str | None) -> int:
-    if form not in (None, "csv", _MCAP):
+    if not source.is_dir() and form not in (None, "csv", _MCAP):
         allowed = f"csv or {_MCAP} of a recording; {', '.join(_MODEL_FORMATS)} of a run folder of `solve` or `diagnose`"
         raise ConfigError(f"{source.name} is no run folder", where=f"--format {form}", allowed=allowed)
-    recording = read_recording(source, allow_nan_effort=True)
-    result, notes = recording_contents(recording), []
-    if form == _MCAP:
-        files: tuple[Path, ...] = (Path(arguments.out) / f"{source.stem}.mcap",)
-        shift = export_mcap(signals_from_recording(recording), files[0])
-        if shift:
-            notes.append(f"{shift:g} s were added to all times, as stamps cannot be negative")
+    contents: dict[str, Any] = {"notes": []}
+    texts: list[str] = []
+    if source.is_dir():
+        files, notes = _export_run_signals(source, out)
     else:
-        files = export_csv(recording, arguments.out)
+        recording, files, notes = read_recording(source, allow_nan_effort=True), [], []
+        contents, texts = recording_contents(recording), recording_summary_lines(recording)
+        if form == _MCAP:
+            files = [Path(out) / f"{source.stem}.mcap"]
+            notes = _shift_notes("", export_mcap(signals_from_recording(recording), files[0]))
+        else:
+            files = list(export_csv(recording, out))
     paths = [str(file) for file in files]
-    result |= {"format": EXPORT_FORMAT, "file": paths, "kind": form or "csv", "notes": [*result["notes"], *notes]}
-    texts = [*notes, *recording_summary_lines(recording)]
-    print_result(arguments, result, lambda: texts, "\n".join(paths), "\n".join(paths))
+    own = {"format": EXPORT_FORMAT, "file": paths, "kind": form or "csv", "notes": [*contents["notes"], *notes]}
+    print_result(arguments, contents | own, lambda: [*notes, *texts], "\n".join(paths), "\n".join(paths))
     return EXIT_DONE
+
+
+def _shift_notes(begin: str, shift: float) -> list[str]:
+    return [f"{begin}{shift:g} s were added to all times, as stamps cannot be negative"] if shift else []
 
 
 # -- models -----------------------------------------------------------------------------------------------------------
@@ -298,9 +293,7 @@ def _export_run_signals(folder: Path, out: str) -> tuple[list[Path], list[str]]:
             raise DataError(what, where=str(source), allowed=allowed, hint="run it again")
         for name, signals in _recordings(file, form).items():
             files.append(Path(out) / f"{name}.mcap")
-            shift = export_mcap(signals, files[-1])
-            if shift:
-                notes.append(f"{files[-1].name}: {shift:g} s were added to all times, as stamps cannot be negative")
+            notes += _shift_notes(f"{files[-1].name}: ", export_mcap(signals, files[-1]))
     return files, notes
 
 

@@ -123,10 +123,6 @@ def run_identifiability(
     ----------
     workers : WorkerConfig or Executor, optional
         Who works out intervals, one parameter a task, and the experiments of `what_if`; this process when absent.
-
-    Raises
-    ------
-    ConfigError, DataError, ModelError, SolverError, OutputError
     """
     asked = options or IdentifiabilityOptions()
     with new_run_folder(run, out, "identifiability") as folder:

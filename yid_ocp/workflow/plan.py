@@ -52,10 +52,6 @@ def run_plan(
     """Plan the motion of a run's goal; write `recording.h5`, CSV tables, `trajectory.json`, result.json and the report.
 
     Successful where the goal was reached within all limits; the run folder says why not.
-
-    Raises
-    ------
-    ConfigError, DataError, ModelError, OutputError
     """
     with new_run_folder(run, out, "plan") as folder:
         folder.begin_run(run, "plan")

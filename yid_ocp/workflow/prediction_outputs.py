@@ -148,6 +148,8 @@ def _baselines(episode: Episode, samples: Measurements, cable: CableTopology | N
             ),
         }
         return {name: array[inside].reshape(len(samples.value), -1) for name, array in arrays.items()}
+    if not len(samples.value):
+        return {}
     first = np.take_along_axis(samples.value, np.isfinite(samples.value).argmax(axis=0)[None], axis=0)
     return {"stays": np.broadcast_to(first, samples.value.shape)}
 

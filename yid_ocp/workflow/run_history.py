@@ -177,7 +177,9 @@ def require_same_model(folders: Sequence[Path]) -> None:
 def _difference(run: RunSettings, folder: str | Path) -> str:
     """The first section of the model in which a run and one in a folder differ, empty where none is known to."""
     there = _settings(folder)
-    for key in _COMPARED_MODEL_SECTIONS if there is not None else ():
+    if there is None:
+        return ""
+    for key in _COMPARED_MODEL_SECTIONS:
         here, other = getattr(run.model, key), getattr(there.model, key)
         if key == "robot" and here is not None and other is not None:
             here, other = Path(here).name, Path(other).name  # a folder may have moved

@@ -54,10 +54,6 @@ def run_simulate(
     noise : bool
         Whether noise of the recorded standard deviations is added to what the model predicts (a virtual experiment
         always has noise).
-
-    Raises
-    ------
-    ConfigError, DataError, ModelError, OutputError
     """
     with new_run_folder(run, out, "simulate") as folder:
         flags = [*(["--seed", str(seed)] if seed else []), *(["--noise"] if noise else [])]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -68,10 +68,6 @@ def run_solve(
     """Estimate, validate and write the run folder; successful where the solver converged.
 
     Where it failed the run folder holds the reason and the best point.
-
-    Raises
-    ------
-    ConfigError, DataError, ModelError, OutputError
     """
     with new_run_folder(run, out) as folder:
         folder.begin_run(run, "solve")
@@ -80,12 +76,13 @@ def run_solve(
         solution, stability = with_stability_check(safe.problem, safe.solution)
         problem = solution.problem or safe.problem
         solution = with_profile_intervals(problem, solution, progress)
-        finer = DiscretisationShifts({})
+        shifts: dict[str, DiscretisationShift] = {}
+        notes: list[str] = []
         if solution.evaluation is not None:
             at = (solution.x, solution.evaluation, _requested_refinements(run))
-            finer = measure_discretisation_shifts(run, problem, *at, progress)
+            shifts, notes = measure_discretisation_shifts(run, problem, *at, progress)
         # the ± and the verdict of everything below count how far the estimate is from a fine model's
-        data_std, solution = solution.std, _with_discretisation_uncertainty(solution, finer)
+        data_std, solution = solution.std, _with_discretisation_uncertainty(solution, shifts)
         progress.begin_stage("predicting the held-out recordings")
         held_out = problem.predict_held_out(solution.x)
         cable = build_cable(run)
@@ -97,8 +94,8 @@ def run_solve(
             "doubts": issues_result(doubts),
             "safeguard": safe.message,
             "covariance": _covariance_result(solution, data_std),
-            "discretisation": finer.to_result(data_std),
-            "discretisation_notes": list(finer.notes),
+            "discretisation": shift_results(shifts, data_std),
+            "discretisation_notes": notes,
             "stability": stability,
             "torque_offsets": {} if solution.evaluation is None else estimated_torque_offsets(problem, solution.x),
         }
@@ -196,24 +193,9 @@ def _prediction_errors(
 # -- discretisation ---------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class DiscretisationShifts:
-    """Shifts of the estimates with a finer discretisation.
-
-    Attributes
-    ----------
-    estimate_shifts : mapping of parameter to DiscretisationShift
-        Of every shared free parameter; empty where nothing was tried.
-    notes : tuple of str
-        Why something that was asked for is not known.
-    """
-
-    estimate_shifts: Mapping[str, DiscretisationShift]
-    notes: tuple[str, ...] = ()
-
-    def to_result(self, std: Mapping[str, float]) -> dict[str, Any]:
-        """Shifts for result.json in the parameter's unit, with the standard deviation from the data alone."""
-        return {name: {**asdict(own), "std": std.get(name)} for name, own in self.estimate_shifts.items()}
+def shift_results(shifts: Mapping[str, DiscretisationShift], std: Mapping[str, float]) -> dict[str, Any]:
+    """Shifts for result.json in the parameter's unit, with the standard deviation from the data alone."""
+    return {name: {**asdict(own), "std": std.get(name)} for name, own in shifts.items()}
 
 
 def _requested_refinements(run: RunSettings) -> tuple[_Refinement, ...]:
@@ -233,8 +215,10 @@ def measure_discretisation_shifts(
     progress: Progress = NULL_PROGRESS,
     *,
     models_alone: bool = False,
-) -> DiscretisationShifts:
+) -> tuple[dict[str, DiscretisationShift], list[str]]:
     """Shifts of the estimates when every link is divided in two and when the time step is halved.
+
+    Of every shared free parameter, none where nothing was tried; and why something that was asked for is not known.
 
     Parameters
     ----------
@@ -262,13 +246,12 @@ def measure_discretisation_shifts(
             found[key] = own
     links, steps = found.get("links", {}), found.get("time_step", {})
     names = problem.shared_parameters if found else ()
-    made = {name: DiscretisationShift(links.get(name), steps.get(name)) for name in names}
-    return DiscretisationShifts(made, tuple(notes))
+    return {name: DiscretisationShift(links.get(name), steps.get(name)) for name in names}, notes
 
 
-def _with_discretisation_uncertainty(solution: Solution, found: DiscretisationShifts) -> Solution:
+def _with_discretisation_uncertainty(solution: Solution, shifts: Mapping[str, DiscretisationShift]) -> Solution:
     sizes = {} if solution.problem is None else typical_parameter_sizes(solution.problem, solution.x)
-    return replace(solution, parameters=inflate_estimates(solution.parameters, found.estimate_shifts, sizes))
+    return replace(solution, parameters=inflate_estimates(solution.parameters, shifts, sizes))
 
 
 def _with_twice_the_links(run: RunSettings, problem: EstimationProblem) -> RefinedProblem:

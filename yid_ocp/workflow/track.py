@@ -240,12 +240,7 @@ def _truth_errors(system: System, found: TrackResult, made: VirtualFrames) -> Ma
 def simulate_frames(
     run: RunSettings, system: System, settings: VirtualFramesSettings
 ) -> tuple[Recording, VirtualFrames]:
-    """Recording and camera frames of a virtual experiment, with initial parameter values as truth.
-
-    Raises
-    ------
-    ConfigError, DataError, ModelError
-    """
+    """Recording and camera frames of a virtual experiment, with initial parameter values as truth."""
     from yid_ocp.virtual.experiment import VirtualExperiment, run_virtual_experiment
     from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine
     from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
