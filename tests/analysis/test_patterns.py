@@ -14,8 +14,6 @@ from made_recordings import holding_pendulum
 from yid_ocp.analysis.sparsity_patterns import (
     NamedRange,
     SparsityPattern,
-    _inverse_sparsity,
-    _nlp_sparsity_masks,
     kkt_pattern,
     kkt_size,
     nlp_stage_sparsity,
@@ -29,31 +27,6 @@ from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers.symbolic_transcription import transcribe
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_an_inverse_can_differ_from_zero_where_it_does(seed):
-    rng = np.random.default_rng(seed)
-    count = 12
-    while True:
-        mask = rng.random((count, count)) < 0.16
-        mask[rng.permutation(count), np.arange(count)] = True
-        values = np.where(mask, rng.normal(size=mask.shape), 0.0)
-        if np.linalg.cond(values) < 1e6:
-            break
-    exact = np.abs(np.linalg.inv(values)) > 1e-12
-    found = _inverse_sparsity(mask)
-    assert not np.any(exact & ~found)
-    # with random values nothing cancels, so that the pattern is the exact one
-    np.testing.assert_array_equal(found, exact)
-    assert not np.all(found)
-
-
-def test_the_inverse_of_a_singular_pattern_is_anything():
-    mask = np.array([[True, True, False], [False, False, True], [False, False, True]])
-    assert np.all(_inverse_sparsity(mask))
-    assert _inverse_sparsity(np.zeros((0, 0), bool)).shape == (0, 0)
-
 
 # -- a step -----------------------------------------------------------------------------------------------------------
 
@@ -159,10 +132,12 @@ def test_the_nlp_has_the_pattern_that_is_shown(urdf_folder, feedback, start):
     stage = nlp_stage_sparsity(
         symbols, problem.shared_parameters, sensors, followed, problem.predictor.estimated_state_indices
     )
-    jacobian, hessian, measured = _nlp_sparsity_masks(stage, episode.grid.steps)
+    steps = episode.grid.steps
+    kkt, size = kkt_pattern(stage, steps), kkt_size(stage, [steps])
+    width = size["variables"]
+    jacobian, curved, measured = kkt.nonzero_mask[width:, :width], kkt.nonzero_mask[:width, :width], kkt.marked_mask
     # the program has the equilibrium at the start and the torques' errors besides
-    size = kkt_size(stage, [episode.grid.steps])
-    shown = np.setdiff1d(np.arange(program.w.numel()), program.block("rest").index)[: size.variables]
+    shown = np.setdiff1d(np.arange(program.w.numel()), program.block("rest").index)[:width]
     rng = np.random.default_rng(0)
     w = program.initial_guess + 1e-3 * rng.normal(size=len(program.initial_guess))
     weights = rng.normal(size=program.g.numel())
@@ -177,39 +152,41 @@ def test_the_nlp_has_the_pattern_that_is_shown(urdf_folder, feedback, start):
     assert np.mean(exact[jacobian[begun:]] != 0) > 0.95
     gauss_newton = np.abs(slope.T @ slope) > 0
     curvature = curvature[shown]
-    assert (size.variables, size.constraints) == (len(shown), begun + len(exact))
-    assert size.jacobian_nonzeros == np.count_nonzero(jacobian)
-    assert size.hessian_nonzeros == np.count_nonzero(hessian)
-    outside = (np.abs(curvature) > 1e-5 * np.abs(curvature).max()) & ~hessian
+    assert size["constraints"] == begun + len(exact) == len(jacobian)
+    assert size["jacobian_nonzeros"] == np.count_nonzero(jacobian)
+    unmeasured = np.count_nonzero(curved & ~measured[:width, :width])
+    assert unmeasured <= size["hessian_nonzeros"] <= np.count_nonzero(curved)
+    outside = (np.abs(curvature) > 1e-5 * np.abs(curvature).max()) & ~curved
     assert not np.any(outside)
     # a reading between two nodes couples them; each node's own block is the one shown
-    f, nx, m = stage.n_free_parameters, problem.step.sizes["nx"], stage.n_multipliers
+    f, nx, m, _ = stage.sizes
     for k in range(episode.grid.steps + 1):
         here = np.concatenate([np.arange(f), f + k * (nx + m) + np.arange(nx)])
         block = np.ix_(here, here)
         assert not np.any(gauss_newton[block] & ~measured[block]), k
 
 
-def test_the_size_of_many_steps_is_that_of_the_masks(urdf_folder):
+def test_the_size_of_many_steps_is_that_of_the_matrices(urdf_folder):
+    """Of two recordings that share their parameters, where nothing is measured and no prior counts."""
     problem = made_problem(urdf_folder, "lqr", "equilibrium")
     symbols = StepSymbols.from_equations(problem.step.equations)
-    stage = nlp_stage_sparsity(symbols, ("T1.bend",), [], (0, 1))
-    one, two = _nlp_sparsity_masks(stage, 5), _nlp_sparsity_masks(stage, 7)
-    size = kkt_size(stage, [5, 7])
-    shared = stage.n_free_parameters
-    assert size.variables == one[0].shape[1] + two[0].shape[1] - shared
-    assert size.constraints == len(one[0]) + len(two[0])
-    assert size.jacobian_nonzeros == np.count_nonzero(one[0]) + np.count_nonzero(two[0])
-    overlap = np.count_nonzero(one[1][:shared, :shared])
-    assert size.hessian_nonzeros == np.count_nonzero(one[1]) + np.count_nonzero(two[1]) - overlap
+    stage = nlp_stage_sparsity(symbols, ("T1.bend",), [], (0, 1), ())
+    size, width, height, nonzeros = kkt_size(stage, [5, 7]), 0, 0, 0
+    for steps in (5, 7):
+        own = kkt_size(stage, [steps])
+        jacobian = kkt_pattern(stage, steps).nonzero_mask[own["variables"] :, : own["variables"]]
+        width, height, nonzeros = width + jacobian.shape[1], height + len(jacobian), nonzeros + jacobian.sum()
+    assert (size["variables"], size["constraints"], size["jacobian_nonzeros"]) == (width - 1, height, nonzeros)
+    separate = sum(kkt_size(stage, [steps])["hessian_nonzeros"] for steps in (5, 7))
+    assert separate - size["hessian_nonzeros"] == np.count_nonzero(stage.hessian_mask[:1, :1])
 
 
 def test_the_kkt_matrix_is_symmetric_and_its_blocks_are_named(urdf_folder):
     problem = made_problem(urdf_folder, "lqr", "equilibrium")
     symbols = StepSymbols.from_equations(problem.step.equations)
     sensors = [samples.sensor for samples in problem.episodes[0].measurements]
-    stage = nlp_stage_sparsity(symbols, problem.shared_parameters, sensors, ())
-    kkt = kkt_pattern(stage, problem.shared_parameters, 2)
+    stage = nlp_stage_sparsity(symbols, problem.shared_parameters, sensors, (), ())
+    kkt = kkt_pattern(stage, 2)
     np.testing.assert_array_equal(kkt.nonzero_mask, kkt.nonzero_mask.T)
     assert [span.name for span in kkt.row_blocks] == [
         "theta", "q0", "p0", "lam0", "q1", "p1", "lam1", "q2", "p2",

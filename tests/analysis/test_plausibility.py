@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.analysis.clock_checks import clock_sensitivities, estimate_clock_error
 from yid_ocp.analysis.effort_checks import check_efforts
 from yid_ocp.analysis.joint_checks import RecordedJointsModel, check_joint_limits
 from yid_ocp.analysis.point_checks import check_cable_points, check_held_points, check_point_distances
@@ -270,22 +269,6 @@ def test_at_rest_nothing_tells_of_clocks(arms, runs):
     rng = np.random.default_rng(0)
     at_rest = with_points(still, "points_arm", lambda p: place + 1e-3 * rng.standard_normal(p.shape))
     assert list(check_held_points(arms[1], stamped(at_rest, 0.5), usual)) == []
-
-
-def test_the_error_of_a_clock_and_its_standard_deviation():
-    """Of a sine with white noise, beside a constant that is not known."""
-    t, noise, rng = np.linspace(0, 10, 400), 0.02, np.random.default_rng(1)
-    found = []
-    for _ in range(60):
-        true = np.sin(2 * (t - 0.01 - 0.002 * (t - 5)))
-        residual = (np.sin(2 * t) - true - 0.3 + noise * rng.standard_normal(len(t))) / noise
-        own = clock_sensitivities(t, 2 * np.cos(2 * t) / noise, (0.0, 10.0))
-        found.append(estimate_clock_error(t, residual, own, np.full((len(t), 1), 1 / noise), np.ones(1), (0.0, 10.0)))
-    for name, std, truth in (("stamp_delay", "stamp_delay_std", 0.01), ("relative_drift", "relative_drift_std", 0.002)):
-        values, stated = (np.array([getattr(one, key) for one in found]) for key in (name, std))
-        assert np.mean(values) == pytest.approx(truth, abs=4 * np.std(values) / 60**0.5 + 0.02 * truth)
-        assert 0.75 < np.std(values) / np.mean(stated) < 1.25
-    assert all(one.explained_excess_fraction > 0.5 for one in found)
 
 
 def test_what_no_change_explains_is_said_so(arms, runs):

@@ -10,11 +10,11 @@ import pytest
 from heard import Heard
 
 from yid_ocp.analysis import experiment_design
-from yid_ocp.analysis.experiment_design import BaseExperiment, CandidateExperimentBuilder, observable_frames
+from yid_ocp.analysis.experiment_design import MECHANICAL_CHANGES, BaseExperiment, CandidateExperimentBuilder
 from yid_ocp.analysis.identifiability import identifiability
-from yid_ocp.analysis.what_if import ExperimentChange, WhatIfOptions, _are_compatible, what_if
+from yid_ocp.analysis.what_if import ChangedExperimentResult, evaluate_change_sets, what_if
 from yid_ocp.data.recording import PointGroup
-from yid_ocp.errors import DataError
+from yid_ocp.errors import DataError, SolverError
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import GaussNewton, solve
@@ -24,87 +24,6 @@ from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.workflow.build_problem import load_problem
 
 TRUTH = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T3.bend": 11.5, "T3.twist": 9.7}
-
-
-@pytest.fixture(scope="module")
-def tube_ranking(held_tube):
-    heard = Heard()
-    return what_if(held_tube, progress=heard), heard.stages
-
-
-def test_the_experiment_as_it_is_agrees_with_the_analysis(held_tube, tube_ranking):
-    ranking, _ = tube_ranking
-    info = identifiability(held_tube)
-    assert ranking.unchanged_experiment.changes == ()
-    assert ranking.unchanged_experiment.verdicts == {name: entry.verdict for name, entry in info.parameters.items()}
-    for name, entry in info.parameters.items():
-        assert ranking.unchanged_experiment.std_relative[name] == pytest.approx(entry.std_relative, rel=1e-5)
-
-
-def test_a_predicted_sensor_tells_what_it_tells_when_it_is_there(held_tube, tube_ranking):
-    ranking, _ = tube_ranking
-    predicted = next(entry for entry in ranking.single_changes if entry.changes == ("camera:T1_1_tip",))
-    episode = held_tube.episodes[0]
-    camera = episode.recording.points[0]
-    both = PointGroup(
-        "points_camera", ["T1_0_tip", "T1_1_tip"], camera.t, np.zeros((21, 2, 3)), 2e-3, sensor="camera", pose=np.eye(4)
-    )
-    recording = replace(episode.recording, points=(both,))
-    info = identifiability(EstimationProblem(held_tube.step, [recording], held_tube.free, held_tube.options))
-    for name, entry in info.parameters.items():
-        assert predicted.std_relative[name] == pytest.approx(entry.std_relative, rel=1e-5)
-
-
-def test_changes_are_ranked_and_the_smallest_set_is_a_pair(tube_ranking):
-    ranking, told = tube_ranking
-    keys = [(-entry.identifiable, -entry.gain) for entry in ranking.single_changes]
-    assert keys == sorted(keys)
-    names = {entry.changes[0] for entry in ranking.single_changes}
-    assert {"weld", "torque", "arm:T1_marker", "camera:T1_marker", "camera:w_T1", "rate:30"} <= names
-    assert not any(entry.is_fully_identifiable for entry in ranking.single_changes)
-    # more light and more points never tell less
-    for entry in ranking.single_changes:
-        if entry.changes[0].startswith(("camera:", "arm:", "rate:")):
-            assert entry.gain >= ranking.unchanged_experiment.gain - 1e-9
-    # the tube is turned only by a weld, and what that takes is felt only in torques
-    assert {frozenset(entry.changes) for entry in ranking.smallest_sufficient_sets} == {frozenset({"weld", "torque"})}
-    assert ranking.smallest_sufficient_sets[0].is_fully_identifiable
-    assert ranking.n_evaluated_sets > len(ranking.single_changes)
-    assert "working out weld grasps in place of points" in told
-
-
-def test_torsional_springs_need_a_marker_off_the_axis(springs):
-    ranking = what_if(springs("torsion"))
-    assert ranking.unchanged_experiment.identifiable == 0
-    complete = {entry.changes for entry in ranking.single_changes if entry.is_fully_identifiable}
-    assert complete == {("camera:coupling_marker",), ("camera:spring_1_marker",)}
-    assert {entry.changes for entry in ranking.smallest_sufficient_sets} == complete
-    assert [entry.changes for entry in ranking.greedy_sequence] == [ranking.single_changes[0].changes]
-
-
-def test_series_springs_need_the_joint(springs):
-    ranking = what_if(springs("series_ends"), options=WhatIfOptions(max_set_size=1))
-    assert [entry.changes for entry in ranking.smallest_sufficient_sets] == [("camera:joint",)]
-
-
-def test_one_motion_and_one_rate_at_a_time():
-    motion, travel = ExperimentChange("motion", "", "motion"), ExperimentChange("travel", "", "travel")
-    slow, fast, weld = (
-        ExperimentChange("rate:10", "", camera_rate=10.0),
-        ExperimentChange("rate:30", "", camera_rate=30.0),
-        ExperimentChange("weld", "", "weld"),
-    )
-    assert _are_compatible((motion, slow, weld))
-    assert not _are_compatible((motion, travel))
-    assert not _are_compatible((slow, fast))
-
-
-def test_sights_of_the_y(single_arm):
-    found = {sight.name: sight for sight in observable_frames(single_arm)}
-    assert set(found) == {f"{form}" for s in ("T1", "T2", "T3") for form in (f"w_{s}", f"{s}_1_tip", f"{s}_marker")}
-    assert found["T2_marker"].is_arm_measurable
-    assert not found["T3_marker"].is_arm_measurable
-    assert "3 cm off the axis at the end of T2" in found["T2_marker"].description
 
 
 @pytest.fixture(scope="module")
@@ -119,31 +38,226 @@ def short_run(repository):
     return load_problem(repository / "configs" / "single_arm_vision.yaml", settings)
 
 
-def test_another_motion_comes_from_held_out_recordings_without_mujoco(short_run, monkeypatch):
-    def missing(*arguments, **settings):
-        raise DataError("MuJoCo is not installed")
+# -- ranks and sets, of results as a table says ------------------------------------------------------------------------
 
+NAMES = {
+    "w": "weld",
+    "m": "motion",
+    "t": "travel",
+    "c": "camera:T1_marker",
+    "a": "arm:T2_marker",
+    "s": "rate:10",
+    "f": "rate:30",
+}
+LETTERS = {name: letter for letter, name in NAMES.items()}
+
+
+def ranked(problem, considered, table, **more):
+    """The ranking where sets find so many of three parameters, with such a gain; None cannot be evaluated."""
+
+    def evaluate(sets, inflation):
+        found = []
+        for changes in sets:
+            key = "".join(sorted(LETTERS[change.name] for change in changes))
+            count, gain = table.get(key, (0, 0.0)) or (0, -math.inf)
+            failed = table.get(key, ()) is None
+            verdicts = {f"k{i}": "identifiable" if i < count else "weak" for i in range(3)}
+            names = tuple(change.name for change in changes)
+            found.append(ChangedExperimentResult(names, key, {}, {} if failed else verdicts, count, gain, "it snaps"))
+        return found
+
+    names = None if considered is None else {NAMES[letter] for letter in considered}
+    return what_if(problem, considered_changes=names, evaluate_changes=evaluate, **more)
+
+
+def words(results):
+    return " ".join("".join(sorted(LETTERS[name] for name in entry.changes)) or "-" for entry in results)
+
+
+@pytest.mark.parametrize(
+    ("considered", "table", "smallest", "greedy", "count"),
+    [
+        ("wca", {"w": (3, 1.0), "c": (2, 5.0), "cw": (3, 9.0)}, "w", "w", 4),
+        ("wcas", {"w": (2, 1.0), "cw": (3, 1.0), "as": (3, 9.0), "acw": (3, 20.0)}, "as cw", "w cw", 11),
+        (
+            "wcas",
+            {"c": (1, 1.0), "a": (1, 2.0), "ac": (2, 1.0), "as": (2, 3.0), "acs": (3, 4.0)},
+            "acs",
+            "a as acs",
+            15,
+        ),
+        ("wcas", {"acsw": (3, 4.0)}, "", "", 15),
+        ("mt", {"m": (1, 1.0), "mt": (3, 9.0)}, "", "m", 3),
+        ("sf", {"f": (1, 1.0), "fs": (3, 9.0)}, "", "f", 3),
+        ("mf", {"m": (1, 1.0), "fm": (3, 9.0)}, "fm", "m fm", 4),
+        ("wc", {"": (3, 0.0), "w": (3, 5.0)}, "-", "", 3),
+        ("wc", {"": (2, 1.0), "w": (1, 5.0)}, "", "", 4),
+        ("wc", {"c": (1, 1.0), "cw": (1, 1.0)}, "", "c", 4),
+        ("", {}, "", "", 1),
+    ],
+    ids=[
+        "one does",
+        "two pairs do",
+        "three do",
+        "four would",
+        "one motion at a time",
+        "one rate at a time",
+        "a motion and a rate",
+        "nothing to find",
+        "never to the worse",
+        "until nothing is gained",
+        "no change",
+    ],
+)
+def test_the_fewest_changes_that_find_every_parameter(short_run, considered, table, smallest, greedy, count):
+    found = ranked(short_run, considered, table)
+    assert words(found.smallest_sufficient_sets) == smallest
+    assert words(found.greedy_sequence) == greedy
+    assert found.n_evaluated_sets == count
+
+
+def test_most_identifiable_first_then_gain_and_what_failed_last(short_run):
+    table = {"f": (2, 1.0), "a": (1, 9.0), "c": (1, 2.0), "w": (0, 50.0), "m": None}
+    assert words(ranked(short_run, "wmcaf", table).single_changes) == "f a c w m"
+    with pytest.raises(SolverError, match="it snaps"):
+        ranked(short_run, "w", {"": None})
+
+
+def test_changes_that_apply(short_run, held_tube):
+    names = {}
+    for problem, key in ((short_run, "y"), (held_tube, "tube")):
+        given = []
+        what_if(problem, evaluate_changes=lambda sets, _, given=given: given.extend(sets) or told(sets))
+        names[key] = {change.name: change for (change,) in (entry for entry in given if len(entry) == 1)}
+    assert {"weld", "motion", "travel", "rate:10", "rate:30"} <= set(names["y"])
+    assert "torque" in names["tube"]
+    assert not {"motion", "rate:10", "camera:T1_0_tip", "second_arm"} & set(names["tube"])
+    for found in names.values():
+        for name, change in found.items():
+            kind, _, what = name.partition(":")
+            assert change.mechanical_change == (name if name in MECHANICAL_CHANGES else "")
+            assert change.camera_frame == (what if kind == "camera" else "")
+            assert change.arm_frame == (what if kind == "arm" else "")
+            assert change.camera_rate == (float(what) if kind == "rate" else None)
+    assert names["tube"]["arm:T1_marker"].description.endswith("at the end of T1, seen by the arm")
+    assert names["tube"]["rate:30"].description == "the camera at 30 Hz without gaps"
+
+
+def told(sets):
+    """Every parameter is found with any change, none without."""
+    return [
+        ChangedExperimentResult(tuple(c.name for c in changes), "", {}, {"k": "weak"}, int(bool(changes)), 1.0)
+        for changes in sets
+    ]
+
+
+@pytest.mark.parametrize(("period", "rates"), [(0.2, ["rate:10", "rate:30"]), (0.09, ["rate:30"]), (0.03, [])])
+def test_faster_cameras_than_there_was(held_tube, period, rates):
+    recording, t = held_tube.episodes[0].recording, period * np.arange(1, 10)
+    camera = PointGroup("points_camera", ["T1_0_tip"], t, np.zeros((9, 1, 3)), 2e-3, sensor="camera", pose=np.eye(4))
+    problem = EstimationProblem(
+        held_tube.step, [replace(recording, points=(camera,))], held_tube.free, held_tube.options
+    )
+    found = what_if(problem, considered_changes={"rate:10", "rate:30"}, evaluate_changes=lambda sets, _: told(sets))
+    assert sorted(name for entry in found.single_changes for name in entry.changes) == rates
+
+
+# -- what experiments would tell ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def tube_ranking(held_tube):
+    heard = Heard()
+    return what_if(held_tube, progress=heard), heard.stages
+
+
+def test_the_experiment_as_it_is_agrees_with_the_analysis(held_tube, tube_ranking):
+    ranking, _ = tube_ranking
+    base, info = ranking.unchanged_experiment, identifiability(held_tube)
+    assert (base.changes, base.words) == ((), "as it is")
+    assert base.verdicts == {name: entry.verdict for name, entry in info.parameters.items()}
+    assert base.identifiable == sum(said == "identifiable" for said in base.verdicts.values())
+    for name, entry in info.parameters.items():
+        assert base.std_relative[name] == pytest.approx(entry.std_relative, rel=1e-5)
+    gain = 0.5 * np.sum(np.log1p(16 * np.linalg.eigvalsh(info.fisher_information)))
+    assert base.gain == pytest.approx(gain, rel=1e-5)
+
+
+def test_a_fit_that_is_worse_than_its_noise_informs_less(held_tube, tube_ranking):
+    x = held_tube.initial_unknowns
+    chi2 = identifiability(held_tube, x).chi2_per_dof
+    assert chi2 > 2
+    found = what_if(held_tube, x, considered_changes=()).unchanged_experiment.std_relative["T1.bend"]
+    known = tube_ranking[0].unchanged_experiment.std_relative["T1.bend"]
+    assert found == pytest.approx(math.sqrt(chi2) * known, rel=1e-5)
+    [other] = evaluate_change_sets(BaseExperiment(held_tube, x), [()], chi2)
+    assert other.std_relative["T1.bend"] == pytest.approx(found, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "frames", "group", "times", "std"),
+    [
+        ("camera:T1_1_tip", ["T1_0_tip", "T1_1_tip"], "points_camera", 0.1 * np.arange(21), 2e-3),
+        ("rate:30", ["T1_0_tip"], "points_camera", np.arange(61) / 30, 2e-3),
+    ],
+)
+def test_a_predicted_sensor_tells_what_it_tells_when_it_is_there(
+    held_tube, tube_ranking, name, frames, group, times, std
+):
+    ranking, _ = tube_ranking
+    predicted = next(entry for entry in ranking.single_changes if entry.changes == (name,))
+    seen = PointGroup(
+        group, frames, times, np.zeros((len(times), len(frames), 3)), std, sensor="camera", pose=np.eye(4)
+    )
+    recording = replace(held_tube.episodes[0].recording, points=(seen,))
+    info = identifiability(EstimationProblem(held_tube.step, [recording], held_tube.free, held_tube.options))
+    for parameter, entry in info.parameters.items():
+        assert predicted.std_relative[parameter] == pytest.approx(entry.std_relative, rel=1e-4)
+
+
+def test_changes_are_ranked_and_the_smallest_set_is_a_pair(tube_ranking):
+    ranking, stages = tube_ranking
+    names = {entry.changes[0] for entry in ranking.single_changes}
+    assert {"weld", "torque", "arm:T1_marker", "camera:T1_marker", "camera:w_T1", "rate:30"} <= names
+    assert all(entry.identifiable < 2 for entry in ranking.single_changes)
+    # more light and more points never tell less
+    for entry in ranking.single_changes:
+        if entry.changes[0].startswith(("camera:", "arm:", "rate:")):
+            assert entry.gain >= ranking.unchanged_experiment.gain - 1e-9
+    # the tube is turned only by a weld, and what that takes is felt only in torques
+    assert [set(entry.changes) for entry in ranking.smallest_sufficient_sets] == [{"weld", "torque"}]
+    assert ranking.smallest_sufficient_sets[0].identifiable == 2
+    assert "working out weld grasps in place of points" in stages
+
+
+def test_torsional_springs_need_a_marker_off_the_axis(springs):
+    ranking = what_if(springs("torsion"))
+    assert ranking.unchanged_experiment.identifiable == 0
+    complete = {entry.changes for entry in ranking.single_changes if set(entry.verdicts.values()) == {"identifiable"}}
+    assert complete == {("camera:coupling_marker",), ("camera:spring_1_marker",)}
+    assert {entry.changes for entry in ranking.smallest_sufficient_sets} == complete
+    assert [entry.changes for entry in ranking.greedy_sequence] == [ranking.single_changes[0].changes]
+
+
+def test_series_springs_need_the_joint(springs):
+    assert [entry.changes for entry in what_if(springs("series_ends")).smallest_sufficient_sets] == [("camera:joint",)]
+
+
+def missing(*arguments, **settings):
+    raise DataError("MuJoCo is not installed")
+
+
+def test_another_motion_comes_from_held_out_recordings_without_mujoco(short_run, monkeypatch):
     monkeypatch.setattr(experiment_design, "simulate_in_mujoco", missing)
     builder = CandidateExperimentBuilder(BaseExperiment(short_run, short_run.initial_unknowns))
     other = builder.build_experiment(frozenset({"motion"}))
     assert not isinstance(other, str), other
     held_out = short_run.held_out[0].measured_driven_angles[:20]
     np.testing.assert_allclose(other.problem.episodes[0].measured_driven_angles[:20], held_out, atol=1e-12)
-    assert builder.build_experiment(frozenset({"travel"})) == "MuJoCo is not installed"
-
-
-def test_what_cannot_be_worked_out_is_said_and_ranked_last(short_run, monkeypatch):
-    def missing(*arguments, **settings):
-        raise DataError("MuJoCo is not installed")
-
-    monkeypatch.setattr(experiment_design, "simulate_in_mujoco", missing)
-    ranking = what_if(
-        short_run, options=WhatIfOptions(considered_changes=("travel", "rate:30"), max_set_size=1), start="known"
-    )
+    ranking = what_if(short_run, considered_changes=("travel", "rate:30"))
     assert [entry.changes for entry in ranking.single_changes] == [("rate:30",), ("travel",)]
-    assert ranking.single_changes[1].message == "MuJoCo is not installed"
-    assert ranking.single_changes[1].verdicts == {}
-    assert ranking.single_changes[1].gain == -math.inf
+    failed = ranking.single_changes[1]
+    assert (failed.message, failed.verdicts, failed.gain) == ("MuJoCo is not installed", {}, -math.inf)
 
 
 # -- the paper's open question ----------------------------------------------------------------------------------------
@@ -169,10 +283,8 @@ def test_two_arms_need_welds_and_no_camera(exact):
     for name in ("dual_arm_vision", "dual_arm_no_vision"):
         problem = exact(name)
         ranking = what_if(problem, at_truth(problem))
-        assert {n for n, v in ranking.unchanged_experiment.verdicts.items() if v == "not_identifiable"} == {
-            "T2.twist",
-            "T3.twist",
-        }
+        hidden = {n for n, v in ranking.unchanged_experiment.verdicts.items() if v == "not_identifiable"}
+        assert hidden == {"T2.twist", "T3.twist"}
         assert [entry.changes for entry in ranking.smallest_sufficient_sets] == [("weld",)]
         assert max(ranking.smallest_sufficient_sets[0].std_relative.values()) < 0.03
 
@@ -200,12 +312,13 @@ def test_the_smallest_set_finds_all_six_in_another_engine(exact):
     experiment = VirtualExperiment(motion, posture, simulation, camera=None, seed=5, recording_name="welded")
     recording = run_virtual_experiment(system, TRUTH, experiment)
     assert [group.name for group in recording.points] == ["points_arm"]
-    step = compile_step(system, 0.01)
-    problem = EstimationProblem(step, [recording], made.free, made.options, dict.fromkeys(TRUTH, 3.0))
+    problem = EstimationProblem(
+        compile_step(system, 0.01), [recording], made.free, made.options, dict.fromkeys(TRUTH, 3.0)
+    )
     solution = solve(problem, GaussNewton())
     assert solution.goodness_of_fit.chi2_per_dof < 1.1
     info = identifiability(problem, solution, intervals="all")
-    assert set(info.identifiable_parameters) == set(TRUTH)
     for name, truth in TRUTH.items():
+        assert info.parameters[name].verdict == "identifiable"
         lower, upper = info.parameters[name].interval
         assert lower < truth < upper, name

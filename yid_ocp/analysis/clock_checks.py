@@ -45,81 +45,46 @@ _FRAME_ERROR_STD, _ENCODER_ZERO_STD = 0.02, 0.02
 
 
 @dataclass(frozen=True)
-class ClockError:
-    """Offset and drift of one point group's clock relative to the joint clock, with standard deviations.
+class _ClockError:
+    """Stamp minus true time [s] in the middle of a group, and the relative rate by which its clock runs faster.
 
-    Attributes
-    ----------
-    stamp_delay, stamp_delay_std : float
-        Recorded stamp minus true time, in the middle of the group [s].
-    relative_drift, relative_drift_std : float
-        Relative rate by which the group's clock runs faster; 0.001 is one part per thousand.
-    explained_excess_fraction : float
-        Fraction of the residual sum of squares above the noise level that both explain; NaN where none is above.
+    `explained` is the fraction of the residual's squares above the noise level that both explain; NaN where none is.
     """
 
-    first_time: float
-    last_time: float
-    stamp_delay: float
-    stamp_delay_std: float
-    relative_drift: float
-    relative_drift_std: float
-    explained_excess_fraction: float
+    span: tuple[float, float]
+    delay: float
+    delay_std: float
+    drift: float
+    drift_std: float
+    explained: float
 
     @property
-    def accumulated_drift(self) -> float:
+    def whole_drift(self) -> float:
         """Drift accumulated from the first to the last time [s]."""
-        return self.relative_drift * (self.last_time - self.first_time)
+        return self.drift * (self.span[1] - self.span[0])
 
-    @property
-    def has_drift(self) -> bool:
-        """Whether the drift is significant."""
-        return abs(self.relative_drift) > _MIN_Z * self.relative_drift_std
-
-    @property
-    def has_delay(self) -> bool:
-        """Whether the offset is significant."""
-        return abs(self.stamp_delay) > _MIN_Z * self.stamp_delay_std
+    def drifts_beyond(self, limit: float) -> bool:
+        """Whether the drift is significant, and larger than a limit in sum [s]."""
+        return abs(self.drift) > _MIN_Z * self.drift_std and abs(self.whole_drift) > limit
 
 
-def clock_offset_tolerance(joints: JointGroup, group: PointGroup) -> float:
+def _offset_tolerance(joints: JointGroup, group: PointGroup) -> float:
     """Clock offset that cannot be resolved below the sample periods [s]."""
     return 0.5 * (median_sample_period(joints.t) + min(median_sample_period(group.t), _MAX_EXPOSURE_TIME))
 
 
-def clock_sensitivities(t: Array, speed: Array, span: tuple[float, float]) -> Array:
-    """Derivatives of predicted values by the clock offset and by the accumulated drift, shape (R, 2)."""
-    return np.stack([speed, speed * (t - 0.5 * sum(span)) / max(span[1] - span[0], 1e-9)], axis=1)
+def _clock_error(
+    t: Array, residual: Array, speed: Array, others: Array, size: Array, span: tuple[float, float]
+) -> _ClockError | None:
+    """A clock's offset and drift from a residual (R,), expected less seen in units of the noise, by least squares.
 
-
-def estimate_clock_error(
-    t: Array, residual: Array, own: Array, others: Array, size: Array, span: tuple[float, float]
-) -> ClockError | None:
-    """Estimate a clock's offset and drift from a residual by least squares, together with other unknowns.
-
-    Parameters
-    ----------
-    t : ndarray, shape (R,)
-    residual : ndarray, shape (R,)
-        Expected less seen, in units of the noise.
-    own : ndarray, shape (R, 2)
-        Its derivatives by offset and accumulated drift; see `clock_sensitivities` [1/s].
-    others : ndarray, shape (R, k)
-        Its derivatives by other unknowns, whose usual sizes are `size`.
-    size : ndarray, shape (k,)
-    span : (float, float)
-        First and last time of the group [s].
-
-    Returns
-    -------
-    ClockError or None
-        None where the motion is not informative.
+    `speed` (R, 2) are its derivatives by offset and accumulated drift (`_by_clock`), `others` (R, k) those by other
+    unknowns, whose usual sizes are `size`. None where the motion is not informative.
     """
-    begin, end = span
-    length, data = max(end - begin, 1e-9), len(t)
-    if not np.all(np.sum(own**2, axis=0) > 0) or data < 3 * _N_TIME_BLOCKS:
+    length, data = max(span[1] - span[0], 1e-9), len(t)
+    if not np.all(np.sum(speed**2, axis=0) > 0) or data < 3 * _N_TIME_BLOCKS:
         return None
-    rows = np.vstack([np.hstack([own, others]), np.hstack([np.zeros((len(size), 2)), np.diag(1 / size)])])
+    rows = np.vstack([np.hstack([speed, others]), np.hstack([np.zeros((len(size), 2)), np.diag(1 / size)])])
     target = np.concatenate([residual, np.zeros(len(size))])
     scale = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
     inverse = np.linalg.pinv((rows / scale).T @ (rows / scale), rcond=1e-12, hermitian=True) / np.outer(scale, scale)
@@ -128,18 +93,20 @@ def estimate_clock_error(
     plain = rows[:, 2:]
     base = target - plain @ np.linalg.lstsq(plain, target, rcond=None)[0]
     after, before = (float(np.sum(x[:data] ** 2)) for x in (remains, base))
-    block = np.clip(((t - begin) / length * _N_TIME_BLOCKS).astype(int), 0, _N_TIME_BLOCKS - 1)
+    block = np.clip(((t - span[0]) / length * _N_TIME_BLOCKS).astype(int), 0, _N_TIME_BLOCKS - 1)
     scores = np.zeros((_N_TIME_BLOCKS, rows.shape[1]))
     np.add.at(scores, block, rows[:data] * remains[:data, None])
     middle = scores.T @ scores * _N_TIME_BLOCKS / (_N_TIME_BLOCKS - 1)
     mean_square = max(after / max(data - 2 - len(size), 1), 1.0)
-    spread = np.maximum(np.diag(inverse @ middle @ inverse), mean_square * np.diag(inverse))
-    std = np.sqrt(spread)
-    beyond = before - data
-    excess = (before - after) / beyond if beyond > 0 else math.nan
-    return ClockError(
-        begin, end, float(found[0]), float(std[0]), float(found[1]) / length, float(std[1]) / length, float(excess)
-    )
+    std = np.sqrt(np.maximum(np.diag(inverse @ middle @ inverse), mean_square * np.diag(inverse)))
+    explained = (before - after) / (before - data) if before > data else math.nan
+    delay, drift = zip(found[:2].tolist(), std[:2].tolist(), strict=True)
+    return _ClockError(span, *delay, drift[0] / length, drift[1] / length, explained)
+
+
+def _by_clock(t: Array, speed: Array, span: tuple[float, float]) -> Array:
+    """Derivatives of predicted values by the clock's offset and by its accumulated drift, shape (R, 2)."""
+    return np.stack([speed, speed * (t - 0.5 * sum(span)) / max(span[1] - span[0], 1e-9)], axis=1)
 
 
 def check_held_point_clock(
@@ -158,13 +125,12 @@ def check_held_point_clock(
     std : float
         Noise of the points [m]; zero where nobody says.
     """
-    begin, end, step = float(t[0]), float(t[-1]), 0.5 * median_sample_period(joints.t)
+    span, step = (float(t[0]), float(t[-1])), 0.5 * median_sample_period(joints.t)
     shifted = np.broadcast_to(np.eye(3), (*seen.shape, 3))
     size = np.concatenate([np.full(by_angle.shape[3], _ENCODER_ZERO_STD), np.full(6, _FRAME_ERROR_STD)])
     late = drift = 0.0
-    found: ClockError | None = None
     for _ in range(_N_RELINEARIZATIONS):
-        at = t - late - drift * (t - 0.5 * (begin + end))
+        at = t - late - drift * (t - 0.5 * sum(span))
         place, speed = path(at), (path(at + step) - path(at - step)) / (2 * step)
         good = np.isfinite(seen) & ((at > joints.t[0]) & (at < joints.t[-1]))[:, None, None]
         if not good.any():
@@ -174,49 +140,38 @@ def check_held_point_clock(
         turned = np.stack([np.cross(axis, place - middle) for axis in np.eye(3)], axis=3)
         others = np.concatenate([by_angle, shifted, turned], axis=3)[good] / noise
         when = np.broadcast_to(t[:, None, None], seen.shape)[good]
-        own = clock_sensitivities(when, speed[good] / noise, (begin, end))
-        more = estimate_clock_error(when, (place - seen)[good] / noise, own, others, size, (begin, end))
-        if more is None:
+        own = _by_clock(when, speed[good] / noise, span)
+        found = _clock_error(when, (place - seen)[good] / noise, own, others, size, span)
+        if found is None:
             return
-        late, drift = late + more.stamp_delay, drift + more.relative_drift
-        found = replace(more, first_time=begin, last_time=end, stamp_delay=late, relative_drift=drift)
-    assert found is not None
-    moved = float(np.sqrt(np.mean(np.sum(speed**2, axis=2))))
-    yield from _said(found, joints, group, moved * max(abs(found.stamp_delay), abs(found.accumulated_drift)) > noise)
-
-
-def _said(found: ClockError, joints: JointGroup, group: PointGroup, matters: bool) -> Iterator[Issue]:
-    limit, late, std = clock_offset_tolerance(joints, group), found.stamp_delay, found.stamp_delay_std
-    if found.has_drift and abs(found.accumulated_drift) > limit:
-        yield _clock_drift_issue(found, group.name, limit, matters)
-    elif found.has_delay and abs(late) > limit:
+        late, drift = late + found.delay, drift + found.drift
+    found = replace(found, delay=late, drift=drift)
+    moved, limit = float(np.sqrt(np.mean(np.sum(speed**2, axis=2)))), _offset_tolerance(joints, group)
+    severity: Severity = "not_trusted" if moved * max(abs(late), abs(found.whole_drift)) > noise else "warning"
+    if found.drifts_beyond(limit):
+        yield _drift_issue(found, group.name, limit, severity)
+    elif abs(late) > _MIN_Z * found.delay_std and abs(late) > limit:
         words = (
-            f"{group.name} is stamped {1e3 * late:+.3g} ± {1e3 * std:.2g} ms from the joints; "
+            f"{group.name} is stamped {1e3 * late:+.3g} ± {1e3 * found.delay_std:.2g} ms from the joints; "
             f"{1e3 * limit:.3g} ms are in doubt anyway, as samples stand for a period"
         )
-        camera = "camera" in group.name.lower() or "camera" in group.sensor.lower() or group.pose is not None
+        camera = "camera" in f"{group.name} {group.sensor}".lower() or group.pose is not None
         setting = f"sensors.{group.name}.use: false"
         if camera and late > 0:
             setting = effect_setting_line("camera_latency", "camera", "delay", late)
-        advice, severity = f"subtract {late:.3g} s from their times", _severity(matters)
+        advice = f"subtract {late:.3g} s from their times"
         yield Issue("clock_offset", words, severity, abs(late) / limit, advice, "", group.name, "t", setting=setting)
 
 
-def _severity(matters: bool) -> Severity:
-    return "not_trusted" if matters else "warning"
-
-
-def _clock_drift_issue(found: ClockError, group: str, limit: float, matters: bool) -> Issue:
-    """The data-quality issue of a drifting point clock."""
-    late, drift, whole = found.stamp_delay, found.relative_drift, found.accumulated_drift
+def _drift_issue(found: _ClockError, group: str, limit: float, severity: Severity) -> Issue:
+    late, drift, whole = found.delay, found.drift, found.whole_drift
     words = (
         f"{group} is stamped {1e3 * (late - 0.5 * whole):+.3g} ms from the joints at its beginning, "
         f"{1e3 * (late + 0.5 * whole):+.3g} ms at its end: its clock runs {1e3 * abs(drift):.2g} ± "
-        f"{1e3 * found.relative_drift_std:.1g} parts per thousand too {'fast' if drift > 0 else 'slowly'}"
+        f"{1e3 * found.drift_std:.1g} parts per thousand too {'fast' if drift > 0 else 'slowly'}"
     )
-    advice = timestamp_correction(late, drift, 0.5 * (found.first_time + found.last_time))
-    setting = f"sensors.{group}.use: false"
-    return Issue("clock_drift", words, _severity(matters), abs(whole) / limit, advice, "", group, "t", setting=setting)
+    advice, setting = timestamp_correction(late, drift, 0.5 * sum(found.span)), f"sensors.{group}.use: false"
+    return Issue("clock_drift", words, severity, abs(whole) / limit, advice, "", group, "t", setting=setting)
 
 
 def timestamp_correction(late: float, drift: float, middle: float) -> str:
@@ -232,15 +187,8 @@ def search_clock_error(
 ) -> tuple[float, float]:
     """Clock offset [s] and relative drift that bring points nearest to a path, by a coarse-to-fine search.
 
-    Parameters
-    ----------
-    knots : (float, float)
-        First and last time at which it is known [s].
-    t : ndarray, shape (N,)
-    seen : ndarray, shape (N, np, 3)
-        [m]
-    drifts : bool
-        Whether the clock may run apart as well, by up to `_MAX_DRIFT`.
+    The path is known from the first to the last of `knots` [s]; points `seen` (N, np, 3) [m] at the times `t` (N,).
+    With `drifts` the clock may run apart as well, by up to `_MAX_DRIFT`.
     """
     middle, span = 0.5 * float(t[0] + t[-1]), float(t[-1] - t[0])
 
@@ -292,28 +240,26 @@ def _drifts(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Ite
     size = np.ones(len(problem.initial_unknowns))
     for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episode_predictions, strict=True)):
         joints, slices = episode.recording.joints, problem.residual_rows.measurements[i]
-        own = slice(slices[0].start, slices[-1].stop) if slices else slice(0)
+        groups = {group.name: group for group in episode.recording.points}
         for k, samples in enumerate(episode.measurements):
-            group = next((g for g in episode.recording.points if g.name == samples.sensor.group_name), None)
+            group = groups.get(samples.sensor.group_name)
             few = samples.n_residuals < MIN_NOISE_DIFFERENCES
             if joints is None or group is None or few or not samples.sensor.point_names:
                 continue
-            late = _by_lateness(problem, x, i, samples, result)
-            at = slice(slices[k].start - own.start, slices[k].stop - own.start)
-            t = times[own]
+            own = slice(slices[0].start, slices[-1].stop)
+            at, t = slice(slices[k].start - own.start, slices[k].stop - own.start), times[own]
             span = float(np.min(t[at])), float(np.max(t[at]))
             columns = np.zeros((len(t), 3))  # the first is for what a filter expects, which is no derivative
-            columns[at, 1:] = clock_sensitivities(t[at], late[samples.is_used], span)
+            speed = _by_lateness(problem, x, i, samples, result)[samples.is_used]
+            columns[at, 1:] = _by_clock(t[at], speed, span)
             whitening = problem.whitening_filters[i]
             if whitening is not None:
                 columns = whitening.whiten(columns, None)[0]
             jacobian = evaluation.jacobian[own] * problem.unknown_scales
-            error = estimate_clock_error(t, evaluation.residual[own], columns[:, 1:], jacobian, size, span)
-            limit = clock_offset_tolerance(joints, group)
-            if error is None or not error.has_drift or not abs(error.accumulated_drift) > limit:
-                continue
-            if error.explained_excess_fraction > _MIN_EXPLAINED_FRACTION:
-                yield _clock_drift_issue(error, group.name, limit, True)
+            error = _clock_error(t, evaluation.residual[own], columns[:, 1:], jacobian, size, span)
+            limit = _offset_tolerance(joints, group)
+            if error is not None and error.drifts_beyond(limit) and error.explained > _MIN_EXPLAINED_FRACTION:
+                yield _drift_issue(error, group.name, limit, "not_trusted")
 
 
 def _by_lateness(
@@ -337,18 +283,17 @@ def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[
     units = {}
     for series in residual_channels(problem):
         r = evaluation.residual[series.residual_indices]
-        if len(r) < MIN_NOISE_DIFFERENCES:
-            continue
-        sums = np.array([part.sum() / math.sqrt(len(part)) for part in np.array_split(r, _N_TIME_BLOCKS)])
-        entry = float(r @ r), float(sums @ sums) / _N_TIME_BLOCKS * len(r), len(r)
-        by_group.setdefault(series.group, []).append(entry)
-        units[series.group] = series.unit
+        if len(r) >= MIN_NOISE_DIFFERENCES:
+            sums = np.array([part.sum() / math.sqrt(len(part)) for part in np.array_split(r, _N_TIME_BLOCKS)])
+            entry = float(r @ r), float(sums @ sums) / _N_TIME_BLOCKS * len(r), len(r)
+            by_group.setdefault(series.group, []).append(entry)
+            units[series.group] = series.unit
     for group, parts in by_group.items():
-        count = sum(entry[2] for entry in parts)
+        *squares, count = (sum(column) for column in zip(*parts, strict=True))
         free = count - len(problem.initial_unknowns)
         if free < 0.5 * count:
             continue
-        seen = math.sqrt(max(sum(entry[i] for entry in parts) for i in (0, 1)) / free)
+        seen = math.sqrt(max(squares) / free)
         if not seen < 1 / QUALITY_LIMITS.max_overstatement_ratio:
             continue
         stated = [s.std[s.is_used] for e in problem.episodes for s in e.measurements if s.sensor.group_name == group]

@@ -124,21 +124,17 @@ def compare_methods(
     """
     runs, whole, problem = [], problem, without_input_errors(problem)
 
-    def told(name: str, entry: Iterate) -> None:
-        if callback is not None:
-            callback(name, entry)
+    def listener(name: str) -> Callable[[Iterate], None] | None:
+        return None if callback is None else lambda entry: callback(name, entry)
 
     for solver in solvers:
         own = problem
         if solver.name == "steepest_descent" and problem.options.weighting != "paper":
             own = problem.with_options(replace(problem.options, weighting="paper"))
-
-        def progress(entry: Iterate, name: str = solver.name) -> None:
-            told(name, entry)
-
         wall, cpu = time.perf_counter(), time.process_time()
         with _Memory() as memory:
-            solution = solve(own, solver, callback=progress, limits=limits, restarts=not whole.has_process_noise)
+            told = listener(solver.name)
+            solution = solve(own, solver, callback=told, limits=limits, restarts=not whole.has_process_noise)
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         cost = problem.evaluate(solution.x, derivatives=False).cost
         runs.append(MethodResult(solver.name, solution, cost, own.predict_held_out(solution.x), wall, cpu, memory.peak))
@@ -149,7 +145,7 @@ def compare_methods(
     judged, held_out = best.solution, best.held_out_predictions
     if whole.has_process_noise:
         able: Solver = next((solver for solver in solvers if uses_process_noise_covariance(solver)), GaussNewton())
-        judged = solve(whole, able, callback=lambda entry: told(_ALL_NOISE_LABEL, entry), limits=limits)
+        judged = solve(whole, able, callback=listener(_ALL_NOISE_LABEL), limits=limits)
         weighted = judged.problem or whole
         judged, held_out = with_profile_intervals(weighted, judged), weighted.predict_held_out(judged.x)
     agreement = {run.method: _differences(run, best, judged.parameters) for run in runs}
@@ -223,14 +219,11 @@ def _descent_errors(
 
 
 class _Memory:
-    """Largest resident memory of this process while the block runs, sampled by a thread."""
-
-    def __init__(self) -> None:
-        self.peak = 0.0
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._watch, daemon=True)
+    """Largest resident memory of this process while the block runs, sampled by a thread [MiB]."""
 
     def __enter__(self) -> _Memory:
+        self.peak, self._stop = 0.0, threading.Event()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
         self._thread.start()
         return self
 
@@ -239,10 +232,9 @@ class _Memory:
         self._thread.join()
 
     def _watch(self) -> None:
-        while True:
+        self.peak = _resident()
+        while not self._stop.wait(_MEMORY_SAMPLING_PERIOD):
             self.peak = max(self.peak, _resident())
-            if self._stop.wait(_MEMORY_SAMPLING_PERIOD):
-                return
 
 
 def _resident() -> float:
@@ -254,8 +246,7 @@ def _resident() -> float:
                 return float(line.split()[1]) / 1024.0
     import resource  # not on Windows
 
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1024.0**2 if sys.platform == "darwin" else 1024.0)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024.0**2 if sys.platform == "darwin" else 1024.0)
 
 
 # -- a cable with and without memory ----------------------------------------------------------------------------------
@@ -279,8 +270,7 @@ def decide_cable_memory(
     remember may be that motion. Each recording that starts so is predicted from the others alone (one Gauss-Newton
     step away from the fit of all), with memory and with none; it is kept where that is the smaller error in sum.
     """
-    memory = [name for name in problem.shared_parameters if name.endswith(_MEMORY_SUFFIX)]
-    moving = _moving(problem)
+    memory, moving = _memory_parameters(problem), _moving(problem)
     if not memory or not moving or solution.evaluation is None:
         return CableMemoryDecision(problem, solution)
     without = without_cable_memory(problem)
@@ -288,26 +278,28 @@ def decide_cable_memory(
     other = solve(without, solver, without.vector(known).tolist(), limits=limits)
     if other.evaluation is None:
         return CableMemoryDecision(problem, solution)
-    if len(moving) >= _MIN_MOVING_RECORDINGS:
-        kept, dropped = (_left_out(p, s, moving) for p, s in ((problem, solution), (without, other)))
-        if kept < dropped:
-            return CableMemoryDecision(problem, solution, f"memory is kept: {_errors_text(kept, dropped)}")
-        return CableMemoryDecision(without, other, f"memory is not kept: {_errors_text(kept, dropped)}")
-    return CableMemoryDecision(without, other, "memory is not kept: too few recordings start in motion to bear it out")
+    if len(moving) < _MIN_MOVING_RECORDINGS:
+        words = "memory is not kept: too few recordings start in motion to bear it out"
+        return CableMemoryDecision(without, other, words)
+    kept, dropped = (_left_out(p, s, moving) for p, s in ((problem, solution), (without, other)))
+    errors = (
+        "recordings that start in motion, each predicted from the others, have the root mean square error "
+        f"{kept:.3g} with it and {dropped:.3g} without, in standard deviations"
+    )
+    if kept < dropped:
+        return CableMemoryDecision(problem, solution, f"memory is kept: {errors}")
+    return CableMemoryDecision(without, other, f"memory is not kept: {errors}")
 
 
 def without_cable_memory(problem: EstimationProblem) -> EstimationProblem:
     """The problem with the cable's memory parameters fixed at zero."""
-    memory = [name for name in problem.shared_parameters if name.endswith(_MEMORY_SUFFIX)]
+    memory = _memory_parameters(problem)
     free = tuple(name for name in problem.free if name not in (*memory, START_SPEED_SCALE_PARAMETER))
     return problem.with_free_subset(free).with_parameter_values(dict.fromkeys(memory, 0.0))
 
 
-def _errors_text(kept: float, dropped: float) -> str:
-    return (
-        "recordings that start in motion, each predicted from the others, have the root mean square error "
-        f"{kept:.3g} with it and {dropped:.3g} without, in standard deviations"
-    )
+def _memory_parameters(problem: EstimationProblem) -> list[str]:
+    return [name for name in problem.shared_parameters if name.endswith(_MEMORY_SUFFIX)]
 
 
 def _moving(problem: EstimationProblem) -> list[int]:
@@ -370,21 +362,9 @@ _ROUNDING_RTOL = 0.02  # a truth so near a published value, relatively, was made
 _ZERO_BOUND_FRACTION = 0.01  # a bound at zero is reached within this fraction of the largest of an ensemble's values
 
 
-@dataclass(frozen=True)
-class _DescentEndpoints:
-    """Values of one parameter where steepest descent with the paper's step lengths ends, on synthetic recordings."""
-
-    start: float
-    stopped: float
-    offsets: tuple[float, ...]
-
-
 @cache
 def _load_torque_ensemble() -> Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]:
-    """Estimates of all ensemble members [N m/rad] by experiment, torque errors (none, offsets) and parameter.
-
-    Written by `benchmarks/torque_ensemble.py`.
-    """
+    """Estimates of all ensemble members [N m/rad] by experiment, torque errors (none, offsets) and parameter."""
     text = (resources.files("yid_ocp.data") / "defaults" / "torque_ensemble.json").read_text(encoding="utf-8")
     found: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]] = json.loads(text)
     return found
@@ -393,57 +373,54 @@ def _load_torque_ensemble() -> Mapping[str, Mapping[str, Mapping[str, Sequence[f
 def explain_paper_estimates(
     experiment: str, estimates: Mapping[str, ParameterEstimate], truth: Mapping[str, float]
 ) -> tuple[str, ...]:
-    """One sentence for each published estimate of an experiment, explaining its difference from ours.
+    """One sentence for each published estimate of an experiment (`PAPER_ESTIMATES`), on its difference from ours.
 
-    Parameters
-    ----------
-    experiment : str
-        A key of `PAPER_ESTIMATES`.
-    estimates : mapping of str to ParameterEstimate
-        Estimates of the free parameters from recordings of such an experiment.
-    truth : mapping of str to float
-        Of these recordings, where it is known.
+    `estimates` are those of the parameters from recordings of such an experiment, `truth` their values where known.
+    Empty where the model does not explain the recordings. The reason, judged by synthetic recordings, is the first of
+    these that applies:
 
-    Returns
-    -------
-    tuple of str
-        Empty where the model does not explain the recordings.
+    not informed: such recordings do not find the parameter, or only so weakly that their interval holds the value;
+    near the truth: the value is within 10 % of the twin's truth;
+    slow: it lies between the start and where the paper's method stops without torque errors, far from the truth, or
+    within 10 % of the latter;
+    torque error: it lies within what constant errors of the torques lead the paper's method to;
+    unexplained: anything else.
     """
     judged = {name: estimates[name] for name in _PAPER_PARAMETERS if name in estimates and estimates[name].free}
     if any(entry.verdict == "not_trusted" for entry in judged.values()):
         return ()
-    found = _load_torque_ensemble()[experiment]
     sentences = []
     for name, entry in judged.items():
-        ends = _DescentEndpoints(_DESCENT_INITIAL_VALUE, found["none"][name][0], tuple(found["offsets"][name]))
         value = PAPER_ESTIMATES[experiment][name]
-        why = _discrepancy_reason(value, entry, truth.get(name), ends)
-        words = _discrepancy_words(why, value, entry, truth.get(name), ends, experiment)
+        words = _discrepancy(experiment, name, value, entry, truth.get(name))
         sentences.append(f"{name} = {value:.4g} of the paper: {words}")
     return tuple(sentences)
 
 
-def _discrepancy_reason(
-    published: float, entry: ParameterEstimate, truth: float | None, ends: _DescentEndpoints
-) -> str:
-    """Label of the likeliest reason for a published estimate, judged by synthetic recordings: the first that applies of
-
-    not_informed: such recordings do not find the parameter, or only so weakly that their interval holds the value;
-    near_truth: the value is within 10 % of the twin's truth;
-    slow: it lies between the start and where the paper's method stops without torque errors, far from the truth, or
-    within 10 % of the latter;
-    torque_error: it lies within what constant errors of the torques lead the paper's method to;
-    unexplained: anything else.
-    """
-    if entry.verdict == "not_identifiable" or (entry.verdict != "identifiable" and _holds(entry, published)):
-        return "not_informed"
-    if truth is not None and _near(published, truth):
-        return "near_truth"
-    if truth is not None and not _near(ends.stopped, truth):
-        low, high = sorted((ends.start, ends.stopped))
-        if low <= published <= high or _near(published, ends.stopped):
-            return "slow"
-    return "torque_error" if is_within_ensemble(published, ends.offsets) else "unexplained"
+def _discrepancy(experiment: str, name: str, value: float, entry: ParameterEstimate, truth: float | None) -> str:
+    ensemble = _load_torque_ensemble()[experiment]
+    stopped, offsets = ensemble["none"][name][0], ensemble["offsets"][name]
+    interval = None if entry.verdict != "weak" or entry.interval in (None, (None, None)) else entry.interval
+    if entry.verdict == "not_identifiable" or (entry.verdict != "identifiable" and _holds(entry, value)):
+        known = f"in such an experiment it {VERDICT_PREDICATES[entry.verdict]}"
+        if interval is not None:
+            return f"hardly informed; {known}, {interval_text(*interval)}, where the value lies"
+        return f"not informed; {known}"
+    if truth is not None and _near(value, truth):
+        chosen = experiment == _TRUTH_EXPERIMENT and abs(value - truth) <= _ROUNDING_RTOL * abs(truth)
+        return f"near the truth of these recordings, {truth:.4g}" + (", which was chosen from it" if chosen else "")
+    low, high = sorted((_DESCENT_INITIAL_VALUE, stopped))
+    if truth is not None and not _near(stopped, truth) and (low <= value <= high or _near(value, stopped)):
+        return (
+            f"slow; without torque errors the paper's method goes from {_DESCENT_INITIAL_VALUE:.3g} to {stopped:.3g} "
+            f"in {_DESCENT_ITERATIONS} iterations"
+        )
+    many = f"{min(offsets):.3g} to {max(offsets):.3g} in {len(offsets)} twins"
+    led = f"constant torque errors of {_TORQUE_BIAS_STD:g} N m lead the paper's method to {many}"
+    if is_within_ensemble(value, offsets):
+        return f"torque error; {led}"
+    open_interval = "" if interval is None else f"leave {interval_text(*interval)} open and not this"
+    return f"unexplained; such recordings {open_interval or 'inform it'}, it is not slow, and {led}"
 
 
 def is_within_ensemble(published: float, values: Sequence[float]) -> bool:
@@ -458,30 +435,3 @@ def _near(value: float, truth: float) -> bool:
 def _holds(entry: ParameterEstimate, value: float) -> bool:
     lower, upper = entry.interval or (entry.value - 2 * entry.std, entry.value + 2 * entry.std)
     return (lower is None or lower <= value) and (upper is None or value <= upper)
-
-
-def _discrepancy_words(
-    why: str, value: float, entry: ParameterEstimate, truth: float | None, ends: _DescentEndpoints, experiment: str
-) -> str:
-    if why == "not_informed":
-        known = f"in such an experiment it {VERDICT_PREDICATES[entry.verdict]}"
-        if entry.verdict == "weak" and entry.interval not in (None, (None, None)):
-            return f"hardly informed; {known}, {interval_text(*entry.interval)}, where the value lies"
-        return f"not informed; {known}"
-    if why == "near_truth":
-        assert truth is not None
-        chosen = experiment == _TRUTH_EXPERIMENT and abs(value - truth) <= _ROUNDING_RTOL * abs(truth)
-        return f"near the truth of these recordings, {truth:.4g}" + (", which was chosen from it" if chosen else "")
-    many = f"{min(ends.offsets):.3g} to {max(ends.offsets):.3g} in {len(ends.offsets)} twins"
-    led = f"constant torque errors of {_TORQUE_BIAS_STD:g} N m lead the paper's method to {many}"
-    if why == "slow":
-        return (
-            f"slow; without torque errors the paper's method goes from {ends.start:.3g} to {ends.stopped:.3g} "
-            f"in {_DESCENT_ITERATIONS} iterations"
-        )
-    if why == "torque_error":
-        return f"torque error; {led}"
-    told = "such recordings inform it"
-    if entry.verdict == "weak" and entry.interval not in (None, (None, None)):
-        told = f"such recordings leave {interval_text(*entry.interval)} open and not this"
-    return f"unexplained; {told}, it is not slow, and {led}"

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 import numpy as np
 import scipy.optimize
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from yid_ocp.inference.linearized_residual import bounded_least_squares_step
 from yid_ocp.inference.uncertainty import ParameterEstimate, verdict_by_relative_std
@@ -22,7 +22,7 @@ from yid_ocp.integrator.step_model import Rollout, TrackingFeedback
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
+from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.unknown_vector import INITIAL_STATE_PREFIX
 
 Array = NDArray[np.float64]
@@ -45,10 +45,7 @@ class DiscretisationShift:
     time_step: float | None = None
 
     def inflated_std(self, std: float) -> float:
-        """Standard deviation combined, in quadrature, with the shifts that exceed it.
-
-        Such a shift counts `_EXTRAPOLATION_FACTOR` times: the extrapolated distance from the limit of a fine model.
-        """
+        """Standard deviation combined, in quadrature, with `_EXTRAPOLATION_FACTOR` times the shifts that exceed it."""
         found = [move for move in (self.links, self.time_step) if move is not None and abs(move) > std]
         return math.hypot(std, *(_EXTRAPOLATION_FACTOR * move for move in found)) if found else std
 
@@ -69,32 +66,26 @@ class RefinedProblem:
     parameter_factors: Mapping[str, float] = field(default_factory=dict)
     subdivided_joints: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
-    def parameter_factor(self, name: str) -> float:
+    def _factor(self, name: str) -> float:
         """Coarse-to-fine factor of an unknown, whose name may include its recording."""
         return float(self.parameter_factors.get(name.split("[")[0], 1.0))
 
-    def unknowns_from_coarse(self, names: Sequence[str], x: Array) -> Array:
-        """The fine problem's unknowns that correspond to a coarse unknown vector, clipped to the bounds.
-
-        In an estimated initial state, divided links share their angle and begin at rest.
-        """
+    def _unknowns(self, names: Sequence[str], x: Array) -> Array:
+        """The unknowns that correspond to coarse ones, within bounds; divided links share their angle, at rest."""
         made, at = self.problem.initial_unknowns, {name: i for i, name in enumerate(self.problem.unknown_names)}
         for name, value in zip(names, x, strict=True):
             base, bracket, recording = name.partition("[")
             joint = base.rpartition(".")[2] if base.startswith(INITIAL_STATE_PREFIX) else ""
             parts = self.subdivided_joints.get(joint)
             if parts is None and name in at:
-                made[at[name]] = value * self.parameter_factor(name)
+                made[at[name]] = value * self._factor(name)
             elif parts is not None and base.startswith(_START_ANGLE_PREFIX):
                 for part in parts:
                     made[at[f"{_START_ANGLE_PREFIX}{part}{bracket}{recording}"]] = value / len(parts)
         return np.clip(made, *self.problem.bounds)
 
-    def equilibrium_guesses_from_coarse(self, coarse: System, found: EquilibriumGuesses) -> EquilibriumGuesses:
-        """Initial guesses for the fine model's equilibria, from the coarse ones."""
-        return tuple(None if q is None else self._shape(coarse, q) for q in found)
-
-    def _shape(self, coarse: System, q: Array) -> Array:
+    def _guess(self, coarse: System, q: Array) -> Array:
+        """Guess of an equilibrium from that of the coarse model."""
         tree = self.problem.system.mechanism
         fine = np.zeros(len(tree.joints))
         for name, angle in zip(coarse.mechanism.joint_names, q, strict=True):
@@ -109,10 +100,10 @@ def joint_subdivision(coarse: System, fine: System) -> dict[str, tuple[str, ...]
     for segment in coarse.segment_layouts:
         links = fine.segment_layout(segment.name).link_joints
         times = len(links) // len(segment.link_joints)
-        for i, joints in enumerate(segment.link_joints):
+        for i, joints in enumerate(segment.link_joints if times > 1 else ()):
             for axis, joint in enumerate(joints):
                 found[joint] = tuple(links[times * i + k][axis] for k in range(times))
-    return {joint: parts for joint, parts in found.items() if len(parts) > 1}
+    return found
 
 
 def discretisation_shifts(
@@ -125,17 +116,12 @@ def discretisation_shifts(
 ) -> dict[str, float] | str:
     """Shift of each shared free parameter by one Gauss-Newton step of a finer model from the coarse unknowns x (nx,).
 
-    Data, bounds and priors are those of the coarse problem. With `model_difference_only` the coarse model's prediction
-    replaces the data, so that away from an estimate only the difference between the two models counts. `at_x` is the
-    coarse problem's evaluation there.
-
-    Returns
-    -------
-    dict of str to float, or str
-        In the coarse parameters' units; a message where the step cannot be made.
+    Data, bounds and priors are those of the coarse problem, whose evaluation is `at_x`. With `model_difference_only`
+    its prediction replaces the data, so that away from an estimate only the difference between the two models counts.
+    In the coarse parameters' units; a message where the step cannot be made.
     """
-    point = refined.unknowns_from_coarse(coarse.unknown_names, x)
-    warm = refined.equilibrium_guesses_from_coarse(coarse.system, at_x.equilibrium_guesses)
+    point, guesses = refined._unknowns(coarse.unknown_names, x), at_x.equilibrium_guesses
+    warm = tuple(None if q is None else refined._guess(coarse.system, q) for q in guesses)
     weighted = any(own is not None for own in coarse.whitening_filters)
     problem = whitened_at(refined.problem, point, warm, rounds=2) if weighted else refined.problem
     evaluation = problem.evaluate(point, equilibrium_guesses=warm)
@@ -146,45 +132,37 @@ def discretisation_shifts(
         if problem.residual_rows != coarse.residual_rows:
             return "the finer model is compared at other samples"
         residual = residual - at_x.residual
-    lower, upper = (bound - point for bound in problem.bounds)
     scale = problem.unknown_scales
-    step = scale * bounded_least_squares_step(evaluation.jacobian * scale, residual, 0.0, lower / scale, upper / scale)
-    at = {name: i for i, name in enumerate(problem.unknown_names)}
-    return {name: float(step[at[name]]) / refined.parameter_factor(name) for name in problem.shared_parameters}
+    low, high = ((bound - point) / scale for bound in problem.bounds)
+    step = scale * bounded_least_squares_step(evaluation.jacobian * scale, residual, 0.0, low, high)
+    moved = dict(zip(problem.unknown_names, map(float, step), strict=True))
+    return {name: moved[name] / refined._factor(name) for name in problem.shared_parameters}
 
 
 def inflate_estimates(
-    estimates: Mapping[str, ParameterEstimate],
-    found: Mapping[str, DiscretisationShift],
-    sizes: Mapping[str, float] | None = None,
+    estimates: Mapping[str, ParameterEstimate], found: Mapping[str, DiscretisationShift], sizes: Mapping[str, float]
 ) -> dict[str, ParameterEstimate]:
     """Estimates whose standard deviation, interval and verdict include their discretisation shift.
 
     A verdict is only ever lowered. `sizes` are typical ones, as in `inference.uncertainty.parameter_verdict`.
     """
-    counted = dict(estimates)
+    counted, ranks = dict(estimates), ("identifiable", "weak", "not_identifiable")
     for name, own in found.items():
         entry = counted[name]
         std = own.inflated_std(entry.std)
         if not entry.free or not std > entry.std:
             continue
-        said = _worse_verdict(entry.verdict, verdict_by_relative_std(entry.value, std, (sizes or {}).get(name, 0.0)))
+        verdict, said = entry.verdict, verdict_by_relative_std(entry.value, std, sizes.get(name, 0.0))
+        if verdict in ranks and said in ranks:
+            verdict = max(verdict, said, key=ranks.index)
         interval = entry.interval
         if interval is not None:
             further = _NORMAL_QUANTILE_95 * math.sqrt(std**2 - entry.std**2)
             low, high = interval
             low = None if low is None else max(low - further, entry.lower)
             interval = low, None if high is None else min(high + further, entry.upper)
-        counted[name] = replace(entry, std=std, verdict=said, interval=interval)
+        counted[name] = replace(entry, std=std, verdict=verdict, interval=interval)
     return counted
-
-
-def _worse_verdict(before: str, after: str) -> str:
-    """The worse of two verdicts; `before` where either is not one of the three ranked ones."""
-    ranks = ("identifiable", "weak", "not_identifiable")
-    if before not in ranks or after not in ranks:
-        return before
-    return max(before, after, key=ranks.index)
 
 
 _DAMPING_PARAMETERS = ("damping", "twist_damping")
@@ -210,11 +188,6 @@ class NaturalFrequencies:
     message: str = ""
 
 
-def _with_prescribed_joints(system: System) -> System:
-    """The system with its driven joints prescribed."""
-    return replace(system, driven=(), servos={}, prescribed=(*system.driven, *system.prescribed))
-
-
 def natural_frequencies(
     system: System,
     posture: Mapping[str, float],
@@ -230,7 +203,6 @@ def natural_frequencies(
     ----------
     posture : mapping of str to float
         Driven and prescribed coordinates [rad or m], held still.
-    theta : ndarray, shape (ntheta,)
     time_step : float
         h [s]; the midpoint rule lowers a frequency f to atan(pi f h)/(pi h).
     force_split, constraint_force : str
@@ -238,7 +210,7 @@ def natural_frequencies(
     guess : ndarray, shape (n,), optional
         Configuration from which rest is sought.
     """
-    still = _with_prescribed_joints(system)
+    still = replace(system, driven=(), servos={}, prescribed=(*system.driven, *system.prescribed))
     if not still.free_indices:
         return NaturalFrequencies(np.zeros(0), message="every coordinate is prescribed, nothing can swing")
     step = compile_step(still, time_step, force_split, constraint_force, use_compiler=False)
@@ -246,10 +218,8 @@ def natural_frequencies(
     rest = EquilibriumSolver(step).solve(known, theta, guess=guess)
     if not rest.is_converged:
         return NaturalFrequencies(np.zeros(0), message=rest.message)
-    undamped = theta.copy()
-    for i, name in enumerate(system.parameters.names):
-        if name.rpartition(".")[2] in _DAMPING_PARAMETERS:
-            undamped[i] = 0.0
+    damps = [name.rpartition(".")[2] in _DAMPING_PARAMETERS for name in system.parameters.names]
+    undamped = np.where(damps, 0.0, theta)
     angles = np.sort(np.angle(_eigenvalues(step, rest, known, undamped)))
     turning = angles[(angles > 1e-7) & (angles < math.pi - 1e-7)]
     growing = int(np.sum(np.abs(_eigenvalues(step, rest, known, theta)) > 1 + 1e-6))
@@ -286,21 +256,21 @@ def min_grasp_gaps(system: System, posture: Mapping[str, float], theta: Array) -
     full[known] = list(posture.values())
     function = ca.Function("phi", [q], [phi, ca.jacobian(phi, q)[:, free]])
 
-    def at(x: Array) -> Array:
+    def phi_at(x: Array, part: int) -> Array:
         full[free] = x
-        return full
+        return np.array(ca.densify(function(full)[part]))
 
     best: Array | None = None
     for seed in range(4):
         start = np.random.default_rng(seed).normal(scale=0.1, size=len(free))
         # a little stiffness keeps the search from winding the object up
         found = scipy.optimize.least_squares(
-            lambda x: np.concatenate([np.array(function(at(x))[0]).ravel(), 1e-4 * x]),
+            lambda x: np.concatenate([phi_at(x, 0).ravel(), 1e-4 * x]),
             start,
-            lambda x: np.vstack([np.array(ca.densify(function(at(x))[1])), 1e-4 * np.eye(len(free))]),
+            lambda x: np.vstack([phi_at(x, 1), 1e-4 * np.eye(len(free))]),
             max_nfev=100,
         )
-        gap = np.array(function(at(found.x))[0]).ravel()
+        gap = phi_at(found.x, 0).ravel()
         if best is None or np.linalg.norm(gap) < np.linalg.norm(best):
             best = gap
         if np.linalg.norm(best) < 1e-3:
@@ -360,43 +330,37 @@ class StepErrorGrowth:
 
 
 def _error_growth_along(
-    step: Step,
-    theta: ArrayLike,
-    rollout: Rollout,
-    feedback: TrackingFeedback | None = None,
-    name: str = "motion",
-    looks: int = _N_CHECKED_NODES,
+    step: Step, theta: Array, rollout: Rollout, feedback: TrackingFeedback | None, name: str, looks: int
 ) -> StepErrorGrowth:
-    """Growth of alternating errors along a rollout, up to its first failed step.
+    """Growth of alternating errors along a rollout, up to its first failed step or singular derivatives.
 
     The eigenvalues of A_k - B_k K_k are taken at some nodes (A_k by the implicit function theorem, so that the
     constraints are in it), their largest alternating magnitude counts for the steps in between in its logarithm, and
-    the stretch of the largest sum is what grows. A step at which Newton failed or the derivatives are singular ends the
-    motion.
+    the stretch of the largest sum is what grows.
     """
     failed = np.flatnonzero(~np.isfinite(rollout.state).all(axis=1))
     steps = (int(failed[0]) if len(failed) else len(rollout.state)) - 1
-    nodes = np.unique(np.linspace(0, max(steps - 1, 0), looks).astype(int)) if steps > 0 else np.zeros(0, int)
     at, magnitudes = [], []
-    for node in nodes:
-        found = _alternating_mode_magnitude(step, np.asarray(theta, float), rollout, int(node), feedback)
+    for node in np.unique(np.linspace(0, steps - 1, looks).astype(int)) if steps > 0 else ():
+        found = _alternating_mode_magnitude(step, theta, rollout, int(node), feedback)
         if found is None:
             break
         at.append(int(node))
         magnitudes.append(found)
     if not at:
         return StepErrorGrowth(name, 0.0, 0.0, 0.0, step.time_step)
-    rates = np.log10(np.maximum(np.interp(np.arange(at[-1] + 1), at, magnitudes), 1e-3))
-    worst = int(np.argmax(magnitudes))
-    return StepErrorGrowth(name, _largest_sum(rates), magnitudes[worst], at[worst] * step.time_step, step.time_step)
+    worst, decades, running = int(np.argmax(magnitudes)), 0.0, 0.0
+    for rate in np.log10(np.maximum(np.interp(np.arange(at[-1] + 1), at, magnitudes), 1e-3)):
+        running = max(0.0, running + float(rate))  # largest sum over a stretch, zero where all shrink (Kadane)
+        decades = max(decades, running)
+    return StepErrorGrowth(name, decades, magnitudes[worst], at[worst] * step.time_step, step.time_step)
 
 
 def _alternating_mode_magnitude(
     step: Step, theta: Array, rollout: Rollout, node: int, feedback: TrackingFeedback | None
 ) -> float | None:
     """Largest magnitude of the eigenvalues of A - B K with negative real part at a node; None where A is not finite."""
-    system, sizes = step.system, step.sizes
-    n, fixed = system.n_coordinates, list(system.prescribed_indices)
+    n, fixed = step.system.n_coordinates, list(step.system.prescribed_indices)
     state, after = rollout.state[node], rollout.state[node + 1]
     a, by_torque, _ = step.jacobians(
         state[:n], state[n : 2 * n], rollout.torque[node], theta, (state[fixed], after[fixed]), state[2 * n :], names=()
@@ -405,21 +369,12 @@ def _alternating_mode_magnitude(
         a[:, feedback.state_indices] -= by_torque @ feedback.gain[node]
     if not np.isfinite(a).all():
         return None
-    moving = np.setdiff1d(np.arange(sizes["nx"]), [*fixed, *(n + index for index in fixed)])
+    moving = np.setdiff1d(np.arange(len(a)), [*fixed, *(n + index for index in fixed)])
     values = np.linalg.eigvals(a[np.ix_(moving, moving)])
     return float(np.max(np.abs(values[values.real < 0]), initial=0.0))
 
 
-def _largest_sum(rates: Array) -> float:
-    """Largest sum over a stretch, zero where all shrink (Kadane)."""
-    best = running = 0.0
-    for rate in rates:
-        running = max(0.0, running + float(rate))
-        best = max(best, running)
-    return best
-
-
-def largest_error_growth(problem: EstimationProblem, x: ArrayLike) -> StepErrorGrowth | None:
+def largest_error_growth(problem: EstimationProblem, x: Array) -> StepErrorGrowth | None:
     """The largest error growth among a problem's recordings, at unknowns x (nx,); None where none has an initial state.
 
     Of a failed rollout it is that along the part before the failure.

@@ -56,6 +56,23 @@ _MAX_EFFORT_RATIO = 1.3
 
 
 @dataclass(frozen=True)
+class _Data:
+    """Motion, recorded efforts (N, k), what bodies and gravity need, and the size of each joint's largest [N m]."""
+
+    arm: RecordedJointsModel
+    motion: SmoothedJointMotion
+    effort: Array
+    needed: Array
+    size: Array
+
+    @property
+    def holders(self) -> tuple[str, ...]:
+        """Frames of the grasps that the arm moves."""
+        frames = (grasp.holder_frame for grasp in self.arm.system.grasps)
+        return tuple(frame for frame in frames if self.arm.is_frame_determined(frame))
+
+
+@dataclass(frozen=True)
 class _Fit:
     """`inverse` 1/g and its `std`, `offset` [N m], what is `left` in sizes of the model's error, each (k,); `cost`.
 
@@ -87,13 +104,15 @@ def check_efforts(arm: RecordedJointsModel, recording: Recording) -> list[Issue]
     if most[0] > _MIN_EFFORT and max(most) < _MAX_FITTED_EFFORT:
         commanded = joints.effort_kind_or_default == "command"
         least = (_IDLE_COMMAND_FRACTION if commanded else 2 * _EFFORT_LIMIT_ERROR_FRACTION) * size
-        dead = _dead(motion.effort, needed, least)
+        # zero throughout although gravity and motion need more than the least that counts
+        wanted = np.sqrt(np.mean(needed**2, axis=0))
+        dead = (np.max(np.abs(motion.effort), axis=0) < 1e-3 * wanted) & (wanted > least)
         if dead.any():
             found.append(_zero(arm, dead))
         else:
             # motion to and fro that is late looks turned round, so that comes first
-            motion_and_efforts = arm, motion, motion.effort, needed, size
-            found += list(_late(*motion_and_efforts)) or list(_by_joint(*motion_and_efforts))
+            data = _Data(arm, motion, motion.effort, needed, size)
+            found += list(_late(data)) or list(_by_joint(data))
     return [replace(issue, recording=recording.name) for issue in found]
 
 
@@ -112,13 +131,6 @@ def _limits(arm: RecordedJointsModel, effort: Array, largest: Array) -> Iterator
         yield _issue("effort_limits", words, float(ratio[j]) / _MAX_EFFORT_RATIO, advice, arm.joint_names[j])
 
 
-def _dead(effort: Array, needed: Array, least: Array) -> NDArray[np.bool_]:
-    """Joints whose effort is zero throughout although gravity and motion need more than the least that counts."""
-    wanted = np.sqrt(np.mean(needed**2, axis=0))
-    silent = np.max(np.abs(effort), axis=0) < 1e-3 * wanted
-    return np.asarray(silent & (wanted > least))
-
-
 def _zero(arm: RecordedJointsModel, dead: NDArray[np.bool_]) -> Issue:
     names = [name for name, off in zip(arm.joint_names, dead, strict=True) if off]
     which = "all joints" if dead.all() else ", ".join(names)
@@ -128,15 +140,14 @@ def _zero(arm: RecordedJointsModel, dead: NDArray[np.bool_]) -> Issue:
     return _issue("effort_zero", words, 1e3, advice, setting=setting)
 
 
-def _by_joint(
-    arm: RecordedJointsModel, motion: SmoothedJointMotion, effort: Array, needed: Array, size: Array
-) -> Iterator[Issue]:
-    loaded, factor = _loaded(arm, motion, size), _WRONG_GAIN_FACTOR
+def _by_joint(data: _Data) -> Iterator[Issue]:
+    arm, effort, needed, size = data.arm, data.effort, data.needed, data.size
+    loaded, factor, names = _loaded(data), _WRONG_GAIN_FACTOR, arm.joint_names
     # What is held can add to efforts, but not several times what the arm itself weighs, nor carry nearly all of that.
     # A prior about one holds a gain that is a power of ten away, so efforts are scaled first.
     ratio = float(np.linalg.norm(needed)) / max(float(np.linalg.norm(effort)), 1e-300)
     common = 1.0 if 1 / factor < ratio < factor else 10.0 ** round(math.log10(ratio))
-    fit = _fitted(arm, motion, common * effort, needed, size)
+    fit = _fitted(replace(data, effort=common * effort))
     told = fit.std < np.maximum(0.6 * np.abs(fit.inverse), 0.35)
     sound = told & (fit.left < _MAX_EXPLAINED_RMS) & (np.abs(fit.offset) < 3 * _OFFSET_FRACTION * size)
     if common != 1.0 and sound.sum() >= 2:
@@ -151,14 +162,14 @@ def _by_joint(
         inverse, off = float(fit.inverse[j]), abs(float(fit.inverse[j]) - 1) / float(fit.std[j])
         strong = 0 < inverse < 1 / factor and fit.direct[j] > factor and not loaded[j]
         if off > _MIN_Z and (inverse > factor or strong):
-            words = f"the effort of {arm.joint_names[j]} is {1 / inverse:.2g} times what gravity and motion need"
-            yield _issue("effort_gain", words, off / _MIN_Z, "find out what the number stands for", arm.joint_names[j])
-    yield from _offsets(arm, fit, needed, size, told & ~loaded)
+            words = f"the effort of {names[j]} is {1 / inverse:.2g} times what gravity and motion need"
+            yield _issue("effort_gain", words, off / _MIN_Z, "find out what the number stands for", names[j])
+    yield from _offsets(data, fit, told & ~loaded)
     lost = fit.left > _WRONG_ROBOT_RMS
-    if arm.has_no_unknown_descendants and lost.sum() > len(arm.joint_names) / 2:
+    if arm.has_no_unknown_descendants and lost.sum() > len(names) / 2:
         left = float(np.median(fit.left[lost]))
         words = (
-            f"efforts of {lost.sum()} of {len(arm.joint_names)} joints are not what this robot needs for this motion: "
+            f"efforts of {lost.sum()} of {len(names)} joints are not what this robot needs for this motion: "
             f"{left:.2g} times what a robot's model is off by"
         )
         advice = "check that the recording is this robot's, its unit of time, and the order of joints"
@@ -179,9 +190,8 @@ def _signs(
         yield _issue("effort_sign", words, by, "turn the sign; effort is what the motor does to the joint", joint)
 
 
-def _offsets(
-    arm: RecordedJointsModel, fit: _Fit, needed: Array, size: Array, told: NDArray[np.bool_]
-) -> Iterator[Issue]:
+def _offsets(data: _Data, fit: _Fit, told: NDArray[np.bool_]) -> Iterator[Issue]:
+    needed, size = data.needed, data.size
     low, high = 1 / _WRONG_GAIN_FACTOR, _WRONG_GAIN_FACTOR
     # a large zero error looks like a large gain; but then the variation follows as it should
     off_zero = (fit.inverse > 0) & (fit.inverse < low) & (fit.direct > low) & (fit.direct < high)
@@ -191,28 +201,24 @@ def _offsets(
         # springs that carry part of the weight are no wrong zero
         balanced = offset[j] * np.mean(needed[:, j]) < 0 and abs(offset[j]) < np.max(np.abs(needed[:, j]))
         if abs(offset[j]) > _MIN_Z * fit.offset_std[j] and not balanced:
-            name, value = arm.joint_names[j], float(offset[j])
+            name, value = data.arm.joint_names[j], float(offset[j])
             words = f"the zero of the effort of {name} is off by {value:+.3g} N m"
             depth = abs(value) / (3 * _OFFSET_FRACTION * float(size[j]))
             setting = effect_setting_line("effort_offset", name, "offset", value)
             yield _issue("effort_offset", words, depth, "let it be estimated, or set the sensor's zero", name, setting)
 
 
-def _late(
-    arm: RecordedJointsModel, motion: SmoothedJointMotion, effort: Array, needed: Array, size: Array
-) -> Iterator[Issue]:
+def _late(data: _Data) -> Iterator[Issue]:
     """Efforts that follow the motion late or early, all alike."""
-    trials = _LAG_SEARCH_STEP * np.arange(-5, 6)
-    if motion.t[-1] - motion.t[0] < 4 * trials[-1]:
-        return
-    if np.max(_fitted(arm, motion, effort, needed, size).left) < _WELL_EXPLAINED_RMS:
+    motion, trials = data.motion, _LAG_SEARCH_STEP * np.arange(-5, 6)
+    if motion.t[-1] - motion.t[0] < 4 * trials[-1] or np.max(_fitted(data).left) < _WELL_EXPLAINED_RMS:
         return
     inside = (motion.t >= motion.t[0] + trials[-1]) & (motion.t <= motion.t[-1] - trials[-1])
     kept = replace(motion, t=motion.t[inside], q=motion.q[inside], v=motion.v[inside], a=motion.a[inside])
     costs = []
     for late in trials:
-        moved = np.stack([np.interp(kept.t + late, motion.t, column) for column in effort.T], axis=1)
-        costs.append(_fitted(arm, kept, moved, needed[inside], size).cost)
+        moved = np.stack([np.interp(kept.t + late, motion.t, column) for column in data.effort.T], axis=1)
+        costs.append(_fitted(replace(data, motion=kept, effort=moved, needed=data.needed[inside])).cost)
     at = int(np.argmin(costs))
     lag = float(trials[at])
     # twice over, so that what friction and grasp take up of a lag does not count
@@ -220,25 +226,24 @@ def _late(
         words = (
             f"efforts fit the motion best {abs(lag):.2g} s {'earlier' if lag > 0 else 'later'} than they were recorded"
         )
-        lines = [effect_setting_line("effort_delay", name, "delay", lag) for name in joints_by_arm(arm.system)]
+        lines = [effect_setting_line("effort_delay", name, "delay", lag) for name in joints_by_arm(data.arm.system)]
         setting = "; ".join(lines) if abs(lag) <= _LAG_SEARCH_STEP else ""
         yield _issue("effort_lag", words, abs(lag) / _LAG_SEARCH_STEP, "shift their times", setting=setting)
 
 
-def _fitted(arm: RecordedJointsModel, motion: SmoothedJointMotion, effort: Array, needed: Array, size: Array) -> _Fit:
+def _fitted(data: _Data) -> _Fit:
+    motion, effort, needed, size = data.motion, data.effort, data.needed, data.size
     count, width = needed.shape
     error = _EFFORT_LIMIT_ERROR_FRACTION * size + _EFFORT_SPREAD_ERROR_FRACTION * needed.std(axis=0)
-    columns, spread = _by_itself(arm, motion, effort, size)
-    loads, sizes = _loads(arm, motion)
-    matrix = np.concatenate([columns, loads], axis=2) / error[:, None]
-    prior = np.concatenate([spread, sizes])
+    columns, spread = _by_itself(data)
+    loads, sizes = _loads(data)
+    matrix, prior = np.concatenate([columns, loads], axis=2) / error[:, None], np.concatenate([spread, sizes])
     independent = max(2 * _INDEPENDENT_SAMPLE_BANDWIDTH * (motion.t[-1] - motion.t[0]), 2.0)
     weight = math.sqrt(min(1.0, independent / count))
     rows, target = weight * matrix.reshape(count * width, -1), weight * (needed / error).ravel()
     normal = rows.T @ rows + np.diag(1 / prior**2)
-    pull = np.zeros(len(prior))
-    pull[:width] = 1 / prior[:width] ** 2
-    found = np.linalg.solve(normal, rows.T @ target + pull)
+    neutral = np.arange(len(prior)) < width
+    found = np.linalg.solve(normal, rows.T @ target + neutral / prior**2)
     std = np.maximum(np.sqrt(np.diag(np.linalg.inv(normal))), _MIN_FITTED_STD)
     remains = (rows @ found - target).reshape(count, width) / weight
     others = np.concatenate([np.zeros(2 * width), found[2 * width :]])
@@ -246,63 +251,52 @@ def _fitted(arm: RecordedJointsModel, motion: SmoothedJointMotion, effort: Array
     shift = effort.mean(axis=0) - explained.mean(axis=0)
     moved, about = explained - explained.mean(axis=0), effort - effort.mean(axis=0)
     direct = np.sum(about * moved, axis=0) / np.maximum(np.sum(moved**2, axis=0), 1e-12)
-    departure = (found - (np.arange(len(prior)) < width)) / prior
-    cost = float(np.sum((rows @ found - target) ** 2) + np.sum(departure**2))
+    cost = float(np.sum((rows @ found - target) ** 2) + np.sum(((found - neutral) / prior) ** 2))
     own = slice(width, 2 * width)
     left = np.sqrt(np.mean(remains**2, axis=0))
     return _Fit(found[:width], std[:width], found[own], std[own], left, direct, shift, cost)
 
 
-def _by_itself(
-    arm: RecordedJointsModel, motion: SmoothedJointMotion, effort: Array, size: Array
-) -> tuple[Array, Array]:
+def _by_itself(data: _Data) -> tuple[Array, Array]:
     """Columns of each joint alone, shape (N, k, 5 k), and their usual sizes: 1/g, offset, friction twice, spring."""
-    count, width = effort.shape
+    motion, size, width = data.motion, data.size, data.effort.shape[1]
+    # a spring is large where the model has one whose stiffness is sought
+    sprung = {spring.joint_name for spring in data.arm.system.elastic_joints}
+    springs = np.where([name in sprung for name in data.arm.joint_names], 10 * size, _JOINT_SPRING_FRACTION * size)
     parts = [
-        (effort, np.full(width, _WRONG_GAIN_FACTOR)),
-        (-np.ones_like(effort), _OFFSET_FRACTION * size),
+        (data.effort, np.full(width, _WRONG_GAIN_FACTOR)),
+        (-np.ones_like(data.effort), _OFFSET_FRACTION * size),
         (-motion.v, VISCOUS_FRICTION_FRACTION * size),
         (-np.tanh(motion.v / 0.02), _COULOMB_FRICTION_FRACTION * size),
-        (-(motion.q - motion.q.mean(axis=0)), _springs(arm, size)),
+        (-(motion.q - motion.q.mean(axis=0)), springs),
     ]
-    columns = np.zeros((count, width, width * len(parts)))
-    for k, (values, _) in enumerate(parts):
-        for j in range(width):
-            columns[:, j, k * width + j] = values[:, j]
+    columns = np.concatenate([values[:, :, None] * np.eye(width) for values, _ in parts], axis=2)
     return columns, np.concatenate([spread for _, spread in parts])
 
 
-def _springs(arm: RecordedJointsModel, size: Array) -> Array:
-    """Usual size of a spring on each joint; large where the model has one whose stiffness is sought."""
-    sprung = {spring.joint_name for spring in arm.system.elastic_joints}
-    return np.where([name in sprung for name in arm.joint_names], 10 * size, _JOINT_SPRING_FRACTION * size)
-
-
-def _loaded(arm: RecordedJointsModel, motion: SmoothedJointMotion, size: Array) -> NDArray[np.bool_]:
+def _loaded(data: _Data) -> NDArray[np.bool_]:
     """Joints on which what is held can act like a wrong zero."""
-    holders = tuple(grasp.holder_frame for grasp in arm.system.grasps if arm.is_frame_determined(grasp.holder_frame))
-    if not holders:
-        return np.zeros(len(arm.joint_names), bool)
-    _, by_angle = arm.frame_positions(holders, motion.q[:: max(1, len(motion.q) // 20)])
+    if not data.holders:
+        return np.zeros(len(data.size), bool)
+    q = data.motion.q
+    _, by_angle = data.arm.frame_positions(data.holders, q[:: max(1, len(q) // 20)])
     lever = np.max(np.linalg.norm(by_angle, axis=2), axis=(0, 1))
-    return np.asarray(_GRASP_FORCE_STD * lever > 3 * _OFFSET_FRACTION * size)
+    return np.asarray(_GRASP_FORCE_STD * lever > 3 * _OFFSET_FRACTION * data.size)
 
 
-def _loads(arm: RecordedJointsModel, motion: SmoothedJointMotion) -> tuple[Array, Array]:
+def _loads(data: _Data) -> tuple[Array, Array]:
     """Columns of the force at every grasp, shape (N, k, 33 per grasp), and their usual sizes."""
-    holders = tuple(grasp.holder_frame for grasp in arm.system.grasps if arm.is_frame_determined(grasp.holder_frame))
-    count, width = motion.q.shape
-    if not holders:
-        return np.zeros((count, width, 0)), np.zeros(0)
-    place, by_angle = arm.frame_positions(holders, motion.q)
-    columns, sizes = [], []
-    for g in range(len(holders)):
+    if not data.holders:
+        return np.zeros((*data.needed.shape, 0)), np.zeros(0)
+    place, by_angle = data.arm.frame_positions(data.holders, data.motion.q)
+    columns = []
+    for g in range(len(data.holders)):
         moved = place[:, g] - place[:, g].mean(axis=0)
-        speed = np.einsum("nik,nk->ni", by_angle[:, g], motion.v)
+        speed = np.einsum("nik,nk->ni", by_angle[:, g], data.motion.v)
         for axis in range(3):
             lever = by_angle[:, g, axis, :]
             squares = [lever * (moved[:, [b]] * moved[:, [c]]) for b in range(3) for c in range(b, 3)]
             columns += [lever, *(lever * moved[:, [b]] for b in range(3)), *squares, lever * speed[:, [axis]]]
-            stiffness = [_GRASP_STIFFNESS_STD] * 3 + [_GRASP_QUADRATIC_STIFFNESS_STD] * 6
-            sizes += [_GRASP_FORCE_STD, *stiffness, _GRASP_DAMPING_STD]
+    stiffness = [_GRASP_STIFFNESS_STD] * 3 + [_GRASP_QUADRATIC_STIFFNESS_STD] * 6
+    sizes = [_GRASP_FORCE_STD, *stiffness, _GRASP_DAMPING_STD] * 3 * len(data.holders)
     return np.stack(columns, axis=2), np.array(sizes)

@@ -60,12 +60,11 @@ class RunEstimates(ReprMixin):
         """Standard deviations, shape (n,)."""
         return np.sqrt(np.diag(self.covariance))
 
-    def select_parameters(self, names: Sequence[str]) -> RunEstimates:
-        """The estimates of the named parameters, in that order; names that the run lacks are skipped."""
-        at = [self.parameter_names.index(name) for name in names if name in self.parameter_names]
-        kept = tuple(self.parameter_names[i] for i in at)
+    def _only(self, names: Sequence[str]) -> RunEstimates:
+        """The estimates of the named parameters, in that order."""
+        at = [self.parameter_names.index(name) for name in names]
         covariance = self.covariance[np.ix_(at, at)]
-        return replace(self, parameter_names=kept, values=self.values[at], covariance=covariance)
+        return replace(self, parameter_names=tuple(names), values=self.values[at], covariance=covariance)
 
 
 @dataclass(frozen=True)
@@ -127,16 +126,6 @@ class EstimateHistory:
     p_value: float
     significance_level: float
 
-    @property
-    def drifted_parameters(self) -> tuple[str, ...]:
-        """Names of parameters that differ significantly between runs."""
-        return tuple(entry.name for entry in self.parameter_drifts if entry.has_drifted)
-
-    @property
-    def outlier_runs(self) -> tuple[str, ...]:
-        """Names of runs that alone disagree with the others."""
-        return tuple(entry.run_name for entry in self.run_consistencies if entry.is_outlier)
-
 
 def nearest_positive_definite(covariance: Array) -> Array:
     """A nearby invertible covariance with the same standard deviations: small correlation eigenvalues are raised."""
@@ -178,31 +167,26 @@ def pool_estimates(runs: Sequence[RunEstimates]) -> tuple[RunEstimates, float, i
 
 
 def assess_drift(runs: Sequence[RunEstimates], level: float = 0.01) -> EstimateHistory:
-    """Test which parameters drifted between runs and which run is an outlier.
+    """Test which parameters drifted between runs, in the order of time, and which run is an outlier.
 
-    Each parameter is tested by its marginal variances, each run by its whole covariance. A run is an outlier where it
-    disagrees with the others and these agree without it, or better than with any other left out. With two runs none is.
-
-    Parameters
-    ----------
-    runs : sequence of RunEstimates
-        Two or more, in the order of time.
-    level : float
-        Significance level; divided by the number of parameters, and by that of runs.
+    Each parameter is tested by its marginal variances, each run by its whole covariance; the significance level is
+    divided by the number of parameters, and by that of runs. A run is an outlier where it disagrees with the others and
+    these agree without it, or better than with any other left out. With two runs none is.
     """
-    names = tuple(dict.fromkeys(name for run in runs for name in run.parameter_names))
-    _, chi2, degrees = pool_estimates(runs)
-    drifts = tuple(_drift(name, runs, level / max(len(names), 1)) for name in names)
+    mean, chi2, degrees = pool_estimates(runs)
+    drifts = tuple(_drift(name, runs, level / len(mean.parameter_names)) for name in mean.parameter_names)
     against = tuple(_against(i, runs, level / len(runs)) for i in range(len(runs)))
-    run_names, p = tuple(run.run_name for run in runs), chi2_p_value(chi2, degrees)
-    return EstimateHistory(run_names, drifts, against, chi2, degrees, p, level)
+    names, p = tuple(run.run_name for run in runs), chi2_p_value(chi2, degrees)
+    return EstimateHistory(names, drifts, against, chi2, degrees, p, level)
 
 
 def _drift(name: str, runs: Sequence[RunEstimates], level: float) -> ParameterDrift:
-    own = [run.select_parameters((name,)) for run in runs if name in run.parameter_names]
+    own = [run._only((name,)) for run in runs if name in run.parameter_names]
     mean, chi2, degrees = pool_estimates(own)
     p = chi2_p_value(chi2, degrees)
-    values, std = tuple(float(run.values[0]) for run in own), tuple(float(run.std[0]) for run in own)
+    values, std = (
+        tuple(float(x[0]) for x in part) for part in zip(*((run.values, run.std) for run in own), strict=True)
+    )
     pooled, places = (float(mean.values[0]), float(mean.std[0])), tuple(run.run_name for run in own)
     return ParameterDrift(name, mean.units.get(name, ""), places, values, std, *pooled, chi2, p, p < level)
 
@@ -224,7 +208,7 @@ def _apart(run: RunEstimates, others: Sequence[RunEstimates]) -> tuple[float, in
     shared = [name for name in run.parameter_names if name in mean.parameter_names]
     if not shared:
         return 0.0, 0, ""
-    own, rest = run.select_parameters(shared), mean.select_parameters(shared)
+    own, rest = run._only(shared), mean._only(shared)
     apart, covariance = own.values - rest.values, nearest_positive_definite(own.covariance + rest.covariance)
     std = np.sqrt(np.diag(covariance))
     unit = apart / std

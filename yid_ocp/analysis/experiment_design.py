@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -37,6 +37,7 @@ _MARKER_AXIS_DISTANCE = 0.03  # of a marker from the axis [m]
 _DEFAULT_CAMERA_STD, _DEFAULT_CAMERA_RATE = 5e-3, 3.0  # of a camera where there was none [m], [Hz]
 _DEFAULT_ARM_POINT_STD = 1e-3  # of points that an arm measures where it measured none [m]
 DEFAULT_TORQUE_STD = 0.1  # of joint torques whose noise nobody stated [N m]
+_MOTION_SEED = 11  # of alternative motions
 # Two arms hold the object pushed together and away from the robot: at its full stretch a branched tube snaps [m].
 _INWARD_GRIPPER_OFFSET, _FORWARD_GRIPPER_OFFSET = 0.05, 0.08
 
@@ -61,10 +62,6 @@ class BaseExperiment:
         Unknowns at which the information is evaluated.
     two_arm_system : System, optional
         The system with a second arm and its grasp.
-    torque_std : float
-        Of joint torques as a measurement, where the recording states none [N m].
-    motion_seed : int
-        Random seed of alternative motions.
     """
 
     problem: EstimationProblem
@@ -72,8 +69,6 @@ class BaseExperiment:
     initial_state_knowledge: InitialStateKnowledge = "assumed"
     grasp_offset_prior_std: float | None = None
     two_arm_system: System | None = None
-    torque_std: float = DEFAULT_TORQUE_STD
-    motion_seed: int = 11
 
     @property
     def parameter_values(self) -> dict[str, float]:
@@ -83,35 +78,34 @@ class BaseExperiment:
 
     def camera_sampling(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
         """The camera's point group, its frame times since the start [s] and its typical standard deviation [m]."""
-        for group in _used_point_groups(self.problem, episode):
-            if recorded_camera_pose(group) is not None:
-                return group, group.t - episode.grid.start_time, float(np.nanmedian(self._std(group)))
-        return None, uniform_sample_times(episode.grid, _DEFAULT_CAMERA_RATE), _DEFAULT_CAMERA_STD
+        times = uniform_sample_times(episode.grid, _DEFAULT_CAMERA_RATE)
+        return self._sampling(episode, lambda g: recorded_camera_pose(g) is not None, times, _DEFAULT_CAMERA_STD)
 
     def arm_sampling(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
         """Point group, sample times [s] and standard deviation [m] of points that the arms measure."""
-        for group in _used_point_groups(self.problem, episode):
-            if "arm" in group.name or group.sensor == "arm":
-                return group, group.t - episode.grid.start_time, float(np.nanmedian(self._std(group)))
-        return None, episode.grid.node_times - episode.grid.start_time, _DEFAULT_ARM_POINT_STD
+        times = episode.grid.node_times - episode.grid.start_time
+        return self._sampling(episode, lambda g: "arm" in g.name or g.sensor == "arm", times, _DEFAULT_ARM_POINT_STD)
+
+    def _sampling(
+        self, episode: Episode, fits: Callable[[PointGroup], bool], times: Array, std: float
+    ) -> tuple[PointGroup | None, Array, float]:
+        for group in filter(fits, _used_point_groups(self.problem, episode)):
+            return group, group.t - episode.grid.start_time, float(np.nanmedian(self._std(group)))
+        return None, times, std
 
     def recorded_observations(self, episode: Episode) -> list[FrameObservation]:
         """Observations of the recording's sensors, one entry for each point."""
         found = []
         for group in _used_point_groups(self.problem, episode):
             std, t = self._std(group), group.t - episode.grid.start_time
-            for point, frame in self.point_frames(group).items():
-                at = group.names.index(point)
-                seen = np.all(np.isfinite(group.position[:, at]), axis=1)
-                found.append(FrameObservation(group.name, frame, t[seen], std[seen, at]))
+            choice = self.problem.options.sensors.get(group.name, SensorOptions())
+            for point in choice.points if choice.points is not None else group.names:
+                frame = choice.frames.get(point, point)
+                if self.problem.system.mechanism.has_frame(frame):
+                    at = group.names.index(point)
+                    seen = np.all(np.isfinite(group.position[:, at]), axis=1)
+                    found.append(FrameObservation(group.name, frame, t[seen], std[seen, at]))
         return found
-
-    def point_frames(self, group: PointGroup) -> dict[str, str]:
-        """Frame of the mechanism that each used point of a group marks, by point name."""
-        choice = self.problem.options.sensors.get(group.name, SensorOptions())
-        wanted = choice.points if choice.points is not None else group.names
-        frames = {point: choice.frames.get(point, point) for point in wanted}
-        return {p: f for p, f in frames.items() if self.problem.system.mechanism.has_frame(f)}
 
     def _std(self, group: PointGroup) -> Array:
         said = self.problem.options.sensors.get(group.name, SensorOptions()).std
@@ -197,9 +191,6 @@ class CandidateExperiment:
     ----------
     problem : EstimationProblem
         With nuisances, and with every measurable frame observed at every node.
-    x : ndarray, shape (nx,)
-    free_parameters : tuple of str
-        In the order of results.
     position_sensitivities : mapping of (episode, group, frame) to ndarray, shape (N + 1, 3, nx + q)
         Sensitivity of a frame's position at every node by the unknowns, then by what stands for the errors of the
         torques that drive this episode (`episode_sensitivities`).
@@ -266,30 +257,31 @@ class CandidateExperimentBuilder:
 
     def build_experiment(self, mechanics: frozenset[str]) -> CandidateExperiment | str:
         """The experiment with a set of mechanical changes, or a message why it cannot be built."""
-        if mechanics not in self._layouts:
-            if mechanics:
-                words = " and ".join(MECHANICAL_CHANGES[name] for name in sorted(mechanics))
-                self._progress.begin_stage(f"working out {words}")
-            try:
-                self._layouts[mechanics] = self._build(mechanics)
-            except YidError as error:
-                self._layouts[mechanics] = error.what
+        if mechanics in self._layouts:
+            return self._layouts[mechanics]
+        if mechanics:
+            words = " and ".join(MECHANICAL_CHANGES[name] for name in sorted(mechanics))
+            self._progress.begin_stage(f"working out {words}")
+        try:
+            self._layouts[mechanics] = self._build(mechanics)
+        except YidError as error:
+            self._layouts[mechanics] = error.what
         return self._layouts[mechanics]
 
     def applicable_changes(self) -> list[str]:
         """Names of the mechanical changes that apply to the system."""
-        setting, system = self.setting, self.setting.problem.system
-        found = []
-        if any(grasp.kind != "weld" for grasp in system.grasps):
-            found.append("weld")
-        if setting.two_arm_system is not None:
-            found.append("second_arm")
-        if system.driven and not system.servos:
-            found += ["motion", "travel"]
-        measured = any(s.sensor.effort_joints for e in setting.problem.episodes for s in e.measurements)
-        if (system.driven or system.prescribed) and not measured and setting.problem.episodes[0].recording.joints:
-            found.append("torque")
-        return found
+        setting, system, episodes = self.setting, self.setting.problem.system, self.setting.problem.episodes
+        moves = bool(system.driven) and not system.servos
+        measured = any(s.sensor.effort_joints for e in episodes for s in e.measurements)
+        robot = (system.driven or system.prescribed) and episodes[0].recording.joints
+        applies = {
+            "weld": any(grasp.kind != "weld" for grasp in system.grasps),
+            "second_arm": setting.two_arm_system is not None,
+            "motion": moves,
+            "travel": moves,
+            "torque": bool(robot) and not measured,
+        }
+        return [name for name, does in applies.items() if does]
 
     def _build(self, mechanics: frozenset[str]) -> CandidateExperiment:
         setting, base = self.setting, self.setting.problem
@@ -299,7 +291,7 @@ class CandidateExperimentBuilder:
         other = mechanics - {"motion", "travel"} or system is not base.system
         step = compile_step_like(base.step, system, use_compiler=False) if other else base.step
         step, seen = with_observable_frames(step)
-        wide = with_nuisance_unknowns(base, setting.x, setting.initial_state_knowledge, setting.grasp_offset_prior_std)
+        wide = with_nuisance_unknowns(base, setting.initial_state_knowledge, setting.grasp_offset_prior_std)
         options = replace(
             wide.options,
             sensors=self._joint_sensors(mechanics),
@@ -336,7 +328,10 @@ class CandidateExperimentBuilder:
             # made motions state their noise, that of joints which the settings do not know too
             sensors = {name: replace(choice, std=None, bias_std=None) for name, choice in sensors.items()}
         if "torque" in mechanics:
-            sensors[EFFORT_GROUP] = self._torque_options()
+            joints = self.setting.problem.episodes[0].recording.joints
+            said = None if joints is None else joints.effort_std
+            stated = said is not None and bool(np.all(np.asarray(said) > 0))
+            sensors[EFFORT_GROUP] = SensorOptions(std=None if stated else DEFAULT_TORQUE_STD)
         return sensors
 
     def _finest(self, episode: Episode) -> dict[str, float]:
@@ -383,7 +378,7 @@ class CandidateExperimentBuilder:
         notes: list[str] = []
         for i, episode in enumerate(base.episodes):
             try:
-                recording, beyond = self._moved(system, episode, setting.motion_seed + i, "travel" in mechanics)
+                recording, beyond = self._moved(system, episode, _MOTION_SEED + i, "travel" in mechanics)
             except DataError:
                 if system.driven != base.system.driven or not base.held_out or "travel" in mechanics:
                     raise
@@ -401,11 +396,8 @@ class CandidateExperimentBuilder:
         """The part of a recording that the problem uses, its torques without the errors that are known."""
         recording, errors, joints = episode.recording, episode.input_errors, episode.recording.joints
         if errors is not None and joints is not None and joints.effort is not None:
-            effort = joints.effort.copy()
-            at = (
-                errors.sample_of_step[:, None],
-                [joints.names.index(name) for name in self.setting.problem.system.driven],
-            )
+            effort, driven = joints.effort.copy(), self.setting.problem.system.driven
+            at = errors.sample_of_step[:, None], [joints.names.index(name) for name in driven]
             effort[at] = effort[at] - errors.total_torque_error
             recording = replace(recording, joints=replace(joints, effort=effort))
         if self.setting.problem.options.duration is None:
@@ -444,25 +436,21 @@ class CandidateExperimentBuilder:
         excitation = MultisineOptions(gripper_travel=travel, max_joint_speed=speed, duration=duration)
         motion = random_multisine(system, values, seed=seed, initial_joint_angles=posture, excitation=excitation)
         run = simulate_in_mujoco(system, values, motion, SimulationOptions(duration), initial_joint_angles=posture)
-        driven, noise = list(system.driven_indices), _noise_as_recorded(base.system, system, episode)
-        q = run.q[:, driven]
-        joints = JointGroup(
-            system.driven,
-            run.t,
-            q,
-            effort=run.effort,
-            effort_kind="command",
-            position_std=noise[0],
-            effort_std=noise[1],
-            effort_bias_std=noise[2],
-        )
+        driven = list(system.driven_indices)
+        q, noise = run.q[:, driven], _noise_as_recorded(base.system, system, episode)
+        names = "position_std", "effort_std", "effort_bias_std"
+        stds = dict(zip(names, noise, strict=True))
+        joints = JointGroup(system.driven, run.t, q, effort=run.effort, effort_kind="command", **stds)
         limits = [system.mechanism.joints[i] for i in driven]
         low, high, most = (
             np.array([getattr(joint, f"{name}_limit") for joint in limits]) for name in ("lower", "upper", "effort")
         )
         beyond = {"range": (q.min(0) < low) | (q.max(0) > high), "torque": np.abs(run.effort).max(0) > most}
-        names = {what: np.array(system.driven)[over] for what, over in beyond.items() if over.any()}
-        notes = [f"beyond the {what} of {', '.join(over)}" for what, over in names.items()]
+        notes = [
+            f"beyond the {what} of {', '.join(np.array(system.driven)[over])}"
+            for what, over in beyond.items()
+            if over.any()
+        ]
         return Recording(joints, source="what if", name=episode.name), notes
 
     def _dense(self, recording: Recording, index: int, seen: Sequence[ObservableFrame], torque: bool) -> Recording:
@@ -493,12 +481,6 @@ class CandidateExperimentBuilder:
         if torque and joints is not None and joints.effort is None:
             joints = replace(joints, effort=np.zeros_like(joints.position))
         return replace(recording, joints=joints, points=tuple(groups))
-
-    def _torque_options(self) -> SensorOptions:
-        joints = self.setting.problem.episodes[0].recording.joints
-        said = None if joints is None else joints.effort_std
-        stated = said is not None and bool(np.all(np.asarray(said) > 0))
-        return SensorOptions(std=None if stated else self.setting.torque_std)
 
 
 def _noise_as_recorded(base: System, system: System, episode: Episode) -> Sequence[Array | float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -11,8 +11,7 @@ import numpy as np
 import threadpoolctl
 from numpy.typing import ArrayLike, NDArray
 
-from yid_ocp.analysis.parameter_combinations import DirectionComponent, describe_combination, join_names, sparse_basis
-from yid_ocp.analysis.profile import ParameterProfile, check_small_estimate, nearby_optimum, profile_likelihood
+from yid_ocp.analysis.profile import ParameterProfile, check_small_estimate, map_at_optimum, profile_likelihood
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError, SolverError, nearest_name_hint
@@ -38,20 +37,23 @@ from yid_ocp.inference.uncertainty import (
 )
 from yid_ocp.inference.whitening import whitened_at
 from yid_ocp.model.system import System
-from yid_ocp.parallel import map_with_batched_calls
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.progress import NULL_PROGRESS, ParallelProgress, Progress
+from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.solvers.base import Solution
 
 Array = NDArray[np.float64]
-InitialStateKnowledge = Literal["assumed", "known", "unknown"]
+InitialStateKnowledge = Literal["assumed", "unknown"]
 
 _GRASP_OFFSET_KIND = "grasp_offset"
 _GRASP_OFFSET_PREFIX = f"{_GRASP_OFFSET_KIND}@"
 GRASP_OFFSET_PRIOR_STD = 0.01  # prior of where a grasp sits [m]
 # A column this much smaller than the largest counts as zero where nuisances are eliminated.
 _RANK_RTOL = 1e-10
+_MAX_DIRECTION_MISMATCH = 0.05  # of a direction against that of a plain combination, both of unit length
+_FINITE_CHANGE_FACTOR = 1.3  # factor on the first parameter in the test of a combination at a finite change
+_MAX_LISTED_NAMES = 4  # in a sentence
+_MAX_RELATIVE_DATA_CHANGE = 0.1  # by which a combination may move the data, of what one change alone does
 
 
 @dataclass(frozen=True)
@@ -136,13 +138,8 @@ class IdentifiabilityResult(ReprMixin):
         for name, entry in self.parameters.items():
             value = parameter_text(entry.value, finite_or_none(entry.std), None)
             rows.append((name, value, entry.unit, VERDICT_WORDS[entry.verdict]))
-        count = count_with_noun(len(self.parameter_names), "parameter")
-        return ReprSummary(f"{len(self.identifiable_parameters)} of {count} found", rows)
-
-    @property
-    def identifiable_parameters(self) -> tuple[str, ...]:
-        """Names of parameters whose verdict is `identifiable`."""
-        return tuple(name for name, entry in self.parameters.items() if entry.verdict == "identifiable")
+        found = sum(entry.verdict == "identifiable" for entry in self.parameters.values())
+        return ReprSummary(f"{found} of {count_with_noun(len(self.parameter_names), 'parameter')} found", rows)
 
     @property
     def unidentifiable_directions(self) -> tuple[ParameterDirection, ...]:
@@ -169,9 +166,9 @@ def identifiability(
     ----------
     solution : Solution or array_like, optional
         Point at which to judge (a solution of this problem, or its unknown vector); the initial values when absent.
-    start : "assumed", "unknown" or "known"
+    start : "assumed" or "unknown"
         As the problem has it, so that verdicts are those of its solution; or every recording's initial state estimated
-        along, with the problem's prior about what it assumes; or none.
+        along, with the problem's prior about what it assumes.
     grasp_std : float, optional
         Prior standard deviation of the fixed `grasp_offset@...` parameters of a system that has any (see
         `with_grasp_offset_effects`), which are estimated along [m]; None for grasps that are known.
@@ -192,20 +189,6 @@ def identifiability(
     Ljung (1999), System Identification, section 7.4; Raue et al. (2009), Bioinformatics 25:1923,
     doi:10.1093/bioinformatics/btp358.
     """
-    # the matrices are small: threads of the linear algebra library cost more than they give
-    with threadpoolctl.threadpool_limits(1):
-        return _information(problem, solution, start, grasp_std, intervals, limits, progress)
-
-
-def _information(
-    problem: EstimationProblem,
-    solution: Solution | ArrayLike | None,
-    start: InitialStateKnowledge,
-    grasp_std: float | None,
-    intervals: Iterable[str] | Literal["all"],
-    limits: GapCriteria,
-    progress: Progress,
-) -> IdentifiabilityResult:
     names = parameter_unknown_names(problem)
     wanted = names if intervals == "all" else tuple(intervals)
     for name in wanted:
@@ -213,86 +196,56 @@ def _information(
             hint = nearest_name_hint(name, names)
             raise ConfigError(f"'{name}' is not a free parameter", hint=hint, where="intervals")
     given = unknowns_from_solution(problem, solution)
-    wide = with_nuisance_unknowns(problem, given, start, grasp_std)
+    wide = with_nuisance_unknowns(problem, start, grasp_std)
     x = transfer_unknowns(given, problem.unknown_names, wide)
-    as_solved, wide = wide is problem, whitened_at(wide, x, rounds=2)
-    evaluation = wide.evaluate(x)
-    if not evaluation.ok or evaluation.jacobian is None:
-        message = f"the model cannot be rolled out where its information is asked for: {evaluation.message}"
-        raise SolverError(message, hint="solve first, or choose other initial values")
-    covariance, chi2 = covariance_and_chi2(wide, evaluation)
-    inflation = math.sqrt(max(1.0, chi2))
-    fit = None
-    if solution is None:
-        # far from the data chi2 says nothing of the noise
-        covariance, inflation = covariance / inflation**2, 1.0
-    else:
-        own = wide if as_solved else whitened_at(problem, given, rounds=2)
-        fit = assess_goodness_of_fit(own, evaluation if as_solved else own.evaluate(given), limits)
-        covariance = covariance_of_fit(wide, evaluation, fit)
-    view = _sensitivities(wide, x, evaluation, names, inflation)
-    judged = parameter_estimates(wide, x, evaluation, covariance, fit)
-    std = np.array([judged[name].std for name in names])
-    own_covariance = covariance[np.ix_(view.chosen, view.chosen)]
-    plain = np.sqrt(np.diag(own_covariance))
-    most = MIN_UNINFORMED_RELATIVE_STD * np.maximum(view.scale, wide.unknown_scales[view.chosen])
-    profiles, judged = _profiles(view, std, wanted, judged, progress)
-    return IdentifiabilityResult(
-        _parameters(view, judged),
-        names,
-        _correlations(own_covariance, np.where(plain < most, plain, np.inf)),
-        view.relative.T @ view.relative,
-        _directions(view, std / view.scale),
-        tuple(name for name in wide.unknown_names if name not in names),
-        chi2,
-        profiles,
-    )
+    # the matrices are small: threads of the linear algebra library cost more than they give
+    with threadpoolctl.threadpool_limits(1):
+        as_solved, wide = wide is problem, whitened_at(wide, x, rounds=2)
+        evaluation = wide.evaluate(x)
+        if not evaluation.ok or evaluation.jacobian is None:
+            message = f"the model cannot be rolled out where its information is asked for: {evaluation.message}"
+            raise SolverError(message, hint="solve first, or choose other initial values")
+        covariance, chi2 = covariance_and_chi2(wide, evaluation)
+        inflation, fit = math.sqrt(max(1.0, chi2)), None
+        if solution is None:
+            # far from the data chi2 says nothing of the noise
+            covariance, inflation = covariance / inflation**2, 1.0
+        else:
+            own = wide if as_solved else whitened_at(problem, given, rounds=2)
+            fit = assess_goodness_of_fit(own, evaluation if as_solved else own.evaluate(given), limits)
+            covariance = covariance_of_fit(wide, evaluation, fit)
+        view = _Sensitivities.of(wide, x, evaluation, names, inflation)
+        judged = parameter_estimates(wide, x, evaluation, covariance, fit)
+        std = np.array([judged[name].std for name in names])
+        profiles = _profiles(view, wanted, judged, progress) if wanted else {}
+        nuisances = tuple(name for name in wide.unknown_names if name not in names)
+        correlations, information = view.correlations(covariance), view.relative.T @ view.relative
+        directions = _directions(view, std / view.scale)
+    parameters = {}
+    for name, value, scale, alone in zip(names, x[view.chosen], view.scale, view.alone, strict=True):
+        entry, relative = judged[name], 1.0 / float(alone) if alone > 0 else math.inf
+        parameters[name] = ParameterInformation(
+            float(value), view.unit(name), entry.std, entry.std / float(scale), relative, entry.verdict, entry.interval
+        )
+    return IdentifiabilityResult(parameters, names, correlations, information, directions, nuisances, chi2, profiles)
 
 
 def _profiles(
-    view: _Sensitivities, std: Array, wanted: Sequence[str], judged: Mapping[str, ParameterEstimate], progress: Progress
-) -> tuple[dict[str, ParameterProfile], dict[str, ParameterEstimate]]:
-    """Profile likelihoods of the wanted parameters about the best fit of all unknowns, and what they leave to say."""
-    if not wanted:
-        return {}, dict(judged)
-    problem, (best, there) = view.problem, nearby_optimum(view.problem, view.x)
-    sizes = typical_parameter_sizes(problem, view.x)
+    view: _Sensitivities, wanted: Sequence[str], judged: dict[str, ParameterEstimate], progress: Progress
+) -> dict[str, ParameterProfile]:
+    """Profile likelihoods of the wanted parameters about the best fit of all unknowns; updates what is judged."""
+    problem, sizes = view.problem, typical_parameter_sizes(view.problem, view.x)
+
+    def one(name: str, best: Array, there: Evaluation) -> tuple[ParameterProfile, ParameterEstimate]:
+        index, size, entry = problem.unknown_names.index(name), sizes[name.split("[")[0]], judged[name]
+        found = profile_likelihood(problem, best, index, float(entry.std), there)
+        said = check_small_estimate(problem, best, index, entry, size, there)
+        return found, with_profile_interval(entry, found.interval, size) if said.verdict == entry.verdict else said
+
     progress.begin_stage(f"intervals of {len(wanted)} parameters by profile likelihood")
-    parts = ParallelProgress(progress, len(wanted), wanted[0])
-
-    def one(name: str) -> tuple[ParameterProfile, ParameterEstimate]:
-        index, size = problem.unknown_names.index(name), sizes[name.split("[")[0]]
-        found = profile_likelihood(problem, best, index, float(std[view.names.index(name)]), there)
-        said = check_small_estimate(problem, best, index, judged[name], size, there)
-        parts.count_done(name)
-        if said.verdict == judged[name].verdict:
-            said = with_profile_interval(judged[name], found.interval, size)
-        return found, said
-
-    pairs = dict(zip(wanted, map_with_batched_calls(one, wanted), strict=True))
-    profiles = {name: profile for name, (profile, _) in pairs.items()}
-    return profiles, {**judged, **{name: said for name, (_, said) in pairs.items()}}
-
-
-def _parameters(view: _Sensitivities, judged: Mapping[str, ParameterEstimate]) -> dict[str, ParameterInformation]:
-    """What is known of each parameter, from standard deviations with all others free and from its interval."""
-    found = {}
-    for i, name in enumerate(view.names):
-        entry = judged[name]
-        scale, alone = float(view.scale[i]), float(view.alone[i])
-        value, relative = float(view.x[view.chosen[i]]), 1.0 / alone if alone > 0 else math.inf
-        found[name] = ParameterInformation(
-            value, view.unit(name), entry.std, entry.std / scale, relative, entry.verdict, entry.interval
-        )
-    return found
-
-
-def _correlations(covariance: Array, std: Array) -> Array:
-    """Correlations of the parameters, NaN where nothing informs one."""
-    known = np.isfinite(std)
-    found = np.full(covariance.shape, np.nan)
-    found[np.ix_(known, known)] = (covariance / np.outer(std, std))[np.ix_(known, known)]
-    return found
+    pairs = map_at_optimum(one, problem, view.x, wanted, progress)
+    judged.update({name: said for name, (_, said) in pairs.items()})
+    return {name: profile for name, (profile, _) in pairs.items()}
 
 
 # -- nuisances --------------------------------------------------------------------------------------------------------
@@ -313,11 +266,7 @@ def unknowns_from_solution(problem: EstimationProblem, solution: Solution | Arra
     if solution is None:
         return problem.initial_unknowns
     if isinstance(solution, Solution):
-        x = problem.initial_unknowns
-        for name, value in zip(solution.unknown_names, solution.x, strict=True):
-            if name in problem.unknown_names:
-                x[problem.unknown_names.index(name)] = value
-        return x
+        return transfer_unknowns(solution.x, solution.unknown_names, problem)
     x = np.array(solution, float)
     if x.shape != (len(problem.unknown_names),):
         shape = f"({len(problem.unknown_names)},), as problem.unknown_names"
@@ -328,36 +277,11 @@ def unknowns_from_solution(problem: EstimationProblem, solution: Solution | Arra
 
 
 def with_nuisance_unknowns(
-    problem: EstimationProblem, x: Array, start: InitialStateKnowledge, grasp_std: float | None
+    problem: EstimationProblem, start: InitialStateKnowledge, grasp_std: float | None
 ) -> EstimationProblem:
-    """The problem with initial state and grasp offsets among its unknowns, or with a fixed initial state.
-
-    Parameters
-    ----------
-    x : ndarray, shape (nx,)
-        Point from which an estimated initial state is fixed.
-    grasp_std : float, optional
-        [m]
-    """
-    if start == "assumed" and grasp_std is None:
-        return problem
+    """The problem with initial states, where `start` is "unknown", and grasp offsets (prior in m) as unknowns."""
     options = problem.options
-    initial, known = options.initial_state, dict(options.known_initial_states)
-    values = {name: dict(entry) for name, entry in options.parameters_by_recording.items()}
-    if initial == "fitted_to_points" and start != "assumed":
-        # the fit's start stays where it is, and becomes the centre of a prior where it is unknown
-        for episode in problem.episodes:
-            if episode.name not in known and episode.fixed_initial_state is not None:
-                known[episode.name] = episode.fixed_initial_state.state
-                values.setdefault(episode.name, {}).update(episode.fixed_initial_state.fitted_parameters)
-    elif start == "known" and initial == "estimated":
-        for i, episode in enumerate(problem.episodes):
-            begin = problem.initial_state(episode, *problem.split(x, i))
-            if begin.failure_message:
-                raise SolverError(f"there is no start to be known: {begin.failure_message}", where=episode.name)
-            known[episode.name] = begin.state
-    if start != "assumed":
-        initial = "estimated" if start == "unknown" else "equilibrium" if initial == "estimated" else initial
+    initial = "estimated" if start == "unknown" else options.initial_state
     grasps = [
         entry.name
         for entry in problem.system.parameters
@@ -365,6 +289,14 @@ def with_nuisance_unknowns(
     ]
     if initial == options.initial_state and not grasps:
         return problem
+    known = dict(options.known_initial_states)
+    values = {name: dict(entry) for name, entry in options.parameters_by_recording.items()}
+    if options.initial_state == "fitted_to_points" and start == "unknown":
+        # what was fitted to the points becomes the centre of a prior
+        for episode in problem.episodes:
+            if episode.name not in known and episode.fixed_initial_state is not None:
+                known[episode.name] = episode.fixed_initial_state.state
+                values.setdefault(episode.name, {}).update(episode.fixed_initial_state.fitted_parameters)
     priors = dict(options.prior_stds) | {name: float(grasp_std) for name in grasps if grasp_std is not None}
     changed = replace(
         options, initial_state=initial, known_initial_states=known, parameters_by_recording=values, prior_stds=priors
@@ -376,47 +308,17 @@ def with_nuisance_unknowns(
 
 def transfer_unknowns(x: Array, names: Sequence[str], other: EstimationProblem) -> Array:
     """Unknown vector of another problem: values of the same names, its own initial values for the rest."""
-    result = other.initial_unknowns
-    place = {name: i for i, name in enumerate(names)}
-    for i, name in enumerate(other.unknown_names):
-        if name in place:
-            result[i] = x[place[name]]
-    return result
+    known = dict(zip(names, x, strict=True))
+    own = zip(other.unknown_names, other.initial_unknowns, strict=True)
+    return np.array([known.get(name, initial) for name, initial in own])
 
 
 # -- sensitivities ----------------------------------------------------------------------------------------------------
 
 
-def _sensitivities(
-    problem: EstimationProblem, x: Array, evaluation: Evaluation, names: tuple[str, ...], inflation: float
-) -> _Sensitivities:
-    """Sensitivities of named unknowns, all others and their priors projected out."""
-    _, jacobian = residual_without_weak_priors(problem, evaluation)
-    jacobian = jacobian.copy()
-    chosen = np.array([problem.unknown_names.index(name) for name in names], int)
-    others = np.setdiff1d(np.arange(jacobian.shape[1]), chosen)
-    # what is known beforehand of the parameters themselves is not something that a sensor sees
-    jacobian[problem.residual_rows.stated_priors, chosen] = 0.0
-    scale = np.where(x[chosen] != 0, np.abs(x[chosen]), problem.unknown_scales[chosen])
-    unit, nuisance = scale / inflation, jacobian[:, others] * problem.unknown_scales[others]
-    relative = _orthogonal_part(jacobian[:, chosen], nuisance) * unit
-    return _Sensitivities(
-        problem, x, evaluation, names, chosen, scale, inflation, jacobian[:, chosen] * unit, relative, nuisance
-    )
-
-
-def _orthogonal_part(columns: Array, explained: Array) -> Array:
-    """The part of columns that is orthogonal to the columns `explained`."""
-    if explained.shape[1] == 0:
-        return columns
-    vectors, singular, _ = np.linalg.svd(explained, full_matrices=False)
-    basis = vectors[:, singular > _RANK_RTOL * max(float(singular.max(initial=0.0)), 1e-300)]
-    return np.asarray(columns - basis @ (basis.T @ columns))
-
-
 @dataclass(frozen=True)
 class _Sensitivities:
-    """What the sensors see of the parameters at one point.
+    """What the sensors see of the named parameters at one point.
 
     `by_alone` is the whitened sensitivity (nr, p) to relative changes with everything else known, `relative` that with
     nuisances eliminated, `nuisance` that of all other unknowns in their scales.
@@ -433,6 +335,21 @@ class _Sensitivities:
     relative: Array
     nuisance: Array
 
+    @staticmethod
+    def of(
+        problem: EstimationProblem, x: Array, evaluation: Evaluation, names: tuple[str, ...], inflation: float
+    ) -> _Sensitivities:
+        jacobian = residual_without_weak_priors(problem, evaluation)[1].copy()
+        chosen = np.array([problem.unknown_names.index(name) for name in names], int)
+        others = np.setdiff1d(np.arange(jacobian.shape[1]), chosen)
+        # what is known beforehand of the parameters themselves is not something that a sensor sees
+        jacobian[problem.residual_rows.stated_priors, chosen] = 0.0
+        scale = np.where(x[chosen] != 0, np.abs(x[chosen]), problem.unknown_scales[chosen])
+        unit, nuisance = scale / inflation, jacobian[:, others] * problem.unknown_scales[others]
+        own = jacobian[:, chosen]
+        relative = _orthogonal_part(own, nuisance) * unit
+        return _Sensitivities(problem, x, evaluation, names, chosen, scale, inflation, own * unit, relative, nuisance)
+
     @property
     def alone(self) -> Array:
         """Size of the sensitivity to relative changes with everything else known, shape (p,)."""
@@ -442,48 +359,116 @@ class _Sensitivities:
         """Unit of a parameter, which may carry its recording's name."""
         return self.problem.system.parameters[name.split("[")[0]].unit
 
+    def correlations(self, covariance: Array) -> Array:
+        """Correlations of the parameters, NaN where nothing informs one."""
+        own = covariance[np.ix_(self.chosen, self.chosen)]
+        std = np.sqrt(np.diag(own))
+        most = MIN_UNINFORMED_RELATIVE_STD * np.maximum(self.scale, self.problem.unknown_scales[self.chosen])
+        std = np.where(std < most, std, np.nan)
+        return np.asarray(own / np.outer(std, std))
+
+
+def _orthogonal_part(columns: Array, explained: Array) -> Array:
+    """The part of columns that is orthogonal to the columns `explained`."""
+    if explained.shape[1] == 0:
+        return columns
+    vectors, singular, _ = np.linalg.svd(explained, full_matrices=False)
+    basis = vectors[:, singular > _RANK_RTOL * max(float(singular.max(initial=0.0)), 1e-300)]
+    return np.asarray(columns - basis @ (basis.T @ columns))
+
 
 def _directions(view: _Sensitivities, std: Array) -> tuple[ParameterDirection, ...]:
     """Unseen parameters, plain unseen combinations, and what is seen; least seen first.
 
     `std`: relative standard deviations of the parameters, which count a misfit in time where directions count its size.
     """
-    relative, alone, count = view.relative, view.alone, len(view.names)
-    found: list[ParameterDirection] = []
-    hidden = [i for i in range(count) if alone[i] * MAX_WEAK_RELATIVE_STD < 1.0]
-    for i in hidden:
-        size = float(np.linalg.norm(relative[:, i]))
-        found.append(_direction(view, size, np.eye(count)[i], f"{view.names[i]} is not seen by any sensor"))
-    rest = [i for i in range(count) if i not in hidden]
-    if rest:
+    relative, count = view.relative, len(view.names)
+    hidden = view.alone * MAX_WEAK_RELATIVE_STD < 1.0
+    found = [
+        _direction(
+            view, float(np.linalg.norm(relative[:, i])), np.eye(count)[i], f"{view.names[i]} is not seen by any sensor"
+        )
+        for i in np.flatnonzero(hidden)
+    ]
+    rest = np.flatnonzero(~hidden)
+    if len(rest):
         _, singular, vectors = np.linalg.svd(relative[:, rest], full_matrices=False)
-        wide = np.zeros((len(rest), count))
-        wide[: len(vectors), rest] = vectors
-        sizes = np.zeros(len(rest))
-        sizes[: len(singular)] = singular
+        sizes, wide = np.zeros(len(rest)), np.zeros((len(rest), count))
+        sizes[: len(singular)], wide[: len(vectors), rest] = singular, vectors
         blind = sizes * MAX_WEAK_RELATIVE_STD < 1.0
         if np.any(blind):
-            for vector in sparse_basis(_completed(wide, rest, blind)):
-                size = float(np.linalg.norm(relative @ vector))
-                found.append(_direction(view, size, vector, _unseen_words(view, vector)))
-        found += [
-            _direction(view, float(size), vector, _seen_words(view, float(size), vector, std))
-            for size, vector in zip(sizes[~blind], wide[~blind], strict=True)
-        ]
+            # an orthonormal basis of what the seen directions leave
+            seen, left = wide[~blind][:, rest], np.zeros((int(blind.sum()), count))
+            left[:, rest] = np.linalg.svd(np.eye(len(rest)) - seen.T @ seen)[0][:, : len(left)].T
+            for vector in _sparse_basis(left):
+                found.append(
+                    _direction(view, float(np.linalg.norm(relative @ vector)), vector, _unseen_words(view, vector))
+                )
+        for size, vector in zip(sizes[~blind], wide[~blind], strict=True):
+            found.append(_direction(view, float(size), vector, _seen_words(view, float(size), vector, std)))
     return tuple(sorted(found, key=lambda entry: entry.singular_value))
 
 
 def _direction(view: _Sensitivities, size: float, vector: Array, words: str) -> ParameterDirection:
     vector = vector * np.sign(vector[np.argmax(np.abs(vector))])
     std = 1.0 / size if size > 0 else math.inf
-    components = {name: float(part) for name, part in zip(view.names, vector, strict=True)}
+    components = dict(zip(view.names, map(float, vector), strict=True))
     return ParameterDirection(size, std, components, parameter_verdict(1.0, std), words)
 
 
-def _components(view: _Sensitivities, vector: Array) -> list[DirectionComponent]:
+def _sparse_basis(vectors: Array) -> list[Array]:
+    """Sparse basis, of unit vectors, of the space spanned by row vectors (d, p).
+
+    Row echelon form with complete pivoting: as many components as there are vectors stand in one vector only.
+    """
+    rows, open_columns = vectors.copy(), list(range(vectors.shape[1]))
+    for i in range(len(rows)):
+        block = np.abs(rows[i:][:, open_columns])
+        pivot, at = np.unravel_index(int(np.argmax(block)), block.shape)
+        column = open_columns.pop(int(at))
+        rows[[i, i + int(pivot)]] = rows[[i + int(pivot), i]]
+        rows[i] /= rows[i, column]
+        for k in range(len(rows)):
+            if k != i:
+                rows[k] -= rows[k, column] * rows[i]
+    return [row / np.linalg.norm(row) for row in rows]
+
+
+# -- words ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Component:
+    """One parameter's coefficient in a direction of relative parameter changes, with its value and unit."""
+
+    name: str
+    coefficient: float
+    value: float
+    unit: str
+
+
+_DataChange = Callable[[Mapping[str, float]], float]
+"""How far the data move where parameters take new values [standard deviations]."""
+
+# what may be seen of a and b: words, slope of a relative change that leaves it, b that does with a new a, like units
+_Combination = tuple[str, Callable[[float, float], tuple[float, float]], Callable[[float, float, float], float], bool]
+_COMBINATIONS: tuple[_Combination, ...] = (
+    (
+        "1/{a} + 1/{b}, as springs in series are",
+        lambda a, b: (a, -b),
+        lambda a, b, n: 1 / (1 / a + 1 / b - 1 / n),
+        True,
+    ),
+    ("{a} + {b}, as springs side by side are", lambda a, b: (b, -a), lambda a, b, n: a + b - n, True),
+    ("the ratio {a} / {b}", lambda a, b: (1.0, 1.0), lambda a, b, n: b * n / a, False),
+    ("the product {a} x {b}", lambda a, b: (1.0, -1.0), lambda a, b, n: b * a / n, False),
+)
+
+
+def _components(view: _Sensitivities, vector: Array) -> list[_Component]:
     """The parameters that make up a direction."""
     return [
-        DirectionComponent(name, float(part), float(view.x[index]), view.unit(name))
+        _Component(name, float(part), float(view.x[index]), view.unit(name))
         for name, part, index in zip(view.names, vector, view.chosen, strict=True)
         if abs(part) > 0.05 * np.max(np.abs(vector))
     ]
@@ -493,9 +478,13 @@ def _unseen_words(view: _Sensitivities, vector: Array) -> str:
     """Why a direction is not seen."""
     parts = _components(view, vector)
     if float(np.linalg.norm(view.by_alone @ vector)) * MAX_WEAK_RELATIVE_STD >= 1.0:
-        what = parts[0].name if len(parts) == 1 else "this: " + describe_combination(parts, None)
+        what = parts[0].name if len(parts) == 1 else "this: " + _combination_words(parts)
         return f"{what} cannot be told apart from {_hiding_nuisances(view, vector)}"
-    return describe_combination(parts, lambda changes: _moved(view, changes))
+    form = _combination(parts[0], parts[1], lambda changes: _moved(view, changes)) if len(parts) == 2 else None
+    if form is None:
+        return _combination_words(parts)
+    names = [part.name for part in parts]
+    return f"{_joined(names)} are seen only as {form.format(a=names[0], b=names[1])}"
 
 
 def _hiding_nuisances(view: _Sensitivities, vector: Array) -> str:
@@ -531,13 +520,46 @@ def _seen_words(view: _Sensitivities, size: float, vector: Array, std: Array) ->
     spread = own if len(parts) == 1 and math.isfinite(own) else 1.0 / size
     how = "is seen" if spread <= MAX_IDENTIFIABLE_RELATIVE_STD else "is seen only weakly"
     joint = "a joint change of " if len(parts) > 1 else ""
-    return f"{joint}{join_names([part.name for part in parts])} {how} (± {percent_text(spread)} %)"
+    return f"{joint}{_joined([part.name for part in parts])} {how} (± {percent_text(spread)} %)"
 
 
-def _completed(wide: Array, rest: Sequence[int], blind: NDArray[np.bool_]) -> Array:
-    """Orthonormal basis of what the seen directions leave, shape (number blind, p)."""
-    seen = wide[~blind][:, rest]
-    vectors = np.linalg.svd(np.eye(len(rest)) - seen.T @ seen)[0][:, : int(blind.sum())]
-    result = np.zeros((int(blind.sum()), wide.shape[1]))
-    result[:, rest] = vectors.T
-    return result
+def _combination_words(parts: Sequence[_Component]) -> str:
+    """A sentence on the trade between the parameters of an unidentifiable direction."""
+    if len(parts) == 1:
+        return f"{parts[0].name} is not seen"
+    largest, shown = max(abs(part.coefficient) for part in parts), parts
+    if len(parts) > _MAX_LISTED_NAMES:
+        shown = sorted(parts, key=lambda part: -abs(part.coefficient))[:_MAX_LISTED_NAMES]
+    trade = " with ".join(f"{part.name} {10 * part.coefficient / largest:+.2g} %" for part in shown)
+    rest = " and the others to match" if len(shown) < len(parts) else ""
+    listed = _joined([part.name for part in parts])
+    return f"{listed} are seen only together: {trade}{rest} changes nothing that is measured"
+
+
+def _joined(names: Sequence[str]) -> str:
+    """Names joined to a text; beyond the first four, only the number of further names is given."""
+    if len(names) > _MAX_LISTED_NAMES:
+        return f"{', '.join(names[:_MAX_LISTED_NAMES])} and {len(names) - _MAX_LISTED_NAMES} more"
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _combination(first: _Component, second: _Component, moved: _DataChange) -> str | None:
+    """Words on the plain combination of two parameters that the data determine, also at a finite change, if any."""
+    direction = np.array([first.coefficient, second.coefficient])
+    direction /= np.linalg.norm(direction)
+    a, b = first.value, second.value
+    new_a = a * _FINITE_CHANGE_FACTOR
+    tried: list[tuple[float, str]] = []
+    for words, slope_at, partner, same_unit in _COMBINATIONS:
+        slope = np.array(slope_at(a, b))
+        mismatch = 1.0 - abs(float(slope @ direction)) / float(np.linalg.norm(slope))
+        if (same_unit and first.unit != second.unit) or mismatch > _MAX_DIRECTION_MISMATCH**2:
+            continue
+        new_b = partner(a, b, new_a)
+        if new_b > 0:
+            tried.append((moved({first.name: new_a, second.name: new_b}), words))
+    if not tried:
+        return None
+    least, best = min(tried, key=lambda entry: entry[0])
+    allowed = max(_MAX_RELATIVE_DATA_CHANGE * moved({first.name: new_a}), 1.0)
+    return best if math.isfinite(least) and least <= allowed else None

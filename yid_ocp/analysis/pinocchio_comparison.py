@@ -24,7 +24,7 @@ from yid_ocp.model.kinematics import (
     mass_matrix,
     rigid_body_derivatives,
 )
-from yid_ocp.model.mechanism import Joint, Mechanism
+from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System
 
 Array = NDArray[np.float64]
@@ -84,23 +84,9 @@ def compare_urdf_with_pinocchio(
 ) -> PinocchioComparison:
     """Compare a robot as this package read it from URDF with Pinocchio's reading of the same file.
 
-    Parameters
-    ----------
-    mechanism : Mechanism
-        What `read_urdf` made of it with the same `joints`, `locked_joints` and `exclude_links`.
-    gravity : ndarray, shape (3,)
-        [m/s^2]
-    joints : sequence of str, optional
-        Joints that were kept; all movable ones when absent.
-    locked : mapping of str to float, optional
-        Values of joints that were not [rad or m].
-    exclude_links : sequence of str
-        Links that were left out with all that hangs on them.
-
-    Raises
-    ------
-    ValueError
-        Pinocchio does not read the file.
+    `mechanism` is what `read_urdf` made of it with the same `joints` (all movable ones when absent), values `locked` of
+    those that were not kept [rad or m], and `exclude_links`, left out with all that hangs on them; gravity (3,) is in
+    m/s^2. Raises ValueError where Pinocchio does not read the file.
     """
     model, locked = pin.buildModelFromXML(_without(path, exclude_links)), locked or {}
     if joints is not None:
@@ -156,7 +142,8 @@ def _assembled(mechanism: Mechanism, gravity: Array, weight: bool) -> Any:
     for j in sorted(range(len(mechanism.joints)), key=mechanism.ancestor_joints):
         joint = mechanism.joints[j]
         placement = pin.SE3(_number(joint.placement.rotation), _number(joint.placement.translation).ravel())
-        index = model.addJoint(placed[joint.parent_index], _joint_model(joint), placement, joint.name)
+        kind = pin.JointModelRevoluteUnaligned if joint.kind == "revolute" else pin.JointModelPrismaticUnaligned
+        index = model.addJoint(placed[joint.parent_index], kind(*joint.axis), placement, joint.name)
         placed[j] = index
         for body in joint.bodies:
             fraction = 1.0 if body.gravity_fraction is None or not weight else float(body.gravity_fraction)
@@ -167,11 +154,6 @@ def _assembled(mechanism: Mechanism, gravity: Array, weight: bool) -> Any:
     return model
 
 
-def _joint_model(joint: Joint) -> Any:
-    kind = pin.JointModelRevoluteUnaligned if joint.kind == "revolute" else pin.JointModelPrismaticUnaligned
-    return kind(*joint.axis)
-
-
 def _number(expression: ca.SX) -> Array:
     return np.array(ca.DM(ca.densify(expression)))
 
@@ -179,10 +161,7 @@ def _number(expression: ca.SX) -> Array:
 def _compared(
     of: str, mechanism: Mechanism, gravity: Array, inert: Any, heavy: Any, posture: Array
 ) -> PinocchioComparison:
-    """Largest differences at the posture and at drawn ones, in random motion.
-
-    `inert` gives mass matrix and inverse dynamics less gravity's forces, `heavy` these forces.
-    """
+    """Largest differences from `inert` (mass matrix, inverse dynamics) and `heavy` (gravity), in random motion."""
     n = len(mechanism.joints)
     q, v, a = (ca.SX.sym(name, n) for name in "qva")
     kinematics = forward_kinematics(mechanism, q)
@@ -193,8 +172,7 @@ def _compared(
     rng = np.random.default_rng(0)
     joints = [inert.joints[inert.getJointId(name)] for name in mechanism.joint_names]
     columns = [joint.idx_v for joint in joints]
-    worst = np.zeros(3)
-    data, weights = inert.createData(), heavy.createData()
+    worst, data, weights = np.zeros(3), inert.createData(), heavy.createData()
     for at in (posture, *rng.uniform(-1.0, 1.0, (_N_RANDOM_CONFIGURATIONS, n))):
         speed, acceleration = rng.normal(size=(2, n))
         theirs_q, theirs_v, theirs_a = pin.neutral(inert), np.zeros(inert.nv), np.zeros(inert.nv)
@@ -207,9 +185,8 @@ def _compared(
         moving = pin.rnea(inert, data, theirs_q, theirs_v, theirs_a)[columns].copy()
         if inert is not heavy:
             moving += weight
-        for i, (found, expected) in enumerate(
-            zip(ours(at, speed, acceleration), (whole, weight[:, None], moving[:, None]), strict=True)
-        ):
+        expected_parts = whole, weight[:, None], moving[:, None]
+        for i, (found, expected) in enumerate(zip(ours(at, speed, acceleration), expected_parts, strict=True)):
             size = float(np.max(np.abs(expected), initial=0.0))
             difference = float(np.max(np.abs(np.array(ca.densify(found)) - expected), initial=0.0))
             worst[i] = max(worst[i], difference / size if size > 0 else difference)

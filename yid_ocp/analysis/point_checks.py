@@ -53,16 +53,14 @@ class _Change:
     channel: str = ""
 
 
-# -- points that the arm holds ----------------------------------------------------------------------------------------
-
-
-def _held_point_frames(system: System, group: PointGroup, choice: SensorOptions) -> dict[str, str]:
-    """Model frame that each point of a group marks; for a grasped point, the frame of the arm that holds it."""
-    holders = {grasp.held_frame: grasp.holder_frame for grasp in system.grasps}
+def _point_frames(system: System, group: PointGroup, choice: SensorOptions) -> dict[str, str]:
+    """Model frame that each used point of a group marks."""
     wanted = group.names if choice.points is None else choice.points
     frames = {name: choice.frames.get(name, name) for name in wanted if name in group.names}
-    frames = {name: holders.get(frame, frame) for name, frame in frames.items()}
     return {name: frame for name, frame in frames.items() if system.mechanism.has_frame(frame)}
+
+
+# -- points that the arm holds ----------------------------------------------------------------------------------------
 
 
 def check_held_points(arm: RecordedJointsModel, recording: Recording, choice: _SensorChoices) -> Iterator[Issue]:
@@ -70,10 +68,16 @@ def check_held_points(arm: RecordedJointsModel, recording: Recording, choice: _S
     joints, tree = recording.joints, arm.system.mechanism
     if joints is None or median_sample_period(joints.t) <= 0:
         return
+    holders = {grasp.held_frame: grasp.holder_frame for grasp in arm.system.grasps}
     for group in recording.points:
+        # of a grasped point, the frame of the arm that holds it
+        frames = {
+            name: holders.get(frame, frame)
+            for name, frame in _point_frames(arm.system, group, choice(group.name)).items()
+        }
         frames = {
             name: frame
-            for name, frame in _held_point_frames(arm.system, group, choice(group.name)).items()
+            for name, frame in frames.items()
             if arm.is_frame_determined(frame) and tree.ancestor_joints(tree.frame(frame).joint_index)
         }
         inside = (group.t >= joints.t[0]) & (group.t <= joints.t[-1])
@@ -109,25 +113,14 @@ def _explained(changes: Sequence[_Change], error: float, allowed: float, recordi
     """The issue that the change which explains most stands for; the first of those that do equally well."""
     best = min((change.error for change in changes), default=math.inf)
     good = (c for c in changes if c.error <= max(1.3 * best, allowed) and c.error < _MAX_REMAINING_FRACTION * error)
-    chosen, far = next(good, None), f"points are {error:.3g} m (rms) from where the model has them"
-    if chosen is None:
-        words, advice = (
-            f"{far}, and no simple change explains it",
-            "check the frame of the points, their names and the robot's description",
-        )
-        return Issue("point_unlike", words, "not_trusted", error / allowed, advice, recording, group)
-    words, where = f"{far}; {chosen.words} it is {chosen.error:.2g} m", "joints" if chosen.channel else group
-    depth = error / allowed
+    words, depth = f"points are {error:.3g} m (rms) from where the model has them", error / allowed
+    for chosen in good:
+        words, where = f"{words}; {chosen.words} it is {chosen.error:.2g} m", "joints" if chosen.channel else group
+        place = recording, where, chosen.channel
+        return Issue(chosen.cause, words, "not_trusted", depth, chosen.advice, *place, setting=chosen.setting)
+    advice = "check the frame of the points, their names and the robot's description"
     return Issue(
-        chosen.cause,
-        words,
-        "not_trusted",
-        depth,
-        chosen.advice,
-        recording,
-        where,
-        chosen.channel,
-        setting=chosen.setting,
+        "point_unlike", f"{words}, and no simple change explains it", "not_trusted", depth, advice, recording, group
     )
 
 
@@ -148,18 +141,17 @@ def _changed_lengths(seen: Array, place: Array) -> Iterator[_Change]:
     for scale in _UNIT_SCALES:
         words = f"divided by {scale:g}"
         yield _Change("point_scale", words, f"divide positions by {scale:g}", _rms(seen / scale - place))
-    best: dict[float, _Change] = {}
-    for order in itertools.permutations(range(3)):
-        for signs in itertools.product((1.0, -1.0), repeat=3):
-            axes = ", ".join(("" if s > 0 else "-") + "xyz"[i] for i, s in zip(order, signs, strict=True))
-            if axes == "x, y, z":
-                continue
-            turned = seen[..., list(order)] * np.array(signs)
-            mirror = np.linalg.det(np.eye(3)[list(order)] * np.array(signs)[:, None]) < 0
-            words = f"with ({axes}) for (x, y, z){', a mirror image,' if mirror else ''}"
-            error = _rms(turned - place)
-            best[error] = _Change("point_mirrored", words, f"use ({axes}) for (x, y, z)", error)
-    yield best[min(best)]
+    best: _Change | None = None
+    for order, signs in itertools.product(itertools.permutations(range(3)), itertools.product((1.0, -1.0), repeat=3)):
+        axes = ", ".join(("" if s > 0 else "-") + "xyz"[i] for i, s in zip(order, signs, strict=True))
+        error = _rms(seen[..., list(order)] * np.array(signs) - place)
+        if axes == "x, y, z" or (best is not None and not error <= best.error):
+            continue
+        mirror = np.linalg.det(np.eye(3)[list(order)] * np.array(signs)[:, None]) < 0
+        words = f"with ({axes}) for (x, y, z){', a mirror image,' if mirror else ''}"
+        best = _Change("point_mirrored", words, f"use ({axes}) for (x, y, z)", error)
+    if best is not None:
+        yield best
 
 
 def _changed_names(seen: Array, place: Array, names: Sequence[str]) -> Iterator[_Change]:
@@ -238,19 +230,12 @@ def _moved(seen: Array, place: Array) -> Iterator[_Change]:
 # -- points of the object ---------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Way:
-    """From a frame down its chain: distance to every joint's origin, as far as the chain is neither known nor fixed.
+def _distances(arm: RecordedJointsModel | None, system: System, theta: Array, frame: str) -> dict[int, float] | None:
+    """Distances from a frame along its chain to every joint's origin, as far as the chain is neither known nor fixed.
 
-    `root` is the last of these joints; its origin is fixed in the world, or on the arm.
+    The first is the root, whose origin is fixed in the world, or on the arm. None for a frame that is fixed or known,
+    or that slides.
     """
-
-    distance: Mapping[int, float]
-    root: int
-
-
-def _way(arm: RecordedJointsModel | None, system: System, theta: Array, frame: str) -> _Way | None:
-    """None for a frame that is fixed or known, or that slides."""
     mechanism, known = system.mechanism, set() if arm is None else set(arm.joint_indices)
     entry = mechanism.frame(frame)
     chain = [i for i in mechanism.ancestor_joints(entry.joint_index) if i not in known]
@@ -262,8 +247,7 @@ def _way(arm: RecordedJointsModel | None, system: System, theta: Array, frame: s
         lengths = [float(x) for x in function.call([theta])]
     except RuntimeError:  # an effect's internal coordinate
         return None
-    total = np.cumsum(lengths)
-    return _Way({i: float(d) for i, d in zip(reversed(chain), total, strict=True)}, chain[0])
+    return dict(zip(chain, np.cumsum(lengths)[::-1].tolist(), strict=True))
 
 
 def check_point_distances(
@@ -275,21 +259,22 @@ def check_point_distances(
     """
     mechanism = system.mechanism
     for group in recording.points:
-        said = choice(group.name)
-        frames = {n: said.frames.get(n, n) for n in (said.points or group.names) if n in group.names}
-        ways = {n: _way(arm, system, theta, f) for n, f in frames.items() if mechanism.has_frame(f)}
+        frames = _point_frames(system, group, choice(group.name))
+        found = {name: _distances(arm, system, theta, frame) for name, frame in frames.items()}
+        ways = {name: way for name, way in found.items() if way is not None}
         noise = _noise(group)
         worst, words, ratio = 0.0, "", 1.0
-        places = {n: group.position[:, group.names.index(n)] for n in ways}
+        places = {name: group.position[:, group.names.index(name)] for name in ways}
         pairs: list[tuple[str, Array, float]] = []
         for name, way in ways.items():
-            if way is not None and mechanism.joints[way.root].parent_index < 0:
-                root = np.array(_fixed(system, theta, way.root))
-                pairs.append((f"{name} from the object's root", places[name] - root, way.distance[way.root]))
+            root = next(iter(way))
+            if mechanism.joints[root].parent_index < 0:
+                at = ca.densify(mechanism.joints[root].placement.translation)
+                fixed = np.array(ca.Function("at", [system.parameters.symbols], [at])(theta)).ravel()
+                pairs.append((f"{name} from the object's root", places[name] - fixed, way[root]))
         for (one, a), (two, b) in itertools.combinations(ways.items(), 2):
-            if a is not None and b is not None and a.root == b.root:
-                both = [i for i in a.distance if i in b.distance]
-                bound = min(a.distance[i] + b.distance[i] for i in both)
+            if next(iter(a)) == next(iter(b)):
+                bound = min(a[i] + b[i] for i in a.keys() & b.keys())
                 pairs.append((f"{one} from {two}", places[one] - places[two], bound))
         for said_as, apart, bound in pairs:
             size = np.linalg.norm(apart, axis=1)
@@ -307,11 +292,6 @@ def check_point_distances(
             if unit:
                 cause, advice = "point_scale", f"check the unit of positions (they are {ratio:.2g} times too far)"
             yield Issue(cause, words, "not_trusted", worst, advice, recording.name, group.name)
-
-
-def _fixed(system: System, theta: Array, joint: int) -> list[float]:
-    at = system.mechanism.joints[joint].placement.translation
-    return [float(x) for x in np.array(ca.Function("at", [system.parameters.symbols], [ca.densify(at)])(theta)).ravel()]
 
 
 def check_object_points(episode: Episode, result: EpisodePrediction, size: float) -> Iterator[Issue]:
@@ -345,9 +325,8 @@ def _changed_pose(seen: Array, place: Array, pose: Array) -> Iterator[_Change]:
     def moved(by: Array) -> Array:
         return seen @ by[:3, :3].T + by[:3, 3]
 
-    frame = "with the camera's pose applied"
     advice = "give positions in the world, not in the camera's frame"
-    yield _Change("point_frame", frame, advice, _rms(moved(pose) - place))
+    yield _Change("point_frame", "with the camera's pose applied", advice, _rms(moved(pose) - place))
     turned, advice = "with the camera's pose the other way round", "the pose is of the camera in the world: invert it"
     yield _Change("point_frame", turned, advice, _rms(moved(pose @ pose) - place))
     for i, axis in enumerate("xyz"):

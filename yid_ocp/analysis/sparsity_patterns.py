@@ -63,19 +63,29 @@ class SparsityPattern:
         return int(np.count_nonzero(self.nonzero_mask))
 
 
-@dataclass(frozen=True)
-class KktSize:
-    """Size of the NLP with a node at every step.
+_Block = tuple[str, tuple[str, ...]]
+"""Name of a block and labels of its entries."""
 
-    `jacobian_nonzeros` counts those of the constraints, `hessian_nonzeros` both triangles of the exact Hessian of the
-    steps' constraints times their multipliers; what measurements add to it is not counted, and the start is linear in
-    the parameters, as multiple shooting takes it.
-    """
 
-    variables: int
-    constraints: int
-    jacobian_nonzeros: int
-    hessian_nonzeros: int
+def _pattern(
+    name: str, title: str, mask: _BoolMatrix, rows: Sequence[_Block], columns: Sequence[_Block]
+) -> SparsityPattern:
+    spans, labels = [], []
+    for blocks in (rows, columns):
+        ends = np.cumsum([0, *(len(own) for _, own in blocks)]).tolist()
+        names = [block for block, _ in blocks]
+        spans.append(tuple(NamedRange(*entry) for entry in zip(names, ends[:-1], ends[1:], strict=True)))
+        labels.append(tuple(label for _, own in blocks for label in own))
+    return SparsityPattern(name, title, mask, *spans, *labels)
+
+
+def _blocks(symbols: StepSymbols, *wanted: str, kept: Sequence[int] | None = None) -> list[_Block]:
+    """Blocks of a step by name, only the kept entries of the first one."""
+    blocks = {block.name: block.labels for block in (*symbols.row_blocks, *symbols.column_blocks)}
+    found = [(name, blocks[name]) for name in wanted]
+    if kept is not None:
+        found[0] = wanted[0], tuple(found[0][1][i] for i in kept)
+    return found
 
 
 # -- one step ---------------------------------------------------------------------------------------------------------
@@ -116,21 +126,22 @@ def step_sparsity_patterns(symbols: StepSymbols) -> dict[str, SparsityPattern]:
         nz = len(system.internal_coordinates)
         return np.vstack([full[:nc], p1, full[nc : nc + nz]])
 
-    unknowns = _spans(symbols, [("q1", free), ("z1", None), ("lam", None)])
-    residual = _spans(symbols, [("del", free), ("internal", None), ("constraint", None)])
-    before, after = (_spans(symbols, [(f"{c}{k}", None) for c in "qpz"]) for k in (0, 1))
-    every = _spans(symbols, [(b.name, None) for b in symbols.row_blocks])
-    torque, theta = _spans(symbols, [("u", None)]), _spans(symbols, [("theta", None)])
-    return {
-        name: SparsityPattern(name, title, mask, rows[0], columns[0], rows[1], columns[1])
-        for name, title, mask, rows, columns in (
-            ("dR_dy", "residual of a step by its unknowns", by_unknown, residual, unknowns),
-            ("A", "A: state after a step by the state before it", response("q0", "p0", "z0"), after, before),
-            ("B_u", "B_u: state after a step by torques", response("u"), after, torque),
-            ("B_theta", "B_theta: state after a step by parameters", response("theta"), after, theta),
-            ("dR_dtheta", "dR/dtheta: equations by parameters", whole[:, symbols.block_slice("theta")], every, theta),
-        )
-    }
+    unknowns = _blocks(symbols, "q1", "z1", "lam", kept=free)
+    residual = _blocks(symbols, "del", "internal", "constraint", kept=free)
+    before, after = _blocks(symbols, "q0", "p0", "z0"), _blocks(symbols, "q1", "p1", "z1")
+    every, torque, theta = (
+        [(b.name, b.labels) for b in symbols.row_blocks],
+        *(_blocks(symbols, b) for b in ("u", "theta")),
+    )
+    by_theta = whole[:, symbols.block_slice("theta")]
+    found = (
+        _pattern("dR_dy", "residual of a step by its unknowns", by_unknown, residual, unknowns),
+        _pattern("A", "A: state after a step by the state before it", response("q0", "p0", "z0"), after, before),
+        _pattern("B_u", "B_u: state after a step by torques", response("u"), after, torque),
+        _pattern("B_theta", "B_theta: state after a step by parameters", response("theta"), after, theta),
+        _pattern("dR_dtheta", "dR/dtheta: equations by parameters", by_theta, every, theta),
+    )
+    return {pattern.name: pattern for pattern in found}
 
 
 def _inverse_sparsity(mask: _BoolMatrix) -> _BoolMatrix:
@@ -178,9 +189,9 @@ class NlpStageSparsity:
         Of these constraints times their multipliers.
     gauss_newton_mask : ndarray of bool, shape (f + nx, f + nx)
         Gauss-Newton Hessian of the priors and of one reading of every sensor, by (theta_free, x_k).
-    constraint_blocks, state_blocks : tuple of NamedRange
-        Blocks of a step's constraints and of a node's state, with the labels of their entries.
-    fixed_start_rows, estimated_start_rows : tuple of int
+    constraint_blocks, state_blocks : sequence of (str, tuple of str)
+        Names and labels of the blocks of a step's constraints, and of a node's state.
+    fixed_start_rows, estimated_start_rows : sequence of int
         Rows of the first node's state that the start fixes, and that have a prior about it; the start depends on all
         free parameters.
     """
@@ -188,19 +199,18 @@ class NlpStageSparsity:
     constraint_mask: _BoolMatrix
     hessian_mask: _BoolMatrix
     gauss_newton_mask: _BoolMatrix
-    constraint_blocks: tuple[NamedRange, ...]
-    state_blocks: tuple[NamedRange, ...]
-    constraint_labels: tuple[str, ...]
-    state_labels: tuple[str, ...]
+    constraint_blocks: Sequence[_Block]
+    state_blocks: Sequence[_Block]
     multiplier_labels: tuple[str, ...]
-    n_free_parameters: int
-    fixed_start_rows: tuple[int, ...]
-    estimated_start_rows: tuple[int, ...]
+    free: tuple[str, ...]
+    fixed_start_rows: Sequence[int]
+    estimated_start_rows: Sequence[int]
 
     @property
-    def n_multipliers(self) -> int:
-        """Number of multipliers of a step."""
-        return len(self.multiplier_labels)
+    def sizes(self) -> tuple[int, int, int, int]:
+        """Numbers of free parameters, states, multipliers and constraints of a step."""
+        f, m, height = len(self.free), len(self.multiplier_labels), len(self.constraint_mask)
+        return f, len(self.gauss_newton_mask) - f, m, height
 
 
 def nlp_stage_sparsity(
@@ -208,7 +218,7 @@ def nlp_stage_sparsity(
     free: Sequence[str],
     sensors: Sequence[Sensor],
     followed: Sequence[int],
-    loose: Sequence[int] = (),
+    loose: Sequence[int],
 ) -> NlpStageSparsity:
     """Sparsity of one stage of the NLP with a node at every step, in the order of `solvers.transcription`.
 
@@ -250,38 +260,40 @@ def nlp_stage_sparsity(
         by_q, by_z, by_theta = (_mask(function.sparsity_out(i)) for i in (1, 3, 6))
         reading = np.hstack([by_theta, by_q, np.zeros((len(by_q), n), bool), by_z])
         measured |= _times(reading.T, reading)
-    row_spans, row_labels = _spans(symbols, [("del", kept), ("internal", None), ("constraint", None), ("p1", None)])
-    node_spans, node_labels = _spans(symbols, [("q0", None), ("p0", None), ("z0", None)])
-    lam_labels = _spans(symbols, [("lam", None)])[1]
-    spans, labels = (row_spans, node_spans), (row_labels, node_labels, lam_labels)
-    fixed = tuple(map(int, np.setdiff1d(np.arange(nx), [*system.prescribed_indices, *loose])))
-    return NlpStageSparsity(by_stage, hessian, measured, *spans, *labels, f, fixed, tuple(map(int, loose)))
+    rows_blocks = _blocks(symbols, "del", "internal", "constraint", "p1", kept=kept)
+    state, labels = _blocks(symbols, "q0", "p0", "z0"), _blocks(symbols, "lam")[0][1]
+    fixed = np.setdiff1d(np.arange(nx), [*system.prescribed_indices, *loose]).tolist()
+    return NlpStageSparsity(by_stage, hessian, measured, rows_blocks, state, labels, tuple(free), fixed, loose)
 
 
-def kkt_size(stage: NlpStageSparsity, steps: Sequence[int]) -> KktSize:
-    """Size of the NLP of several recordings, whose numbers of steps are given."""
-    f, nx, m = stage.n_free_parameters, stage.state_blocks[-1].stop, stage.n_multipliers
-    height = len(stage.constraint_mask)
+def kkt_size(stage: NlpStageSparsity, steps: Sequence[int]) -> dict[str, int]:
+    """Size of the NLP with a node at every step, of several recordings, whose numbers of steps are given.
+
+    `jacobian_nonzeros` counts those of the constraints, `hessian_nonzeros` both triangles of the exact Hessian of the
+    steps' constraints times their multipliers; what measurements add to it is not counted, and the start is linear in
+    the parameters, as multiple shooting takes it.
+    """
+    (f, nx, m, height), begun = stage.sizes, len(stage.fixed_start_rows)
     # every step after the first adds the same entries
     one, two = (int(np.count_nonzero(_nlp_sparsity_masks(stage, k)[1])) for k in (1, 2))
-    shared = int(np.count_nonzero(stage.hessian_mask[:f, :f]))
-    return KktSize(
-        f + sum((k + 1) * nx + k * m for k in steps),
-        sum(len(stage.fixed_start_rows) + k * height for k in steps),
-        sum(len(stage.fixed_start_rows) * (1 + f) + k * int(np.count_nonzero(stage.constraint_mask)) for k in steps),
-        shared + sum(one - shared + (k - 1) * (two - one) for k in steps),
-    )
+    shared, each = int(np.count_nonzero(stage.hessian_mask[:f, :f])), int(np.count_nonzero(stage.constraint_mask))
+    return {
+        "variables": f + sum((k + 1) * nx + k * m for k in steps),
+        "constraints": sum(begun + k * height for k in steps),
+        "jacobian_nonzeros": sum(begun * (1 + f) + k * each for k in steps),
+        "hessian_nonzeros": shared + sum(one - shared + (k - 1) * (two - one) for k in steps),
+    }
 
 
 def _nlp_sparsity_masks(stage: NlpStageSparsity, steps: int) -> tuple[_BoolMatrix, _BoolMatrix, _BoolMatrix]:
     """Sparsity masks of one recording's constraint Jacobian, constraint Hessian and measurement Hessian."""
-    f, nx, m, fixed = stage.n_free_parameters, stage.state_blocks[-1].stop, stage.n_multipliers, stage.fixed_start_rows
-    width, height = f + (steps + 1) * nx + steps * m, len(stage.constraint_mask)
+    (f, nx, m, height), fixed = stage.sizes, stage.fixed_start_rows
+    width = f + (steps + 1) * nx + steps * m
     jacobian = np.zeros((len(fixed) + steps * height, width), bool)
     hessian, measured = np.zeros((width, width), bool), np.zeros((width, width), bool)
     jacobian[np.arange(len(fixed)), f + np.array(fixed, int)] = True
     jacobian[: len(fixed), :f] = True
-    if stage.estimated_start_rows:
+    if len(stage.estimated_start_rows):
         begun = np.concatenate([np.arange(f), f + np.array(stage.estimated_start_rows)])
         measured[np.ix_(begun, begun)] = True
     for k in range(steps + 1):
@@ -298,49 +310,22 @@ def _nlp_sparsity_masks(stage: NlpStageSparsity, steps: int) -> tuple[_BoolMatri
     return jacobian, hessian, measured
 
 
-_LabelledBlocks = tuple[tuple[NamedRange, ...], tuple[str, ...]]
-
-
-def _spans(symbols: StepSymbols, wanted: Sequence[tuple[str, Sequence[int] | None]]) -> _LabelledBlocks:
-    """Blocks one after the other, each whole or some of it, with the labels of their entries."""
-    blocks = {block.name: block for block in (*symbols.row_blocks, *symbols.column_blocks)}
-    spans: list[NamedRange] = []
-    labels: list[str] = []
-    for name, chosen in wanted:
-        block = blocks[name]
-        kept = range(len(block.labels)) if chosen is None else chosen
-        spans.append(NamedRange(name, len(labels), len(labels) + len(kept)))
-        labels += [block.labels[i] for i in kept]
-    return tuple(spans), tuple(labels)
-
-
-def kkt_pattern(stage: NlpStageSparsity, free: Sequence[str], steps: int) -> SparsityPattern:
+def kkt_pattern(stage: NlpStageSparsity, steps: int) -> SparsityPattern:
     """The KKT matrix [[H, J'], [J, 0]] of the first steps of a recording, as if every node were measured."""
     jacobian, hessian, measured = _nlp_sparsity_masks(stage, steps)
     blank = np.zeros((len(jacobian), len(jacobian)), bool)
     mask = np.vstack([np.hstack([hessian | measured, jacobian.T]), np.hstack([jacobian, blank])])
-    spans: list[NamedRange] = []
-    labels: list[str] = []
-
-    def add(name: str, own: Sequence[str]) -> None:
-        if own:
-            spans.append(NamedRange(name, len(labels), len(labels) + len(own)))
-            labels.extend(own)
-
-    add("theta", free)
+    blocks = [("theta", stage.free)]
     for k in range(steps + 1):
-        for span in stage.state_blocks:
-            add(f"{span.name[0]}{k}", stage.state_labels[span.start : span.stop])
-        add(f"lam{k}", stage.multiplier_labels if k < steps else ())
-    add("start", [stage.state_labels[i] for i in stage.fixed_start_rows])
+        blocks += [(f"{name[0]}{k}", labels) for name, labels in stage.state_blocks]
+        blocks += [(f"lam{k}", stage.multiplier_labels)] if k < steps else []
+    state = [label for _, labels in stage.state_blocks for label in labels]
+    blocks.append(("start", tuple(state[i] for i in stage.fixed_start_rows)))
     for k in range(steps):
-        for span in stage.constraint_blocks:
-            name = f"p{k + 1} rule" if span.name == "p1" else f"{span.name}{k}"
-            add(name, stage.constraint_labels[span.start : span.stop])
-    blocks, named = tuple(spans), tuple(labels)
-    title = f"KKT matrix of the NLP with a node at every step: the first {steps} steps"
+        blocks += [(f"p{k + 1} rule" if n == "p1" else f"{n}{k}", labels) for n, labels in stage.constraint_blocks]
+    blocks = [block for block in blocks if block[1]]
     marked = np.zeros_like(mask)
     marked[: len(measured), : len(measured)] = measured
-    return SparsityPattern(
-        "kkt", title, mask, blocks, blocks, named, named, marked, "of a reading or a prior, where there is one"
-    )
+    title = f"KKT matrix of the NLP with a node at every step: the first {steps} steps"
+    found = _pattern("kkt", title, mask, blocks, blocks)
+    return replace(found, marked_mask=marked, mark_label="of a reading or a prior, where there is one")

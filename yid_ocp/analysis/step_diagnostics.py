@@ -8,11 +8,11 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from yid_ocp.analysis.step_symbols import StepSymbols
-from yid_ocp.integrator.step import Step, float_array_of_shape
-from yid_ocp.integrator.step_model import StepLinearization, TrackingFeedback
+from yid_ocp.integrator.step import Step
+from yid_ocp.integrator.step_model import StepLinearization
 from yid_ocp.model.system import System
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.sensors import sensor_function
@@ -25,12 +25,10 @@ _DIFFERENCE_STEP = 1e-5
 
 @dataclass(frozen=True)
 class CheckedLinearisation:
-    """A_k (nx, nx), B_k at a state (q, p, z), with their deviation from finite differences.
+    """A_k (nx, nx), B_k (nx, nu) and (nx, ntheta) at a state (q, p, z), with their deviation from finite differences.
 
     Attributes
     ----------
-    b_input : ndarray, shape (nx, nu)
-    b_theta : ndarray, shape (nx, ntheta)
     spectral_radius : float
         Largest absolute eigenvalue of A.
     finite_difference_errors : dict of str to float
@@ -50,59 +48,37 @@ def step_structure(step: Step) -> dict[str, Any]:
 
     `unknowns` are the free coordinates, internal coordinates and multipliers that Newton's iteration solves for.
     """
-    e, functions = step.equations, step.functions.all_functions
-    return {
-        "sizes": step.sizes,
-        "unknowns": e.unknowns.numel(),
-        "jacobian_nonzeros": ca.jacobian_sparsity(e.residual, e.unknowns).nnz(),
-        "functions": [
-            {
-                "name": f.name(),
-                "operations": f.n_instructions(),
-                "nonzeros": sum(f.nnz_out(i) for i in range(f.n_out())),
-            }
-            for f in functions
-        ],
-    }
+    e, found = step.equations, []
+    for f in step.functions.all_functions:
+        nonzeros = sum(f.nnz_out(i) for i in range(f.n_out()))
+        found.append({"name": f.name(), "operations": f.n_instructions(), "nonzeros": nonzeros})
+    nonzeros = ca.jacobian_sparsity(e.residual, e.unknowns).nnz()
+    counts = {"unknowns": e.unknowns.numel(), "jacobian_nonzeros": nonzeros}
+    return {"sizes": step.sizes, **counts, "functions": found}
 
 
-def linearise_and_check(
-    step: Step, state: ArrayLike, torque: ArrayLike, theta: ArrayLike, prescribed: tuple[ArrayLike, ArrayLike] | None
-) -> CheckedLinearisation:
-    """Linearise a step at a state (A_k, B_k) and compare it with central finite differences.
+def linearise_and_check(step: Step, state: Array, torque: Array, theta: Array, path: Array) -> CheckedLinearisation:
+    """Linearise a step at a state (nx,) (A_k, B_k) and compare it with central finite differences.
 
-    Parameters
-    ----------
-    state : array_like, shape (nx,)
-        (q, p, z)
-    torque : array_like, shape (nu,)
-        [N m]
-    theta : array_like, shape (ntheta,)
-    prescribed : pair of array_like, shape (nc,), or None
-        Prescribed coordinates at both ends of the step.
+    The torque (nu,) is in N m; `path` (nc,) are the prescribed coordinates, before and after the step.
     """
-    sizes = step.sizes
-    n, nx = sizes["n"], sizes["nx"]
-    x = float_array_of_shape("state", state, (nx,))
-    u = float_array_of_shape("torque", torque, (sizes["nu"],))
-    values = float_array_of_shape("theta", theta, (sizes["ntheta"],))
-    a, b_input, b_theta = step.jacobians(x[:n], x[n : 2 * n], u, values, prescribed, x[2 * n :])
+    n, pair = step.sizes["n"], (path, path) if len(path) else None
+    a, b_input, b_theta = step.jacobians(state[:n], state[n : 2 * n], torque, theta, pair, state[2 * n :])
 
     def after(x: Array, u: Array, values: Array) -> Array:
-        q1, p1, _, status = step(x[:n], x[n : 2 * n], u, values, prescribed, x[2 * n :])
+        q1, p1, _, status = step(x[:n], x[n : 2 * n], u, values, pair, x[2 * n :])
         return np.concatenate([q1, p1, status.internal_coordinates])
 
-    fixed = np.array(step.system.prescribed_indices, int)
-    by_state = _differences(lambda v: after(v, u, values), x)
+    by_state = _differences(lambda v: after(v, torque, theta), state)
     # prescribed coordinates come from the path, so the finite difference does not see them as part of the state
-    keep = np.setdiff1d(np.arange(nx), fixed)
+    keep = np.setdiff1d(np.arange(len(state)), step.system.prescribed_indices)
     errors = {
         "A": _error(a[:, keep], by_state[:, keep]),
-        "B_u": _error(b_input, _differences(lambda v: after(x, v, values), u)),
-        "B_theta": _error(b_theta, _differences(lambda v: after(x, u, v), values)),
+        "B_u": _error(b_input, _differences(lambda v: after(state, v, theta), torque)),
+        "B_theta": _error(b_theta, _differences(lambda v: after(state, torque, v), theta)),
     }
     radius = float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0))
-    return CheckedLinearisation(x, a, b_input, b_theta, radius, errors)
+    return CheckedLinearisation(state, a, b_input, b_theta, radius, errors)
 
 
 def linearise_step_equations(step: Step, state: Array, torque: Array, theta: Array, path: Array) -> StepLinearization:
@@ -219,16 +195,6 @@ class ParameterDependence:
         return f"{said}, {len(self.seen)} of which sensors see to first order ({_summarize_rows(self.seen)}){best}"
 
 
-@dataclass(frozen=True)
-class _Readings:
-    """One sensor at the rest, whitened: derivatives of its readings by state, effort and parameters."""
-
-    name: str
-    by_state: Array
-    by_effort: Array
-    by_theta: Array
-
-
 def parameter_dependences(
     step: Step, symbols: StepSymbols, episode: Episode | None, state: Array, theta: Array, stages: StepLinearization
 ) -> tuple[ParameterDependence, ...]:
@@ -249,11 +215,15 @@ def parameter_dependences(
             ParameterDependence(p.name, p.unit, tuple(names[r] for r in sorted(entered[i])), None, "", (), None, 0.0)
             for i, p in enumerate(parameters)
         )
-    linear = _Linear.of(step, stages, episode.tracking_feedback)
-    sensors = _readings(step, episode, state, theta)
+    sizes = step.sizes
+    gain = np.zeros((sizes["nu"], sizes["nx"]))
+    if episode.tracking_feedback is not None:
+        gain[:, episode.tracking_feedback.state_indices] = episode.tracking_feedback.gain[0]
+    sensors = _sensors(step, episode, state, theta)
     steps = min(_RESPONSE_STEPS, episode.grid.steps)
-    by_row = linear.answers(np.eye(len(names)), sensors, steps, held=False)
-    by_theta = linear.answers(linear.by_theta, sensors, steps, held=True)
+    pushed = np.vstack([stages.residual_by_theta[0], stages.p1_by_theta[0]])
+    by_row = _answers(step, stages, gain, np.eye(len(names)), sensors, steps, False)
+    by_theta = _answers(step, stages, gain, pushed, sensors, steps, True)
     strength = np.max(by_row, axis=0, initial=0.0)
     found = []
     for i, p in enumerate(parameters):
@@ -261,11 +231,9 @@ def parameter_dependences(
         answered = [r for r in rows if strength[r] > _MIN_RELATIVE_RESPONSE * np.max(strength)]
         best = sensors[int(np.argmax(np.max(by_row[:, answered], axis=1)))].name if answered else ""
         read = tuple(s.name for s in sensors if np.any(s.by_theta[:, i]))
-        # what is rounding beside the parameter seen best is nothing
         moved = float(np.max(by_theta[:, i], initial=0.0))
-        seen = tuple(names[r] for r in answered)
-        rows_named = tuple(names[r] for r in rows)
-        found.append(ParameterDependence(p.name, p.unit, rows_named, seen, best, read, moved, steps * step.time_step))
+        seen, entered_rows = (tuple(names[r] for r in chosen) for chosen in (answered, rows))
+        found.append(ParameterDependence(p.name, p.unit, entered_rows, seen, best, read, moved, steps * step.time_step))
     return tuple(found)
 
 
@@ -277,64 +245,61 @@ def _summarize_rows(names: Sequence[str]) -> str:
     return ", ".join(f"{kinds.count(kind)} of {kind}" for kind in dict.fromkeys(kinds))
 
 
-def _readings(step: Step, episode: Episode, state: Array, theta: Array) -> list[_Readings]:
-    system, n = step.system, step.system.n_coordinates
-    found = []
+@dataclass(frozen=True)
+class _WhitenedSensor:
+    """One sensor at the rest, whitened: derivatives of its readings by state, effort and parameters."""
+
+    name: str
+    by_state: Array
+    by_effort: Array
+    by_theta: Array
+
+
+def _sensors(step: Step, episode: Episode, state: Array, theta: Array) -> list[_WhitenedSensor]:
+    system, n, found = step.system, step.system.n_coordinates, []
+    at = [state[:n], np.zeros(n), state[2 * n :], np.zeros(n), np.zeros(system.n_constraints), theta]
     for samples in episode.measurements:
-        used = np.any(samples.is_used, axis=0)
         known = np.where(np.isfinite(samples.std) & samples.is_used, samples.std, np.nan)
-        if not np.any(used) or not np.any(np.isfinite(known)):
-            continue
-        std = np.array([np.nanmedian(known[:, k]) if u else np.inf for k, u in enumerate(used)])
-        function = sensor_function(system, samples.sensor, system.parameters.names)
-        at = [state[:n], np.zeros(n), state[2 * n :], np.zeros(n), np.zeros(system.n_constraints), theta]
-        _, by_q, _, by_z, by_effort, _, by_theta = (np.array(x.full()) / std[:, None] for x in function.call(at))
-        by_state = np.hstack([by_q, np.zeros_like(by_q), by_z])
-        found.append(_Readings(samples.sensor.group_name, by_state, by_effort, by_theta))
+        if np.any(np.isfinite(known)):
+            used = np.any(samples.is_used, axis=0)
+            std = np.array([np.nanmedian(known[:, k]) if u else np.inf for k, u in enumerate(used)])
+            function = sensor_function(system, samples.sensor, system.parameters.names)
+            _, by_q, _, by_z, by_effort, _, by_theta = (np.array(x.full()) / std[:, None] for x in function.call(at))
+            by_state = np.hstack([by_q, np.zeros_like(by_q), by_z])
+            found.append(_WhitenedSensor(samples.sensor.group_name, by_state, by_effort, by_theta))
     return found
 
 
-@dataclass(frozen=True)
-class _Linear:
-    """The equations of a step about a rest, to first order."""
-
-    step: Step
-    stages: StepLinearization
-    gain: Array
-    by_theta: Array
-
-    @staticmethod
-    def of(step: Step, stages: StepLinearization, feedback: TrackingFeedback | None) -> _Linear:
-        sizes = step.sizes
-        gain = np.zeros((sizes["nu"], sizes["nx"]))
-        if feedback is not None:
-            gain[:, feedback.state_indices] = feedback.gain[0]
-        return _Linear(step, stages, gain, np.vstack([stages.residual_by_theta[0], stages.p1_by_theta[0]]))
-
-    def answers(self, push: Array, sensors: Sequence[_Readings], steps: int, held: bool) -> Array:
-        """Largest whitened answer of every sensor, shape (len(sensors), c)."""
-        sizes, stages, h = self.step.sizes, self.stages, self.step.time_step
-        n, nz, width = sizes["n"], sizes["nz"], push.shape[1]
-        nt = n + nz + sizes["m"]
-        known = list(self.step.system.prescribed_indices)
-        solved = np.setdiff1d(np.arange(nt), known)
-        new, p_new = stages.residual_by_new[0], stages.p1_by_new[0]
-        inverse = np.linalg.inv(new[np.ix_(solved, solved)])
-        identity = np.vstack([np.eye(n), np.zeros((nt - n, n))])
-        old = np.hstack([stages.residual_by_old[0][:, :n], identity, stages.residual_by_old[0][:, n:]])
-        p_old = np.hstack([stages.p1_by_old[0][:, :n], np.zeros((n, n)), stages.p1_by_old[0][:, n:]])
-        old, p_old = old - stages.residual_by_input[0] @ self.gain, p_old - stages.p1_by_input[0] @ self.gain
-        x = np.zeros((sizes["nx"], width))
-        largest = np.zeros((len(sensors), width))
-        for k in range(steps + 1):
-            added = push if held or k == 0 else np.zeros_like(push)
-            y = np.zeros((nt, width))
-            y[solved] = -inverse @ (old @ x + added[:nt])[solved]
-            effort = np.zeros((n, width))
-            effort[known] = -(new @ y + old @ x + added[:nt])[known] / h
-            for i, sensor in enumerate(sensors):
-                read = sensor.by_state @ x + sensor.by_effort @ effort + (sensor.by_theta if held else 0.0)
-                largest[i] = np.maximum(largest[i], np.max(np.abs(read), axis=0, initial=0.0))
-            momentum = p_new @ y + p_old @ x + added[nt:]
-            x = np.vstack([y[:n], momentum, y[n : n + nz]])
-        return largest
+def _answers(
+    step: Step,
+    stages: StepLinearization,
+    gain: Array,
+    push: Array,
+    sensors: Sequence[_WhitenedSensor],
+    steps: int,
+    held: bool,
+) -> Array:
+    """Largest whitened answer of every sensor to pushes on rows, of one step or `held`, shape (len(sensors), c)."""
+    sizes, h = step.sizes, step.time_step
+    n, nz, width = sizes["n"], sizes["nz"], push.shape[1]
+    nt = n + nz + sizes["m"]
+    known = list(step.system.prescribed_indices)
+    solved = np.setdiff1d(np.arange(nt), known)
+    new, p_new = stages.residual_by_new[0], stages.p1_by_new[0]
+    inverse = np.linalg.inv(new[np.ix_(solved, solved)])
+    identity = np.vstack([np.eye(n), np.zeros((nt - n, n))])
+    old = np.hstack([stages.residual_by_old[0][:, :n], identity, stages.residual_by_old[0][:, n:]])
+    p_old = np.hstack([stages.p1_by_old[0][:, :n], np.zeros((n, n)), stages.p1_by_old[0][:, n:]])
+    old, p_old = old - stages.residual_by_input[0] @ gain, p_old - stages.p1_by_input[0] @ gain
+    x, largest = np.zeros((sizes["nx"], width)), np.zeros((len(sensors), width))
+    for k in range(steps + 1):
+        added = push if held or k == 0 else np.zeros_like(push)
+        y, effort = np.zeros((nt, width)), np.zeros((n, width))
+        y[solved] = -inverse @ (old @ x + added[:nt])[solved]
+        effort[known] = -(new @ y + old @ x + added[:nt])[known] / h
+        for i, sensor in enumerate(sensors):
+            read = sensor.by_state @ x + sensor.by_effort @ effort + (sensor.by_theta if held else 0.0)
+            largest[i] = np.maximum(largest[i], np.max(np.abs(read), axis=0, initial=0.0))
+        momentum = p_new @ y + p_old @ x + added[nt:]
+        x = np.vstack([y[:n], momentum, y[n : n + nz]])
+    return largest

@@ -22,6 +22,17 @@ _MAX_FRACTION_LENGTH = 60  # characters beyond which a fraction is written on on
 
 # operation: template, how tightly it binds, what it asks of its parts
 _OperationTemplate = tuple[str, int, tuple[int, ...]]
+
+
+def _comparisons(**signs: str) -> dict[int, _OperationTemplate]:
+    """Templates of comparisons and of conditions joined by a sign."""
+    logic = ("AND", "OR")
+    return {
+        getattr(ca, f"OP_{name}"): ("{0} " + sign + " {1}", _COMPARISON, ((_ATOM if name in logic else _SUM),) * 2)
+        for name, sign in signs.items()
+    }
+
+
 _TEXT_TEMPLATES: dict[int, _OperationTemplate] = {
     ca.OP_ADD: ("{0} + {1}", _SUM, (_SUM, _SUM)),
     ca.OP_SUB: ("{0} - {1}", _SUM, (_SUM, _PRODUCT)),
@@ -31,15 +42,9 @@ _TEXT_TEMPLATES: dict[int, _OperationTemplate] = {
     ca.OP_TWICE: ("2*{0}", _PRODUCT, (_PRODUCT,)),
     ca.OP_INV: ("1/{0}", _PRODUCT, (_POWER,)),
     ca.OP_SQ: ("{0}^2", _POWER, (_ATOM,)),
-    ca.OP_POW: ("{0}^{1}", _POWER, (_ATOM, _ATOM)),
-    ca.OP_CONSTPOW: ("{0}^{1}", _POWER, (_ATOM, _ATOM)),
-    ca.OP_LT: ("{0} < {1}", _COMPARISON, (_SUM, _SUM)),
-    ca.OP_LE: ("{0} <= {1}", _COMPARISON, (_SUM, _SUM)),
-    ca.OP_EQ: ("{0} == {1}", _COMPARISON, (_SUM, _SUM)),
-    ca.OP_NE: ("{0} != {1}", _COMPARISON, (_SUM, _SUM)),
+    **dict.fromkeys((ca.OP_POW, ca.OP_CONSTPOW), ("{0}^{1}", _POWER, (_ATOM, _ATOM))),
+    **_comparisons(LT="<", LE="<=", EQ="==", NE="!=", AND="and", OR="or"),
     ca.OP_NOT: ("not {0}", _COMPARISON, (_ATOM,)),
-    ca.OP_AND: ("{0} and {1}", _COMPARISON, (_ATOM, _ATOM)),
-    ca.OP_OR: ("{0} or {1}", _COMPARISON, (_ATOM, _ATOM)),
     ca.OP_IF_ELSE_ZERO: ("if({0}, {1}, 0)", _ATOM, (_COMPARISON, _COMPARISON)),
     ca.OP_FABS: ("abs({0})", _ATOM, (_COMPARISON,)),
     ca.OP_FMIN: ("min({0}, {1})", _ATOM, (_COMPARISON, _COMPARISON)),
@@ -51,14 +56,9 @@ _LATEX_TEMPLATES: dict[int, _OperationTemplate] = _TEXT_TEMPLATES | {
     ca.OP_TWICE: (r"2 \, {0}", _PRODUCT, (_PRODUCT,)),
     ca.OP_INV: (r"\frac{{1}}{{{0}}}", _ATOM, (_COMPARISON,)),
     ca.OP_SQ: ("{{{0}}}^{{2}}", _POWER, (_ATOM,)),
-    ca.OP_POW: ("{{{0}}}^{{{1}}}", _POWER, (_ATOM, _COMPARISON)),
-    ca.OP_CONSTPOW: ("{{{0}}}^{{{1}}}", _POWER, (_ATOM, _COMPARISON)),
-    ca.OP_LE: (r"{0} \le {1}", _COMPARISON, (_SUM, _SUM)),
-    ca.OP_EQ: ("{0} = {1}", _COMPARISON, (_SUM, _SUM)),
-    ca.OP_NE: (r"{0} \ne {1}", _COMPARISON, (_SUM, _SUM)),
+    **dict.fromkeys((ca.OP_POW, ca.OP_CONSTPOW), ("{{{0}}}^{{{1}}}", _POWER, (_ATOM, _COMPARISON))),
+    **_comparisons(LE=r"\le", EQ="=", NE=r"\ne", AND=r"\land", OR=r"\lor"),
     ca.OP_NOT: (r"\lnot {0}", _COMPARISON, (_ATOM,)),
-    ca.OP_AND: (r"{0} \land {1}", _COMPARISON, (_ATOM, _ATOM)),
-    ca.OP_OR: (r"{0} \lor {1}", _COMPARISON, (_ATOM, _ATOM)),
     ca.OP_IF_ELSE_ZERO: (r"[{0}] \, {1}", _PRODUCT, (_COMPARISON, _PRODUCT)),
     ca.OP_FABS: ("|{0}|", _ATOM, (_COMPARISON,)),
 }
@@ -93,14 +93,6 @@ class FormulaText:
     variable_indices: tuple[int, ...]
 
 
-@dataclass(frozen=True)
-class _Node:
-    op: int
-    parts: tuple[int, ...]
-    place: int = -1
-    value: float = 0.0
-
-
 def count_operations(expressions: Sequence[ca.SX], variables: ca.SX) -> int:
     """Number of operations that evaluate all expressions, each shared one counted once."""
     function = _function(expressions, variables)
@@ -111,49 +103,40 @@ def count_operations(expressions: Sequence[ca.SX], variables: ca.SX) -> int:
 def format_expressions(
     expressions: Sequence[ca.SX], variables: ca.SX, names: Sequence[SymbolName], latex: bool = False
 ) -> FormulaText:
-    """Scalar expressions as text or LaTeX with named variables.
-
-    Parameters
-    ----------
-    variables : casadi.SX, shape (k, 1)
-        All symbols that may occur.
-    names : sequence of SymbolName
-        Of the variables, in order.
-    latex : bool
-        LaTeX in place of text.
-    """
+    """Scalar expressions as text or LaTeX, with the names of the variables (k, 1), all symbols that may occur."""
     nodes, results = _nodes(_function(expressions, variables), len(expressions))
     uses = [0] * len(nodes)
-    for node in nodes:
-        for part in node.parts:
-            uses[part] += 1
-    for result in results:
-        uses[result] += 1
+    for used in itertools.chain(*(parts for op, parts, _ in nodes if op not in _LEAF_OPERATIONS), results):
+        uses[used] += 1
     layouts = _LATEX_TEMPLATES if latex else _TEXT_TEMPLATES
     written: list[tuple[str, int]] = []
     shared: list[tuple[str, str]] = []
-    for i, node in enumerate(nodes):
-        if node.op == ca.OP_INPUT:
-            name = names[node.place]
+    for i, (op, parts, value) in enumerate(nodes):
+        if op == ca.OP_INPUT:
+            name = names[int(value)]
             written.append((name.latex if latex else name.text, _ATOM))
-        elif node.op == ca.OP_CONST:
-            written.append((_number(node.value, latex), _SUM if node.value < 0 else _ATOM))
+        elif op == ca.OP_CONST:
+            written.append((_number(value, latex), _SUM if value < 0 else _ATOM))
         else:
-            text, tightness = _written(node, [written[part] for part in node.parts], layouts, latex)
-            simple = node.op == ca.OP_NEG and nodes[node.parts[0]].op in _LEAF_OPERATIONS
+            text, tightness = _written(op, [written[part] for part in parts], layouts, latex)
+            simple = op == ca.OP_NEG and nodes[parts[0]][0] in _LEAF_OPERATIONS
             if uses[i] > 1 and not simple:
                 name_of = f"c_{{{len(shared) + 1}}}" if latex else f"c{len(shared) + 1}"
                 shared.append((name_of, text))
                 text, tightness = name_of, _ATOM
             written.append((text, tightness))
-    counted = sum(node.op not in _LEAF_OPERATIONS for node in nodes)
-    seen = tuple(sorted({node.place for node in nodes if node.op == ca.OP_INPUT}))
+    counted = sum(op not in _LEAF_OPERATIONS for op, _, _ in nodes)
+    seen = tuple(sorted({int(value) for op, _, value in nodes if op == ca.OP_INPUT}))
     return FormulaText(tuple(shared), tuple(written[r][0] for r in results), counted, seen)
 
 
 def _function(expressions: Sequence[ca.SX], variables: ca.SX) -> ca.Function:
     together = ca.cse(ca.densify(ca.vertcat(*expressions)))
     return ca.Function("formula", [variables], [together])
+
+
+_Node = tuple[int, tuple[int, ...], float]
+"""Operation, nodes that it takes, and the index of a variable or the value of a constant."""
 
 
 def _nodes(function: ca.Function, count: int) -> tuple[list[_Node], list[int]]:
@@ -166,32 +149,25 @@ def _nodes(function: ca.Function, count: int) -> tuple[list[_Node], list[int]]:
         if op == ca.OP_OUTPUT:
             results[given[1]] = at[taken[0]]
             continue
-        if op == ca.OP_INPUT:
-            node = _Node(op, (), place=taken[1])
-        elif op == ca.OP_CONST:
-            node = _Node(op, (), value=float(function.instruction_constant(i)))
-        else:
-            node = _Node(op, tuple(at[register] for register in taken))
+        value = float(taken[1]) if op == ca.OP_INPUT else function.instruction_constant(i) if op == ca.OP_CONST else 0.0
+        parts = () if op in _LEAF_OPERATIONS else tuple(at[register] for register in taken)
         at[given[0]] = len(nodes)
-        nodes.append(node)
+        nodes.append((op, parts, float(value)))
     return nodes, results
 
 
 def _written(
-    node: _Node, parts: list[tuple[str, int]], layouts: dict[int, _OperationTemplate], latex: bool
+    op: int, parts: list[tuple[str, int]], layouts: dict[int, _OperationTemplate], latex: bool
 ) -> tuple[str, int]:
-    if node.op not in layouts:
-        called = _FUNCTION_NAMES[node.op]
-        known = called in ("sin", "cos", "tan", "exp", "log", "sinh", "cosh", "tanh", "min", "max")
-        arguments = ", ".join(text for text, _ in parts)
+    if op not in layouts:
+        called, arguments = _FUNCTION_NAMES[op], ", ".join(text for text, _ in parts)
         if latex and called == "sqrt":
             return rf"\sqrt{{{arguments}}}", _ATOM
+        known = called in ("sin", "cos", "tan", "exp", "log", "sinh", "cosh", "tanh", "min", "max")
         head = called if not latex else "\\" + called if known else rf"\operatorname{{{called}}}"
         return f"{head}({arguments})", _ATOM
-    layout = layouts[node.op]
-    if latex and node.op in (ca.OP_DIV, ca.OP_INV) and sum(len(text) for text, _ in parts) > _MAX_FRACTION_LENGTH:
-        layout = _TEXT_TEMPLATES[node.op]
-    template, tightness, asked = layout
+    long = latex and op in (ca.OP_DIV, ca.OP_INV) and sum(len(text) for text, _ in parts) > _MAX_FRACTION_LENGTH
+    template, tightness, asked = (_TEXT_TEMPLATES if long else layouts)[op]
     texts = [text if has >= wants else f"({text})" for (text, has), wants in zip(parts, asked, strict=True)]
     return template.format(*texts), tightness
 
@@ -254,7 +230,7 @@ class EquationEntry:
         return bool(self.expression.is_zero())
 
     def numeric_value(self, variables: ca.SX, at: NDArray[np.float64]) -> float:
-        """Numeric value of the entry at variables (k,) in the order of the symbols (`StepSymbols.column_symbols`)."""
+        """Numeric value of the entry at values (k,) of the variables."""
         return float(ca.Function("value", [variables], [ca.densify(self.expression)])(at))
 
     @property
@@ -364,7 +340,7 @@ class StepSymbols(ReprMixin):
         return _place(name, self.row_names, "row", self.row_blocks)
 
     def column_index(self, name: str) -> int:
-        """Index of a column by its full name; raises `ConfigError` with the nearest name where it does not exist."""
+        """As `row_index`, of a column."""
         return _place(name, self.column_names, "column", self.column_blocks)
 
     def equation_entry(self, text: str) -> EquationEntry:
@@ -379,22 +355,19 @@ class StepSymbols(ReprMixin):
         """
         said = [part.strip() for part in text.split(",")]
         if len(said) > 2 or not all(said):
-            raise ConfigError(
-                f"'{text}' is no entry",
-                where="--entry",
-                allowed="the name of a row, or of a row and a column with a comma between them",
-                hint="--entry 'del[T1_0_x], q1[T1_0_x]'",
-            )
+            allowed = "the name of a row, or of a row and a column with a comma between them"
+            hint = "--entry 'del[T1_0_x], q1[T1_0_x]'"
+            raise ConfigError(f"'{text}' is no entry", where="--entry", allowed=allowed, hint=hint)
         row, column = self.row_index(said[0]), ""
         expression = self.row_expressions[row]
         if len(said) == 2:
             at = self.column_index(said[1])
             expression, column = ca.jacobian(expression, self.column_symbols[at]), self.column_names[at]
         made = format_expressions([expression], self.column_symbols, self.column_display_names)
-        used = self.summarize_columns(made.variable_indices)
+        used = self._summarize_columns(made.variable_indices)
         return EquationEntry(self.row_names[row], column, made, used, expression)
 
-    def summarize_columns(self, places: Iterable[int]) -> tuple[str, ...]:
+    def _summarize_columns(self, places: Iterable[int]) -> tuple[str, ...]:
         """Names of columns by index; a block with many of them is abbreviated, `24 of q0`."""
         chosen, names, words = set(places), self.column_names, []
         for block in self.column_blocks:
@@ -413,7 +386,7 @@ class StepSymbols(ReprMixin):
             if count <= _MAX_PRINTED_OPERATIONS:
                 said += self.equation_entry(name).text_lines
             else:
-                used = self.summarize_columns(place[symbol.element_hash()] for symbol in ca.symvar(row))
+                used = self._summarize_columns(place[symbol.element_hash()] for symbol in ca.symvar(row))
                 said.append(_headline(name, count, used))
         head = (
             "equations of one step; `inspect --entry 'NAME'` prints any of them whole, with ', COLUMN' its derivative"
@@ -435,17 +408,10 @@ def _place(name: str, known: tuple[str, ...], kind: str, blocks: tuple[SymbolBlo
     if name in known:
         return known.index(name)
     shapes = [f"{b.name}[{b.labels[0]}]" if b.full_names[0] != b.labels[0] else b.labels[0] for b in blocks if b.labels]
-    raise ConfigError(
-        f"the equations of a step have no {kind} '{name}'",
-        where="--entry",
-        allowed=f"{kind}s of these kinds: {', '.join(shapes)}",
-        hint=nearest_name_hint(name, known) if len(known) < 12 else _close(name, known, blocks),
-    )
-
-
-def _close(name: str, known: tuple[str, ...], blocks: tuple[SymbolBlock, ...]) -> str:
-    """The nearest name: of the same block where the block is right, else of all."""
-    block = name.partition("[")[0]
-    same = [n for b in blocks if b.name == block for n in b.full_names]
-    said = nearest_name_hint(name, same or known)
-    return said if said.startswith("did") else "`yid-ocp inspect` lists all names in equations.txt"
+    # of the same block where the block is right
+    same = tuple(n for b in blocks if b.name == name.partition("[")[0] for n in b.full_names)
+    hint = nearest_name_hint(name, known if len(known) < 12 else same or known)
+    if len(known) >= 12 and not hint.startswith("did"):
+        hint = "`yid-ocp inspect` lists all names in equations.txt"
+    allowed = f"{kind}s of these kinds: {', '.join(shapes)}"
+    raise ConfigError(f"the equations of a step have no {kind} '{name}'", where="--entry", allowed=allowed, hint=hint)

@@ -13,7 +13,6 @@ Halko, Martinsson and Tropp (2011), SIAM Review 53:2, doi:10.1137/090771806 (sin
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
@@ -46,19 +45,8 @@ def episode_sensitivities(
 ) -> tuple[dict[tuple[str, str], Array], Array]:
     """Sensitivities of an episode's points at every node, and Fisher information of its joint measurements.
 
-    Parameters
-    ----------
-    problem : EstimationProblem
-        With every point in view at every node, of unit standard deviation.
-    evaluation : Evaluation
-        At `x`, with its Jacobian.
-    x : ndarray, shape (nx,)
-    i : int
-        Place of the episode.
-    finest : mapping of group to float
-        Least standard deviation of its points [m].
-    encoders : EstimationProblem, optional
-        The same with the encoders of driven joints as measurements.
+    In `problem` every point is in view at every node, of unit standard deviation; `evaluation` is at x (nx,), `finest`
+    each group's least standard deviation [m], `encoders` the same with the encoders of driven joints as measurements.
 
     Returns
     -------
@@ -134,7 +122,7 @@ def _low_rank_error_sensitivity(course: NominalTrajectory, errors: InputErrors, 
     The tracking filter keeps the arms on what they followed. Where it follows encoders that are measurements, its share
     of their noise is taken as independent of theirs, which is small beside that of torques.
     """
-    motion = _Motion.of(course, errors)
+    motion = _Motion(course, errors)
     rng = np.random.default_rng(0)
     shape, most = slopes.shape[:2], min(_MAX_RANDOM_SAMPLES, motion.size, slopes.shape[0] * slopes.shape[1])
     count = min(_INITIAL_RANDOM_SAMPLES, most)
@@ -154,21 +142,10 @@ def _low_rank_error_sensitivity(course: NominalTrajectory, errors: InputErrors, 
     return (basis @ (vectors[:, kept] * sizes[kept])).reshape(*shape, -1)
 
 
-@dataclass(frozen=True)
 class _Motion:
     """How errors of unit standard deviation move the state: of the start, of samples, of steps, the constant one."""
 
-    by_state: Array
-    by_torque: Array
-    by_angles: Array
-    start_by_angles: Array
-    start_by_torque: Array
-    torque_std: Array
-    bias_std: Array
-    sample: NDArray[np.int64]
-
-    @staticmethod
-    def of(course: NominalTrajectory, errors: InputErrors) -> _Motion:
+    def __init__(self, course: NominalTrajectory, errors: InputErrors) -> None:
         step, feedback = course.model_functions.step, course.tracking_feedback
         momentum = course.model_functions.momentum_shift.momentum_by_torque(course.theta)
         by_state, by_torque, by_angles = [], [], []
@@ -183,34 +160,23 @@ class _Motion:
             by_state.append(state)
             by_torque.append(by_error)
             by_angles.append(angles)
-        return _Motion(
-            np.array(by_state),
-            np.array(by_torque),
-            np.array(by_angles),
-            course.initial_state_by_angles * errors.angle_std,
-            course.initial_state_by_torque,
-            errors.torque_std,
-            errors.torque_bias_std,
-            np.unique(errors.sample_of_step, return_inverse=True)[1],
-        )
-
-    @property
-    def size(self) -> int:
-        """Number of errors."""
-        steps, _, nu = self.by_torque.shape
-        return nu * (2 + int(self.sample[-1]) + 1 + steps)
+        self.by_state, self.by_torque, self.by_angles = by_state, by_torque, by_angles
+        self.start_by_angles = course.initial_state_by_angles * errors.angle_std
+        self.start_by_torque = course.initial_state_by_torque
+        self.torque_std, self.bias_std = errors.torque_std[:, None], errors.torque_bias_std[:, None]
+        self.sample = np.unique(errors.sample_of_step, return_inverse=True)[1]
+        self.samples = int(self.sample[-1]) + 1
+        self.size = len(self.torque_std) * (2 + self.samples + len(by_torque))
 
     def _parts(self, errors: Array) -> tuple[Array, Array, Array, Array]:
         """Errors of the start's angles, constant ones, those of samples and of steps, each (..., nu, c)."""
-        nu = len(self.torque_std)
-        parts = errors.reshape(-1, nu, errors.shape[1])
-        samples = int(self.sample[-1]) + 1
-        return parts[0], parts[1], parts[2 : 2 + samples], parts[2 + samples :]
+        parts = errors.reshape(-1, len(self.torque_std), errors.shape[1])
+        return parts[0], parts[1], parts[2 : 2 + self.samples], parts[2 + self.samples :]
 
     def moved(self, errors: Array, slopes: Array) -> Array:
         """Readings by errors, G e: (size, c) to (N + 1, k, c)."""
         angles, constant, white, followed = self._parts(errors)
-        constant, white = self.bias_std[:, None] * constant, self.torque_std[:, None] * white
+        constant, white = self.bias_std * constant, self.torque_std * white
         state = self.start_by_angles @ angles + self.start_by_torque @ (constant + white[0])
         found = np.empty((*slopes.shape[:2], errors.shape[1]))
         found[0] = slopes[0] @ state
@@ -235,6 +201,6 @@ class _Motion:
         angles += self.start_by_angles.T @ costate
         constant += first
         white[0] += first
-        constant *= self.bias_std[:, None]
-        white *= self.torque_std[:, None]
+        constant *= self.bias_std
+        white *= self.torque_std
         return result

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 from yid_ocp.analysis.experiment_design import (
     ARM_GROUP,
     CAMERA_GROUP,
-    DEFAULT_TORQUE_STD,
     MECHANICAL_CHANGES,
     BaseExperiment,
     CandidateExperiment,
@@ -49,6 +48,8 @@ class ExperimentChange:
         `weld`, `second_arm`, `motion`, `travel`, `torque`, `camera:FRAME`, `arm:FRAME` or `rate:HERTZ`.
     mechanical_change : str
         Key of `MECHANICAL_CHANGES`, empty where only sensors change.
+    camera_frame, arm_frame : str
+        Frame that the camera sees, or an arm measures, besides; empty for none.
     camera_rate : float or None
         Of the camera [Hz].
     """
@@ -56,8 +57,8 @@ class ExperimentChange:
     name: str
     description: str
     mechanical_change: str = ""
-    added_camera_frames: tuple[str, ...] = ()
-    added_arm_frames: tuple[str, ...] = ()
+    camera_frame: str = ""
+    arm_frame: str = ""
     camera_rate: float | None = None
 
 
@@ -85,7 +86,7 @@ class ChangedExperimentResult:
     message: str = ""
 
     @property
-    def is_fully_identifiable(self) -> bool:
+    def _is_complete(self) -> bool:
         """Whether every parameter is identifiable."""
         return bool(self.verdicts) and self.identifiable == len(self.verdicts)
 
@@ -119,26 +120,6 @@ class ExperimentRanking(ReprMixin):
         return ReprSummary(f"{count}, {self.n_evaluated_sets} sets of them judged", rows)
 
 
-@dataclass(frozen=True)
-class WhatIfOptions:
-    """Settings of the search for changes of an experiment.
-
-    Attributes
-    ----------
-    torque_std : float
-        Noise of joint torques as a measurement, where the recordings state none [N m].
-    motion_seed : int
-        Random seed of alternative motions.
-    considered_changes : tuple of str, optional
-        Names of changes to consider, all when absent.
-    """
-
-    torque_std: float = DEFAULT_TORQUE_STD
-    motion_seed: int = 11
-    max_set_size: int = _MAX_CHANGE_SET_SIZE
-    considered_changes: tuple[str, ...] | None = None
-
-
 ChangeSetEvaluator = Callable[[Sequence[Sequence[ExperimentChange]], float], list[ChangedExperimentResult]]
 """From sets of changes and a factor on the stated variances to the predicted results, one for each set."""
 
@@ -150,7 +131,7 @@ def what_if(
     start: InitialStateKnowledge = "assumed",
     grasp_std: float | None = None,
     two_arm_system: System | None = None,
-    options: WhatIfOptions | None = None,
+    considered_changes: Collection[str] | None = None,
     progress: Progress = NULL_PROGRESS,
     evaluate_changes: ChangeSetEvaluator | None = None,
 ) -> ExperimentRanking:
@@ -168,6 +149,8 @@ def what_if(
         Nuisances, as in `identifiability`.
     two_arm_system : System, optional
         The system with one more arm and its grasp; without it that change is not tried.
+    considered_changes : collection of str, optional
+        Names of changes to consider, all when absent.
     evaluate_changes : callable, optional
         Evaluates sets of changes by `evaluate_change_sets`, in other processes for example; in this one when absent.
 
@@ -178,22 +161,21 @@ def what_if(
     ConfigError, DataError
         As `identifiability`.
     """
-    options = options or WhatIfOptions()
-    x = unknowns_from_solution(problem, solution)
-    fit = None if solution is None else identifiability(problem, x, start=start, grasp_std=grasp_std)
-    inflation = 1.0 if fit is None else max(1.0, fit.chi2_per_dof)
-    setting = BaseExperiment(problem, x, start, grasp_std, two_arm_system, options.torque_std, options.motion_seed)
-    outcomes = _Outcomes(setting, CandidateExperimentBuilder(setting, progress), inflation, evaluate_changes, progress)
+    x, inflation = unknowns_from_solution(problem, solution), 1.0
+    if solution is not None:
+        inflation = max(1.0, identifiability(problem, x, start=start, grasp_std=grasp_std).chi2_per_dof)
+    setting = BaseExperiment(problem, x, start, grasp_std, two_arm_system)
+    outcomes = _Outcomes(setting, inflation, progress, evaluate_changes)
     (base,) = outcomes.of_all([()])
     if not base.verdicts:
         raise SolverError(base.message)
-    wanted = options.considered_changes
-    known = _possible_changes(setting, outcomes.builder)
-    changes = [change for change in known if wanted is None or change.name in wanted]
+    changes = [
+        change for change in outcomes.possible if considered_changes is None or change.name in considered_changes
+    ]
     singles = _rank_results(outcomes.of_all([(change,) for change in changes]))
-    greedy = _greedy(outcomes, changes, base, options.max_set_size)
-    smallest = _smallest(outcomes, changes, base, options.max_set_size)
-    return ExperimentRanking(base, tuple(singles), tuple(_rank_results(smallest)), tuple(greedy), outcomes.count)
+    greedy = _greedy(outcomes, changes, base)
+    smallest = _rank_results(_smallest(outcomes, changes, base))
+    return ExperimentRanking(base, tuple(singles), tuple(smallest), tuple(greedy), len(outcomes.known))
 
 
 def evaluate_change_sets(
@@ -203,47 +185,42 @@ def evaluate_change_sets(
 
     `inflation` is the factor by which variances are larger than stated.
     """
-    outcomes = _Outcomes(setting, CandidateExperimentBuilder(setting), inflation)
-    known = {change.name: change for change in _possible_changes(setting, outcomes.builder)}
+    outcomes = _Outcomes(setting, inflation)
+    known = {change.name: change for change in outcomes.possible}
     return outcomes.of_all([[known[name] for name in names] for names in sets])
 
 
 def _smallest(
-    outcomes: _Outcomes, changes: Sequence[ExperimentChange], base: ChangedExperimentResult, largest: int
+    outcomes: _Outcomes, changes: Sequence[ExperimentChange], base: ChangedExperimentResult
 ) -> list[ChangedExperimentResult]:
     """All sets of as few changes as will do with which every parameter is identifiable."""
-    for size in range(0 if base.is_fully_identifiable else 1, largest + 1):
+    if base._is_complete:
+        return [base]
+    for size in range(1, _MAX_CHANGE_SET_SIZE + 1) if changes else ():
         found = outcomes.of_all([chosen for chosen in itertools.combinations(changes, size) if _are_compatible(chosen)])
-        complete = [outcome for outcome in found if outcome.is_fully_identifiable]
-        if complete or not changes:
+        complete = [outcome for outcome in found if outcome._is_complete]
+        if complete:
             return complete
     return []
 
 
-def _possible_changes(setting: BaseExperiment, builder: CandidateExperimentBuilder) -> list[ExperimentChange]:
-    """All single changes that apply to an experiment."""
-    episode = setting.problem.episodes[0]
-    camera, arm = setting.camera_sampling(episode)[0], setting.arm_sampling(episode)[0]
-    views = setting.recorded_observations(episode)
-    looked, felt = (
-        {view.frame for view in views if group is not None and view.point_group == group.name}
-        for group in (camera, arm)
-    )
-    changes = [ExperimentChange(name, MECHANICAL_CHANGES[name], name) for name in builder.applicable_changes()]
-    for sight in observable_frames(setting.problem.system):
-        name, words = sight.name, sight.description
-        if name not in looked | felt:
-            changes.append(
-                ExperimentChange(f"camera:{name}", f"{words}, seen by the camera", added_camera_frames=(name,))
-            )
-        if sight.is_arm_measurable and name not in felt:
-            changes.append(ExperimentChange(f"arm:{name}", f"{words}, seen by the arm", added_arm_frames=(name,)))
-    if camera is not None:
-        now = 1.0 / float(np.median(np.diff(camera.t))) if len(camera.t) > 1 else 0.0
-        for rate in (rate for rate in _FASTER_CAMERA_RATES if rate > now):
-            words = f"the camera at {rate:g} Hz without gaps"
-            changes.append(ExperimentChange(f"rate:{rate:g}", words, camera_rate=rate))
-    return changes
+def _greedy(
+    outcomes: _Outcomes, changes: Sequence[ExperimentChange], base: ChangedExperimentResult
+) -> list[ChangedExperimentResult]:
+    """Best single change added one after the other."""
+    chosen: tuple[ExperimentChange, ...] = ()
+    steps: list[ChangedExperimentResult] = []
+    best = base
+    while len(chosen) < _MAX_CHANGE_SET_SIZE and not best._is_complete:
+        trials = [(*chosen, change) for change in changes if change not in chosen]
+        trials = [trial for trial in trials if _are_compatible(trial)]
+        found = outcomes.of_all(trials)
+        top = next(iter(_rank_results(found)), best)
+        if (top.identifiable, top.gain) <= (best.identifiable, best.gain):
+            break
+        chosen, best = trials[found.index(top)], top
+        steps.append(top)
+    return steps
 
 
 def _are_compatible(changes: Sequence[ExperimentChange]) -> bool:
@@ -258,33 +235,57 @@ def _rank_results(outcomes: Iterable[ChangedExperimentResult]) -> list[ChangedEx
     return sorted(outcomes, key=lambda entry: (not entry.verdicts, -entry.identifiable, -entry.gain))
 
 
+def _words(changes: Sequence[ExperimentChange]) -> str:
+    return "; ".join(change.description for change in changes) or "as it is"
+
+
 class _Outcomes:
     """What sets of changes would tell, each worked out once."""
 
     def __init__(
         self,
         setting: BaseExperiment,
-        builder: CandidateExperimentBuilder,
         inflation: float,
-        judge: ChangeSetEvaluator | None = None,
         progress: Progress = NULL_PROGRESS,
+        judge: ChangeSetEvaluator | None = None,
     ) -> None:
-        self.setting, self.builder, self.inflation, self.progress = setting, builder, inflation, progress
-        self._judge = judge or self._judged
-        self._known: dict[frozenset[str], ChangedExperimentResult] = {}
+        self.setting, self.inflation, self.progress = setting, inflation, progress
+        self.builder = CandidateExperimentBuilder(setting, progress)
+        self.judge = judge or self._judged
+        self.known: dict[frozenset[str], ChangedExperimentResult] = {}
 
     @property
-    def count(self) -> int:
-        """Sets worked out so far."""
-        return len(self._known)
+    def possible(self) -> list[ExperimentChange]:
+        """All single changes that apply to the experiment."""
+        setting, episode = self.setting, self.setting.problem.episodes[0]
+        camera, arm = setting.camera_sampling(episode)[0], setting.arm_sampling(episode)[0]
+        views = setting.recorded_observations(episode)
+        looked, felt = (
+            {view.frame for view in views if group is not None and view.point_group == group.name}
+            for group in (camera, arm)
+        )
+        names = self.builder.applicable_changes()
+        changes = [ExperimentChange(name, MECHANICAL_CHANGES[name], name) for name in names]
+        for sight in observable_frames(setting.problem.system):
+            name, words = sight.name, sight.description
+            if name not in looked | felt:
+                changes.append(ExperimentChange(f"camera:{name}", f"{words}, seen by the camera", camera_frame=name))
+            if sight.is_arm_measurable and name not in felt:
+                changes.append(ExperimentChange(f"arm:{name}", f"{words}, seen by the arm", arm_frame=name))
+        if camera is not None:
+            now = 1.0 / float(np.median(np.diff(camera.t))) if len(camera.t) > 1 else 0.0
+            for rate in (rate for rate in _FASTER_CAMERA_RATES if rate > now):
+                words = f"the camera at {rate:g} Hz without gaps"
+                changes.append(ExperimentChange(f"rate:{rate:g}", words, camera_rate=rate))
+        return changes
 
     def of_all(self, sets: Sequence[Sequence[ExperimentChange]]) -> list[ChangedExperimentResult]:
         """The outcomes of several sets of changes."""
         keys = [frozenset(change.name for change in changes) for changes in sets]
-        new = {key: changes for key, changes in zip(keys, sets, strict=True) if key not in self._known}
+        new = {key: changes for key, changes in zip(keys, sets, strict=True) if key not in self.known}
         if new:
-            self._known |= dict(zip(new, self._judge(list(new.values()), self.inflation), strict=True))
-        return [self._known[key] for key in keys]
+            self.known |= dict(zip(new, self.judge(list(new.values()), self.inflation), strict=True))
+        return [self.known[key] for key in keys]
 
     def _judged(self, sets: Sequence[Sequence[ExperimentChange]], _: float) -> list[ChangedExperimentResult]:
         self.progress.begin_stage(f"judging {len(sets)} experiments")
@@ -327,14 +328,10 @@ class _Outcomes:
             for view in setting.recorded_observations(episode)
             if view.point_group != looking or view.frame not in held - before
         ]
-        views += [look(frame) for change in changes for frame in change.added_camera_frames]
-        feels = [*sorted(held - before), *(frame for change in changes for frame in change.added_arm_frames)]
+        views += [look(change.camera_frame) for change in changes if change.camera_frame]
+        feels = [*sorted(held - before), *(change.arm_frame for change in changes if change.arm_frame)]
         views += [FrameObservation(feeling, frame, arm_times, np.full((len(arm_times), 3), arm_std)) for frame in feels]
         return views
-
-
-def _words(changes: Sequence[ExperimentChange]) -> str:
-    return "; ".join(change.description for change in changes) or "as it is"
 
 
 def _relative_stds_and_gain(layout: CandidateExperiment, information: Array) -> tuple[dict[str, float], float]:
@@ -353,24 +350,3 @@ def _relative_stds_and_gain(layout: CandidateExperiment, information: Array) -> 
     std = np.sqrt(np.sum(vectors**2 / values, axis=1))
     gain = 0.5 * float(np.sum(np.log1p(MAX_WEAK_RELATIVE_STD**2 * values)))
     return dict(zip(layout.free_parameters, map(float, std), strict=True)), gain
-
-
-def _greedy(
-    outcomes: _Outcomes, changes: Sequence[ExperimentChange], base: ChangedExperimentResult, largest: int
-) -> list[ChangedExperimentResult]:
-    """Best single change added one after the other."""
-    chosen: tuple[ExperimentChange, ...] = ()
-    steps: list[ChangedExperimentResult] = []
-    best = base
-    while len(chosen) < largest and not best.is_fully_identifiable:
-        trials = [(*chosen, change) for change in changes if change not in chosen]
-        trials = [trial for trial in trials if _are_compatible(trial)]
-        if not trials:
-            break
-        found = outcomes.of_all(trials)
-        top = _rank_results(found)[0]
-        if (top.identifiable, top.gain) <= (best.identifiable, best.gain):
-            break
-        chosen, best = trials[found.index(top)], top
-        steps.append(top)
-    return steps

@@ -28,7 +28,6 @@ from yid_ocp.analysis.what_if import (
     ChangedExperimentResult,
     ExperimentChange,
     ExperimentRanking,
-    WhatIfOptions,
     evaluate_change_sets,
     what_if,
 )
@@ -299,10 +298,10 @@ def _change_set_outcomes(
 ) -> list[dict[str, Any]]:
     """Task: expected information of the experiment with each set of changes, as plain data."""
     run, problem = _problem(common)
-    other, options = system_with_second_arm(run, build_system(run)), WhatIfOptions()
+    other = system_with_second_arm(run, build_system(run))
     two_arms = None if other is None else with_grasp_offset_effects(other)
-    known = (unknowns_from_solution(problem, common["x"]), common["start"], common["grasp_std"], two_arms)
-    setting = BaseExperiment(problem, *known, options.torque_std, options.motion_seed)
+    x = unknowns_from_solution(problem, common["x"])
+    setting = BaseExperiment(problem, x, common["start"], common["grasp_std"], two_arms)
     return [to_plain_data(entry) for entry in evaluate_change_sets(setting, sets, inflation)]
 
 

@@ -165,13 +165,13 @@ def _point(step: Step, problem: EstimationProblem | None) -> _LinearisationPoint
 
 
 def _linearised(step: Step, point: _LinearisationPoint) -> tuple[CheckedLinearisation, StepLinearization]:
-    still, at = point.prescribed_positions, (point.state, point.torque, point.theta)
+    at = point.state, point.torque, point.theta, point.prescribed_positions
     try:
-        found = linearise_and_check(step, *at, (still, still) if len(still) else None)
+        found = linearise_and_check(step, *at)
     except np.linalg.LinAlgError as error:
         what = "the step cannot be linearised: its equations are singular"
         raise ModelError(what, where=point.description) from error
-    return found, linearise_step_equations(step, *at, still)
+    return found, linearise_step_equations(step, *at)
 
 
 def _columns_at(step: Step, point: _LinearisationPoint) -> Array:
@@ -208,9 +208,9 @@ def _nlp(symbols: StepSymbols, problem: EstimationProblem, picture: Path) -> dic
         problem.predictor.estimated_state_indices,
     )
     steps = [entry.grid.steps for entry in problem.episodes]
-    draw_sparsity_patterns(picture, [[kkt_pattern(stage, problem.shared_parameters, min(_SHOWN_STEPS, *steps))]])
+    draw_sparsity_patterns(picture, [[kkt_pattern(stage, min(_SHOWN_STEPS, *steps))]])
     left_out = [*(sensor.group_name for sensor in sensors if sensor.effort_joints), *problem.local_parameters]
-    return {**asdict(kkt_size(stage, steps)), "left_out": left_out}
+    return {**kkt_size(stage, steps), "left_out": left_out}
 
 
 def _dependence(

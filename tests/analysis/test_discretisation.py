@@ -13,7 +13,6 @@ from made_models import Formula, estimate
 from yid_ocp.analysis.discretisation import (
     DiscretisationShift,
     RefinedProblem,
-    _worse_verdict,
     discretisation_shifts,
     inflate_estimates,
     joint_subdivision,
@@ -36,6 +35,12 @@ def problem(rows, start, shared=None, **more):
 # -- the step ---------------------------------------------------------------------------------------------------------
 
 
+def shifts(coarse, finer, factors=None, **more):
+    """Of the coarse problem's parameters at its initial values."""
+    x = coarse.initial_unknowns
+    return discretisation_shifts(RefinedProblem(finer, factors or {}), coarse, x, coarse.evaluate(x), **more)
+
+
 @pytest.mark.parametrize("factor", [1.0, 2.0])
 def test_an_estimate_moves_to_where_a_linear_finer_model_fits_best(factor):
     """The finer model's own parameter is so many times the coarse one's; its best fit is at 3.3 coarse units."""
@@ -43,51 +48,27 @@ def test_an_estimate_moves_to_where_a_linear_finer_model_fits_best(factor):
     finer = problem(
         lambda x: [2 * (x["a"] / factor - 3.3), x["a"] / factor + x["b"] - 5.1], {"a": 1.0, "b": 1.0}, bounds=OPEN
     )
-    at = coarse.evaluate(coarse.initial_unknowns)
-    found = discretisation_shifts(RefinedProblem(finer, {"a": factor}), coarse, coarse.initial_unknowns, at)
-    assert found == pytest.approx({"a": 0.3, "b": -0.2})
+    assert shifts(coarse, finer, {"a": factor}) == pytest.approx({"a": 0.3, "b": -0.2})
 
 
 def test_a_point_that_is_no_estimate_counts_the_difference_of_the_models_alone():
     """At 2 the coarse model wants to go to 3 and the finer one to 3.3."""
     coarse = problem(lambda x: [2 * (x["a"] - 3.0)], {"a": 2.0}, bounds=OPEN)
     finer = problem(lambda x: [2 * (x["a"] - 3.3)], {"a": 2.0}, bounds=OPEN)
-    at = coarse.evaluate(coarse.initial_unknowns)
-    assert discretisation_shifts(RefinedProblem(finer), coarse, coarse.initial_unknowns, at) == pytest.approx(
-        {"a": 1.3}
-    )
-    assert discretisation_shifts(
-        RefinedProblem(finer), coarse, coarse.initial_unknowns, at, model_difference_only=True
-    ) == pytest.approx({"a": 0.3})
+    assert shifts(coarse, finer) == pytest.approx({"a": 1.3})
+    assert shifts(coarse, finer, model_difference_only=True) == pytest.approx({"a": 0.3})
 
 
 def test_a_move_ends_at_the_bound():
+    start = {"a": 1.0}
+    assert shifts(problem(lambda x: [x["a"] - 1.0], start), problem(lambda x: [x["a"] + 5.0], start)) == {"a": -1.0}
+
+
+def test_what_cannot_be_compared_says_why():
     coarse = problem(lambda x: [x["a"] - 1.0], {"a": 1.0})
-    finer = problem(lambda x: [x["a"] + 5.0], {"a": 1.0})
-    at = coarse.evaluate(coarse.initial_unknowns)
-    assert discretisation_shifts(RefinedProblem(finer), coarse, coarse.initial_unknowns, at) == pytest.approx(
-        {"a": -1.0}
-    )
-
-
-def test_a_finer_model_that_cannot_be_rolled_out_says_why():
-    coarse = problem(lambda x: [x["a"] - 1.0], {"a": 1.0})
-    finer = problem(lambda x: [x["a"]], {"a": 1.0}, fails=lambda values: True)
-    assert (
-        discretisation_shifts(
-            RefinedProblem(finer), coarse, coarse.initial_unknowns, coarse.evaluate(coarse.initial_unknowns)
-        )
-        == "it snaps"
-    )
-
-
-def test_models_that_are_compared_at_other_samples_have_no_difference():
-    coarse = problem(lambda x: [x["a"] - 1.0], {"a": 1.0})
-    finer = problem(lambda x: [x["a"], x["a"]], {"a": 1.0})
-    at = coarse.evaluate(coarse.initial_unknowns)
-    assert "other samples" in discretisation_shifts(
-        RefinedProblem(finer), coarse, coarse.initial_unknowns, at, model_difference_only=True
-    )
+    assert shifts(coarse, problem(lambda x: [x["a"]], {"a": 1.0}, fails=lambda values: True)) == "it snaps"
+    longer = problem(lambda x: [x["a"], x["a"]], {"a": 1.0})
+    assert "other samples" in shifts(coarse, longer, model_difference_only=True)
 
 
 # -- what stands for what ---------------------------------------------------------------------------------------------
@@ -108,25 +89,34 @@ def test_divided_links_share_their_angle():
         "T1_1_y": ("T1_2_y", "T1_3_y"),
     }
     assert joint_subdivision(coarse, coarse) == joint_subdivision(fine, coarse) == {}
-    made = problem(lambda x: [x["a"]], {"a": 1.0})
-    made.system = fine
-    [warm] = RefinedProblem(made, subdivided_joints=divided).equilibrium_guesses_from_coarse(
-        coarse, (np.array([0.2, -0.4, 0.6, 0.8]),)
-    )
-    np.testing.assert_allclose(warm, [0.1, -0.2, 0.1, -0.2, 0.3, 0.4, 0.3, 0.4])
-    assert RefinedProblem(made, subdivided_joints=divided).equilibrium_guesses_from_coarse(coarse, (None,)) == (None,)
 
 
-def test_a_start_is_carried_to_the_finer_chain():
+def test_a_start_and_its_equilibrium_are_carried_to_the_finer_chain():
+    """Of a chain of half the links, whose angles are shared; what a finer model has besides keeps its own value."""
     names = [f"start.{kind}.{joint}[run]" for kind in "qp" for joint in ("T1_0_x", "T1_1_x")]
-    coarse = ("a", "c[run]", "start.q.T1_0_x[run]", "start.p.T1_0_x[run]", "gone")
+    free = dict.fromkeys((*names, "start.q.T1_0_x[run]", "start.p.T1_0_x[run]"), (-9.0, 9.0))
+    given = {"a": 1.5, "c[run]": 2.0, "start.q.T1_0_x[run]": 0.4, "start.p.T1_0_x[run]": 0.9, "gone": 5.0}
+    coarse = problem(lambda x: [x["a"]], given, bounds=free)
+    coarse.system = chain(1)
     start = {"a": 1.0, "c[run]": 1.0, "b": 7.0, **dict.fromkeys(names, 0.0)}
-    made = problem(lambda x: [x["a"]], start, bounds=dict.fromkeys(names, (-9.0, 9.0)))
-    refined = RefinedProblem(made, {"a": 2.0, "c": 3.0}, {"T1_0_x": ("T1_0_x", "T1_1_x")})
-    point = dict(
-        zip(made.unknown_names, refined.unknowns_from_coarse(coarse, np.array([1.5, 2.0, 0.4, 0.9, 5.0])), strict=True)
+    fine, asked = problem(lambda x: [x["a"]], start, bounds=free), []
+    fine.system = chain(2)
+    inner = fine.evaluate
+    fine.evaluate = lambda x, equilibrium_guesses: asked.append((x, equilibrium_guesses)) or inner(x)
+    at = replace(
+        coarse.evaluate(coarse.initial_unknowns),
+        episode_predictions=(
+            SimpleNamespace(equilibrium_guess=np.array([0.2, -0.4])),
+            SimpleNamespace(equilibrium_guess=None),
+        ),
     )
+    refined = RefinedProblem(fine, {"a": 2.0, "c": 3.0}, joint_subdivision(coarse.system, fine.system))
+    discretisation_shifts(refined, coarse, coarse.initial_unknowns, at)
+    [(x, (warm, none))] = asked
+    point = dict(zip(fine.unknown_names, x, strict=True))
     assert point == {"a": 3.0, "c[run]": 6.0, "b": 7.0, **dict(zip(names, (0.2, 0.2, 0.0, 0.0), strict=True))}
+    np.testing.assert_allclose(warm, [0.1, -0.2, 0.1, -0.2])
+    assert none is None
 
 
 # -- what it leaves of a standard deviation ---------------------------------------------------------------------------
@@ -158,12 +148,13 @@ def test_a_move_larger_than_the_standard_deviation_widens_it_to_where_the_limit_
         (0.4, "weak", "weak"),
         (0.6, "at_bound", "at_bound"),
         (30.0, "not_identifiable", "not_identifiable"),
+        (0.6, "not_trusted", "not_trusted"),
     ],
 )
 def test_a_verdict_is_lowered_by_moves_and_never_raised(move, before, after):
     """Of a value of 10 and a standard deviation of 0.02: ten percent are reached by a move of half of them."""
     said = {"a": estimate(10.0, 0.02, verdict=before), "b": estimate(10.0, 0.02), "c": estimate(3.0, 0.0, free=False)}
-    found = inflate_estimates(said, {"c": DiscretisationShift(9.0), "a": DiscretisationShift(move)})
+    found = inflate_estimates(said, {"c": DiscretisationShift(9.0), "a": DiscretisationShift(move)}, {})
     assert found["a"].verdict == after
     assert found["a"].std == (0.02 if move < 0.02 else pytest.approx(math.hypot(0.02, 2 * move)))
     assert found["b"] == said["b"]
@@ -184,7 +175,7 @@ def test_a_verdict_is_lowered_by_moves_and_never_raised(move, before, after):
 )
 def test_an_interval_grows_at_its_ends_by_what_the_move_adds(interval, expected):
     said = replace(estimate(10.0, 0.2), interval=interval, lower=0.0, upper=20.0)
-    found = inflate_estimates({"a": said}, {"a": DiscretisationShift(0.3)})["a"].interval
+    found = inflate_estimates({"a": said}, {"a": DiscretisationShift(0.3)}, {})["a"].interval
     if expected is None:
         assert found is None
     else:
@@ -193,12 +184,7 @@ def test_an_interval_grows_at_its_ends_by_what_the_move_adds(interval, expected)
 
 def test_what_nothing_informs_stays_unknown():
     said = {"a": estimate(10.0, math.inf, verdict="not_identifiable")}
-    assert inflate_estimates(said, {"a": DiscretisationShift(5.0, 5.0)}) == said
-
-
-def test_the_worse_of_two_verdicts():
-    assert _worse_verdict("identifiable", "weak") == _worse_verdict("weak", "identifiable") == "weak"
-    assert _worse_verdict("not_trusted", "weak") == "not_trusted"
+    assert inflate_estimates(said, {"a": DiscretisationShift(5.0, 5.0)}, {}) == said
 
 
 # -- on a real chain --------------------------------------------------------------------------------------------------

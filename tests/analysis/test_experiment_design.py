@@ -1,0 +1,458 @@
+"""Experiments that were not made: what could see, what it would tell, how robots would move."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import casadi as ca
+import numpy as np
+import pytest
+from heard import Heard
+from made_recordings import GRID, group, holding_pendulum, places, setting
+
+from yid_ocp.analysis import experiment_design as module
+from yid_ocp.analysis.experiment_design import (
+    ARM_GROUP,
+    CAMERA_GROUP,
+    BaseExperiment,
+    CandidateExperiment,
+    CandidateExperimentBuilder,
+    FrameObservation,
+    observable_frames,
+    uniform_sample_times,
+    with_observable_frames,
+)
+from yid_ocp.analysis.identifiability import identifiability, with_grasp_offset_effects, with_nuisance_unknowns
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.errors import DataError
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.model import Segment, System, flexible_object
+from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.servos_and_springs import RobotJointSpring
+from yid_ocp.model.urdf import read_urdf
+from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
+from yid_ocp.problem.measurements import TimeGrid
+
+MARKER_DISTANCE = 0.03
+
+
+@pytest.fixture(scope="module")
+def holding(urdf_folder):
+    return holding_pendulum(urdf_folder)
+
+
+# -- what a recording saw ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("groups", "camera", "arm"),
+    [
+        ([group()], "points_camera", None),
+        ([group("points_arm"), group()], "points_camera", "points_arm"),
+        ([group("points_x", sensor="arm"), group("points_y", sensor="a camera")], "points_y", "points_x"),
+        ([group("points_z", pose=np.eye(4))], "points_z", None),
+        ([group("points_left_arm")], None, "points_left_arm"),
+        ([group("points_mocap")], None, None),
+    ],
+)
+def test_cameras_and_arms_are_told_apart(groups, camera, arm):
+    made, episode = setting(*groups)
+    for (found, times, std), name, usual in (
+        (made.camera_sampling(episode), camera, (np.arange(7) / 3.0, 5e-3)),
+        (made.arm_sampling(episode), arm, (0.1 * np.arange(21), 1e-3)),
+    ):
+        assert (None if found is None else found.name) == name
+        np.testing.assert_allclose(times, [0.0, 0.5, 1.0] if name else usual[0], atol=1e-12)
+        assert std == (2e-3 if name else usual[1])
+
+
+def test_the_typical_noise_is_the_median_or_the_stated_one():
+    std = np.full((3, 2, 3), 2e-3)
+    std[0] = [9e-3, np.nan, 9e-3]
+    made, episode = setting(group(std=std))
+    assert made.camera_sampling(episode)[2] == 2e-3
+    made, episode = setting(group(std=None), sensors={"points_camera": SensorOptions(std=3e-3)})
+    assert made.camera_sampling(episode)[2] == 3e-3
+    unknown, episode = setting(group(std=None))
+    with pytest.raises(DataError, match="the noise level of group 'points_camera' is not known"):
+        unknown.recorded_observations(episode)
+
+
+def test_observations_are_of_used_points_that_the_model_has_where_they_were_seen():
+    made = group(names=("a", "led", "nothing"))
+    position = made.position.copy()
+    position[1, 1] = np.nan
+    sensors = {
+        "points_camera": SensorOptions(frames={"led": "tip"}),
+        "points_arm": SensorOptions(points=("b",)),
+        "points_off": SensorOptions(use=False),
+    }
+    chosen, episode = setting(
+        replace(made, position=position), group("points_arm"), group("points_off"), sensors=sensors
+    )
+    found = chosen.recorded_observations(episode)
+    assert [(view.point_group, view.frame) for view in found] == [
+        ("points_camera", "a"),
+        ("points_camera", "tip"),
+        ("points_arm", "b"),
+    ]
+    np.testing.assert_allclose(found[0].times, [0.0, 0.5, 1.0])
+    np.testing.assert_allclose(found[1].times, [0.0, 1.0])
+    np.testing.assert_array_equal(found[1].std, np.full((2, 3), 2e-3))
+
+
+@pytest.mark.parametrize(("rate", "times"), [(1.0, [0.0, 1.0, 2.0]), (0.4, [0.0]), (10.0, 0.1 * np.arange(21))])
+def test_an_even_clock_covers_the_recording(rate, times):
+    np.testing.assert_allclose(uniform_sample_times(GRID, rate), times, atol=1e-12)
+
+
+# -- information ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def sloped():
+    """Three recordings whose frames move by random slopes; the prior is 7 of the first unknown."""
+    rng = np.random.default_rng(3)
+    slopes = {(i, "camera", frame): rng.standard_normal((5, 3, 2)) for i in range(3) for frame in ("a", "b")}
+    problem = SimpleNamespace(episodes=[SimpleNamespace(grid=TimeGrid(10.0, 0.5, 4))] * 3)
+    return CandidateExperiment(problem, np.zeros(2), ("p", "q"), slopes, np.diag([7.0, 0.0]))
+
+
+def view(times, std, frame="a"):
+    return FrameObservation("camera", frame, np.array(times), np.array(std, float) * np.ones((len(times), 3)))
+
+
+@pytest.mark.parametrize(
+    ("time", "weights"),
+    [
+        (0.0, {0: 1.0}),
+        (0.5, {1: 1.0}),
+        (0.75, {1: 0.5, 2: 0.5}),
+        (1.6, {3: 0.8, 4: 0.2}),
+        (2.0, {4: 1.0}),
+        (-0.1, {}),
+        (2.1, {}),
+    ],
+    ids=["start", "node", "halfway", "part of the way", "end", "before", "after"],
+)
+def test_a_view_is_interpolated_between_nodes(sloped, time, weights):
+    std = np.array([[0.1, 0.2, 0.5]])
+    slopes = sloped.position_sensitivities[0, "camera", "a"]
+    rows = sum((w * slopes[k] for k, w in weights.items()), np.zeros((3, 2))) / std.T
+    found = sloped.fisher_information([[view([time], std)], [], []])
+    np.testing.assert_allclose(found, np.diag([7.0, 0.0]) + rows.T @ rows, atol=1e-9)
+
+
+def test_views_add_up_over_frames_times_and_recordings(sloped):
+    """Lists of views come in turn where there are fewer than recordings."""
+
+    def told(i, frame, node, std):
+        rows = sloped.position_sensitivities[i, "camera", frame][node] / std
+        return rows.T @ rows
+
+    def information(std):
+        first = sum(told(i, "a", node, std) for i in (0, 2) for node in (0, 2))
+        return np.diag([7.0, 0.0]) + first + told(1, "a", 1, 0.2) + told(1, "b", 1, 0.2)
+
+    for std in (0.1, 0.1, 0.05):
+        views = [[view([0.0, 1.0], std)], [view([0.5], 0.2), view([0.5], 0.2, "b")]]
+        np.testing.assert_allclose(sloped.fisher_information(views), information(std))
+
+
+# -- what could be seen -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("links", "middle"), [(1, []), (2, ["T1_0_tip"]), (3, ["T1_1_tip"]), (4, ["T1_1_tip"])])
+def test_a_segment_has_a_tip_a_middle_and_a_marker(links, middle):
+    tube = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=links, bend=4.0, twist=3.0)])
+    *there, marker = observable_frames(System.build(None, objects=[(tube, None, None)]))
+    assert [sight.name for sight in (*there, marker)] == ["w_T1", *middle, "T1_marker"]
+    assert not any(sight.is_arm_measurable for sight in (*there, marker))
+    assert all(sight.added_frame is None for sight in there)
+    assert marker.description == "a marker 3 cm off the axis at the end of T1"
+
+
+def test_a_marker_is_off_the_axis_and_felt_at_a_held_end(holding):
+    found = observable_frames(holding)
+    assert {sight.name for sight in found if sight.is_arm_measurable} == {"T1_marker"}
+    tip, beside = places(holding, ["w_T1", found[-1].added_frame], np.zeros(holding.n_coordinates))
+    np.testing.assert_allclose(beside - tip, [MARKER_DISTANCE, 0.0, 0.0], atol=1e-12)
+
+
+URDF = """<robot name="r"><link name="wall"/>
+<joint name="turn" type="continuous"><parent link="wall"/><child link="a"/><axis xyz="{axis}"/></joint>
+<link name="a"><inertial><mass value="0.5"/><inertia ixx="1e-3" ixy="0" ixz="0" iyy="1e-3" iyz="0" izz="1e-3"/>
+</inertial></link>
+<joint name="slide" type="prismatic"><parent link="a"/><child link="b"/><axis xyz="1 0 0"/>
+<limit lower="-1" upper="1" effort="100" velocity="5"/></joint>
+<link name="b"><inertial><mass value="0.5"/><inertia ixx="1e-3" ixy="0" ixz="0" iyy="1e-3" iyz="0" izz="1e-3"/>
+</inertial></link></robot>"""
+
+
+@pytest.mark.parametrize(
+    ("axis", "beside"),
+    [((1, 0, 0), (0, 1, 0)), ((0, 0, 1), (1, 0, 0)), ((0.64, 0.48, 0.6), (-0.64 * 0.48, 1 - 0.48**2, -0.48 * 0.6))],
+)
+def test_a_springy_joint_has_a_marker_across_its_axis(tmp_path, axis, beside):
+    file = tmp_path / "r.urdf"
+    file.write_text(URDF.format(axis=" ".join(map(str, axis))))
+    springs = {"turn": RobotJointSpring(1.0), "slide": RobotJointSpring(1.0)}
+    system = System.build(read_urdf(file), springs=springs, point_frames=["b"])
+    *moving, marker = observable_frames(system)
+    assert [sight.name for sight in moving] == [
+        name for name, frame in system.mechanism.frames.items() if frame.joint_index >= 0
+    ]
+    assert (marker.name, marker.description) == ("turn_marker", "a marker 3 cm off the axis of turn")
+    wanted = MARKER_DISTANCE * np.array(beside) / np.linalg.norm(beside)
+    np.testing.assert_allclose(places(system, [marker.added_frame], np.zeros(2))[0], wanted, atol=1e-12)
+
+
+# -- mechanics --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("settings", "possible"),
+    [
+        ({"joints": False}, ""),
+        ({"grasps": ("weld", "point")}, "weld"),
+        ({"grasps": ("weld",)}, ""),
+        ({"second": "arm"}, "second_arm"),
+        ({"driven": ("a",)}, "motion travel torque"),
+        ({"driven": ("a",), "measured": True}, "motion travel"),
+        ({"driven": ("a",), "joints": False}, "motion travel"),
+        ({"driven": ("a",), "servos": {"a": 1}}, "torque"),
+        ({"prescribed": ("a",)}, "torque"),
+        ({"prescribed": ("a",), "measured": True}, ""),
+    ],
+)
+def test_changes_of_mechanics_that_make_sense(settings, possible):
+    made = {"grasps": (), "driven": (), "prescribed": (), "servos": {}, "measured": False, "joints": True} | settings
+    grasps = [SimpleNamespace(kind=kind) for kind in made["grasps"]]
+    system = SimpleNamespace(**{name: made[name] for name in ("driven", "prescribed", "servos")}, grasps=grasps)
+    sensor = SimpleNamespace(effort_joints=made["measured"])
+    recording = SimpleNamespace(joints=object() if made["joints"] else None)
+    episode = SimpleNamespace(measurements=(SimpleNamespace(sensor=sensor),), recording=recording)
+    base = BaseExperiment(
+        SimpleNamespace(system=system, episodes=(episode,)), np.zeros(1), two_arm_system=made.get("second")
+    )
+    assert CandidateExperimentBuilder(base).applicable_changes() == possible.split()
+
+
+@pytest.fixture(scope="module")
+def swung(urdf_folder):
+    """swung(**options): a pendulum, the shoulder moved as measured, the elbow springy, the tip seen by a camera."""
+    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
+    system = System.build(
+        robot, prescribed=["shoulder"], springs={"elbow": RobotJointSpring(3.0)}, damping=0.1, point_frames=["tip"]
+    )
+    step = compile_step(system, 0.02, use_compiler=False)
+    t = 0.02 * np.arange(41)
+    path = 0.4 * np.sin(7.0 * t)
+    camera = PointGroup(CAMERA_GROUP, ["tip"], t[::4], np.zeros((11, 1, 3)), 2e-3, sensor="camera", pose=np.eye(4))
+
+    def build(effort_std=None, **options):
+        joints = JointGroup(["shoulder"], t, path[:, None], position_std=0.0, effort_std=effort_std)
+        recording, chosen = Recording(joints, (camera,), name="swing"), ProblemOptions(path_cutoff=math.inf, **options)
+        return EstimationProblem(step, [recording], ("elbow.stiffness", "elbow.rest"), chosen, {"elbow.rest": 0.1})
+
+    return build
+
+
+def built(problem, *mechanics, heard=None, **settings):
+    """The builder of a problem's variants, and the variant with these changes."""
+    made = CandidateExperimentBuilder(
+        BaseExperiment(problem, problem.initial_unknowns, **settings), *([heard] if heard else [])
+    )
+    found = made.build_experiment(frozenset(mechanics))
+    assert not isinstance(found, str), found
+    return made, found
+
+
+def informed(problem, *mechanics):
+    made, found = built(problem, *mechanics)
+    views = [made.setting.recorded_observations(episode) for episode in problem.episodes]
+    return found, found.fisher_information(views)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"huber_threshold": 0.1},
+        {"weighting": "paper"},
+        {"weak_prior_factor": 0.01},
+        {"prior_stds": {"elbow.stiffness": 1e-3}},
+        {"duration": 0.8},
+    ],
+    ids=["plain", "robust", "paper", "weak priors", "stated priors", "all of it"],
+)
+def test_information_is_of_the_sensors_alone(swung, options):
+    """Neither robust costs nor weights nor priors of the parameters themselves change what sensors would tell."""
+    problem = swung()
+    rows = problem.evaluate(problem.initial_unknowns).jacobian[problem.residual_rows.data]
+    made, found = informed(swung(**options))
+    assert made.free_parameters == ("elbow.stiffness", "elbow.rest")
+    assert not np.any(made.prior_information)
+    np.testing.assert_allclose(found, rows.T @ rows, rtol=1e-9)
+
+
+def test_shorter_recordings_tell_less(swung):
+    _, whole = informed(swung())
+    made, half = informed(swung(duration=0.4))
+    assert made.problem.episodes[0].grid.steps == 20
+    assert np.all(np.linalg.eigvalsh(whole - half) > 0)
+
+
+def test_torques_as_a_measurement_are_fixed_information_with_typical_noise(swung):
+    heard = Heard()
+    builder, made = built(swung(), "torque", heard=heard)
+    blind = made.fisher_information([[]])
+    assert np.all(np.linalg.eigvalsh(blind) > 0)
+    stated = built(swung(effort_std=0.05), "torque")[1].fisher_information([[]])
+    np.testing.assert_allclose(stated, 4 * blind, rtol=1e-9)
+    assert made.problem.system.prescribed == ("shoulder",)
+    assert builder.build_experiment(frozenset({"torque"})) is made
+    assert heard.stages == ["working out joint torques as a measurement, the arms' motion as known"]
+
+
+def test_every_frame_is_in_view_at_every_node(swung):
+    [episode] = built(swung())[1].problem.episodes
+    assert [points.name for points in episode.recording.points] == [CAMERA_GROUP]
+    camera = episode.recording.points[0]
+    assert set(camera.names) == {sight.name for sight in observable_frames(swung().system)}
+    np.testing.assert_allclose(camera.t, episode.grid.node_times)
+    assert np.all(camera.std == 1.0)
+
+
+def test_more_frames_need_no_new_equations(swung):
+    step = swung().step
+    more, seen = with_observable_frames(step)
+    assert {sight.name for sight in seen} <= set(more.system.mechanism.frames)
+    assert more.kernel is step.kernel
+    assert built(swung())[1].problem.step.kernel is step.kernel
+
+
+def test_what_cannot_be_evaluated_is_no_variant(swung):
+    problem = swung()
+    x = np.array([np.nan, 0.1])
+    found = CandidateExperimentBuilder(BaseExperiment(problem, x)).build_experiment(frozenset())
+    assert found == "elbow.stiffness = nan is not a finite number"
+
+
+@pytest.mark.parametrize(
+    ("initial", "start", "given"),
+    [
+        ("equilibrium", "assumed", False),
+        ("equilibrium", "unknown", False),
+        ("estimated", "unknown", False),
+        ("fitted_to_points", "unknown", True),
+    ],
+)
+def test_starts_are_unknown_where_that_is_asked(swung, initial, start, given):
+    """What was fitted to the points becomes the centre of a prior."""
+    problem = swung(initial_state=initial)
+    made = with_nuisance_unknowns(problem, start, None)
+    unknown = "estimated" if start == "unknown" else initial
+    assert made.options.initial_state == unknown
+    assert (made is problem) == (unknown == initial)
+    assert made.free == problem.free
+    assert set(made.options.known_initial_states) == ({"swing"} if given else set())
+    if given:
+        before = problem.initial_state(problem.episodes[0], *problem.split(problem.initial_unknowns, 0)).state
+        np.testing.assert_allclose(made.options.known_initial_states["swing"], before)
+        after = made.initial_state(made.episodes[0], *made.split(made.initial_unknowns, 0)).state
+        np.testing.assert_allclose(after, before)
+
+
+@pytest.mark.parametrize("std", [None, 2e-3])
+def test_where_grasps_sit_is_unknown_only_where_that_is_asked(held_tube, std):
+    step = compile_step(with_grasp_offset_effects(held_tube.system), 0.02, use_compiler=False)
+    recordings = [episode.recording for episode in held_tube.episodes]
+    free = (*held_tube.free, "grasp_offset@hand.dy")
+    problem = EstimationProblem(step, recordings, free, held_tube.options)
+    added = () if std is None else ("grasp_offset@hand.dx", "grasp_offset@hand.dz")
+    assert identifiability(problem, grasp_std=std).nuisance_names == added
+    assert with_nuisance_unknowns(problem, "assumed", std).options.prior_stds == dict.fromkeys(added, std)
+
+
+def test_welds_keep_the_orientation_at_the_start(held_tube):
+    builder, made = built(held_tube, "weld")
+    (grasp,), free = made.problem.system.grasps, builder.build_experiment(frozenset())
+    assert grasp.kind == "weld"
+    start = free.problem.initial_state(free.problem.episodes[0], *free.problem.split(free.x, 0))
+    system, symbol = free.problem.system, ca.SX.sym("q", made.problem.system.n_coordinates)
+    tree = replace(system.mechanism, parameters=system.parameters).with_numeric_values(None)
+    kinematics = forward_kinematics(tree, symbol)
+    turn = kinematics.frame_pose(grasp.holder_frame).rotation.T @ kinematics.frame_pose(grasp.held_frame).rotation
+    wanted = np.array(ca.Function("turn", [symbol], [turn])(start.state[: system.n_coordinates]))
+    np.testing.assert_allclose(np.array(ca.DM(grasp.held_orientation)), wanted, atol=1e-9)
+    assert np.linalg.norm(wanted - np.eye(3)) > 0.01
+    assert ARM_GROUP not in {points.name for points in held_tube.episodes[0].recording.points}
+    assert ARM_GROUP in {points.name for points in made.problem.episodes[0].recording.points}
+
+
+# -- motions ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def driven(holding):
+    """The pendulum's motors at work for two seconds, with narrow limits; the rod's middle seen."""
+    joints = list(holding.mechanism.joints)
+    for i, (lower, upper, effort) in enumerate([(-1.0, 0.35, 0.1), (-0.65, 2.0, 0.05)]):
+        joints[i] = replace(joints[i], lower_limit=lower, upper_limit=upper, effort_limit=effort)
+    system = replace(holding, mechanism=replace(holding.mechanism, joints=tuple(joints)))
+    t = 0.02 * np.arange(101)
+    angles = np.array([0.3, -0.6]) + np.outer(np.sin(2 * t) ** 2, [0.03, -0.05])
+    group = JointGroup(
+        ("shoulder", "elbow"), t, angles, effort=np.zeros((101, 2)), effort_kind="command", position_std=1e-3
+    )
+    camera = PointGroup(CAMERA_GROUP, ["T1_1_tip"], t[::5], np.zeros((21, 1, 3)), 2e-3, sensor="camera", pose=np.eye(4))
+    step = compile_step(system, 0.02, use_compiler=False)
+    return EstimationProblem(step, [Recording(group, (camera,), name="run")], ("T1.bend",), ProblemOptions())
+
+
+@pytest.mark.parametrize(
+    ("name", "factor", "q", "effort", "note"),
+    [
+        ("motion", 1.0, (0.04, 0.0), (0.09, -0.04), ()),
+        ("travel", 2.0, (0.06, 0.0), (0.0, 0.0), ("beyond the range of shoulder",)),
+        (
+            "motion",
+            1.0,
+            (0.06, -0.06),
+            (0, -0.06),
+            ("beyond the range of shoulder, elbow", "beyond the torque of elbow"),
+        ),
+    ],
+)
+def test_another_motion_starts_where_the_recording_does(driven, monkeypatch, name, factor, q, effort, note):
+    """With an engine that goes to and fro: it travels as far as recorded, and what a robot cannot do is noted."""
+    asked = SimpleNamespace()
+
+    def draw(system, values, seed, initial_joint_angles, excitation):
+        asked.seed, asked.start, asked.excitation = seed, initial_joint_angles, excitation
+        return "motion"
+
+    def simulate(system, values, motion, simulation, initial_joint_angles):
+        t = 0.02 * np.arange(101)
+        angles = np.array(list(asked.start.values())) + np.outer(np.sin(t) ** 2, q)
+        whole = np.hstack([angles, np.zeros((101, system.n_coordinates - 2))])
+        return SimpleNamespace(t=t, q=whole, effort=np.tile(effort, (101, 1)))
+
+    monkeypatch.setattr(module, "random_multisine", draw)
+    monkeypatch.setattr(module, "simulate_in_mujoco", simulate)
+    _, made = built(driven, name)
+    assert made.feasibility_notes == note
+    episode = driven.episodes[0]
+    assert asked.start == pytest.approx(
+        dict(zip(("shoulder", "elbow"), episode.measured_driven_angles[0], strict=True))
+    )
+    angles = np.zeros((len(episode.measured_driven_angles), driven.system.n_coordinates))
+    angles[:, :2] = episode.measured_driven_angles
+    way = np.array([places(driven.system, ["tip"], at)[0] for at in angles])
+    farthest = np.linalg.norm(way - way[0], axis=1).max()
+    assert asked.excitation.gripper_travel == pytest.approx(factor * farthest)
+    assert (asked.seed, asked.excitation.max_joint_speed) == (11, 1.4 * factor)
+    assert asked.excitation.duration == pytest.approx(2.0)

@@ -1,0 +1,340 @@
+"""Profile likelihood on formulas whose intervals are known."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import casadi as ca
+import numpy as np
+import pytest
+from made_models import Formula, estimate, solution
+
+from yid_ocp.analysis.profile import CHI2_QUANTILE_95, is_small_problem, profile_likelihood, with_profile_intervals
+from yid_ocp.inference.linearized_residual import residual_without_weak_priors
+
+OPEN = dict.fromkeys("ab", (-math.inf, math.inf))
+HALF = 1.959963984540054
+
+
+def profiled(problem, name="a", std=None):
+    """The profile about the initial unknowns; the best fit itself is not evaluated again."""
+    x, index = problem.initial_unknowns, problem.unknown_names.index(name)
+    best = problem.evaluate(x)
+    if std is None:
+        _, jacobian = residual_without_weak_priors(problem, best)
+        std = float(np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian))[index]))
+    problem.asked.clear()
+    found = profile_likelihood(problem, x, index, std, best)
+    assert tuple(x) not in problem.asked
+    return found
+
+
+# -- intervals --------------------------------------------------------------------------------------------------------
+
+ROWS = np.array([[1.0, 0.9], [0.3, 1.0], [0.5, 0.5]])
+STD = math.sqrt(np.linalg.inv(ROWS.T @ ROWS)[0, 0])
+
+
+@pytest.mark.parametrize(
+    ("rows", "start", "more", "lower", "upper"),
+    [
+        (lambda x: [2 * (x["a"] - 3)], {"a": 3.0}, {"bounds": OPEN}, 3 - HALF / 2, 3 + HALF / 2),
+        (
+            lambda x: [r[0] * (x["a"] - 1.0) + r[1] * (x["b"] + 2.0) for r in ROWS],
+            {"a": 1.0, "b": -2.0},
+            {"bounds": OPEN},
+            1 - HALF * STD,
+            1 + HALF * STD,
+        ),
+        (
+            lambda x: [2 * (x["a"] - 3) + 4.0, 2 * (x["a"] - 3) - 4.0, 2 * (x["a"] - 3)],
+            {"a": 3.0},
+            {"bounds": OPEN},
+            3 - HALF * 4 / math.sqrt(12),
+            3 + HALF * 4 / math.sqrt(12),
+        ),
+        (
+            lambda x: [x["a"] - 3, (x["a"] - 3) * math.sqrt(3.0), 50 * (x["a"] - 3)],
+            {"a": 3.0},
+            {"bounds": OPEN, "stated": 1, "weak": 1},
+            3 - HALF / 2,
+            3 + HALF / 2,
+        ),
+        (
+            lambda x: [0.02 * (x["a"] - 3), math.sqrt(12.0) * (x["a"] - 3)],
+            {"a": 3.0},
+            {"bounds": OPEN, "stated": 1, "noise": 0.01},
+            3 - HALF / 4,
+            3 + HALF / 4,
+        ),
+        (lambda x: [x["a"] - 3.0], {"a": 3.0}, {}, 3 - HALF, 3 + HALF),
+        (lambda x: [x["a"] * 1e3 - 3.0], {"a": 3e-3}, {}, (3 - HALF) / 1e3, (3 + HALF) / 1e3),
+        (lambda x: [5 * ca.log(x["a"] / 3.0)], {"a": 3.0}, {}, 3 * math.exp(-HALF / 5), 3 * math.exp(HALF / 5)),
+        (lambda x: [2 * (1 / x["a"] - 1 / 3.0)], {"a": 3.0}, {}, 1 / (1 / 3 + HALF / 2), None),
+        (lambda x: [x["a"] - 3.0], {"a": 3.0}, {"bounds": {"a": (2.5, 6.0)}}, None, 3 + HALF),
+        (lambda x: [x["a"] - 3.0], {"a": 3.0}, {"bounds": {"a": (-9.0, 4.0)}}, 3 - HALF, None),
+        (
+            lambda x: [x["a"] + x["b"] - 4.0, 0.1 * (x["b"] - 1.0)],
+            {"a": 3.0, "b": 1.0},
+            {"bounds": {"b": (0.5, 1.25), "a": OPEN["a"]}},
+            2.75 - math.sqrt(HALF**2 - 0.025**2),
+            3.5 + math.sqrt(HALF**2 - 0.05**2),
+        ),
+        (
+            lambda x: [x["a"] - 3.0],
+            {"a": 3.0},
+            {"bounds": OPEN, "fails": lambda v: abs(v["a"] - 3) > 2.2},
+            3 - HALF,
+            3 + HALF,
+        ),
+        (
+            lambda x: [0.5 * (x["a"] - 3.0), 1e4 * ca.fmax(x["a"] - 3.7, 0.0)],
+            {"a": 3.0},
+            {"bounds": OPEN},
+            3 - 2 * HALF,
+            3.7,
+        ),
+    ],
+    ids=[
+        "linear",
+        "others are refitted",
+        "a misfit widens it",
+        "stated priors count, weak ones do not",
+        "rows in metres",
+        "a positive unknown",
+        "another unit",
+        "lopsided",
+        "open on one side",
+        "a bound below",
+        "a bound above",
+        "others at their bounds",
+        "a failure beyond the end",
+        "a cliff",
+    ],
+)
+def test_an_interval_is_where_chi2_rises_by_the_quantile(rows, start, more, lower, upper):
+    problem = Formula(rows, start, **more)
+    found = profiled(problem)
+    assert pytest.approx(HALF**2, rel=1e-12) == CHI2_QUANTILE_95
+    ends = [None if end is None else pytest.approx(end, rel=0.02) for end in (lower, upper)]
+    assert list(found.interval) == ends
+    assert (found.name, found.value, found.notes) == ("a", start["a"], ())
+    assert np.all(np.diff(found.values) > 0)
+    assert found.delta_chi2.min() == 0.0
+
+
+def test_series_springs_have_a_common_lower_end():
+    """Neither can be softer than both together, to within the noise."""
+    found = profiled(Formula(lambda x: [100 * (1 / x["a"] + 1 / x["b"] - 1.0)], {"a": 2.0, "b": 2.0}), std=math.inf)
+    assert found.interval == (pytest.approx(1 / (1 + HALF / 100), rel=0.02), None)
+
+
+@pytest.mark.parametrize(
+    ("rows", "more", "ends"),
+    [
+        (lambda x: [0 * x["a"] + 1.0], {}, (3e-3, 3e3)),
+        (lambda x: [0 * x["a"] + 1.0], {"bounds": OPEN, "scales": {"a": 2.0}}, (-1997.0, 2003.0)),
+        (lambda x: [20 * (x["a"] * x["b"] - 15.0)], {}, (3e-3, 3e3)),
+    ],
+    ids=["positive", "of either sign", "one factor of a product"],
+)
+def test_what_nothing_informs_is_open_on_both_sides(rows, more, ends):
+    found = profiled(Formula(rows, {"a": 3.0, "b": 5.0}, **more), std=math.inf)
+    assert (found.lower, found.upper, found.notes) == (None, None, ())
+    assert (found.values[0], found.values[-1]) == pytest.approx(ends)
+    assert found.delta_chi2.max() < 0.1
+
+
+@pytest.mark.parametrize(("start", "side"), [(6.0, "upper"), (2.5, "lower")])
+def test_an_unknown_at_its_bound_is_open_there_without_a_search(start, side):
+    problem = Formula(lambda x: [x["a"] - start], {"a": start}, bounds={"a": (2.5, 6.0)})
+    found = profiled(problem, std=1.0)
+    assert (getattr(found, side), found.notes) == (None, ())
+    assert all((x[0] < start) == (side == "upper") for x in problem.asked)
+
+
+@pytest.mark.parametrize(("limit", "side"), [(7.0, "above"), (-7.0, "below")])
+def test_where_the_rollout_fails_the_end_is_open_and_said(limit, side):
+    far = (lambda v: v["a"] > limit) if limit > 0 else (lambda v: v["a"] < limit)
+    found = profiled(Formula(lambda x: [0.1 * (x["a"] - 3.0)], {"a": 3.0}, bounds=OPEN, fails=far))
+    lower, upper = found.interval
+    assert (upper if limit > 0 else lower) is None
+    assert (lower if limit > 0 else upper) == pytest.approx(3 - 10 * HALF * np.sign(limit), rel=0.02)
+    [note] = found.notes
+    assert note.startswith(f"the model cannot be rolled out {side} {limit:.0f}")
+
+
+def test_others_where_they_were_help_where_the_tangent_leads_too_far():
+    def rows(x):
+        return [x["a"] + x["b"] - 4.0, 0.5 * (x["b"] - 1.0)]
+
+    found = profiled(Formula(rows, {"a": 3.0, "b": 1.0}, bounds=OPEN, fails=lambda v: v["b"] < 0.2))
+    assert found.lower == pytest.approx(3 - HALF * math.sqrt(5.0), rel=0.02)
+    assert 3 < found.upper < 3 + HALF * math.sqrt(5.0)
+
+
+@pytest.mark.parametrize(("start", "notes"), [(3.8, 1), (3.1, 0)])
+def test_a_better_fit_that_is_met_on_the_way_is_said_and_counts_as_the_best(start, notes):
+    def rows(x):
+        return [2 * (x["a"] - 3.0), *(0 * x["a"] for _ in range(9))]
+
+    found = profiled(Formula(rows, {"a": start}, bounds=OPEN))
+    assert len(found.notes) == notes
+    assert all(note.startswith("a fit better by 2.") for note in found.notes)
+    assert found.delta_chi2.min() == 0.0
+    assert found.lower == pytest.approx(3 - HALF / 2, rel=0.04)
+
+
+# -- how far it steps -------------------------------------------------------------------------------------------------
+
+
+def steps(problem, std, unit):
+    """Values asked below and above the best fit, in a unit."""
+    profiled(problem, std=std)
+    moved = [(x[0] - problem.initial_unknowns[0]) / unit for x in problem.asked]
+    return [-d for d in moved if d < 0], [d for d in moved if d > 0]
+
+
+@pytest.mark.parametrize(
+    ("guess", "asked"),
+    [
+        (1.0, [1.0]),
+        (0.995, [0.995]),
+        (0.1, [0.1, 0.4, 1.18, 1.0]),
+        (0.04, [0.04, 0.16, 0.64, 1.108, 1.0]),
+        (0.9, [0.9, 1.08, 1.0]),
+        (5.0, [5.0, 1.0]),
+        (15.0, [15.0, 7.5, 7.5 - 6.5 * 7.5 / 7.0, 1.0]),
+    ],
+)
+def test_a_line_is_followed_no_faster_than_it_is_known(guess, asked):
+    """A parabola's root is a line: the next point is a third beyond its end, no more than three times what is gone.
+
+    Of two sides, one that is kept counts half; heights of more than ten times the end's are halved.
+    """
+    problem = Formula(lambda x: [2 * (x["a"] - 3.0)], {"a": 3.0}, bounds=OPEN, scales={"a": 100.0})
+    for side in steps(problem, 0.5 * guess, 0.5 * HALF):
+        assert side == pytest.approx(asked, rel=1e-6)
+
+
+def test_the_first_step_is_no_larger_than_the_unknown_itself():
+    either = Formula(lambda x: [0 * x["a"] + 1.0], {"a": 3.0}, bounds=OPEN, scales={"a": 2.0})
+    below, above = steps(either, math.inf, HALF)
+    assert below[0] == above[0] == pytest.approx(20.0)
+    below, above = steps(Formula(lambda x: [0 * x["a"] + 1.0], {"a": 3.0}), math.inf, 3.0)
+    assert [1 - below[0], 1 + above[0]] == pytest.approx([math.exp(-0.5 * HALF), math.exp(0.5 * HALF)])
+
+
+def test_refits_leave_little_on_the_table():
+    """The other unknown follows the first on a curve, so that its tangent alone is not enough."""
+
+    def rows(x):
+        return [x["a"] - 3.0 + x["b"], 2 * (x["b"] - 0.3 * (x["a"] - 3.0) ** 2)]
+
+    found = profiled(Formula(rows, {"a": 3.0, "b": 0.0}, bounds=OPEN))
+    gone = found.values - 3.0
+    exact = (gone + 0.3 * gone**2) ** 2 / (1 + 1 / 4)
+    assert np.max(found.delta_chi2) > 3
+    np.testing.assert_allclose(found.delta_chi2, exact, atol=2e-3)
+    assert np.all(found.delta_chi2 >= exact - 1e-9)
+
+
+def test_edges_take_few_refits():
+    def rows(x):
+        return [0.5 * (x["a"] - 3.0), 1e4 * ca.fmax(x["a"] - 3.7, 0.0)]
+
+    below, above = steps(Formula(rows, {"a": 3.0}, bounds=OPEN), 2.0, 1.0)
+    assert len(below) == 1
+    assert 10 <= len(above) <= 16
+    fails = Formula(lambda x: [0.1 * (x["a"] - 3.0)], {"a": 3.0}, bounds=OPEN, fails=lambda v: v["a"] > 7.0)
+    below, above = steps(fails, 10.0, 10 * HALF)
+    assert below == pytest.approx([1.0])
+    # half the way to where it failed, time and again
+    assert above[:3] == pytest.approx([1.0, 1.0, 0.5], rel=1e-6)
+
+
+def test_a_refit_that_fails_takes_ever_shorter_steps_and_gives_up_after_nine():
+    """The other unknown would follow on a parabola; where it moves at all the model cannot be rolled out."""
+    problem = Formula(
+        lambda x: [0.01 * (x["a"] - 3.0), x["b"] - 0.3 * (x["a"] - 3.0) ** 2],
+        {"a": 3.0, "b": 0.0},
+        bounds=OPEN,
+        scales={"a": 100.0, "b": 1.0},
+        fails=lambda v: v["b"] > 1e-9,
+    )
+    profiled(problem, std=100.0)
+    first = next(x[0] for x in problem.asked if x[0] > 3.0)
+    assert first == pytest.approx(3.0 + 100 * HALF)
+    whole, tried = 0.3 * (first - 3.0) ** 2, [b for a, b in problem.asked if a == first]
+    expected = [0.0, *(1 / (1 + damping) for damping in (1e-8, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0, 10.0))]
+    np.testing.assert_allclose(np.array(tried) / whole, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("left", "refitted"), [(0.7e-3, False), (1.5e-3, True)])
+def test_a_refit_is_worth_a_thousandth_of_chi2(left, refitted):
+    def rows(x):
+        return [x["a"] - 3.0, x["b"] - math.sqrt(left) * ((x["a"] - 3.0) / HALF) ** 2]
+
+    problem = Formula(rows, {"a": 3.0, "b": 0.0}, bounds=OPEN, scales={"a": 1.0, "b": 1.0})
+    profiled(problem, std=1.0)
+    first = next(x[0] for x in problem.asked if x[0] > 3.0)
+    assert (len([a for a, _ in problem.asked if a == first]) > 1) is refitted
+
+
+@pytest.mark.parametrize(
+    ("parameters", "unknowns", "expected"),
+    [(12, 300, True), (13, 13, False), (1, 301, False), (1, 1, True)],
+)
+def test_intervals_are_worked_out_unasked_where_they_take_no_time(parameters, unknowns, expected):
+    names = tuple(f"k{i}" for i in range(parameters))
+    starts = tuple(f"start.q.joint[{i}]" for i in range(unknowns - parameters))
+    problem = SimpleNamespace(unknown_names=names + starts, shared_parameters=names, local_parameters=())
+    assert is_small_problem(problem) is expected
+
+
+# -- verdicts ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("size", "value", "std", "verdict", "expected", "interval"),
+    [
+        (1.7, 0.2, 0.25, "identifiable", ("not_identifiable", math.inf), None),
+        (3.2 / 0.99, 0.2, 0.01, "identifiable", ("not_identifiable", math.inf), None),
+        (3.35 / 0.99, 0.2, 0.01, "identifiable", ("identifiable", 0.01), None),
+        (1.7, 7.0, 0.01, "identifiable", ("identifiable", 0.01), None),
+        (1.7, 12.0, 7.0, "weak", ("weak", math.inf), (12.0 / (1 + HALF / 1.7), None)),
+    ],
+    ids=["by chance", "3.2 of 3.29 deviations", "3.35 deviations", "not small", "open above"],
+)
+def test_a_small_stiffness_counts_where_its_typical_size_is_ruled_out(size, value, std, verdict, expected, interval):
+    """Noise makes it fit best, while the typical size, 20 as others of its kind have, fits nearly as well."""
+
+    def rows(x):
+        return [100.0 * (x["a.bend"] - 20.0), size * (1.0 - value / x["b.bend"])]
+
+    found = judged(Formula(rows, {"a.bend": 20.0, "b.bend": value}), estimate(value, std, verdict))
+    assert (found.verdict, found.std) == expected
+    assert (found.interval is None) == (interval is None)
+    if interval:
+        assert found.interval == (pytest.approx(interval[0], rel=0.02), None)
+
+
+def judged(problem, entry):
+    """The second parameter's estimate with its interval, where that is worked out; the first stays as it is."""
+    first = estimate(20.0, 0.01)
+    fitted = solution(a_bend=first, b_bend=entry)
+    there = problem.evaluate(problem.initial_unknowns)
+    found = with_profile_intervals(problem, replace(fitted, x=problem.initial_unknowns, evaluation=there)).parameters
+    assert found["a.bend"] == first
+    return found["b.bend"]
+
+
+def test_a_stiffness_that_is_known_to_be_small_is_found():
+    problem = Formula(
+        lambda x: [100 * (x["a.bend"] - 20.0), 10.0 * (x["b.bend"] - 0.05)], {"a.bend": 20.0, "b.bend": 0.05}
+    )
+    found = judged(problem, estimate(0.05, 0.1))
+    assert (found.verdict, found.std) == ("identifiable", 0.1)
+    assert found.interval == (None, pytest.approx(0.05 + HALF / 10, rel=0.01))
