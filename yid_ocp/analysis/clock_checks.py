@@ -114,16 +114,8 @@ def check_held_point_clock(
 ) -> Iterator[Issue]:
     """Issues of clock offset or drift of points whose positions follow from the joint angles.
 
-    Parameters
-    ----------
-    t : ndarray, shape (N,)
-        Times at which they are compared.
-    seen : ndarray, shape (N, np, 3)
-        [m]
-    by_angle : ndarray, shape (N, np, 3, k)
-        Derivative of their places by the angles.
-    std : float
-        Noise of the points [m]; zero where nobody says.
+    They are seen (N, np, 3) [m] at the times `t` (N,); `by_angle` (N, np, 3, k) is the derivative of their places by
+    the angles, `std` their noise [m], zero where nobody says.
     """
     span, step = (float(t[0]), float(t[-1])), 0.5 * median_sample_period(joints.t)
     shifted = np.broadcast_to(np.eye(3), (*seen.shape, 3))

@@ -46,15 +46,7 @@ _MIN_MOVING_RECORDINGS = 2  # that start in motion, of which one is left out at 
 
 @dataclass(frozen=True)
 class MethodResult:
-    """Solution, cost and computing effort of one estimation method.
-
-    Attributes
-    ----------
-    whitened_cost : float
-        Cost of its solution in the problem's own weighting, the same for all methods.
-    peak_memory_mib : float
-        Largest resident memory of the process during the run [MiB].
-    """
+    """Solution, its cost in the problem's own weighting, time and largest resident memory of one estimation method."""
 
     method: str
     solution: Solution
@@ -113,14 +105,8 @@ def compare_methods(
     without process noise, whose covariance not every method can carry. With process noise, the verdicts come from one
     more run of a method that can.
 
-    Parameters
-    ----------
-    truth : mapping of str to float, optional
-        Known parameter values.
-    callback : callable, optional
-        Called with the method's name and every `Iterate`.
-    limits : GapCriteria, optional
-        Limits from which a residual counts as more than noise.
+    `truth` are known parameter values; `callback` is called with the method's name and every `Iterate`; `limits` say
+    when a residual is more than noise.
     """
     runs, whole, problem = [], problem, without_input_errors(problem)
 

@@ -172,15 +172,9 @@ _DAMPING_PARAMETERS = ("damping", "twist_damping")
 class NaturalFrequencies:
     """Natural frequencies of one step map about an equilibrium, its robot held still.
 
-    Attributes
-    ----------
-    frequencies_hz : ndarray, shape (k,)
-        Undamped, ascending [Hz].
-    n_unstable_modes : int
-        Number of damped modes that still grow from step to step: the equilibrium is unstable, or the time step is too
-        long for the tension that the grasps put on the object.
-    message : str
-        Why there are no frequencies, empty otherwise.
+    The frequencies (k,) are undamped and ascending [Hz]; unstable modes are damped ones that still grow from step to
+    step: the equilibrium is unstable, or the time step is too long for the tension that the grasps put on the object.
+    The message says why there are no frequencies.
     """
 
     frequencies_hz: Array
@@ -199,16 +193,8 @@ def natural_frequencies(
 ) -> NaturalFrequencies:
     """Natural frequencies of a system's step map about an equilibrium, from the eigenvalues of A_k without damping.
 
-    Parameters
-    ----------
-    posture : mapping of str to float
-        Driven and prescribed coordinates [rad or m], held still.
-    time_step : float
-        h [s]; the midpoint rule lowers a frequency f to atan(pi f h)/(pi h).
-    force_split, constraint_force : str
-        As in `compile_step`; the split affects growth, not the undamped frequencies.
-    guess : ndarray, shape (n,), optional
-        Configuration from which rest is sought.
+    The driven and prescribed coordinates `posture` [rad or m] are held still; rest is sought from `guess` (n,). The
+    midpoint rule lowers a frequency f to atan(pi f h)/(pi h); the force split (`compile_step`) affects growth alone.
     """
     still = replace(system, driven=(), servos={}, prescribed=(*system.driven, *system.prescribed))
     if not still.free_indices:
@@ -295,14 +281,8 @@ class StepErrorGrowth:
     eigenvalue has a negative real part turns back at every step, and is the method's own. Where its magnitude exceeds
     one, the equations no longer follow the body, however well Newton solves them.
 
-    Attributes
-    ----------
-    growth_decades : float
-        Powers of ten by which such an error grows over the stretch of the motion on which it grows most.
-    max_step_factor : float
-        Largest growth in one step.
-    max_growth_time : float
-        Time of this largest growth, from the start of the motion [s].
+    `growth_decades` are the powers of ten by which such an error grows over the stretch on which it grows most,
+    `max_step_factor` is the largest growth in one step, at `max_growth_time` from the start of the motion [s].
     """
 
     recording_name: str

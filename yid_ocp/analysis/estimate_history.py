@@ -69,16 +69,9 @@ class RunEstimates(ReprMixin):
 
 @dataclass(frozen=True)
 class ParameterDrift:
-    """Test whether one parameter has the same value in all runs that have it.
+    """Test whether one parameter has the same value in all runs that have it: pooled mean, chi2 of the differences.
 
-    Attributes
-    ----------
-    mean, mean_std : float
-        Pooled over these runs.
-    chi2, p_value : float
-        Of the differences; p is one where only one run has it.
-    has_drifted : bool
-        Whether p is below the requested level, Bonferroni-corrected for the number of parameters.
+    It has drifted where p is below the requested level, Bonferroni-corrected for the number of parameters.
     """
 
     name: str
@@ -95,14 +88,9 @@ class ParameterDrift:
 
 @dataclass(frozen=True)
 class RunConsistency:
-    """Test of one run against the pooled estimates of all others.
+    """Test of one run against the pooled estimates of all others; its parameter that differs most is the worst.
 
-    Attributes
-    ----------
-    worst_parameter : str
-        Parameter that differs most, in standard deviations.
-    is_outlier : bool
-        Whether it alone disagrees with the others, which agree without it.
+    It is an outlier where it alone disagrees with the others, which agree without it.
     """
 
     run_name: str

@@ -56,12 +56,7 @@ class FrameObservation:
 class BaseExperiment:
     """The recorded experiment, and what its variants may use.
 
-    Attributes
-    ----------
-    x : ndarray, shape (nx,)
-        Unknowns at which the information is evaluated.
-    two_arm_system : System, optional
-        The system with a second arm and its grasp.
+    The information is evaluated at the unknowns `x` (nx,); `two_arm_system` has a second arm and its grasp.
     """
 
     problem: EstimationProblem

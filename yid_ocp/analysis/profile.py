@@ -86,16 +86,8 @@ def profile_likelihood(
     Unknowns that are positive by nature move in their logarithm. The weak prior does not count. An end is open where
     the level is not reached before the unknown's bound, or before it has changed by a factor of 1000.
 
-    Parameters
-    ----------
-    x : ndarray, shape (nx,)
-        The best fit.
-    index : int
-        Which unknown.
-    std : float
-        Its standard deviation, for the first guess; may be infinite.
-    evaluation : Evaluation
-        At `x`, with the Jacobian.
+    `x` (nx,) is the best fit, `evaluation` that at it, with the Jacobian, `std` the unknown's standard deviation, for
+    the first guess; it may be infinite.
 
     References
     ----------

@@ -222,16 +222,9 @@ def nlp_stage_sparsity(
 ) -> NlpStageSparsity:
     """Sparsity of one stage of the NLP with a node at every step, in the order of `solvers.transcription`.
 
-    Parameters
-    ----------
-    free : sequence of str
-        Parameters that are unknowns.
-    sensors : sequence of Sensor
-        Those that read nodes.
-    followed : sequence of int
-        Rows of the state that the tracking filter feeds back to the torques.
-    loose : sequence of int
-        Rows of the first node's state that are estimated, with a prior; the start fixes those that are not prescribed.
+    The parameters `free` are unknowns, `sensors` read nodes, the tracking filter feeds the rows `followed` of the state
+    back to the torques, and the rows `loose` of the first node's state are estimated, with a prior; the start fixes the
+    others that are not prescribed.
     """
     e, system = symbols.equations, symbols.equations.system
     kept = list(system.free_indices)

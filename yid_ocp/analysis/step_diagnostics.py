@@ -133,23 +133,10 @@ _MAX_LISTED_ROWS = 8  # rows that are named one by one
 class ParameterDependence:
     """The equations of a step that one parameter enters, and how strongly sensors respond to it.
 
-    Attributes
-    ----------
-    rows : tuple of str
-        Equation rows that contain it, whatever the state.
-    seen : tuple of str or None
-        Those of them to which a sensor responds to first order; None without sensors.
-    best : str
-        Sensor that responds most; empty where none does.
-    read : tuple of str
-        Sensors whose reading depends on the parameter directly.
-    moved : float or None
-        Largest change of a reading per unit of the parameter, starting at the equilibrium, in standard deviations.
-    seconds : float
-        Time span over which readings were simulated [s].
-    along : float or None
-        Change of all readings of the recordings per unit of the parameter, in standard deviations (root of the sum of
-        squares); None where not requested.
+    `rows` contain it whatever the state; `seen` are those of them to which a sensor responds to first order, None without
+    sensors, and `best` is the sensor that responds most; the readings of the sensors `read` depend on it directly.
+    `moved` is the largest change of a reading within `seconds` per unit of the parameter, starting at the equilibrium,
+    `along` that of all readings of the recordings (root of the sum of squares), both in standard deviations.
     """
 
     parameter: str

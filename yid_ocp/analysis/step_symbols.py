@@ -77,14 +77,8 @@ class SymbolName:
 class FormulaText:
     """Expressions written as text, with their shared subexpressions.
 
-    Attributes
-    ----------
-    shared_subexpressions : tuple of (str, str)
-        Name and expression of each part that occurs more than once; each may use those before it.
-    n_operations : int
-        Number of operations, each shared one counted once.
-    variable_indices : tuple of int
-        Indices of the variables that occur.
+    Name and expression of each part that occurs more than once, which may use those before it; the number of operations
+    counts each shared one once; the indices are of the variables that occur.
     """
 
     shared_subexpressions: tuple[tuple[str, str], ...]
@@ -186,15 +180,8 @@ _MAX_LISTED_SYMBOLS = 6  # names of one block that are still listed one by one
 class SymbolBlock:
     """A named block of equations or variables of one kind.
 
-    Attributes
-    ----------
-    name : str
-        Such as `del` or `q1`.
-    labels : tuple of str
-        One for every entry: a joint, a grasp's equation, an internal coordinate, a parameter.
-    expressions : casadi.SX, shape (len(labels), 1)
-    latex_template : str
-        LaTeX symbol, with `#` in place of the label.
+    Labels, one for every entry of the expressions (k, 1), are those of a joint, a grasp's equation, an internal
+    coordinate or a parameter; they take the place of `#` in the LaTeX template.
     """
 
     name: str
