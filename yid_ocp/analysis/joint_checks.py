@@ -40,13 +40,7 @@ _MIN_SIGNAL_STDS = 5.0  # standard deviations from which on a signal counts as s
 class RecordedJointsModel:
     """Numeric kinematics and inverse dynamics of the joints whose angles are recorded.
 
-    Unknown coordinates beyond them, such as a beam's bending, are zero.
-
-    Attributes
-    ----------
-    theta : ndarray, shape (ntheta,)
-    joint_names : tuple of str, length k
-        Driven, then prescribed joints.
+    Driven joints come first, then prescribed ones; unknown coordinates, such as a beam's bending, are zero.
     """
 
     system: System
@@ -77,17 +71,13 @@ class RecordedJointsModel:
     def is_frame_determined(self, frame: str) -> bool:
         """Whether a frame's position follows from the recorded angles alone."""
         mechanism = self.system.mechanism
-        known = set(self.joint_indices)
-        return all(i in known for i in mechanism.ancestor_joints(mechanism.frame(frame).joint_index))
+        return set(mechanism.ancestor_joints(mechanism.frame(frame).joint_index)) <= set(self.joint_indices)
 
     @cached_property
     def has_no_unknown_descendants(self) -> bool:
         """Whether no joint of unknown angle depends on the recorded joints."""
-        known = set(self.joint_indices)
-        return not any(
-            i not in known and set(self.system.mechanism.ancestor_joints(i)) & known
-            for i in range(self.system.n_coordinates)
-        )
+        ancestors, known = self.system.mechanism.ancestor_joints, set(self.joint_indices)
+        return not any(set(ancestors(i)) & known for i in range(self.system.n_coordinates) if i not in known)
 
     def frame_positions(self, frames: tuple[str, ...], q: Array) -> tuple[Array, Array]:
         """Positions (N, nf, 3) [m] of frames and their Jacobian (N, nf, 3, k) by the recorded angles (N, k).
@@ -179,24 +169,23 @@ def check_joint_limits(arm: RecordedJointsModel, recording: Recording) -> Iterat
 
 
 def _angle_issues(arm: RecordedJointsModel, position: Array) -> Iterator[Issue]:
-    low, high = (np.array([getattr(joint, side) for joint in arm.joints]) for side in ("lower_limit", "upper_limit"))
-    margin = _ANGLE_LIMIT_MARGIN
+    low, high = (np.array([getattr(joint, f"{side}_limit") for joint in arm.joints]) for side in ("lower", "upper"))
+    margin, degrees = _ANGLE_LIMIT_MARGIN, position / DEGREES_PER_RADIAN
     beyond = np.maximum(low - position, position - high).max(axis=0)
-    if not np.any(beyond > margin):
-        return
-    degrees = position / DEGREES_PER_RADIAN
     inside = np.all((degrees > low - margin) & (degrees < high + margin))
-    if inside and np.median(np.max(np.abs(position), axis=0)) > 2 * math.pi:
+    if np.any(beyond > margin) and inside and np.median(np.max(np.abs(position), axis=0)) > 2 * math.pi:
         words = f"angles reach {np.max(np.abs(position)):.3g} rad; taken as degrees all are within their limits"
         advice = "convert angles to radians; a CSV is read with units: {position: deg}"
         yield Issue("degrees", words, "refused", float(np.max(beyond)) / margin, advice, "", channel="position")
         return
-    for j in (int(j) for j in np.flatnonzero(beyond > margin)):
+    for j in np.flatnonzero(beyond > margin):
         name, unit = arm.joint_names[j], arm.joints[j].coordinate_unit
         words = f"{name} goes {beyond[j]:.3g} {unit} beyond its limits of {low[j]:.3g} to {high[j]:.3g}"
-        advice = "check the joint's zero, unit and column, and that the recording is this robot's"
-        depth = float(beyond[j]) / margin
-        yield Issue("angle_limits", words, "not_trusted", depth, advice, "", channel=f"position.{name}")
+        advice, depth = (
+            "check the joint's zero, unit and column, and that the recording is this robot's",
+            beyond[j] / margin,
+        )
+        yield Issue("angle_limits", words, "not_trusted", float(depth), advice, "", channel=f"position.{name}")
 
 
 def _speed_issues(arm: RecordedJointsModel, t: Array, position: Array) -> Iterator[Issue]:
@@ -206,14 +195,12 @@ def _speed_issues(arm: RecordedJointsModel, t: Array, position: Array) -> Iterat
     limits = np.array([joint.velocity_limit for joint in arm.joints])
     speed = np.abs(position[stride:] - position[:-stride]) / (t[stride:] - t[:-stride])[:, None]
     ratio = np.percentile(speed, 99, axis=0) / limits
-    if np.any(ratio > _MAX_SPEED_RATIO):
-        j = int(np.argmax(ratio))
+    j = int(np.argmax(ratio))
+    if ratio[j] > _MAX_SPEED_RATIO:
         able = f"{limits[j]:.3g} {arm.joints[j].coordinate_unit}/s"
         words = f"{arm.joint_names[j]} turns {ratio[j]:.3g} times as fast as it can ({able})"
-        depth = float(ratio[j]) / _MAX_SPEED_RATIO
-        yield Issue(
-            "speed_limits", words, "not_trusted", depth, "check the unit of time and of angles", "", channel="t"
-        )
+        advice, depth = "check the unit of time and of angles", float(ratio[j]) / _MAX_SPEED_RATIO
+        yield Issue("speed_limits", words, "not_trusted", depth, advice, "", channel="t")
 
 
 def effect_setting_line(kind: str, location: str, quantity: str, value: float) -> str:
@@ -272,13 +259,7 @@ def _noise(joints: JointGroup, names: Sequence[str], effort: SensorOptions) -> A
 def check_joint_excitation(
     recordings: Sequence[Recording], asked: Mapping[str, Sequence[str]], position: SensorOptions
 ) -> Iterator[Issue]:
-    """Issues of joints that have free parameters but hardly move in any recording.
-
-    Parameters
-    ----------
-    asked : mapping of str to sequence of str
-        Free parameters of each joint.
-    """
+    """Issues of joints that have free parameters, `asked` by joint, but hardly move in any recording."""
     for joint, parameters in asked.items():
         widest, limit, name = 0.0, QUALITY_LIMITS.min_joint_motion, ""
         for recording in recordings:
@@ -286,12 +267,14 @@ def check_joint_excitation(
             if joints is None or joint not in joints.names:
                 continue
             angle = joints.position[:, joints.names.index(joint)]
-            given = position.std if position.std is not None else joints.position_std
+            noise, given = (
+                white_noise_std(joints.t, angle),
+                joints.position_std if position.std is None else position.std,
+            )
             if given is not None:
                 std = values_by_joint(given, joints.names, (joint,), f"sensors.{POSITION_GROUP}.std")
-                limit = max(limit, 6 * float(std[0]))
-            limit = max(limit, 6 * white_noise_std(joints.t, angle))
-            width = float(np.ptp(angle))
+                noise = max(noise, float(std[0]))
+            limit, width = max(limit, 6 * noise), float(np.ptp(angle))
             if not name or width > widest:
                 widest, name = width, recording.name
         if name and widest < limit:

@@ -133,10 +133,10 @@ _MAX_LISTED_ROWS = 8  # rows that are named one by one
 class ParameterDependence:
     """The equations of a step that one parameter enters, and how strongly sensors respond to it.
 
-    `rows` contain it whatever the state; `seen` are those of them to which a sensor responds to first order, None without
-    sensors, and `best` is the sensor that responds most; the readings of the sensors `read` depend on it directly.
-    `moved` is the largest change of a reading within `seconds` per unit of the parameter, starting at the equilibrium,
-    `along` that of all readings of the recordings (root of the sum of squares), both in standard deviations.
+    `rows` contain it whatever the state; `seen` are those of them to which a sensor responds to first order, None
+    without sensors, and `best` is the sensor that responds most; the readings of the sensors `read` depend on it
+    directly. `moved` is the largest change of a reading within `seconds` per unit of the parameter, starting at the
+    equilibrium, `along` that of all readings of the recordings (root of the sum of squares) [standard deviations].
     """
 
     parameter: str
