@@ -133,11 +133,11 @@ def check_held_point_clock(
         others = np.concatenate([by_angle, shifted, turned], axis=3)[good] / noise
         when = np.broadcast_to(t[:, None, None], seen.shape)[good]
         own = _by_clock(when, speed[good] / noise, span)
-        found = _clock_error(when, (place - seen)[good] / noise, own, others, size, span)
-        if found is None:
+        more = _clock_error(when, (place - seen)[good] / noise, own, others, size, span)
+        if more is None:
             return
-        late, drift = late + found.delay, drift + found.drift
-    found = replace(found, delay=late, drift=drift)
+        late, drift = late + more.delay, drift + more.drift
+    found = replace(more, delay=late, drift=drift)
     moved, limit = float(np.sqrt(np.mean(np.sum(speed**2, axis=2)))), _offset_tolerance(joints, group)
     severity: Severity = "not_trusted" if moved * max(abs(late), abs(found.whole_drift)) > noise else "warning"
     if found.drifts_beyond(limit):

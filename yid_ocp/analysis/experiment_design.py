@@ -433,9 +433,8 @@ class CandidateExperimentBuilder:
         run = simulate_in_mujoco(system, values, motion, SimulationOptions(duration), initial_joint_angles=posture)
         driven = list(system.driven_indices)
         q, noise = run.q[:, driven], _noise_as_recorded(base.system, system, episode)
-        names = "position_std", "effort_std", "effort_bias_std"
-        stds = dict(zip(names, noise, strict=True))
-        joints = JointGroup(system.driven, run.t, q, effort=run.effort, effort_kind="command", **stds)
+        joints = JointGroup(system.driven, run.t, q, effort=run.effort, effort_kind="command")
+        joints = replace(joints, position_std=noise[0], effort_std=noise[1], effort_bias_std=noise[2])
         limits = [system.mechanism.joints[i] for i in driven]
         low, high, most = (
             np.array([getattr(joint, f"{name}_limit") for joint in limits]) for name in ("lower", "upper", "effort")

@@ -70,13 +70,13 @@ _Block = tuple[str, tuple[str, ...]]
 def _pattern(
     name: str, title: str, mask: _BoolMatrix, rows: Sequence[_Block], columns: Sequence[_Block]
 ) -> SparsityPattern:
-    spans, labels = [], []
-    for blocks in (rows, columns):
+    def named(blocks: Sequence[_Block]) -> tuple[tuple[NamedRange, ...], tuple[str, ...]]:
         ends = np.cumsum([0, *(len(own) for _, own in blocks)]).tolist()
-        names = [block for block, _ in blocks]
-        spans.append(tuple(NamedRange(*entry) for entry in zip(names, ends[:-1], ends[1:], strict=True)))
-        labels.append(tuple(label for _, own in blocks for label in own))
-    return SparsityPattern(name, title, mask, *spans, *labels)
+        spans = (NamedRange(*entry) for entry in zip((name for name, _ in blocks), ends[:-1], ends[1:], strict=True))
+        return tuple(spans), tuple(label for _, own in blocks for label in own)
+
+    (row_spans, row_labels), (column_spans, column_labels) = named(rows), named(columns)
+    return SparsityPattern(name, title, mask, row_spans, column_spans, row_labels, column_labels)
 
 
 def _blocks(symbols: StepSymbols, *wanted: str, kept: Sequence[int] | None = None) -> list[_Block]:
