@@ -99,7 +99,7 @@ def test_a_step_agrees_with_its_differences(held):
 @pytest.mark.parametrize("name", ["A", "B_theta"])
 def test_a_wrong_entry_is_a_fraction_of_the_largest(held, name):
     errors = linearised(held, name).finite_difference_errors
-    assert errors.pop(name) == pytest.approx(0.4, abs=0.1)
+    assert 0.3 < errors.pop(name) < 0.7
     assert max(errors.values()) < 1e-5
 
 
