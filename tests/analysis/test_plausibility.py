@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.analysis.effort_checks import check_efforts
-from yid_ocp.analysis.joint_checks import RecordedJointsModel, check_joint_limits
+from yid_ocp.analysis.joint_checks import RecordedJointsModel, check_efforts, check_joint_limits
 from yid_ocp.analysis.point_checks import check_cable_points, check_held_points, check_point_distances
 from yid_ocp.data import read_recording
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording

@@ -1,4 +1,4 @@
-"""Kinematics and dynamics of the joints with recorded angles, and checks of their limits and of their excitation."""
+"""Kinematics and dynamics of the joints with recorded angles, and checks of limits, excitation and efforts."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from yid_ocp.data.channel_checks import white_noise_std
 from yid_ocp.data.issues import DEGREES_PER_RADIAN, QUALITY_LIMITS, Issue, median_sample_period
 from yid_ocp.data.recording import JointGroup, Recording
+from yid_ocp.effects.base import joints_by_arm
 from yid_ocp.model.kinematics import forward_kinematics, rigid_body_derivatives
 from yid_ocp.model.mechanism import Joint
 from yid_ocp.model.system import System
@@ -31,7 +32,7 @@ _ANGLE_LIMIT_MARGIN = 0.1
 _MAX_SPEED_RATIO = 1.5  # factor by which joints may turn faster than the URDF says that they can
 _SPEED_SAMPLE_STRIDE = 5  # samples over which a speed is taken, so that neither noise nor steps of encoders count
 _MOTION_BANDWIDTH_HZ = 5.0  # where motion of a robot's arm ends; what is faster is left out [Hz]
-VISCOUS_FRICTION_FRACTION = 0.04
+_VISCOUS_FRICTION_FRACTION = 0.04
 """Usual viscous friction beside a joint's largest effort [per rad/s]."""
 _MIN_SIGNAL_STDS = 5.0  # standard deviations from which on a signal counts as seen, all samples and joints together
 
@@ -229,7 +230,7 @@ def check_dynamic_excitation(arm: RecordedJointsModel, recording: Recording, eff
     still = np.zeros_like(motion.q)
     moving = arm.inverse_dynamics(motion.q, motion.v, motion.a) - arm.inverse_dynamics(motion.q, still, still)
     limit = np.array([joint.effort_limit for joint in arm.joints])
-    friction = np.where(np.isfinite(limit), VISCOUS_FRICTION_FRACTION * limit, 0.0) * motion.v
+    friction = np.where(np.isfinite(limit), _VISCOUS_FRICTION_FRACTION * limit, 0.0) * motion.v
     # noise beyond the band of motion is smoothed away, so that so many samples count as one
     apart = max(1.0, 1 / (2 * _MOTION_BANDWIDTH_HZ * median_sample_period(joints.t)))
     samples = len(joints.t) / apart
@@ -286,3 +287,283 @@ def check_joint_excitation(
             line = "; ".join(f"parameters.{parameter}.free: false" for parameter in parameters)
             where = name, "joints", f"position.{joint}"
             yield Issue("weak_excitation", words, "warning", depth, advice, *where, setting=line)
+
+
+# -- efforts ----------------------------------------------------------------------------------------------------------
+# With measured effort e_j of joint j and the effort w_j that bodies and gravity need (Newton and Euler),
+#
+#     e_j / g_j = w_j + c_j + d_j v_j + s_j sign(v_j) + k_j q_j + (J' f)_j,
+#
+# linear in 1/g_j, offset, friction, springs and in the force f = f_0 + K (x - mean x) + D dx/dt + (quadratic in x) with
+# which each grasp loads the arm, whatever it holds. All have priors of the size that robots have, so that a joint about
+# which the recording says nothing keeps g = 1. Nothing is said of a joint whose effort is not explained: a
+# counterbalance that the URDF does not have is no wrong sign.
+
+_EFFORT_LIMIT_ERROR_FRACTION, _EFFORT_SPREAD_ERROR_FRACTION = 0.02, 0.1
+"""What a robot's model is off by: part of the joint's largest effort, part of the spread of what it needs."""
+_OFFSET_FRACTION, _COULOMB_FRICTION_FRACTION, _JOINT_SPRING_FRACTION = 0.05, 0.02, 0.02
+"""Usual sizes beside a joint's largest effort: of a zero's error, of dry friction, of a spring [per rad]."""
+_GRASP_FORCE_STD, _GRASP_STIFFNESS_STD, _GRASP_QUADRATIC_STIFFNESS_STD, _GRASP_DAMPING_STD = 30.0, 150.0, 1500.0, 30.0
+"""Usual sizes of the force on a grasp [N], and by which it changes [N/m, N/m^2, N s/m]."""
+_WRONG_GAIN_FACTOR = 3.0  # usual size of 1/g, and the factor from which a gain counts as wrong
+_MAX_EXPLAINED_RMS = 1.5
+"""Root mean square of what is left, in sizes of the model's error, up to which a joint's effort is explained."""
+_WELL_EXPLAINED_RMS = 0.5  # the same up to which nothing is left to be explained by a lag
+_WRONG_ROBOT_RMS = 3.0  # the same from which on it is not this robot's
+_MIN_FITTED_STD, _MAX_FITTED_EFFORT = 1e-12, 1e12  # where numbers end that a fit can be made of
+_MIN_Z = 5.0  # standard deviations from which on a number counts
+_INDEPENDENT_SAMPLE_BANDWIDTH = 1.0  # samples further apart than half of its inverse count as independent [Hz]
+_MIN_EFFORT = 1e-3  # efforts below this tell nothing [N m]
+_LAG_SEARCH_STEP = 0.1
+"""Steps in which a lag of efforts behind the motion is looked for; a shorter one is no gross error [s]."""
+_IDLE_COMMAND_FRACTION = 0.2
+"""Part of the largest effort that a joint of which nothing is asked may seem to need: it swings, and has friction."""
+_MAX_EFFORT_RATIO = 1.3
+"""Factor by which an effort may exceed the URDF's limit, which some makers state for continuous use."""
+
+
+@dataclass(frozen=True)
+class _Data:
+    """Motion, recorded efforts (N, k), what bodies and gravity need, and the size of each joint's largest [N m]."""
+
+    arm: RecordedJointsModel
+    motion: SmoothedJointMotion
+    effort: Array
+    needed: Array
+    size: Array
+
+    @property
+    def holders(self) -> tuple[str, ...]:
+        """Frames of the grasps that the arm moves."""
+        frames = (grasp.holder_frame for grasp in self.arm.system.grasps)
+        return tuple(frame for frame in frames if self.arm.is_frame_determined(frame))
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """`inverse` 1/g and its `std`, `offset` [N m], what is `left` in sizes of the model's error, each (k,); `cost`.
+
+    `direct` is the gain by which an effort's variation follows what is needed, `shift` by how much it is off in the
+    mean [N m]: without the prior, and not made smaller by noise of what was measured.
+    """
+
+    inverse: Array
+    std: Array
+    offset: Array
+    offset_std: Array
+    left: Array
+    direct: Array
+    shift: Array
+    cost: float
+
+
+def check_efforts(arm: RecordedJointsModel, recording: Recording) -> list[Issue]:
+    """Issues of recorded efforts that disagree with the inverse dynamics of the recorded motion."""
+    joints = recording.joints
+    motion = None if joints is None else smoothed_joint_motion(joints, arm.joint_names)
+    if joints is None or motion is None or motion.effort is None or len(motion.t) < 10:
+        return []
+    needed = arm.inverse_dynamics(motion.q, motion.v, motion.a)
+    largest = np.array([joint.effort_limit for joint in arm.joints])
+    size = np.where(np.isfinite(largest), largest, np.maximum(np.max(np.abs(needed), axis=0), 1e-9))
+    found = list(_limits(arm, motion.effort, largest))
+    most = [float(np.max(np.abs(values), initial=0.0)) for values in (needed, motion.effort)]
+    if most[0] > _MIN_EFFORT and max(most) < _MAX_FITTED_EFFORT:
+        commanded = joints.effort_kind_or_default == "command"
+        least = (_IDLE_COMMAND_FRACTION if commanded else 2 * _EFFORT_LIMIT_ERROR_FRACTION) * size
+        # zero throughout although gravity and motion need more than the least that counts
+        wanted = np.sqrt(np.mean(needed**2, axis=0))
+        dead = (np.max(np.abs(motion.effort), axis=0) < 1e-3 * wanted) & (wanted > least)
+        if dead.any():
+            found.append(_zero(arm, dead))
+        else:
+            # motion to and fro that is late looks turned round, so that comes first
+            data = _Data(arm, motion, motion.effort, needed, size)
+            found += list(_late(data)) or list(_by_joint(data))
+    return [replace(issue, recording=recording.name) for issue in found]
+
+
+def _issue(cause: str, words: str, depth: float, advice: str, joint: str = "", setting: str = "") -> Issue:
+    """An issue of one joint's effort, or of all."""
+    channel = f"effort.{joint}" if joint else "effort"
+    return Issue(cause, words, "not_trusted", depth, advice, "", "joints", channel, setting=setting)
+
+
+def _limits(arm: RecordedJointsModel, effort: Array, largest: Array) -> Iterator[Issue]:
+    ratio = np.percentile(np.abs(effort), 99, axis=0) / largest
+    if np.any(ratio > _MAX_EFFORT_RATIO):
+        j = int(np.argmax(ratio))
+        words = f"the effort of {arm.joint_names[j]} is {ratio[j]:.3g} times what it can bear ({largest[j]:.3g} N m)"
+        advice = "check the unit of efforts (N m) and the robot's description"
+        yield _issue("effort_limits", words, float(ratio[j]) / _MAX_EFFORT_RATIO, advice, arm.joint_names[j])
+
+
+def _zero(arm: RecordedJointsModel, dead: NDArray[np.bool_]) -> Issue:
+    names = [name for name, off in zip(arm.joint_names, dead, strict=True) if off]
+    which = "all joints" if dead.all() else ", ".join(names)
+    words = f"the effort of {which} is zero throughout, while gravity and motion need more"
+    advice = "record efforts; to leave these out, move the arms as measured and switch their efforts off"
+    setting = "model.arms.mode: prescribed, sensors.joints.effort.use: false"
+    return _issue("effort_zero", words, 1e3, advice, setting=setting)
+
+
+def _by_joint(data: _Data) -> Iterator[Issue]:
+    arm, effort, needed, size = data.arm, data.effort, data.needed, data.size
+    loaded, factor, names = _loaded(data), _WRONG_GAIN_FACTOR, arm.joint_names
+    # What is held can add to efforts, but not several times what the arm itself weighs, nor carry nearly all of that.
+    # A prior about one holds a gain that is a power of ten away, so efforts are scaled first.
+    ratio = float(np.linalg.norm(needed)) / max(float(np.linalg.norm(effort)), 1e-300)
+    common = 1.0 if 1 / factor < ratio < factor else 10.0 ** round(math.log10(ratio))
+    fit = _fitted(replace(data, effort=common * effort))
+    told = fit.std < np.maximum(0.6 * np.abs(fit.inverse), 0.35)
+    sound = told & (fit.left < _MAX_EXPLAINED_RMS) & (np.abs(fit.offset) < 3 * _OFFSET_FRACTION * size)
+    if common != 1.0 and sound.sum() >= 2:
+        scale = 1 / (common * max(float(np.median(np.abs(fit.inverse[sound]))), _MIN_FITTED_STD))
+        if not 1 / factor < scale < factor:
+            words = f"efforts are about {scale:.2g} times what gravity and motion need"
+            advice = f"divide efforts by {1 / common:g}, if their unit is another"
+            yield _issue("effort_gain", words, max(scale, 1 / scale) / factor, advice)
+    turned = sound & (fit.inverse < -_MIN_Z * fit.std / 2) & (fit.inverse < -0.3)
+    yield from _signs(arm, fit, turned, told & (fit.inverse > _MIN_Z * fit.std / 2) & (fit.inverse > 0.3))
+    for j in np.flatnonzero(sound & ~turned):
+        inverse, off = float(fit.inverse[j]), abs(float(fit.inverse[j]) - 1) / float(fit.std[j])
+        strong = 0 < inverse < 1 / factor and fit.direct[j] > factor and not loaded[j]
+        if off > _MIN_Z and (inverse > factor or strong):
+            words = f"the effort of {names[j]} is {1 / inverse:.2g} times what gravity and motion need"
+            yield _issue("effort_gain", words, off / _MIN_Z, "find out what the number stands for", names[j])
+    yield from _offsets(data, fit, told & ~loaded)
+    lost = fit.left > _WRONG_ROBOT_RMS
+    if arm.has_no_unknown_descendants and lost.sum() > len(names) / 2:
+        left = float(np.median(fit.left[lost]))
+        words = (
+            f"efforts of {lost.sum()} of {len(names)} joints are not what this robot needs for this motion: "
+            f"{left:.2g} times what a robot's model is off by"
+        )
+        advice = "check that the recording is this robot's, its unit of time, and the order of joints"
+        yield _issue("effort_unlike", words, left / _WRONG_ROBOT_RMS, advice)
+
+
+def _signs(
+    arm: RecordedJointsModel, fit: _Fit, turned: NDArray[np.bool_], upright: NDArray[np.bool_]
+) -> Iterator[Issue]:
+    depth = -fit.inverse / fit.std / (_MIN_Z / 2)
+    cases = [
+        (f"the effort of {arm.joint_names[j]} has", float(depth[j]), arm.joint_names[j]) for j in np.flatnonzero(turned)
+    ]
+    if turned.sum() >= 2 and not upright.any():
+        cases = [("all efforts have", float(np.max(depth[turned])), "")]
+    for who, by, joint in cases:
+        words = f"{who} the opposite sign of what gravity and motion need"
+        yield _issue("effort_sign", words, by, "turn the sign; effort is what the motor does to the joint", joint)
+
+
+def _offsets(data: _Data, fit: _Fit, told: NDArray[np.bool_]) -> Iterator[Issue]:
+    needed, size = data.needed, data.size
+    low, high = 1 / _WRONG_GAIN_FACTOR, _WRONG_GAIN_FACTOR
+    # a large zero error looks like a large gain; but then the variation follows as it should
+    off_zero = (fit.inverse > 0) & (fit.inverse < low) & (fit.direct > low) & (fit.direct < high)
+    offset = np.where(off_zero, fit.shift, fit.offset)
+    calm = told & (fit.left < _MAX_EXPLAINED_RMS / 1.5) & (off_zero | ((fit.inverse > low) & (fit.inverse < high)))
+    for j in np.flatnonzero(calm & (np.abs(offset) > 3 * _OFFSET_FRACTION * size)):
+        # springs that carry part of the weight are no wrong zero
+        balanced = offset[j] * np.mean(needed[:, j]) < 0 and abs(offset[j]) < np.max(np.abs(needed[:, j]))
+        if abs(offset[j]) > _MIN_Z * fit.offset_std[j] and not balanced:
+            name, value = data.arm.joint_names[j], float(offset[j])
+            words = f"the zero of the effort of {name} is off by {value:+.3g} N m"
+            depth = abs(value) / (3 * _OFFSET_FRACTION * float(size[j]))
+            setting = effect_setting_line("effort_offset", name, "offset", value)
+            yield _issue("effort_offset", words, depth, "let it be estimated, or set the sensor's zero", name, setting)
+
+
+def _late(data: _Data) -> Iterator[Issue]:
+    """Efforts that follow the motion late or early, all alike."""
+    motion, trials = data.motion, _LAG_SEARCH_STEP * np.arange(-5, 6)
+    if motion.t[-1] - motion.t[0] < 4 * trials[-1] or np.max(_fitted(data).left) < _WELL_EXPLAINED_RMS:
+        return
+    inside = (motion.t >= motion.t[0] + trials[-1]) & (motion.t <= motion.t[-1] - trials[-1])
+    kept = replace(motion, t=motion.t[inside], q=motion.q[inside], v=motion.v[inside], a=motion.a[inside])
+    costs = []
+    for late in trials:
+        moved = np.stack([np.interp(kept.t + late, motion.t, column) for column in data.effort.T], axis=1)
+        costs.append(_fitted(replace(data, motion=kept, effort=moved, needed=data.needed[inside])).cost)
+    at = int(np.argmin(costs))
+    lag = float(trials[at])
+    # twice over, so that what friction and grasp take up of a lag does not count
+    if abs(lag) > 0.5 * _LAG_SEARCH_STEP and costs[at] < 0.4 * costs[len(trials) // 2]:
+        words = (
+            f"efforts fit the motion best {abs(lag):.2g} s {'earlier' if lag > 0 else 'later'} than they were recorded"
+        )
+        lines = [effect_setting_line("effort_delay", name, "delay", lag) for name in joints_by_arm(data.arm.system)]
+        setting = "; ".join(lines) if abs(lag) <= _LAG_SEARCH_STEP else ""
+        yield _issue("effort_lag", words, abs(lag) / _LAG_SEARCH_STEP, "shift their times", setting=setting)
+
+
+def _fitted(data: _Data) -> _Fit:
+    motion, effort, needed, size = data.motion, data.effort, data.needed, data.size
+    count, width = needed.shape
+    error = _EFFORT_LIMIT_ERROR_FRACTION * size + _EFFORT_SPREAD_ERROR_FRACTION * needed.std(axis=0)
+    columns, spread = _by_itself(data)
+    loads, sizes = _loads(data)
+    matrix, prior = np.concatenate([columns, loads], axis=2) / error[:, None], np.concatenate([spread, sizes])
+    independent = max(2 * _INDEPENDENT_SAMPLE_BANDWIDTH * (motion.t[-1] - motion.t[0]), 2.0)
+    weight = math.sqrt(min(1.0, independent / count))
+    rows, target = weight * matrix.reshape(count * width, -1), weight * (needed / error).ravel()
+    normal = rows.T @ rows + np.diag(1 / prior**2)
+    neutral = np.arange(len(prior)) < width
+    found = np.linalg.solve(normal, rows.T @ target + neutral / prior**2)
+    std = np.maximum(np.sqrt(np.diag(np.linalg.inv(normal))), _MIN_FITTED_STD)
+    remains = (rows @ found - target).reshape(count, width) / weight
+    others = np.concatenate([np.zeros(2 * width), found[2 * width :]])
+    explained = needed - np.einsum("njc,c->nj", matrix * error[:, None], others)
+    shift = effort.mean(axis=0) - explained.mean(axis=0)
+    moved, about = explained - explained.mean(axis=0), effort - effort.mean(axis=0)
+    direct = np.sum(about * moved, axis=0) / np.maximum(np.sum(moved**2, axis=0), 1e-12)
+    cost = float(np.sum((rows @ found - target) ** 2) + np.sum(((found - neutral) / prior) ** 2))
+    own = slice(width, 2 * width)
+    left = np.sqrt(np.mean(remains**2, axis=0))
+    return _Fit(found[:width], std[:width], found[own], std[own], left, direct, shift, cost)
+
+
+def _by_itself(data: _Data) -> tuple[Array, Array]:
+    """Columns of each joint alone, shape (N, k, 5 k), and their usual sizes: 1/g, offset, friction twice, spring."""
+    motion, size, width = data.motion, data.size, data.effort.shape[1]
+    # a spring is large where the model has one whose stiffness is sought
+    sprung = {spring.joint_name for spring in data.arm.system.elastic_joints}
+    springs = np.where([name in sprung for name in data.arm.joint_names], 10 * size, _JOINT_SPRING_FRACTION * size)
+    parts = [
+        (data.effort, np.full(width, _WRONG_GAIN_FACTOR)),
+        (-np.ones_like(data.effort), _OFFSET_FRACTION * size),
+        (-motion.v, _VISCOUS_FRICTION_FRACTION * size),
+        (-np.tanh(motion.v / 0.02), _COULOMB_FRICTION_FRACTION * size),
+        (-(motion.q - motion.q.mean(axis=0)), springs),
+    ]
+    columns = np.concatenate([values[:, :, None] * np.eye(width) for values, _ in parts], axis=2)
+    return columns, np.concatenate([spread for _, spread in parts])
+
+
+def _loaded(data: _Data) -> NDArray[np.bool_]:
+    """Joints on which what is held can act like a wrong zero."""
+    if not data.holders:
+        return np.zeros(len(data.size), bool)
+    q = data.motion.q
+    _, by_angle = data.arm.frame_positions(data.holders, q[:: max(1, len(q) // 20)])
+    lever = np.max(np.linalg.norm(by_angle, axis=2), axis=(0, 1))
+    return np.asarray(_GRASP_FORCE_STD * lever > 3 * _OFFSET_FRACTION * data.size)
+
+
+def _loads(data: _Data) -> tuple[Array, Array]:
+    """Columns of the force at every grasp, shape (N, k, 33 per grasp), and their usual sizes."""
+    if not data.holders:
+        return np.zeros((*data.needed.shape, 0)), np.zeros(0)
+    place, by_angle = data.arm.frame_positions(data.holders, data.motion.q)
+    columns = []
+    for g in range(len(data.holders)):
+        moved = place[:, g] - place[:, g].mean(axis=0)
+        speed = np.einsum("nik,nk->ni", by_angle[:, g], data.motion.v)
+        for axis in range(3):
+            lever = by_angle[:, g, axis, :]
+            squares = [lever * (moved[:, [b]] * moved[:, [c]]) for b in range(3) for c in range(b, 3)]
+            columns += [lever, *(lever * moved[:, [b]] for b in range(3)), *squares, lever * speed[:, [axis]]]
+    stiffness = [_GRASP_STIFFNESS_STD] * 3 + [_GRASP_QUADRATIC_STIFFNESS_STD] * 6
+    sizes = [_GRASP_FORCE_STD, *stiffness, _GRASP_DAMPING_STD] * 3 * len(data.holders)
+    return np.stack(columns, axis=2), np.array(sizes)

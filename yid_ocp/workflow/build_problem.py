@@ -15,10 +15,10 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.analysis.discretisation import min_grasp_gaps
-from yid_ocp.analysis.effort_checks import check_efforts
 from yid_ocp.analysis.joint_checks import (
     RecordedJointsModel,
     check_dynamic_excitation,
+    check_efforts,
     check_joint_excitation,
     check_joint_limits,
 )
