@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 
 from yid_ocp.analysis.pinocchio_comparison import (
-    _RELATIVE_TOLERANCE,
     PinocchioComparison,
     compare_system_with_pinocchio,
     compare_urdf_with_pinocchio,
 )
-from yid_ocp.analysis.step_diagnostics import with_numeric_parameters
 from yid_ocp.effects import make_effect
 from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.model.mechanism import Mechanism
@@ -73,28 +71,9 @@ def test_effects_are_compared_as_well(urdf_folder, kind, location, value):
     theta = system.parameters.vector({names[0]: value})
     found = compare_system_with_pinocchio(system, theta, np.zeros(system.n_coordinates))
     assert found.agrees, found.words
-    # the effect is there
-    plain = check_against(system, theta, system.parameters.vector())
-    assert not plain.agrees
 
 
-def check_against(system, theta, other) -> PinocchioComparison:
-    """The system at `theta` beside Pinocchio's model of it at `other`."""
-    from yid_ocp.analysis import pinocchio_comparison
-
-    gravity = np.array(ca.DM(system.gravity)).ravel()
-    wrong = with_numeric_parameters(system, other).mechanism
-    models = [pinocchio_comparison._assembled(wrong, gravity, weight) for weight in (False, True)]
-    mechanism = with_numeric_parameters(system, theta).mechanism
-    return pinocchio_comparison._compared("it", mechanism, gravity, *models, np.zeros(system.n_coordinates))
-
-
-def test_a_wrong_number_is_said(urdf_folder):
-    system = branched(urdf_folder)
-    found = check_against(system, system.parameters.vector(), system.parameters.vector({"T2.mass": 0.0501}))
-    assert not found.agrees
-    assert min(found.mass, found.weight, found.motion) > _RELATIVE_TOLERANCE
-    assert found.words.startswith("it differs from Pinocchio's: mass matrix by ")
+def test_differences_are_said():
     assert (
         PinocchioComparison("it", 0.0, 0.02, 0.0).words
         == "it differs from Pinocchio's: weight by 2 % of the largest entry"

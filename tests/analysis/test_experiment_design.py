@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from heard import Heard
-from made_recordings import GRID, group, holding_pendulum, places, setting
+from made_recordings import group, holding_pendulum, places, setting
 
 from yid_ocp.analysis import experiment_design as module
 from yid_ocp.analysis.experiment_design import (
@@ -21,7 +21,6 @@ from yid_ocp.analysis.experiment_design import (
     CandidateExperimentBuilder,
     FrameObservation,
     observable_frames,
-    uniform_sample_times,
     with_observable_frames,
 )
 from yid_ocp.analysis.identifiability import identifiability, with_grasp_offset_effects, with_nuisance_unknowns
@@ -101,11 +100,6 @@ def test_observations_are_of_used_points_that_the_model_has_where_they_were_seen
     np.testing.assert_allclose(found[0].times, [0.0, 0.5, 1.0])
     np.testing.assert_allclose(found[1].times, [0.0, 1.0])
     np.testing.assert_array_equal(found[1].std, np.full((2, 3), 2e-3))
-
-
-@pytest.mark.parametrize(("rate", "times"), [(1.0, [0.0, 1.0, 2.0]), (0.4, [0.0]), (10.0, 0.1 * np.arange(21))])
-def test_an_even_clock_covers_the_recording(rate, times):
-    np.testing.assert_allclose(uniform_sample_times(GRID, rate), times, atol=1e-12)
 
 
 # -- information ------------------------------------------------------------------------------------------------------
