@@ -32,6 +32,7 @@ _ANGLE_LIMIT_MARGIN = 0.1
 _MAX_SPEED_RATIO = 1.5  # factor by which joints may turn faster than the URDF says that they can
 _SPEED_SAMPLE_STRIDE = 5  # samples over which a speed is taken, so that neither noise nor steps of encoders count
 _MOTION_BANDWIDTH_HZ = 5.0  # where motion of a robot's arm ends; what is faster is left out [Hz]
+_MAX_MOTION_SAMPLES = 300
 _VISCOUS_FRICTION_FRACTION = 0.04
 """Usual viscous friction beside a joint's largest effort [per rad/s]."""
 _MIN_SIGNAL_STDS = 5.0  # standard deviations from which on a signal counts as seen, all samples and joints together
@@ -75,7 +76,7 @@ class RecordedJointsModel:
         return set(mechanism.ancestor_joints(mechanism.frame(frame).joint_index)) <= set(self.joint_indices)
 
     @cached_property
-    def has_no_unknown_descendants(self) -> bool:
+    def _has_no_unknown_descendants(self) -> bool:
         """Whether no joint of unknown angle depends on the recorded joints."""
         ancestors, known = self.system.mechanism.ancestor_joints, set(self.joint_indices)
         return not any(set(ancestors(i)) & known for i in range(self.system.n_coordinates) if i not in known)
@@ -129,7 +130,7 @@ class RecordedJointsModel:
 
 
 @dataclass(frozen=True)
-class SmoothedJointMotion:
+class _SmoothedMotion:
     """Smoothed recorded motion at times t (N,): q, v, a and the effort [N m], each (N, k); both ends are left out."""
 
     t: Array
@@ -139,8 +140,8 @@ class SmoothedJointMotion:
     effort: Array | None
 
 
-def smoothed_joint_motion(joints: JointGroup, names: tuple[str, ...], most: int = 300) -> SmoothedJointMotion | None:
-    """Smoothed motion of the named joints at up to `most` times; None where the recording is too short."""
+def _smoothed_motion(joints: JointGroup, names: tuple[str, ...]) -> _SmoothedMotion | None:
+    """Smoothed motion of the named joints at up to `_MAX_MOTION_SAMPLES` times; None where the recording is too short."""
     t, step = joints.t, median_sample_period(joints.t)
     if len(t) < 30 or step <= 0 or t[-1] - t[0] > 1e5 * step:
         return None
@@ -148,13 +149,13 @@ def smoothed_joint_motion(joints: JointGroup, names: tuple[str, ...], most: int 
     low_pass = LowPassFilter(min(_MOTION_BANDWIDTH_HZ, 0.2 / step))
     course = scipy.interpolate.CubicSpline(t, low_pass(t, joints.position[:, columns]), axis=0)
     end = max(5, min(len(t) // 10, round(0.3 / step)))
-    kept = slice(end, len(t) - end, max(1, len(t) // most))
+    kept = slice(end, len(t) - end, max(1, len(t) // _MAX_MOTION_SAMPLES))
     at = t[kept]
     effort = None
     if joints.effort is not None and not np.isnan(joints.effort[:, columns]).any():
         smooth = low_pass(t, joints.effort[:, columns])
         effort = np.stack([np.interp(at, t, column) for column in smooth.T], axis=1)
-    return SmoothedJointMotion(at, course(at), course(at, 1), course(at, 2), effort)
+    return _SmoothedMotion(at, course(at), course(at, 1), course(at, 2), effort)
 
 
 def check_joint_limits(arm: RecordedJointsModel, recording: Recording) -> Iterator[Issue]:
@@ -219,7 +220,7 @@ def check_dynamic_excitation(arm: RecordedJointsModel, recording: Recording, eff
     taken from inverse dynamics and friction of a typical size. The recording is one that the arm `is_recorded_in`.
     """
     joints = recording.joints
-    motion = None if joints is None else smoothed_joint_motion(joints, arm.joint_names)
+    motion = None if joints is None else _smoothed_motion(joints, arm.joint_names)
     if joints is None or motion is None or motion.effort is None or effort.use is False:
         return
     if float(np.max(np.ptp(motion.q, axis=0))) < QUALITY_LIMITS.min_joint_motion:
@@ -327,7 +328,7 @@ class _Data:
     """Motion, recorded efforts (N, k), what bodies and gravity need, and the size of each joint's largest [N m]."""
 
     arm: RecordedJointsModel
-    motion: SmoothedJointMotion
+    motion: _SmoothedMotion
     effort: Array
     needed: Array
     size: Array
@@ -360,7 +361,7 @@ class _Fit:
 def check_efforts(arm: RecordedJointsModel, recording: Recording) -> list[Issue]:
     """Issues of recorded efforts that disagree with the inverse dynamics of the recorded motion."""
     joints = recording.joints
-    motion = None if joints is None else smoothed_joint_motion(joints, arm.joint_names)
+    motion = None if joints is None else _smoothed_motion(joints, arm.joint_names)
     if joints is None or motion is None or motion.effort is None or len(motion.t) < 10:
         return []
     needed = arm.inverse_dynamics(motion.q, motion.v, motion.a)
@@ -433,7 +434,7 @@ def _by_joint(data: _Data) -> Iterator[Issue]:
             yield _issue("effort_gain", words, off / _MIN_Z, "find out what the number stands for", names[j])
     yield from _offsets(data, fit, told & ~loaded)
     lost = fit.left > _WRONG_ROBOT_RMS
-    if arm.has_no_unknown_descendants and lost.sum() > len(names) / 2:
+    if arm._has_no_unknown_descendants and lost.sum() > len(names) / 2:
         left = float(np.median(fit.left[lost]))
         words = (
             f"efforts of {lost.sum()} of {len(names)} joints are not what this robot needs for this motion: "

@@ -178,33 +178,18 @@ def _mask(pattern: ca.Sparsity) -> _BoolMatrix:
 
 
 @dataclass(frozen=True)
-class NlpStageSparsity:
-    """Sparsity of one stage of the NLP, the same for all stages.
+class _NlpStage:
+    """Sparsity of one stage of the NLP, the same for all; the start depends on all free parameters."""
 
-    Attributes
-    ----------
-    constraint_mask : ndarray of bool, shape (r, w)
-        One step's constraints by (theta_free, x_k, x_{k+1}, lam_k).
-    hessian_mask : ndarray of bool, shape (w, w)
-        Of these constraints times their multipliers.
-    gauss_newton_mask : ndarray of bool, shape (f + nx, f + nx)
-        Gauss-Newton Hessian of the priors and of one reading of every sensor, by (theta_free, x_k).
-    constraint_blocks, state_blocks : sequence of (str, tuple of str)
-        Names and labels of the blocks of a step's constraints, and of a node's state.
-    fixed_start_rows, estimated_start_rows : sequence of int
-        Rows of the first node's state that the start fixes, and that have a prior about it; the start depends on all
-        free parameters.
-    """
-
-    constraint_mask: _BoolMatrix
-    hessian_mask: _BoolMatrix
-    gauss_newton_mask: _BoolMatrix
+    constraint_mask: _BoolMatrix  # one step's constraints by (theta_free, x_k, x_{k+1}, lam_k)
+    hessian_mask: _BoolMatrix  # of these constraints times their multipliers
+    gauss_newton_mask: _BoolMatrix  # of the priors and of one reading of every sensor, by (theta_free, x_k)
     constraint_blocks: Sequence[_Block]
     state_blocks: Sequence[_Block]
     multiplier_labels: tuple[str, ...]
     free: tuple[str, ...]
-    fixed_start_rows: Sequence[int]
-    estimated_start_rows: Sequence[int]
+    fixed_start_rows: Sequence[int]  # of the first node's state, that the start fixes
+    estimated_start_rows: Sequence[int]  # that have a prior about it
 
     @property
     def sizes(self) -> tuple[int, int, int, int]:
@@ -219,7 +204,7 @@ def nlp_stage_sparsity(
     sensors: Sequence[Sensor],
     followed: Sequence[int],
     loose: Sequence[int],
-) -> NlpStageSparsity:
+) -> _NlpStage:
     """Sparsity of one stage of the NLP with a node at every step, in the order of `solvers.transcription`.
 
     The parameters `free` are unknowns, `sensors` read nodes, the tracking filter feeds the rows `followed` of the state
@@ -256,10 +241,10 @@ def nlp_stage_sparsity(
     rows_blocks = _blocks(symbols, "del", "internal", "constraint", "p1", kept=kept)
     state, labels = _blocks(symbols, "q0", "p0", "z0"), _blocks(symbols, "lam")[0][1]
     fixed = np.setdiff1d(np.arange(nx), [*system.prescribed_indices, *loose]).tolist()
-    return NlpStageSparsity(by_stage, hessian, measured, rows_blocks, state, labels, tuple(free), fixed, loose)
+    return _NlpStage(by_stage, hessian, measured, rows_blocks, state, labels, tuple(free), fixed, loose)
 
 
-def kkt_size(stage: NlpStageSparsity, steps: Sequence[int]) -> dict[str, int]:
+def kkt_size(stage: _NlpStage, steps: Sequence[int]) -> dict[str, int]:
     """Size of the NLP with a node at every step, of several recordings, whose numbers of steps are given.
 
     `jacobian_nonzeros` counts those of the constraints, `hessian_nonzeros` both triangles of the exact Hessian of the
@@ -278,7 +263,7 @@ def kkt_size(stage: NlpStageSparsity, steps: Sequence[int]) -> dict[str, int]:
     }
 
 
-def _nlp_sparsity_masks(stage: NlpStageSparsity, steps: int) -> tuple[_BoolMatrix, _BoolMatrix, _BoolMatrix]:
+def _nlp_sparsity_masks(stage: _NlpStage, steps: int) -> tuple[_BoolMatrix, _BoolMatrix, _BoolMatrix]:
     """Sparsity masks of one recording's constraint Jacobian, constraint Hessian and measurement Hessian."""
     (f, nx, m, height), fixed = stage.sizes, stage.fixed_start_rows
     width = f + (steps + 1) * nx + steps * m
@@ -303,7 +288,7 @@ def _nlp_sparsity_masks(stage: NlpStageSparsity, steps: int) -> tuple[_BoolMatri
     return jacobian, hessian, measured
 
 
-def kkt_pattern(stage: NlpStageSparsity, steps: int) -> SparsityPattern:
+def kkt_pattern(stage: _NlpStage, steps: int) -> SparsityPattern:
     """The KKT matrix [[H, J'], [J, 0]] of the first steps of a recording, as if every node were measured."""
     jacobian, hessian, measured = _nlp_sparsity_masks(stage, steps)
     blank = np.zeros((len(jacobian), len(jacobian)), bool)
