@@ -32,7 +32,7 @@ _ANGLE_LIMIT_MARGIN = 0.1
 _MAX_SPEED_RATIO = 1.5  # factor by which joints may turn faster than the URDF says that they can
 _SPEED_SAMPLE_STRIDE = 5  # samples over which a speed is taken, so that neither noise nor steps of encoders count
 _MOTION_BANDWIDTH_HZ = 5.0  # where motion of a robot's arm ends; what is faster is left out [Hz]
-_MAX_MOTION_SAMPLES = 300
+_MAX_MOTION_SAMPLES = 300  # about so many samples of a motion are looked at
 _VISCOUS_FRICTION_FRACTION = 0.04
 """Usual viscous friction beside a joint's largest effort [per rad/s]."""
 _MIN_SIGNAL_STDS = 5.0  # standard deviations from which on a signal counts as seen, all samples and joints together
@@ -141,7 +141,7 @@ class _SmoothedMotion:
 
 
 def _smoothed_motion(joints: JointGroup, names: tuple[str, ...]) -> _SmoothedMotion | None:
-    """Smoothed motion of the named joints at up to `_MAX_MOTION_SAMPLES` times; None where the recording is too short."""
+    """Smoothed motion of the named joints at a few hundred times; None where the recording is too short."""
     t, step = joints.t, median_sample_period(joints.t)
     if len(t) < 30 or step <= 0 or t[-1] - t[0] > 1e5 * step:
         return None
