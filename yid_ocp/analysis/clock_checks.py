@@ -137,6 +137,7 @@ def check_held_point_clock(
         if more is None:
             return
         late, drift = late + more.delay, drift + more.drift
+    assert more is not None
     found = replace(more, delay=late, drift=drift)
     moved, limit = float(np.sqrt(np.mean(np.sum(speed**2, axis=2)))), _offset_tolerance(joints, group)
     severity: Severity = "not_trusted" if moved * max(abs(late), abs(found.whole_drift)) > noise else "warning"
